@@ -52,7 +52,7 @@ class Rig(Enum):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `acquire` with arguments, by default those of the process, and return the exit code (`EXIT_CODES`)."""
+    """Run `acquire` with arguments (default: `sys.argv`) and return the exit code (`EXIT_CODES`)."""
     return console.run(lambda: app(args=argv, prog_name="acquire"))
 
 
@@ -308,15 +308,14 @@ def run(
         outcome = run_session(
             settings, session, shown.progress, shown.announce, retake, ending, shown.show_frame, shown.state
         )
-    output.add(
-        session=session, frames=outcome.total, left=outcome.remaining, refused=outcome.refused, doubts=outcome.doubts
-    )
+    missing, refused, doubts = outcome.remaining, outcome.refused, outcome.doubts
+    output.add(session=session, frames=outcome.total, left=missing, refused=refused, doubts=doubts)
     for doubt in outcome.doubts:
         print(f"doubt: {doubt}")
     if not outcome.complete:
         raise QualityError(
-            f"{outcome.total - outcome.remaining} of {outcome.total} planned frames are complete, {outcome.remaining} "
-            "are missing; remove the causes, and run the same command again: " + "; ".join(outcome.refused)
+            f"{outcome.total - missing} of {outcome.total} planned frames are complete, {missing} are missing; remove "
+            "the causes, and run the same command again: " + "; ".join(refused)
         )
     print(f"{session}: complete, {outcome.total} frames; next: build-lut {shlex.quote(str(session))} LUT/")
 

@@ -98,7 +98,6 @@ def _state_text(head: Head) -> str:
 
 
 def _remaining_text(head: Head) -> str:
-    """Return the remaining time; the number of frames if no run is active."""
     if head.done == head.total:
         return "none"
     if not head.alive:
@@ -109,7 +108,6 @@ def _remaining_text(head: Head) -> str:
 
 
 def _white_drift(view: SessionView) -> float | None:
-    """Return the relative change of the newest accepted white frame since the first; None with fewer than two."""
     white_steps = {step.number for step in view.steps if step.kind == "white"}
     rgb = [
         attempt.seen
@@ -155,5 +153,4 @@ def check_text(check: Check) -> str:
 
 
 def _block(title: str, lines: list[str]) -> list[str]:
-    """Return lines under a title; empty without lines."""
     return [f"{title}:", *(f"  {line}" for line in lines)] if lines else []

@@ -217,9 +217,7 @@ def _exposure_findings(exposure: TriedExposures, settings: LabSettings) -> list[
         findings.append(Finding("exposure", "fault", reason))
     difference = disagreement(first, settings.camera.exposure)
     if difference is not None:
-        findings.append(
-            Finding("settings", "fault", difference, remedy="set the mode dial to M and leave the other dials")
-        )
+        findings.append(Finding("settings", "fault", difference, remedy="set the mode dial of the camera to M"))
     return findings
 
 
@@ -267,14 +265,10 @@ def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
     tilt_deg, quarters = off_level_deg(framing.rotation_deg)
     turned = f", in addition to a harmless turn by {90 * quarters}°" if quarters else ""
     across, down = keystone(project(framing.homography, [(0, 0), (width, 0), (width, height), (0, height)]))
+    tilt = f"the chart is turned by {tilt_deg:+.1f}° in the image{turned}"
     lost = falloff(table.frames[0].paper.field.at(chart.centres_mm))
     return [
-        judge_value(
-            TURN,
-            abs(tilt_deg),
-            f"the chart is turned by {tilt_deg:+.1f}° in the image{turned}",
-            details={"turned": quarters},
-        ),
+        judge_value(TURN, abs(tilt_deg), tilt, details={"turned": quarters}),
         judge_value(KEYSTONE, max(across, down), details={"across": across, "down": down}),
         judge_value(
             EVENNESS,
@@ -288,7 +282,6 @@ def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
 def _make_devices_ready(
     devices: Devices, settings: LabSettings, announce: Callable[[str], None]
 ) -> tuple[list[str], list[Finding]]:
-    """Make every device ready for a frame; return a line on each, and warnings of screen and projector."""
     projector = devices.projector
     questions: dict[str, Callable[[], object]] = {
         "camera": lambda: (devices.camera.identity(), devices.camera.configure(settings.camera.exposure)),

@@ -39,10 +39,7 @@ class Shot:
         positions = phases(self.mosaic)
         return np.array(
             [
-                max(
-                    float(np.percentile(blocks[position], percentile) - black[position])
-                    for position in positions[channel]
-                )
+                max(float(np.percentile(blocks[phase], percentile) - black[phase]) for phase in positions[channel])
                 for channel in CHANNELS
             ]
         )
@@ -178,7 +175,7 @@ def measure_saturation(first: Shot, take: Callable[[float], Shot], times_s: Sequ
 
 
 def _plateaus(shorter: Shot, longer: Shot) -> list[float]:
-    """Return the counts of those positions of the 2×2 block that are saturated in the longer frame."""
+    """Return the counts of all saturated positions of the 2×2 block in the longer frame."""
     shorter_counts, longer_counts = _paper_counts(shorter.mosaic), _paper_counts(longer.mosaic)
     black = frame_black(shorter.mosaic)
     expected = (shorter_counts - black) * longer.shutter_s / shorter.shutter_s
@@ -200,9 +197,7 @@ def measure_level(shot: Shot, saturation: Saturation, white: _Array | None = Non
     """
     black = frame_black(shot.mosaic)
     positions = phases(shot.mosaic)
-    ranges = np.array(
-        [saturation.counts - np.mean([black[position] for position in positions[channel]]) for channel in CHANNELS]
-    )
+    ranges = np.array([saturation.counts - np.mean([black[at] for at in positions[channel]]) for channel in CHANNELS])
     white = shot.brightest(99.0) if white is None else white
     red, green, blue = (white / ranges).tolist()
     return TriedTime(shot.shutter_s, (red, green, blue), max(red, green, blue) >= CLIPPING_SHARE)
@@ -294,8 +289,7 @@ def judge_exposure(
         return finding
     if not _is_suitable(first):
         reason = (
-            f"{100 * SUITABLE[0]:.0f} to {100 * SUITABLE[1]:.0f} % expected: above, brighter places clip; below, noise "
-            "grows"
+            f"{100 * SUITABLE[0]:.0f} to {100 * SUITABLE[1]:.0f} % expected: above, places clip; below, noise grows"
         )
         return replace(finding, grade="remark", reason=reason, remedy=remedy)
     if not saturation.measured:

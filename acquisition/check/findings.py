@@ -25,7 +25,7 @@ class Finding:
     - `name`: of the figure or limit, or of the checked object, such as "chart".
     - `grade`: good, remark, fault or not checked.
     - `said`: the measured value in words, or the reason why it could not be measured.
-    - `value`: the judged value; None if there is none.
+    - `value`: the judged value; None without a value.
     - `unit`: unit of the value and the limits, as in `Limit`.
     - `good`, `tolerable`: ranges that are accepted, and accepted with remarks.
     - `reason`: the expected value and the harm beyond it; empty if the value is good.

@@ -64,13 +64,12 @@ def _card(supplies: Supplies, needed: int) -> Finding:
     if supplies.saves_to_host:
         return Finding("card", "good", "frames are saved on this computer, the card is not used")
     if supplies.card_free_bytes is None:
-        reason = "frames are saved on the camera's card, and the camera does not report its free space"
-        return not_checked("card", reason, f"make sure that {bytes_text(needed, up=True)} are free on it")
+        remedy = f"make sure that {bytes_text(needed, up=True)} are free on it"
+        return not_checked("card", "frames are saved on the camera's card, but its free space is not reported", remedy)
     return judge_value(
         CARD,
         supplies.card_free_bytes / max(needed, 1),
-        f"the card, where frames are saved, has {bytes_text(supplies.card_free_bytes)} free, "
-        f"{bytes_text(needed, up=True)} needed",
+        f"the card has {bytes_text(supplies.card_free_bytes)} free, {bytes_text(needed, up=True)} needed for frames",
         "",
         {"free_bytes": supplies.card_free_bytes, "needed_bytes": needed},
     )
@@ -83,8 +82,7 @@ def judge_noise_reduction(timings: Sequence[tuple[float, float]]) -> Finding:
     """
     times = sorted(timings)
     if not times or times[-1][0] < 1.0 or times[-1][0] < 4 * times[0][0]:
-        reason = "it needs two exposures that differ by a factor of 4, the longer at least 1 s"
-        return not_checked(NOISE_REDUCTION.name, reason)
+        return not_checked(NOISE_REDUCTION.name, "no exposure of at least 1 s is 4 times as long as another one")
     shortest = np.median([elapsed_s - shutter_s for shutter_s, elapsed_s in times if shutter_s == times[0][0]])
     longest = np.median([elapsed_s - shutter_s for shutter_s, elapsed_s in times if shutter_s == times[-1][0]])
     growth = float((longest - shortest) / (times[-1][0] - times[0][0]))

@@ -65,9 +65,7 @@ from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError, RegistrationError
 from foundation.robust import sigma_of
 
-_BEFORE_RESTART = (
-    "this frame was exposed before an inconsistency of the earlier frames was detected; those frames are repeated first"
-)
+_BEFORE_RESTART = "this frame was exposed before earlier frames proved inconsistent; those frames are repeated first"
 
 _UNPREDICTABLE = (
     "this illuminant cannot be predicted: an accepted black frame and one of each primary are needed; see why those "
@@ -318,7 +316,7 @@ def _judge_repeated(state: JudgeState, measured: Measured) -> Check:
 
 
 def _independence(frame: Measured, reference: Measured) -> float | None:
-    """Return the noise of the difference of two frames over that of independent frames; None if it is too small."""
+    """Return the noise of the difference of two frames, relative to independent frames; None if it is too small."""
     if frame.samples.shape != reference.samples.shape or len(frame.samples) == 0:
         return None
     noise, other_noise = frame.green_noise, reference.green_noise
@@ -794,7 +792,7 @@ def _light_distance(amounts: _Array, reference: _Array, scatter: float) -> float
 class _LightComparison:
     """Comparison of the light of a frame with the ordered `codes` and with other explanations.
 
-    - `previous`: the previous frame; None if there is none.
+    - `previous`: the previous frame, or None.
     - `plan`: codes of all illuminants.
     """
 
@@ -905,7 +903,7 @@ class _LightComparison:
         )
 
     def _other_reason(self, squared: float) -> str:
-        """Return the message about another illuminant of the plan, black or white that is shown; else ""."""
+        # Also black and white may be shown instead of the ordered illuminant.
         best: tuple[float, Codes] | None = None
         # Only codes of similar amounts are compared in full.
         for codes in self._nearest([*self.plan, (0, 0, 0), (255, 255, 255)]):
@@ -988,7 +986,6 @@ def _brightness_reason(brightness: float, room: float) -> str:
 
 
 def _without_model(light: FrameLight, codes: Codes, last: RecentFrame | None) -> Check:
-    """Check, without frames of the primaries, whether the light has changed since the previous frame."""
     if last is None or last.amounts is None or last.codes == codes or not any(codes) or not any(last.codes):
         return Check(OFF_CODES_DEG.name)
     linear = np.array([decode_srgb(np.array(c) / 255) for c in (codes, last.codes)])
@@ -1048,7 +1045,7 @@ def _judge_evenness(
     """Check that a lit frame shows one illuminant everywhere; return also the deviating tiles (T,) to draw.
 
     `moved_px`: (2,) displacement of the chart from the basis. `previous`: the previous frame, which may still be shown
-    in a part; None if there is none.
+    in a part of this one, or None.
     """
     rest = light.tiles
     systematic = UNIFORMITY.accept if basis.of_primaries else limits.UNEVEN_WHITE
@@ -1138,7 +1135,7 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
 
 
 def _is_ragged(rest: Residuals, wrong_strips: npt.NDArray[np.bool_]) -> bool:
-    """Return whether the deviation of strips (S,) bool changes from row to row; a shadow is continuous."""
+    # The deviation of a shadow is continuous, the deviation of scrambled rows changes from row to row.
     deviation, is_wrong = np.nan_to_num(rest.signed).reshape(-1, SEGMENTS), wrong_strips.reshape(-1, SEGMENTS)
     are_neighbours = is_wrong[1:] & is_wrong[:-1]
     if np.count_nonzero(are_neighbours) < ROWS.accept:

@@ -1,4 +1,4 @@
-"""Limits of the live judge, in addition to those of `calibration.figures` and LAB.toml, each with its reason.
+"""Limits of the live judge that are not in `calibration.figures` or LAB.toml, each with its reason.
 
 Quantities that scatter (colour wheel, shutter, lamp) are limited in standard deviations of the measured scatter.
 """

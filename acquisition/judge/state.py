@@ -367,7 +367,7 @@ class FrameLight:
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """The images whose weighted sum is a frame.
+    """Images of the primaries; a frame is their weighted sum.
 
     - `dark`: (T, 3) float64, counts above black while the projector shows black.
     - `maps`: (3, T, 3) float64, light added by each primary, of channel R, G, B.
@@ -593,7 +593,7 @@ class JudgeState:
     - `lost`: whether the measurement of an accepted reference of an earlier run cannot be read.
     - `founding`: whether no illuminant has been accepted since the start, the resumption or the pause of the run.
     - `first_frames`: frames accepted during this time.
-    - `contradicted`: numbers of steps whose frames contradicted these once.
+    - `contradicted`: numbers of the steps that contradicted these frames once.
     - `restarts`: number of repetitions of these frames for this reason.
     - `first_step`: number of the step of their first; None before it.
     - `restart_step`: number of the step that a restart takes first; None after it. A frame of another step was already
@@ -693,9 +693,8 @@ class JudgeState:
             state = replace(state, founding=False, first_frames=(), restarts=0)
         if step.kind != "dark":
             # Deviations from before a step of the lamp are meaningless.
-            leaning = (
-                Leaning() if examined.lamp.stepped or state.rested else state.leaning.extended(examined.lamp.leaning)
-            )
+            is_new = examined.lamp.stepped or state.rested
+            leaning = Leaning() if is_new else state.leaning.extended(examined.lamp.leaning)
             state = replace(state, rested=False, leaning=leaning)
         steady = float(np.hypot(*(frame.moved_px - np.array(self.candidate[1:])))) <= limits.STEADY_PX
         if not np.isnan(frame.moved_px).any() and (self.rested or steady):

@@ -229,7 +229,6 @@ def read_session(folder: Path, earlier: SessionView | None = None) -> SessionVie
 
 
 def _without_own_files(folder: Path) -> str:
-    """Return that chart or illuminants of a session are missing, with the remedy; else ""."""
     missing = [str(folder / name) for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
     return f"{' and '.join(missing)}: missing; restore from a copy of the session" if missing else ""
 
@@ -290,8 +289,7 @@ def head_of(
         elif _is_full(view, free_bytes) and (state, _cause(sentence)) != ("paused", "the disk"):
             state, sentence = "late", "the disk is full; delete files, then the run resumes automatically"
     judged = [attempt for attempt in attempts if attempt.verdict is not None]
-    timed = (TimedAttempt(attempt.seconds, attempt.verdict in (ACCEPTED, VOIDED)) for attempt in judged)
-    remaining = time_left(timed, missing)
+    remaining = time_left((TimedAttempt(view.seconds, view.verdict in (ACCEPTED, VOIDED)) for view in judged), missing)
     is_lab_time_real = (
         heartbeat is not None
         and bool(attempts)
@@ -324,7 +322,6 @@ def _is_full(view: SessionView, free_bytes: int | None) -> bool:
 
 
 def _cause(sentence: str) -> str:
-    """Return the device that a sentence names first."""
     positions = {sentence.find(cause): cause for cause in CAUSES if cause in sentence}
     return positions[min(positions)] if positions else ""
 
@@ -428,10 +425,9 @@ class SessionWatch:
             return self._head()
 
     def picture(self, attempt: int) -> bytes:
-        """Return the preview of an attempt as JPEG; empty if there is none."""
+        """Return the preview of an attempt as JPEG, or b""."""
         view = self.view()
-        attempts = view.attempts if view else ()
-        match = next((candidate for candidate in attempts if candidate.id == attempt and candidate.has_frame), None)
+        match = next((row for row in view.attempts if row.id == attempt and row.has_frame), None) if view else None
         return _read_picture(self.folder, match.file) if match else b""
 
     def state(self, since: str = "") -> Json | None:
@@ -458,18 +454,15 @@ class SessionWatch:
         return self._known.view.head(datetime.now(UTC))
 
     def _news(self, numbered: _Numbered, since: str) -> Json:
-        """Return the changes that a page with this cursor does not have."""
         view = numbered.view
         epoch, revision, *_ = (*since.split("."), "", "")
         is_complete = epoch != numbered.epoch or not _REVISION.fullmatch(revision)
         received = -1 if is_complete else int(revision)
         recent = {attempt.id for attempt in view.attempts[-_SENT_AGAIN:]}
-        revisions = numbered.attempts
-        attempts = [each for each in view.attempts if revisions[each.id] > received or each.id in recent]
+        rows = [row for row in view.attempts if numbered.attempts[row.id] > received or row.id in recent]
         changes: Json = {
             "frames": [
-                _attempt_json(attempt, numbered.whites[attempt.id], _preview_version(self.folder, attempt.file))
-                for attempt in attempts
+                _attempt_json(row, numbered.whites[row.id], _preview_version(self.folder, row.file)) for row in rows
             ],
             "events": [_event_json(event) for event in view.events if numbered.events[event.number] > received],
         }
@@ -525,7 +518,7 @@ def _numbered(inode: int, view: SessionView, earlier: _Numbered | None) -> _Numb
 
 
 def _signature(path: Path) -> _Signature:
-    """Return data that changes with the journal: of its file, and of its write-ahead file."""
+    # Data that change with the journal: of its file, and of its write-ahead file.
     signature: list[tuple[int, int, int]] = []
     for suffix in ("", "-wal"):
         try:
@@ -541,8 +534,8 @@ def _signature(path: Path) -> _Signature:
 def _session_json(view: SessionView) -> Json:
     """Return the constant content of a session: name, plan, illuminants and devices.
 
-    A step is [number, kind, illuminant, red, green, blue], an illuminant [index, kind, K, [r, b], red, green, blue];
-    its chromaticity is that of `experiment.lights`, None for black.
+    A step is [number, kind, illuminant, red, green, blue], an illuminant [index, kind, K, [r, b], red, green, blue].
+    The chromaticity [r, b] is defined in `experiment.lights`; None for black.
     """
     kinds = {light.index: (light.kind, light.cct_k) for light in view.lights}
     colours = {step.illumination: step.colour for step in view.steps if step.illumination is not None}
@@ -574,11 +567,6 @@ def place_of(red: float, green: float, blue: float) -> list[float] | None:
 
 
 def _attempt_json(view: AttemptView, white: tuple[float, float, float] | None, preview: int | None) -> Json:
-    """Return an attempt.
-
-    `white`: RGB of the white frame with which it is compared; None if there is none. `preview`: version of its picture;
-    None if there is none.
-    """
     seen = view.seen
     chromaticity = place_of(*(rgb / w for rgb, w in zip(seen, white, strict=True))) if seen and white else None
     values: Json = {
@@ -599,7 +587,7 @@ def _attempt_json(view: AttemptView, white: tuple[float, float, float] | None, p
 
 
 def _check(check: Check) -> list[Any]:
-    """Return a check: [name, unit, value, low, high], and the reason if there is one."""
+    # [name, unit, value, low, high], and the reason if there is one.
     numbers = [None if number is None else _rounded(number) for number in (check.value, check.low, check.high)]
     return [check.name, check.unit, *numbers, *([check.reason] if check.reason else [])]
 
@@ -763,11 +751,9 @@ def _script() -> str:
     return "".join(map(_web_text, SCRIPTS))
 
 
-def _policy(directives: str) -> str:
+def _policy(sources: str) -> str:
     style, script = _hash(_web_text("page.css")), _hash(_script())
-    return (
-        f"default-src 'none'; script-src {script}; style-src {style}; base-uri 'none'; form-action 'none'; {directives}"
-    )
+    return f"default-src 'none'; script-src {script}; style-src {style}; base-uri 'none'; form-action 'none'; {sources}"
 
 
 def _hash(text: str) -> str:

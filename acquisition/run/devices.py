@@ -94,7 +94,7 @@ def reported_error(projector: Projector) -> DeviceFault | None:
     """Return the errors that a projector reports, as one fault; None if it reports none."""
     part_names = ", ".join(fault.part for fault in projector.faults() if fault.severity is Severity.ERROR)
     remedy = "look at its display and have it repaired"
-    return DeviceFault(f"the projector reports an error of {part_names}", remedy=remedy) if part_names else None
+    return DeviceFault(f"the projector reports an error of its {part_names}", remedy=remedy) if part_names else None
 
 
 def _power_fault(projector: Projector) -> DeviceFault | None:
@@ -171,7 +171,8 @@ def _wait_until_healthy(projector: Projector, retry: RetryPolicy, pause: Pause, 
         if not isinstance(fault, LinkError):
             answered = retry.clock.monotonic()
             went_out = went_out or not _is_lit(projector)
-        # Once per pause: repeated tries would wear out a lamp that does not light.
+        # Only on request, since somebody may have switched it off on purpose; and once per pause, since repeated tries
+        # would wear out a lamp that does not light.
         if relight and _power(projector) is Power.STANDBY:
             relight = False
             with suppress(DeviceError):
@@ -196,8 +197,7 @@ def _light(projector: Projector, retry: RetryPolicy) -> bool:
             state = "does not answer" if power is None else f"is still in {power.value}"
             start = "it was switched on" if switched else "the first question"
             raise DeviceFault(
-                f"the projector {state} {POWER_LIMIT_S:g} s after {start}, but must be on",
-                remedy="look at its lamp and its display",
+                f"the projector {state} {POWER_LIMIT_S:g} s after {start}", remedy="look at its lamp and its display"
             )
         state = "does not answer yet" if power is None else f"is in {power.value}"
         retry.wait(1.0, "waiting", lambda state=state: f"waiting for the lamp; the projector {state}")
@@ -206,7 +206,7 @@ def _light(projector: Projector, retry: RetryPolicy) -> bool:
 
 
 def _power(projector: Projector) -> Power | None:
-    """Return the power state; None without an answer, which some projectors do not give while the lamp is lighting."""
+    # Some projectors do not answer while the lamp is lighting.
     try:
         return projector.power()
     except (LinkError, DeviceRefused):
@@ -241,7 +241,6 @@ def _warm_up(projector: Projector, sequence: SequenceSettings, retry: RetryPolic
 
 
 def _stayed_lit(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> bool:
-    """Wait for a lamp that was just lit; return False if it went out during this time."""
     until = retry.clock.monotonic() + sequence.warm_up_s
     wait = duration_text(sequence.warm_up_s)
     retry.report("warming up", f"the lamp was just lit; the run waits {wait} until its colour is steady")
@@ -373,7 +372,7 @@ def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
 
 
 def fault_of(device: str, fault: CropError) -> CropError:
-    """Return a fault whose message begins with the name of its device: an address alone does not identify it."""
+    """Return a fault with the name of its device in front: an address alone does not identify it."""
     if str(fault).startswith((device, f"the {device}")):
         return fault
     if fault.about is not None:
@@ -397,7 +396,7 @@ def _light_period_s(projector: ProjectorCable) -> float:
 
 
 def wheel_of(settings: LabSettings) -> float:
-    """Return the turns per second of the colour wheel; 0 if there is none, or it is unknown."""
+    """Return the turns per second of the colour wheel; 0 without a wheel, or if it is unknown."""
     if settings.rig == "simulated":
         return float(settings.simulated.room.get("wheel_hz", 0))
     return settings.lab.projector.colour_wheel_hz or 0.0 if settings.rig == "lab" else 0.0
@@ -548,7 +547,7 @@ class RetryPolicy:
                     self._idle()
 
     def sign_of_life(self, state: str, sentence: str, within_s: float) -> None:
-        """Report what the run waits for; errors of the disk are ignored."""
+        """Report the reason of the wait; errors of the disk are ignored."""
         with suppress(StorageError):
             self._on_wait(state, sentence, within_s)
 
@@ -660,17 +659,16 @@ def pause_cause(sentence: str) -> str:
 
 
 def _with_name(name: str, sentence: str) -> str:
-    """Return a sentence with the name of the device in front, unless it is already there."""
     return sentence if sentence.startswith(name) else f"{name}: {sentence}"
 
 
 def _kind(fault: CropError | str) -> str:
-    """Return the text of a fault without its numbers, which may change from one try to the next."""
+    # Numbers in a message may change from one try to the next.
     return re.sub(r"\d+(?:[.,]\d+)*", "#", str(fault))
 
 
 def _family(fault: CropError) -> type[CropError]:
-    """Return the nearest class of the error tree: classes of drivers have other parameters."""
+    # Classes of drivers have other parameters than a message.
     return next(error_class for error_class in type(fault).__mro__ if error_class.__module__ == errors.__name__)
 
 
@@ -735,9 +733,9 @@ class RunWatch:
 
     @contextmanager
     def step(self, device: str, doing: str, expected_s: float, step_kind: str) -> Generator[None]:
-        """Watch what a device does in the block.
+        """Watch a device during the block.
 
-        Its expected duration is `expected_s`, or that of the last step of the same kind if it is longer.
+        The expected duration is `expected_s`, or the duration of the last step of this kind if it was longer.
         """
         step = _Step(device, doing, max(expected_s, self._took.get(step_kind, 0.0)), self._elapsed())
         with self._lock:
@@ -754,21 +752,17 @@ class RunWatch:
         """Look at the time."""
         late: _Step | None = None
         with self._lock:
-            now_s = self._elapsed()
-            passed, self._last = now_s - self._last, now_s
+            now = self._elapsed()
+            passed, self._last = now - self._last, now
             step = self._step
             if passed > GAP_S:
                 self._gap_s += passed
                 if step is not None:
                     step.started += passed
-            if (
-                step is not None
-                and not step.is_reported
-                and now_s - step.started > LATE_TIMES * step.expected_s + LATE_S
-            ):
+            if step is not None and not step.is_reported and now - step.started > LATE_TIMES * step.expected_s + LATE_S:
                 late, step.is_reported = step, True
         if late is not None:
-            started = datetime.now(UTC) - timedelta(seconds=now_s - late.started)
+            started = datetime.now(UTC) - timedelta(seconds=now - late.started)
             expected = duration_text(late.expected_s) if late.expected_s >= 1 else f"{late.expected_s:.1g} s"
             since = f"{started.astimezone():%Y-%m-%d %H:%M:%S}"
             self._on_late(

@@ -47,7 +47,7 @@ class Imported:
 
     - `refused`: one sentence for each refused frame.
     - `left`: illuminants and kinds of frames without an accepted frame, in words.
-    - `unchecked`: suffixes of files whose completeness cannot be checked.
+    - `unchecked`: suffixes of formats that cannot be checked for completeness.
     """
 
     refused: tuple[str, ...]

@@ -106,7 +106,7 @@ class Taken:
 
 @dataclass(frozen=True)
 class ShownLight:
-    """A step whose illuminant has been shown since `since`, s of the clock; showing it took `show_s`.
+    """A step with its illuminant on the screen since `since`, s of the clock; showing it took `show_s`.
 
     `replaced`: the previous colour; None for the first.
     """
@@ -120,7 +120,7 @@ class ShownLight:
 
 @dataclass(frozen=True)
 class Exposed:
-    """An exposed frame; `checks` are those of the devices.
+    """An exposed frame, with the checks of the devices.
 
     `number`: of its attempt in the journal. `stem`: name of its file without suffix. `changed`: whether another colour
     was shown and exposed before it, so that a late or frozen picture would be detected.
@@ -140,7 +140,7 @@ class Saved:
     """A complete raw file and its verdict.
 
     - `save_s`, `judge_s`: durations of hashing, flushing and renaming, and of judging, s of the computer's clock.
-    - `preview_fault`: why its preview could not be written; "" if it was, or there is none.
+    - `preview_fault`: why its preview could not be written; "" if there was no fault.
     """
 
     received: ReceivedFile
@@ -200,7 +200,6 @@ class Pipeline:
         return None
 
     def _take(self, light: ShownLight) -> ShownLight | None:
-        """Take the frame of the illuminant on the screen; return the next one on the screen."""
         settling_s = self._settle(light)
         if self._ending.asked:
             return self._next_light()
@@ -233,7 +232,7 @@ class Pipeline:
         return ShownLight(step, shown_at, since, since - start_s, replaced)
 
     def _show_following(self) -> ShownLight | None:
-        """Show the next illuminant if it is known; a fault is handled later, when no frame waits in the camera."""
+        # A fault is handled later, when no frame waits in the camera.
         step = None if self._ending.asked else self._job.queue.next()
         if step is None:
             return None
@@ -256,6 +255,7 @@ class Pipeline:
         shutter_s = self._job.settings.camera.shutter_s
         kept_count = journal.kept_files(step)
         stem = step.stem if kept_count == 0 else f"{step.stem}_try{kept_count + 1}"
+        # An attempt lasts from the new picture to the end of the exposure, so that attempts do not overlap.
         number = self._job.on_disk(lambda: journal.begin(step, f"frames/{stem}", light.shown_at))
         self._job.queue.begin(step)
         self._note_gap()
@@ -286,7 +286,7 @@ class Pipeline:
         return gap_s
 
     def _gap_check(self) -> tuple[Check, ...]:
-        """Refuse a frame during which the program was stopped: it is unknown what the screen showed."""
+        # The screen may have shown anything while the program was stopped.
         if not (gap_s := self._note_gap()):
             return ()
         reason = (
@@ -307,7 +307,6 @@ class Pipeline:
         return (Check("screen"),)
 
     def _projector_check(self, step: SessionStep) -> tuple[Check, ...]:
-        """Ask for the health of the projector, while the next illuminant settles."""
         if self._health is None:
             return ()
         with self._job.watch.step("the projector", "is asked for its health", SHOW_S, "health"):
@@ -315,7 +314,6 @@ class Pipeline:
         return (Check("projector", reason="" if fault is None else str(fault)),)
 
     def _hand_over(self, frame: Exposed) -> None:
-        """Download the frame and pass it to the saving thread; a lost frame is exposed again."""
         clock = self._job.devices.clock
         start_s = clock.monotonic()
         try:
@@ -362,7 +360,7 @@ class Pipeline:
             self._observe(Taken(frame.step, saved.judgement, len(self._job.queue)))
 
     def _give_up(self, step: SessionStep, number: int, error: CropError) -> None:
-        """Record an attempt that failed for a device or the disk, not for its content."""
+        # The attempt failed for a device or the disk, not for its content.
         self._job.queue.withdraw(step)
         self._collect(0)
         moment = self._job.devices.clock.now()
@@ -464,8 +462,9 @@ class Verdicts:
         )
         if saved.preview_fault and not self._lacks_previews:
             self._lacks_previews = True
-            sentence = f"{saved.preview_fault}; frames are accepted without previews, further faults are not reported"
-            job.retry.report("preview", sentence)
+            job.retry.report(
+                "preview", f"{saved.preview_fault}; frames are accepted without, later faults not reported"
+            )
         voided = self._voided_ahead.pop(frame.number, "")
         if judgement.accepted and voided:
             job.queue.withdraw(step)
@@ -488,7 +487,7 @@ class Verdicts:
             self._unused_bytes = job.on_disk(lambda: job.session.journal.unused_bytes(self._last_before))
 
     def void_lost(self) -> bool:
-        """Open steps again whose files have been deleted or truncated; return whether there are any."""
+        """Open the steps of deleted or truncated files again; return whether there are any."""
         queue, files = self._job.queue, self._job.on_disk(self._job.session.lost_files)
         lost = [frame for frame in files if not queue.is_open(frame.step)]
         if lost:
@@ -617,7 +616,7 @@ class LastingCause:
             self._testing = None
 
     def _link(self) -> None:
-        """Take the frames first that connect later frames to earlier ones: the cause may have changed something."""
+        # The cause may have changed chart, camera or lamp.
         job = self._job
         attempts = job.on_disk(job.session.journal.attempts)
         if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
@@ -647,9 +646,7 @@ def _accepted_changes(
     percent = values.get(OFF_BRIGHTNESS.name, 0.0)
     # An accepted step of the lamp is beyond its limit. Frames that connect runs have wide limits.
     stepped = any(check.name == OFF_BRIGHTNESS.name and check.is_beyond for check in judgement.checks)
-    links = step.kind == "response" and any(
-        reference.kind == "light" and reference.number < step.number for reference in steps
-    )
+    links = step.kind == "response" and any(lit.kind == "light" and lit.number < step.number for lit in steps)
     if stepped or (links and abs(percent) > judge.drift_percent):
         sign = "stronger" if percent > 0 else "weaker"
         sentence = (
@@ -658,12 +655,10 @@ def _accepted_changes(
         )
         events.append(("level", sentence))
     room_percent = values.get(LEAK_SHARE.name, 0.0)
-    first_number = min(reference.number for reference in steps if reference.kind == step.kind)
-    if room_percent > ROOM_LIGHT_PERCENT and step.number == first_number:
+    if room_percent > ROOM_LIGHT_PERCENT and step.number == min(row.number for row in steps if row.kind == step.kind):
         sentence = (
-            f"{step_name(step)}: black has {room_percent:.1f} % of white, at most {ROOM_LIGHT_PERCENT:g} % expected, "
-            "and this light is in every frame. Switch off other lamps; otherwise build-lut adds a remark, and "
-            "--subtract-dark subtracts the light"
+            f"{step_name(step)}: black has {room_percent:.1f} % of white, at most {ROOM_LIGHT_PERCENT:g} % expected; "
+            "switch off other lamps. Otherwise build-lut adds a remark, and --subtract-dark subtracts this light"
         )
         events.append((DOUBT, sentence))
     return events
@@ -724,7 +719,7 @@ class StepQueue:
         return self._in_a_row >= GIVEN_UP_IN_A_ROW
 
     def next(self) -> SessionStep | None:
-        """Return the next step; None if there is none now."""
+        """Return the next step; None if no step is open now."""
         ready = self._open - self._under_way - self._given_up.keys()
         number = next((number for number in self._first if number in ready), min(ready, default=None))
         if number is None and not self._under_way:
@@ -786,7 +781,7 @@ class StepQueue:
         return True
 
     def void(self, numbers: Iterable[int], reason: str) -> None:
-        """Open steps again whose frames were voided; steps without remaining tries are given up."""
+        """Open steps with voided frames again; steps without remaining tries are given up."""
         for number in sorted(numbers):
             self._open.add(number)
             if self._tries[number] >= self._attempts:
@@ -816,7 +811,6 @@ class StepQueue:
             self._first.remove(number)
 
     def _add_closing(self) -> int | None:
-        """Add the reference that must follow the last illuminants; None if none is needed."""
         for reference in self._closing:
             if reference in self._unclosed:
                 self._unclosed.discard(reference)

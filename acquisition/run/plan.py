@@ -133,7 +133,7 @@ def nothing_to_retake(folder: Path) -> InputError:
 
 
 def require_same(session: Session, settings: LabSettings) -> None:
-    """Require that the settings that change frames, the chart and the illuminants are those of the session's start."""
+    """Require unchanged settings (those that change frames), chart and illuminants since the start of the session."""
     try:
         earlier = parse_lab(session.settings_text(), str(session.folder / "session.toml"))
     except ConfigurationError as error:
@@ -372,7 +372,7 @@ OFFERED_WITHIN: Final = 0.01
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What a run will take and need, and what would end it.
+    """Needs of a run, and faults that would end it.
 
     - `frame_bytes`, `frame_s`: size of a raw file, bytes, and time of a frame, s.
     - `warm_up_s`: warm-up of the lamp before the first frame, s; 0 if it is known to burn.
@@ -515,7 +515,6 @@ def _disk_fault(work: Work, size: Estimate, free_bytes: int) -> StorageError | s
 
 
 def _black_fault(settings: LabSettings, work: Work) -> CropError | None:
-    """Return the fault of a new session with a black illuminant, which could never be complete."""
     black = [step.illumination for step in work.steps if step.kind == "light" and not any(step.colour)]
     if work.done or not black:
         return None
@@ -639,11 +638,8 @@ def _frames_text(work: Work) -> str:
     counts = Counter(step.kind for step in work.steps if step.number not in work.done)
     kinds_text = ", ".join(f"{counts[name]} {name}" for name in KINDS if counts[name])
     done_text = f"{counted(len(work.done), 'frame')} of {len(work.steps)} done"
-    return (
-        f"{counted(work.remaining, 'frame')} to take ({kinds_text}); {done_text}"
-        if work.remaining
-        else f"complete; {done_text}"
-    )
+    open_text = f"{counted(work.remaining, 'frame')} to take ({kinds_text})" if work.remaining else "complete"
+    return f"{open_text}; {done_text}"
 
 
 def _turns_text(settings: LabSettings) -> str:

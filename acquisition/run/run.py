@@ -143,7 +143,6 @@ class Notices:
                 self._failed.put(f"{label} did not receive a notice: {failure}; the run continues without it")
 
     def _run(self, event: str, message: str, body: bytes) -> str:
-        """Run the command; return why it failed, or ""."""
         variables = {"CROP_EVENT": event, "CROP_MESSAGE": message, "CROP_SESSION": self._session}
         try:
             # In its own process group: Ctrl-C does not reach it, and its child processes can be ended with it.
@@ -167,7 +166,6 @@ class Notices:
         return f"it ended with {process.returncode}, 0 expected" if process.returncode else ""
 
     def _posted(self, event: str, message: str, body: bytes) -> str:
-        """Post to the URL; return why it failed, or ""."""
         url = urlsplit(self._target)
         headers = {"Content-Type": "application/json; charset=utf-8", "User-Agent": "CroP"}
         if event.isascii():
@@ -191,6 +189,7 @@ def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
     try:
         with urllib.request.build_opener(Unredirected).open(request, timeout=LIMIT_S):
             return ""
+    # Texts of library errors may contain the secret address: only their number or kind is reported.
     except urllib.error.HTTPError as error:
         error.close()
         return f"it answered {error.code}"
@@ -203,7 +202,7 @@ def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
 class PauseNotices:
     """Sends notices of pauses: one per cause in `QUIET_S`, and the end of a reported pause.
 
-    `tell`: receives an event and its sentence.
+    `tell`: receives an event and a sentence.
     """
 
     def __init__(self, tell: Callable[[str, str], object], clock: Clock) -> None:
@@ -244,7 +243,6 @@ def verdict_line(frame: Taken) -> str:
 
 
 def _number_text(check: Check) -> str:
-    """Return name and value of a check, as in ``off_codes_deg 0.21°``."""
     unit = "" if not check.unit else check.unit if check.unit.startswith("°") else f" {check.unit}"
     return f"{check.name} {check.value:.3g}{unit}{' (beyond its limit)' if check.is_beyond else ''}"
 
@@ -389,7 +387,7 @@ class Life:
         self._notices.close()
 
     def _to_manager(self, text: str) -> None:
-        """Send a datagram as in sd_notify(3); errors are ignored."""
+        # A datagram as in sd_notify(3); errors are ignored.
         if self._manager[:1] in ("/", "@"):
             address = self._manager.replace("@", "\0", 1) if self._manager.startswith("@") else self._manager
             with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as link:
@@ -398,7 +396,7 @@ class Life:
 
 
 def _watchdog_s(environment: Mapping[str, str]) -> float:
-    """Return the watchdog time of the service manager, s; 0 if there is none."""
+    """Return the watchdog time of the service manager, s; 0 without a watchdog."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return 0.0
     try:
@@ -485,7 +483,7 @@ def _signs_of(session: Session) -> Generator[SignOfLife]:
 
 
 def _report(session: Session, announce: Callable[[str], object]) -> None:
-    """Write the report of the session. A disk error must not change the end of the run: it can be derived again."""
+    # A disk error must not change the end of the run: the report can be derived again.
     try:
         write_session_report(session.folder)
     except CropError as error:
@@ -744,9 +742,7 @@ class _Reports:
         self._announce = announce
         self._state = state
         name = session.folder.name
-        self._notices = Notices(
-            settings.sequence.notify, name, lambda failure: self.doubt(f"sequence.notify: {failure}")
-        )
+        self._notices = Notices(settings.sequence.notify, name, lambda text: self.doubt(f"sequence.notify: {text}"))
         self._life = Life(settings.notify.alive, name, lambda failure: self.doubt(f"notify.alive: {failure}"), clock)
         self._pauses = PauseNotices(self._notify, clock)
 

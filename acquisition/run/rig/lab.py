@@ -42,8 +42,8 @@ CONNECT_S = 5.0  # time for a projector to accept a connection, s; milliseconds 
 def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, shows: bool = True) -> Devices:
     """Open the camera, the projector and its display.
 
-    `session`: the resumed session, whose time continues after its last frame; None for a new one. `shows`: whether to
-    open the display; if not, a `LightNotShown` replaces it.
+    `session`: the resumed session, whose last frame sets the time; None for a new one. `shows`: whether to open the
+    display; if not, a `LightNotShown` replaces it.
     """
     _hold_lab(settings.file, opened)
     clock = session_clock(session)
@@ -80,7 +80,7 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, 
 
 
 def _hold_lab(file: str, opened: ExitStack) -> None:
-    """Lock the laboratory against other commands: two programs on one cable would read each other's answers."""
+    # Two programs on one cable would read each other's answers.
     # Settings without a file cannot be used by another command.
     with suppress(OSError):
         status = Path(file).stat()

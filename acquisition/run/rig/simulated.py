@@ -95,7 +95,7 @@ def simulated_room(settings: LabSettings) -> Room:
 
 
 def _earlier_exposures(session: Session | None) -> list[tuple[float, Colour]]:
-    """Return time (s since the opening) and colour of every earlier exposure."""
+    # Time, s since the opening, and colour of every earlier exposure.
     if session is None:
         return []
     colours = {step.number: step.colour for step in session.steps}

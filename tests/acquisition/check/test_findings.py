@@ -22,14 +22,8 @@ def test_grades_values_by_both_limits(value: float, grade: str) -> None:
 
 
 def test_prints_faults_first() -> None:
-    report = CheckReport(
-        ("camera",),
-        (
-            judge_value(LIMIT, 0.3, "fine", "x"),
-            not_checked("other", "no references"),
-            judge_value(LIMIT, 0.0, "bad", "mend it"),
-        ),
-    )
+    good, fault = judge_value(LIMIT, 0.3, "fine", "x"), judge_value(LIMIT, 0.0, "bad", "mend it")
+    report = CheckReport(("camera",), (good, not_checked("other", "no references"), fault))
     lines = report.lines()
     assert [line.split()[0] for line in lines] == ["camera", "fault", "not", "good"]
     assert lines[1].endswith("bad (at least 20 % expected: it breaks); mend it")
