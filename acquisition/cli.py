@@ -1,4 +1,4 @@
-"""`acquire`: design the experiment, take it, and show how far it is. Parse, build, call, print; nothing else."""
+"""`acquire`: design the experiment, take a session, and show its progress."""
 
 from __future__ import annotations
 
@@ -32,42 +32,41 @@ if TYPE_CHECKING:
     from experiment.config import LabSettings
 
 app = new_app(
-    "Plan, print and take a session: a chart photographed raw under many known lights.\n\n" + EXIT_CODES,
+    "Plan, print and take a session: raw photographs of a chart under many known illuminants.\n\n" + EXIT_CODES,
     no_args_is_help=True,
 )
 
 
 class Arrangement(Enum):
-    """How the colours lie on the sheet."""
+    """Arrangement of the colours on the sheet."""
 
     TAGGED = "tagged"
     PAPER = "paper"
 
 
 class Rig(Enum):
-    """What a lab that is begun consists of."""
+    """Devices of a new laboratory."""
 
     LAB = "lab"
     SIMULATED = "simulated"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `acquire` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
+    """Run `acquire` with arguments (default: `sys.argv`) and return the exit code (`EXIT_CODES`)."""
     return console.run(lambda: app(args=argv, prog_name="acquire"))
 
 
 @app.command(epilog=EXIT_CODES)
 def init(
-    lab: Annotated[Path, typer.Argument(metavar="LAB", help="Folder of the lab; made if it is not there.")],
+    lab: Annotated[Path, typer.Argument(metavar="LAB", help="Folder of the lab; created if it does not exist.")],
     rig: Annotated[
-        Rig, typer.Option(help="lab: camera and projector, to be named in LAB.toml; simulated: no hardware.")
+        Rig, typer.Option(help="lab: camera and projector, to be entered in LAB.toml; simulated: no hardware.")
     ] = Rig.LAB,
 ) -> None:
-    """Begin a lab: a commented LAB.toml, the chart to print and the 707 lights.
+    """Create a lab: a commented LAB.toml, the chart to print and the 707 illuminants.
 
-    Reads no file. Writes LAB/LAB.toml, chart/ (as acquire chart does, without the TIFF) and illuminations.csv (as
-    acquire illuminations does). A chart or lights that are there already stay as they are; a LAB.toml that is there
-    is an error.
+    Reads no file. Writes LAB/LAB.toml, chart/ (like acquire chart, without the TIFF) and illuminations.csv (like
+    acquire illuminations). An existing chart or existing illuminants stay unchanged; an existing LAB.toml is an error.
     """
     settings, print_folder, lights = lab / "LAB.toml", lab / "chart", lab / "illuminations.csv"
     require_free(settings, "the settings")
@@ -77,20 +76,18 @@ def init(
     if not lights.exists():
         illuminations(lights)
     write_atomic(settings, files("acquisition").joinpath("data", f"{rig.value}.toml").read_text("utf-8"))
-    then = "name your devices in it" if rig is Rig.LAB else "change it as you like"
-    print(f"{settings}: {then}, then: acquire check {shlex.quote(str(settings))}")
+    edit = "enter your devices" if rig is Rig.LAB else "change it if necessary"
+    print(f"{settings}: {edit}, then run: acquire check {shlex.quote(str(settings))}")
 
 
 @app.command(epilog=EXIT_CODES)
 @with_json("acquire chart")
 def chart(
-    out: Annotated[
-        Path, typer.Argument(help="New folder for chart.json, chart.tif, chart.pdf and what goes with them.")
-    ],
-    bits: Annotated[int, typer.Option(min=1, max=5, help="Bits kept of each channel; 5 gives 32 768 colours.")] = 5,
+    out: Annotated[Path, typer.Argument(help="New folder for chart.json, chart.tif, chart.pdf and related files.")],
+    bits: Annotated[int, typer.Option(min=1, max=5, help="Bits per channel; 5 gives 32 768 colours.")] = 5,
     page: Annotated[
         str | None,
-        typer.Option(help="Paper, landscape: A0 … A8, or WIDTHxHEIGHT in mm; else the smallest that fits."),
+        typer.Option(help="Paper, landscape: A0 … A8, or WIDTHxHEIGHT in mm; by default the smallest that fits."),
     ] = None,
     arrangement: Annotated[
         Arrangement,
@@ -99,17 +96,17 @@ def chart(
     tiff: Annotated[bool, typer.Option(help="Write the 600-dpi TIFF.")] = True,
     tagged_tiff: Annotated[
         bool,
-        typer.Option("--tagged-tiff", help="Write chart-srgb.tif too, tagged as sRGB, to print through a profile."),
+        typer.Option("--tagged-tiff", help="Also write chart-srgb.tif, tagged as sRGB, to print through a profile."),
     ] = False,
     *,
     output: JsonOutput,
 ) -> None:
-    """Make the print: every colour once, AprilTags and achromatic references, at true size.
+    """Design the chart: every colour once, AprilTags and achromatic references, in true size.
 
-    Reads no file. Writes OUT/chart.json (what calibration reads), chart.pdf (vector, PDF/X-4), chart.tif (600 dpi),
-    preview.png, proof.pdf (an A4 page to try the printer with) and PRINTING.txt. Print the PDF or the TIFF with the
-    printer's colour management off, at 100 %, on matte paper. A line on stderr warns when cells are too small for the
-    paper's cameras.
+    Reads no file. Writes OUT/chart.json (for calibration), chart.pdf (vector, PDF/X-4), chart.tif (600 dpi),
+    preview.png, proof.pdf (an A4 page to test the printer) and PRINTING.txt. Print the PDF or the TIFF on matte paper
+    at 100 %, with the printer's colour management off. Prints a warning to stderr if patches are too small for the
+    cameras of the paper.
     """
     from experiment.chart.layout import design_chart, paper_chart
     from experiment.chart.printing import save_pdf, save_preview, save_tiff
@@ -131,7 +128,7 @@ def chart(
     cell = " × ".join(dict.fromkeys(f"{side:.2f}" for side in design.cell_mm))
     print(
         f"{out}: {design.colour_count} colours, {len(design.tags)} tags, {len(design.references)} references "
-        f"on {width:g} × {height:g} mm, cells of {cell} mm"
+        f"on {width:g} × {height:g} mm, patches of {cell} mm"
     )
     small = small_parts_warning(design)
     output.add(
@@ -150,7 +147,7 @@ def chart(
 
 def _page(text: str | None) -> str | tuple[float, float] | None:
     try:
-        width, height = (float(part) for part in (text or "").lower().split("x"))
+        width, height = (float(side) for side in (text or "").lower().split("x"))
     except ValueError:
         return text
     return width, height
@@ -159,42 +156,42 @@ def _page(text: str | None) -> str | tuple[float, float] | None:
 @app.command(epilog=EXIT_CODES)
 @with_json("acquire illuminations")
 def illuminations(
-    out: Annotated[Path, typer.Argument(help="New CSV file; a plot of the lights is written beside it as .png.")],
+    out: Annotated[Path, typer.Argument(help="New CSV file; a plot of the illuminants is written next to it as .png.")],
     grid: Annotated[int, typer.Option(min=0, max=200, help="Steps along an edge of the chromaticity triangle.")] = 35,
     blackbodies: Annotated[
-        str, typer.Option(help="Black bodies as FIRST:LAST:STEP in kelvin, or a list K,K,…; empty for none.")
+        str, typer.Option(help="Black bodies as FIRST:LAST:STEP in kelvin, or as a list K,K,…; empty for none.")
     ] = "2000:10000:200",
     *,
     output: JsonOutput,
 ) -> None:
-    """Make the lights: uniformly spread chromaticities and black bodies; 707 by default.
+    """Plan the illuminants: uniformly spread chromaticities and black bodies; 707 by default.
 
-    Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb-chromaticities beside it.
+    Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb chromaticities next to it.
     """
     from experiment.lights import parse_ccts, plan_illuminations, plot_illuminations, save_illuminations
 
     plot = out.with_suffix(".png")
     if plot == out:
-        raise InputError(f"{out} is where the plot of the lights goes; name the lights {out.with_suffix('.csv')}")
-    require_free(out, "the lights")
-    require_free(plot, "the plot of the lights")
+        raise InputError(f"{out} is the name of the plot; name the file of illuminants {out.with_suffix('.csv')}")
+    require_free(out, "the illuminants")
+    require_free(plot, "the plot of the illuminants")
     lights = plan_illuminations(grid, parse_ccts(blackbodies))
     if not lights:
-        raise InputError("no light is left: grid is 0 and there are no black bodies; name some")
+        raise InputError("there are 0 illuminants, at least 1 is needed; set --grid or --blackbodies")
     save_illuminations(lights, out)
     plot_illuminations(lights, plot)
     output.add(file=out, plot=plot, lights=len(lights), kinds=Counter(light.kind for light in lights))
-    print(f"{out}: {len(lights)} lights; plot in {plot}")
+    print(f"{out}: {len(lights)} illuminants; plot in {plot}")
 
 
 @app.command(epilog=EXIT_CODES)
 @with_json("acquire devices")
 def devices(
-    identify: Annotated[bool, typer.Option(help="Show on every display its number for ten seconds.")] = False,
+    identify: Annotated[bool, typer.Option(help="Show the number of every display on it for 10 s.")] = False,
     *,
     output: JsonOutput,
 ) -> None:
-    """List what is attached and reachable: cameras, serial ports, displays, projectors on the network.
+    """List available devices: cameras, serial ports, displays, projectors on the network.
 
     Reads and writes no file.
     """
@@ -217,44 +214,44 @@ def check(
     lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
     picture: Annotated[
         Path | None,
-        typer.Option(help="Save as PNG the frame with what was found on it, maps of light, blur and print, verdicts."),
+        typer.Option(help="Save a PNG: the frame with detected tags, maps of light, blur and print, and the verdicts."),
     ] = None,
     corners: Annotated[
         tuple[str, str, str, str] | None,
         option(
             "X,Y X,Y X,Y X,Y",
-            "As in build-lut: the corners of the field of a chart without tags.",
+            "Corners of the field of a chart without tags, as in build-lut.",
         ),
     ] = None,
     linearity: Annotated[
-        bool, typer.Option("--linearity", help="Take a series of exposures too, which shows the sensor's linearity.")
+        bool, typer.Option("--linearity", help="Also take a series of exposures, to measure the sensor's linearity.")
     ] = False,
     *,
     output: JsonOutput,
 ) -> None:
-    """Say whether the lab is ready: a verdict on exposure, light, sharpness, print, sensor, supplies; record nothing.
+    """Check whether the lab is ready: exposure, light, sharpness, print, sensor and supplies; record nothing.
 
-    Reads LAB.toml, the chart and the lights it names. Takes some 25 frames and keeps none; tries shutter times until
-    one suits, then judges white, dark, the primaries and grey by the figures of build-lut. Each verdict is good, a
-    remark, a fault, or not checked, with its number, limit, reason and remedy.
-    Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all
-    named at once, each with its remedy, and end it with 3, or with 2 if LAB.toml or a language file is at fault.
+    Reads LAB.toml, its chart and its illuminants. Takes about 25 frames and deletes them. Tries shutter times until one
+    is suitable, then judges white, dark, primary and grey frames by the figures of build-lut. Each verdict is good, a
+    remark, a fault, or not checked, with value, limit, reason and remedy. Writes nothing except the file of --picture.
+    Ends with 4 if there is a fault. If devices cannot be used, reports all of them with remedies, and ends with 3, or
+    with 2 if LAB.toml or a language file is wrong.
     """
     from acquisition.check.check import check_lab
     from experiment.config import load_lab
 
     settings = load_lab(lab)
-    given = None
+    field_corners = None
     if corners is not None:
         from experiment.framing.field import parse_corners
 
-        given = parse_corners(corners)
+        field_corners = parse_corners(corners)
     with orderly_end():
         report = check_lab(
             settings,
             lambda sentence: print(sentence, file=sys.stderr),
             picture=picture,
-            corners=given,
+            corners=field_corners,
             linearity=linearity,
         )
     if output.is_requested:
@@ -264,9 +261,9 @@ def check(
             print(line)
         if picture is not None:
             print(f"picture     {picture}")
-    if faults := [finding.name for finding in report.of("fault")]:
+    if faults := [finding.name for finding in report.with_grade("fault")]:
         raise QualityError(
-            f"{counted(len(faults), 'fault')}: {', '.join(faults)}", remedy="the verdicts say what mends it"
+            f"{counted(len(faults), 'fault')}: {', '.join(faults)}", remedy="the verdicts give the remedies"
         )
 
 
@@ -279,26 +276,26 @@ def run(
         str | None,
         option(
             "LIGHTS",
-            "Take lights again, as in 12,40-44; bad: the frames that build-lut refused, by the newest report "
-            "beside SESSION. What was taken of them before is kept and not used.",
+            "Repeat illuminants, such as 12,40-44; bad: the frames that build-lut refused in the newest report "
+            "next to SESSION. Their earlier frames are kept, but not used.",
         ),
     ] = None,
     dry_run: Annotated[
         bool,
         typer.Option(
             "--dry-run",
-            help="Open and ask every device, print what the run would take, need and find, and what would end it; "
-            "nothing is lit, released, shown or written.",
+            help="Ask every device, and print the frames, time and space of the run, and faults that would end it; "
+            "switches no lamp on, takes no frame, shows and writes nothing.",
         ),
     ] = False,
     *,
     output: JsonOutput,
 ) -> None:
-    """Take the session, or take up one that was interrupted.
+    """Take the session, or resume an interrupted one.
 
-    What a dry run prints is checked before anything moves. Reads LAB.toml, the chart and the lights it names. Writes
-    SESSION: session.toml, chart.json, illuminations.csv, frames/, previews/, journal.sqlite, frames.csv, report.html.
-    Interrupt it as you like and run it again. Ends with 4 when frames were refused; the next run tries those again.
+    First checks everything that a dry run prints. Reads LAB.toml, its chart and its illuminants. Writes SESSION:
+    session.toml, chart.json, illuminations.csv, frames/, previews/, journal.sqlite, frames.csv, report.html. It can be
+    interrupted at any time and run again. Ends with 4 if frames were refused; the next run repeats them.
     """
     from acquisition.run.run import Terminal, run_session
     from experiment.config import load_lab
@@ -309,14 +306,16 @@ def run(
         return
     with orderly_end() as ending, Terminal() as shown:
         outcome = run_session(
-            settings, session, shown.progress, shown.announce, retake, ending, shown.taken, shown.state
+            settings, session, shown.progress, shown.announce, retake, ending, shown.show_frame, shown.state
         )
-    output.add(session=session, frames=outcome.total, left=outcome.left, refused=outcome.refused, doubts=outcome.doubts)
+    missing, refused, doubts = outcome.remaining, outcome.refused, outcome.doubts
+    output.add(session=session, frames=outcome.total, left=missing, refused=refused, doubts=doubts)
     for doubt in outcome.doubts:
         print(f"doubt: {doubt}")
     if not outcome.complete:
         raise QualityError(
-            f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)
+            f"{outcome.total - missing} of {outcome.total} planned frames are complete, {missing} are missing; remove "
+            "the causes, and run the same command again: " + "; ".join(refused)
         )
     print(f"{session}: complete, {outcome.total} frames; next: build-lut {shlex.quote(str(session))} LUT/")
 
@@ -328,7 +327,7 @@ def _print_plan(settings: LabSettings, session: Path, retake: str | None, output
         plan = dry_run(settings, session, retake)
     output.add(
         session=session,
-        frames=plan.work.left,
+        frames=plan.work.remaining,
         frame_s=plan.frame_s.value,
         warm_up_s=plan.warm_up_s,
         time_s=plan.time_s,
@@ -349,12 +348,12 @@ def status(
     *,
     output: JsonOutput,
 ) -> None:
-    """Show how far a session is, how long it will take, what was measured last, and what was refused.
+    """Show the progress of a session: state, remaining time, last measurements, and refused frames.
 
-    Reads SESSION, also while it is being taken; writes nothing. Ends with 0 when a run is at work, or the session is
-    complete. Ends with 3 when a step of the run is late, no sign of life came in its time, it is paused for a device or
-    ended for one, or it was killed; with 4 when it is paused for its frames, or ended with frames left, or its files,
-    chart or lights are lost; with 5 when its disk is full or at fault.
+    Reads SESSION, also during a run; writes nothing. Ends with 0 if a run is active, or the session is complete. Ends
+    with 3 if a step is late, no sign of life came in time, the run is paused or ended for a device, or was killed; with
+    4 if it is paused for its frames, has ended with missing frames, or files, chart or illuminants are lost; with 5 if
+    the disk is full or faulty.
     """
     from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path
@@ -368,59 +367,59 @@ def status(
         print("\n".join(status_lines(view, now)))
     head = view.head(now)
     if head.state in ("late", "silent", "paused", "stopped", "incomplete"):
-        of_none = QualityError if head.state == "incomplete" else DeviceError
-        kinds = {"": of_none, "the disk": StorageError, "the frames": QualityError}
-        raise kinds.get(head.cause, DeviceError)(head.sentence)
+        default = QualityError if head.state == "incomplete" else DeviceError
+        errors = {"": default, "the disk": StorageError, "the frames": QualityError}
+        raise errors.get(head.cause, DeviceError)(head.sentence)
 
 
 @app.command(epilog=EXIT_CODES)
 def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
-    """Make the journal of a session anew that was deleted, overwritten or damaged.
+    """Restore the journal of a session after it was deleted, overwritten or damaged.
 
-    Reads SESSION/ledger.jsonl, where each run writes what the journal holds a second time. Writes
-    SESSION/journal.sqlite; what stands in its place is renamed, not deleted. Frames stay as they are.
+    Reads SESSION/ledger.jsonl, the second copy of the journal. Writes SESSION/journal.sqlite; an existing file is
+    renamed, not deleted. Frames stay unchanged.
     """
     from experiment.session.folder import busy_message, rebuild_journal
     from experiment.session.journal import JOURNAL_FILE
 
     with locked_folder(session, busy_message(session)):
         attempts = rebuild_journal(session)
-    print(f"{session / JOURNAL_FILE}: made anew, {attempts} attempts; next: acquire status {session}")
+    print(f"{session / JOURNAL_FILE}: restored with {attempts} attempts; next: acquire status {session}")
 
 
 @app.command(epilog=EXIT_CODES)
 def monitor(
-    session: Annotated[Path, typer.Argument(help="Session folder; one that is not there yet is waited for.")],
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8707,
+    session: Annotated[Path, typer.Argument(help="Session folder; if it does not exist, the page waits for it.")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 for any free port.")] = 8707,
     host: Annotated[
         str,
-        typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in the house look, a phone for one."),
+        typer.Option(help="Address to listen on; 0.0.0.0 for access from other computers and phones."),
     ] = "127.0.0.1",
 ) -> None:
     """Show a session as a live web page, until interrupted.
 
-    Reads SESSION, also while it is being taken; writes nothing and never holds a run up. With --host the address holds
-    a token, new at each start: whoever has the address can look, and nobody can change anything. It is printed as a QR
-    code, too.
+    Reads SESSION, also during a run; writes nothing and never delays a run. With --host the address contains a new
+    token: everybody who has the address can view the session, but nobody can change anything. It is also printed as a
+    QR code.
     """
     from acquisition.monitor.serving import open_monitor
 
     with open_monitor(session, port, host) as server:
         if not server.has_session:
-            print(f"{session} holds no session yet; the page waits until acquire run begins one there")
-        server.serve(str(session), "can look at the session")
+            print(f"{session} has no session yet; the page waits until acquire run starts one")
+        server.serve(str(session), "can view the session")
 
 
 @app.command(epilog=EXIT_CODES)
 def report(
     session: Annotated[Path, typer.Argument(help="Session folder.")],
     out: Annotated[
-        Path | None, typer.Argument(help="HTML file, replaced if it is there; SESSION/report.html by default.")
+        Path | None, typer.Argument(help="HTML file, replaced if it exists; SESSION/report.html by default.")
     ] = None,
 ) -> None:
-    """Write what the monitor's page shows as one HTML file, pictures and all, to be kept or mailed.
+    """Write the monitor's page with its pictures as one HTML file.
 
-    Reads SESSION, also while it is being taken. acquire run writes the same file when it ends.
+    Reads SESSION, also during a run. acquire run writes the same file when it ends.
     """
     from acquisition.monitor.view import write_session_report
 
@@ -432,17 +431,17 @@ def report(
 @with_json("acquire import")
 def import_(
     frames: Annotated[
-        Path, typer.Argument(help="CSV of raw files, columns as frames.csv; with illuminations.csv beside.")
+        Path, typer.Argument(help="CSV of raw files, columns as in frames.csv; illuminations.csv must be next to it.")
     ],
-    chart: Annotated[Path, typer.Argument(help="chart.json of the print.")],
+    chart: Annotated[Path, typer.Argument(help="chart.json of the printed chart.")],
     session: Annotated[Path, typer.Argument(help="New session folder.")],
     *,
     output: JsonOutput,
 ) -> None:
     """Make a session from raw files taken by other means; every file is copied and judged.
 
-    Reads FRAMES, illuminations.csv beside it, CHART and the raw files. Writes SESSION, as acquire run does. Ends with 4
-    when a light, or every white or dark frame, is without an accepted frame; the session is there all the same.
+    Reads FRAMES, illuminations.csv next to it, CHART and the raw files. Writes SESSION, like acquire run. Ends with 4
+    if an illuminant, or every white or dark frame, has no accepted frame; the session is written anyway.
     """
     from acquisition.run.importing import import_session
 
@@ -452,14 +451,14 @@ def import_(
     print(f"{session}: imported; {len(imported.refused)} frames refused")
     if imported.unchecked:
         print(
-            f"{', '.join(imported.unchecked)}: whether files of this format are complete cannot be checked; convert "
-            "them to DNG to have it checked"
+            f"{', '.join(imported.unchecked)}: the completeness of files of this format cannot be checked; convert "
+            "them to DNG to check it"
         )
     for line in imported.refused:
         print(f"  {line}")
     if imported.left:
         raise QualityError(
-            f"{session}: {len(imported.left)} are without an accepted frame: {first_few(imported.left)}; list other "
+            f"{session}: {len(imported.left)} without an accepted frame: {first_few(imported.left)}; list other "
             "files and import them into a new folder"
         )
 

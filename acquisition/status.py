@@ -1,8 +1,4 @@
-"""What `acquire status` says of a session: whether it lives, how far it is, what was measured last, what went wrong.
-
-It says what the page of `acquire monitor` says, from the same look at the journal, in lines for a terminal and as
-values for programs.
-"""
+"""Text and JSON of `acquire status`: the same content as the page of `acquire monitor`."""
 
 from __future__ import annotations
 
@@ -17,35 +13,35 @@ from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, Check, doubts_of, duration_text
 from foundation.errors import CropError, counted
 
-LAST = 5  # Verdicts, and events, that are shown: chosen, a screen has room for them beside the rest
+LAST = 5  # verdicts and events to show: chosen, as many as fit on a screen
 
 
-# What marks a value outside its limits that refused no frame.
-BEYOND = " (beyond; it follows from another cause, or is followed)"
+# Mark of a value beyond its limits that did not refuse the frame.
+BEYOND = " (beyond its limit, but accepted, or explained by another cause)"
 
-# What the numbers of the checks are, for who has not read docs/how-to/night-run.md.
+# Meanings of the checks, as in docs/how-to/night-run.md.
 MEANINGS = {
-    "data": "photosites without counts",
-    "clipping": "photosites that are clipped",
-    "exposure": "brightest photosites, of saturation",
-    "chart": "tags found, or references on a chart without",
-    "repeated": "noise of the difference to earlier frames, of that of independent ones",
-    "movement": "of the chart, from where it lies at rest",
-    "blur": "of the print, softer than in the first white frame",
-    "rows": "strips of rows that show what belongs elsewhere",
-    "uniformity": "the tile that deviates most from the frame's light",
-    "off_codes_deg": "from the light ordered to the one seen",
-    "off_brightness": "brighter than foretold from the frames before",
-    "stray_share": "light from elsewhere, of white",
-    "dark_drift": "change of the light in dark frames, of white",
-    "leak_share": "light in the dark frame, of white",
-    "white_drift": "brightness of white since the first white frame",
-    "additivity": "white beyond the sum of the primaries",
+    "data": "share of photosites without counts",
+    "clipping": "share of clipped photosites",
+    "exposure": "brightest photosites, share of saturation",
+    "chart": "detected tags, or white references of a chart without tags",
+    "repeated": "noise of the difference to earlier frames, relative to independent frames",
+    "movement": "distance of the chart from its rest position",
+    "blur": "blur compared with the first white frame",
+    "rows": "strips of rows with unexpected content",
+    "uniformity": "largest deviation of a tile from the light of the frame",
+    "off_codes_deg": "angle between ordered and measured illuminant",
+    "off_brightness": "brightness relative to the prediction from earlier frames",
+    "stray_share": "light that is not from the projector, share of white",
+    "dark_drift": "change of the light in dark frames, share of white",
+    "leak_share": "light in the dark frame, share of white",
+    "white_drift": "brightness of white relative to the first white frame",
+    "additivity": "white relative to the sum of the primaries",
 }
 
 
 def read_status(folder: Path, now: datetime) -> SessionView:
-    """Return a session as it stands; one that is complete is opened, too, as who makes a table of it opens it."""
+    """Return the view of a session; a complete one is also opened, to detect faults that would stop build-lut."""
     view = read_session(folder)
     if view.head(now).state == "complete":
         try:
@@ -56,17 +52,17 @@ def read_status(folder: Path, now: datetime) -> SessionView:
 
 
 def status_lines(view: SessionView, now: datetime) -> list[str]:
-    """Return a session's state for people, line by line."""
+    """Return the state of a session as lines for a terminal."""
     head = view.head(now)
     lines = [
-        f"state   {_state(head)}",
-        f"frames  {head.done} of {head.total}",
-        f"lights  {head.lights_done} of {head.lights_total}",
-        f"left    {_left(head)}",
-        f"refused {head.refused}, failed {head.failed}, voided {head.voided}",
+        f"state       {_state_text(head)}",
+        f"frames      {head.done} of {head.total}",
+        f"illuminants {head.lights_done} of {head.lights_total}",
+        f"left        {_remaining_text(head)}",
+        f"refused     {head.refused}, failed {head.failed}, voided {head.voided}",
     ]
     if (drift := _white_drift(view)) is not None:
-        lines.append(f"white   {drift:+.2%} since the first white frame")
+        lines.append(f"white       {drift:+.2%} since the first white frame")
     lines += _block("doubts", doubts_of(view.events))
     lines += _block("last measured", [check_text(check) for check in _newest_checks(view).values()])
     judged = [attempt for attempt in view.attempts if attempt.verdict is not None]
@@ -78,7 +74,7 @@ def status_lines(view: SessionView, now: datetime) -> list[str]:
 
 
 def status_json(view: SessionView, now: datetime) -> dict[str, Any]:
-    """Return a session's state for programs: the fields of `Head`, and what was measured and refused; times as text."""
+    """Return the state of a session for programs: the fields of `Head`, measured values and refusals; times as text."""
     head = view.head(now)
     values = head.to_plain()
     if not head.alive:
@@ -93,7 +89,7 @@ def status_json(view: SessionView, now: datetime) -> dict[str, Any]:
     }
 
 
-def _state(head: Head) -> str:
+def _state_text(head: Head) -> str:
     if head.state == "copy":
         return head.sentence
     if not head.sentence or head.sentence.startswith(head.state):
@@ -101,26 +97,24 @@ def _state(head: Head) -> str:
     return f"{head.state}: {head.sentence}"
 
 
-def _left(head: Head) -> str:
-    """Return the time left; none of a run that is not at work."""
+def _remaining_text(head: Head) -> str:
     if head.done == head.total:
-        return "nothing"
+        return "none"
     if not head.alive:
-        at_work = "this copy gets none" if head.state == "copy" else "no run is at work"
-        return f"{counted(head.total - head.done, 'frame')}; {at_work}"
+        reason = "this is a copy without a run" if head.state == "copy" else "no run is active"
+        return f"{counted(head.total - head.done, 'frame')}; {reason}"
     ready = f", ready at {head.eta.astimezone():%H:%M}" if head.eta is not None else ""
     return f"{duration_text(head.remaining_s)}{ready}"
 
 
 def _white_drift(view: SessionView) -> float | None:
-    """Return how much brighter the newest accepted white frame is than the first, 0 for equal; None without two."""
     white_steps = {step.number for step in view.steps if step.kind == "white"}
-    seen = [
+    rgb = [
         attempt.seen
         for attempt in view.attempts
         if attempt.step in white_steps and attempt.verdict == ACCEPTED and attempt.seen is not None
     ]
-    return sum(seen[-1]) / sum(seen[0]) - 1 if len(seen) > 1 and sum(seen[0]) > 0 else None
+    return sum(rgb[-1]) / sum(rgb[0]) - 1 if len(rgb) > 1 and sum(rgb[0]) > 0 else None
 
 
 def _newest_checks(view: SessionView) -> Mapping[str, Check]:
@@ -128,11 +122,11 @@ def _newest_checks(view: SessionView) -> Mapping[str, Check]:
 
 
 def _open_reasons(view: SessionView) -> dict[int, str]:
-    done = {attempt.step for attempt in view.attempts if attempt.verdict == ACCEPTED}
+    accepted_steps = {attempt.step for attempt in view.attempts if attempt.verdict == ACCEPTED}
     return {
         attempt.step: f"{attempt.file}: {attempt.reason}"
         for attempt in view.attempts
-        if attempt.reason and attempt.step not in done
+        if attempt.reason and attempt.step not in accepted_steps
     }
 
 
@@ -141,12 +135,12 @@ def _verdict_text(attempt: AttemptView) -> str:
 
 
 def check_text(check: Check) -> str:
-    """Return what was found, what is allowed, and what the number is."""
+    """Return value, limits and meaning of a check."""
     unit = f" {check.unit}" if check.unit else ""
     sign = "+" if check.low is not None and check.low < 0 else ""
     match check.low, check.high:
         case None, None:
-            allowed = "; no limits before more frames tell how it scatters" if check.name == "off_brightness" else ""
+            allowed = "; no limits until its scatter is known" if check.name == "off_brightness" else ""
         case None, high:
             allowed = f", at most {high:.4g}{unit}"
         case low, None:
@@ -159,5 +153,4 @@ def check_text(check: Check) -> str:
 
 
 def _block(title: str, lines: list[str]) -> list[str]:
-    """Return lines under a title; nothing where there are none."""
     return [f"{title}:", *(f"  {line}" for line in lines)] if lines else []

@@ -84,7 +84,7 @@ def main() -> None:
         for name, bits, room in (*ROOMS, *(FULL if full else ())):
             report = check(folder, bits, room)
             found = next((each for each in report.findings if each.name == name), not_checked(name, "not measured"))
-            others = [each.name for each in report.of("fault") if each.name != name]
+            others = [each.name for each in report.with_grade("fault") if each.name != name]
             told = ", ".join(f"{key} {value:g}" for key, value in room.items())
             more = f" [also at fault: {', '.join(others)}]" if others else ""
             print(f"{name:<18}{bits:<6}{told:<52}{found.grade:<13}{found.said[:110]}{more}", flush=True)
@@ -92,13 +92,13 @@ def main() -> None:
         for bits in (1, 2, 3):
             for seed in SEEDS:
                 report = check(folder, bits, {}, seed)
-                for each in (*report.of("fault"), *report.of("remark")):
+                for each in (*report.with_grade("fault"), *report.with_grade("remark")):
                     alarms += 1
                     print(f"false alarm: {bits} bits, seed {seed}: {each.name}: {each.sentence()}")
         print(f"false alarms in {3 * len(SEEDS)} good rooms: {alarms}")
         if full:
             reports = [check(folder, 5, {}, seed) for seed in range(3)]
-            bad = [each for report in reports for each in (*report.of("fault"), *report.of("remark"))]
+            bad = [each for report in reports for each in (*report.with_grade("fault"), *report.with_grade("remark"))]
             print(f"false alarms in 3 good rooms with the full chart: {len(bad)}")
 
 

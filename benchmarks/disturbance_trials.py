@@ -98,27 +98,26 @@ TRIALS = (
 )
 
 
-_ANOTHER_LIGHT = "still seen|another light is seen|not the one ordered"
-_ELSEWHERE = "light from elsewhere|other light fall on the chart|was a lamp or a display switched"
+_ANOTHER_LIGHT = "still shows the previous|shows another illuminant|is not the ordered"
+_ELSEWHERE = "darken the room|other light than|other light falls on the chart|the room light has changed"
 
 NAMED = {
     "frozen screen, from a frame on": _ANOTHER_LIGHT,
     "stale frame": _ANOTHER_LIGHT,
-    "pop-up during the exposure": f"a window cover|{_ANOTHER_LIGHT}",
-    "bump": "the chart has moved|not recognised where it was",
+    "pop-up during the exposure": f"a window (may have )?cover|a window or a screen saver covers|{_ANOTHER_LIGHT}",
+    "bump": "the chart has moved|not detected at its last position",
     "lamp": "the lamp",
     "light in the room": _ELSEWHERE,
     "light in the room, warm": _ELSEWHERE,
     "defocus": "focus",
-    "person": "does somebody or something stand before|did somebody walk past",
-    "hand": "does somebody or something stand before",
-    "half-changed picture": "only a part of the picture had changed|did only a part of the picture change|"
-    "did only a part of it change|did the picture change during",
-    "late picture": "light of the frame before|is the picture late|did the picture change during",
+    "person": "somebody or something stands in front|somebody walked past",
+    "hand": "somebody or something stands in front",
+    "half-changed picture": "only part of the picture ha[ds] changed|the picture changed during",
+    "late picture": "previous illuminant|the picture is late|the picture changed during",
     "repeated file": "a frame that it had given before",
     "zeroed strip": r"rows, from row \d+,? do not reach",
     "scrambled rows": "the file was damaged",
-    "dead primary": "no (red|blue) comes through|does the lamp fail|is the projector on",
+    "dead primary": "(red|blue) is missing|check the lamp|that the projector is on",
     "screen saver": "screen saver",
     "another camera": "connect the camera",
     "another ISO speed": "ISO speed 200",

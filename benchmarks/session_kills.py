@@ -376,7 +376,7 @@ class TroubledSessions:
 
             def work(by_operation: bool = by_operation, operation: int = operation, seconds: float = seconds) -> None:
                 telling(self._tell, Pause, "wait", "pause")
-                telling(self._tell, devices, "_outlast", "relighting")
+                telling(self._tell, devices, "_wait_until_healthy", "relighting")
                 telling(self._tell, devices, "_warm_up", "relighting")
                 telling(self._tell, Journal, "rebuild", "rebuilding")
                 self._tell_retakes()

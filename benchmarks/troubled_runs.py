@@ -360,7 +360,7 @@ def pop_up(frame: int) -> str:
 LOST = "acquire rebuild"
 
 CAUSES: tuple[Cause, ...] = (
-    Cause("one frame late, from a frame on", lambda lab, _: _is_late(lab, 30, 10**9), "light|first frames"),
+    Cause("one frame late, from a frame on", lambda lab, _: _is_late(lab, 30, 10**9), "illuminant|first frames"),
     Cause("one frame late for eight frames", lambda lab, _: _is_late(lab, 30, 38)),
     Cause("a pop-up in every tenth frame", events=tuple(pop_up(frame) for frame in range(25, 400, 10))),
     Cause(

@@ -1,7 +1,7 @@
-"""Check a rig before the session: devices asked, an exposure suggested, trial frames judged as a table is.
+"""Check a rig before the session: ask the devices, propose a shutter time, and judge trial frames as a LUT is judged.
 
-Takes some 25 frames into a hidden folder beside LAB.toml, which is removed at the end; records nothing. The lamp is
-switched on if it was off, and stays on, which is said; a muted picture is shown.
+A check takes about 25 frames into a hidden folder next to LAB.toml, deletes it at the end, and records nothing. The
+lamp is switched on if it was off, and stays on.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from acquisition.check.exposure import (
     Saturation,
     Shot,
     TriedTime,
-    best_of,
+    best_trial,
     fitting_times,
     judge_exposure,
-    level_of,
+    measure_level,
     measure_saturation,
-    search,
+    try_times,
 )
-from acquisition.check.findings import CheckReport, Finding, judged, not_checked
+from acquisition.check.findings import CheckReport, Finding, judge_value, not_checked
 from acquisition.check.picture import check_png
 from acquisition.check.supplies import judge_disk, judge_noise_reduction, judge_supplies
 from acquisition.check.trial import (
@@ -63,18 +63,20 @@ from experiment.session.folder import Session
 from foundation.errors import RegistrationError, StorageError, counted
 from foundation.files import write_atomic
 
-# White at the settings' shutter time, of saturation, at which trial frames are taken so; else with a better time.
+# White level at the shutter time of the settings, as a share of saturation, at which trial frames are taken with it.
+# Outside, they are taken at the best tried time.
 USABLE = (0.3, 0.9)
 
 _Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class FoundExposure:
-    """What white frames show of the exposure.
+class TriedExposures:
+    """White frames at the tried shutter times.
 
     - `first`: white at the shutter time of the settings.
-    - `trials`, `times_s`: shutter times tried, that of the settings first, and those that can be used.
+    - `trials`: tried shutter times, the setting first.
+    - `times_s`: shutter times that can be set, s.
     """
 
     first: Shot
@@ -84,10 +86,10 @@ class FoundExposure:
 
     @property
     def used_s(self) -> float:
-        """Shutter time of the trial frames."""
+        """Shutter time of the trial frames, s."""
         first = self.trials[0]
         usable = USABLE[0] <= first.highest <= USABLE[1] and not first.clipped
-        return first.shutter_s if usable else best_of(self.trials).shutter_s
+        return first.shutter_s if usable else best_trial(self.trials).shutter_s
 
 
 def check_lab(
@@ -98,59 +100,59 @@ def check_lab(
     corners: Corners | None = None,
     linearity: bool = False,
 ) -> CheckReport:
-    """Check the rig that the settings name; record nothing.
+    """Check the rig of the settings; record nothing.
 
-    `picture`: where to draw what was found, PNG. `corners`: of the field of a chart without tags, as given by hand,
-    half-size px. `linearity`: whether to take a series of exposures that shows the sensor's linearity.
+    `picture`: PNG file to draw. `corners`: corners of the field of a chart without tags, half-size px. `linearity`:
+    also take an exposure series that measures the linearity of the sensor.
     """
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
     frames = len(planned_steps(settings, lights))
-    lines = [f"lights      {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} of a session"]
-    beside = Path(settings.file).parent
-    free_bytes_at(beside)
+    lines = [f"illuminants {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} in a session"]
+    lab_folder = Path(settings.file).parent
+    free_bytes_at(lab_folder)
     # Not in /tmp, which may be in memory: the frames are 0.4 to 0.7 GB.
-    with tempfile.TemporaryDirectory(prefix=".check.", dir=beside) as name:
+    with tempfile.TemporaryDirectory(prefix=".check.", dir=lab_folder) as name:
         scratch = Path(name)
         with open_rig(settings, chart) as devices:
             described, screen = _make_devices_ready(devices, settings, announce)
             camera = Photographer(devices, settings, scratch)
-            found = _find_exposure(camera, settings, chart, devices.camera.shutter_speeds(), announce)
+            exposure = _try_exposures(camera, settings, chart, devices.camera.shutter_speeds(), announce)
             announce("taking trial frames: white, dark, primaries, grey")
             series = scratch / "series" if linearity else None
-            best = best_of(found.trials)
-            series_s = series_times(found.times_s, best.shutter_s, best.highest) if series else ()
-            shots = [camera.take(colour, found.used_s) for colour in PRIMARIES.values()]
+            best = best_trial(exposure.trials)
+            series_s = series_times(exposure.times_s, best.shutter_s, best.highest) if series else ()
+            shots = [camera.take(colour, exposure.used_s) for colour in PRIMARIES.values()]
             primaries = np.array([shot.brightest(99.0) for shot in shots])
-            shown = trial_lights(lights, primaries)
-            steps = trial_steps(shown)
-            _require_space(beside, (len(steps) + len(series_s)) * found.first.size)
-            taken = Session.create(scratch / "trial", settings.to_toml(), chart, shown, steps)
+            lights = trial_lights(lights, primaries)
+            steps = trial_steps(lights)
+            _require_space(lab_folder, (len(steps) + len(series_s)) * exposure.first.size)
+            session = Session.create(scratch / "trial", settings.to_toml(), chart, lights, steps)
             (scratch / "series").mkdir()
-            take_trial(camera, taken, found.used_s, series_s, scratch / "series")
+            take_trial(camera, session, exposure.used_s, series_s, scratch / "series")
             camera.restore()
-            supplies = judge_supplies(devices.camera, frames, found.first.size)
+            supplies = judge_supplies(devices.camera, frames, exposure.first.size)
         announce("measuring the trial frames")
-        with taken:
-            trial = measure_trial(taken, found.saturation, corners, series)
+        with session:
+            trial = measure_trial(session, exposure.saturation, corners, series)
     lines += described
-    if found.used_s != found.first.shutter_s:
+    if exposure.used_s != exposure.first.shutter_s:
         lines.append(
-            f"frames      taken at {found.used_s:.4g} s, since white is clipped or dark as the settings have it"
+            f"frames      exposed {exposure.used_s:.4g} s, because white is clipped or dark at the time of the settings"
         )
     findings = [
-        *_exposure_findings(found, settings),
+        *_exposure_findings(exposure, settings),
         *_figure_findings(trial, settings),
         *_pose_and_light(trial, chart),
         judge_noise_reduction(camera.timings),
         *([not_checked("series", trial.series_trouble)] if trial.series_trouble else []),
         *screen,
         *(Finding("settings", "remark", doubt) for doubt in settings_doubts(settings)),
-        judge_disk(beside, frames, found.first.size),
+        judge_disk(lab_folder, frames, exposure.first.size),
         *supplies,
     ]
     values = {row.figure.name: row.value for row in trial.verdict.rows}
-    first_s = found.used_s if found.used_s != found.first.shutter_s else None
+    first_s = exposure.used_s if exposure.used_s != exposure.first.shutter_s else None
     outcome = None if trial.table is None or first_s is not None else trial.verdict.outcome
     report = CheckReport(tuple(lines), tuple(findings), outcome, values, trial.not_known, first_s)
     if picture is not None:
@@ -158,123 +160,120 @@ def check_lab(
     return report
 
 
-def _require_space(folder: Path, needed: int) -> None:
-    if (free := free_bytes_at(folder)) < needed:
+def _require_space(folder: Path, needed_bytes: int) -> None:
+    if (free_bytes := free_bytes_at(folder)) < needed_bytes:
         raise StorageError(
-            f"{bytes_text(free)} free at {folder}, {bytes_text(needed, up=True)} needed for the frames of a check; "
-            "free as much"
+            f"{bytes_text(free_bytes)} free at {folder}, {bytes_text(needed_bytes, up=True)} needed for the frames "
+            "of a check; delete other files"
         )
 
 
-def _find_exposure(
+def _try_exposures(
     camera: Photographer,
     settings: LabSettings,
     chart: Chart,
     offered_s: Sequence[float],
     announce: Callable[[str], None],
-) -> FoundExposure:
-    """Return how bright white is at the shutter times that were tried until one suits."""
+) -> TriedExposures:
     first = camera.take(WHITE)
     if settings.rig == "replay":
-        stated, counts = float(first.mosaic.white_level), float(first.mosaic.saturation())
-        saturation = Saturation(counts, counts < stated, stated)
-        return FoundExposure(first, (level_of(first, saturation, _paper(first, chart)),), (), saturation)
-    # A time that the body does not list was taken all the same, so it counts among them.
+        stated_counts, counts = float(first.mosaic.white_level), float(first.mosaic.saturation())
+        saturation = Saturation(counts, counts < stated_counts, stated_counts)
+        return TriedExposures(first, (measure_level(first, saturation, _paper(first, chart)),), (), saturation)
+    # The camera accepted the time of the settings even if it is not in its list.
     times = fitting_times(sorted({*offered_s, settings.camera.shutter_s}) if offered_s else (), period_s(settings))
-    announce("measuring the sensor's saturation: frames of white, longer and longer")
+    announce("measuring the saturation level with longer and longer frames of white")
     saturation = measure_saturation(first, lambda seconds: camera.take(WHITE, seconds), times)
 
     def level(shot: Shot) -> TriedTime:
-        return level_of(shot, saturation, _paper(shot, chart))
+        return measure_level(shot, saturation, _paper(shot, chart))
 
-    trials = search(level(first), lambda seconds: level(camera.take(WHITE, seconds)), times)
-    return FoundExposure(first, trials, tuple(times), saturation)
+    trials = try_times(level(first), lambda seconds: level(camera.take(WHITE, seconds)), times)
+    return TriedExposures(first, trials, tuple(times), saturation)
 
 
 def _paper(shot: Shot, chart: Chart) -> _Array | None:
-    """Return (3,) counts above black of bare paper, as the live judge measures it; None if the chart is not found."""
+    """Return (3,) counts above black of white paper, as `acquire run` measures them; None if no chart is detected."""
     if not chart.tags:
         return None
     black = frame_black(shot.mosaic)
     try:
-        anchor = Anchor.of(shot.mosaic, black, chart)
+        anchor = Anchor.from_white(shot.mosaic, black, chart)
     except RegistrationError:
         return None
     level = anchor.paper_level(shot.mosaic, black, phases(shot.mosaic))
     return None if np.isnan(level).any() else level
 
 
-def _exposure_findings(found: FoundExposure, settings: LabSettings) -> list[Finding]:
-    """Return the findings on the frame at the settings' exposure: its brightness, and what a run would refuse of it."""
-    first = found.first.mosaic
-    findings = [judge_exposure(found.trials, found.saturation, found.times_s, period_s(settings))]
-    measured = measure_exposure(replace(first, white_level=round(found.saturation.counts)))
-    refused = refusal(measured, "white", settings.limits)
+def _exposure_findings(exposure: TriedExposures, settings: LabSettings) -> list[Finding]:
+    first = exposure.first.mosaic
+    findings = [judge_exposure(exposure.trials, exposure.saturation, exposure.times_s, period_s(settings))]
+    measured = measure_exposure(replace(first, white_level=round(exposure.saturation.counts)))
+    reason = refusal(measured, "white", settings.limits)
     is_clipped = 100 * measured.clipped > settings.limits.clipped_percent
-    said = f"{measured.clipped:.2%} of the photosites of a white frame are clipped"
-    findings.append(Finding("clipping", "fault", refused or "") if is_clipped else Finding("clipping", "good", said))
-    if refused is not None and not is_clipped:
-        findings.append(Finding("exposure", "fault", refused))
-    differs = disagreement(first, settings.camera.exposure)
-    if differs is not None:
-        findings.append(Finding("settings", "fault", differs, remedy="set the mode dial to M and touch no other"))
+    share = f"{measured.clipped:.2%} of the photosites of a white frame are clipped"
+    findings.append(Finding("clipping", "fault", reason or "") if is_clipped else Finding("clipping", "good", share))
+    if reason is not None and not is_clipped:
+        findings.append(Finding("exposure", "fault", reason))
+    difference = disagreement(first, settings.camera.exposure)
+    if difference is not None:
+        findings.append(Finding("settings", "fault", difference, remedy="set the mode dial of the camera to M"))
     return findings
 
 
 def _figure_findings(trial: Trial, settings: LabSettings) -> list[Finding]:
     if trial.table is None:
-        return [Finding("chart", "fault", trial.trouble), not_checked("figures", "the chart cannot be measured")]
+        return [Finding("chart", "fault", trial.trouble), not_checked("figures", "the chart was not measured")]
     table = trial.table
     rows = [row for row in trial.verdict.rows if row.figure is not BRIGHTEST_SHARE]
     findings = [_figure_finding(row, table) for row in rows]
     value, allowed = trial.dark_percent, settings.judge.dark_percent
     if value <= allowed:
         return findings
-    # The run refuses dark frames earlier than a table is refused.
+    # `acquire run` refuses dark frames at a lower limit than `build-lut`.
     fault = Finding(
         LEAK_SHARE.name,
         "fault",
-        f"the dark frame has {value:.1f} % of white, in the mean or in some places",
+        f"the dark frame has {value:.1f} % of white (mean, or the brightest 6 % of the frame)",
         value / 100,
         LEAK_SHARE.unit,
         tolerable=(None, allowed / 100),
-        reason=f"judge.dark_percent allows {allowed:g} %: a run refuses the frame",
+        reason=f"at most {allowed:g} % expected (judge.dark_percent): acquire run would refuse the frame",
         remedy=LEAK_SHARE.remedy,
     )
-    return [*(one for one in findings if one.name != LEAK_SHARE.name), fault]
+    return [*(finding for finding in findings if finding.name != LEAK_SHARE.name), fault]
 
 
 def _figure_finding(row: JudgedValue, table: TableMeasurements) -> Finding:
     if row.outcome == "accept":
-        return judged(row.figure, row.value)
+        return judge_value(row.figure, row.value)
     detail, remedy = detail_and_remedy(row.figure, table)
     cause = explain(row.figure, table)
     if cause is not None and cause.is_known:
         remedy = cause.decision.cause.remedy
         detail += f", probably {cause.decision.cause.description}"
-    place = positions_text(cause)
-    said = f"{row.figure.title}: {row.measured}{detail}{f', {place}' if place else ''}"
-    return judged(row.figure, row.value, said, remedy)
+    where = positions_text(cause)
+    sentence = f"{row.figure.title}: {row.measured}{detail}{f', {where}' if where else ''}"
+    return judge_value(row.figure, row.value, sentence, remedy)
 
 
 def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
     if trial.table is None:
-        return [not_checked(one.name, "the chart cannot be measured") for one in (TURN, KEYSTONE, EVENNESS)]
+        return [not_checked(limit.name, "the chart was not measured") for limit in (TURN, KEYSTONE, EVENNESS)]
     table = trial.table
     framing, (width, height) = table.registration.framing, chart.page_mm
-    off, quarters = off_level_deg(framing.rotation_deg)
-    turned = f"; it is turned by {90 * quarters}° besides, which does no harm" if quarters else ""
+    tilt_deg, quarters = off_level_deg(framing.rotation_deg)
+    turned = f", in addition to a harmless turn by {90 * quarters}°" if quarters else ""
     across, down = keystone(project(framing.homography, [(0, 0), (width, 0), (width, height), (0, height)]))
+    tilt = f"the chart is turned by {tilt_deg:+.1f}° in the image{turned}"
     lost = falloff(table.frames[0].paper.field.at(chart.centres_mm))
     return [
-        judged(
-            TURN, abs(off), f"the chart's rows are {off:+.1f}° to the picture's{turned}", details={"turned": quarters}
-        ),
-        judged(KEYSTONE, max(across, down), details={"across": across, "down": down}),
-        judged(
+        judge_value(TURN, abs(tilt_deg), tilt, details={"turned": quarters}),
+        judge_value(KEYSTONE, max(across, down), details={"across": across, "down": down}),
+        judge_value(
             EVENNESS,
             float(lost.max()),
-            f"lens and projector together lose {100 * lost.max():.0f} % of the light at the darkest place of the chart",
+            f"the darkest place of the chart has {100 * lost.max():.0f} % less light than the brightest",
             details={"falloff": lost.tolist()},
         ),
     ]
@@ -283,35 +282,34 @@ def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
 def _make_devices_ready(
     devices: Devices, settings: LabSettings, announce: Callable[[str], None]
 ) -> tuple[list[str], list[Finding]]:
-    """Make every device ready for a frame; return a line about each, and what screen and projector report."""
     projector = devices.projector
     questions: dict[str, Callable[[], object]] = {
         "camera": lambda: (devices.camera.identity(), devices.camera.configure(settings.camera.exposure)),
         "display": lambda: devices.presenter.show(Colour(0, 0, 0)),
     }
     if projector is not None:
-        questions["projector"] = lambda: (projector.identity(), projector.power(), _require_sound(projector))
+        questions["projector"] = lambda: (projector.identity(), projector.power(), _require_no_fault(projector))
     ask_all(questions)
     body = devices.camera.identity()
     lines = [f"camera      {body.name}, serial {body.serial}"]
     warnings = devices.presenter.warnings() if isinstance(devices.presenter, ReportsWarnings) else ()
     findings = [Finding("screen", "remark", warning) for warning in warnings]
     if projector is None:
-        lines.append("projector   not under control: see to its lamp yourself")
+        lines.append("projector   not controlled: switch its lamp on and off by hand")
         return lines, findings
     state, _ = projector_state(projector)
     patience = RetryPolicy(
-        devices.clock, 0, lambda what, sentence: announce(f"{what}: {sentence}"), lambda: keep_awake(devices.camera)
+        devices.clock, 0, lambda event, sentence: announce(f"{event}: {sentence}"), lambda: keep_awake(devices.camera)
     )
     make_ready(projector, settings.sequence, patience)
-    lines.append(f"projector   {state}; it stays on when the check is over")
-    parts = [fault.part for fault in projector.faults() if fault.severity is Severity.WARNING]
-    if parts:
-        said = f"the projector warns of its {', '.join(parts)}"
-        findings.append(Finding("projector", "remark", said, remedy="look at its display before the session"))
+    lines.append(f"projector   {state}; it stays on after the check")
+    worn_parts = ", ".join(fault.part for fault in projector.faults() if fault.severity is Severity.WARNING)
+    if worn_parts:
+        warning = f"the projector reports a warning about its {worn_parts}"
+        findings.append(Finding("projector", "remark", warning, remedy="look at its display before the session"))
     return lines, findings
 
 
-def _require_sound(projector: Projector) -> None:
+def _require_no_fault(projector: Projector) -> None:
     if (fault := reported_error(projector)) is not None:
         raise fault

@@ -1,10 +1,6 @@
-"""The exposure that suits: where the sensor saturates, and the shutter time at which white is bright and not clipped.
+"""Measure the saturation level of the sensor and search the shutter time at which white is bright but not clipped.
 
-- Saturation is measured, not looked up: exposed longer, a photosite that is not saturated counts in proportion more,
-  one that is does not. LibRaw states 15 831 for an EOS 550D that saturates at 13 584.
-- The search goes by measurement as well: each shutter time that is proposed has been tried.
-- Trial frames are taken at the shutter time of the settings, or, if white is clipped or dark at that, at the best one
-  that was found.
+Every proposed shutter time has been tried.
 """
 
 from __future__ import annotations
@@ -19,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.check.findings import Finding, judged
+from acquisition.check.findings import Finding, judge_value
 from acquisition.run.devices import Devices, holds_whole_turns
 from calibration.figures.figure import format_value
 from calibration.figures.truth import BRIGHTEST_SHARE
@@ -31,34 +27,34 @@ from experiment.config import LabSettings
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One frame: the shutter time that was set, seconds, its counts, and the bytes of its file."""
+    """A frame with its shutter time, s, its counts and the size of its file, bytes."""
 
     shutter_s: float
     mosaic: Mosaic
     size: int
 
     def brightest(self, percentile: float) -> npt.NDArray[np.float64]:
-        """Return (3,) float64: counts above black of R, G and B at a percentile of their photosites."""
+        """Return (3,) float64: a percentile of the counts above black of R, G and B."""
         black, blocks = frame_black(self.mosaic), self.mosaic.block_planes()[:, :, ::2, ::2]
-        found = phases(self.mosaic)
+        positions = phases(self.mosaic)
         return np.array(
             [
-                max(float(np.percentile(blocks[place], percentile) - black[place]) for place in found[channel])
+                max(float(np.percentile(blocks[phase], percentile) - black[phase]) for phase in positions[channel])
                 for channel in CHANNELS
             ]
         )
 
 
 class Photographer:
-    """Takes frames with the devices of a rig; ISO speed and aperture of the settings are never changed."""
+    """Takes frames with the devices of a rig; never changes the ISO speed and the aperture of the settings."""
 
     def __init__(self, devices: Devices, settings: LabSettings, scratch: Path) -> None:
         self._devices = devices
         self._settings = settings
         self._file = scratch / "frame"
         self._shutter_s = settings.camera.shutter_s
+        # Of every frame: shutter time, and time from release until its file was received, s.
         self.timings: list[tuple[float, float]] = []
-        """Of every frame taken: shutter time and the time until its file was here, seconds."""
 
     def capture(self, colour: Colour, shutter_s: float, into: BinaryIO) -> CapturedFrame:
         """Show a plain colour, take a frame of it, and write its file."""
@@ -72,7 +68,7 @@ class Photographer:
         return captured
 
     def take(self, colour: Colour, shutter_s: float | None = None) -> Shot:
-        """Return a frame, at the shutter time of the settings if no other is given; its file is not kept."""
+        """Return a frame, by default at the shutter time of the settings; its file is deleted."""
         seconds = self._settings.camera.shutter_s if shutter_s is None else shutter_s
         with self._file.open("wb") as stream:
             size = self.capture(colour, seconds, stream).size
@@ -81,7 +77,7 @@ class Photographer:
         return Shot(seconds, mosaic, size)
 
     def now(self) -> datetime:
-        """Return the time of the clock by which frames are taken."""
+        """Return the time of the clock of the frames."""
         return self._devices.clock.now()
 
     def restore(self) -> None:
@@ -94,37 +90,39 @@ class Photographer:
             self._shutter_s = shutter_s
 
 
-TARGET = 0.7  # White as a share of saturation that is looked for
+TARGET = 0.7  # white level to search for, as a share of saturation
 
-# White's share of saturation at which no other time is suggested (judgement): above, brighter places and the lamp's
-# drift clip; below, each stop doubles the noise of dark cells.
+# White levels, as shares of saturation, at which no other time is proposed (judgement). Above, brighter places and the
+# drift of the lamp clip; below, each stop doubles the noise of dark patches.
 SUITABLE = (0.6, 0.8)
 
-TRIALS = 8  # Shutter times that are tried at most: from any time to any other are five steps of 16 and a last one
+TRIALS = 8  # tries at most: five steps of 16 and a last one lead from any time to any other
 
-# How much longer a frame is exposed to see the sensor saturate: white's weakest channel has a third of the strongest,
-# and a good exposure is at 0.7.
+# Factor of the exposure that saturates the sensor: the weakest channel of white has a third of the strongest, which is
+# at 0.7 of saturation in a good exposure.
 LONGER = 8.0
 
-LONGEST_S = 30.0  # No longer time is tried: the wait, and hot photosites
+LONGEST_S = 30.0  # longest shutter time to try: longer frames cost waiting time and have more hot photosites
 
-# Of the counts that a longer time should give; what counts less is saturated. Times are stated as engraved, 0.3 s for
-# 0.315 s, which makes a ratio of two wrong by 8 % at most.
+# Share of the expected counts below which a photosite is saturated. Shutter times are stated as engraved (0.3 s for
+# 0.315 s), so that a ratio of two is wrong by up to 8 %.
 PROPORTIONAL = 0.9
 
-# Share of the stated range from which on counts may be saturation: noise in the dark is not proportional either.
+# Share of the stated range below which counts cannot be saturation: noise in the dark is not proportional either.
 LEAST_RANGE = 0.25
 
 _Array = npt.NDArray[np.float64]
 
 
+# Saturation is measured, because the level in the file can be wrong: LibRaw states 15 831 for an EOS 550D that
+# saturates at 13 584. A longer exposure raises the count of a photosite in proportion, unless it is saturated.
 @dataclass(frozen=True)
 class Saturation:
-    """Where the sensor saturates.
+    """Saturation level of the sensor.
 
-    - `counts`: raw count, the lowest of the positions of the 2×2 block.
-    - `measured`: whether a frame showed it; else it is what the file states.
-    - `stated`: what the file states.
+    - `counts`: raw counts, the lowest of the positions of the 2×2 block.
+    - `measured`: whether a frame was saturated; if not, `counts` is the level in the file.
+    - `stated`: the level in the file.
     """
 
     counts: float
@@ -132,13 +130,12 @@ class Saturation:
     stated: float
 
     def __str__(self) -> str:
-        """Return "13584 counts, measured"."""
-        return f"{self.counts:.0f} counts, {'measured' if self.measured else 'as the file states, not measured'}"
+        return f"{self.counts:.0f} counts, {'measured' if self.measured else 'from the file, not measured'}"
 
 
 @dataclass(frozen=True)
 class TriedTime:
-    """A shutter time that was tried: white's share of saturation in R, G and B, and whether it overflowed."""
+    """A tried shutter time: white levels of R, G and B (shares of saturation), and whether white was clipped."""
 
     shutter_s: float
     level: tuple[float, float, float]
@@ -146,12 +143,12 @@ class TriedTime:
 
     @property
     def highest(self) -> float:
-        """White in the strongest channel."""
+        """White level of the strongest channel."""
         return max(self.level)
 
 
 def fitting_times(offered_s: Sequence[float], period_s: float | None) -> list[float]:
-    """Return those of the offered times, rising, that hold whole periods of the light, if it has one, up to 30 s."""
+    """Return the offered times up to 30 s, rising, that hold whole periods of the light, if it has a period."""
     return [
         time
         for time in sorted(offered_s)
@@ -160,100 +157,102 @@ def fitting_times(offered_s: Sequence[float], period_s: float | None) -> list[fl
 
 
 def measure_saturation(first: Shot, take: Callable[[float], Shot], times_s: Sequence[float]) -> Saturation:
-    """Return where the sensor saturates, by frames of white exposed longer and longer.
+    """Measure the saturation level with longer and longer frames of white.
 
-    `take`: takes a frame of white at a shutter time, seconds.
+    `take`: takes a frame of white at a shutter time, s.
     """
-    stated = float(first.mosaic.white_level)
+    stated_counts = float(first.mosaic.white_level)
     longer = first
     while True:
         longer_s = next((time for time in times_s if time >= LONGER * longer.shutter_s), max(times_s, default=0.0))
         if longer_s < 1.5 * first.shutter_s or longer_s <= longer.shutter_s:
-            return Saturation(stated, False, stated)
-        # Against the frame before: in a dim first one the brightest hundredths are noise.
-        before, longer = longer, take(longer_s)
-        found = _plateaus(before, longer)
-        if found:
-            return Saturation(min(found), True, stated)
+            return Saturation(stated_counts, False, stated_counts)
+        # Compared with the previous frame: the brightest hundredth of a dim first frame is noise.
+        shorter, longer = longer, take(longer_s)
+        saturated_counts = _plateaus(shorter, longer)
+        if saturated_counts:
+            return Saturation(min(saturated_counts), True, stated_counts)
 
 
 def _plateaus(shorter: Shot, longer: Shot) -> list[float]:
-    """Return the counts at which positions of the block saturate in the longer of two frames; none where none does."""
-    before, after = _paper_counts(shorter.mosaic), _paper_counts(longer.mosaic)
+    """Return the counts of all saturated positions of the 2×2 block in the longer frame."""
+    shorter_counts, longer_counts = _paper_counts(shorter.mosaic), _paper_counts(longer.mosaic)
     black = frame_black(shorter.mosaic)
-    expected = (before - black) * longer.shutter_s / shorter.shutter_s
-    enough = LEAST_RANGE * (shorter.mosaic.white_level - black)
-    full = (after - black < PROPORTIONAL * expected) & (after - black > enough)
-    return [float(value) for value in after[full]]
+    expected = (shorter_counts - black) * longer.shutter_s / shorter.shutter_s
+    least_counts = LEAST_RANGE * (shorter.mosaic.white_level - black)
+    is_saturated = (longer_counts - black < PROPORTIONAL * expected) & (longer_counts - black > least_counts)
+    return [float(value) for value in longer_counts[is_saturated]]
 
 
 def _paper_counts(mosaic: Mosaic) -> _Array:
-    """Return (2, 2) float64: the raw counts of bare paper at each position of the block."""
+    """Return (2, 2) float64: raw counts of white paper at each position of the 2×2 block."""
     return np.asarray(np.percentile(mosaic.block_planes()[:, :, ::2, ::2], PAPER_PERCENTILE, axis=(2, 3)))
 
 
-def level_of(shot: Shot, saturation: Saturation, white: _Array | None = None) -> TriedTime:
-    """Return how bright white is in a frame.
+def measure_level(shot: Shot, saturation: Saturation, white: _Array | None = None) -> TriedTime:
+    """Return the white level of a frame.
 
-    `white`: (3,) float64 counts above black of the brightest paper; None where the chart's place is not known: then the
-    brightest hundredth of the frame stands for it.
+    `white`: (3,) float64 counts above black of the brightest paper; None if the chart was not detected. The brightest
+    hundredth of the frame is used then.
     """
     black = frame_black(shot.mosaic)
-    found = phases(shot.mosaic)
-    ranges = np.array([saturation.counts - np.mean([black[place] for place in found[channel]]) for channel in CHANNELS])
+    positions = phases(shot.mosaic)
+    ranges = np.array([saturation.counts - np.mean([black[at] for at in positions[channel]]) for channel in CHANNELS])
     white = shot.brightest(99.0) if white is None else white
     red, green, blue = (white / ranges).tolist()
     return TriedTime(shot.shutter_s, (red, green, blue), max(red, green, blue) >= CLIPPING_SHARE)
 
 
-def search(first: TriedTime, measure: Callable[[float], TriedTime], times_s: Sequence[float]) -> tuple[TriedTime, ...]:
-    """Return the times that were tried until the best of those offered was among them; the first is `first`.
+def try_times(
+    first: TriedTime, measure: Callable[[float], TriedTime], times_s: Sequence[float]
+) -> tuple[TriedTime, ...]:
+    """Return the tried times, `first` included, until the best offered time is among them.
 
-    `measure`: takes a frame at a shutter time, seconds, and says how bright white is.
+    `measure`: takes a frame at a shutter time, s, and returns its white level.
     """
     trials = [first]
     while len(trials) < TRIALS:
-        wanted = _next_time(trials, times_s)
-        if wanted is None:
+        next_s = _next_time(trials, times_s)
+        if next_s is None:
             break
-        trials.append(measure(wanted))
+        trials.append(measure(next_s))
     return tuple(trials)
 
 
-def best_of(trials: Sequence[TriedTime]) -> TriedTime:
-    """Return the trial nearest to the target: the darkest where all overflow."""
-    whole = [trial for trial in trials if not trial.clipped]
-    if not whole:
+def best_trial(trials: Sequence[TriedTime]) -> TriedTime:
+    """Return the trial nearest to the target, or the darkest if all are clipped."""
+    unclipped = [trial for trial in trials if not trial.clipped]
+    if not unclipped:
         return min(trials, key=lambda trial: trial.shutter_s)
-    inside = [trial for trial in whole if _is_suitable(trial)]
-    return min(inside or whole, key=lambda trial: abs(math.log(max(trial.highest, 1e-6) / TARGET)))
+    suitable = [trial for trial in unclipped if _is_suitable(trial)]
+    return min(suitable or unclipped, key=lambda trial: abs(math.log(max(trial.highest, 1e-6) / TARGET)))
 
 
 def _next_time(trials: Sequence[TriedTime], times_s: Sequence[float]) -> float | None:
-    tried = {trial.shutter_s for trial in trials}
-    whole = [trial for trial in trials if not trial.clipped]
-    if not whole:
-        shortest = min(tried)
-        below = [time for time in times_s if time <= shortest / 4]
-        wanted = below[-1] if below else next((time for time in times_s if time < shortest), None)
-        return None if wanted in tried else wanted
-    brightest = max(whole, key=lambda trial: trial.highest)
-    # Too dark a frame tells little more than that it is dark.
+    tried_s = {trial.shutter_s for trial in trials}
+    unclipped = [trial for trial in trials if not trial.clipped]
+    if not unclipped:
+        shortest = min(tried_s)
+        much_shorter = [time for time in times_s if time <= shortest / 4]
+        next_s = much_shorter[-1] if much_shorter else next((time for time in times_s if time < shortest), None)
+        return None if next_s in tried_s else next_s
+    brightest = max(unclipped, key=lambda trial: trial.highest)
+    # The level of a very dark frame is inaccurate: at most a factor of 16 at a time.
     gain = min(TARGET / max(brightest.highest, 1e-6), 16.0)
     ceiling = min((trial.shutter_s for trial in trials if trial.clipped), default=math.inf)
     low, high = SUITABLE
-    able = [time for time in times_s if time < ceiling]
+    shorter = [time for time in times_s if time < ceiling]
     target_s = brightest.shutter_s * gain
-    suited = [time for time in able if low <= brightest.highest * time / brightest.shutter_s <= high]
-    wanted = min(suited or able, key=lambda time: abs(math.log(time / target_s)), default=None)
-    if wanted is None or wanted in tried:
+    suitable = [time for time in shorter if low <= brightest.highest * time / brightest.shutter_s <= high]
+    next_s = min(suitable or shorter, key=lambda time: abs(math.log(time / target_s)), default=None)
+    if next_s is None or next_s in tried_s:
         return None
-    predicted = brightest.highest * wanted / brightest.shutter_s
+    predicted = brightest.highest * next_s / brightest.shutter_s
     if low <= brightest.highest <= high and abs(math.log(predicted / TARGET)) > abs(
         math.log(brightest.highest / TARGET)
     ):
         return None
-    return wanted
+    return next_s
 
 
 def judge_exposure(
@@ -262,14 +261,14 @@ def judge_exposure(
     times_s: Sequence[float],
     period_s: float | None,
 ) -> Finding:
-    """Return the finding on the exposure of the settings, which is that of the first trial.
+    """Judge the exposure of the settings, which is the first trial.
 
-    `period_s`: after which the light repeats, seconds; None where it is steady.
+    `period_s`: period of the light, s; None if the light is steady.
     """
-    first, best = trials[0], best_of(trials)
+    first, best = trials[0], best_trial(trials)
     channel = CHANNELS[int(np.argmax(first.level))]
-    seen = "saturates" if first.clipped else f"is at {format_value(first.highest, 'share')} of saturation"
-    said = f"white {seen} ({saturation}) in {channel} at {first.shutter_s:.4g} s"
+    level = "saturates" if first.clipped else f"is at {format_value(first.highest, 'share')} of saturation"
+    measurement = f"white {level} ({saturation}) in {channel} at {first.shutter_s:.4g} s"
     details = {
         "shutter_s": first.shutter_s,
         "level": list(first.level),
@@ -279,40 +278,40 @@ def judge_exposure(
         "trials": [[trial.shutter_s, trial.highest, trial.clipped] for trial in trials],
     }
     if not times_s:
-        remedy = "the camera lists no shutter times; set another camera.shutter_s and check again"
+        remedy = "the camera lists no shutter times: set another camera.shutter_s and repeat the check"
     elif _is_suitable(best):
-        remedy = f"set camera.shutter_s = {best.shutter_s:.4g} (tried: {format_value(best.highest, 'share')})"
+        remedy = f"set camera.shutter_s = {best.shutter_s:.4g} (measured: {format_value(best.highest, 'share')})"
         details["proposed_shutter_s"] = best.shutter_s
     else:
-        remedy = _no_time(best, period_s)
-    found = judged(BRIGHTEST_SHARE, 1.0 if first.clipped else first.highest, said, remedy, details)
-    if found.grade != "good":
-        return found
+        remedy = _remedy_without_time(best, period_s)
+    finding = judge_value(BRIGHTEST_SHARE, 1.0 if first.clipped else first.highest, measurement, remedy, details)
+    if finding.grade != "good":
+        return finding
     if not _is_suitable(first):
-        why = (
-            f"{100 * SUITABLE[0]:.0f} to {100 * SUITABLE[1]:.0f} % suits: above, other places clip; below, noise grows"
+        reason = (
+            f"{100 * SUITABLE[0]:.0f} to {100 * SUITABLE[1]:.0f} % expected: above, places clip; below, noise grows"
         )
-        return replace(found, grade="remark", reason=why, remedy=remedy)
+        return replace(finding, grade="remark", reason=reason, remedy=remedy)
     if not saturation.measured:
-        why = "no frame saturates the sensor: the share is of what the file states"
-        return replace(found, grade="remark", reason=why, remedy="brighten the light if you can")
-    return found
+        reason = "no frame saturated the sensor, so that the saturation level of the file was used"
+        return replace(finding, grade="remark", reason=reason, remedy="make the projector brighter if possible")
+    return finding
 
 
 def _is_suitable(trial: TriedTime) -> bool:
     return SUITABLE[0] <= trial.highest <= SUITABLE[1] and not trial.clipped
 
 
-def _no_time(best: TriedTime, period_s: float | None) -> str:
-    turns = f" and holds whole turns of {format_value(period_s, 's')}" if period_s else ""
+def _remedy_without_time(best: TriedTime, period_s: float | None) -> str:
+    turns = f" and that is a multiple of {format_value(period_s, 's')}" if period_s else ""
     nearest = (
         f"even the shortest, {best.shutter_s:.4g} s, saturates"
         if best.clipped
         else f"the nearest, camera.shutter_s = {best.shutter_s:.4g}, gives {format_value(best.highest, 'share')}"
     )
-    bright = best.clipped or best.highest > TARGET
-    aperture, speed = ("higher", "lower") if bright else ("lower", "higher")
+    is_bright = best.clipped or best.highest > TARGET
+    aperture, speed = ("higher", "lower") if is_bright else ("lower", "higher")
     return (
-        f"no shutter time that the camera offers{turns} leads there, {nearest}: set a {aperture} f-number or a {speed} "
-        f"ISO speed{', or dim the projector' if bright else ', or a brighter projector'}"
+        f"no shutter time that the camera offers{turns} reaches this level, {nearest}: set a {aperture} f-number or a "
+        f"{speed} ISO speed, or {'dim the projector' if is_bright else 'use a brighter projector'}"
     )

@@ -1,7 +1,7 @@
-"""What a check found: one frozen value for each thing measured, its grade by its limit, text and JSON of all of them.
+"""Findings of `acquire check`: one frozen value for each measured quantity, graded by its limit, as text and as JSON.
 
-A value that a table is accepted with is good, one that it is remarked on for a remark, beyond that a fault
-(`calibration.figures.figure.Limit`). What could not be measured is `not checked`, with the reason; it is never good.
+A value that `build-lut` accepts is good, a value that it remarks on is a remark, a value that it refuses is a fault
+(`calibration.figures.figure.Limit`). A quantity that could not be measured is `not checked`, never good.
 """
 
 from __future__ import annotations
@@ -13,23 +13,24 @@ from typing import Any, Literal
 from calibration.figures.figure import Limit, Outcome, Range
 
 Grade = Literal["fault", "remark", "not checked", "good"]
-GRADES: tuple[Grade, ...] = ("fault", "remark", "not checked", "good")  # In the order in which findings are reported
+GRADES: tuple[Grade, ...] = ("fault", "remark", "not checked", "good")  # in the order of the report
 
 _GRADES: Mapping[Outcome, Grade] = {"accept": "good", "accept with remarks": "remark", "refuse": "fault"}
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """Verdict on one quantity. The fields are the keys of `--json`.
 
-    - `name`: of the figure or limit that judges it, or of what was looked at: "chart".
-    - `grade`: good, remark, fault, or not checked.
-    - `said`: what was seen, with its numbers; or why nothing was.
-    - `value`: the number that was judged; None where there is none.
-    - `unit`: of the value and the limits, as in `Limit`.
-    - `reason`: what goes wrong beyond them; empty where the value is good.
-    - `remedy`: what to do; empty where nothing is to be done.
-    - `details`: further numbers and words by name, for programs.
+    - `name`: of the figure or limit, or of the checked object, such as "chart".
+    - `grade`: good, remark, fault or not checked.
+    - `said`: the measured value in words, or the reason why it could not be measured.
+    - `value`: the judged value; None without a value.
+    - `unit`: unit of the value and the limits, as in `Limit`.
+    - `good`, `tolerable`: ranges that are accepted, and accepted with remarks.
+    - `reason`: the expected value and the harm beyond it; empty if the value is good.
+    - `remedy`: what to do; empty if nothing needs to be done.
+    - `details`: further values by name, for programs.
     """
 
     name: str
@@ -44,26 +45,26 @@ class Finding:
     details: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def sentence(self) -> str:
-        """Return what was seen, why it matters, and what to do, as one sentence."""
-        why = f" ({self.reason})" if self.reason else ""
-        return f"{self.said}{why}{f'; {self.remedy}' if self.remedy else ''}"
+        """Return measurement, expectation and remedy as one sentence."""
+        reason = f" ({self.reason})" if self.reason else ""
+        return f"{self.said}{reason}{f'; {self.remedy}' if self.remedy else ''}"
 
     def line(self) -> str:
-        """Return grade, name and sentence, in columns."""
+        """Return grade, name and sentence in columns."""
         return f"{self.grade:<12}{self.name:<24}{self.sentence()}"
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What a whole check found.
+    """Result of a check.
 
-    - `devices`: what answered, a line each, and what was done with it.
-    - `findings`: in the order in which they were looked at.
-    - `forecast`: what `build-lut` would say, as far as these frames show it: "accept", "accept with remarks" or
-      "refuse"; None where the chart was not found, or the exposure of the settings is not that of the frames.
-    - `figures`: the table's figures that are known, by their names in `report.json`.
-    - `not_known`: the names of those that are known only when there are frames of a session.
-    - `first_s`: the shutter time to set before anything is forecast, at which the figures hold; None if it is set.
+    - `devices`: one line for each device.
+    - `findings`: in the order of measurement.
+    - `forecast`: verdict of `build-lut` on the figures that a check measures; None if the chart was not detected, or
+      the trial frames were not exposed as the settings state.
+    - `figures`: measured figures by their names in `report.json`.
+    - `not_known`: names of the figures that only a session can measure.
+    - `first_s`: shutter time of the trial frames, s, to be set before the forecast is valid; None if it is set.
     """
 
     devices: tuple[str, ...]
@@ -74,27 +75,27 @@ class CheckReport:
     first_s: float | None = None
 
     def sorted(self) -> list[Finding]:
-        """Return the findings by their grades, faults first."""
-        return [finding for grade in GRADES for finding in self.of(grade)]
+        """Return the findings by grade, faults first."""
+        return [finding for grade in GRADES for finding in self.with_grade(grade)]
 
-    def of(self, grade: Grade) -> tuple[Finding, ...]:
+    def with_grade(self, grade: Grade) -> tuple[Finding, ...]:
         """Return the findings of one grade."""
         return tuple(finding for finding in self.findings if finding.grade == grade)
 
     def lines(self) -> tuple[str, ...]:
-        """Return the report as lines for a terminal: devices, then findings, faults first."""
+        """Return the report for a terminal: devices, then findings, faults first."""
         return *self.devices, *(finding.line() for finding in self.sorted()), *self._forecast_lines()
 
     def _forecast_lines(self) -> list[str]:
         if not self.figures:
             return []
         names = ", ".join(name.replace("_", " ") for name in self.not_known)
-        said = f"build-lut would say {self.forecast!r} by the {len(self.figures)} figures known now"
+        forecast = f"build-lut would return {self.forecast!r} on the {len(self.figures)} figures of this check"
         if self.first_s is not None:
-            said = f"set camera.shutter_s to {self.first_s:.4g} first; these figures hold for {self.first_s:.4g} s"
+            forecast = f"no forecast: the frames were exposed {self.first_s:.4g} s; set camera.shutter_s to this value"
         return [
-            f"table       {said}",
-            f"            not known before the session: {names}",
+            f"LUT         {forecast}",
+            f"            figures that only a session can measure: {names}",
         ]
 
     def values(self) -> dict[str, Any]:
@@ -107,23 +108,23 @@ class CheckReport:
         }
         return {
             "devices": self.devices,
-            "faults": len(self.of("fault")),
+            "faults": len(self.with_grade("fault")),
             "findings": self.findings,
             "table": table if self.figures else None,
         }
 
 
-def judged(
-    limit: Limit, value: float, said: str = "", remedy: str = "", details: Mapping[str, Any] | None = None
+def judge_value(
+    limit: Limit, value: float, sentence: str = "", remedy: str = "", details: Mapping[str, Any] | None = None
 ) -> Finding:
-    """Return the finding of a value by its limit; title and remedy of the limit if nothing else is said."""
+    """Judge a value by its limit; by default the sentence has the title and the remedy of the limit."""
     grade, (good, tolerable) = _GRADES[limit.outcome(value)], limit.ranges
     is_good = grade == "good"
     expected = f", {limit.expected} expected" if is_good else ""
     return Finding(
         limit.name,
         grade,
-        said or f"{limit.title}: {limit.text(value)}{expected}",
+        sentence or f"{limit.title}: {limit.text(value)}{expected}",
         value,
         limit.unit,
         good,
@@ -134,6 +135,6 @@ def judged(
     )
 
 
-def not_checked(name: str, why: str, remedy: str = "") -> Finding:
-    """Return the finding of what could not be looked at."""
-    return Finding(name, "not checked", why, remedy=remedy)
+def not_checked(name: str, reason: str, remedy: str = "") -> Finding:
+    """Return the finding of a quantity that could not be measured."""
+    return Finding(name, "not checked", reason, remedy=remedy)

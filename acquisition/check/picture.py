@@ -1,6 +1,6 @@
-"""The picture of a check: the frame with tags and their blur, maps of light, sharpness and print, and every verdict.
+"""Picture of a check: the frame with tags and their blur, maps of light, sharpness and print, and every verdict.
 
-Matplotlib is imported where the picture is made, and through its objects only.
+Matplotlib is imported when the picture is drawn, and only its objects are used.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from experiment.framing.finding import annotated_png
 from experiment.framing.homography import project
 from experiment.framing.sharpness import MAX_BLUR_PX, edge_blurs
 
-# Of the grades: dark enough to be read on white.
+# Colours of the grades, dark enough to be read on white.
 COLOURS = {"fault": "#b42318", "remark": "#b54708", "not checked": "#667085", "good": "#027a48"}
 
-_LINE = 150  # Letters to a line of verdicts
+_LINE = 150  # characters in a line of the verdicts
 
 
 def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:
-    """Return the picture of a check as PNG bytes; without a chart, the frame with what was looked for."""
+    """Return the picture of a check as PNG; without a detected chart, only the frame with detected tags."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -37,15 +37,15 @@ def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(3, 2, height_ratios=[frame_in / 2, frame_in / 2, text_in])
     _draw_frame(figure.add_subplot(grid[0, 0]), trial, chart)
-    places = [figure.add_subplot(grid[place]) for place in ((0, 1), (1, 0), (1, 1))]
+    map_axes = [figure.add_subplot(grid[position]) for position in ((0, 1), (1, 0), (1, 1))]
     if trial.table is None:
-        for axes in places:
+        for axes in map_axes:
             axes.axis("off")
-            axes.text(0.5, 0.5, "not measured: see the fault of the chart", ha="center", color="0.4")
+            axes.text(0.5, 0.5, "not measured: the chart was not detected", ha="center", color="0.4")
     else:
-        _draw_light(places[0], trial.table, chart)
-        _draw_sharpness(places[1], trial.table, chart)
-        _draw_print(places[2], trial.table, chart)
+        _draw_light(map_axes[0], trial.table, chart)
+        _draw_sharpness(map_axes[1], trial.table, chart)
+        _draw_print(map_axes[2], trial.table, chart)
     axes = figure.add_subplot(grid[2, :])
     axes.axis("off")
     for number, (line, grade) in enumerate(lines):
@@ -69,7 +69,7 @@ def _draw_frame(axes: Any, trial: Trial, chart: Chart) -> None:
     png = annotated_png(trial.white, chart, None if trial.table is None else trial.table.registration.framing)
     image = np.asarray(cv2.imdecode(np.frombuffer(png, dtype=np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)
     axes.imshow(image[..., ::-1])
-    axes.set_title("white, with what was found of the chart")
+    axes.set_title("white frame with detected tags")
     axes.set_xticks([])
     axes.set_yticks([])
 
@@ -93,8 +93,8 @@ def _draw_light(axes: Any, table: TableMeasurements, chart: Chart) -> None:
     image = axes.contourf(x, y, share, levels=np.linspace(0, 1, 21), cmap="viridis")
     lines = axes.contour(x, y, share, levels=np.arange(0.1, 1, 0.1), colors="white", linewidths=0.8)
     axes.clabel(lines, fmt=_per_cent, fontsize=8)
-    axes.figure.colorbar(image, ax=axes, shrink=0.8, label="of the brightest place")
-    _page(axes, chart, "light of lens and projector, green")
+    axes.figure.colorbar(image, ax=axes, shrink=0.8, label="share of the maximum")
+    _page(axes, chart, "flat field of lens and projector, green")
 
 
 def _per_cent(share: float) -> str:
@@ -103,8 +103,8 @@ def _per_cent(share: float) -> str:
 
 def _draw_sharpness(axes: Any, table: TableMeasurements, chart: Chart) -> None:
     framing = table.registration.framing
-    places, sigma = edge_blurs(framing)
-    points = project(np.asarray(np.linalg.inv(framing.homography), dtype=np.float64), places)
+    edges_px, sigma = edge_blurs(framing)
+    points = project(np.asarray(np.linalg.inv(framing.homography), dtype=np.float64), edges_px)
     marks = axes.scatter(
         points[:, 0], points[:, 1], c=sigma, s=380, cmap="RdYlGn_r", vmin=0.3, vmax=MAX_BLUR_PX + 0.3, edgecolors="0.3"
     )
@@ -112,20 +112,20 @@ def _draw_sharpness(axes: Any, table: TableMeasurements, chart: Chart) -> None:
         for (x, y), value in zip(points, sigma, strict=True):
             axes.text(x, y, f"{value:.2f}", ha="center", va="center", fontsize=7)
     axes.figure.colorbar(marks, ax=axes, shrink=0.8, label="σ, half-size px")
-    _page(axes, chart, "blur of printed edges")
+    _page(axes, chart, "blur of the printed edges")
 
 
 def _draw_print(axes: Any, table: TableMeasurements, chart: Chart) -> None:
     stains = table.cells.stains
     if not stains.known:
-        _page(axes, chart, "print: not known of a chart of few colours")
+        _page(axes, chart, "print: cannot be measured on a chart of few colours")
         return
-    points, off = stains.places_mm, 100 * stains.largest_deviation()
+    points, deviation_percent = stains.places_mm, 100 * stains.largest_deviation()
     size = float(np.clip(90_000 / len(points), 4.5, 120))
     marks = axes.scatter(
-        points[:, 0], points[:, 1], c=off, s=size, marker="s", cmap="RdBu", vmin=-6, vmax=6, linewidths=0
+        points[:, 0], points[:, 1], c=deviation_percent, s=size, marker="s", cmap="RdBu", vmin=-6, vmax=6, linewidths=0
     )
     stained = points[stains.stained]
     axes.scatter(stained[:, 0], stained[:, 1], s=2 * size, facecolors="none", edgecolors="#d400ff", linewidths=1)
-    axes.figure.colorbar(marks, ax=axes, shrink=0.8, label="%, seen over expected")
-    _page(axes, chart, "print: surroundings of cells against the colours of their codes")
+    axes.figure.colorbar(marks, ax=axes, shrink=0.8, label="measured over expected, %")
+    _page(axes, chart, "print: surroundings of patches, deviation from their printed colours")

@@ -1,6 +1,6 @@
-"""The trial set: a session of a dozen frames, taken into a folder that is thrown away, and measured as any session is.
+"""Trial frames: a temporary session of about 12 frames, measured as any session is.
 
-White several times, dark, the primaries, grey, and the light of the plan that gives the fewest counts.
+They are white several times, dark, the primaries, grey, and the darkest illuminant of the plan.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from experiment.session.records import MIDDLE, FrameKind, Judgement, SessionStep
 from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError, QualityError, RegistrationError
 
-WHITES = 3  # White frames before the lights, and as many after them: their spread is the flicker of the light
+WHITES = 3  # white frames at the beginning and at the end: their scatter is the flicker of the lamp
 
-SERIES = 8  # Shutter times of a series of linearity
+SERIES = 8  # shutter times of a linearity series
 
 PRIMARIES = {"red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255)}
 
-# The lights of a trial by name, besides the plan's darkest.
+# Colours of the trial illuminants, in addition to the darkest of the plan.
 _COLOURS = {"white": WHITE, **PRIMARIES, "grey": Colour(MIDDLE, MIDDLE, MIDDLE)}
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Trial frames as measured.
+    """Measurements of trial frames.
 
     - `white`: the first white frame.
-    - `table`: their measurements; None if the chart was not found, or cannot be used.
-    - `verdict`: the figures that trial frames show, judged.
-    - `dark_percent`: the light of the dark frames as the live judge measures it, of white.
-    - `trouble`: why there are no measurements; "" if there are.
-    - `series_trouble`: why a series of exposures shows nothing; "" if it does, or none was asked for.
+    - `table`: measurements; None if the chart was not detected or cannot be used.
+    - `verdict`: the judged figures that trial frames can measure.
+    - `dark_percent`: light in the dark frames, percent of white, as `acquire run` measures it.
+    - `trouble`: why `table` is None; "" if it is not.
+    - `series_trouble`: why the linearity series cannot be used; "" if it can, or was not requested.
     """
 
     white: Mosaic
@@ -60,16 +60,16 @@ class Trial:
 
     @property
     def not_known(self) -> tuple[str, ...]:
-        """Names of the figures that only a session shows."""
-        known = {row.figure.name for row in self.verdict.rows}
-        return tuple(figure.name for figure in FIGURES if figure.name not in known)
+        """Names of the figures that only a session can measure."""
+        measured = {row.figure.name for row in self.verdict.rows}
+        return tuple(figure.name for figure in FIGURES if figure.name not in measured)
 
 
 def trial_lights(plan: Sequence[Illumination], primaries: npt.NDArray[np.float64]) -> tuple[Illumination, ...]:
-    """Return the lights of a trial: white, the primaries, grey, and the darkest light of the plan.
+    """Return the illuminants of a trial: white, the primaries, grey, and the darkest of the plan.
 
-    `primaries`: (3, 3) counts of R, G and B under the projector's red, its green and its blue, which predict those of a
-    light. The darkest has the fewest in its strongest channel, as in `darkest_counts`.
+    `primaries`: (3, 3) counts of R, G and B under the red, green and blue of the projector, which predict the counts of
+    any illuminant. The darkest illuminant has the fewest counts in its strongest channel, as in `darkest_counts`.
     """
     colours = dict(_COLOURS)
     if plan:
@@ -83,30 +83,30 @@ def trial_lights(plan: Sequence[Illumination], primaries: npt.NDArray[np.float64
 
 
 def trial_steps(lights: Sequence[Illumination]) -> tuple[SessionStep, ...]:
-    """Return the plan of a trial."""
-    around: list[tuple[FrameKind, int | None, Colour]] = [("white", None, WHITE)] * WHITES
-    around.append(("dark", None, BLACK))
-    lit: list[tuple[FrameKind, int | None, Colour]] = [("light", one.index, one.colour) for one in lights]
-    shown = [*around, *lit, *around]
-    return tuple(SessionStep(number, *step) for number, step in enumerate(shown))
+    """Return the plan of a trial: references, illuminants, references."""
+    references: list[tuple[FrameKind, int | None, Colour]] = [("white", None, WHITE)] * WHITES
+    references.append(("dark", None, BLACK))
+    lit: list[tuple[FrameKind, int | None, Colour]] = [("light", light.index, light.colour) for light in lights]
+    planned = [*references, *lit, *references]
+    return tuple(SessionStep(number, *step) for number, step in enumerate(planned))
 
 
 def series_times(times_s: Sequence[float], white_s: float, white_level: float) -> list[float]:
-    """Return the shutter times of a series in which white goes from 6 to 94 % of saturation, rising.
+    """Return rising shutter times at which white has 6 to 94 % of saturation.
 
-    `white_s`, `white_level`: a shutter time, and white's share of saturation at it.
+    `white_s`, `white_level`: a shutter time, s, and the white level at it, as a share of saturation.
     """
-    able = [time for time in times_s if 0.06 <= white_level * time / white_s <= 0.94]
-    if len(able) <= SERIES:
-        return able
-    wanted = np.geomspace(able[0], able[-1], SERIES)
-    return sorted({min(able, key=lambda time: abs(np.log(time / each))) for each in wanted.tolist()})
+    usable_s = [time for time in times_s if 0.06 <= white_level * time / white_s <= 0.94]
+    if len(usable_s) <= SERIES:
+        return usable_s
+    targets_s = np.geomspace(usable_s[0], usable_s[-1], SERIES)
+    return sorted({min(usable_s, key=lambda time: abs(np.log(time / target_s))) for target_s in targets_s.tolist()})
 
 
 def take_trial(
     camera: Photographer, session: Session, shutter_s: float, series_s: Sequence[float], series: Path
 ) -> None:
-    """Take the frames of a trial into its session, and a series of white at rising shutter times into a folder."""
+    """Take the trial frames into their session, and frames of white at rising shutter times into a folder."""
     for step in session.steps:
         attempt = session.journal.begin(step, f"frames/{step.stem}", camera.now())
         received = session.receive(step.stem, lambda stream, step=step: camera.capture(step.colour, shutter_s, stream))
@@ -117,7 +117,7 @@ def take_trial(
 
 
 def measure_trial(session: Session, saturation: Saturation, corners: Corners | None, series: Path | None) -> Trial:
-    """Return what trial frames show."""
+    """Measure the trial frames; `series` is the folder of a linearity series, or None."""
     frames = session.frames()
     white = read_raw(session.folder / frames[0].file)
     options = replace(PAPER_OPTIONS, corners=corners)
@@ -130,7 +130,7 @@ def measure_trial(session: Session, saturation: Saturation, corners: Corners | N
     rows = tuple(row for row in result.verdict.rows if row.figure.before_session)
     lit = _tiles(white)
     dark = [_tiles(read_raw(session.folder / frame.file)) for frame in frames if frame.kind == "dark"]
-    # From white the live judge subtracts the dark light that it knows: all but in the first dark frame of a session.
+    # `acquire run` subtracts the previous dark frame from white, so that the first dark frame is 0.
     levels = [dark_level(tiles, white_scale(lit - dark[0])) for tiles in dark]
     return Trial(white, result.figures, Verdict(rows), max(levels, default=0.0))
 

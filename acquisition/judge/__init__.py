@@ -1,1 +1,1 @@
-"""What a frame shows, judged as it is taken: the light, the chart, the exposure."""
+"""Judge each frame as it is taken: light, chart and exposure."""

@@ -1,16 +1,16 @@
-"""What is kept of a frame: its measurements (`experiment.measures.frame`), and where the chart lay.
+"""Record of a frame: its measurements (`experiment.measures.frame`) and the position of the chart.
 
-`Anchor` is the chart's place in the first white frame, from which later
-frames tell how far it has moved, and blurred: its gauges are the chart's tags or, where
-no chart is looked for, the places of most texture (`experiment.framing.pictures`); the frame is kept around them alone.
-`Frame` is both, and the bytes that the journal keeps of it.
+`Anchor` holds the position of the chart in the first white frame. Movement and blur of later frames are measured
+against it at gauges: the tags of the chart or, without a chart, the places with most texture
+(`experiment.framing.pictures`). `Frame` holds the measurements, and converts them to the bytes that the journal stores.
 
 Format of the bytes (version 1): a zip archive of arrays as `numpy.savez` writes it, without pickled objects. `facts` is
-UTF-8 JSON as uint8; `tiles` (T, 3) float32; `strips` (S, 3) float32 or empty; an anchor's arrays begin with `anchor_`.
-Samples of noise are not kept: the digest knows a frame again. Bytes of another version are passed over: the judge then
-begins anew, as at a session's start.
+UTF-8 JSON as uint8; `tiles` (T, 3) float32; `strips` (S, 3) float32 or empty; the names of an anchor's arrays begin
+with `anchor_`. Samples of noise are not stored, because the digest identifies a frame. Bytes of another version are
+ignored: the judge then starts without earlier frames.
 
-Places are in 2×2 blocks of the mosaic ("half-size pixels"). T = 384 tiles, S strips of rows (four a row of blocks).
+Positions are in 2×2 blocks of the mosaic ("half-size pixels"). T = 384 tiles, S strips of rows (four in a row of
+blocks).
 """
 
 from __future__ import annotations
@@ -50,31 +50,32 @@ from foundation.errors import FormatError
 
 _Array = npt.NDArray[np.float64]
 
-_TEXTURE_PX = 32  # Side of a textured place that stands for a tag
+_TEXTURE_PX = 32  # side of a textured place that replaces a tag, half-size px
 
-_TEXTURES = (4, 2)  # Textured places along the frame's width and height: as many as gauges are measured
+_TEXTURES = (4, 2)  # textured places along width and height: as many as gauges are measured
 
-# How far from where a plane print would have it a white reference is looked for: lens and waves move it as far.
+# Search radius around the predicted position of a white reference, half-size px: lens distortion and waves of the paper
+# move it as far.
 _PAPER_REACH_PX = 4
 
-# Share of the brightest references' light that a place must have to be paper: the field falls off to about that.
+# Level of paper, as a share of the brightest references: the flat field falls off to about this.
 _PAPER_LEVEL = 0.7
 
-# Side of the square that is brightest in the middle of a reference of 10 px. Of the 3×3 pixels that are measured the
-# brightest would be those whose noise was high in this frame, and all later frames would seem darker by 0.2 %.
+# Side of the square with the largest mean inside a reference of 10 px. The brightest of 3×3 px would be a place with
+# high noise in this frame, so that all later frames would seem darker by 0.2 %.
 _PAPER_PX = 7
 
-_MOST_PAPER = 300  # White references that are looked at: their mean is good to 0.1 % where one is to 2 %
+_MOST_PAPER = 300  # white references to measure: their mean is accurate to 0.1 % if each is to 2 %
 
 
 @dataclass(frozen=True, eq=False)
 class Anchor:
-    """The chart's place in a white frame.
+    """Position of the chart in a white frame.
 
-    - `framing`: its tags, or places of texture that stand for tags.
-    - `gauges`: the frame around them, of each channel, counts above black; 0 elsewhere.
-    - `paper`: (N, 2) int64, columns and rows of blocks in the middle of bare paper.
-    - `of_chart`: whether the chart was found; else the places are just textured ones.
+    - `framing`: its tags, or textured places in their stead.
+    - `gauges`: counts above black of each channel around the tags; 0 elsewhere.
+    - `paper`: (N, 2) int64, columns and rows of blocks on white paper.
+    - `of_chart`: whether the chart was detected; if not, the places are only textured.
     """
 
     framing: ChartPose
@@ -83,8 +84,8 @@ class Anchor:
     of_chart: bool
 
     @classmethod
-    def of(cls, mosaic: Mosaic, black: _Array, chart: Chart | None) -> Anchor:
-        """Return the anchor of a white frame; `black` (2, 2) float64 counts, `chart` None if none is looked for."""
+    def from_white(cls, mosaic: Mosaic, black: _Array, chart: Chart | None) -> Anchor:
+        """Return the anchor of a white frame; `black` (2, 2) float64 counts, `chart` None to use textured places."""
         if chart is None:
             plane = strongest_plane(mosaic, black)
             framing = _textures(plane)
@@ -94,35 +95,32 @@ class Anchor:
             whites = np.array([reference.centre_mm for reference in chart.white_references]).reshape(-1, 2)
             paper = _paper(framing.plane.values, project(framing.homography, whites[:_MOST_PAPER]))
         gauges: dict[Channel, Plane] = {c: gauges_of(mosaic, c, black, framing) for c in CHANNELS}
-        # The whole plane is let go: only the gauges' surroundings are ever looked at again.
-        kept = replace(framing, plane=gauges[framing.plane.channel])
-        return cls(kept, gauges, paper, chart is not None)
+        # To save memory the full plane is dropped: only the surroundings of the gauges are needed later.
+        small_framing = replace(framing, plane=gauges[framing.plane.channel])
+        return cls(small_framing, gauges, paper, chart is not None)
 
     def shift(self, mosaic: Mosaic, black: _Array, channel: Channel) -> Shift:
-        """Return how far the chart has moved, and how much softer it is, in a later frame's colour.
-
-        `black` (2, 2) float64 counts, of that frame.
-        """
+        """Measure movement and blur of a later frame in one channel; `black` (2, 2) float64 counts of that frame."""
         return shift_between(self.gauges[channel], self.framing, gauges_of(mosaic, channel, black, self.framing))
 
     def displacement(self, mosaic: Mosaic, black: _Array, channel: Channel) -> tuple[float, float] | None:
-        """Return how far the tags have moved however far that is, px right and down; None where they are not seen.
+        """Return a movement of any size, half-size px right and down; None if too few tags are detected.
 
-        `black` (2, 2) float64 counts, of the frame.
+        `black` (2, 2) float64 counts of the frame.
         """
         if not self.of_chart or not self.framing.tags:
             return None
-        found = {tag.id: tag.centre_px for tag in detect_tags(plane_of(mosaic, channel, black))}
-        moved = [found[tag.id] - tag.centre_px for tag in self.framing.tags if tag.id in found]
-        if len(moved) < max(2, len(self.framing.tags) // 4):
+        centres_px = {tag.id: tag.centre_px for tag in detect_tags(plane_of(mosaic, channel, black))}
+        shifts_px = [centres_px[tag.id] - tag.centre_px for tag in self.framing.tags if tag.id in centres_px]
+        if len(shifts_px) < max(2, len(self.framing.tags) // 4):
             return None
-        dx, dy = np.median(np.array(moved), axis=0).tolist()
+        dx, dy = np.median(np.array(shifts_px), axis=0).tolist()
         return dx, dy
 
     def paper_level(self, mosaic: Mosaic, black: _Array, phases: dict[Channel, tuple[tuple[int, int], ...]]) -> _Array:
-        """Return (3,) float64: camera RGB of bare paper above `black` (2, 2), mean of the middle half of its places.
+        """Return (3,) float64: RGB counts of white paper above black, mean of the middle half of its places.
 
-        All NaN where no place is known.
+        `black`: (2, 2) float64 counts. The result is NaN without white references.
         """
         blocks = mosaic.block_planes()
         x, y = self.paper.T
@@ -131,66 +129,66 @@ class Anchor:
             return np.full(3, np.nan)
         level, quarter = np.empty(3), len(x) // 4
         for number, channel in enumerate(CHANNELS):
-            seen = [
-                np.mean([blocks[place][y + dy, x + dx] for dy, dx in around], axis=0) - black[place]
-                for place in phases[channel]
+            planes = [
+                np.mean([blocks[position][y + dy, x + dx] for dy, dx in around], axis=0) - black[position]
+                for position in phases[channel]
             ]
-            # A hand before some of the places does not count. The light falls off by a quarter over them, so that
-            # their median would rest on the few near it, and on the noise of those.
-            level[number] = np.sort(np.mean(seen, axis=0))[quarter : len(x) - quarter].mean()
+            # The middle half ignores a hand in front of some places. A median would depend on the noise of few places,
+            # because the light falls off by a quarter over the chart.
+            level[number] = np.sort(np.mean(planes, axis=0))[quarter : len(x) - quarter].mean()
         return level
 
     @property
     def outlines(self) -> tuple[_Array, ...]:
-        """(K, 2) float64 each, px: outlines of the tags; none where no chart is looked for."""
+        """(K, 2) float64 each, half-size px: outlines of the tags; empty without a chart."""
         if not self.of_chart:
             return ()
         return tuple(tag.corners_px for tag in self.framing.tags)
 
     def boxes(self) -> list[tuple[int, int, int, int]]:
-        """Return what of the gauges' planes is not 0: left, top, right, bottom (exclusive)."""
+        """Return the boxes outside of which the gauges are 0: left, top, right, bottom (exclusive)."""
         height, width = self.framing.plane.values.shape
         return [(x0, y0, min(x1, width), min(y1, height)) for x0, y0, x1, y1 in gauge_boxes(self.framing)]
 
 
 def _paper(values: npt.NDArray[np.float32], places: _Array) -> npt.NDArray[np.int64]:
-    """Return (N, 2) the middles of the brightest squares near places (N, 2) px, if they are as bright as paper."""
+    """Return (N, 2) centres of the brightest squares near `places` (N, 2) px that are as bright as paper."""
     height, width = values.shape
     reach, half = _PAPER_REACH_PX, _PAPER_PX // 2
-    seen = reach + half
-    at = places.round().astype(np.int64)
-    inside = ((at >= seen) & (at < (width - seen, height - seen))).all(axis=1)
-    found: list[tuple[int, int]] = []
+    margin = reach + half
+    rounded = places.round().astype(np.int64)
+    inside = ((rounded >= margin) & (rounded < (width - margin, height - margin))).all(axis=1)
+    centres: list[tuple[int, int]] = []
     levels: list[float] = []
-    for x, y in at[inside].tolist():
-        around = values[y - seen : y + seen + 1, x - seen : x + seen + 1]
+    for x, y in rounded[inside].tolist():
+        around = values[y - margin : y + margin + 1, x - margin : x + margin + 1]
         crop = cv2.blur(around, (_PAPER_PX, _PAPER_PX))[half:-half, half:-half]
         row, column = divmod(int(crop.argmax()), crop.shape[1])
-        found.append((x - reach + column, y - reach + row))
+        centres.append((x - reach + column, y - reach + row))
         levels.append(float(crop[row, column]))
-    if not found:
+    if not centres:
         return _brightest(values)
     bright = np.array(levels) > _PAPER_LEVEL * np.percentile(levels, 90)
-    return np.array(found, dtype=np.int64)[bright]
+    return np.array(centres, dtype=np.int64)[bright]
 
 
 def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
-    """Return (N, 2) the brightest 3×3 neighbourhoods of the parts of a plane, those as bright as the brightest.
+    """Return (N, 2) centres of the brightest 3×3 neighbourhoods in a grid of regions.
 
-    Their noise is high in this frame, too: without a chart, a few tenths of a percent of a drift of white are none.
+    Their noise is high in this frame: without a chart, a drift of white of a few tenths of a percent is no evidence.
     """
     smooth = cv2.blur(values, (3, 3))
     height, width = smooth.shape
-    found: list[tuple[int, int]] = []
+    centres: list[tuple[int, int]] = []
     levels: list[float] = []
-    for top in range(2, height - height // 12, height // 12):
-        for left in range(2, width - width // 16, width // 16):
-            part = smooth[top : top + height // 12 - 2, left : left + width // 16 - 2]
-            row, column = divmod(int(part.argmax()), part.shape[1])
-            found.append((left + column, top + row))
-            levels.append(float(part[row, column]))
+    for y0 in range(2, height - height // 12, height // 12):
+        for x0 in range(2, width - width // 16, width // 16):
+            region = smooth[y0 : y0 + height // 12 - 2, x0 : x0 + width // 16 - 2]
+            row, column = divmod(int(region.argmax()), region.shape[1])
+            centres.append((x0 + column, y0 + row))
+            levels.append(float(region[row, column]))
     bright = np.array(levels) > _PAPER_LEVEL * np.percentile(levels, 90)
-    return np.array(found, dtype=np.int64)[bright]
+    return np.array(centres, dtype=np.int64)[bright]
 
 
 def _textures(plane: Plane) -> ChartPose:
@@ -203,29 +201,29 @@ def _textures(plane: Plane) -> ChartPose:
     across, down = _TEXTURES
     for row in range(down):
         for column in range(across):
-            top, bottom = (max(margin, row * height // down), min(height - margin, (row + 1) * height // down))
-            left, right = (max(margin, column * width // across), min(width - margin, (column + 1) * width // across))
-            part = energy[top:bottom, left:right]
-            if not part.size:
+            y0, y1 = (max(margin, row * height // down), min(height - margin, (row + 1) * height // down))
+            x0, x1 = (max(margin, column * width // across), min(width - margin, (column + 1) * width // across))
+            region = energy[y0:y1, x0:x1]
+            if not region.size:
                 continue
-            y, x = divmod(int(part.argmax()), part.shape[1])
-            middle = np.array([left + x, top + y]) + plane.offset_px
+            y, x = divmod(int(region.argmax()), region.shape[1])
+            middle = np.array([x0 + x, y0 + y]) + plane.offset_px
             corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
             tags.append(DetectedTag(len(tags), corners + middle, 0.0))
     return ChartPose(plane, tuple(tags), (), np.eye(3), 0.0, float("nan"), 1.0, True, 0.0)
 
 
-VERSION = 1  # Of the format of the bytes
+VERSION = 1  # version of the byte format
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame that was measured.
+    """Measurements of a frame.
 
-    - `measured`: its light; `strips` may be empty where they were not kept.
-    - `paper`: (3,) float64, camera RGB of bare paper above black; NaN where no paper is known.
-    - `moved_px`: (2,) how far the chart lay from the anchor, right and down; NaN where it could not be told.
-    - `anchor`: the chart's place, if this frame is the one to compare with from now on.
+    - `measured`: its light; `strips` may be empty if they were not stored.
+    - `paper`: (3,) float64, RGB counts of white paper above black; NaN without white references.
+    - `moved_px`: (2,) displacement of the chart from the anchor, half-size px right and down; NaN if not measured.
+    - `anchor`: position of the chart, if later frames are compared with this frame.
     """
 
     measured: Measured
@@ -234,22 +232,22 @@ class Frame:
     anchor: Anchor | None = None
 
     def to_bytes(self, with_strips: bool) -> bytes:
-        """Return the bytes that `of_bytes` reads; strips are kept for frames that others are compared with."""
-        frame = self.measured
+        """Return the bytes that `from_bytes` reads; `with_strips` for frames with which others are compared."""
+        measured = self.measured
         facts: dict[str, Any] = {
             "version": VERSION,
-            "places": [frame.places.rows, frame.places.columns],
-            "digest": frame.digest.hex(),
-            "noise": [frame.noise.floor, frame.noise.slope],
-            "black": [frame.black, frame.black_measured],
-            "levels": [frame.range_dn, frame.brightest_dn, frame.clipped, frame.empty],
-            "camera": [frame.camera, frame.serial],
+            "places": [measured.places.rows, measured.places.columns],
+            "digest": measured.digest.hex(),
+            "noise": [measured.noise.floor, measured.noise.slope],
+            "black": [measured.black, measured.black_measured],
+            "levels": [measured.range_dn, measured.brightest_dn, measured.clipped, measured.empty],
+            "camera": [measured.camera, measured.serial],
             "paper": self.paper.tolist(),
             "moved_px": self.moved_px.tolist(),
         }
         arrays: dict[str, npt.NDArray[Any]] = {
-            "tiles": frame.tiles.astype(np.float32),
-            "strips": (frame.strips if with_strips else frame.strips[:0]).astype(np.float32),
+            "tiles": measured.tiles.astype(np.float32),
+            "strips": (measured.strips if with_strips else measured.strips[:0]).astype(np.float32),
         }
         if self.anchor is not None:
             arrays |= _anchor_arrays(self.anchor)
@@ -260,8 +258,8 @@ class Frame:
         return stream.getvalue()
 
     @classmethod
-    def of_bytes(cls, data: bytes) -> Frame | None:
-        """Return the frame of bytes that `to_bytes` made; None where they are of another version, or damaged."""
+    def from_bytes(cls, data: bytes) -> Frame | None:
+        """Return the frame of the bytes of `to_bytes`; None if they have another version or are damaged."""
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
                 facts = json.loads(bytes(arrays["facts"]))
@@ -333,57 +331,57 @@ def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
     return anchor
 
 
-# How far a file's exposure may lie from the one asked for. Nominal values are rounded, and files state either: 0.3 s
-# stands for 0.354 s on a dial of half stops, which is 0.24 stops. A dial turned by one third differs by 0.2 to 0.5
-# stops in what the file states, so that most such turns are seen, and every one of more.
+# Largest difference between the exposure in a file and the one set, stops. Nominal values are rounded, and files state
+# either: 0.3 s means 0.354 s on a dial of half stops, which is 0.24 stops. A dial turned by a third of a stop differs
+# by 0.2 to 0.5 stops in the file, so that most such turns are detected, and every larger one.
 EXPOSURE_TOLERANCE_STOPS = 0.25
 
 
-def disagreement(mosaic: Mosaic, asked: ExposureSettings) -> str | None:
-    """Return how the exposure that a raw file states differs from the one asked for, or None where it does not.
+def disagreement(mosaic: Mosaic, settings: ExposureSettings) -> str | None:
+    """Return how the exposure in a raw file differs from the settings, or None if it does not.
 
-    A value that the file does not state is passed over, and so is 0, the aperture of a lens without contacts.
+    A value that the file does not state is ignored, and so is 0, the aperture of a lens without contacts.
     """
     differing = [
-        f"{name} {stated:g} instead of {'none' if wanted is None else f'{wanted:g}'}"
-        for name, stated, wanted, stops in (
-            ("ISO speed", mosaic.iso, asked.iso, 1),
-            ("aperture", mosaic.aperture, asked.aperture, 2),
-            ("shutter time in s", mosaic.shutter_s, asked.shutter_s, 1),
+        f"{name} {value:g} instead of {'none' if setting is None else f'{setting:g}'}"
+        for name, value, setting, stops in (
+            ("ISO speed", mosaic.iso, settings.iso, 1),
+            ("aperture", mosaic.aperture, settings.aperture, 2),
+            ("shutter time in s", mosaic.shutter_s, settings.shutter_s, 1),
         )
-        if stated and (wanted is None or abs(stops * math.log2(stated / wanted)) >= EXPOSURE_TOLERANCE_STOPS)
+        if value and (setting is None or abs(stops * math.log2(value / setting)) >= EXPOSURE_TOLERANCE_STOPS)
     ]
     if not differing:
         return None
-    return f"the file states {', '.join(differing)}; was a dial of the camera turned?"
+    return f"the file states {', '.join(differing)}; check the dials of the camera"
 
 
 def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str | None:
-    """Return why a frame cannot be used, or None when it can."""
+    """Return why a frame cannot be used, or None if it can."""
     if kind == "dark":
         if exposure.level * 100 > limits.stray_light_percent:
             return (
-                f"the dark frame reaches {exposure.level:.1%} of saturation, {limits.stray_light_percent:g} % allowed; "
-                "is another light on, or the projector's picture not black?"
+                f"the dark frame reaches {exposure.level:.1%} of saturation, at most {limits.stray_light_percent:g} % "
+                "allowed; switch other lamps off, and make sure that the projector shows black"
             )
         return None
     if exposure.clipped * 100 > limits.clipped_percent:
         return (
-            f"{exposure.clipped:.1%} of the photosites are clipped, {limits.clipped_percent:g} % allowed; "
-            "dim the projector, or set a shorter exposure (acquire check recommends one) and begin a new session"
+            f"{exposure.clipped:.1%} of the photosites are clipped, at most {limits.clipped_percent:g} % allowed; dim "
+            "the projector, or set a shorter exposure (acquire check proposes one) and start a new session"
         )
-    # Of the greys by which the projector's curve is known the darkest are meant to be dark.
+    # Response frames measure the tone curve of the projector: the darkest greys are dark on purpose.
     if kind != "response" and exposure.brightest_dn < limits.too_dark_dn:
         return (
             f"the brightest photosites are {exposure.brightest_dn:.0f} counts above black, "
-            f"at least {limits.too_dark_dn:g} expected; is the projector on, its picture not muted, the lens cap off? "
-            "If so, expose longer, in a new session"
+            f"at least {limits.too_dark_dn:g} expected; make sure that the projector is on, its picture is not muted "
+            "and the lens cap is off, or start a new session with a longer exposure"
         )
     return None
 
 
 def whole_frame(path: Path) -> Mosaic | str:
-    """Return the frame of a raw file, or why there is none, or none that is whole."""
+    """Return the mosaic of a raw file, or why it cannot be read or is incomplete."""
     try:
         mosaic = read_raw(path)
     except FormatError as error:
@@ -393,24 +391,24 @@ def whole_frame(path: Path) -> Mosaic | str:
 
 
 def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
-    """Decode a raw file and return why it cannot be used, or None when it can."""
+    """Decode a raw file and return why it cannot be used, or None if it can."""
     mosaic = whole_frame(path)
     if isinstance(mosaic, str):
         return mosaic
-    # What was asked for is not known of frames taken by other means.
-    differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
-    return differs or refusal(measure_exposure(mosaic), kind, settings.limits)
+    # Imported frames were taken with other settings.
+    difference = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
+    return difference or refusal(measure_exposure(mosaic), kind, settings.limits)
 
 
 class ExposureJudge:
-    """A `experiment.session.records.FrameJudge` that looks at the exposure of each frame alone."""
+    """A `experiment.session.records.FrameJudge` that judges only the exposure of each frame."""
 
     def __init__(self, settings: LabSettings) -> None:
         self._settings = settings
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
-        """Return whether the frame can be read and is exposed as it should be."""
+        """Judge whether the file can be read and is well exposed."""
         return Judgement.of_reason("exposure", judge_file(file, step.kind, self._settings))
 
     def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
-        """Do nothing: no frame is held against another."""
+        """Do nothing: frames are judged independently."""

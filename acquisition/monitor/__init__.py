@@ -1,1 +1,1 @@
-"""A session to look at: the live page of `acquire monitor`, and the report that stays when the session is over."""
+"""Live page of `acquire monitor`, and the report of a session."""

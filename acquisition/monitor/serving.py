@@ -1,4 +1,4 @@
-"""The live page's server: four addresses, answered from the journal; see `foundation.local_server`. It never writes."""
+"""Server of the live page: four addresses, answered from the journal (`foundation.local_server`). It never writes."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ _FRAME = re.compile(r"frame/([1-9][0-9]{0,8})\.jpg")
 
 
 def open_monitor(folder: Path, port: int, host: str = "127.0.0.1") -> MonitorServer:
-    """Return a server for a session, not yet serving."""
+    """Return a server for a session; it does not serve yet."""
     if (folder / JOURNAL_FILE).exists() or ledger_path(folder).exists():
         read_session(folder)
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FormatError(
-            f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import, or one "
-            "that is not there yet"
+            f"{folder} is not a session, because {JOURNAL_FILE} is missing; name a folder made by acquire run or "
+            "import, or a folder that does not exist yet"
         )
     return MonitorServer(SessionWatch(folder), host, port)
 
 
 class MonitorServer(LocalServer):
-    """Serves one session."""
+    """Server of one session."""
 
     command = "acquire monitor"
 
@@ -38,11 +38,11 @@ class MonitorServer(LocalServer):
 
     @property
     def has_session(self) -> bool:
-        """Whether there is a session to show; else one is waited for."""
+        """Whether there is a session to show."""
         return self.watch.head().state != "absent"
 
     def answer(self, request: Request) -> Response | Refusal:
-        """Return the page, the session's state since a cursor, the old summary, or the picture of an attempt."""
+        """Return the page, the changes of the state since a cursor, the summary, or the picture of an attempt."""
         match request.path:
             case "":
                 text, policy = self.page
@@ -52,10 +52,10 @@ class MonitorServer(LocalServer):
                 return Response("", b"") if state is None else Response("application/json", to_bytes(state))
             case "status.json":
                 return Response("application/json", json.dumps(self.watch.head().to_plain()).encode())
-            case path if found := _FRAME.fullmatch(path):
-                data = self.watch.picture(int(found[1]))
-                # The page names the version of a picture, so that one that is written anew has another address.
-                kept = {"Cache-Control": "private, max-age=86400"}
-                return Response("image/jpeg", data, kept) if data else Refusal(404, "there is no picture of that frame")
+            case path if match := _FRAME.fullmatch(path):
+                data = self.watch.picture(int(match[1]))
+                # Pictures can be cached: the page adds a version to their addresses.
+                headers = {"Cache-Control": "private, max-age=86400"}
+                return Response("image/jpeg", data, headers) if data else Refusal(404, "this frame has no picture")
             case _:
-                return Refusal(404, "here are /, /state.json, /status.json and /frame/ATTEMPT.jpg")
+                return Refusal(404, "available are /, /state.json, /status.json and /frame/ATTEMPT.jpg")

@@ -1,14 +1,13 @@
-"""A session as its journal shows it: its attempts, how it stands, and what a page gets of it while it grows.
+"""View of a session from its journal: attempts, current state, and the changes for a page.
 
-Nothing is ever written, and nothing is held open. What is asked first of a run that nobody attends is whether it lives,
-is good, when it is done, and what must be done (`Head`). An attempt changes as long as it has no verdict, and once more
-when it is voided; what else is known of it is written once, so that of 800 attempts a few are read in detail.
+Nothing is written, and no file stays open. `Head` answers first whether the run is alive and well, when it will be
+complete, and what must be done. Rows that cannot change any more are read only once.
 
-One `SessionWatch` serves any number of pages. It opens the journal only when the file has changed, for as long as a few
-queries take, so that a session can be begun, ended, deleted, replaced or restored meanwhile. Each change gets a number;
-a page names the newest that it has and gets what came since, as JSON, and previews of frames.
+One `SessionWatch` serves any number of pages. It opens the journal only after a change and for a short time, so that a
+session can be started, ended, deleted, replaced or restored meanwhile. Each change has a number; a page sends the
+newest number that it has, and receives the later changes as JSON, and previews of frames.
 
-Times of a page are milliseconds since 1970 UTC, numbers have six digits; its script (`web/page.js`) reads exactly this.
+Times for a page are milliseconds since 1970 UTC, numbers have six digits; its script (`web/page.js`) reads this format.
 All of it is data; the page makes elements of it, never markup.
 """
 
@@ -60,31 +59,31 @@ from foundation.colorimetry import decode_srgb
 from foundation.errors import CropError, FormatError, first_few
 from foundation.files import write_atomic
 
-RUN_STARTS = "start"  # The event with which a run begins to take frames
+RUN_STARTS = "start"  # event at the start of the first frame of a run
 
-# Times that frames lately took, after which one is late: a download that is tried again takes twice as long.
+# Durations of recent frames after which a frame is late: a repeated download takes twice as long.
 LATE_FRAMES = 3
 
-AT_WORK = ("running", "waiting", "paused", "late")  # States of a run that is at work
+AT_WORK = ("running", "waiting", "paused", "late")  # states of an active run
 
-# What a run may hang at, or wait for somebody to mend.
+# Names of devices in sentences, for which a run may hang or wait.
 CAUSES = ("the camera", "the screen", "the projector", "the disk", "the frames")
 
-# A disk with less is full, also before the first frame: a row of the journal with what the judge keeps has 100 kB.
+# Free space below which a disk is full before the first frame: a row of the journal has 100 kB.
 LEAST_FREE_BYTES = 1 << 20
 
-LOOK = "look at the camera, its cable and the machine"  # What helps where a run says nothing
+LOOK = "look at the camera, its cable and the machine"  # remedy if a run reports nothing
 
-# How far the lab's clock may be from that of the wall for the end to be told as a time of day; a simulated lab's time
-# passes otherwise, and an attempt that is older than this says nothing of when the run will end.
+# Largest difference, s, between the clocks of lab and computer at which the end is shown as a time of day. The time of
+# a simulated lab passes differently, and an older attempt cannot predict the end.
 LAB_CLOCK_S = 600.0
 
 
 @dataclass(frozen=True)
 class AttemptView(Attempt):
-    """One attempt at a frame with what is kept of it (`AttemptDetails`).
+    """An attempt at a frame with its details (`AttemptDetails`).
 
-    `seconds`: from the start of the attempt before to the start of this one; None for the first of a run.
+    `seconds`: from the start of the previous attempt to the start of this one; None for the first of a run.
     """
 
     seen: tuple[float, float, float] | None = None
@@ -95,27 +94,24 @@ class AttemptView(Attempt):
 
 @dataclass(frozen=True)
 class Head:
-    """How a session stands.
+    """State of a session.
 
-    - `state`: ``running``, ``waiting`` or ``paused`` as the run says it; ``late``: it runs, and a frame takes much
-      longer than those before; ``silent``: it is there, and the sign of life that it announced did not come;
-      ``complete``; ``incomplete``: it has ended and frames are left; ``stopped``: killed or power lost; ``copy``: the
-      run's signs of life are those of another folder; ``unknown``: the journal has no sign of life; ``absent``,
-      ``gone``, ``unreadable``: there is no journal to read, yet, or any more.
-    - `sentence`: the same in words, with the remedy behind a semicolon where there is one; empty while there is nothing
-      to say.
-    - `alive`: whether a run is at work.
-    - `beat`, `until`: when it last gave a sign of life, and when the next is due, by the wall clock; None if it never
-      did.
-    - `total`, `done`, `lights_total`, `lights_done`: frames of the plan, and those that are accepted; the same of the
-      lights alone.
-    - `refused`, `failed`, `voided`: attempts that ended so.
+    - `state`: ``running``, ``waiting`` or ``paused`` as reported by the run; ``late``: a frame takes much longer than
+      the previous ones; ``silent``: the process exists, but its sign of life did not come; ``complete``;
+      ``incomplete``: ended with missing frames; ``stopped``: killed, or power lost; ``copy``: the signs of life belong
+      to another folder; ``unknown``: the journal has no sign of life; ``absent``, ``gone``, ``unreadable``: there is no
+      journal yet, or no longer, or it cannot be read.
+    - `sentence`: the state in words, with the remedy after a semicolon; may be "".
+    - `alive`: whether a run is active.
+    - `beat`, `until`: time of the last sign of life, and of the next that is due, by the computer's clock; None without
+      any.
+    - `total`, `done`, `lights_total`, `lights_done`: planned and accepted frames; the same of the illuminants alone.
+    - `refused`, `failed`, `voided`: number of such attempts.
     - `seconds_per_frame`: median interval of the newest `RECENT` attempts; None before the second.
-    - `remaining_s`: time left by the lab's clock, retakes and references included; None while it is unknown.
-    - `eta`: when all frames are there, by the wall clock; None where that cannot be told.
-    - `cause`: of a run that is late or paused, or ended with frames left: one of `CAUSES`; empty where that is not
-      known, or nothing is wrong.
-    - `last`: when the newest frame was released, by the lab's clock.
+    - `remaining_s`: remaining time by the lab's clock, with retakes and references; None if unknown.
+    - `eta`: time at which all frames will be complete, by the computer's clock; None if unknown.
+    - `cause`: one of `CAUSES` if the run is late or paused, or ended with missing frames; "" if unknown.
+    - `last`: time of the newest frame by the lab's clock.
     """
 
     state: str
@@ -137,26 +133,25 @@ class Head:
     last: datetime | None = None
 
     def to_plain(self) -> dict[str, Any]:
-        """Return it for programs, times as ISO 8601 text."""
+        """Return the fields for programs, times as ISO 8601 text."""
         return {name: at.isoformat() if isinstance(at, datetime) else at for name, at in vars(self).items()}
 
 
 @dataclass(frozen=True)
 class SessionView:
-    """A session as it was read; attempts and events oldest first.
+    """A session as read from the disk; attempts and events, oldest first.
 
-    - `name`, `given`: its folder, by name and as it was named by who asked, for the sentence that says what comes next.
-    - `lights`: those of the plan; none if their file cannot be read.
-    - `records`: what the journal says of devices, software and plan.
-    - `heartbeat`, `place`: the newest sign of life, and where it lies; None where that is not known.
-    - `frame_bytes`: size of its largest frame; 0 before the first.
-    - `lost`: files of frames that count and are gone or cut, by step; only looked for where all frames are there.
-    - `unreadable`: why no table can be made of it, and what helps, such as a lost chart; only looked for where all
-      frames are there.
+    - `name`, `given`: name of its folder, and its path as given, for the sentence with the next command.
+    - `lights`: illuminants of the plan; empty if their file cannot be read.
+    - `records`: devices, software and plan, as recorded in the journal.
+    - `heartbeat`, `place`: newest sign of life, and the location of the folder; None if unknown.
+    - `frame_bytes`: size of its largest frame; 0 without frames.
+    - `lost`: deleted or truncated files of accepted frames by step; determined only for a complete session.
+    - `unreadable`: why no LUT can be made, and the remedy; determined only for a complete session.
     """
 
     name: str
-    given: str
+    path_text: str
     steps: tuple[SessionStep, ...]
     lights: tuple[Illumination, ...]
     records: Mapping[str, str]
@@ -169,20 +164,20 @@ class SessionView:
     unreadable: str = ""
 
     def head(self, now: datetime) -> Head:
-        """Return how it stands at the wall clock's `now`; process and disk are looked at."""
+        """Return the state at the computer's time `now`, using also the state of process and disk."""
         process = self.heartbeat.process if self.heartbeat else None
         return head_of(
             self,
             now,
             process.is_alive() if process else None,
             is_stopped=bool(process and process.is_stopped()),
-            free_bytes=_free_bytes_of(Path(self.given)),
+            free_bytes=_free_bytes_of(Path(self.path_text)),
         )
 
     def whites(self) -> dict[int, tuple[float, float, float] | None]:
-        """Return by attempt what was seen of the white frame that it is compared with.
+        """Return for each attempt the RGB of its white frame.
 
-        That is the newest accepted one up to it; before the first of them, the first.
+        This is the newest accepted white frame up to the attempt; before the first one, the first.
         """
         white_steps = {step.number for step in self.steps if step.kind == "white"}
         whites = {
@@ -198,22 +193,22 @@ class SessionView:
         return against
 
 
-def read_session(folder: Path, before: SessionView | None = None) -> SessionView:
-    """Return a session as it stands on the disk; of what was read `before` only what has changed is read again."""
+def read_session(folder: Path, earlier: SessionView | None = None) -> SessionView:
+    """Read a session from the disk; `before`: an earlier view, of which only changes are read again."""
     path = folder / JOURNAL_FILE
-    opened = Journal.open(path) if before else open_journal(folder)
+    opened = Journal.open(path) if earlier else open_journal(folder)
     with closing(opened) as journal, journal.snapshot():
         steps, verdicts, events = journal.steps(), journal.verdicts(), journal.events()
         accepted = journal.accepted_files()
-        known = {view.id: view for view in before.attempts} if before else {}
+        views = {view.id: view for view in earlier.attempts} if earlier else {}
         changed = [
             number
             for number, started_at, verdict in verdicts
-            if (old := known.get(number)) is None or (old.verdict, old.started_at) != (verdict, started_at)
+            if (old := views.get(number)) is None or (old.verdict, old.started_at) != (verdict, started_at)
         ]
         rows = journal.attempts(changed)
         details, nothing = journal.details(changed), AttemptDetails()
-        known |= {row.id: AttemptView(**vars(row), **vars(details.get(row.id, nothing))) for row in rows}
+        views |= {row.id: AttemptView(**vars(row), **vars(details.get(row.id, nothing))) for row in rows}
         records, heartbeat = journal.records(), journal.heartbeat()
     starts = [event.at for event in events if event.what == RUN_STARTS]
     is_complete = {step.number for step in steps} <= {frame.step for frame in accepted}
@@ -221,9 +216,9 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
         folder.resolve().name,
         str(folder),
         steps,
-        before.lights if before and before.steps == steps else _lights_of(folder),
+        earlier.lights if earlier and earlier.steps == steps else _lights_of(folder),
         records,
-        with_seconds([known[number] for number, *_ in verdicts], starts),
+        with_seconds([views[number] for number, *_ in verdicts], starts),
         tuple(events),
         heartbeat,
         SessionPlace.of(path),
@@ -234,13 +229,12 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
 
 
 def _without_own_files(folder: Path) -> str:
-    """Return that chart or lights of a session are gone, and what helps; nothing where they are there."""
-    gone = [str(folder / name) for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
-    return f"{' and '.join(gone)}: gone; restore it from a copy of the session" if gone else ""
+    missing = [str(folder / name) for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
+    return f"{' and '.join(missing)}: missing; restore from a copy of the session" if missing else ""
 
 
 def _lights_of(folder: Path) -> tuple[Illumination, ...]:
-    """Return the lights' kinds and temperatures; the plan has their codes, which are shown also without the file."""
+    # Only kinds and temperatures are read from the file: the plan has the codes.
     try:
         return load_illuminations(folder / "illuminations.csv")
     except (CropError, OSError):
@@ -248,23 +242,19 @@ def _lights_of(folder: Path) -> tuple[Illumination, ...]:
 
 
 def with_seconds(views: Sequence[AttemptView], starts: Iterable[datetime]) -> tuple[AttemptView, ...]:
-    """Return attempts, oldest first, with the seconds since the one before; none across the start of a run.
-
-    And none where time goes back, as where the clock was set.
-    """
-    begun = sorted(starts)
+    """Return attempts, oldest first, with the seconds since the previous one; None after the start of a run."""
+    start_times = sorted(starts)
     timed: list[AttemptView] = []
-    for before, view in zip([None, *views], views, strict=False):
-        apart = before is None or any(before.started_at < start <= view.started_at for start in begun)
-        seconds = None if before is None or apart else (view.started_at - before.started_at).total_seconds()
-        # A clock that was set back between the two says nothing of how long it took.
+    for previous, view in zip([None, *views], views, strict=False):
+        is_first = previous is None or any(previous.started_at < start <= view.started_at for start in start_times)
+        seconds = None if previous is None or is_first else (view.started_at - previous.started_at).total_seconds()
+        # A negative interval means that the clock was set back.
         seconds = None if seconds is not None and seconds < 0 else seconds
         timed.append(view if seconds == view.seconds else replace(view, seconds=seconds))
     return tuple(timed)
 
 
 def _free_bytes_of(folder: Path) -> int | None:
-    """Return what a session's disk has free; None where it does not say."""
     try:
         return shutil.disk_usage(folder).free
     except OSError:
@@ -279,27 +269,28 @@ def head_of(
     is_stopped: bool = False,
     free_bytes: int | None = None,
 ) -> Head:
-    """Return how a session stands.
+    """Return the state of a session.
 
-    `process_alive`: whether the process that gave the newest sign of life is there; None if that cannot be told.
-    `is_stopped`: whether it was stopped by a signal. `free_bytes`: of the session's disk; None if it does not say.
+    `process_alive`: whether the process of the newest sign of life exists; None if unknown. `is_stopped`: whether it
+    was stopped by a signal. `free_bytes`: on the session's disk; None if unknown.
     """
     steps, attempts, heartbeat = view.steps, view.attempts, view.heartbeat
-    done = {one.step for one in attempts if one.verdict == ACCEPTED} & {step.number for step in steps} - {*view.lost}
-    verdicts = [one.verdict for one in attempts]
-    left = len(steps) - len(done)
-    intervals = [one.seconds for one in attempts[-RECENT:] if one.seconds is not None]
+    accepted = {attempt.step for attempt in attempts if attempt.verdict == ACCEPTED}
+    complete = accepted & {step.number for step in steps} - {*view.lost}
+    verdicts = [attempt.verdict for attempt in attempts]
+    missing = len(steps) - len(complete)
+    intervals = [attempt.seconds for attempt in attempts[-RECENT:] if attempt.seconds is not None]
     frame_s = statistics.median(intervals) if intervals else None
-    state, sentence = _state_of(view, now, process_alive, left, frame_s)
+    state, sentence = _state_of(view, now, process_alive, missing, frame_s)
     if state in AT_WORK and heartbeat is not None:
         if is_stopped:
             pid = heartbeat.process.pid
-            state, sentence = "silent", f"its process {pid} was stopped by a signal; kill -CONT {pid} lets it go on"
+            state, sentence = "silent", f"its process {pid} was stopped by a signal; resume it by kill -CONT {pid}"
         elif _is_full(view, free_bytes) and (state, _cause(sentence)) != ("paused", "the disk"):
-            state, sentence = "late", "the disk is full; free space, and the run goes on by itself"
-    judged = (one for one in attempts if one.verdict is not None)
-    remaining = time_left((TimedAttempt(one.seconds, one.verdict in (ACCEPTED, VOIDED)) for one in judged), left)
-    near = (
+            state, sentence = "late", "the disk is full; delete files, then the run resumes automatically"
+    judged = [attempt for attempt in attempts if attempt.verdict is not None]
+    remaining = time_left((TimedAttempt(view.seconds, view.verdict in (ACCEPTED, VOIDED)) for view in judged), missing)
+    is_lab_time_real = (
         heartbeat is not None
         and bool(attempts)
         and state == "running"
@@ -312,17 +303,17 @@ def head_of(
         heartbeat.at if heartbeat else None,
         heartbeat.until if heartbeat else None,
         total=len(steps),
-        done=len(done),
+        done=len(complete),
         lights_total=sum(step.kind == "light" for step in steps),
-        lights_done=sum(step.kind == "light" and step.number in done for step in steps),
+        lights_done=sum(step.kind == "light" and step.number in complete for step in steps),
         refused=verdicts.count(REFUSED),
         failed=verdicts.count(FAILED),
         voided=verdicts.count(VOIDED),
         seconds_per_frame=frame_s,
         remaining_s=remaining,
-        eta=now + timedelta(seconds=remaining) if near and remaining is not None else None,
+        eta=now + timedelta(seconds=remaining) if is_lab_time_real and remaining is not None else None,
         cause=_cause(sentence) if state in ("late", "paused", "incomplete") else "",
-        last=next((one.taken_at for one in reversed(attempts) if one.taken_at is not None), None),
+        last=next((attempt.taken_at for attempt in reversed(attempts) if attempt.taken_at is not None), None),
     )
 
 
@@ -331,71 +322,70 @@ def _is_full(view: SessionView, free_bytes: int | None) -> bool:
 
 
 def _cause(sentence: str) -> str:
-    """Return what a sentence names first."""
-    named = {sentence.find(cause): cause for cause in CAUSES if cause in sentence}
-    return named[min(named)] if named else ""
+    positions = {sentence.find(cause): cause for cause in CAUSES if cause in sentence}
+    return positions[min(positions)] if positions else ""
 
 
 def _state_of(
-    view: SessionView, now: datetime, process_alive: bool | None, left: int, frame_s: float | None
+    view: SessionView, now: datetime, process_alive: bool | None, missing: int, frame_s: float | None
 ) -> tuple[str, str]:
-    heartbeat, here, total = view.heartbeat, view.place, len(view.steps)
-    copied = heartbeat is not None and heartbeat.state != "ended" and heartbeat.belongs_to(here) is False
-    over = heartbeat is None or heartbeat.state == "ended" or copied or heartbeat.is_dead(now, process_alive)
-    if over and view.unreadable:
+    heartbeat, location, total = view.heartbeat, view.place, len(view.steps)
+    is_copy = heartbeat is not None and heartbeat.state != "ended" and heartbeat.belongs_to(location) is False
+    is_over = heartbeat is None or heartbeat.state == "ended" or is_copy or heartbeat.is_dead(now, process_alive)
+    if is_over and view.unreadable:
         return "incomplete", view.unreadable
-    if over and total and not left:
-        return "complete", f"complete, {total} frames; next: build-lut {shlex.quote(view.given)} LUT/"
-    if over and view.lost:
-        gone = first_few(list(view.lost.values()), 3)
-        return "incomplete", f"{gone}: gone or cut since taken; restore from a copy, or {AGAIN}, which takes it again"
+    if is_over and total and not missing:
+        return "complete", f"complete, {total} frames; next: build-lut {shlex.quote(view.path_text)} LUT/"
+    if is_over and view.lost:
+        files = first_few(list(view.lost.values()), 3)
+        return "incomplete", f"{files}: deleted or truncated; restore from a copy, or {AGAIN} to repeat the frames"
     if heartbeat is None:
-        return "unknown", f"{left} of {total} frames are left, and the journal has no sign of life of a run"
-    if copied and here is not None:
-        return "copy", heartbeat.sentence_of_copy(here, process_alive)
+        return "unknown", f"{missing} of {total} frames are missing, and the journal has no sign of life of a run"
+    if is_copy and location is not None:
+        return "copy", heartbeat.sentence_of_copy(location, process_alive)
     if heartbeat.is_dead(now, process_alive):
         return "stopped", heartbeat.sentence_for(now, process_alive)
     if heartbeat.state == "ended":
-        return "incomplete", heartbeat.sentence or f"ended with {left} of {total} frames left; {AGAIN}"
+        return "incomplete", heartbeat.sentence or f"ended, {missing} of {total} frames are missing; {AGAIN}"
     since = f"{heartbeat.at.astimezone():%Y-%m-%d %H:%M:%S}"
     if now > heartbeat.until + timedelta(seconds=LATE_S):
-        doing = f"then: {heartbeat.sentence}"
-        return "silent", f"no sign since {since}, and its process is there: it hangs, or was stopped ({doing}); {LOOK}"
+        report = f"last report: {heartbeat.sentence}"
+        return "silent", f"no sign of life since {since}, but its process exists: it hangs ({report}); {LOOK}"
     if heartbeat.state == "running" and frame_s is not None:
         due_s = BEAT_S + LATE_FRAMES * frame_s + LATE_S
         if (now - heartbeat.at).total_seconds() > due_s:
-            return "late", f"late since {since}: a frame takes {frame_s:.1f} s, and none came; {LOOK}"
+            return "late", f"late since {since}: no frame came, expected after {frame_s:.1f} s; {LOOK}"
     return heartbeat.state, heartbeat.sentence
 
 
-Json = dict[str, Any]  # A JSON object
+Json = dict[str, Any]  # a JSON object
 
 
-# A file that changed so short a time before it was looked at may change again within the resolution of its time stamp
-# (10 ms at the slowest tick of Linux, more over a network), and is read once more.
+# Age of a file, s, below which it is read again: it may change within the resolution of its time stamp (10 ms at the
+# slowest tick of Linux, more over a network).
 FRESH_S = 0.25
 
-# After so long a session is read again though its journal is as before: files of its frames may be gone.
+# Interval, s, after which an unchanged session is read again: files of its frames may have been deleted.
 LOOK_AGAIN_S = 10.0
 
-# Newest attempts that are told again whenever anything is: a preview is written after its row, and a pipeline has two
-# frames in hand beside the one that it shows.
-_TOLD_AGAIN = 3
+# Newest attempts that are sent again with any change: a preview is written after its row, and two more frames may be in
+# the pipeline.
+_SENT_AGAIN = 3
 
 
-MOST_PICTURE_BYTES = 4 << 20  # Bytes of a preview that is shown: many times what one of 640 pixels has
+MOST_PICTURE_BYTES = 4 << 20  # size limit of a preview: many times that of 640 px
 
 _JPEG = b"\xff\xd8\xff"
 
 _REVISION = re.compile("[0-9]{1,9}")
 
-# Inode, time of change in ns and size of the journal and of what is written beside it; empty without a journal.
+# Inode, time of change (ns) and size of the journal and of its write-ahead file; empty without a journal.
 _Signature = tuple[tuple[int, int, int], ...]
 
 
 @dataclass(frozen=True)
 class _Numbered:
-    """A session as it was read, and at which change each part of it became as it is."""
+    """A view of a session, with the number of the last change of each attempt and event."""
 
     epoch: str
     inode: int
@@ -407,9 +397,9 @@ class _Numbered:
 
 
 class SessionWatch:
-    """A session that is looked at again and again; may be used from several threads.
+    """A session that is read repeatedly; may be used by several threads.
 
-    `clock`: returns seconds; the machine's own unless a test has another.
+    `clock`: returns seconds.
     """
 
     def __init__(self, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
@@ -423,70 +413,69 @@ class SessionWatch:
         self._trouble: Head | None = None
 
     def view(self) -> SessionView | None:
-        """Return the session as it stands now; None if there is none to read."""
+        """Return the current view of the session; None if it cannot be read."""
         with self._lock:
             self._refresh()
             return self._known.view if self._known else None
 
     def head(self) -> Head:
-        """Return how the session stands now."""
+        """Return the current state."""
         with self._lock:
             self._refresh()
             return self._head()
 
     def picture(self, attempt: int) -> bytes:
-        """Return the preview of an attempt's frame as JPEG; none if there is no such attempt, or no preview."""
+        """Return the preview of an attempt as JPEG, or b""."""
         view = self.view()
-        found = next((one for one in view.attempts if one.id == attempt and one.has_frame), None) if view else None
-        return _read_picture(self.folder, found.file) if found else b""
+        match = next((row for row in view.attempts if row.id == attempt and row.has_frame), None) if view else None
+        return _read_picture(self.folder, match.file) if match else b""
 
     def state(self, since: str = "") -> Json | None:
-        """Return what has changed since a page's cursor; None if nothing has.
+        """Return the changes since a page's cursor; None if there are none.
 
-        `since`: the `cursor` of the answer before; one that is not known here, or empty, gives everything.
+        `since`: the `cursor` of the previous answer; everything is returned if it is unknown or empty.
         """
         with self._lock:
             self._refresh()
-            known = self._known
+            numbered = self._known
             head = _head_json(self._head())
-            epoch, revision = (known.epoch, known.revision) if known else ("", 0)
+            epoch, revision = (numbered.epoch, numbered.revision) if numbered else ("", 0)
             cursor = f"{epoch}.{revision}.{digest(head)}"
             if since == cursor:
                 return None
             state: Json = {"cursor": cursor, "head": head}
-            if known is not None:
-                state |= self._news(known, since)
+            if numbered is not None:
+                state |= self._news(numbered, since)
             return state
 
     def _head(self) -> Head:
         if self._trouble is not None or self._known is None:
-            return self._trouble or Head("absent", f"there is no session {self.folder} yet: this page waits for it")
+            return self._trouble or Head("absent", f"the session {self.folder} does not exist yet; this page waits")
         return self._known.view.head(datetime.now(UTC))
 
-    def _news(self, known: _Numbered, since: str) -> Json:
-        """Return what a page with this cursor does not have."""
-        view = known.view
+    def _news(self, numbered: _Numbered, since: str) -> Json:
+        view = numbered.view
         epoch, revision, *_ = (*since.split("."), "", "")
-        whole = epoch != known.epoch or not _REVISION.fullmatch(revision)
-        seen = -1 if whole else int(revision)
-        recent = {one.id for one in view.attempts[-_TOLD_AGAIN:]}
-        news = [one for one in view.attempts if known.attempts[one.id] > seen or one.id in recent]
+        is_complete = epoch != numbered.epoch or not _REVISION.fullmatch(revision)
+        received = -1 if is_complete else int(revision)
+        recent = {attempt.id for attempt in view.attempts[-_SENT_AGAIN:]}
+        rows = [row for row in view.attempts if numbered.attempts[row.id] > received or row.id in recent]
         changes: Json = {
             "frames": [
-                _attempt_json(one, known.whites[one.id], _preview_version(self.folder, one.file)) for one in news
+                _attempt_json(row, numbered.whites[row.id], _preview_version(self.folder, row.file)) for row in rows
             ],
-            "events": [_event_json(one) for one in view.events if known.events[one.number] > seen],
+            "events": [_event_json(event) for event in view.events if numbered.events[event.number] > received],
         }
-        if whole:
+        if is_complete:
             changes["session"] = _session_json(view)
         return {key: value for key, value in changes.items() if value}
 
     def _refresh(self) -> None:
         signature = _signature(self.folder / JOURNAL_FILE)
-        now = self._clock()
-        if signature == self._signature and not self._unsettled and now < self._read_at + LOOK_AGAIN_S:
+        now_s = self._clock()
+        if signature == self._signature and not self._unsettled and now_s < self._read_at + LOOK_AGAIN_S:
             return
-        self._read_at = now
+        self._read_at = now_s
         newest = max((changed for _, changed, _ in signature), default=0)
         self._unsettled = bool(signature) and time.time_ns() - newest < FRESH_S * 1e9
         self._signature = signature
@@ -495,82 +484,82 @@ class SessionWatch:
                 self._trouble = Head("gone", no_journal_text(self.folder))
                 self._known = None
             elif self._known is not None:
-                self._trouble = Head("gone", f"the session {self.folder} is gone; this page goes on when it is back")
+                self._trouble = Head("gone", f"the session {self.folder} is missing; this page waits until it is back")
                 self._known = None
             return
         inode = signature[0][0]
-        known = self._known if self._known is not None and self._known.inode == inode else None
+        numbered = self._known if self._known is not None and self._known.inode == inode else None
         try:
-            view = read_session(self.folder, known.view if known else None)
+            view = read_session(self.folder, numbered.view if numbered else None)
         except CropError as error:
             self._trouble = Head("unreadable", str(error))
             self._unsettled = True
             return
         self._trouble = None
-        self._known = _numbered(inode, view, known)
+        self._known = _numbered(inode, view, numbered)
 
 
-def _numbered(inode: int, view: SessionView, before: _Numbered | None) -> _Numbered:
-    """Return a session with its changes numbered; one that is not the same any more is told anew as a whole."""
+def _numbered(inode: int, view: SessionView, earlier: _Numbered | None) -> _Numbered:
+    """Return a view with numbered changes; a replaced session starts again with all its content."""
     whites = view.whites()
-    lost = before is not None and not before.attempts.keys() <= whites.keys()
-    if before is None or lost or (view.steps, view.records) != (before.view.steps, before.view.records):
-        attempts, events = dict.fromkeys(whites, 0), dict.fromkeys((one.number for one in view.events), 0)
+    has_lost = earlier is not None and not earlier.attempts.keys() <= whites.keys()
+    if earlier is None or has_lost or (view.steps, view.records) != (earlier.view.steps, earlier.view.records):
+        attempts, events = dict.fromkeys(whites, 0), dict.fromkeys((event.number for event in view.events), 0)
         return _Numbered(secrets.token_hex(4), inode, 0, view, whites, attempts, events)
-    old = {one.id: one for one in before.view.attempts}
-    # Identity first: what was not read again is the same object, and comparing its checks would take its time.
-    differing = {one.id for one in view.attempts if old.get(one.id) is not one and old.get(one.id) != one}
-    changed = [number for number, white in whites.items() if number in differing or before.whites[number] != white]
-    new = [one.number for one in view.events if one.number not in before.events]
-    revision = before.revision + bool(changed or new)
-    attempts = {**before.attempts, **dict.fromkeys(changed, revision)}
-    events = {**before.events, **dict.fromkeys(new, revision)}
-    return _Numbered(before.epoch, inode, revision, view, whites, attempts, events)
+    old = {attempt.id: attempt for attempt in earlier.view.attempts}
+    # Identity is compared first, because comparing all checks is slow. Attempts that were not read again are identical.
+    differing = {new.id for new in view.attempts if old.get(new.id) is not new and old.get(new.id) != new}
+    changed = [number for number, white in whites.items() if number in differing or earlier.whites[number] != white]
+    new = [event.number for event in view.events if event.number not in earlier.events]
+    revision = earlier.revision + bool(changed or new)
+    attempts = {**earlier.attempts, **dict.fromkeys(changed, revision)}
+    events = {**earlier.events, **dict.fromkeys(new, revision)}
+    return _Numbered(earlier.epoch, inode, revision, view, whites, attempts, events)
 
 
 def _signature(path: Path) -> _Signature:
-    """Return what tells whether a journal has changed: of its file, and of the one that write-ahead mode adds."""
-    found: list[tuple[int, int, int]] = []
+    # Data that change with the journal: of its file, and of its write-ahead file.
+    signature: list[tuple[int, int, int]] = []
     for suffix in ("", "-wal"):
         try:
-            of = path.with_name(path.name + suffix).stat()
+            status = path.with_name(path.name + suffix).stat()
         except OSError:
             if not suffix:
                 return ()
             continue
-        found.append((of.st_ino, of.st_mtime_ns, of.st_size))
-    return tuple(found)
+        signature.append((status.st_ino, status.st_mtime_ns, status.st_size))
+    return tuple(signature)
 
 
 def _session_json(view: SessionView) -> Json:
-    """Return what does not change while a session is taken: its name, plan, lights and devices.
+    """Return the constant content of a session: name, plan, illuminants and devices.
 
-    A step is [number, kind, light, red, green, blue], a light [index, kind, K, [r, b], red, green, blue]; its
-    chromaticity is that of `experiment.lights`, None for one without any light.
+    A step is [number, kind, illuminant, red, green, blue], an illuminant [index, kind, K, [r, b], red, green, blue].
+    The chromaticity [r, b] is defined in `experiment.lights`; None for black.
     """
     kinds = {light.index: (light.kind, light.cct_k) for light in view.lights}
-    shown = {step.illumination: step.colour for step in view.steps if step.illumination is not None}
-    codes = dict(sorted(shown.items()))
-    places = planned_places(list(codes.values()))
+    colours = {step.illumination: step.colour for step in view.steps if step.illumination is not None}
+    codes = dict(sorted(colours.items()))
+    chromaticities = planned_places(list(codes.values()))
     return {
         "name": view.name,
         "steps": [[step.number, step.kind, step.illumination, *step.colour] for step in view.steps],
         "lights": [
-            [index, *kinds.get(index, ("", None)), place, *codes[index]]
-            for index, place in zip(codes, places, strict=True)
+            [index, *kinds.get(index, ("", None)), chromaticity, *codes[index]]
+            for index, chromaticity in zip(codes, chromaticities, strict=True)
         ],
         "records": [[key, text] for key, text in view.records.items()],
     }
 
 
 def planned_places(codes: Sequence[tuple[int, int, int]]) -> list[list[float] | None]:
-    """Return the chromaticities [r, b] of the linear light that codes stand for, 0 … 1; None for no light."""
+    """Return the chromaticities [r, b] (0 … 1) of the linear light of codes; None for black."""
     linear = decode_srgb(np.array(codes, dtype=np.float64).reshape(-1, 3) / 255)
     return [place_of(red, green, blue) for red, green, blue in linear.tolist()]
 
 
 def place_of(red: float, green: float, blue: float) -> list[float] | None:
-    """Return the chromaticity [r, b] of linear values; None unless they are a light's."""
+    """Return the chromaticity [r, b] of linear values; None if their sum is not positive."""
     total = red + green + blue
     if not math.isfinite(total) or total <= 0:
         return None
@@ -578,13 +567,8 @@ def place_of(red: float, green: float, blue: float) -> list[float] | None:
 
 
 def _attempt_json(view: AttemptView, white: tuple[float, float, float] | None, preview: int | None) -> Json:
-    """Return an attempt.
-
-    `white`: what was seen of the white frame that it is held against; None if there is none. `preview`: what names the
-    version of its picture; None if there is none.
-    """
     seen = view.seen
-    place = place_of(*(one / of for one, of in zip(seen, white, strict=True))) if seen and white else None
+    chromaticity = place_of(*(rgb / w for rgb, w in zip(seen, white, strict=True))) if seen and white else None
     values: Json = {
         "id": view.id,
         "step": view.step,
@@ -593,7 +577,7 @@ def _attempt_json(view: AttemptView, white: tuple[float, float, float] | None, p
         "verdict": view.verdict,
         "reason": view.reason,
         "seen": [_rounded(value) for value in seen] if seen else None,
-        "seen_at": place,
+        "seen_at": chromaticity,
         "checks": [_check(check) for check in view.checks],
         "timings": {name: _rounded(seconds) for name, seconds in view.timings.items()},
         "seconds": None if view.seconds is None else _rounded(view.seconds),
@@ -603,13 +587,12 @@ def _attempt_json(view: AttemptView, white: tuple[float, float, float] | None, p
 
 
 def _check(check: Check) -> list[Any]:
-    """Return a check: [name, unit, value, low, high], and the reason where there is one."""
+    # [name, unit, value, low, high], and the reason if there is one.
     numbers = [None if number is None else _rounded(number) for number in (check.value, check.low, check.high)]
     return [check.name, check.unit, *numbers, *([check.reason] if check.reason else [])]
 
 
 def _event_json(event: SessionEvent) -> list[Any]:
-    """Return an event: [time, what, detail]."""
     return [_milliseconds(event.at), event.what, event.detail]
 
 
@@ -623,18 +606,18 @@ def _rounded(value: float) -> float | None:
     return float(f"{value:.6g}") if math.isfinite(value) else None
 
 
-def _milliseconds(at: datetime | None) -> int | None:
-    return None if at is None else round(at.timestamp() * 1000)
+def _milliseconds(moment: datetime | None) -> int | None:
+    return None if moment is None else round(moment.timestamp() * 1000)
 
 
 def to_bytes(values: Json) -> bytes:
-    """Return JSON as it is sent; no character of it ends a script element, wherever it is put."""
+    """Return JSON as bytes; none of its characters can end a script element."""
     text = json.dumps(values, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029").encode()
 
 
 def digest(values: Json) -> str:
-    """Return a short text that is another for other content."""
+    """Return a short hash of the content."""
     return hashlib.blake2b(to_bytes(values), digest_size=6).hexdigest()
 
 
@@ -646,7 +629,7 @@ def _preview_version(folder: Path, file: str) -> int | None:
 
 
 def _read_picture(folder: Path, file: str) -> bytes:
-    """Return the bytes of a raw file's preview; none if it is not there, is no regular file, no JPEG, or too large."""
+    """Return the preview of a raw file; empty if it is missing, no regular file, no JPEG, or too large."""
     path = preview_path(folder, file)
     with suppress(OSError):
         if path.is_symlink() or not path.is_file() or path.stat().st_size > MOST_PICTURE_BYTES:
@@ -656,38 +639,38 @@ def _read_picture(folder: Path, file: str) -> bytes:
     return b""
 
 
-REPORT_FILE = "report.html"  # Name of a session's report in its folder
+REPORT_FILE = "report.html"  # name of the report in the session's folder
 
-# Bytes of all pictures in a report: with the third that base64 adds it can still be mailed (10 MB at most servers).
+# Total size of the pictures in a report: with the third added by base64 it can still be mailed (10 MB on most servers).
 MOST_PICTURES_BYTES = 6 << 20
 
-# Files that make up the page's script, in the order in which they stand in it; the last one begins.
+# Files of the page's script in their order; the last one starts the page.
 SCRIPTS = ("plots.js", "head.js", "series.js", "page.js")
 
-_PLACE = re.compile(r"\{(title|plain|policy|data|style|script)\}")
+_FIELD = re.compile(r"\{(title|plain|policy|data|style|script)\}")
 
 
 def live_page(name: str) -> tuple[str, str]:
-    """Return the page that asks its server for the session's state, and the policy that the server sends along.
+    """Return the live page, and the content security policy for its header.
 
     `name` is shown until the server has answered.
     """
-    plain = "This page shows the session by a script, which the browser does not run. See acquire status instead."
+    plain = "This page needs JavaScript, which the browser does not run. Use acquire status instead."
     policy = _policy("connect-src 'self'; img-src 'self' data:; frame-ancestors 'none'")
     return _filled(title=name, plain=plain, policy="", data=""), policy
 
 
 def write_session_report(folder: Path, path: Path | None = None) -> Path:
-    """Write the report of the session in `folder`, into it where no path is given, and return its path.
+    """Write the report of the session in `folder`, by default into it, and return its path.
 
-    To be called at the end of a run, also by the run itself: a run that goes on in this very process counts as ended.
+    Also called by the run itself at its end: a run in this process counts as ended.
     """
     path = folder / REPORT_FILE if path is None else path
     read_session(folder)
     watch = SessionWatch(folder)
     state, view = watch.state(), watch.view()
     if state is None or view is None:
-        raise FormatError("has gone while its report was made", about=folder, remedy="name a session")
+        raise FormatError("the session was deleted while its report was written", about=folder, remedy="name a session")
     now = datetime.now(UTC)
     head = _ended(view).head(now)
     state["head"] = _head_json(head)
@@ -713,35 +696,35 @@ def _ended(view: SessionView) -> SessionView:
 
 
 def _pictures(folder: Path, attempts: Sequence[AttemptView]) -> Iterator[tuple[int, bytes]]:
-    """Yield attempts with their pictures, as many as fit: the refused ones, then the last, then evenly spread ones."""
-    left = MOST_PICTURES_BYTES
+    """Yield attempts with pictures up to the size limit: refused ones, the last one, then evenly spread ones."""
+    free_bytes = MOST_PICTURES_BYTES
     refused = [view for view in attempts if view.has_frame and view.verdict not in (None, ACCEPTED)]
     accepted = [view for view in attempts if view.verdict == ACCEPTED]
-    for view in [*refused, *(accepted[place] for place in _spread(len(accepted)))]:
+    for view in [*refused, *(accepted[index] for index in _spread(len(accepted)))]:
         data = _read_picture(folder, view.file)
-        if data and len(data) <= left:
-            left -= len(data)
+        if data and len(data) <= free_bytes:
+            free_bytes -= len(data)
             yield view.id, data
 
 
 def _spread(count: int) -> list[int]:
-    """Return 0 … count − 1 so that any number of them from the front is spread evenly; the last and the first lead."""
-    places = dict.fromkeys([count - 1, 0] if count else [])
+    """Return 0 … count − 1, last and first in front, so that any number of them from the front is spread evenly."""
+    indices = dict.fromkeys([count - 1, 0] if count else [])
     step = count
     while step > 1:
         step = (step + 1) // 2
-        places |= dict.fromkeys(range(0, count, step))
-    return list(places)
+        indices |= dict.fromkeys(range(0, count, step))
+    return list(indices)
 
 
 def _plain(head: Head) -> str:
     return "\n".join(
         (
             head.sentence,
-            f"frames {head.done} of {head.total}, lights {head.lights_done} of {head.lights_total}",
+            f"frames {head.done} of {head.total}, illuminants {head.lights_done} of {head.lights_total}",
             f"refused {head.refused}, failed {head.failed}, voided {head.voided}",
-            f"a frame took {duration_text(head.seconds_per_frame)}",
-            "Pictures and plots are shown by a script, which this viewer does not run; open the file in a browser.",
+            f"time per frame {duration_text(head.seconds_per_frame)}",
+            "Pictures and plots need JavaScript, which this viewer does not run; open the file in a browser.",
         )
     )
 
@@ -752,25 +735,25 @@ def _filled(*, title: str, plain: str, policy: str, data: str) -> str:
         "plain": html.escape(plain),
         "policy": policy,
         "data": data,
-        "style": _part("page.css"),
+        "style": _web_text("page.css"),
         "script": _script(),
     }
-    # In one pass: what is put in is not looked through for further places.
-    return _PLACE.sub(lambda found: values[found[1]], _part("page.html"))
+    # In one pass, so that inserted text is not searched for further fields.
+    return _FIELD.sub(lambda match: values[match[1]], _web_text("page.html"))
 
 
 @cache
-def _part(name: str) -> str:
+def _web_text(name: str) -> str:
     return (resources.files("acquisition.monitor") / "web" / name).read_text(encoding="utf-8")
 
 
 def _script() -> str:
-    return "".join(map(_part, SCRIPTS))
+    return "".join(map(_web_text, SCRIPTS))
 
 
-def _policy(more: str) -> str:
-    style, script = _hash(_part("page.css")), _hash(_script())
-    return f"default-src 'none'; script-src {script}; style-src {style}; base-uri 'none'; form-action 'none'; {more}"
+def _policy(sources: str) -> str:
+    style, script = _hash(_web_text("page.css")), _hash(_script())
+    return f"default-src 'none'; script-src {script}; style-src {style}; base-uri 'none'; form-action 'none'; {sources}"
 
 
 def _hash(text: str) -> str:

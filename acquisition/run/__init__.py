@@ -1,1 +1,1 @@
-"""Taking a session: devices opened, frames taken in order, judged, and imported from elsewhere."""
+"""Take a session: plan, devices, frames, retries, notices; and import of raw files taken by other means."""

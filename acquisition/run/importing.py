@@ -1,7 +1,7 @@
-"""A session from raw files taken by other means: a list of frames, the chart, the lights.
+"""Import a session from raw files taken by other means: a list of frames, the chart, the illuminants.
 
-Every file is copied byte for byte, checked against its hash where the list has one, and judged where the list has no
-verdict. The result is a session like any other.
+Every file is copied unchanged, checked against its hash if the list has one, and judged if the list has no verdict. The
+result is a session like any other.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from foundation.folders import require_free
 
 @dataclass(frozen=True)
 class ListedFrame:
-    """One row of the list; empty text and None where it states nothing."""
+    """One row of the list; fields are empty or None if it states nothing."""
 
     kind: FrameKind
     illumination: int | None
@@ -43,11 +43,11 @@ class ListedFrame:
 
 @dataclass(frozen=True)
 class Imported:
-    """How an import ended.
+    """Result of an import.
 
-    - `refused`: what was refused, one line a frame.
-    - `left`: lights and kinds of frames of which none was accepted, in words.
-    - `unchecked`: suffixes of the files of which nobody can check whether they are complete.
+    - `refused`: one sentence for each refused frame.
+    - `left`: illuminants and kinds of frames without an accepted frame, in words.
+    - `unchecked`: suffixes of formats that cannot be checked for completeness.
     """
 
     refused: tuple[str, ...]
@@ -56,14 +56,14 @@ class Imported:
 
 
 def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, ...]]:
-    """Read a list of frames, columns as `frames.csv`, files relative to the list; and the lights beside it.
+    """Read a list of frames (columns as in `frames.csv`, paths relative to it) and the illuminants next to it.
 
-    Only `kind`, `illumination` and `file` must be filled. Rows of the kind ``response`` are passed over: they serve
-    while a session is taken, and the list does not say which codes they show.
+    Only `kind`, `illumination` and `file` must be filled. Rows of the kind ``response`` are ignored: only a running
+    session needs them, and the list does not state their codes.
     """
     rows = read_csv(path, "name a CSV file in UTF-8", "the list of frames")[1]
     if not rows or any(column not in rows[0] for column in FRAME_COLUMNS[:3]):
-        raise FormatError(f"expected frames under the columns {','.join(FRAME_COLUMNS)}", about=path)
+        raise FormatError(f"no frames under the expected columns {','.join(FRAME_COLUMNS)}", about=path)
     lights = load_illuminations(path.parent / "illuminations.csv")
     frames = [
         _listed(row, f"{path}, line {number}", path.parent, len(lights))
@@ -83,25 +83,25 @@ def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int
     file = folder / cell("file")
     if not cell("file") or not file.is_file():
         raise FormatError(
-            f"there is no file {file}", about=where, remedy="files are named relative to the list", value=file
+            f"the file {file} does not exist", about=where, remedy="give paths relative to the list", value=file
         )
     try:
         illumination = int(cell("illumination")) if kind == "light" else None
         exposure_s = float(cell("exposure_s") or 0)
-        stated = cell("taken_at")
-        taken_at = datetime.fromisoformat(stated) if stated else datetime.fromtimestamp(file.stat().st_mtime, UTC)
+        time = cell("taken_at")
+        taken_at = datetime.fromisoformat(time) if time else datetime.fromtimestamp(file.stat().st_mtime, UTC)
     except ValueError as error:
         raise FormatError(str(error), about=where) from error
     if illumination is not None and not 0 <= illumination < lights:
-        said = f"illumination is {illumination}, illuminations.csv has 0 … {lights - 1}"
-        raise FormatError(said, about=where, value=illumination)
+        problem = f"illumination is {illumination}, expected 0 … {lights - 1} as in illuminations.csv"
+        raise FormatError(problem, about=where, value=illumination)
     if not 0 <= exposure_s < math.inf:
-        said = f"exposure_s is {exposure_s:g}, expected seconds, or nothing if it is not known"
-        raise FormatError(said, about=where, value=exposure_s)
+        problem = f"exposure_s is {exposure_s:g}, expected seconds, or nothing if it is unknown"
+        raise FormatError(problem, about=where, value=exposure_s)
     verdict = cell("verdict")
     if verdict not in ("", ACCEPTED, REFUSED) and not verdict.startswith(f"{REFUSED}: "):
-        said = f"verdict is {verdict!r}, expected {ACCEPTED}, {REFUSED}: REASON, or nothing"
-        raise FormatError(said, about=where, value=verdict)
+        problem = f"verdict is {verdict!r}, expected {ACCEPTED}, {REFUSED}: REASON, or nothing"
+        raise FormatError(problem, about=where, value=verdict)
     if not taken_at.tzinfo:
         taken_at = taken_at.replace(tzinfo=UTC)
     return ListedFrame(kind, illumination, file, cell("sha256").lower(), taken_at, exposure_s, verdict)
@@ -116,23 +116,23 @@ def import_session(
     loaded = load_chart(chart)
     for frame in frames:
         if frame.sha256 and file_sha256(frame.path) != frame.sha256:
-            said = f"{frame.path} is not the file that {frame_list} lists: its SHA-256 differs"
-            raise FormatError(said, remedy="copy it again", value=frame.path)
+            problem = f"the SHA-256 of {frame.path} differs from the one in {frame_list}"
+            raise FormatError(problem, remedy="copy the file again", value=frame.path)
     settings = LabSettings(rig="imported", chart=chart, illuminations=frame_list.parent / "illuminations.csv")
     steps = [_step(number, frame, lights) for number, frame in enumerate(frames)]
     refused: list[str] = []
-    taken: dict[str, ListedFrame] = {}
+    light_files: dict[str, ListedFrame] = {}
     with Session.create(folder, settings.to_toml(), loaded, lights, steps) as session:
         try:
             for step, frame in zip(steps, frames, strict=True):
                 reason, sha256 = _take_over(session, step, frame, settings)
-                first = taken.setdefault(sha256, frame) if frame.kind == "light" else frame
+                first = light_files.setdefault(sha256, frame) if frame.kind == "light" else frame
                 if first.illumination != frame.illumination:
                     raise FormatError(
-                        f"lights {first.illumination} and {frame.illumination} have the same raw file, "
+                        f"illuminants {first.illumination} and {frame.illumination} have the same raw file, "
                         f"{first.path.name} and {frame.path.name}",
                         about=frame_list,
-                        remedy="list each light's own",
+                        remedy="list a separate file for each illuminant",
                         value=(first.illumination, frame.illumination),
                     )
                 if reason:
@@ -145,7 +145,7 @@ def import_session(
             shutil.rmtree(folder)
             raise
         unchecked = {frame.path.suffix.lower() for frame in frames if not _can_be_checked(frame.path)}
-        return Imported(tuple(refused), tuple(_left(session)), tuple(sorted(unchecked)))
+        return Imported(tuple(refused), tuple(_missing_frames(session)), tuple(sorted(unchecked)))
 
 
 def _can_be_checked(path: Path) -> bool:
@@ -153,11 +153,11 @@ def _can_be_checked(path: Path) -> bool:
         return layout_is_known(stream.read(LAYOUT_START))
 
 
-def _left(session: Session) -> list[str]:
+def _missing_frames(session: Session) -> list[str]:
     accepted = {(frame.kind, frame.illumination) for frame in session.frames() if frame.accepted}
     listed = dict.fromkeys((step.kind, step.illumination) for step in session.steps)
     return [
-        f"every {kind} frame" if light is None else f"light {light}"
+        f"every {kind} frame" if light is None else f"illuminant {light}"
         for kind, light in listed
         if (kind, light) not in accepted
     ]
@@ -173,7 +173,7 @@ def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> 
 def _take_over(
     session: Session, step: SessionStep, frame: ListedFrame, settings: LabSettings
 ) -> tuple[str | None, str]:
-    """Copy and judge a frame; return why it is refused, None if it is not, and the SHA-256 of its file."""
+    """Copy and judge a frame; return the reason of a refusal, or None, and the SHA-256 of its file."""
 
     def copy(into: BinaryIO) -> CapturedFrame:
         with frame.path.open("rb") as stream:
@@ -183,11 +183,11 @@ def _take_over(
     attempt = session.journal.begin(step, f"frames/{step.stem}", frame.taken_at)
     received = session.receive(step.stem, copy)
     if frame.verdict == ACCEPTED:
-        # Whoever judged it may not have seen that its file is damaged, or saw it before it was.
-        found = whole_frame(received.path)
-        reason = found if isinstance(found, str) else None
+        # The file may have been damaged after this verdict, or without notice.
+        content = whole_frame(received.path)
+        reason = content if isinstance(content, str) else None
     elif frame.verdict:
-        reason = frame.verdict.removeprefix(REFUSED).removeprefix(":").strip() or "for no reason that is listed"
+        reason = frame.verdict.removeprefix(REFUSED).removeprefix(":").strip() or "the list gives no reason"
     else:
         reason = judge_file(received.path, frame.kind, settings)
     session.journal.commit(

@@ -1,25 +1,9 @@
-"""A frame's way: while one is downloaded the next light settles, while one is exposed the last is judged.
+"""Take the frames of a run: download one while the next illuminant settles, and judge one while the next is exposed.
 
-docs/explanation/steps.md has the order of its steps. `StepQueue` says which frame is next, `Pipeline` moves the
-devices, `Verdicts` lets frames count and draws what follows for others, `LastingCause` waits for what would refuse
-every frame. Rules that hold inside, of time and order:
-
-- Settling counts from when the light was shown, so that it passes during the download and while verdicts are awaited.
-- The saving thread touches no device and no journal: rows are committed on the devices' thread, in the order of taking.
-- An attempt's row gets `started_at` when its light was shown and `ended_at` when the exposure was over and the light
-  could change: what they enclose are parts of the run's time that do not overlap, though the work on the frames does.
-- A light that is shown and not taken, because a refused one came first, leaves no row.
-- What fails is waited for (`RetryPolicy`) when no frame waits in the camera that could be saved first.
-
-And of what is taken next:
-
-- Open steps are taken in the plan's order, so that a refused one comes before those behind it.
-- A reference that voids other frames is taken again before them: it shows whether the cause is still there.
-- Lights are followed by a white and a dark frame. Where lights that are taken again would have none behind them,
-  another pair is put behind the plan before they are, so that a run that is killed meanwhile is not complete.
-- A refused reference may void all lights since the last good one. Where more lights than usual are taken again in a
-  row, a pair comes between them, too.
-- What a run that is taken up shows first is put into the session's plan by `link_runs`.
+docs/explanation/steps.md has the order of the steps. `StepQueue` selects the next frame, `Pipeline` moves the devices,
+`Verdicts` records verdicts and their consequences for other frames, `LastingCause` waits for a cause that would refuse
+every frame. The saving thread uses no device and no journal: rows are committed by the devices' thread, in the order of
+taking.
 """
 
 from __future__ import annotations
@@ -70,19 +54,19 @@ from foundation.console import EndRequest
 from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted, first_few
 from foundation.files import write_atomic
 
-# Frames whose verdict is not known when the next is exposed. A frame is judged while the next is exposed and
-# downloaded, which takes several times as long; with more frames ahead, more would be lost where one is refused.
+# Frames without a verdict when the next is exposed. A frame is judged during the next exposure and download, which take
+# several times as long. With more frames ahead, a refusal would cost more of them.
 AHEAD = 1
 
-# Tries at fetching a frame before it is exposed again: a driver has renewed its connection several times by then.
+# Tries to download a frame before it is exposed again: by then a driver has renewed its connection several times.
 DOWNLOADS = 2
 
-# What steps are expected to take, seconds, until they took longer: a write to the journal, a picture that is shown or
-# read back, release and readout beside the shutter's time and as much again for the camera's own dark frame, the
-# verdict of a large frame, its download over a slow cable.
+# Expected durations of the first steps of a kind, s: a write to the journal; showing or reading back a picture; release
+# and readout, in addition to the shutter time and as much again for the camera's own dark frame; the verdict on a large
+# frame; its download over a slow cable.
 COMMIT_S, SHOW_S, RELEASE_S, JUDGE_S, DOWNLOAD_S = 1.0, 2.0, 3.0, 5.0, 10.0
 
-PROMISE = "ending after this frame; press Ctrl-C again to end at once"  # What somebody is told who asks a run to end
+PROMISE = "ending after this frame; press Ctrl-C again to end at once"  # answer to a request to end the run
 
 _CAMERA, _SCREEN, _DISK = "the camera", "the screen", "the disk"
 
@@ -91,7 +75,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Job:
-    """What a run has from its first frame to its last."""
+    """Everything that a run needs for its frames."""
 
     session: Session
     devices: Devices
@@ -102,10 +86,10 @@ class Job:
     watch: RunWatch
 
     def on_disk(self, action: Callable[[], _Result]) -> _Result:
-        """Return what `action` returns; while the disk is full or gone, it is waited for."""
+        """Return the result of `action`; wait while the disk is full or missing."""
 
         def watched() -> _Result:
-            with self.watch.step(_DISK, "takes what the journal says", COMMIT_S, "commit"):
+            with self.watch.step(_DISK, "stores a row of the journal", COMMIT_S, "commit"):
                 return action()
 
         return self.retry.attempt(watched, _DISK)
@@ -113,18 +97,18 @@ class Job:
 
 @dataclass(frozen=True)
 class Taken:
-    """A frame that was taken and judged; `left` steps of the plan are without an accepted frame now."""
+    """A judged frame; `remaining` steps of the plan have no accepted frame."""
 
     step: SessionStep
     judgement: Judgement
-    left: int
+    remaining: int
 
 
 @dataclass(frozen=True)
 class ShownLight:
-    """A step whose light is on the screen since `since`, seconds of the clock; to show it took `show_s`.
+    """A step with its illuminant on the screen since `since`, s of the clock; showing it took `show_s`.
 
-    `replaced`: the colour that was shown before; None for the first.
+    `replaced`: the previous colour; None for the first.
     """
 
     step: SessionStep
@@ -136,10 +120,10 @@ class ShownLight:
 
 @dataclass(frozen=True)
 class Exposed:
-    """A frame that is in the camera or beyond it; `checks` are what the devices say of it.
+    """An exposed frame, with the checks of the devices.
 
-    `number` is that of its attempt in the journal, `stem` its file's name without suffix. `changed`: whether another
-    colour was shown, and exposed, before it, so that a picture that is late or stands still would be seen.
+    `number`: of its attempt in the journal. `stem`: name of its file without suffix. `changed`: whether another colour
+    was shown and exposed before it, so that a late or frozen picture would be detected.
     """
 
     step: SessionStep
@@ -153,10 +137,10 @@ class Exposed:
 
 @dataclass(frozen=True)
 class Saved:
-    """A raw file that is complete on the disk, and what was seen in it.
+    """A complete raw file and its verdict.
 
-    - `save_s`, `judge_s`: seconds of this machine's time that hashing, flushing and renaming took, and judging.
-    - `preview_fault`: why its preview could not be written; empty where it was, or there is none.
+    - `save_s`, `judge_s`: durations of hashing, flushing and renaming, and of judging, s of the computer's clock.
+    - `preview_fault`: why its preview could not be written; "" if there was no fault.
     """
 
     received: ReceivedFile
@@ -167,7 +151,7 @@ class Saved:
 
 
 class Pipeline:
-    """Moves the devices; `saving` is the thread that completes files and judges them, one after another."""
+    """Moves the devices; `saving` is the thread that completes and judges files, one after another."""
 
     def __init__(
         self, job: Job, saving: ThreadPoolExecutor, observe: Callable[[Taken], object], ending: EndRequest
@@ -183,9 +167,9 @@ class Pipeline:
         self._exposed: Colour | None = None
 
     def run(self) -> None:
-        """Take frames until the queue is empty or the end was asked for.
+        """Take frames until the queue is empty or the end is requested.
 
-        Whatever ends it, frames that the camera has given are completed, judged and journalled first.
+        Frames that the camera has delivered are completed, judged and recorded in any case.
         """
         try:
             with self._ending.postponed(PROMISE):
@@ -197,12 +181,12 @@ class Pipeline:
             raise
 
     def _next_light(self) -> ShownLight | None:
-        """Show the next light; wait for verdicts where it depends on them; None where nothing more is to be taken."""
+        """Show the next illuminant, after verdicts on which it depends; None if nothing is left to take."""
         while not self._ending.is_requested:
             if self._verdicts.is_spent:
                 self._collect(0)
                 self._verdicts.require_budget()
-            if self._lasting.is_found:
+            if self._lasting.must_wait:
                 self._collect(0)
                 self._lasting.wait()
             step = self._job.queue.next()
@@ -216,40 +200,39 @@ class Pipeline:
         return None
 
     def _take(self, light: ShownLight) -> ShownLight | None:
-        """Take the frame of the light that is on the screen; return the next one that is."""
         settling_s = self._settle(light)
         if self._ending.is_requested:
             return self._next_light()
         frame = self._expose(light, settling_s)
         if frame is None:
             return self._next_light()
-        # While it is doubtful whether frames can be had at all, one is taken at a time.
-        ahead = 0 if self._lasting.is_probed else AHEAD
+        # One frame at a time while frames test whether a lasting cause has gone.
+        ahead = 0 if self._lasting.is_testing else AHEAD
         following = self._show_following() if ahead else None
         frame = replace(frame, checks=(*frame.checks, *self._projector_check(frame.step)))
         self._hand_over(frame)
         self._collect(ahead)
         if not all(check.passed for check in frame.checks):
-            # What ails a device now decides whether the next frame makes sense.
+            # A device must be healthy before the next frame.
             self._collect(0)
             if self._job.devices.projector is not None:
                 with self._ending.at_once():
                     await_health(self._job.devices.projector, self._job.settings.sequence, self._job.retry)
-        elif following is not None and not self._lasting.is_found and self._job.queue.next() == following.step:
+        elif following is not None and not self._lasting.must_wait and self._job.queue.next() == following.step:
             return following
         return self._next_light()
 
     def _show(self, step: SessionStep) -> ShownLight:
         clock = self._job.devices.clock
-        shown_at, begun = clock.now(), clock.monotonic()
+        shown_at, start_s = clock.now(), clock.monotonic()
         with self._job.watch.step(_SCREEN, f"shows {step_name(step)}", SHOW_S, "show"):
             self._job.devices.presenter.show(step.colour)
         since = clock.monotonic()
         replaced, self._shown = self._shown, step.colour
-        return ShownLight(step, shown_at, since, since - begun, replaced)
+        return ShownLight(step, shown_at, since, since - start_s, replaced)
 
     def _show_following(self) -> ShownLight | None:
-        """Show the next light if it is known; a presenter that fails is met when no frame waits in the camera."""
+        # A fault is handled later, when no frame waits in the camera.
         step = None if self._ending.is_requested else self._job.queue.next()
         if step is None:
             return None
@@ -259,7 +242,7 @@ class Pipeline:
             return None
 
     def _settle(self, light: ShownLight) -> float:
-        """Let the rest of the settling pass; return how long that took."""
+        # Settling begins with the new picture, so that it continues during download and verdicts.
         clock = self._job.devices.clock
         rest = self._job.settings.sequence.settle_s - (clock.monotonic() - light.since)
         if rest > 0:
@@ -267,15 +250,16 @@ class Pipeline:
         return max(rest, 0.0)
 
     def _expose(self, light: ShownLight, settling_s: float) -> Exposed | None:
-        """Release the shutter; None where the camera failed, and was waited for."""
+        """Release the shutter; return None after waiting for a camera that failed."""
         clock, step, journal = self._job.devices.clock, light.step, self._job.session.journal
         shutter_s = self._job.settings.camera.shutter_s
-        kept = journal.kept_files(step)
-        stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
+        kept_count = journal.kept_files(step)
+        stem = step.stem if kept_count == 0 else f"{step.stem}_try{kept_count + 1}"
+        # An attempt lasts from the new picture to the end of the exposure, so that attempts do not overlap.
         number = self._job.on_disk(lambda: journal.begin(step, f"frames/{stem}", light.shown_at))
         self._job.queue.begin(step)
         self._note_gap()
-        begun = clock.monotonic()
+        start_s = clock.monotonic()
         changed = step.colour not in (light.replaced, self._exposed)
         self._exposed = step.colour
         try:
@@ -285,32 +269,29 @@ class Pipeline:
             self._give_up(step, number, error)
             self._pause_for(_CAMERA, error)
             return None
-        timings = {"show": light.show_s, "settle": settling_s, "expose": clock.monotonic() - begun}
+        timings = {"show": light.show_s, "settle": settling_s, "expose": clock.monotonic() - start_s}
         checks = (*self._screen_check(step), *self._gap_check())
         return Exposed(step, number, stem, clock.now(), checks, timings, changed)
 
     def _note_gap(self) -> float:
-        """Tell of a time in which the program stood still; return how long that was, seconds.
-
-        A date that was set meanwhile is told, too.
-        """
+        """Report a time during which the program was stopped, and a change of the clock; return the time, s."""
         clock = self._job.devices.clock
         if isinstance(clock, SteadyClock) and (set_by_s := clock.step_s()):
-            way = "ahead" if set_by_s > 0 else "back"
-            by = f"{way} by {duration_text(abs(set_by_s))}"
-            self._job.retry.report("clock", f"the machine's clock was set {by}; the session's time goes on as before")
+            change = f"{'ahead' if set_by_s > 0 else 'back'} by {duration_text(abs(set_by_s))}"
+            sentence = f"the computer's clock was set {change}; the time of the session continues unchanged"
+            self._job.retry.report("clock", sentence)
         if gap_s := self._job.watch.gap_s():
-            sentence = f"the run stood still for {duration_text(gap_s)}: the machine slept, or the process was stopped"
+            sentence = f"the run was stopped for {duration_text(gap_s)}: the computer slept, or the process was stopped"
             self._job.retry.report("gap", sentence)
         return gap_s
 
     def _gap_check(self) -> tuple[Check, ...]:
-        """Refuse a frame during which the program stood still: nobody knows what the screen showed meanwhile."""
+        # The screen may have shown anything while the program was stopped.
         if not (gap_s := self._note_gap()):
             return ()
         reason = (
-            f"the run stood still for {duration_text(gap_s)} while the frame was exposed; keep the machine from "
-            "sleeping; the frame is taken again"
+            f"the run was stopped for {duration_text(gap_s)} during the exposure, at most {GAP_S:g} s allowed; switch "
+            "off sleep mode. The frame is repeated"
         )
         return (Check("gap", gap_s, None, GAP_S, "s", reason),)
 
@@ -319,14 +300,13 @@ class Pipeline:
         if not isinstance(presenter, ReadsBack):
             return ()
         try:
-            with self._job.watch.step(_SCREEN, f"is asked whether it shows {step_name(step)}", SHOW_S, "verify"):
+            with self._job.watch.step(_SCREEN, f"reads back {step_name(step)}", SHOW_S, "verify"):
                 presenter.verify(step.colour)
         except DeviceError as error:
             return (Check("screen", reason=str(error)),)
         return (Check("screen"),)
 
     def _projector_check(self, step: SessionStep) -> tuple[Check, ...]:
-        """Ask the projector for its health; it answers while the next light settles."""
         if self._health is None:
             return ()
         with self._job.watch.step("the projector", "is asked for its health", SHOW_S, "health"):
@@ -334,9 +314,8 @@ class Pipeline:
         return (Check("projector", reason="" if fault is None else str(fault)),)
 
     def _hand_over(self, frame: Exposed) -> None:
-        """Fetch the frame from the camera and hand it to the saving thread; a frame that is lost is exposed again."""
         clock = self._job.devices.clock
-        begun = clock.monotonic()
+        start_s = clock.monotonic()
         try:
             complete = self._fetch(frame)
         except DeviceError as error:
@@ -344,13 +323,13 @@ class Pipeline:
             self._pause_for(_CAMERA, error)
             return
         self._clear_pause(_CAMERA)
-        frame = replace(frame, timings={**frame.timings, "download": clock.monotonic() - begun})
+        frame = replace(frame, timings={**frame.timings, "download": clock.monotonic() - start_s})
         self._under_way.append((frame, self._saving.submit(_save, self._job, complete, frame)))
 
     def _fetch(self, frame: Exposed) -> Callable[[], ReceivedFile]:
-        """Let the camera write the frame under a hidden name; return what completes the file.
+        """Download the frame under a hidden name; return the function that completes the file.
 
-        What a full disk cannot take stays in the camera.
+        If the disk is full, the frame stays in the camera.
         """
         download = partial(_download, self._job, frame)
         for _ in range(DOWNLOADS - 1):
@@ -361,34 +340,34 @@ class Pipeline:
         return self._job.retry.attempt(download, _DISK, curable=_is_of_disk)
 
     def _collect(self, keep: int) -> None:
-        """Journal the frames whose verdicts are due, oldest first, until `keep` are left to wait for."""
+        """Record the oldest frames with their verdicts until only `keep` wait for one."""
         while len(self._under_way) > keep:
             frame, awaited = self._under_way.popleft()
-            begun = time.perf_counter()
+            start_s = time.perf_counter()
             try:
-                with self._job.watch.step(_DISK, f"takes {step_name(frame.step)}, which is judged", JUDGE_S, "judge"):
+                with self._job.watch.step(_DISK, f"stores {step_name(frame.step)}, which is judged", JUDGE_S, "judge"):
                     saved = awaited.result()
             except (DeviceError, StorageError) as error:
                 self._give_up(frame.step, frame.number, error)
                 self._pause_for(_DISK, error)
                 continue
             self._clear_pause(_DISK)
-            timings = {"save": saved.save_s, "judge": saved.judge_s, "waited": time.perf_counter() - begun}
+            timings = {"save": saved.save_s, "judge": saved.judge_s, "waited": time.perf_counter() - start_s}
             frame = replace(frame, timings={**frame.timings, **timings})
             if self._health is not None and not saved.judgement.accepted:
                 self._health.suspect()
-            self._verdicts.take_in(frame, saved, [later for later, _ in self._under_way])
+            self._verdicts.take_in(frame, saved, [exposed for exposed, _ in self._under_way])
             self._observe(Taken(frame.step, saved.judgement, len(self._job.queue)))
 
     def _give_up(self, step: SessionStep, number: int, error: CropError) -> None:
-        """Note an attempt that gave no frame, by no fault of what was to be photographed."""
+        # The attempt failed for a device or the disk, not for its content.
         self._job.queue.withdraw(step)
         self._collect(0)
-        now = self._job.devices.clock.now()
-        self._job.on_disk(lambda: self._job.session.journal.fail(number, now, str(error)))
+        moment = self._job.devices.clock.now()
+        self._job.on_disk(lambda: self._job.session.journal.fail(number, moment, str(error)))
 
     def _pause_for(self, name: str, fault: CropError) -> None:
-        """Wait for a camera or disk that lost a frame; the pause lasts until a frame came through."""
+        """Wait for the camera or disk that lost a frame; the pause lasts until the next frame succeeds."""
         self._pauses.setdefault(name, self._job.retry.pause(name, idle=name != _CAMERA)).wait(fault)
 
     def _clear_pause(self, name: str) -> None:
@@ -396,14 +375,14 @@ class Pipeline:
             pause.over()
 
     def _salvage(self, error: BaseException) -> None:
-        """Journal what the camera has given, whatever ended the run; a further fault does not hide the first."""
         while self._under_way:
             try:
                 self._collect(0)
-            except CropError as further:
-                if str(further) == str(error):
+            except CropError as second_error:
+                # The first error ended the run, and must not be hidden.
+                if str(second_error) == str(error):
                     continue
-                error.add_note(f"then: {further}")
+                error.add_note(f"then: {second_error}")
 
 
 def _is_of_disk(fault: CropError) -> bool:
@@ -411,15 +390,15 @@ def _is_of_disk(fault: CropError) -> bool:
 
 
 def _download(job: Job, frame: Exposed) -> Callable[[], ReceivedFile]:
-    """Let the camera write the frame exposed last into `frames/`, under a hidden name; return what completes it."""
+    """Download the last frame into `frames/` under a hidden name; return the function that completes the file."""
     incoming = IncomingFile(job.session.frames_folder / frame.stem)
     try:
         with job.watch.step(_CAMERA, f"sends {step_name(frame.step)} to the disk", DOWNLOAD_S, "download"):
             captured = job.devices.camera.download(incoming.stream)
         size = incoming.stream.seek(0, 2)
         if size != captured.size or size == 0:
-            # Found here and not when the file is completed: the body may hold the frame still.
-            raise DeviceError(f"{captured.name}: the camera says {captured.size} bytes, {size} arrived")
+            # Checked before the file is completed, because the camera may still have the frame.
+            raise DeviceError(f"{captured.name}: {size} bytes arrived, {captured.size} expected by the camera")
     except BaseException:
         with incoming:
             raise
@@ -427,25 +406,24 @@ def _download(job: Job, frame: Exposed) -> Callable[[], ReceivedFile]:
 
 
 def _save(job: Job, complete: Callable[[], ReceivedFile], frame: Exposed) -> Saved:
-    """Make a frame's file whole and judge it; what the saving thread does."""
-    begun = time.perf_counter()
+    start_s = time.perf_counter()
     received = complete()
     saved = time.perf_counter()
     judgement, preview_fault = Judgement(frame.checks), ""
     if judgement.accepted:
-        seen = job.judge.judge(received.path, frame.step)
-        judgement = replace(seen, checks=(*frame.checks, *seen.checks), preview=b"")
-        if seen.preview:
-            # It is derived and may be lost; flushing it would cost the devices' thread as much as a row.
+        verdict = job.judge.judge(received.path, frame.step)
+        judgement = replace(verdict, checks=(*frame.checks, *verdict.checks), preview=b"")
+        if verdict.preview:
+            # A preview may be lost, because it can be derived again; flushing it would cost as much as a row.
             try:
-                write_atomic(preview_path(job.session.folder, received.path.name), seen.preview)
+                write_atomic(preview_path(job.session.folder, received.path.name), verdict.preview)
             except CropError as error:
                 preview_fault = str(error)
-    return Saved(received, judgement, saved - begun, time.perf_counter() - saved, preview_fault)
+    return Saved(received, judgement, saved - start_s, time.perf_counter() - saved, preview_fault)
 
 
 class Verdicts:
-    """Lets frames count or not, in the order of taking, and draws what follows for those before and behind them."""
+    """Records verdicts in the order of taking, and their consequences for earlier and later frames."""
 
     def __init__(self, job: Job, lasting: LastingCause) -> None:
         self._job, self._lasting = job, lasting
@@ -457,20 +435,20 @@ class Verdicts:
 
     @property
     def is_spent(self) -> bool:
-        """Whether this run has filled the disk with more frames that are not used than it may."""
+        """Whether unused frames of this run take more space than allowed."""
         return self._unused_bytes > self._budget_gb * 1e9
 
     def require_budget(self) -> None:
-        """Raise if `is_spent`: what refuses so many frames is not chance, and fills the disk."""
+        """Raise if `is_spent`: so many refusals have a systematic cause, and fill the disk."""
         if self.is_spent:
             raise QualityError(
-                f"refused and voided frames of this run take {self._unused_bytes / 1e9:.3g} GB of the disk, "
-                f"{self._budget_gb:g} allowed (sequence.refused_gb); acquire status names the causes: mend "
-                "them, then run the same command again; it has the same budget anew"
+                f"refused and voided frames of this run take {self._unused_bytes / 1e9:.3g} GB of the disk, at most "
+                f"{self._budget_gb:g} GB allowed (sequence.refused_gb); acquire status lists the causes: remove them, "
+                "and run the same command again, with a new budget"
             )
 
     def take_in(self, frame: Exposed, saved: Saved, under_way: Sequence[Exposed]) -> None:
-        """Journal a verdict; `under_way`: the frames behind it, whose verdicts are not known."""
+        """Record a verdict; `under_way`: later frames without a verdict."""
         job, step, judgement = self._job, frame.step, saved.judgement
         job.on_disk(
             lambda: job.session.journal.commit(
@@ -484,15 +462,17 @@ class Verdicts:
         )
         if saved.preview_fault and not self._lacks_previews:
             self._lacks_previews = True
-            job.retry.report("preview", f"{saved.preview_fault}; frames count without, and more is not said of it")
+            job.retry.report(
+                "preview", f"{saved.preview_fault}; frames are accepted without, later faults not reported"
+            )
         voided = self._voided_ahead.pop(frame.number, "")
         if judgement.accepted and voided:
             job.queue.withdraw(step)
             self._void((frame.number,), voided)
         elif judgement.accepted:
             job.queue.accept(step)
-            for what, sentence in _followed_changes(step, judgement, job.session.steps, job.settings.judge):
-                job.retry.report(what, sentence)
+            for event, sentence in _accepted_changes(step, judgement, job.session.steps, job.settings.judge):
+                job.retry.report(event, sentence)
             job.retry.accepted()
             self._lasting.accepted(step, frame.changed)
         else:
@@ -507,61 +487,61 @@ class Verdicts:
             self._unused_bytes = job.on_disk(lambda: job.session.journal.unused_bytes(self._last_before))
 
     def void_lost(self) -> bool:
-        """Open the steps again whose files are gone or cut since they were taken; return whether there are any."""
-        queue, found = self._job.queue, self._job.on_disk(self._job.session.lost_files)
-        lost = [frame for frame in found if not queue.is_open(frame.step)]
+        """Open the steps of deleted or truncated files again; return whether there are any."""
+        queue, files = self._job.queue, self._job.on_disk(self._job.session.lost_files)
+        lost = [frame for frame in files if not queue.is_open(frame.step)]
         if lost:
-            reason = f"{first_few([frame.file for frame in lost])}: gone or cut while the run was at work"
+            reason = f"{first_few([frame.file for frame in lost])}: deleted or truncated during the run"
             queue.void([frame.step for frame in lost], reason)
             self._void([frame.attempt for frame in lost], reason)
         return bool(lost)
 
     def _refuse(self, step: SessionStep, judgement: Judgement) -> None:
         queue = self._job.queue
-        first = judgement.lasting or (judgement.voids and step.kind in REFERENCES)
-        again = queue.refuse(step, judgement.reason, before_others=first)
-        # What would be taken again without a good reference would be voided again, all night.
-        in_vain = judgement.voids and not again
-        pauses = judgement.lasting or queue.is_stuck or self._lasting.is_probed or in_vain
-        after = "it is tried again after a pause" if pauses else "it is left for the next run"
-        then = "it is taken again" if again else after
+        # A reference that voids other frames is repeated before them, to show whether the cause has gone.
+        is_first = judgement.lasting or (judgement.voids and step.kind in REFERENCES)
+        is_repeated = queue.refuse(step, judgement.reason, before_others=is_first)
+        # Without a good reference, repeated frames would be voided again, all night.
+        in_vain = judgement.voids and not is_repeated
+        pauses = judgement.lasting or queue.is_stuck or self._lasting.is_testing or in_vain
+        follow_up = "repeated after a pause" if pauses else "left for the next run"
         sentence = f"{step_name(step)}: {judgement.reason}"
-        self._job.retry.report("refused", f"{sentence} ({then})")
+        self._job.retry.report("refused", f"{sentence} ({'repeated now' if is_repeated else follow_up})")
         if pauses:
-            self._lasting.found(sentence, step)
+            self._lasting.note(sentence, step)
 
-    def _void_since_reference(self, refused: Exposed, why: str, under_way: Sequence[Exposed]) -> None:
-        """Void what was taken since the last good reference of the refused one's kind, frames under way included.
+    def _void_since_reference(self, refused: Exposed, cause: str, under_way: Sequence[Exposed]) -> None:
+        """Void all frames since the last good reference of this kind, frames without a verdict included.
 
-        A reference of another kind stays that was taken beside the good one, before any light.
+        References of another kind next to the good one, before any illuminant, stay valid.
         """
-        queue, kind = self._job.queue, refused.step.kind
-        reason = f"taken between a good reference and {step_name(refused.step)}, which was refused: {why}"
+        queue, reference_kind = self._job.queue, refused.step.kind
+        reason = f"taken between a good reference and {step_name(refused.step)}, which was refused: {cause}"
         since: dict[int, int] = {}
         for attempt in self._job.session.journal.attempts():
             if attempt.verdict == ACCEPTED and attempt.id < refused.number:
-                if attempt.kind == kind:
+                if attempt.kind == reference_kind:
                     since.clear()
                 elif since or attempt.kind not in REFERENCES:
                     since[attempt.id] = attempt.step
         queue.void(since.values(), reason)
         if queue.is_stuck:
-            self._lasting.found(reason, None)
+            self._lasting.note(reason, None)
         self._void(since, reason)
         self._void_ahead(under_way, reason)
 
-    def _void_first_frames(self, refused: Exposed, why: str, under_way: Sequence[Exposed]) -> None:
-        """Void what this run has taken, since its last pause for something lasting: by that others are judged."""
-        reason = f"the first frames contradict {step_name(refused.step)}: {why}"
+    def _void_first_frames(self, refused: Exposed, cause: str, under_way: Sequence[Exposed]) -> None:
+        """Void all frames of this run since its last pause for a lasting cause: the model depends on them."""
+        reason = f"the first frames contradict {step_name(refused.step)}: {cause}"
         since = {
             attempt.id: attempt.step
             for attempt in self._job.session.journal.attempts()
             if attempt.verdict == ACCEPTED and self._lasting.last_before < attempt.id < refused.number
         }
         self._void(since, reason)
-        # The refused one, and what is under way, are taken again in their places among them.
-        again = {refused.step.number, *since.values(), *(frame.step.number for frame in under_way)}
-        self._job.queue.begin_with(step for step in self._job.session.steps if step.number in again)
+        # The refused frame and frames without a verdict are repeated with them, in the order of the plan.
+        numbers = {refused.step.number, *since.values(), *(frame.step.number for frame in under_way)}
+        self._job.queue.begin_with(step for step in self._job.session.steps if step.number in numbers)
         self._void_ahead(under_way, reason)
 
     def _void_ahead(self, under_way: Sequence[Exposed], reason: str) -> None:
@@ -570,19 +550,18 @@ class Verdicts:
     def _void(self, attempts: Collection[int], reason: str) -> None:
         if not attempts:
             return
-        now = self._job.devices.clock.now()
-        self._job.on_disk(lambda: self._job.session.journal.void(tuple(attempts), now, reason))
-        self._job.retry.report("voided", f"{counted(len(attempts), 'frame')}, to be taken again: {reason}")
+        moment = self._job.devices.clock.now()
+        self._job.on_disk(lambda: self._job.session.journal.void(tuple(attempts), moment, reason))
+        self._job.retry.report("voided", f"{counted(len(attempts), 'frame')} voided and repeated: {reason}")
 
 
 class LastingCause:
-    """What would refuse every frame: waited for, and tried again at growing intervals until it is seen to be over.
+    """A cause that would refuse every frame: the run waits, and repeats frames at growing intervals until it has gone.
 
-    A picture that is always late shows the right light where a frame is taken twice in a row. So that it is over is
-    shown by a light that follows another one, or by all frames that were taken to find out, of which one follows
-    another light.
+    A picture that is always late shows the right illuminant if it is shown twice in a row. The cause has therefore
+    gone after an accepted change of the illuminant, or after all test frames, one of which changes it.
 
-    - `last_before`: the newest attempt from before the run, or from before its last pause for something lasting.
+    - `last_before`: newest attempt before the run, or before its last pause for a lasting cause.
     """
 
     def __init__(self, job: Job) -> None:
@@ -590,29 +569,29 @@ class LastingCause:
         self.last_before = max((attempt.id for attempt in job.session.journal.attempts()), default=0)
         self._sentence = ""
         self._step: SessionStep | None = None
-        self._probing: Pause | None = None
+        self._testing: Pause | None = None
         self._to_show: set[int] = set()
         self._is_changing = False
 
     @property
-    def is_found(self) -> bool:
+    def must_wait(self) -> bool:
         """Whether the run must wait before its next frame."""
         return bool(self._sentence)
 
     @property
-    def is_probed(self) -> bool:
-        """Whether it was waited for, and the frames have not shown yet that it is over."""
-        return self._probing is not None
+    def is_testing(self) -> bool:
+        """Whether frames are testing, after a wait, if the cause has gone."""
+        return self._testing is not None
 
-    def found(self, sentence: str, step: SessionStep | None) -> None:
-        """Note the cause, and the step whose frame it refused; None where it voided those of others."""
+    def note(self, sentence: str, step: SessionStep | None) -> None:
+        """Note the cause, and the refused step; None if it voided frames of others."""
         self._sentence, self._step = sentence, step
 
     def wait(self) -> None:
-        """Let time pass for somebody to remove the cause, then let the frames be tried again."""
+        """Wait, so that somebody can remove the cause, then open the steps again."""
         fault, self._sentence = QualityError(self._sentence), ""
-        self._probing = self._probing or self._job.retry.pause(FRAMES)
-        self._probing.back_off(fault)
+        self._testing = self._testing or self._job.retry.pause(FRAMES)
+        self._testing.back_off(fault)
         self._job.queue.retry()
         self._to_show, self._is_changing = set(), False
         if self._step is not None:
@@ -621,9 +600,9 @@ class LastingCause:
                 self._link()
 
     def accepted(self, step: SessionStep, changed: bool) -> None:
-        """Note an accepted frame, which may show that the cause is gone; `changed`: see `Exposed`.
+        """Note an accepted frame, which may show that the cause has gone; `changed`: see `Exposed`.
 
-        A dark frame is accepted where no light reaches the chart, too.
+        A dark frame is no evidence: it is also accepted if no light reaches the chart.
         """
         self._to_show.discard(step.number)
         self._is_changing |= changed and step.kind != "dark"
@@ -631,13 +610,13 @@ class LastingCause:
             self.over()
 
     def over(self) -> None:
-        """Let the run go on as before the cause was found."""
-        if self._probing is not None:
-            self._probing.over()
-            self._probing = None
+        """End the pause."""
+        if self._testing is not None:
+            self._testing.over()
+            self._testing = None
 
     def _link(self) -> None:
-        """Take the frames first that link what follows to what was taken: what lasted may have changed for good."""
+        # The cause may have changed chart, camera or lamp.
         job = self._job
         attempts = job.on_disk(job.session.journal.attempts)
         if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
@@ -645,62 +624,64 @@ class LastingCause:
             job.queue.begin_with(step for step in job.session.steps if step.number in numbers)
             self._to_show.update(numbers)
         self.last_before = attempts[-1].id
-        # Every file that was handed over is judged: a wait begins with that.
+        # All files have been judged before the wait.
         if isinstance(job.judge, OutlastsPauses):
             job.judge.after_pause()
 
 
-def _followed_changes(
+def _accepted_changes(
     step: SessionStep, judgement: Judgement, steps: Sequence[SessionStep], judge: JudgeSettings
 ) -> list[tuple[str, str]]:
-    """Return what is said of changes that a run follows, and of light that every frame has: words, and sentences."""
+    """Return events and sentences about accepted changes, and about light in all frames."""
     values = {check.name: check.value for check in judgement.checks if check.value is not None}
-    said: list[tuple[str, str]] = []
+    events: list[tuple[str, str]] = []
     moved_px = values.get("movement", 0.0)
     if moved_px > judge.moved_px:
         sentence = (
-            f"{step_name(step)}: the chart lies {moved_px:.2f} px from where it was; the run goes on with its new "
-            "place, and build-lut follows it with a remark. Fix camera and print; to have all lights of one place, "
-            "begin a new session"
+            f"{step_name(step)}: the chart has moved by {moved_px:.2f} px, at most {judge.moved_px:g} px expected; the "
+            "run continues at the new position, and build-lut shifts its grid with a remark. Fasten camera and chart; "
+            "for one position in all frames, start a new session"
         )
-        said.append(("moved", sentence))
+        events.append(("moved", sentence))
     percent = values.get(OFF_BRIGHTNESS.name, 0.0)
-    # A step of the lamp that was shown twice is beyond its limit. Frames that link runs have wide limits.
+    # An accepted step of the lamp is beyond its limit. Frames that connect runs have wide limits.
     stepped = any(check.name == OFF_BRIGHTNESS.name and check.is_beyond for check in judgement.checks)
-    links = step.kind == "response" and any(one.kind == "light" and one.number < step.number for one in steps)
+    links = step.kind == "response" and any(lit.kind == "light" and lit.number < step.number for lit in steps)
     if stepped or (links and abs(percent) > judge.drift_percent):
-        more = "stronger" if percent > 0 else "weaker"
+        sign = "stronger" if percent > 0 else "weaker"
         sentence = (
-            f"{step_name(step)}: the light is {abs(percent):.1f} % {more} than in the frames before; the run goes "
-            "on at the new level, and build-lut follows it by the white frames"
+            f"{step_name(step)}: the light is {abs(percent):.1f} % {sign} than in the previous frames; the run "
+            "continues at the new level, which build-lut takes from the white frames"
         )
-        said.append(("level", sentence))
+        events.append(("level", sentence))
     room_percent = values.get(LEAK_SHARE.name, 0.0)
-    if room_percent > ROOM_LIGHT_PERCENT and step.number == min(one.number for one in steps if one.kind == step.kind):
+    if room_percent > ROOM_LIGHT_PERCENT and step.number == min(row.number for row in steps if row.kind == step.kind):
         sentence = (
-            f"{step_name(step)}: black has {room_percent:.1f} % of white, {ROOM_LIGHT_PERCENT:g} % expected; every "
-            "light has it. Switch off what shines in the room; build-lut remarks on it, --subtract-dark takes it out"
+            f"{step_name(step)}: black has {room_percent:.1f} % of white, at most {ROOM_LIGHT_PERCENT:g} % expected; "
+            "switch off other lamps. Otherwise build-lut adds a remark, and --subtract-dark subtracts this light"
         )
-        said.append((DOUBT, sentence))
-    return said
+        events.append((DOUBT, sentence))
+    return events
 
 
-# Steps given up one after another after which going on makes no sense: something lasting is wrong. One may be chance,
-# and two neighbours may share a cause that passes.
+# Consecutive steps without a usable frame that end the normal run: there must be a lasting cause. One may be chance,
+# and two neighbours may share a passing cause.
 GIVEN_UP_IN_A_ROW = 3
 
 
 class StepQueue:
-    """The steps of a session that are still to be taken in this run.
+    """The steps of a session that this run has to take, in the order of the plan.
 
-    `append`: given a reference's kind, puts one behind the plan and returns it.
-    `reference_every`: lights that are taken in a row without references between them; None: as many as the plan has.
+    A refused step is therefore repeated before later ones.
+
+    `append`: adds a reference of a kind to the end of the plan and returns it. `reference_every`: illuminants in a row
+    without a reference between them; None for any number.
     """
 
     def __init__(
         self,
         steps: Sequence[SessionStep],
-        done: Collection[int],
+        done_numbers: Collection[int],
         attempts: int,
         append: Callable[[FrameKind], SessionStep],
         first: Iterable[int] = (),
@@ -710,7 +691,7 @@ class StepQueue:
         self._steps = {step.number: step for step in steps}
         self._first = list(first)
         self._probes: list[int] = []
-        self._open = {step.number for step in steps if step.number not in done} | set(self._first)
+        self._open = {step.number for step in steps if step.number not in done_numbers} | set(self._first)
         self._attempts = attempts
         self._tries: Counter[int] = Counter()
         self._under_way: set[int] = set()
@@ -718,53 +699,53 @@ class StepQueue:
         self._in_a_row = 0
         self._unclosed: set[str] = set(unclosed)
         self._append = append
-        planned = {step.kind for step in steps}
-        self._closing: list[FrameKind] = [kind for kind in REFERENCES if kind in planned]
+        planned_kinds = {step.kind for step in steps}
+        self._closing: list[FrameKind] = [reference for reference in REFERENCES if reference in planned_kinds]
         self._reference_every = reference_every
         self._lights_since = dict.fromkeys(self._closing, 0)
 
     def __len__(self) -> int:
-        """Return how many steps are without an accepted frame, given up or under way included."""
+        """Return the number of steps without an accepted frame, in any state."""
         return len(self._open)
 
     @property
     def given_up(self) -> tuple[str, ...]:
-        """Why steps were left for the next run, a sentence each, in the order in which they were."""
+        """For each step left for the next run, a sentence with the reason, in this order."""
         return tuple(f"{step_name(self._steps[number])}: {reason}" for number, reason in self._given_up.items())
 
     @property
     def is_stuck(self) -> bool:
-        """Whether so many steps were given up in a row that something lasting is wrong."""
+        """Whether so many steps in a row were given up that there must be a lasting cause."""
         return self._in_a_row >= GIVEN_UP_IN_A_ROW
 
     def next(self) -> SessionStep | None:
-        """Return the step to take next; None while nothing is to be taken that is not under way."""
+        """Return the next step; None if no step is open now."""
         ready = self._open - self._under_way - self._given_up.keys()
         number = next((number for number in self._first if number in ready), min(ready, default=None))
         if number is None and not self._under_way:
-            number = self._closed()
+            number = self._add_closing()
         if number is not None and self._steps[number].kind == "light":
-            number = self._between(number)
+            number = self._light_or_reference(number)
         return None if number is None else self._steps[number]
 
     def is_open(self, number: int) -> bool:
-        """Return whether a step is without an accepted frame."""
+        """Return whether a step has no accepted frame."""
         return number in self._open
 
     def begin(self, step: SessionStep) -> None:
-        """Note that an attempt at `step` begins."""
+        """Note the start of an attempt."""
         self._under_way.add(step.number)
         self._tries[step.number] += 1
 
     def withdraw(self, step: SessionStep) -> None:
-        """Note that the attempt under way came to nothing by no fault of the frame: it is no try."""
+        """Note that an attempt failed for another reason than its content: it does not count as a try."""
         self._under_way.discard(step.number)
         self._tries[step.number] -= 1
 
     def retry(self) -> None:
-        """Give the steps that were given up their tries again: somebody has had time to remove the cause.
+        """Open the given-up steps again, with all their tries.
 
-        Those that came before all others do so again: they show whether it is removed.
+        Steps that had priority have it again, because they show whether the cause has gone.
         """
         for number in self._given_up:
             self._tries[number] = 0
@@ -774,22 +755,22 @@ class StepQueue:
         self._in_a_row = 0
 
     def accept(self, step: SessionStep) -> None:
-        """Note that the attempt under way gave an accepted frame."""
+        """Note an accepted frame."""
         self._under_way.discard(step.number)
         self._open.discard(step.number)
         self._forget_first(step.number)
         if step.kind == "light":
             self._unclosed.update(REFERENCES)
-            self._lights_since = {kind: count + 1 for kind, count in self._lights_since.items()}
+            self._lights_since = {reference: count + 1 for reference, count in self._lights_since.items()}
         elif step.kind in self._lights_since:
             self._lights_since[step.kind] = 0
         self._unclosed.discard(step.kind)
-        # A dark frame is accepted where no light reaches the chart, too.
+        # A dark frame is no evidence of progress: it is also accepted if no light reaches the chart.
         if step.kind != "dark":
             self._in_a_row = 0
 
     def refuse(self, step: SessionStep, reason: str, *, before_others: bool = False) -> bool:
-        """Note that the attempt under way gave no frame that can be used; return whether the step is tried again."""
+        """Note a refused frame; return whether the step is tried again."""
         self._under_way.discard(step.number)
         self._open.add(step.number)
         if before_others and step.number not in self._first:
@@ -800,14 +781,14 @@ class StepQueue:
         return True
 
     def void(self, numbers: Iterable[int], reason: str) -> None:
-        """Open steps again whose frames cannot be trusted any more; those without a try left are given up."""
+        """Open steps with voided frames again; steps without remaining tries are given up."""
         for number in sorted(numbers):
             self._open.add(number)
             if self._tries[number] >= self._attempts:
                 self._give_up(number, reason)
 
     def begin_with(self, steps: Iterable[SessionStep]) -> None:
-        """Take steps, old or new, before all others in the order of the plan, with all their tries."""
+        """Take old or new steps before all others, in the order of the plan, with all their tries."""
         steps = sorted(steps, key=lambda step: step.number)
         numbers = [step.number for step in steps]
         self._steps |= {step.number: step for step in steps}
@@ -829,83 +810,80 @@ class StepQueue:
         if number in self._first:
             self._first.remove(number)
 
-    def _closed(self) -> int | None:
-        """Put a reference behind the plan that closes the last lights; None where none is needed."""
-        for kind in self._closing:
-            if kind in self._unclosed:
-                self._unclosed.discard(kind)
-                return self._appended(kind)
+    def _add_closing(self) -> int | None:
+        for reference in self._closing:
+            if reference in self._unclosed:
+                self._unclosed.discard(reference)
+                return self._append_reference(reference)
         return None
 
-    def _between(self, light: int) -> int:
-        """Return what is taken now where a light is next: a reference, where too many lights were taken since the last.
+    def _light_or_reference(self, light: int) -> int:
+        """Return the illuminant, or a reference if too many illuminants were taken since the last one.
 
-        References that will follow are in the plan when this returns.
+        The references that will follow are added to the plan first, so that a killed run does not look complete.
         """
-        for kind in self._closing:
-            if not any(number > light and self._steps[number].kind == kind for number in self._open):
-                self._appended(kind)
-            coming = any(self._steps[number].kind == kind for number in self._under_way)
-            if self._reference_every and self._lights_since[kind] >= self._reference_every and not coming:
-                self._lights_since[kind] = 0
-                return self._appended(kind)
+        for reference in self._closing:
+            if not any(number > light and self._steps[number].kind == reference for number in self._open):
+                self._append_reference(reference)
+            is_coming = any(self._steps[number].kind == reference for number in self._under_way)
+            if self._reference_every and self._lights_since[reference] >= self._reference_every and not is_coming:
+                self._lights_since[reference] = 0
+                return self._append_reference(reference)
         return light
 
-    def _appended(self, kind: FrameKind) -> int:
-        step = self._append(kind)
+    def _append_reference(self, reference: FrameKind) -> int:
+        step = self._append(reference)
         self._steps[step.number] = step
         self._open.add(step.number)
         return step.number
 
 
-def unclosed_kinds(taken: Iterable[str]) -> frozenset[str]:
-    """Return the kinds of references that are missing behind the last light of accepted frames in taking order."""
+def unclosed_kinds(kinds: Iterable[str]) -> frozenset[str]:
+    """Return the kinds of references missing after the last illuminant; `taken`: kinds of accepted frames in order."""
     unclosed: set[str] = set()
-    for kind in taken:
-        if kind == "light":
+    for name in kinds:
+        if name == "light":
             unclosed.update(REFERENCES)
-        unclosed.discard(kind)
+        unclosed.discard(name)
     return frozenset(unclosed)
 
 
 def step_name(step: SessionStep) -> str:
-    """Return what a sentence calls a step."""
-    return f"light {step.illumination}" if step.illumination is not None else f"{step.kind} frame {step.number}"
+    """Return the name of a step in messages."""
+    return f"illuminant {step.illumination}" if step.illumination is not None else f"{step.kind} frame {step.number}"
 
 
-def link_runs(session: Session, at: datetime) -> tuple[int, ...]:
-    """Put the frames that link this run to those before into the plan, `at` a moment; return their steps' numbers.
+def link_runs(session: Session, moment: datetime) -> tuple[int, ...]:
+    """Add the frames to the plan that connect this run to the earlier ones; return the numbers of their steps.
 
-    They are some by which the projector is known, so that a chart, a camera or a lamp that changed between the runs is
-    seen before the first light is taken.
-
-    A set that an earlier run left unfinished is voided and taken again: the chart may have been moved since. Nothing is
-    added where nothing was taken yet, or the session does not know its projector by frames of its primaries.
+    They show changes of chart, camera or lamp before the first illuminant. A set that an earlier run did not finish is
+    voided and repeated, because the chart may have been moved since. Nothing is added to a session without frames, or
+    without frames of the primaries.
     """
-    taken = [attempt for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
-    if not taken or all(step.kind != "response" for step in session.steps):
+    accepted = [attempt for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
+    if not accepted or all(step.kind != "response" for step in session.steps):
         return ()
     links = link_steps(session.steps[-1].number + 1)
-    unfinished = _unfinished(session.steps[-len(links) :], links, taken)
+    unfinished = _unfinished(session.steps[-len(links) :], links, accepted)
     if not unfinished:
-        return _added(session, links)
+        return _add_steps(session, links)
     numbers = tuple(step.number for step in unfinished)
-    again = [attempt.id for attempt in taken if attempt.step in numbers]
-    session.journal.void(again, at, "the frames that link runs are taken again, all of them")
+    unfinished_attempts = [attempt.id for attempt in accepted if attempt.step in numbers]
+    session.journal.void(unfinished_attempts, moment, "all frames that connect two runs are repeated")
     return numbers
 
 
-def _added(session: Session, steps: Sequence[SessionStep]) -> tuple[int, ...]:
+def _add_steps(session: Session, steps: Sequence[SessionStep]) -> tuple[int, ...]:
     session.add_steps(steps)
     return tuple(step.number for step in steps)
 
 
 def _unfinished(
-    tail: Sequence[SessionStep], links: Sequence[SessionStep], taken: Sequence[Attempt]
+    tail: Sequence[SessionStep], links: Sequence[SessionStep], accepted: Sequence[Attempt]
 ) -> Sequence[SessionStep]:
-    """Return the last steps of the plan where they are links behind which nothing was taken; else nothing."""
+    """Return the last steps of the plan if they connect runs and nothing was taken after them; else nothing."""
     if [(step.kind, step.colour) for step in tail] != [(step.kind, step.colour) for step in links]:
         return ()
     numbers = {step.number for step in tail}
-    done = {attempt.step for attempt in taken if attempt.step in numbers}
-    return tail if not done or taken[-1].step in numbers else ()
+    accepted_steps = {attempt.step for attempt in accepted if attempt.step in numbers}
+    return tail if not accepted_steps or accepted[-1].step in numbers else ()

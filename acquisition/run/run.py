@@ -1,22 +1,7 @@
-"""From LAB.toml to a session on disk: creates it or takes it up, opens the rig, and takes every frame that is open.
+"""Take a session from LAB.toml: create or resume it, open the rig, take all open frames, and send notices.
 
-The first part tells others of a run: the terminal, a command, a URL, systemd, a dead man's switch. No frame waits for
-them; docs/how-to/night-run.md says what they get.
-
-Rules that hold inside for a session that is taken up:
-
-- Files are held against their hashes before a device is opened: what is damaged is taken again.
-- A session has one camera and one projector: a table of two sensors, even of the same model, is a table of none, and
-  nothing in the frames says so. There is no option to go on with another one.
-
-For telling:
-
-- Telling takes no time: a thread of its own delivers, one notice after another, each within `LIMIT_S`.
-- A notice that cannot be delivered hurts nobody: what failed is said once, by the thread that tells.
-- Of the target nothing is said but a URL's scheme and host, or a program's name: the rest may be a secret. Errors of
-  libraries, whose text may hold it, are told by their number or kind.
-- Signs of life (`Life`) come from the steps of the run itself, a frame, a try in a pause: a run that hangs gives none,
-  and its silence tells that it hangs.
+Notices go to the terminal, a command, a URL, systemd and a dead man's switch (docs/how-to/night-run.md). A thread of
+its own delivers them, so that no frame waits. A notice that cannot be delivered is reported once.
 """
 
 from __future__ import annotations
@@ -84,18 +69,17 @@ from foundation.errors import CropError, DeviceRefused, InputError, StorageError
 from foundation.secret_texts import is_webhook, target_label
 from foundation.version import software
 
-LIMIT_S: Final = 20.0  # How long a receiver may take; a message to a telephone takes seconds
-ENDING_S: Final = 2.0  # How much longer the end waits for the last one, so that a receiver that is too slow is named
-# Between two notices of a pause for the same cause: whoever was told once in the hour, and did not come, is not woken
-# by each time that it comes and goes.
+LIMIT_S: Final = 20.0  # time for a receiver to accept a notice, s; a message to a telephone takes seconds
+ENDING_S: Final = 2.0  # additional time for the last notice, s, so that a slow receiver is reported by name
+# Interval between two notices of pauses with the same cause, s: more notices would not bring anybody sooner.
 QUIET_S: Final = 3600.0
-QUEUED: Final = 100  # Notices that may wait for a slow receiver; more are dropped
+QUEUED: Final = 100  # notices that can wait for a slow receiver; more are dropped
 
 
 class Notices:
-    """Tells a target what happens; close it at the end, which waits for what was told, for `LIMIT_S` at most.
+    """Sends events to a target; `close` waits up to `LIMIT_S` for the last.
 
-    `target`: a URL or a command line; empty: nobody is told.
+    `target`: a URL or a command line; empty for none.
     """
 
     def __init__(self, target: str, session: str, warn: Callable[[str], object] = lambda sentence: None) -> None:
@@ -104,14 +88,14 @@ class Notices:
         self._warn = warn
         self._waiting: queue.Queue[tuple[str, str, bytes] | None] = queue.Queue(QUEUED)
         self._failed: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
         self._closed = False
         self._thread = threading.Thread(target=self._deliver_all, name="notices", daemon=True)
         if target:
             self._thread.start()
 
     def tell(self, event: str, message: str, at: datetime) -> None:
-        """Tell what happens; returns at once."""
+        """Send an event; returns at once."""
         if not self._target:
             return
         text = f"{self._session}: {event}: {message}"
@@ -130,37 +114,38 @@ class Notices:
         self.say_failures()
 
     def close(self) -> None:
-        """Wait until all was delivered, or for `LIMIT_S` and a little; a second call does nothing."""
+        """Wait until all notices are delivered, at most for `LIMIT_S` and `ENDING_S`; a second call does nothing."""
         if self._thread.is_alive() and not self._closed:
             until = time.monotonic() + LIMIT_S + ENDING_S
             with suppress(queue.Full):
                 self._waiting.put(None, timeout=LIMIT_S)
             self._thread.join(max(until - time.monotonic(), 0))
             if self._thread.is_alive():
-                self._failed.put(f"{target_label(self._target)} was not told all before the end")
+                self._failed.put(f"{target_label(self._target)} did not receive all notices before the end")
         self._closed = True
         self.say_failures()
 
     def say_failures(self) -> None:
-        """Say what could not be delivered meanwhile; from the thread that tells, as often as it likes."""
+        """Report notices that could not be delivered; called by the thread of the run."""
         while not self._failed.empty():
             sentence = self._failed.get()
-            # A receiver that is gone stays gone for the night: once is enough.
-            if sentence not in self._said:
-                self._said.add(sentence)
+            # A receiver that is out of reach usually stays so: each failure is reported once.
+            if sentence not in self._reported:
+                self._reported.add(sentence)
                 self._warn(sentence)
 
     def _deliver_all(self) -> None:
         while (notice := self._waiting.get()) is not None:
-            why = self._posted(*notice) if is_webhook(self._target) else self._run(*notice)
-            if why:
-                self._failed.put(f"{target_label(self._target)} could not be told: {why}; the run goes on without")
+            failure = self._posted(*notice) if is_webhook(self._target) else self._run(*notice)
+            if failure:
+                # Only scheme and host, or the program, are named: the rest of the target may be a secret.
+                label = target_label(self._target)
+                self._failed.put(f"{label} did not receive a notice: {failure}; the run continues without it")
 
     def _run(self, event: str, message: str, body: bytes) -> str:
-        """Run the command; return why it failed, empty if it did not."""
         variables = {"CROP_EVENT": event, "CROP_MESSAGE": message, "CROP_SESSION": self._session}
         try:
-            # In a group of its own: Ctrl-C is not for it, and what it starts ends with it.
+            # In its own process group: Ctrl-C does not reach it, and its child processes can be ended with it.
             process = subprocess.Popen(
                 shlex.split(self._target),
                 stdin=subprocess.PIPE,
@@ -181,24 +166,21 @@ class Notices:
         return f"it ended with {process.returncode}, 0 expected" if process.returncode else ""
 
     def _posted(self, event: str, message: str, body: bytes) -> str:
-        """Post to the URL; return why it failed, empty if it did not."""
-        parts = urlsplit(self._target)
+        url = urlsplit(self._target)
         headers = {"Content-Type": "application/json; charset=utf-8", "User-Agent": "CroP"}
         if event.isascii():
             headers["Title"] = f"CroP: {event}"
-        if parts.username is not None:
-            word = f"{unquote(parts.username)}:{unquote(parts.password or '')}".encode()
-            headers["Authorization"] = f"Basic {base64.b64encode(word).decode()}"
-        bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2], fragment=""))
-        return _post(bare, body, headers)
+        if url.username is not None:
+            credentials = f"{unquote(url.username)}:{unquote(url.password or '')}".encode()
+            headers["Authorization"] = f"Basic {base64.b64encode(credentials).decode()}"
+        bare_url = urlunsplit(url._replace(netloc=url.netloc.rpartition("@")[2], fragment=""))
+        return _post(bare_url, body, headers)
 
 
 def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
-    """Post to a URL without user name; return why it failed, empty if it did not."""
-    # They cost a thirtieth of a second, which every command would pay.
 
     class Unredirected(urllib.request.HTTPRedirectHandler):
-        """Follows no redirection: the body would be lost on the way, and the answer be a success."""
+        """Follows no redirection, which would lose the body and still return success."""
 
         def redirect_request(self, req: object, fp: object, code: int, msg: str, headers: object, newurl: str) -> None:
             return None
@@ -207,6 +189,7 @@ def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
     try:
         with urllib.request.build_opener(Unredirected).open(request, timeout=LIMIT_S):
             return ""
+    # Texts of library errors may contain the secret address: only their number or kind is reported.
     except urllib.error.HTTPError as error:
         error.close()
         return f"it answered {error.code}"
@@ -217,9 +200,9 @@ def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
 
 
 class PauseNotices:
-    """Tells of pauses: of one for the same cause once in `QUIET_S`, of the end of one that was told.
+    """Sends notices of pauses: one per cause in `QUIET_S`, and the end of a reported pause.
 
-    `tell`: takes an event and its sentence.
+    `tell`: receives an event and a sentence.
     """
 
     def __init__(self, tell: Callable[[str, str], object], clock: Clock) -> None:
@@ -228,52 +211,50 @@ class PauseNotices:
         self._is_told = False
 
     def paused(self, sentence: str) -> None:
-        """Note a pause as it begins, or as it lasts: one that began too early to be told is told later."""
+        """Note a pause at its start, and repeatedly during it: a notice held back by `QUIET_S` is sent later."""
         if self._is_told:
             return
-        cause, now = pause_cause(sentence), self._clock.monotonic()
-        if now - self._told_at.get(cause, -math.inf) >= QUIET_S:
-            self._told_at[cause] = now
+        cause, now_s = pause_cause(sentence), self._clock.monotonic()
+        if now_s - self._told_at.get(cause, -math.inf) >= QUIET_S:
+            self._told_at[cause] = now_s
             self._is_told = True
             self._tell("paused", sentence)
 
     def resumed(self, sentence: str) -> None:
-        """Note that the pause is over."""
+        """Note the end of the pause."""
         if self._is_told:
             self._is_told = False
             self._tell("resumed", sentence)
 
 
-# Checks that the line about the last frame has, as far as they have a number.
+# Checks in the line about the last frame, if they have a value.
 SHOWN = (
     OFF_CODES_DEG.name, "movement", "blur", WHITE_DRIFT.name,
     LEAK_SHARE.name, STRAY_SHARE.name, DARK_DRIFT.name, "exposure",
 )  # fmt: skip
 
 
-def verdict_line(taken: Taken) -> str:
-    """Return what is said of the last frame in a line: its verdict, and numbers with their units."""
-    checks = [check for check in taken.judgement.checks if check.name in SHOWN and check.value is not None]
+def verdict_line(frame: Taken) -> str:
+    """Return verdict and measured values of a frame in one line."""
+    checks = [check for check in frame.judgement.checks if check.name in SHOWN and check.value is not None]
     numbers = map(_number_text, sorted(checks, key=lambda check: SHOWN.index(check.name)))
-    said = "accepted" if taken.judgement.accepted else "refused"
-    return ", ".join([f"{step_name(taken.step)} {said}", *numbers])
+    verdict = "accepted" if frame.judgement.accepted else "refused"
+    return ", ".join([f"{step_name(frame.step)} {verdict}", *numbers])
 
 
 def _number_text(check: Check) -> str:
-    """Return a check's name and number, as in ``off_codes_deg 0.21°``."""
     unit = "" if not check.unit else check.unit if check.unit.startswith("°") else f" {check.unit}"
     return f"{check.name} {check.value:.3g}{unit}{' (beyond its limit)' if check.is_beyond else ''}"
 
 
-# Between two lines on how far a run is, where they go into a file: enough to see that it lives, and a night's
-# thousand lines can still be read.
+# Interval between two lines of progress in a file, s: short enough to show progress, long enough to be read.
 PLAIN_S: Final = 30.0
 
 
 class Terminal:
-    """Shows a run: as a bar on a terminal, else as a line now and then; use it in a `with` block.
+    """Shows a run as a progress bar on a terminal, otherwise as lines; use it in a `with` block.
 
-    `clock`: returns seconds; the machine's own unless a test has another.
+    `clock`: returns seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -284,7 +265,7 @@ class Terminal:
         self._clock = clock
         self._since: float | None = None
         self._attempts: deque[TimedAttempt] = deque(maxlen=RECENT)
-        self._said = ""
+        self._reported = ""
         self._plain = shows_progress() and not console.is_terminal
         self._plain_due = -math.inf
         self._bar = Progress(
@@ -298,71 +279,72 @@ class Terminal:
             redirect_stdout=sys.stdout.isatty(),
             disable=not shows_progress() or self._plain,
         )
-        self._task = self._bar.add_task("frames", total=None, left="", said="")
+        self._task = self._bar.add_task("frames", total=None, remaining="", said="")
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self, error_type: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._bar.live.is_started:
-            self._bar.update(self._task, left="", said="")
+            self._bar.update(self._task, remaining="", said="")
             self._bar.stop()
 
-    def progress(self, done: int, total: int) -> None:
-        """Show how many frames are done."""
-        # What is refused before there is anything to count gets no bar.
+    def progress(self, done_count: int, total: int) -> None:
+        """Show the number of accepted frames."""
+        # A run that is refused before its first frame shows no bar.
         if not self._bar.live.is_started:
             self._bar.start()
-        left_s = time_left(self._attempts, total - done)
-        left = "" if left_s is None or done == total else f"left {duration_text(left_s)}"
-        self._bar.update(self._task, completed=done, total=total, left=left)
-        self._say_plainly(", ".join(filter(None, [f"{done} of {total} frames", left, self._said])), done == total)
+        left_s = time_left(self._attempts, total - done_count)
+        left_text = "" if left_s is None or done_count == total else f"left {duration_text(left_s)}"
+        self._bar.update(self._task, completed=done_count, total=total, remaining=left_text)
+        line = ", ".join(filter(None, [f"{done_count} of {total} frames", left_text, self._reported]))
+        self._print_line(line, is_last=done_count == total)
 
-    def taken(self, taken: Taken) -> None:
-        """Show the verdict of a frame, and take its time for that of those to come."""
-        now = self._clock()
-        seconds = None if self._since is None else now - self._since
-        self._attempts.append(TimedAttempt(seconds, taken.judgement.accepted))
-        self._since = now
-        self._said = verdict_line(taken)
-        self._bar.update(self._task, said=self._said)
+    def show_frame(self, frame: Taken) -> None:
+        """Show the verdict of a frame, and update the estimate of the remaining time."""
+        now_s = self._clock()
+        seconds = None if self._since is None else now_s - self._since
+        self._attempts.append(TimedAttempt(seconds, frame.judgement.accepted))
+        self._since = now_s
+        self._reported = verdict_line(frame)
+        self._bar.update(self._task, said=self._reported)
 
     def announce(self, sentence: str) -> None:
-        """Print a line that stays."""
+        """Print a permanent line."""
         _print(sentence)
 
     def state(self, sentence: str) -> None:
-        """Show what the run waits for until the next frame; the time until then is no frame's."""
+        """Show the reason of a wait until the next frame; this time does not count as a frame's time."""
         self._since = None
-        self._bar.update(self._task, said=sentence, left="")
-        self._say_plainly(sentence)
+        self._bar.update(self._task, said=sentence, remaining="")
+        self._print_line(sentence)
 
-    def _say_plainly(self, line: str, at_once: bool = False) -> None:
-        """Print a line with the time of day where there is no bar, not more often than each `PLAIN_S`."""
-        now = self._clock()
-        if self._plain and (at_once or now >= self._plain_due):
-            self._plain_due = now + PLAIN_S
+    def _print_line(self, line: str, is_last: bool = False) -> None:
+        """Print a line with the time of day if there is no bar, at most every `PLAIN_S`."""
+        now_s = self._clock()
+        if self._plain and (is_last or now_s >= self._plain_due):
+            self._plain_due = now_s + PLAIN_S
             _print(f"{datetime.now().astimezone():%H:%M:%S} {line}")
 
 
 def _print(line: str) -> None:
-    # A log on a disk that is full for a while ends no run: the journal has what counts.
+    # A log on a full disk must not end the run: the journal has all important events.
     with suppress(OSError):
         print(line, file=sys.stderr)
 
 
-ALIVE_S: Final = 60.0  # Between two signs to a dead man's switch: services of that kind count minutes
+ALIVE_S: Final = 60.0  # interval between two signs to a dead man's switch, s: such services count minutes
 
-# Of the watchdog's time, between two signs at least: sd_watchdog_enabled(3) recommends half of it at most.
+# Share of the watchdog's time between two signs: sd_watchdog_enabled(3) recommends at most half.
 WATCHDOG_SHARE: Final = 0.25
 
 
 class Life:
-    """Gives signs of life of a run; close it at the end.
+    """Sends signs of life from the steps of a run, so that a hanging run sends none; close it at the end.
 
-    `target`: the dead man's switch, a URL or a command; empty: none. `environment`: what a service manager has set.
+    `target`: dead man's switch, a URL or a command; empty for none. `environment`: variables set by a service manager.
     """
 
     def __init__(
@@ -380,32 +362,32 @@ class Life:
         self._told = self._fed = -math.inf
 
     def ready(self) -> None:
-        """Tell that devices and session are open, and the run is at work."""
+        """Report that devices and session are open."""
         self._to_manager("READY=1")
         self.sign("at work")
 
     def sign(self, doing: str) -> None:
-        """Tell what the run does now, as often as is wanted."""
-        now = self._clock.monotonic()
-        if now - self._fed >= self._watchdog_s * WATCHDOG_SHARE:
-            self._fed = now
+        """Report the current activity; may be called at any rate."""
+        now_s = self._clock.monotonic()
+        if now_s - self._fed >= self._watchdog_s * WATCHDOG_SHARE:
+            self._fed = now_s
             self._to_manager(f"WATCHDOG=1\nSTATUS={' '.join(doing.split())}")
-        if now - self._told >= ALIVE_S:
-            self._told = now
+        if now_s - self._told >= ALIVE_S:
+            self._told = now_s
             self._notices.tell("alive", doing, datetime.now(UTC))
         self._notices.say_failures()
 
     def end(self, how: str, sentence: str) -> None:
-        """Tell how the run ended; nothing follows."""
+        """Report how the run ended."""
         self._to_manager(f"STOPPING=1\nSTATUS={how}: {' '.join(sentence.split())}")
         self._notices.tell(how, sentence, datetime.now(UTC))
 
     def close(self) -> None:
-        """Let what was told be delivered."""
+        """Wait for the delivery of notices."""
         self._notices.close()
 
     def _to_manager(self, text: str) -> None:
-        """Send a datagram as sd_notify(3) describes; a manager that does not take it hurts nobody."""
+        # A datagram as in sd_notify(3); errors are ignored.
         if self._manager[:1] in ("/", "@"):
             address = self._manager.replace("@", "\0", 1) if self._manager.startswith("@") else self._manager
             with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as link:
@@ -414,7 +396,7 @@ class Life:
 
 
 def _watchdog_s(environment: Mapping[str, str]) -> float:
-    """Return after how many seconds of silence this process is ended; 0 where nobody does."""
+    """Return the watchdog time of the service manager, s; 0 without a watchdog."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return 0.0
     try:
@@ -423,7 +405,7 @@ def _watchdog_s(environment: Mapping[str, str]) -> float:
         return 0.0
 
 
-# How long a camera is expected to take for its settings: a dozen messages, each with an answer that is waited for.
+# expected time for a camera to accept its settings, s: a dozen messages with answers
 CONFIGURE_S = 10.0
 
 
@@ -434,15 +416,16 @@ def run_session(
     announce: Callable[[str], object] = lambda sentence: None,
     retake: str | None = None,
     ending: EndRequest | None = None,
-    taken: Callable[[Taken], object] = lambda taken: None,
+    on_frame: Callable[[Taken], object] = lambda on_frame: None,
     state: Callable[[str], object] = lambda sentence: None,
 ) -> RunOutcome:
-    """Take the session `folder`, new or interrupted, with the rig that the settings name.
+    """Take the session `folder`, new or interrupted, with the rig of the settings.
 
-    `retake`: what to take again (`Session.retake`); nothing if None.
+    `retake`: frames to repeat (`Session.retake`); None for none.
     """
+    # Damaged files are detected before a device is opened, and taken again.
     with ExitStack() as at_last, ExitStack() as opened:
-        session = opened.enter_context(_taken_up(settings, folder, announce)) if session_exists(folder) else None
+        session = opened.enter_context(_resumed(settings, folder, announce)) if session_exists(folder) else None
         if session is None and retake is not None:
             raise nothing_to_retake(folder)
         alive = None if session is None else opened.enter_context(_signs_of(session))
@@ -450,9 +433,9 @@ def run_session(
             if retake is not None:
                 session.retake(retake)
 
-            def checking(done: int, total: int) -> None:
-                state(f"checking frame {done} of {total}")
-                alive(f"{BEGINS}; frame {done} of {total}")
+            def checking(checked: int, total: int) -> None:
+                state(f"checking frame {checked} of {total}")
+                alive(f"{BEGINS}; frame {checked} of {total}")
 
             if session.journal.accepted_files() and (damaged := session.verify(checking)):
                 announce(f"voided: {first_few(damaged, 5)}")
@@ -464,7 +447,7 @@ def run_session(
         devices = opened.enter_context(open_rig(settings, chart, session))
         require_plan(settings, folder, session, devices)
         if session is None:
-            session = opened.enter_context(_begun(settings, folder))
+            session = opened.enter_context(_created(settings, folder))
             session.journal.retry_locked(settings.sequence.patience_s, announce)
         require_same_devices(session, devices, settings)
         if note := clock_note(session, devices.clock):
@@ -472,17 +455,17 @@ def run_session(
         first = link_runs(session, devices.clock.now())
         total = len(session.steps)
         observe(len(session.done_steps()), total)
-        # When the screen is dark and the journal at rest.
+        # Written after the screen is dark and the journal is closed.
         at_last.callback(_report, session, announce)
         sign = alive or opened.enter_context(_signs_of(session))
         sign("")
 
         def count(frame: Taken) -> None:
             sign("")
-            taken(frame)
+            on_frame(frame)
             # A reference may have been put behind the plan.
             total = len(session.steps)
-            observe(total - frame.left, total)
+            observe(total - frame.remaining, total)
 
         judge = LiveJudge(settings, session.chart, session.illuminations)
         return take_session(session, devices, settings, judge, count, announce, state, ending, first)
@@ -490,24 +473,24 @@ def run_session(
 
 @contextmanager
 def _signs_of(session: Session) -> Generator[SignOfLife]:
-    """Note how the run before ended, if it was killed, and say from now on that this one is there."""
+    """Send signs of life of this run; first note that the previous one was killed, if it was."""
     journal = session.journal
     if note := killed_note(session):
-        # The lab's clock is not open yet, and may be another than the wall's.
+        # The clock of the lab, which may differ from the computer's, is not open yet.
         journal.note(last_frame_time(journal.attempts()) or datetime.now(UTC), "killed", note)
     with signs_of_life(journal.beat, journal.run_state, TRY_S) as alive:
         yield alive
 
 
 def _report(session: Session, announce: Callable[[str], object]) -> None:
-    """Write the session's report; it is derived, so that a disk that does not take it leaves the run as it ended."""
+    # A disk error must not change the end of the run: the report can be derived again.
     try:
         write_session_report(session.folder)
     except CropError as error:
-        announce(f"report: {error}; when that is mended, acquire report {session.folder} makes it")
+        announce(f"report: {error}; then write it with acquire report {session.folder}")
 
 
-def _taken_up(settings: LabSettings, folder: Path, announce: Callable[[str], object]) -> Session:
+def _resumed(settings: LabSettings, folder: Path, announce: Callable[[str], object]) -> Session:
     session = Session.open_for_run(folder, settings.sequence.patience_s, announce)
     try:
         require_same(session, settings)
@@ -517,23 +500,24 @@ def _taken_up(settings: LabSettings, folder: Path, announce: Callable[[str], obj
     return session
 
 
-def _begun(settings: LabSettings, folder: Path) -> Session:
+def _created(settings: LabSettings, folder: Path) -> Session:
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
     try:
         return Session.create(folder, settings.to_toml(), chart, lights, planned_steps(settings, lights))
     except InputError:
-        # It was not there when this run began: another one has made it since, and frames come into it.
+        # Another run has created the folder since this one started.
         if session_exists(folder):
             raise InputError(busy_message(folder)) from None
         raise
 
 
 def require_same_devices(session: Session, devices: Devices, settings: LabSettings) -> None:
-    """Require that camera and projector are those that the session was begun with; note those of a new one."""
-    known = session.journal.records()
+    """Require the camera and the projector of the session's start; record them if the session is new."""
+    # A LUT of two sensors, even of the same model, is worthless, and the frames would not show it.
+    recorded = session.journal.records()
     body = devices.camera.identity()
-    # Its firmware may be brought up to date between two runs, and the name in a projector's menu may change.
+    # Firmware versions and the name in a projector's menu are not compared, because they may change.
     names = {"camera": f"{body.maker} {body.model}, serial number {body.serial}"}
     if devices.projector is not None:
         projector = devices.projector.identity()
@@ -541,62 +525,59 @@ def require_same_devices(session: Session, devices: Devices, settings: LabSettin
     if settings.rig == "lab":
         display = settings.lab.light.display
         names["screen"] = "display" if display is None else f"display {display}"
-    for what, name in names.items():
-        before = known.get(what, name)
-        if before != name:
+    for device, name in names.items():
+        expected = recorded.get(device, name)
+        if expected != name:
             raise DeviceRefused(
-                f"{session.folder} was begun with the {what} {before}, and now there is {name}: frames of both would "
-                "not make one table",
-                remedy=f"connect the {what} of before, or begin a new session",
+                f"the {device} is {name}, but {session.folder} was started with {expected}; frames of both cannot be "
+                "combined",
+                remedy=f"connect the first {device}, or start a new session",
                 value=name,
-                expected=before,
+                expected=expected,
             )
-    for what, name in {**names, "software": software()}.items():
-        if known.get(what) != name:
-            session.journal.record(what, name)
+    for key, name in {**names, "software": software()}.items():
+        if recorded.get(key) != name:
+            session.journal.record(key, name)
 
 
 def clock_note(session: Session, clock: Clock) -> str:
-    """Return what to say where the machine's clock is behind the session's last frame, with the remedy.
-
-    Else nothing.
-    """
+    """Return a warning if the clock of the computer is behind the last frame of the session; else ""."""
     if not isinstance(clock, SteadyClock) or not clock.behind_s:
         return ""
     return (
-        f"clock: it is {duration_text(clock.behind_s)} behind the last frame of {session.folder}, or was ahead when "
-        "that was taken; the session's time goes on from there, so that its frames stay in their order; set the "
-        "machine's clock right"
+        f"clock: the computer's clock is {duration_text(clock.behind_s)} behind the last frame of {session.folder}, or "
+        "was ahead then; the time of the session continues from this frame, so that the order of its frames is kept; "
+        "set the clock"
     )
 
 
 def killed_note(session: Session) -> str:
-    """Return what the journal is to say of the run before, if that did not end in order; else nothing."""
+    """Return the journal's note about a previous run that did not end normally; else ""."""
     beat = session.journal.heartbeat()
     if beat is None or beat.state == "ended" or beat.belongs_to(SessionPlace.of(session.journal.path)) is False:
         return ""
-    at = f"{beat.at.astimezone():%Y-%m-%d %H:%M:%S}"
-    return f"the run before gave its last sign of life at {at}, and was killed, or power was lost"
+    time = f"{beat.at.astimezone():%Y-%m-%d %H:%M:%S}"
+    return f"the previous run gave its last sign of life at {time}, then it was killed, or power was lost"
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """Why a run ended.
+    """How a run ended.
 
-    - `total`, `left`: steps of the plan, and those without an accepted frame.
-    - `refused`: why steps were left for the next run, a sentence each.
-    - `doubts`: what stopped nothing in this run and those before, and is to be seen.
+    - `total`, `left`: number of planned steps, and of steps without an accepted frame.
+    - `refused`: for each of these steps, why it was left for the next run.
+    - `doubts`: warnings of this run and earlier ones that stopped nothing.
     """
 
     total: int
-    left: int
+    remaining: int
     refused: tuple[str, ...]
     doubts: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:
-        """Whether every step has its frame."""
-        return self.left == 0
+        """Whether every step has an accepted frame."""
+        return self.remaining == 0
 
 
 def take_session(
@@ -604,7 +585,7 @@ def take_session(
     devices: Devices,
     settings: LabSettings,
     judge: FrameJudge | None = None,
-    observe: Callable[[Taken], object] = lambda taken: None,
+    observe: Callable[[Taken], object] = lambda on_frame: None,
     announce: Callable[[str], object] = lambda sentence: None,
     state: Callable[[str], object] = lambda sentence: None,
     ending: EndRequest | None = None,
@@ -612,55 +593,58 @@ def take_session(
 ) -> RunOutcome:
     """Take every step of the session's plan that has no accepted frame yet.
 
-    `judge`: looks at every frame; None looks at its exposure alone. `state`: called every few seconds of a wait with
-    what is waited for and how long; the newest holds. `ending`: by which the run learns that it is to end after the
-    running frame; None for a run that nobody asks. `first`: numbers of steps that are taken before all others.
+    - `judge`: judges every frame; None to judge only its exposure.
+    - `observe`: receives every frame.
+    - `announce`: receives the sentences of events.
+    - `state`: receives every few seconds the reason and the duration of a wait.
+    - `ending`: request to end after the current frame; None if nobody can request it.
+    - `first`: numbers of steps to take before all others.
     """
     sequence = settings.sequence
     reports = _Reports(session, devices.clock, announce, state, settings)
-    asked = ending or EndRequest()
+    end_request = ending or EndRequest()
     retry = RetryPolicy(
         devices.clock,
         sequence.patience_s,
         reports.tell,
         lambda: keep_awake(devices.camera),
         reports.sign_of_life,
-        asked.at_once,
+        end_request.at_once,
     )
 
     def count(frame: Taken) -> None:
-        reports.working(f"{len(session.steps) - frame.left} of {len(session.steps)} frames")
+        reports.working(f"{len(session.steps) - frame.remaining} of {len(session.steps)} frames")
         observe(frame)
 
     reports.ready()
     try:
         for stray in session.set_aside_strays():
-            reports.tell("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
+            reports.tell("stray", f"{stray.name}: a complete file, but not in the journal; it is not used")
         with RunWatch(reports.late) as watch:
             queue = _open_steps(session, settings, first)
             job = Job(session, devices, settings, queue, judge or ExposureJudge(settings), retry, watch)
             if len(job.queue):
                 _make_ready(job)
                 with ThreadPoolExecutor(1, "saving") as saving:
-                    Pipeline(job, saving, count, asked).run()
+                    Pipeline(job, saving, count, end_request).run()
         session.journal.require_whole()
         doubts = tuple(doubts_of(session.journal.events()))
         outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up, doubts)
-        if asked.is_requested and not outcome.complete:
+        if end_request.is_requested and not outcome.complete:
             raise KeyboardInterrupt
         leave_lab(devices, RunEnd.COMPLETE if outcome.complete else RunEnd.UNFINISHED, sequence, reports.tell)
     except BaseException as error:
         interrupted = isinstance(error, KeyboardInterrupt)
         leave_lab(devices, RunEnd.INTERRUPTED if interrupted else RunEnd.UNFINISHED, sequence, reports.tell)
-        # It is derived, and made anew at the next opening: the fault that is there counts.
+        # frames.csv is written again at the next opening: its errors must not hide this one.
         with suppress(StorageError):
             session.write_frames_csv()
         reports.end("interrupted" if interrupted else "ended", str(error) or "by the operator")
         raise
     else:
         session.write_frames_csv()
-        left = f"{outcome.left} of {outcome.total} frames left"
-        reports.end("complete" if outcome.complete else "incomplete", "; ".join([left, *outcome.refused]))
+        left_text = f"{outcome.remaining} of {outcome.total} frames left"
+        reports.end("complete" if outcome.complete else "incomplete", "; ".join([left_text, *outcome.refused]))
     finally:
         reports.close()
     return outcome
@@ -673,7 +657,7 @@ def _open_steps(session: Session, settings: LabSettings, first: Sequence[int]) -
         session.add_steps([step])
         return step
 
-    taken = [attempt.kind for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
+    accepted_kinds = [attempt.kind for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
     sequence = settings.sequence
     return StepQueue(
         session.steps,
@@ -681,7 +665,7 @@ def _open_steps(session: Session, settings: LabSettings, first: Sequence[int]) -
         sequence.attempts,
         append,
         first,
-        unclosed_kinds(taken),
+        unclosed_kinds(accepted_kinds),
         sequence.reference_every,
     )
 
@@ -697,10 +681,10 @@ def _make_ready(job: Job) -> None:
         make_ready(devices.projector, settings.sequence, job.retry)
 
 
-BEGINS = "a run begins: it looks at its frames and opens its devices"  # What a run says before it takes frames
+BEGINS = "a run begins: it looks at its frames and opens its devices"  # sign of life of a run before its first frame
 
 
-# A run's way to say that it is there, and what is waited for; with nothing, that frames are taken.
+# Reports that a run is alive, and what it waits for; "" while it takes frames.
 SignOfLife = Callable[[str], None]
 
 
@@ -708,8 +692,8 @@ SignOfLife = Callable[[str], None]
 def signs_of_life(
     beat: Callable[[RunState, str, datetime], None], newest: Callable[[], RunState | None], within_s: float
 ) -> Generator[SignOfLife]:
-    """Say that a run is there while the block runs, and in the end that it is over, and why."""
-    last, said = -math.inf, ""
+    """Send signs of life while the block runs, and in the end why it ended."""
+    last_s, reported_state = -math.inf, ""
 
     def say(state: RunState, sentence: str) -> None:
         with suppress(CropError):
@@ -721,13 +705,13 @@ def signs_of_life(
         return False
 
     def alive(waits_for: str) -> None:
-        nonlocal last, said
+        nonlocal last_s, reported_state
         state: RunState = "waiting" if waits_for else "running"
-        if time.monotonic() - last >= BEAT_S or state != said or changes(state):
-            last, said = time.monotonic(), state
+        if time.monotonic() - last_s >= BEAT_S or state != reported_state or changes(state):
+            last_s, reported_state = time.monotonic(), state
             say(state, waits_for or "frames are taken")
 
-    cause = f"ended by a mistake of the program; {AGAIN}"
+    cause = f"ended by an error in the program; {AGAIN}"
     try:
         alive(BEGINS)
         yield alive
@@ -743,7 +727,7 @@ def signs_of_life(
 
 
 class _Reports:
-    """Where words of a run go: terminal, journal, whoever is notified."""
+    """Sends events of a run to terminal, journal and the target of notices."""
 
     def __init__(
         self,
@@ -758,50 +742,50 @@ class _Reports:
         self._announce = announce
         self._state = state
         name = session.folder.name
-        self._notices = Notices(settings.sequence.notify, name, lambda why: self.doubt(f"sequence.notify: {why}"))
-        self._life = Life(settings.notify.alive, name, lambda why: self.doubt(f"notify.alive: {why}"), clock)
+        self._notices = Notices(settings.sequence.notify, name, lambda text: self.doubt(f"sequence.notify: {text}"))
+        self._life = Life(settings.notify.alive, name, lambda failure: self.doubt(f"notify.alive: {failure}"), clock)
         self._pauses = PauseNotices(self._notify, clock)
 
     def ready(self) -> None:
-        """Say that devices and session are open."""
+        """Report that devices and session are open."""
         self._life.ready()
 
     def working(self, doing: str) -> None:
-        """Say what the run does now, and what could not be told of it to others."""
+        """Report the current activity, and notices that could not be delivered."""
         self._life.sign(doing)
         self._notices.say_failures()
 
     def doubt(self, sentence: str) -> None:
-        """Tell what stops nothing and is to be seen in the morning; a disk that cannot take it is told of already."""
+        """Report a warning for the morning; errors of the disk are reported elsewhere."""
         self._announce(f"{DOUBT}: {sentence}")
         with suppress(StorageError):
             self._journal.note(self._clock.now(), DOUBT, sentence)
 
-    def tell(self, what: str, sentence: str, /) -> None:
-        """Tell what happens."""
-        self._announce(f"{what}: {sentence}")
-        if what == "paused":
+    def tell(self, event: str, sentence: str, /) -> None:
+        """Report an event."""
+        self._announce(f"{event}: {sentence}")
+        if event == "paused":
             self._pauses.paused(sentence)
-        elif what == "resumed":
+        elif event == "resumed":
             self._pauses.resumed(sentence)
-        if what != VOIDED:  # the journal notes that with the rows that it changes
-            self._journal.note(self._clock.now(), what, sentence)
+        if event != VOIDED:  # the journal notes this event together with the changed rows
+            self._journal.note(self._clock.now(), event, sentence)
 
-    def sign_of_life(self, what: str, sentence: str, within_s: float, /) -> None:
-        """Say that the run waits, and for what."""
-        doing: RunState = "paused" if what == "paused" else "waiting"
+    def sign_of_life(self, state: str, sentence: str, within_s: float, /) -> None:
+        """Report that the run waits, and for what."""
+        doing: RunState = "paused" if state == "paused" else "waiting"
         if doing == "paused":
             self._pauses.paused(sentence)
         self._state(sentence)
         self.working(f"{doing}: {sentence}")
         self._journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
 
-    def late(self, sentence: str, begun: datetime) -> None:
-        """Say, from another thread, that a step takes longer than it should: the run's own thread waits for it."""
-        thread_beat(self._journal.path, "late", sentence, begun + timedelta(seconds=TRY_S))
+    def late(self, sentence: str, started: datetime) -> None:
+        """Report a late step from another thread, while the thread of the run waits for it."""
+        thread_beat(self._journal.path, "late", sentence, started + timedelta(seconds=TRY_S))
 
     def end(self, how: str, sentence: str) -> None:
-        """Note why the run is over; a disk that cannot take that is told of already."""
+        """Note why the run ended; errors of the disk are reported elsewhere."""
         self._notify(how, sentence)
         self._life.end(how, sentence)
         with suppress(StorageError):
@@ -811,6 +795,6 @@ class _Reports:
         self._notices.tell(event, sentence, datetime.now(UTC))
 
     def close(self) -> None:
-        """Let the last notices be delivered."""
+        """Wait for the delivery of notices."""
         self._notices.close()
         self._life.close()

@@ -1,4 +1,4 @@
-"""The charts and lights of the experiment's tests are the acquisition's as well."""
+"""Charts and illuminants shared with the tests of the experiment."""
 
 from tests.calibration.lab import rendered_once
 from tests.experiment.conftest import a0, a7, plan

@@ -1,4 +1,4 @@
-"""The command `acquire chart` as a user meets it: what it writes, prints and returns."""
+"""The commands `acquire chart` and `acquire init`: files, output and exit codes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def chart(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 
 
 @pytest.mark.slow
-def test_everything_for_the_print_shop(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_writes_all_print_files(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert chart("out", "--bits", "1") == 0
     printed = capsys.readouterr()
     assert printed.err == ""
@@ -50,14 +50,14 @@ def test_everything_for_the_print_shop(chart: Run, capsys: pytest.CaptureFixture
     assert saved.seed == 1
     assert saved.sha256 == design_chart(1).sha256
     assert saved.sha256[:16] in Path("out/PRINTING.txt").read_text(encoding="utf-8")
-    # The marks in the margins do not mislead who looks for tags.
+    # The marks in the margins are not detected as tags.
     grey = tifffile.imread("out/chart.tif")[:, :, 1]
     found = Detector(families="tag36h11", nthreads=1, quad_decimate=1.0).detect(np.ascontiguousarray(grey))
     assert sorted(tag.tag_id for tag in found) == [tag.id for tag in saved.tags]
 
 
 @pytest.mark.slow
-def test_a_page_too_small_for_the_usual_cells_gets_smaller_ones(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_small_page_gets_small_patches(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert chart("out", "--bits", "2", "--page", "A8", "--no-tiff") == 0
     printed = capsys.readouterr()
     assert printed.err == "", "a camera goes nearer to a small sheet, so its cells are as large in the frame"
@@ -67,9 +67,7 @@ def test_a_page_too_small_for_the_usual_cells_gets_smaller_ones(chart: Run, caps
 
 
 @pytest.mark.slow
-def test_cells_that_a_camera_cannot_separate_are_made_and_warned_of(
-    chart: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_warns_of_small_patches(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert chart("out", "--bits", "2", "--page", "900x34", "--no-tiff") == 0
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("warning: patches of 2.12 mm are small for a camera")
@@ -79,7 +77,7 @@ def test_cells_that_a_camera_cannot_separate_are_made_and_warned_of(
 
 
 @pytest.mark.slow
-def test_the_paper_s_arrangement(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_arranges_chart_of_paper(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert chart("out", "--arrangement", "paper", "--bits", "2", "--page", "A6", "--no-tiff") == 0
     assert "64 colours, 0 tags, 10 references on 148 × 105 mm, cells of 16.47 × 11.09 mm" in capsys.readouterr().out
     assert load_chart(Path("out/chart.json")).tags == ()
@@ -93,7 +91,7 @@ def test_the_paper_s_arrangement(chart: Run, capsys: pytest.CaptureFixture[str])
         (("--page", "1e9x1e9"), "10000 mm"),
     ],
 )
-def test_what_cannot_be_printed_is_refused_in_one_line(
+def test_refuses_impossible_page(
     chart: Run, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
 ) -> None:
     assert chart("out", *arguments) == 2
@@ -112,7 +110,7 @@ def begun(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(("options", "rig"), [([], "lab"), (["--rig", "simulated"], "simulated")])
-def test_what_is_there_stays_and_the_rest_is_written(
+def test_init_keeps_existing_files(
     options: list[str], rig: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lab = begun(tmp_path / "lab")
@@ -126,7 +124,7 @@ def test_what_is_there_stays_and_the_rest_is_written(
     assert f"acquire check {lab / 'LAB.toml'}" in capsys.readouterr().out
 
 
-def test_settings_are_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_init_never_overwrites_settings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lab = begun(tmp_path)
     (lab / "LAB.toml").write_text("mine")
     assert main(["init", str(lab)]) == 2
@@ -135,7 +133,7 @@ def test_settings_are_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.slow
-def test_an_empty_folder_gets_the_whole_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_init_fills_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = list[object]()
 
     def designed(*design: object) -> Chart:

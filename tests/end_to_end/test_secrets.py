@@ -70,7 +70,7 @@ def test_no_file_of_a_session_and_its_table_holds_a_secret(
 
     settings = load_lab(lab)
     assert run_session(settings, session, look, said.append, state=said.append).complete
-    assert any("http://127.0.0.1" in sentence and "could not be told" in sentence for sentence in said)
+    assert any("http://127.0.0.1" in sentence and "did not receive" in sentence for sentence in said)
     assert command("acquisition.cli", "status", session) == 0
     assert command("acquisition.cli", "status", session, "--json") == 0
     assert command("acquisition.cli", "report", session) == 0

@@ -1,4 +1,4 @@
-// The head of the page: what is asked at three in the morning. Called from page.js, whose model it shows.
+// The head of the page: state, progress and remedy. Called from page.js, whose model it shows.
 
 function fact(name, value, bad = false) {
   return element("div", {}, element("dt", {}, name), element("dd", bad ? { class: "bad" } : {}, value));
@@ -20,13 +20,13 @@ function drawHead() {
   const facts = [];
   if (head.total) {
     facts.push(
-      fact("lights", `${head.lights_done} of ${head.lights_total}`),
+      fact("illuminants", `${head.lights_done} of ${head.lights_total}`),
       fact("frames", `${head.done} of ${head.total}`),
     );
     if (head.done < head.total)
-      facts.push(fact("time left", head.alive ? durationText(head.remaining_s) : "stands still", !head.alive));
-    if (head.eta && head.alive) facts.push(fact("done at about", timeText(head.eta)));
-    if (head.seconds_per_frame) facts.push(fact("a frame", `${short(head.seconds_per_frame)} s`));
+      facts.push(fact("time left", head.alive ? durationText(head.remaining_s) : "no run active", !head.alive));
+    if (head.eta && head.alive) facts.push(fact("complete at about", timeText(head.eta)));
+    if (head.seconds_per_frame) facts.push(fact("time per frame", `${short(head.seconds_per_frame)} s`));
     facts.push(
       fact("refused", String(head.refused), head.refused > 0),
       fact("failed", String(head.failed), head.failed > 0),
@@ -50,8 +50,8 @@ function drawBanner() {
     : head.state === "complete"
       ? "good"
       : "";
-  // The house's sentences name the fault, behind a semicolon the remedy, and in brackets at the end how long it lasts;
-  // only fault and remedy are read out, since the last changes all the time.
+  // A sentence has the form "fault; remedy (duration)". The duration is shown separately, because it changes all the
+  // time and must not be read aloud by a screen reader.
   const [, text, lasts] = (quiet ? "" : head.sentence).match(/^(.*?)(?: \(([^()]*)\))?$/s);
   const [fault, ...remedy] = text.split("; ");
   if ($("banner-text").dataset.text !== text) {
@@ -61,7 +61,7 @@ function drawBanner() {
   $("countdown").textContent = lasts ?? "";
 }
 
-/** Draw what changes with time alone: the countdown, the age of the last sign of life, and whether we are answered. */
+/** Draw the age of the last sign of life, and whether the server answers. */
 function drawClock() {
   if (embedded) return;
   const { head } = model;
@@ -80,11 +80,11 @@ function drawClock() {
   $("offline").hidden = !silent;
   if (silent)
     $("offline").textContent =
-      `acquire monitor has not answered since ${timeText(answeredAt)}: what stands here is old. ` +
-      "The run itself may well go on; look at its terminal, or start acquire monitor again.";
+      `acquire monitor has not answered since ${timeText(answeredAt)}; this page is out of date. ` +
+      "The run itself may be active: look at its terminal, or start acquire monitor again.";
 }
 
-/** Draw the tab's icon: a ring that fills, in the colour of the state. */
+/** Draw the icon of the tab: a ring for the progress, in the colour of the state. */
 function drawIcon(share) {
   const colours = { running: "#2f8fd0", complete: "#2f8fd0", waiting: "#e0a000", paused: "#e0a000", late: "#e0a000" };
   const colour = colours[model.head.state] ?? "#d9541e";

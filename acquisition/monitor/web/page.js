@@ -1,12 +1,11 @@
-// The page of a session. The state comes from state.json, or stands in the page itself (a report): nothing is asked
-// then.
+// The page of a session. A live page fetches the state from state.json; a report has it embedded.
 
-// A frame takes two seconds and more; a page that nobody sees may be later.
+// A frame takes at least 2 s; a hidden page may be updated later.
 const POLL_MS = 2000;
 const POLL_HIDDEN_MS = 10000;
-// A disk may stall for seconds before the journal can be read.
+// The disk may delay reading the journal by several seconds.
 const ANSWER_LIMIT_MS = 10000;
-// More is looked up in the journal.
+// All events are in the journal.
 const EVENTS_SHOWN = 100;
 const REFUSED_SHOWN = 12;
 const STATES = {
@@ -16,19 +15,19 @@ const STATES = {
   complete: ["■", "complete"],
   incomplete: ["■", "ended, incomplete"],
   late: ["‖", "late"],
-  silent: ["✕", "no sign"],
+  silent: ["✕", "no sign of life"],
   stopped: ["✕", "stopped"],
   copy: ["⧉", "a copy"],
   gone: ["✕", "no session"],
   unreadable: ["✕", "cannot be read"],
-  absent: ["…", "not begun"],
-  unknown: ["?", "no sign of life known"],
+  absent: ["…", "not started"],
+  unknown: ["?", "state unknown"],
 };
 const LOUD = new Set(["paused", "late", "silent", "incomplete", "stopped", "complete"]);
 const WHITE = "white, red\u00a0─ green\u00a0╌ blue\u00a0┈";
 const BLACK = "black, red\u00a0─ green\u00a0╌ blue\u00a0┈";
-const PACE = "seconds a frame";
-// Plots in the order in which an operator asks; what is not named here follows in the order of the journal.
+const PACE = "seconds per frame";
+// Plots in order of interest; other checks follow in the order of the journal.
 const PLOT_ORDER = [
   WHITE,
   "white_drift",
@@ -63,7 +62,7 @@ let sound = null;
 let drawn = { plots: [], strip: null };
 
 const now = () => Date.now() + clockOffset;
-// Local time in the form of ISO 8601, as in the report's title and in the files of a session, in whatever language.
+// Local time as in ISO 8601, as in the title of the report and the files of a session.
 const joined = (numbers, sign) => numbers.map((number) => String(number).padStart(2, "0")).join(sign);
 
 function timeText(ms) {
@@ -88,7 +87,7 @@ function durationText(seconds) {
   return minutes ? `${minutes} min ${String(rest).padStart(2, "0")} s` : `${rest} s`;
 }
 
-// State: what came is put into the model ---------------------------------------------------------------------------
+// State: changes are stored in the model ---------------------------------------------------------------------------
 
 function take(state) {
   const before = model.head;
@@ -120,22 +119,22 @@ let answeredOnce = false;
 
 const inOrder = () => [...model.frames.values()].sort((one, other) => one.id - other.id);
 const stepOf = (frame) => model.session.steps.get(frame.step);
-/** Return whether an attempt is under way: one without a verdict from before the newest start was cut off. */
+/** Return whether an attempt is active: without a verdict before the newest start it was interrupted. */
 const isOpen = (frame) => !frame.verdict && model.head.alive && frame.at >= model.begun;
 const codesText = (codes) => codes.join(" ");
 const fillOf = (codes) => `rgb(${codes.join(",")})`;
 
 function nameOf(step) {
-  if (!step) return "a frame that the plan does not name";
+  if (!step) return "a frame outside the plan";
   if (step.kind !== "light") return `${step.kind} frame ${step.number}`;
   const light = model.session.lights.get(step.light);
-  return `light ${step.light}${light && light.cct ? ` (${short(light.cct)} K)` : ""}`;
+  return `illuminant ${step.light}${light && light.cct ? ` (${short(light.cct)} K)` : ""}`;
 }
 
 /**
- * Return the frame that the page shows: the chosen one, else the newest that has a verdict.
+ * Return the frame to show: the chosen one, else the newest with a verdict.
  *
- * When nothing is taken any more that is not the dark frame with which a session ends, on which there is nothing to see.
+ * After the run, the newest lit frame is shown instead of the final dark frame.
  */
 function frameShown(frames) {
   if (chosen !== null && model.frames.has(chosen)) return model.frames.get(chosen);
@@ -156,7 +155,7 @@ function drawSession() {
   drawn.planned.clear();
   drawn.seen.clear();
   $("records").replaceChildren(
-    ...(session.records.length ? session.records : [["", "Nothing is recorded."]]).flatMap(([key, text]) => [
+    ...(session.records.length ? session.records : [["", "No records."]]).flatMap(([key, text]) => [
       element("dt", {}, key),
       element("dd", {}, text),
     ]),
@@ -196,7 +195,7 @@ function drawLight(index, frames) {
           ? "refused"
           : "planned";
   const form = light.kind === "blackbody" ? "diamond" : "circle";
-  const title = `light ${index}, ${codesText(light.codes)}${light.cct ? `, ${short(light.cct)} K` : ""}: ${state}`;
+  const title = `illuminant ${index}, ${codesText(light.codes)}${light.cct ? `, ${short(light.cct)} K` : ""}: ${state}`;
   drawn.planned.plane.mark(index, light.at, { form, state, fill: fillOf(light.codes), title });
   const seen = accepted ?? frames.findLast((frame) => frame.seen_at);
   drawn.seen.plane.mark(index, seen?.seen_at ?? null, {
@@ -207,7 +206,7 @@ function drawLight(index, frames) {
   });
 }
 
-/** Draw what the projector's primaries, as they were seen, can make: straight lines, since light adds up. */
+/** Draw the triangle of the measured primaries: mixtures lie within it, because light adds. */
 function drawReach(frames) {
   const primaries = [0, 1, 2].map((channel) =>
     frames.findLast((frame) => {
@@ -226,8 +225,8 @@ function drawWall(frames) {
   const swatch = $("swatch");
   if (!open) {
     swatch.style.background = "";
-    swatch.setAttribute("aria-label", "nothing known");
-    $("wall").replaceChildren(model.head.alive ? "Between two frames" : "Not known: nothing is being taken");
+    swatch.setAttribute("aria-label", "unknown colour");
+    $("wall").replaceChildren(model.head.alive ? "Between two frames" : "Unknown: no run is active");
     return;
   }
   swatch.style.background = fillOf(open.codes);
@@ -272,7 +271,7 @@ function drawChoice(frames) {
   drawPicture(frame);
   if (!frame) return;
   const step = stepOf(frame);
-  const verdict = frame.verdict || (isOpen(frame) ? "under way" : "cut off");
+  const verdict = frame.verdict || (isOpen(frame) ? "active" : "interrupted");
   $("frame-caption").replaceChildren(
     `${nameOf(step)}, shown as ${step ? codesText(step.codes) : "?"}, at ${dayText(frame.taken ?? frame.at)}: `,
     element("b", frame.verdict === "accepted" ? {} : { class: "bad" }, verdict),
@@ -281,20 +280,20 @@ function drawChoice(frames) {
   $("checks").tBodies[0].replaceChildren(
     ...(frame.checks ?? []).map(([name, unit, value, low, high, reason]) => {
       const beyond = value !== null && ((low !== null && value < low) || (high !== null && value > high));
-      const mark = beyond && !reason ? " beyond its limit: it follows from another cause, or is followed" : "";
-      const found = value !== null ? `${withUnit(value, unit)}${mark}` : reason ? "refused" : "no fault";
+      const mark = beyond && !reason ? " (beyond its limit, but accepted, or explained by another cause)" : "";
+      const result = value !== null ? `${withUnit(value, unit)}${mark}` : reason ? "refused" : "no fault";
       return element(
         "tr",
         reason ? { class: "bad" } : {},
         element("th", { scope: "row" }, `${reason ? "✕ " : ""}${name}`),
-        element("td", { class: "number" }, found),
+        element("td", { class: "number" }, result),
         element("td", { class: "number note" }, limitText(low, high, unit)),
       );
     }),
   );
   const timings = Object.entries(frame.timings ?? {}).map(
-    // Below a millisecond nothing was done.
-    ([what, seconds]) => `${what} ${seconds < 0.001 ? "0" : short(seconds)} s`,
+    // Less than 1 ms is shown as 0.
+    ([name, seconds]) => `${name} ${seconds < 0.001 ? "0" : short(seconds)} s`,
   );
   $("timings").textContent = timings.length ? `Time: ${timings.join(", ")}` : "";
 }
@@ -313,33 +312,33 @@ function drawPicture(frame) {
   without.textContent = !frame
     ? "No frame yet"
     : frame.preview
-      ? "Not among this report's pictures"
-      : "No picture of this frame";
+      ? "This report does not include the picture"
+      : "This frame has no picture";
   if (source === null) {
     picture.removeAttribute("src");
     return;
   }
   if (picture.getAttribute("src") !== source) picture.src = source;
-  picture.alt = `${nameOf(stepOf(frame))}: ${frame.verdict || "under way"}${frame.reason ? `, ${frame.reason}` : ""}`;
+  picture.alt = `${nameOf(stepOf(frame))}: ${frame.verdict || "active"}${frame.reason ? `, ${frame.reason}` : ""}`;
 }
 
-// Asking -----------------------------------------------------------------------------------------------------------
+// Polling -----------------------------------------------------------------------------------------------------------
 
 async function poll() {
   try {
     const limit = new AbortController();
     const timer = setTimeout(() => limit.abort(), ANSWER_LIMIT_MS);
-    const asked = fetch(`state.json?since=${encodeURIComponent(model.cursor)}`, {
+    const request = fetch(`state.json?since=${encodeURIComponent(model.cursor)}`, {
       cache: "no-store",
       signal: limit.signal,
     });
-    const answer = await asked.finally(() => clearTimeout(timer));
+    const answer = await request.finally(() => clearTimeout(timer));
     if (!answer.ok) throw new Error(`answered ${answer.status}`);
     answeredAt = Date.now();
     clockOffset = Date.parse(answer.headers.get("Date")) + 500 - answeredAt;
     if (answer.status !== 204) take(await answer.json());
   } catch (error) {
-    // Said by the page once it has lasted (drawClock); a fault of the page itself belongs in the console.
+    // A server that does not answer is reported by drawClock; other errors go to the console.
     if (!["TypeError", "AbortError"].includes(error.name) && !String(error.message).startsWith("answered"))
       console.error(error);
   }
@@ -356,34 +355,34 @@ function legend() {
   };
   $("legend").replaceChildren(
     mark("planned", "circle", "planned"),
-    mark("accepted", "circle", "taken"),
-    mark("accepted", "diamond", "taken, black body"),
+    mark("accepted", "circle", "accepted"),
+    mark("accepted", "diamond", "accepted, black body"),
     mark("shown", "circle", "on the wall"),
     mark("refused", "cross", "refused"),
   );
   $("lights-note").textContent =
-    "Each light at r = R/(R+G+B), b = B/(R+G+B), in its own colour. " +
-    "A mark out of its place in the plane of what was seen was lit by another light than ordered.";
+    "Each illuminant at r = R/(R+G+B), b = B/(R+G+B), in its own colour. " +
+    "If a mark lies at another place in the measured plane, the frame shows another illuminant than ordered.";
 }
 
 function planeIn(id, label) {
   const box = $(id);
   const plane = () =>
     new Plane(box, label, (light) => {
-      const frame = inOrder().findLast((one) => stepOf(one)?.kind === "light" && stepOf(one).light === light);
+      const frame = inOrder().findLast((candidate) => stepOf(candidate)?.kind === "light" && stepOf(candidate).light === light);
       if (frame) choose(frame.id);
     });
-  const made = { plane: plane() };
-  made.clear = () => {
+  const view = { plane: plane() };
+  view.clear = () => {
     box.replaceChildren();
-    made.plane = plane();
+    view.plane = plane();
   };
-  return made;
+  return view;
 }
 
 function begin() {
-  drawn.planned = planeIn("planned", "Chromaticities of the lights as planned");
-  drawn.seen = planeIn("seen", "Chromaticities of the lights as seen by the camera");
+  drawn.planned = planeIn("planned", "Planned chromaticities of the illuminants");
+  drawn.seen = planeIn("seen", "Measured chromaticities of the illuminants");
   legend();
   $("previous").addEventListener("click", () => stride(-1));
   $("next").addEventListener("click", () => stride(1));
@@ -401,7 +400,7 @@ function begin() {
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.altKey || event.metaKey) return;
     const frames = inOrder();
-    // Home and End scroll, but where the focus is on plots or planes.
+    // Home and End scroll the page unless the focus is on a plot.
     if (["Home", "End"].includes(event.key) && !document.activeElement.closest("#planned, #seen, #series")) return;
     const acts = {
       ArrowLeft: () => stride(-1),

@@ -1,5 +1,5 @@
 "use strict";
-// Drawing: elements made of data, never of markup, so that no text of a session can become code.
+// Plots and elements, made from data and never from markup, so that no text of a session can become code.
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -8,7 +8,7 @@ function element(name, attributes = {}, ...children) {
   return filled(document.createElement(name), attributes, children);
 }
 
-/** Return an SVG element; as `element`. */
+/** Return an SVG element; arguments as for `element`. */
 function shape(name, attributes = {}, ...children) {
   return filled(document.createElementNS(SVG, name), attributes, children);
 }
@@ -19,7 +19,7 @@ function filled(made, attributes, children) {
   return made;
 }
 
-/** Return a number with three digits that matter. */
+/** Return a number with three significant digits. */
 function short(value) {
   if (value === null || value === undefined) return "–";
   if (value === 0) return "0";
@@ -29,7 +29,7 @@ function short(value) {
   return size >= 0.0005 ? String(Number(value.toPrecision(size >= 0.01 ? 3 : 2))) : value.toExponential(1);
 }
 
-/** Return a number with as many decimals as a range of `span` wants. */
+/** Return a number with enough decimals for a range of `span`. */
 function within(value, span) {
   const decimals = Math.max(0, Math.min(6, 2 - Math.floor(Math.log10(span))));
   return decimals > 4 ? short(value) : value.toFixed(decimals);
@@ -38,14 +38,14 @@ function within(value, span) {
 /** Return a value as text with its unit. */
 const withUnit = (value, unit) => (unit ? `${short(value)} ${unit}` : short(value));
 
-/** Return what a check allows, as text. */
+/** Return the limits of a check as text. */
 function limitText(low, high, unit) {
   if (low !== null && high !== null) return `${short(low)} … ${withUnit(high, unit)}`;
   if (high !== null) return `≤ ${withUnit(high, unit)}`;
   return low !== null ? `≥ ${withUnit(low, unit)}` : "";
 }
 
-/** Return the path of a mark of radius `size` around x, y: form and not colour alone tells how a frame stands. */
+/** Return the path of a mark of radius `size` around x, y: the form shows the state, too, not the colour alone. */
 function markPath(kind, x, y, size) {
   if (kind === "cross")
     return `M${x - size} ${y - size}L${x + size} ${y + size}M${x - size} ${y + size}L${x + size} ${y - size}`;
@@ -53,7 +53,7 @@ function markPath(kind, x, y, size) {
   return `M${x - size} ${y}a${size} ${size} 0 1 0 ${2 * size} 0a${size} ${size} 0 1 0 ${-2 * size} 0Z`;
 }
 
-/** The rb-chromaticity plane: a mark for each light, the triangle of all lights, a ring around the chosen one. */
+/** The plane of rb chromaticities: a mark for each illuminant, their triangle, a ring around the chosen one. */
 class Plane {
   constructor(box, label, onChoose) {
     this.marks = new Map();
@@ -94,7 +94,7 @@ class Plane {
     return [34 + r * Plane.SIDE, 8 + (1 - b) * Plane.SIDE];
   }
 
-  /** Draw the mark of a light at [r, b]; null takes it away. */
+  /** Draw the mark of an illuminant at [r, b]; null removes it. */
   mark(light, at, { form, state, fill, title }) {
     let mark = this.marks.get(light);
     if (at === null) {
@@ -107,7 +107,7 @@ class Plane {
       mark = shape("path", {}, shape("title"));
       this.marks.set(light, mark);
     }
-    // What is new lies on top.
+    // New marks are on top.
     this.layer.append(mark);
     const [x, y] = Plane.place(...at);
     this.places.set(light, [x, y]);
@@ -119,7 +119,7 @@ class Plane {
     mark.firstChild.textContent = title;
   }
 
-  /** Draw the triangle between three places: what lights made of them can reach. */
+  /** Draw the triangle between three chromaticities: the range of their mixtures. */
   drawReach(places) {
     this.reach.setAttribute("d", `${pathThrough(places.map((at) => Plane.place(...at)))}Z`);
   }
@@ -131,24 +131,24 @@ class Plane {
 
   nearest(event) {
     const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
-    let [found, least] = [null, 20 ** 2];
+    let [nearest, least] = [null, 20 ** 2];
     for (const [light, [x, y]] of this.places) {
       const distance = (x - point.x) ** 2 + (y - point.y) ** 2;
-      if (distance < least) [found, least] = [light, distance];
+      if (distance < least) [nearest, least] = [light, distance];
     }
-    return found;
+    return nearest;
   }
 }
 Plane.SIDE = 300;
 
 const PLOT = { width: 340, height: 96, left: 42, right: 4, top: 5, bottom: 14 };
 
-/** Return where the attempt at `index` of `count` lies along a plot. */
+/** Return the x coordinate of attempt `index` of `count` in a plot. */
 function across(index, count, plot = PLOT) {
   return plot.left + (count > 1 ? index / (count - 1) : 0.5) * (plot.width - plot.left - plot.right);
 }
 
-/** Return a path through points; null lifts the pen. */
+/** Return a path through points; null interrupts it. */
 function pathThrough(points) {
   let path = "";
   let down = false;
@@ -166,13 +166,13 @@ function pathThrough(points) {
 const quantile = (sorted, share) => sorted[Math.round(share * (sorted.length - 1))];
 
 /**
- * Return the range of values that a plot shows, at least `least` wide.
+ * Return the range of a plot, at least `least` wide.
  *
- * Limits are within it, so that what drifts towards one is seen to; what is far beyond them, or far from nearly all
- * others (dim lights have wide limits), is drawn at the edge, so that a few frames do not flatten the rest.
+ * It includes most limits, so that drifts towards them are visible. Values far beyond, and limits far from nearly all
+ * others (dim illuminants), are drawn at the edge, so that a few frames do not flatten the rest.
  */
 function rangeOf(values, limits, least) {
-  const [sorted, bounds] = [values, limits].map((numbers) => [...numbers].sort((one, other) => one - other));
+  const [sorted, bounds] = [values, limits].map((numbers) => [...numbers].sort((a, b) => a - b));
   const [first, last] = [sorted[0], sorted[sorted.length - 1]];
   const within = bounds.length ? [quantile(bounds, 0.1), quantile(bounds, 0.9)] : [];
   let low = Math.min(quantile(sorted, 0.05), ...within);
@@ -184,7 +184,7 @@ function rangeOf(values, limits, least) {
 }
 
 /**
- * Return a plot of one quantity, attempt after attempt.
+ * Return a plot of one quantity over the attempts.
  *
  * Points are {index, value, good, low, high, curve}: `low` and `high` are limits or null, `curve` the number of the
  * line that joins them, 0 … 2.
@@ -198,13 +198,13 @@ function plotOf({ name, unit, points, count, least }) {
   );
   const bottom = PLOT.height - PLOT.bottom;
   const y = (value) => bottom - ((value - low) / (high - low)) * (bottom - PLOT.top);
-  const held = (value) => Math.max(PLOT.top, Math.min(bottom, y(value)));
-  const at = (point) => [across(point.index, count), held(point.value)];
+  const clamped = (value) => Math.max(PLOT.top, Math.min(bottom, y(value)));
+  const at = (point) => [across(point.index, count), clamped(point.value)];
   const bad = points.filter((point) => !point.good);
   const latest = [0, 1, 2].map((curve) => points.findLast((point) => point.curve === curve)).filter(Boolean);
-  const said = `${latest.map((point) => within(point.value, high - low)).join(", ")} ${unit ?? ""}`.trim();
+  const values = `${latest.map((point) => within(point.value, high - low)).join(", ")} ${unit ?? ""}`.trim();
   const allowed = limitText(latest[0].low, latest[0].high, unit);
-  const label = `${name}: ${said} at last${allowed ? `, allowed ${allowed}` : ""}; ${bad.length} refused for it`;
+  const label = `${name}: latest ${values}${allowed ? `, allowed ${allowed}` : ""}; ${bad.length} refused`;
   const svg = shape("svg", { viewBox: `0 0 ${PLOT.width} ${PLOT.height}`, role: "img", "aria-label": label });
   svg.append(
     shape("line", { class: "axis", x1: PLOT.left, x2: PLOT.width - PLOT.right, y1: bottom, y2: bottom }),
@@ -212,7 +212,7 @@ function plotOf({ name, unit, points, count, least }) {
     shape("text", { x: PLOT.left - 5, y: bottom, "text-anchor": "end" }, short(low)),
   );
   for (const side of ["low", "high"]) {
-    const line = points.map((point) => (point[side] === null ? null : [across(point.index, count), held(point[side])]));
+    const line = points.map((point) => (point[side] === null ? null : [across(point.index, count), clamped(point[side])]));
     const alone = line.length === 1 && line[0];
     const path = alone ? `M${PLOT.left} ${alone[1]}H${PLOT.width - PLOT.right}` : pathThrough(line);
     if (path) svg.append(shape("path", { class: "limit", d: path }));
@@ -241,14 +241,14 @@ function plotOf({ name, unit, points, count, least }) {
     "div",
     { class: "plot-head" },
     element("b", {}, name),
-    element("span", {}, [said, allowed].filter(Boolean).join(", ")),
+    element("span", {}, [values, allowed].filter(Boolean).join(", ")),
   );
   return { box: element("div", { class: "plot" }, head, svg), cursor };
 }
 
 const STRIP = { width: 1000, height: 34, left: 2, right: 2 };
 
-/** Return a strip with a tick for each attempt; height and colour say how it ended. */
+/** Return a strip with a tick for each attempt; height and colour show the verdict. */
 function stripOf(frames) {
   const svg = shape("svg", { viewBox: `0 0 ${STRIP.width} ${STRIP.height}`, role: "img", preserveAspectRatio: "none" });
   const tops = { accepted: 16, refused: 0, voided: 8, failed: 24, open: 16 };

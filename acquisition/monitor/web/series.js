@@ -1,10 +1,10 @@
-// What was measured frame by frame, what was refused, and events. Called from page.js, whose model it shows.
+// Measured values of all frames, refused frames, and events. Called from page.js, whose model it shows.
 
 function seriesOf(frames) {
   const series = new Map();
   const add = (name, unit, point, least = 0) => {
     if (point.value === null || point.value === undefined) return;
-    // One name may stand for two quantities: that of a light, in degrees, and that of a primary, in percent.
+    // One check may have two units: degrees for an illuminant, percent for a primary.
     const key = `${name} ${unit}`;
     if (!series.has(key)) series.set(key, { name, unit, least, points: [] });
     series.get(key).points.push({ low: null, high: null, good: true, curve: 0, ...point });
@@ -36,8 +36,8 @@ function drawSeries(frames) {
   const count = frames.length;
   const refusals = frames.filter((frame) => frame.verdict && frame.verdict !== "accepted").length;
   $("series-note").textContent =
-    `${count} attempts in the order in which they were made, ${refusals} without an accepted frame; ` +
-    "dashed lines are limits, crosses were refused for that.";
+    `${count} attempts in the order of taking, ${refusals} of them not accepted. ` +
+    "Dashed lines are limits, crosses are frames refused by the check.";
   drawn.strip = stripOf(frames);
   drawn.strip.svg.setAttribute("aria-label", `Verdicts of ${count} attempts`);
   $("verdicts").replaceChildren(drawn.strip.svg);
@@ -65,7 +65,7 @@ function drawRefused(frames) {
     allRefused,
     bad.map((frame) => [frame.id, frame.verdict, frame.preview, again.has(frame.step)]),
   ]);
-  if (drawn.refused === key) return; // What a reader looks at, or has the focus on, stays as it is.
+  if (drawn.refused === key) return; // Unchanged content keeps scroll position and focus.
   drawn.refused = key;
   $("refused-title").textContent = bad.length ? `Refused frames (${bad.length})` : "Refused frames";
   $("more").hidden = bad.length <= REFUSED_SHOWN;
@@ -86,7 +86,7 @@ function refusalOf(frame, mended) {
   });
   const parts = [button];
   const source = pictureOf(frame);
-  // A report is printed and photographed whole; a live page fetches what comes into sight.
+  // A report may be printed, and needs all pictures; a live page loads only visible ones.
   const loading = embedded ? "eager" : "lazy";
   if (source) parts.push(element("img", { src: source, alt: `${name}, ${frame.verdict}`, loading }));
   parts.push(element("p", {}, frame.reason || "no reason recorded"));
@@ -94,7 +94,7 @@ function refusalOf(frame, mended) {
     element(
       "p",
       { class: "note" },
-      `${dayText(frame.taken ?? frame.at)}; ${mended ? "taken again since and accepted" : "not yet taken again"}`,
+      `${dayText(frame.taken ?? frame.at)}; ${mended ? "repeated and accepted" : "not repeated yet"}`,
     ),
   );
   return element("article", { class: "refusal" }, ...parts);

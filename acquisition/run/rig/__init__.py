@@ -1,1 +1,1 @@
-"""What a session is taken with: real devices, the simulated lab, or a recorded session; opened here only."""
+"""Open the devices of a rig: real ones, or the simulated laboratory."""

@@ -1,4 +1,4 @@
-"""The real lab: every device that LAB.toml names, opened over its cable; and what there is to choose from."""
+"""Open the devices of a real laboratory that LAB.toml names, and list the available ones."""
 
 from __future__ import annotations
 
@@ -36,15 +36,14 @@ from foundation.holds import hold
 __all__ = ["Attached", "attached_devices", "identify_displays"]
 
 
-CONNECT_S = 5.0  # How long a projector may take to accept a connection; on a lab's network it takes milliseconds
+CONNECT_S = 5.0  # time for a projector to accept a connection, s; milliseconds on a local network
 
 
 def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, shows: bool = True) -> Devices:
-    """Open the camera, the projector and its light that LAB.toml names, of which another program may be at work.
+    """Open the camera, the projector and its display.
 
-    What is opened last is the light: its black would cover the picture of a run that has the camera. `session`: the
-    session that is taken up: time goes on behind its last frame; None for a new one, and for a check. `shows`: whether
-    the light is opened; if not, a `LightNotShown` stands for it.
+    `session`: the resumed session, whose last frame sets the time; None for a new one. `shows`: whether to open the
+    display; if not, a `LightNotShown` replaces it.
     """
     _hold_lab(settings.file, opened)
     clock = session_clock(session)
@@ -74,21 +73,22 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, 
             presenters.append(LightNotShown(display_warnings(display)))
         opened.callback(presenters[0].close)
 
-    # One that cannot be used does not keep the others' faults from being told.
+    # All faults are reported together. The display is opened last: its black would cover the picture of another run
+    # that uses the camera.
     ask_all({"camera": open_camera, "projector": open_projector, "display": open_presenter})
     return Devices(cameras[0], presenters[0], projectors[0], clock)
 
 
 def _hold_lab(file: str, opened: ExitStack) -> None:
-    """Hold the lab of a LAB.toml against other commands: two at one cable take each other's answers."""
-    # Settings that come from no file have nobody who could name them a second time.
+    # Two programs on one cable would read each other's answers.
+    # Settings without a file cannot be used by another command.
     with suppress(OSError):
-        place = Path(file).stat()
-        opened.enter_context(hold(f"the lab of {file}", f"lab {place.st_dev} {place.st_ino}"))
+        status = Path(file).stat()
+        opened.enter_context(hold(f"the lab of {file}", f"lab {status.st_dev} {status.st_ino}"))
 
 
 def session_clock(session: Session | None) -> SteadyClock:
-    """Return this machine's time for a session, going on behind its last frame; None for one that has none."""
+    """Return the computer's clock, continued after the last frame of a session."""
     return SteadyClock(SystemClock(), None if session is None else last_frame_time(session.journal.attempts()))
 
 
@@ -98,14 +98,14 @@ def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:
             usb = partial(open_usb, vendor=VENDOR_CANON_USB, serial=cable.serial, port=cable.usb_port)
             if cable.host is not None:
                 raise ConfigurationError(
-                    'lab.camera.host is given, and the camera\'s connection is "usb"',
+                    'lab.camera.host is given, but lab.camera.connection is "usb"',
                     about=file,
-                    remedy='write connection = "ptpip" for a camera on the network, or leave host out',
+                    remedy='write connection = "ptpip" for a camera on the network, or delete host',
                 )
             return CanonEos(lambda: UsbTransport(usb(), clock), clock)
         case "ptpip":
             host = _required(cable.host, "lab.camera.host", "the camera's address", file)
-            # A body remembers the computers it was paired with by this number.
+            # The camera identifies paired computers by this number.
             guid = uuid.uuid5(uuid.NAMESPACE_DNS, f"croplab.{uuid.getnode()}").bytes
             return CanonEos(
                 lambda: IpTransport.connect(
@@ -122,17 +122,17 @@ def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector 
         return None
     if cable.host is not None and cable.device is not None:
         raise ConfigurationError(
-            "lab.projector.host and lab.projector.device are both given, and one line controls the projector",
+            "lab.projector.host and lab.projector.device are both given, but only one line controls the projector",
             about=file,
-            remedy="leave out the one that is not connected",
+            remedy="delete the one that is not connected",
         )
     if cable.control == "serial":
         return _line_projector(cable, clock, file)
     if cable.device is not None:
         raise ConfigurationError(
-            "lab.projector.device is a serial port, and PJLink goes by the network",
+            "lab.projector.device is a serial port, but PJLink needs the network",
             about=file,
-            remedy='give the projector\'s address as host, or write control = "serial" and its language',
+            remedy='give the address of the projector as host, or write control = "serial" and its language',
         )
     host = _required(cable.host, "lab.projector.host", "the projector's address", file)
     port = cable.port or PJLINK_PORT
@@ -152,9 +152,9 @@ def _line_projector(cable: ProjectorCable, clock: Clock, file: str) -> LineProje
     if cable.host is not None:
         if language.network is None:
             raise ConfigurationError(
-                f"lab.projector.host: {language.maker} projectors are reached over a serial port only",
+                f"lab.projector.host is given, but {language.maker} projectors have only a serial port",
                 about=file,
-                remedy="name lab.projector.device, acquire devices lists what is there",
+                remedy="name lab.projector.device; acquire devices lists the serial ports",
             )
         host, port = cable.host, cable.port or language.network.port
         label = f"the projector at {host}:{port}"
@@ -166,16 +166,16 @@ def _line_projector(cable: ProjectorCable, clock: Clock, file: str) -> LineProje
     )
 
 
-def _required(value: str | None, key: str, what: str, file: str) -> str:
+def _required(value: str | None, key: str, meaning: str, file: str) -> str:
     if value is None:
-        remedy = f"name {what}, acquire devices lists what is there"
+        remedy = f"set it to {meaning}; acquire devices lists what is available"
         raise ConfigurationError(f"{key} is missing", about=file, remedy=remedy, value=key)
     return value
 
 
 @dataclass(frozen=True)
 class Attached:
-    """What of one kind is attached or reachable: `kind` in the plural, what was found, or why it could not be asked."""
+    """Available devices of one kind (in the plural), or the reason why they could not be listed."""
 
     kind: str
     found: tuple[str, ...]
@@ -183,15 +183,15 @@ class Attached:
 
 
 def attached_devices() -> Generator[Attached]:
-    """Yield what is attached and reachable, kind by kind; a kind that cannot be asked says why."""
+    """Yield the available devices, kind by kind."""
     yield _attached("cameras on USB", lambda: [str(device) for device in list_devices()])
     yield _attached("serial ports", list_serial_ports)
     yield _attached("displays", lambda: [str(display) for display in list_displays()])
-    yield _attached("projectors by PJLink", lambda: [f"{found.host}, MAC {found.mac}" for found in search()])
+    yield _attached("projectors by PJLink", lambda: [f"{device.host}, MAC {device.mac}" for device in search()])
 
 
-def _attached(kind: str, ask: Callable[[], Iterable[str]]) -> Attached:
+def _attached(kind: str, list_names: Callable[[], Iterable[str]]) -> Attached:
     try:
-        return Attached(kind, tuple(ask()))
+        return Attached(kind, tuple(list_names()))
     except CropError as error:
         return Attached(kind, (), str(error))

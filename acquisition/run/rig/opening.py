@@ -1,7 +1,4 @@
-"""Open the rig that the settings name, and close it whatever happens.
-
-`rig = "lab"` opens the devices that LAB.toml names, `rig = "simulated"` builds the simulated lab.
-"""
+"""Open the rig of the settings, and close it in any case: `rig = "lab"` or `rig = "simulated"`."""
 
 from __future__ import annotations
 
@@ -23,17 +20,18 @@ def open_rig(
     *,
     shows: bool = True,
 ) -> Generator[Devices]:
-    """Open every device that the settings name; close them all at the end, whatever the end.
+    """Open every device of the settings; close them all at the end.
 
-    `session`: the session that is taken up; None for a new one, and for a check, which records nothing. `shows`:
-    whether the light is opened, which is black then; what a dry run asks it shows nothing.
+    `session`: the resumed session; None for a new one, and for a check. `shows`: whether to open the display, which is
+    black then; a dry run does not.
     """
     if settings.rig == "imported":
         raise ConfigurationError(
-            'rig = "imported" marks a session whose frames were taken by other means; nothing more can be taken of it'
+            'rig is "imported", expected "lab" or "simulated": no frames can be added to a session whose frames were '
+            "taken by other means; start a new session"
         )
     with ExitStack() as opened:
-        # The drivers of a real lab and the simulated world are each loaded where they are opened, and not otherwise.
+        # Drivers and the simulated world are imported only if they are needed.
         if settings.rig == "lab":
             from acquisition.run.rig.lab import open_lab
 
@@ -45,7 +43,7 @@ def open_rig(
 
 
 def known_frame_bytes(settings: LabSettings) -> int | None:
-    """Return the size of the raw files of a simulated rig, bytes; None where a real camera decides it."""
+    """Return the size of simulated raw files, bytes; None for a real camera."""
     if settings.rig != "simulated":
         return None
     from acquisition.run.rig.simulated import simulated_frame_bytes

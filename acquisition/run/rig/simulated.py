@@ -1,7 +1,7 @@
-"""The simulated lab: real drivers over memory, with a camera, a projector and a room at the far end of their wires.
+"""Build the simulated laboratory: real drivers in memory, connected to a simulated camera, projector and room.
 
-A simulated lab that is taken up again is in the state that the session's journal gives: same time, lamp burning, same
-pictures taken; so an interrupted session ends in the same bytes as an undisturbed one.
+A resumed simulated laboratory has the state of the session's journal: the same time, the lamp on, the same number of
+frames. An interrupted session therefore ends in the same bytes as an undisturbed one.
 """
 
 from __future__ import annotations
@@ -36,16 +36,13 @@ from sim.world.rendering import Print
 from sim.world.sensors import BODIES, Body, find_body
 from sim.world.world import Room, World, read_room
 
-SERIAL = "0000000001"  # Serial number of the simulated body, on its wire and in its frames; one lab has one body
+SERIAL = "0000000001"  # serial number of the simulated camera and in its frames; one laboratory has one camera
 
 
 def open_simulated(settings: LabSettings, chart: Chart, session: Session | None, opened: ExitStack) -> Devices:
-    """Build the simulated lab.
-
-    `session`: the session that is taken up; None for a check that records nothing.
-    """
-    before = _taken_before(session)
-    exposed = Counter(colour for _, colour in before)
+    """Build the simulated laboratory; `session` is the resumed session, or None."""
+    exposures = _earlier_exposures(session)
+    exposed = Counter(colour for _, colour in exposures)
     last = None if session is None else last_frame_time(session.journal.attempts())
     clock = SimulatedClock(last or SIM_START)
     screen = Screen()
@@ -53,12 +50,12 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     sensor = simulated_body(settings)
     world = World(sheet(chart), sensor, simulated_room(settings))
     events = read_disturbances(settings.simulated.events, settings.file)
-    film = WorldFilm(world, lambda: screen.colour, simulated.light, SERIAL, exposed, events, before)
-    # On mains power, as a camera that takes 707 frames is.
-    # A body of sensitivities alone speaks as an EOS 550D does: only what its sensor sees is its own.
-    spoken = EOS_BODIES.get(settings.simulated.body, EOS_BODIES["EOS 550D"])
-    apertures = () if settings.camera.exposure.aperture is None else spoken.aperture_codes
-    body = replace(spoken, shots_per_charge=10**9, aperture_codes=apertures)
+    film = WorldFilm(world, lambda: screen.colour, simulated.light, SERIAL, exposed, events, exposures)
+    # A body given by its sensitivities alone uses the protocol of an EOS 550D.
+    protocol = EOS_BODIES.get(settings.simulated.body, EOS_BODIES["EOS 550D"])
+    apertures = () if settings.camera.exposure.aperture is None else protocol.aperture_codes
+    # The camera runs on mains power, as for any long session.
+    body = replace(protocol, shots_per_charge=10**9, aperture_codes=apertures)
     eos = SimulatedEos(body, film, clock, serial=SERIAL, auto_power_off_s=0)
     peer = PjLinkPeer(simulated)
     projector = PjLinkProjector(lambda: PeerLink(peer))
@@ -71,34 +68,34 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
 
 
 def sheet(chart: Chart) -> Print:
-    """Return the chart as the simulated room hangs it up."""
+    """Return the chart as it hangs in the simulated room."""
     drawn = drawing(chart)
     return Print(drawn.page_mm, drawn.rectangles_mm, drawn.rgb)
 
 
 def simulated_body(settings: LabSettings) -> Body:
-    """Return the simulated camera body that the settings name."""
+    """Return the simulated camera of the settings."""
     name, changes = settings.simulated.body, settings.simulated.camera or {}
     if name not in BODIES and name not in known_sensitivities() and not Path(name).is_file():
-        known = ", ".join([*sorted(BODIES), *known_sensitivities()])
-        said = f"simulated.body = {name!r}: known are {known}"
-        raise ConfigurationError(said, about=settings.file, value=name)
+        names = ", ".join([*sorted(BODIES), *known_sensitivities()])
+        problem = f"simulated.body is {name!r}, expected a file of sensitivities or one of {names}"
+        raise ConfigurationError(problem, about=settings.file, value=name)
     return find_body(name, changes, settings.file, "simulated.camera")
 
 
 def simulated_frame_bytes(settings: LabSettings) -> int:
-    """Return the size of a raw file that the simulated camera writes: 16 bits a photosite."""
+    """Return the size of a simulated raw file, bytes: 2 bytes for each photosite."""
     rows, columns = simulated_body(settings).sensor
     return 2 * rows * columns
 
 
 def simulated_room(settings: LabSettings) -> Room:
-    """Return the default room with the seed and the changes of the settings."""
+    """Return the room of the settings: the default room with their seed and changes."""
     return read_room(settings.simulated.seed, settings.simulated.room, settings.file, "simulated.room")
 
 
-def _taken_before(session: Session | None) -> list[tuple[float, Colour]]:
-    """Return the second since the opening, and the colour, of every picture that was taken before."""
+def _earlier_exposures(session: Session | None) -> list[tuple[float, Colour]]:
+    # Time, s since the opening, and colour of every earlier exposure.
     if session is None:
         return []
     colours = {step.number: step.colour for step in session.steps}

@@ -1,4 +1,4 @@
-"""Rooms for checks: a small chart before a small sensor, in the simulated lab that `acquire check` opens."""
+"""A small chart and a small sensor in the simulated laboratory, for `acquire check`."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ Check = Callable[..., CheckReport]
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with charts of one to three bits and three lights."""
-    place = tmp_path_factory.mktemp("check")
+    """Return a folder with charts of one to three bits and three illuminants."""
+    folder = tmp_path_factory.mktemp("check")
     for bits in (1, 2, 3):
-        design_chart(bits).save(place / f"chart{bits}.json")
-    save_illuminations(plan_illuminations(1, ()), place / "illuminations.csv")
-    return place
+        design_chart(bits).save(folder / f"chart{bits}.json")
+    save_illuminations(plan_illuminations(1, ()), folder / "illuminations.csv")
+    return folder
 
 
 def lab_toml(chart: str, camera: str = "", more: str = "", seed: int = 1, **room: Any) -> str:
     """Return the text of a LAB.toml of a simulated room."""
-    told = "".join(f"{key} = {json.dumps(value)}\n" for key, value in room.items())
+    room_text = "".join(f"{key} = {json.dumps(value)}\n" for key, value in room.items())
     return (
         f'rig = "simulated"\nchart = "{chart}"\nilluminations = "illuminations.csv"\n[camera]\n{camera}\n{more}\n'
-        f'[sequence]\nwarm_up_s = 0\n[simulated]\nbody = "Test"\nseed = {seed}\n[simulated.room]\n{told}'
+        f'[sequence]\nwarm_up_s = 0\n[simulated]\nbody = "Test"\nseed = {seed}\n[simulated.room]\n{room_text}'
     )
 
 
 @pytest.fixture(scope="session")
 def check(folder: Path) -> Check:
-    """Return what checks a room."""
+    """Return a function that checks a room."""
 
     def run(
         bits: int = 2,

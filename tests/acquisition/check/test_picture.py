@@ -1,4 +1,4 @@
-"""The picture of a check shows what was found: the light, every tag's blur, every cell that is off, each verdict."""
+"""Picture of a check: flat field, blur of every tag, deviating patches, and verdicts."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ FINDINGS = (Finding("turn", "good", "level"), Finding("disk", "fault", "full", r
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Return the figures that are saved from now on."""
+    """Return the list of figures saved during the test."""
     figures = list[Any]()
     save = Figure.savefig
 
-    def saved(figure: Figure, *given: Any, **more: Any) -> None:
+    def saved(figure: Figure, *args: Any, **options: Any) -> None:
         figures.append(figure)
-        save(figure, *given, **more)
+        save(figure, *args, **options)
 
     monkeypatch.setattr(Figure, "savefig", saved)
     return figures
@@ -46,7 +46,7 @@ def trial_of(lab: Lab, folder: Path) -> Trial:
 
 
 @pytest.mark.slow
-def test_the_picture_shows_light_blur_print_and_verdicts(tmp_path: Path, drawn: list[Any]) -> None:
+def test_draws_light_blur_print_and_verdicts(tmp_path: Path, drawn: list[Any]) -> None:
     lab = hang(3, room=Room(waviness_mm=0.5, stain_mm=20.0, stain_depth=0.3))
     trial = trial_of(lab, tmp_path / "session")
     assert trial.table is not None
@@ -59,22 +59,22 @@ def test_the_picture_shows_light_blur_print_and_verdicts(tmp_path: Path, drawn: 
         assert (axes.get_xlim(), axes.get_ylim()) == ((0, width), (height, 0))
     (tags,) = blur.collections
     assert isinstance(tags, PathCollection)
-    places = np.asarray(tags.get_offsets())
-    assert len(places) == len(blur.texts) == len(lab.chart.tags)
+    tags_mm = np.asarray(tags.get_offsets())
+    assert len(tags_mm) == len(blur.texts) == len(lab.chart.tags)
     for tag in lab.chart.tags:
         # Lens and waves move a tag by a millimetre.
-        assert np.linalg.norm(places - tag.corners_mm.mean(axis=0), axis=1).min() < 3
-    cells, off = print_.collections
+        assert np.linalg.norm(tags_mm - tag.corners_mm.mean(axis=0), axis=1).min() < 3
+    cells, stained = print_.collections
     stains = trial.table.cells.stains
     np.testing.assert_allclose(np.asarray(cells.get_offsets()), stains.places_mm)
-    np.testing.assert_allclose(np.asarray(off.get_offsets()), stains.places_mm[stains.stained])
-    assert len(np.asarray(off.get_offsets())) > 3
+    np.testing.assert_allclose(np.asarray(stained.get_offsets()), stains.places_mm[stains.stained])
+    assert len(np.asarray(stained.get_offsets())) > 3
     lines = [text.get_text() for text in verdicts.texts]
     assert [line.split()[0] for line in lines] == ["fault", "good"]
 
 
 @pytest.mark.slow
-def test_without_a_chart_the_frame_is_drawn_alone(tmp_path: Path, drawn: list[Any]) -> None:
+def test_draws_only_frame_without_chart(tmp_path: Path, drawn: list[Any]) -> None:
     lab = hang()
     trial = Trial(lab.mosaic(tmp_path), None, Verdict(()), trouble="not found")
     assert check_png(trial, lab.chart, CheckReport((), FINDINGS))[:4] == b"\x89PNG"

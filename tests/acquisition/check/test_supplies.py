@@ -1,4 +1,4 @@
-"""What a check asks of the body: battery, card, disk, and whether it takes dark frames of its own."""
+"""Checks of battery, card, disk and the camera's own dark frames."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from drivers.camera import Supplies
 from foundation.errors import LinkTimeout
 
 
-def test_a_body_that_takes_dark_frames_of_its_own_is_told() -> None:
-    def found(longest: float, took: float) -> Finding:
+def test_reports_noise_reduction_of_camera() -> None:
+    def finding(longest: float, took: float) -> Finding:
         return judge_noise_reduction([(0.5, 2.5), (longest, took), (0.5, 2.7), (0.5, 2.6), (2.0, 9.0)])
 
-    # Beside 0.5 s, 2.1 s more; beside 4 s the same, or 4 s more than that; half of it is let pass.
-    assert found(4.0, 6.1).value == pytest.approx(0.0)
-    doubled = found(4.0, 10.1)
+    # 2.1 s more than 0.5 s; 4 s takes the same, or 4 s more than that; up to half of it is accepted.
+    assert finding(4.0, 6.1).value == pytest.approx(0.0)
+    doubled = finding(4.0, 10.1)
     assert (doubled.value, doubled.grade) == (pytest.approx(4.0 / 3.5), "remark")
-    assert [found(4.0, 6.1 + 3.5 * share).grade for share in (0.49, 0.51)] == ["good", "remark"]
-    for few in ([], [(0.1, 2.0), (0.99, 4.0)], [(0.51, 2.0), (2.0, 4.0)]):
-        assert judge_noise_reduction(few).grade == "not checked"
+    assert [finding(4.0, 6.1 + 3.5 * share).grade for share in (0.49, 0.51)] == ["good", "remark"]
+    for timings in ([], [(0.1, 2.0), (0.99, 4.0)], [(0.51, 2.0), (2.0, 4.0)]):
+        assert judge_noise_reduction(timings).grade == "not checked"
     assert judge_noise_reduction([(0.25, 2.0), (1.0, 4.0)]).grade == "remark"
 
 
-def test_the_disk_is_asked_where_the_session_will_be(tmp_path: Path) -> None:
-    there = judge_disk(tmp_path / "not" / "yet", 10, 1000)
-    assert there.grade == "good"
-    assert str(tmp_path) in there.said
+def test_judges_disk_of_session_folder(tmp_path: Path) -> None:
+    finding = judge_disk(tmp_path / "not" / "yet", 10, 1000)
+    assert finding.grade == "good"
+    assert str(tmp_path) in finding.said
     assert judge_disk(tmp_path, 10**9, 25_000_000).grade == "fault"
 
 
 @pytest.mark.parametrize(
-    ("left", "frames", "battery", "card"),
+    ("supplies", "frames", "battery", "card"),
     [
         (Supplies(), 767, "not checked", "good"),
         (Supplies(battery=1.0), 767, "not checked", "good"),
@@ -50,9 +50,7 @@ def test_the_disk_is_asked_where_the_session_will_be(tmp_path: Path) -> None:
         (None, 767, "not checked", "not checked"),
     ],
 )
-def test_battery_and_card_are_judged_as_far_as_the_body_tells(
-    left: Supplies | None, frames: int, battery: str, card: str
-) -> None:
+def test_judges_battery_and_card(supplies: Supplies | None, frames: int, battery: str, card: str) -> None:
     body = Mock()
-    body.supplies.side_effect = [LinkTimeout("the camera does not answer") if left is None else left]
-    assert [found.grade for found in judge_supplies(body, frames, 25 * 10**6)] == [battery, card]
+    body.supplies.side_effect = [LinkTimeout("the camera does not answer") if supplies is None else supplies]
+    assert [finding.grade for finding in judge_supplies(body, frames, 25 * 10**6)] == [battery, card]

@@ -1,4 +1,4 @@
-"""A small room whose frames are judged: a chart of 3 bits before the Test body, and everything that can go wrong."""
+"""A small simulated room with a chart of 3 bits, the Test body, and a judge of its frames."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FRAMES = itertools.count()
 
 @dataclass
 class Bench:
-    """A judge, the room before it, and the frames of a plan."""
+    """A room, the frames of a plan, and their judge."""
 
     world: World
     chart: Chart
@@ -47,35 +47,35 @@ class Bench:
     body: Body = BODIES["Test"]
 
     def counts(self, step: SessionStep, *events: AnyDisturbance, before: Colour = BLACK) -> Counts:
-        """Return the counts of a new frame, after one of a colour: no two have the same noise."""
+        """Return the counts of a new frame, taken after a colour; every frame has its own noise."""
         moment = Moment(0, 0.0, step.colour, ((-1.0, before),))
-        gone_wrong = Disturbances(events)
+        disturbances = Disturbances(events)
         counts = self.world.expose(
-            gone_wrong.shown(moment),
+            disturbances.shown(moment),
             self.settings.camera.exposure,
             key=(next(FRAMES),),
-            situation=gone_wrong.situation(moment),
+            situation=disturbances.situation(moment),
         )
-        return gone_wrong.counted(counts, moment)
+        return disturbances.counted(counts, moment)
 
     def show(self, counts: Counts, step: SessionStep, **writing: Any) -> Judgement:
-        """Return what is said of counts."""
+        """Judge counts as a raw file."""
         path = self.folder / "frame.dng"
-        given: dict[str, Any] = {
+        writing_options: dict[str, Any] = {
             "settings": self.settings.camera.exposure,
             "taken_at": datetime(2026, 1, 1, tzinfo=UTC),
             **writing,
         }
-        body = given.pop("body", self.body)
+        body = writing_options.pop("body", self.body)
         with path.open("wb") as stream:
-            write_dng(stream, counts, body, **given)
+            write_dng(stream, counts, body, **writing_options)
         return self.judge.judge(path, step)
 
     def take(self, step: SessionStep, *events: AnyDisturbance, before: Colour = BLACK) -> Judgement:
         return self.show(self.counts(step, *events, before=before), step)
 
     def fork(self) -> Bench:
-        """Return the bench with a judge of its own that knows what this one does."""
+        """Return a copy with its own judge in the same state."""
         return replace(self, judge=copy.copy(self.judge))
 
     def light(self, red: int, green: int, blue: int, number: int = 900) -> SessionStep:
@@ -86,21 +86,21 @@ def bench(folder: Path, room: Room, count: int = 12, every: int = 6, lab: str = 
     chart = design_chart(3, "A7")
     plan = plan_illuminations()
     order: list[int] = np.random.default_rng(room.seed).permutation(len(plan)).tolist()
-    some = tuple(replace(plan[k], index=n) for n, k in enumerate(order[:count]))
+    planned = tuple(replace(plan[k], index=n) for n, k in enumerate(order[:count]))
     settings = parse_lab(lab, "LAB.toml")
-    steps = plan_steps(some, every, seed=1, response=RESPONSE if response else ())
+    steps = plan_steps(planned, every, seed=1, response=RESPONSE if response else ())
     world = World(sheet(chart), BODIES["Test"], room)
     return Bench(world, chart, plan, steps, settings, folder, LiveJudge(settings, chart, plan))
 
 
 @pytest.fixture(scope="session")
 def taught(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    """Make a bench whose judge has seen a whole small session under a colour wheel, all of it accepted."""
-    made = bench(tmp_path_factory.mktemp("judge"), Room(seed=3, wheel_hz=60, transfer=2.2), count=12, every=6)
-    for step in made.steps:
-        judgement = made.take(step)
+    """Make a bench after a small accepted session with a colour wheel."""
+    lab = bench(tmp_path_factory.mktemp("judge"), Room(seed=3, wheel_hz=60, transfer=2.2), count=12, every=6)
+    for step in lab.steps:
+        judgement = lab.take(step)
         assert judgement.accepted, f"{step}: {judgement.reason}"
-    return made
+    return lab
 
 
 EXPOSURE = ExposureSettings(100, 8.0, 0.5)

@@ -1,4 +1,4 @@
-"""Frames of a few levels, and what is known after them, without a room."""
+"""Frames of a few levels, and the state of the judge after them, without a room."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.judge.state import Basis, Codes, JudgeState, Seen
+from acquisition.judge.state import Basis, Codes, JudgeState, RecentFrame
 from experiment.measures.frame import SEGMENTS, TILE_COLUMNS, TILE_ROWS, FramePlaces, Measured, Noise
 from experiment.session.records import TOP
 
 TILES = TILE_ROWS * TILE_COLUMNS
 PLACES = FramePlaces(160, 240)
+# RGB counts above black of a dark and of a white frame: white adds 2000, 4000 and 2400.
 DARK, LIT = (10.0, 12.0, 11.0), (2010.0, 4012.0, 2411.0)
-"""Camera RGB of a dark and of a white frame, counts above black: white adds 2000, 4000 and 2400."""
+# Counts added by each primary; their sum is white.
 PRIMARIES = np.array([[1600.0, 300.0, 40.0], [300.0, 3200.0, 360.0], [100.0, 500.0, 2000.0]])
-"""What each primary adds, counts: together what white adds."""
 NOISE = Noise(1.0, 0.1)
 
 
@@ -28,10 +28,10 @@ def measured(level: npt.ArrayLike, black_measured: bool = True, noise: Noise = N
     return Measured(tiles, strips, samples, b"", noise, 0.0, black_measured, 1e4, 0.0, 0.0, 0.0, "", "", PLACES)
 
 
-def known(**more: object) -> JudgeState:
-    """Return what is known after a white and a dark frame."""
+def base_state(**changes: object) -> JudgeState:
+    """Return the state after a white and a dark frame."""
     dark = measured(DARK)
-    return replace(JudgeState(white=measured(LIT), dark=dark, first_dark=dark), **more)  # pyrefly: ignore[bad-argument-type]
+    return replace(JudgeState(white=measured(LIT), dark=dark, first_dark=dark), **changes)  # pyrefly: ignore[bad-argument-type]
 
 
 def picture(codes: Codes, gain: npt.ArrayLike = 1.0) -> Measured:
@@ -40,11 +40,11 @@ def picture(codes: Codes, gain: npt.ArrayLike = 1.0) -> Measured:
     return measured(DARK + amounts @ PRIMARIES)
 
 
-def begun(gain: npt.ArrayLike = 1.0, greys: int = 6) -> JudgeState:
-    """Return what is known after the first frames, white among them times `gain`."""
+def started_state(gain: npt.ArrayLike = 1.0, greys: int = 6) -> JudgeState:
+    """Return the state after the first frames; white is multiplied by `gain`."""
     dark, white = measured(DARK), picture((255, 255, 255), gain)
     primaries = [(TOP, 0, 0), (0, TOP, 0), (0, 0, TOP)]
     codes = [*primaries, *[(grey, grey, grey) for grey in (TOP, 208, 160, 112, 64, 32)[:greys]]]
-    frames = [Seen(one, picture(one), None) for one in codes]
-    basis = Basis.between((frames[0].measured, frames[1].measured, frames[2].measured), dark)
-    return known(basis=basis, first_frames=(Seen((255, 255, 255), white, None), *frames))
+    frames = [RecentFrame(code, picture(code), None) for code in codes]
+    basis = Basis.from_primaries((frames[0].measured, frames[1].measured, frames[2].measured), dark)
+    return base_state(basis=basis, first_frames=(RecentFrame((255, 255, 255), white, None), *frames))

@@ -1,6 +1,6 @@
-"""Each disturbance is refused at its frame and named; what is no disturbance is accepted.
+"""Every disturbance is refused at its frame with the right cause, and undisturbed frames are accepted.
 
-In a room; then, without one, what is said at limits and just beyond them.
+First in a simulated room, then at the limits of single checks without a room.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from acquisition.judge.judge import (
 )
 from acquisition.judge.measure import Frame
 from acquisition.judge.state import (
-    Examined,
+    ExaminedFrame,
     FrameLight,
     JudgeState,
-    LampSeen,
+    LampState,
     Leaning,
     ProjectorModel,
+    RecentFrame,
     Residuals,
-    Seen,
 )
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
@@ -58,7 +58,17 @@ from sim.world.disturbances import (
 from sim.world.sensors import BODIES
 from sim.world.world import Room, Situation
 from tests.acquisition.judge.conftest import EXPOSURE, FRAMES, LAB, Bench, bench
-from tests.acquisition.judge.made_up import DARK, LIT, NOISE, PRIMARIES, TILES, begun, known, measured, picture
+from tests.acquisition.judge.made_up import (
+    DARK,
+    LIT,
+    NOISE,
+    PRIMARIES,
+    TILES,
+    base_state,
+    measured,
+    picture,
+    started_state,
+)
 
 ORANGE, SKY, DEEP_BLUE = (255, 197, 126), (113, 188, 255), (0, 0, 255)
 WHITE_STEP = SessionStep(901, "white", None, WHITE)
@@ -67,7 +77,7 @@ DARK_STEP = SessionStep(902, "dark", None, BLACK)
 
 @pytest.fixture
 def few(taught: Bench, tmp_path: Path) -> Bench:
-    """Return a lab of a plan of six lights that has taken nothing yet, in the room that the others know."""
+    """Return a lab with a plan of six illuminants and no frames, in the room of `taught`."""
     lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
     lab.world = taught.world
     return lab
@@ -75,19 +85,19 @@ def few(taught: Bench, tmp_path: Path) -> Bench:
 
 @pytest.fixture(scope="module")
 def earlier(taught: Bench, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[SessionStep, bytes]]:
-    """Return what was measured of the frames of such a plan, but for its last pair, by a run that is over."""
+    """Return steps and measurements of an earlier run of such a plan without its last two frames."""
     lab = bench(tmp_path_factory.mktemp("earlier"), Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
     lab.world = taught.world
-    kept: list[tuple[SessionStep, bytes]] = []
+    measurements: list[tuple[SessionStep, bytes]] = []
     for step in lab.steps[:-2]:
         judgement = lab.take(step)
         assert judgement.accepted
-        kept.append((step, judgement.measurement))
-    return kept
+        measurements.append((step, judgement.measurement))
+    return measurements
 
 
 def resume(lab: Bench, earlier: list[tuple[SessionStep, bytes]]) -> Bench:
-    """Return the lab of another run that has taken up what an earlier one took."""
+    """Return the lab after a new judge has recalled the frames of an earlier run."""
     resumed = replace(lab, judge=LiveJudge(lab.settings, lab.chart, lab.lights))
     for step, measurement in earlier:
         resumed.judge.recall(step, measurement, True)
@@ -99,46 +109,44 @@ def cause(judgement: Judgement) -> str:
 
 
 def check(judgement: Judgement, name: str) -> Check:
-    return next(found for found in judgement.checks if found.name == name)
+    return next(check for check in judgement.checks if check.name == name)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("codes", [SKY, DEEP_BLUE, (48, 255, 188)])
-def test_a_light_that_was_ordered_is_accepted(taught: Bench, codes: tuple[int, int, int]) -> None:
+def test_accepts_ordered_illuminants(taught: Bench, codes: tuple[int, int, int]) -> None:
     lab = taught.fork()
-    said = [lab.take(lab.light(*codes)) for _ in range(2)]
-    assert [judgement.reason for judgement in said] == ["", ""]
-    assert said[0].seen is not None
-    assert said[0].preview[:2] == b"\xff\xd8"
+    judgements = [lab.take(lab.light(*codes)) for _ in range(2)]
+    assert [judgement.reason for judgement in judgements] == ["", ""]
+    assert judgements[0].seen is not None
+    assert judgements[0].preview[:2] == b"\xff\xd8"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("shown", "ordered"), [(ORANGE, SKY), (SKY, ORANGE), ((255, 249, 255), (255, 245, 246))])
-def test_the_light_of_the_frame_before_is_told(
-    taught: Bench, shown: tuple[int, int, int], ordered: tuple[int, int, int]
-) -> None:
+def test_reports_previous_illuminant(taught: Bench, shown: tuple[int, int, int], ordered: tuple[int, int, int]) -> None:
     lab = taught.fork()
     assert lab.take(lab.light(*shown)).accepted
     stale = lab.take(lab.light(*shown))
     assert stale.accepted  # the same light ordered again is no fault
     frozen = lab.show(lab.counts(lab.light(*shown)), lab.light(*ordered))
     assert cause(frozen) == "off_codes_deg"
-    assert "of the frame before" in frozen.reason
+    assert "the previous illuminant" in frozen.reason
     assert str(shown) in frozen.reason
 
 
 @pytest.mark.slow
-def test_another_light_of_the_plan_is_named(taught: Bench) -> None:
+def test_reports_other_illuminant_of_plan(taught: Bench) -> None:
     lab = taught.fork()
     assert lab.take(lab.light(*DEEP_BLUE)).accepted
     other = lab.lights[300].colour
-    seen = lab.show(lab.counts(lab.light(*other)), lab.light(*ORANGE))
-    assert cause(seen) == "off_codes_deg"
-    assert str(tuple(other)) in seen.reason
+    judgement = lab.show(lab.counts(lab.light(*other)), lab.light(*ORANGE))
+    assert cause(judgement) == "off_codes_deg"
+    assert str(tuple(other)) in judgement.reason
 
 
 @pytest.mark.slow
-def test_a_small_bump_that_stays_is_followed_and_a_large_one_lasts(taught: Bench) -> None:
+def test_follows_small_bump_and_stops_at_large_one(taught: Bench) -> None:
     lab = taught.fork()
     small = Bump(px=0.45)
     assert cause(lab.take(lab.light(*ORANGE), small)) == "movement"
@@ -151,7 +159,7 @@ def test_a_small_bump_that_stays_is_followed_and_a_large_one_lasts(taught: Bench
 
 @pytest.mark.slow
 @pytest.mark.parametrize("percent", [-3.0, -50.0])
-def test_a_step_of_the_lamp_is_told_from_another_light(taught: Bench, percent: float) -> None:
+def test_reports_lamp_step(taught: Bench, percent: float) -> None:
     lab = taught.fork()
     judgement = lab.take(lab.light(*SKY), LampStep(percent=percent))
     assert cause(judgement) == "off_brightness"
@@ -163,7 +171,7 @@ def test_a_step_of_the_lamp_is_told_from_another_light(taught: Bench, percent: f
 
 
 @pytest.mark.slow
-def test_light_in_the_room_is_told(taught: Bench) -> None:
+def test_reports_room_light(taught: Bench) -> None:
     lit = AmbientStep(percent=1.0)
     lab = taught.fork()
     blue = lab.take(lab.light(*DEEP_BLUE), lit)
@@ -186,12 +194,12 @@ def test_light_in_the_room_is_told(taught: Bench) -> None:
         (DEEP_BLUE, Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3), "uniformity", "bottom right"),
         (ORANGE, ScreenSaver(share=1.0), "uniformity", "screen saver"),
         (DEEP_BLUE, ScreenSaver(share=0.3), "uniformity", "screen saver"),
-        (ORANGE, HalfChanged(place=(-9, -9, 9, 9), share=0.08), "off_codes_deg", "of the frame before"),
+        (ORANGE, HalfChanged(place=(-9, -9, 9, 9), share=0.08), "off_codes_deg", "of the previous illuminant"),
         (ORANGE, HalfChanged(place=(-9, -9, 0.2, 0.2)), "uniformity", "for 100% of"),
         (ORANGE, HalfChanged(place=(-9, -9, 0.2, 0.2), share=0.3), "uniformity", "for 30% of"),
     ],
 )
-def test_what_is_uneven_or_late_is_refused_and_named(
+def test_reports_uneven_and_late_pictures(
     taught: Bench, codes: tuple[int, int, int], event: AnyDisturbance, name: str, words: str
 ) -> None:
     lab = taught.fork()
@@ -199,34 +207,34 @@ def test_what_is_uneven_or_late_is_refused_and_named(
     judgement = lab.take(lab.light(*codes), event, before=Colour(*SKY))
     assert cause(judgement) == name
     assert words in judgement.reason
-    assert ("still showed the light of the frame before, " in judgement.reason) == words.startswith("for ")
+    assert ("still showed the previous illuminant" in judgement.reason) == words.startswith("for ")
 
 
 @pytest.mark.slow
-def test_who_walks_past_is_no_chart_that_moved(taught: Bench) -> None:
+def test_distinguishes_person_from_movement(taught: Bench) -> None:
     passing = taught.fork().take(WHITE_STEP, Person(place=(0.2, -0.2, 0.55, 1.2), left=0.9))
     assert cause(passing) == "uniformity"
-    assert "walk past" in passing.reason
-    # Nor does a chart that moved, or lost its focus, become somebody who passes.
+    assert "walked past" in passing.reason
+    # A moved or defocused chart is not reported as a person.
     assert cause(taught.fork().take(WHITE_STEP, Bump(px=0.4))) == "movement"
     assert cause(taught.fork().take(WHITE_STEP, Defocus(px=0.5))) == "blur"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("codes", [ORANGE, (40, 180, 220)])
-def test_a_primary_without_light_is_named(taught: Bench, codes: tuple[int, int, int]) -> None:
+def test_reports_missing_primary(taught: Bench, codes: tuple[int, int, int]) -> None:
     lab = taught.fork()
-    assert "no red comes through" in lab.take(lab.light(*codes), DeadPrimary()).reason
-    # One that was dimmed, or another light that lacks red, is not called dead.
+    assert "red is missing" in lab.take(lab.light(*codes), DeadPrimary()).reason
+    # A dimmed primary, or another illuminant without red, is not reported as missing.
     for other in ((codes[0] // 2, *codes[1:]), (0, codes[1], codes[2] // 2)):
         lab = taught.fork()
-        seen = lab.show(lab.counts(lab.light(*other)), lab.light(*codes))
-        assert not seen.accepted
-        assert "comes through" not in seen.reason
+        judgement = lab.show(lab.counts(lab.light(*other)), lab.light(*codes))
+        assert not judgement.accepted
+        assert "is missing" not in judgement.reason
 
 
 @pytest.mark.slow
-def test_a_window_over_the_picture_is_told(taught: Bench) -> None:
+def test_reports_window_over_picture(taught: Bench) -> None:
     lab = taught.fork()
     judgement = lab.take(WHITE_STEP, PopUp())
     assert cause(judgement) == "uniformity"
@@ -236,21 +244,21 @@ def test_a_window_over_the_picture_is_told(taught: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_a_frame_given_twice_is_told_by_its_noise(taught: Bench) -> None:
+def test_reports_repeated_frame_by_noise(taught: Bench) -> None:
     lab = taught.fork()
     step = lab.light(*ORANGE)
     counts = lab.counts(step)
     assert lab.show(counts, step).accepted
     assert cause(lab.show(counts, step)) == "repeated"
     assert cause(lab.show(counts, lab.light(*SKY))) == "repeated"
-    # Passed on through something that changes a few counts: it is not the same file, but the same noise.
+    # Some counts were changed on the way: another file, but the same noise.
     changed = counts + (np.random.default_rng(1).random(counts.shape) < 0.2).astype(np.uint16)
     assert cause(lab.show(changed, step)) == "repeated"
     assert lab.take(step).accepted
 
 
 @pytest.mark.slow
-def test_missing_and_misplaced_rows_are_told(taught: Bench) -> None:
+def test_reports_missing_and_misplaced_rows(taught: Bench) -> None:
     lab = taught.fork()
     assert cause(lab.take(lab.light(*ORANGE), ZeroedStrip(top=0.5, bottom=0.51))) == "data"
     assert cause(lab.take(lab.light(*ORANGE), ScrambledRows())) == "rows"
@@ -262,7 +270,7 @@ def test_missing_and_misplaced_rows_are_told(taught: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_another_camera_exposure_or_file_is_told(taught: Bench, tmp_path: Path) -> None:
+def test_reports_wrong_camera_exposure_or_file(taught: Bench, tmp_path: Path) -> None:
     lab = taught.fork()
     step = lab.light(*ORANGE)
     other = lab.show(lab.counts(step), step, serial="7")
@@ -277,7 +285,7 @@ def test_another_camera_exposure_or_file_is_told(taught: Bench, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_dark_and_clipped_frames_are_told(taught: Bench) -> None:
+def test_reports_dark_and_clipped_frames(taught: Bench) -> None:
     lab = taught.fork()
     assert cause(lab.show(lab.counts(DARK_STEP), lab.light(*ORANGE))) == "exposure"
     assert cause(lab.show(lab.counts(lab.light(*ORANGE)), DARK_STEP)) == "leak_share"
@@ -286,71 +294,69 @@ def test_dark_and_clipped_frames_are_told(taught: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_a_screen_that_stays_lit_is_told_in_the_dark_frame(taught: Bench) -> None:
+def test_reports_lit_screen_in_dark_frame(taught: Bench) -> None:
     lab = taught.fork()
     assert lab.take(lab.light(*ORANGE)).accepted
-    assert "of the frame before" in lab.show(lab.counts(lab.light(*ORANGE)), DARK_STEP).reason
+    assert "previous illuminant" in lab.show(lab.counts(lab.light(*ORANGE)), DARK_STEP).reason
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wanting", [1, 4])
-def test_nothing_is_accepted_unseen_where_a_primary_or_the_dark_frame_is_wanting(few: Bench, wanting: int) -> None:
+@pytest.mark.parametrize("missing", [1, 4])
+def test_refuses_unpredictable_illuminants(few: Bench, missing: int) -> None:
     green = SessionStep(903, "response", None, Colour(0, 250, 0))
     for step in few.steps[:5]:
-        if step.number != wanting:
+        if step.number != missing:
             assert few.take(step).accepted
         else:
             assert not few.show(few.counts(green), step).accepted
-    # The screen stands still, and nothing would foretell its light.
+    # The screen is frozen, and its light cannot be predicted.
     grey, light = few.steps[5], next(step for step in few.steps if step.kind == "light")
-    unseen = [few.show(few.counts(green), step) for step in (grey, light)]
-    assert [cause(judgement) for judgement in unseen] == ["off_codes_deg", "off_codes_deg"]
-    assert "is accepted, from which it is known" in unseen[0].reason
-    assert few.take(few.steps[wanting]).accepted
+    unpredicted = [few.show(few.counts(green), step) for step in (grey, light)]
+    assert [cause(judgement) for judgement in unpredicted] == ["off_codes_deg", "off_codes_deg"]
+    assert "cannot be predicted" in unpredicted[0].reason
+    assert few.take(few.steps[missing]).accepted
     assert [few.take(step).reason for step in (grey, light)] == ["", ""]
     assert cause(few.show(few.counts(green), light)) == "off_codes_deg"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("passing", [0, 4])
-def test_somebody_who_passes_in_a_frame_that_others_are_held_against_is_told(few: Bench, passing: int) -> None:
+def test_reports_person_in_first_frames(few: Bench, passing: int) -> None:
     hand = Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3)
-    said = [few.take(step, *([hand] if step.number == passing else [])) for step in few.steps[:5]]
-    assert [judgement.accepted for judgement in said] == [True] * 4 + [False]
-    assert cause(said[4]) == "uniformity"
-    assert said[4].voids
+    judgements = [few.take(step, *([hand] if step.number == passing else [])) for step in few.steps[:5]]
+    assert [judgement.accepted for judgement in judgements] == [True] * 4 + [False]
+    assert cause(judgements[4]) == "uniformity"
+    assert judgements[4].voids
     light = next(step for step in few.steps if step.kind == "light")
-    again = [few.take(step) for step in (*few.steps[:6], light)]
-    assert [judgement.reason for judgement in again] == [""] * 7
+    repeated = [few.take(step) for step in (*few.steps[:6], light)]
+    assert [judgement.reason for judgement in repeated] == [""] * 7
 
 
 @pytest.mark.slow
-def test_somebody_who_passes_while_a_chart_that_moved_is_shown_the_primaries_is_told(
-    few: Bench, earlier: list[tuple[SessionStep, bytes]]
-) -> None:
+def test_reports_person_in_primaries_of_moved_chart(few: Bench, earlier: list[tuple[SessionStep, bytes]]) -> None:
     resumed = resume(few, earlier)
     elsewhere, hand = Bump(px=6.7), Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3)
     ties = link_steps(500)
-    said = [resumed.take(step, elsewhere, *([hand] if step.number == 502 else [])) for step in ties[:4]]
-    assert [judgement.voids for judgement in said] == [False, False, False, True]
-    again = [resumed.take(step, elsewhere) for step in (*ties, resumed.light(*SKY))]
-    assert [judgement.reason for judgement in again] == [""] * 7
+    judgements = [resumed.take(step, elsewhere, *([hand] if step.number == 502 else [])) for step in ties[:4]]
+    assert [judgement.voids for judgement in judgements] == [False, False, False, True]
+    repeated = [resumed.take(step, elsewhere) for step in (*ties, resumed.light(*SKY))]
+    assert [judgement.reason for judgement in repeated] == [""] * 7
 
 
 @pytest.mark.slow
-def test_a_session_whose_measurements_are_lost_goes_on(few: Bench) -> None:
+def test_continues_without_earlier_measurements(few: Bench) -> None:
     for step in few.steps[:2]:
         few.judge.recall(step, b"of another version", True)
-    said = [few.take(step).reason for step in (*link_steps(500), few.light(*SKY), DARK_STEP, few.light(*SKY))]
-    assert said == [""] * 9
+    judgements = [few.take(step).reason for step in (*link_steps(500), few.light(*SKY), DARK_STEP, few.light(*SKY))]
+    assert judgements == [""] * 9
     assert few.judge.state.modelled
 
 
 @pytest.mark.slow
-def test_a_run_taken_up_again_knows_what_was_seen(few: Bench, earlier: list[tuple[SessionStep, bytes]]) -> None:
+def test_resumes_with_earlier_model(few: Bench, earlier: list[tuple[SessionStep, bytes]]) -> None:
     resumed = resume(few, earlier)
     assert resumed.judge.state.modelled
-    # A day later the lamp is 3 % weaker: drift, no other light.
+    # A lamp that is 3 % weaker after a day has drifted.
     weaker = LampStep(percent=-3)
     ties = [resumed.take(step, weaker) for step in link_steps(500)]
     assert [tie.reason for tie in ties] == [""] * 6
@@ -358,30 +364,26 @@ def test_a_run_taken_up_again_knows_what_was_seen(few: Bench, earlier: list[tupl
     assert resumed.take(resumed.light(*SKY), weaker).accepted
     assert cause(resumed.show(resumed.counts(resumed.light(*SKY), weaker), resumed.light(*ORANGE))) == "off_codes_deg"
     assert cause(resumed.take(resumed.light(*SKY), LampStep(percent=-6))) == "off_brightness"
-    # Another lamp is told before the first light is taken under it.
+    # Another lamp is reported before the first illuminant.
     tie = resume(few, earlier).take(link_steps(500)[0], LampStep(percent=-21))
     assert cause(tie) == "white_drift"
     assert tie.lasting
 
 
 @pytest.mark.slow
-def test_a_chart_that_moved_between_runs_is_told_and_followed(
-    few: Bench, earlier: list[tuple[SessionStep, bytes]]
-) -> None:
+def test_follows_chart_that_moved_between_runs(few: Bench, earlier: list[tuple[SessionStep, bytes]]) -> None:
     resumed = resume(few, earlier)
     elsewhere = Bump(px=6.7, direction_deg=-27)
-    said = [resumed.take(step, elsewhere) for step in link_steps(500)]
-    assert all(judgement.accepted for judgement in said), [judgement.reason for judgement in said]
-    assert check(said[0], "movement").value == pytest.approx(6.7, abs=0.3)
+    judgements = [resumed.take(step, elsewhere) for step in link_steps(500)]
+    assert all(judgement.accepted for judgement in judgements), [judgement.reason for judgement in judgements]
+    assert check(judgements[0], "movement").value == pytest.approx(6.7, abs=0.3)
     later = resumed.take(resumed.light(*SKY), elsewhere)
     assert later.accepted, later.reason
     assert cause(resumed.take(resumed.light(*SKY))) == "movement"
 
 
 @pytest.mark.slow
-def test_without_response_frames_a_stale_light_is_told_and_others_are_not_refused(
-    tmp_path: Path, taught: Bench
-) -> None:
+def test_judges_without_response_frames(tmp_path: Path, taught: Bench) -> None:
     lab = bench(tmp_path, Room(seed=3), count=6, every=3, response=False)
     lab.world = taught.world
     for step in lab.steps:
@@ -393,7 +395,7 @@ def test_without_response_frames_a_stale_light_is_told_and_others_are_not_refuse
 
 
 @pytest.mark.slow
-def test_a_chart_that_is_not_there_is_said_in_the_first_frame(tmp_path: Path, taught: Bench) -> None:
+def test_reports_missing_chart_in_first_frame(tmp_path: Path, taught: Bench) -> None:
     wall = taught.world.expose(Colour(0, 0, 0), EXPOSURE, key=(1,))
     wall[60:, 60:] += np.uint16(3000)
     lab = bench(tmp_path, Room(seed=3))
@@ -405,7 +407,7 @@ def test_a_chart_that_is_not_there_is_said_in_the_first_frame(tmp_path: Path, ta
 
 
 @pytest.mark.slow
-def test_a_projector_that_does_not_add_is_told_and_not_refused(tmp_path: Path, taught: Bench) -> None:
+def test_reports_non_additive_projector_without_refusing(tmp_path: Path, taught: Bench) -> None:
     lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=10, every=5)
     lab.world = taught.world
 
@@ -417,26 +419,28 @@ def test_a_projector_that_does_not_add_is_told_and_not_refused(tmp_path: Path, t
         key = (next(FRAMES),)
         return lab.show(lab.world.expose(step.colour, EXPOSURE, key=key, situation=shown(colour or step.colour)), step)
 
-    said = [take(step) for step in lab.steps]
-    assert [judgement.reason for judgement in said if judgement.reason] == []
-    white = next(one for one, step in zip(said[::-1], lab.steps[::-1], strict=True) if step.kind == "white")
+    judgements = [take(step) for step in lab.steps]
+    assert [judgement.reason for judgement in judgements if judgement.reason] == []
+    white = next(
+        judgement for judgement, step in zip(judgements[::-1], lab.steps[::-1], strict=True) if step.kind == "white"
+    )
     assert check(white, "additivity").value == pytest.approx(40, abs=3)
-    of_lights = [one for one, step in zip(said, lab.steps, strict=True) if step.kind == "light"]
-    limits = [check(one, "off_codes_deg").high or 0 for one in of_lights]
+    of_lights = [judgement for judgement, step in zip(judgements, lab.steps, strict=True) if step.kind == "light"]
+    limits = [check(judgement, "off_codes_deg").high or 0 for judgement in of_lights]
     assert max(limits) > 0.8  # wider than where light adds
     assert cause(take(lab.light(*ORANGE), Colour(*SKY))) == "off_codes_deg"
 
 
 @pytest.mark.slow
-def test_where_white_has_some_hundred_counts_noise_and_black_level_are_no_light(tmp_path: Path) -> None:
+def test_accepts_dim_session_with_black_level_errors(tmp_path: Path) -> None:
     lab = bench(tmp_path, Room(seed=14, wheel_hz=60, white_level_share=0.05), count=4, every=4)
-    assert [said.reason for said in map(lab.take, lab.steps) if said.reason] == []
+    assert [judgements.reason for judgements in map(lab.take, lab.steps) if judgements.reason] == []
     assert lab.take(lab.light(*ORANGE)).accepted
     assert cause(lab.show(lab.counts(lab.light(*ORANGE)), lab.light(*SKY))) == "off_codes_deg"
 
 
 @pytest.mark.slow
-def test_a_first_frame_that_is_clipped_is_not_taken_again_and_again(tmp_path: Path) -> None:
+def test_stops_at_clipped_first_frame(tmp_path: Path) -> None:
     lab = bench(tmp_path, Room(seed=3, white_level_share=4.0))
     judgement = lab.take(WHITE_STEP)
     assert cause(judgement) == "clipping"
@@ -445,7 +449,7 @@ def test_a_first_frame_that_is_clipped_is_not_taken_again_and_again(tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_a_light_too_dark_for_it_leaves_blur_to_the_next_reference(taught: Bench) -> None:
+def test_measures_blur_at_next_reference_after_dim_illuminant(taught: Bench) -> None:
     lab = taught.fork()
     dim = lab.take(lab.light(0, 0, 56), Defocus(px=1))
     assert check(dim, "blur").value is None
@@ -458,56 +462,56 @@ def test_a_light_too_dark_for_it_leaves_blur_to_the_next_reference(taught: Bench
 JUDGE = JudgeSettings()
 
 
-def of_dark(state: JudgeState, frame: Measured) -> dict[str, Check]:
+def dark_checks(state: JudgeState, frame: Measured) -> dict[str, Check]:
     return {check.name: check for check in judge_dark(state, frame, JUDGE.dark_percent, JUDGE.ambient_percent)}
 
 
 @pytest.mark.parametrize(("percent", "passes"), [(4.9, True), (5.1, False)])
-def test_a_dark_frame_is_held_against_white_in_its_worst_channel(percent: float, passes: bool) -> None:
+def test_compares_dark_frame_with_white_per_channel(percent: float, passes: bool) -> None:
     # Of what white adds to green; the others stay at 0.
-    found = of_dark(known(first_dark=None), measured((0.0, 40.0 * percent, 0.0)))
-    assert found["leak_share"].passed is passes
-    assert found["leak_share"].value == pytest.approx(percent, abs=0.001)
-    assert (found["leak_share"].high, found["leak_share"].unit) == (5.0, "%")
-    assert "dark_drift" not in found, "there is no first dark frame that it could have changed from"
+    checks = dark_checks(base_state(first_dark=None), measured((0.0, 40.0 * percent, 0.0)))
+    assert checks["leak_share"].passed is passes
+    assert checks["leak_share"].value == pytest.approx(percent, abs=0.001)
+    assert (checks["leak_share"].high, checks["leak_share"].unit) == (5.0, "%")
+    assert "dark_drift" not in checks, "there is no first dark frame that it could have changed from"
 
 
 @pytest.mark.parametrize(("lit", "passes"), [(TILES // 20, True), (TILES // 10, False)])
-def test_light_in_a_part_of_a_dark_frame_counts_from_six_of_a_hundred_tiles(lit: int, passes: bool) -> None:
+def test_refuses_light_in_six_percent_of_dark_tiles(lit: int, passes: bool) -> None:
     tiles = np.zeros((TILES, 3))
     tiles[:lit] = 0.06 * (np.array(LIT) - DARK)
-    assert of_dark(known(first_dark=None), measured(tiles))["leak_share"].passed is passes
+    assert dark_checks(base_state(first_dark=None), measured(tiles))["leak_share"].passed is passes
 
 
-def test_where_white_hardly_lights_a_third_of_its_mean_stands_for_it() -> None:
+def test_replaces_dim_white_by_third_of_mean() -> None:
     tiles = np.tile(np.array(LIT), (TILES, 1))
     tiles[: TILES // 5] = DARK
-    state = replace(known(first_dark=None), white=measured(tiles))
+    state = replace(base_state(first_dark=None), white=measured(tiles))
     # 60 counts of green are 1.5 % of white where it lights, and 5.6 % of a third of its mean.
     unlit = np.zeros((TILES, 3))
     unlit[: TILES // 5, 1] = 60.0
-    assert of_dark(state, measured(unlit))["leak_share"].value == pytest.approx(
+    assert dark_checks(state, measured(unlit))["leak_share"].value == pytest.approx(
         100 * 60 / (4000 * (1 - TILES // 5 / TILES) / 3), abs=1e-3
     )
 
 
-@pytest.mark.parametrize("more", [True, False])
-def test_a_lamp_in_a_corner_is_told_by_its_region(more: bool) -> None:
-    """A corner of 4 × 4 tiles that changed by 1 % of white: a mean over all 24 regions would be below the limit."""
+@pytest.mark.parametrize("is_brighter", [True, False])
+def test_reports_lamp_in_corner_of_dark_frame(is_brighter: bool) -> None:
+    """A corner of 4 × 4 tiles changed by 1 % of white; the mean of all 24 regions would be below the limit."""
     grid = np.tile(np.array(DARK), (TILE_ROWS, TILE_COLUMNS, 1))
-    grid[-4:, -4:] += (0.01 if more else -0.01) * (np.array(LIT) - DARK)
-    found = of_dark(known(), measured(grid.reshape(TILES, 3)))
-    assert found["leak_share"].passed
-    assert not found["dark_drift"].passed
-    assert found["dark_drift"].value == pytest.approx(1.0, abs=0.001)
-    assert ("of white more" in found["dark_drift"].reason) is more
-    assert ("of white less" in found["dark_drift"].reason) is not more
-    assert of_dark(known(), measured(DARK))["dark_drift"] == Check("dark_drift", 0.0, None, 0.2, "%")
+    grid[-4:, -4:] += (0.01 if is_brighter else -0.01) * (np.array(LIT) - DARK)
+    checks = dark_checks(base_state(), measured(grid.reshape(TILES, 3)))
+    assert checks["leak_share"].passed
+    assert not checks["dark_drift"].passed
+    assert checks["dark_drift"].value == pytest.approx(1.0, abs=0.001)
+    assert ("(more)" in checks["dark_drift"].reason) is is_brighter
+    assert ("(less)" in checks["dark_drift"].reason) is not is_brighter
+    assert dark_checks(base_state(), measured(DARK))["dark_drift"] == Check("dark_drift", 0.0, None, 0.2, "%")
 
 
-def test_the_change_that_is_allowed_in_the_dark_is_wider_where_noise_or_the_black_level_makes_one() -> None:
+def test_widens_dark_limit_by_noise_and_black_level() -> None:
     def allowed(frame: Measured, white: npt.ArrayLike = LIT) -> float:
-        return of_dark(replace(known(), white=measured(white)), frame)["dark_drift"].high or 0.0
+        return dark_checks(replace(base_state(), white=measured(white)), frame)["dark_drift"].high or 0.0
 
     assert allowed(measured(DARK)) == JUDGE.ambient_percent
     # The black level's drift is .3 counts; σ is 40 counts, in 100 blocks of each of 16 tiles 1 count; white is 2000.
@@ -522,7 +526,7 @@ def test_the_change_that_is_allowed_in_the_dark_is_wider_where_noise_or_the_blac
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_paper_white_is_held_against_the_first_of_the_session(sign: int) -> None:
+def test_limits_drift_of_paper_white(sign: int) -> None:
     paper = np.array([500.0, 1000.0, 700.0])
     first = Frame(measured(LIT), paper, np.zeros(2))
 
@@ -541,13 +545,13 @@ def test_paper_white_is_held_against_the_first_of_the_session(sign: int) -> None
 @pytest.mark.parametrize(
     ("own", "other", "passes", "black"), [(0.11, 0, True, False), (0.09, 0, False, True), (0.11, 0.12, False, False)]
 )
-def test_a_primary_below_a_tenth_of_white_is_nearly_black(own: float, other: float, passes: bool, black: bool) -> None:
+def test_refuses_primary_below_tenth_of_white(own: float, other: float, passes: bool, black: bool) -> None:
     share = np.array([0.0, own, other])
-    found = judge_first_primary(known(), measured(DARK + share * (np.array(LIT) - DARK)), 1)
-    assert (found.passed, "nearly black" in found.reason) == (passes, black)
-    assert (found.low, found.high) == (10.0, None)
+    failed = judge_first_primary(base_state(), measured(DARK + share * (np.array(LIT) - DARK)), 1)
+    assert (failed.passed, "nearly black" in failed.reason) == (passes, black)
+    assert (failed.low, failed.high) == (10.0, None)
     # Without a dark frame the counts count as they are.
-    bare = judge_first_primary(replace(known(), dark=None), measured(share * LIT), 1)
+    bare = judge_first_primary(replace(base_state(), dark=None), measured(share * LIT), 1)
     assert (bare.value, bare.passed) == (pytest.approx(100 * own), passes)
 
 
@@ -565,59 +569,57 @@ LIGHT = SessionStep(20, "light", 0, Colour(255, 197, 126))
         (0.7, "off_brightness"),
     ],
 )
-def test_the_first_white_frame_is_held_against_what_the_others_say_before_the_first_light(
-    gain: npt.ArrayLike, name: str | None
-) -> None:
-    found = judge_first_frames(begun(gain), LIGHT, None, JUDGE)
-    assert (None if found is None else found.name) == name
-    if name == "off_brightness" and found is not None:
-        assert found.value == pytest.approx(100 * (float(np.max(gain)) - 1), abs=2)
-        assert found.low is not None
-        assert found.low == -(found.high or 0) < -JUDGE.drift_percent
-        assert f"{found.value:+.1f} % as bright" in found.reason
+def test_compares_first_white_with_prediction(gain: npt.ArrayLike, name: str | None) -> None:
+    failed = judge_first_frames(started_state(gain), LIGHT, None, JUDGE)
+    assert (None if failed is None else failed.name) == name
+    if name == "off_brightness" and failed is not None:
+        assert failed.value == pytest.approx(100 * (float(np.max(gain)) - 1), abs=2)
+        assert failed.low is not None
+        assert failed.low == -(failed.high or 0) < -JUDGE.drift_percent
+        assert f"{failed.value:+.1f} %" in failed.reason
 
 
-def test_the_first_white_frame_is_judged_at_the_first_light_alone_and_where_enough_is_known() -> None:
-    odd = begun(1.3)
+def test_judges_first_white_only_at_first_illuminant() -> None:
+    odd = started_state(1.3)
     assert judge_first_frames(odd, replace(LIGHT, kind="response"), None, JUDGE) is None
     assert judge_first_frames(replace(odd, founding=False), LIGHT, None, JUDGE) is None
     assert judge_first_frames(replace(odd, basis=None), LIGHT, None, JUDGE) is None
     assert judge_first_frames(replace(odd, first_frames=odd.first_frames[1:]), LIGHT, None, JUDGE) is None
-    assert judge_first_frames(begun(1.3, greys=0), LIGHT, None, JUDGE) is None
+    assert judge_first_frames(started_state(1.3, greys=0), LIGHT, None, JUDGE) is None
 
 
-def test_first_frames_are_doubted_where_a_step_contradicts_them_twice() -> None:
+def test_repeats_first_frames_after_two_contradictions() -> None:
     uneven = Check("uniformity", 0.3, None, 0.02, "", "part is covered")
-    state = begun()
-    assert judge_first_frames(state, LIGHT, uneven, JUDGE) is None, "once may be anything"
-    doubted = replace(state, doubted=frozenset({LIGHT.number}))
-    found = judge_first_frames(doubted, LIGHT, uneven, JUDGE)
-    assert found is not None
-    assert (found.name, found.value, found.high) == ("uniformity", 0.3, 0.02)
-    assert found.reason.startswith("part is covered; ")
-    assert judge_first_frames(doubted, LIGHT, replace(uneven, name="file"), JUDGE) is None, "contradicts no frame"
-    # A frame refused for want of the primaries has nothing that it could contradict.
-    awaiting = replace(doubted, basis=None, asked=True)
+    state = started_state()
+    assert judge_first_frames(state, LIGHT, uneven, JUDGE) is None, "one contradiction is no evidence"
+    contradicted = replace(state, contradicted=frozenset({LIGHT.number}))
+    failed = judge_first_frames(contradicted, LIGHT, uneven, JUDGE)
+    assert failed is not None
+    assert (failed.name, failed.value, failed.high) == ("uniformity", 0.3, 0.02)
+    assert failed.reason.startswith("part is covered; ")
+    assert judge_first_frames(contradicted, LIGHT, replace(uneven, name="file"), JUDGE) is None, "contradicts no frame"
+    # A frame that was refused because primaries are missing contradicts no frame.
+    awaiting = replace(contradicted, basis=None, primary_shown=True)
     assert judge_first_frames(awaiting, LIGHT, Check("off_codes_deg", reason="is accepted"), JUDGE) is None
     assert judge_first_frames(awaiting, LIGHT, uneven, JUDGE) is not None
-    assert judge_first_frames(doubted, LIGHT, Check("off_codes_deg", reason="is another"), JUDGE) is not None
-    only_dark = replace(doubted, first_frames=(Seen((0, 0, 0), measured(DARK), None),))
-    assert judge_first_frames(only_dark, LIGHT, uneven, JUDGE) is None, "of a dark frame nothing is learnt"
+    assert judge_first_frames(contradicted, LIGHT, Check("off_codes_deg", reason="is another"), JUDGE) is not None
+    only_dark = replace(contradicted, first_frames=(RecentFrame((0, 0, 0), measured(DARK), None),))
+    assert judge_first_frames(only_dark, LIGHT, uneven, JUDGE) is None, "a dark frame cannot be contradicted"
 
 
-def test_first_frames_are_taken_again_as_often_as_a_passer_by_needs_and_then_somebody_is_asked() -> None:
+def test_asks_for_help_after_repeated_restarts() -> None:
     uneven = Check("uniformity", 0.3, None, 0.02, "", "part is covered")
-    doubted = replace(begun(), doubted=frozenset({LIGHT.number}))
-    said = [
-        judge_first_frames(replace(doubted, restarts=restarts), LIGHT, uneven, JUDGE)
+    contradicted = replace(started_state(), contradicted=frozenset({LIGHT.number}))
+    judgements = [
+        judge_first_frames(replace(contradicted, restarts=restarts), LIGHT, uneven, JUDGE)
         for restarts in range(MOST_RESTARTS + 2)
     ]
-    asked = ["do not agree" in found.reason for found in said if found is not None]
-    assert asked == [False] * MOST_RESTARTS + [True, True]
+    need_person = ["still disagree" in conflict.reason for conflict in judgements if conflict is not None]
+    assert need_person == [False] * MOST_RESTARTS + [True, True]
 
 
-def test_amounts_are_as_sure_as_the_noise_of_all_tiles_and_the_black_level() -> None:
-    frame, basis = picture((200, 150, 100)), begun().basis
+def test_computes_covariance_of_amounts() -> None:
+    frame, basis = picture((200, 150, 100)), started_state().basis
     assert basis is not None
     seen = frame.tiles[0] - DARK
     # Of 100 blocks to a tile, green twice a block; what else a tile is off by is 0.3 %.
@@ -636,12 +638,12 @@ def test_amounts_are_as_sure_as_the_noise_of_all_tiles_and_the_black_level() -> 
     [(False, (np.nan, np.nan), (0.0, 0.0)), (False, (0.35, 0.0), (0.3, 0.0)), (True, (np.nan, np.nan), (0.3, 0.0))],
     ids=["creeps", "repeated", "after a pause"],
 )
-def test_a_chart_s_place_of_rest_is_another_only_if_it_is_shown_twice_or_after_a_pause(
+def test_changes_rest_position_after_two_frames_or_pause(
     rested: bool, candidate: tuple[float, float], rests: tuple[float, float]
 ) -> None:
     frame = Frame(measured(LIT), np.full(3, 500.0), np.array([0.3, 0.0]))
-    before = known(moved_px=np.zeros(2), rested=rested, candidate=(np.nan, *candidate))
-    after = before.after(LIGHT, Examined(frame, None, True)).moved_px
+    before = base_state(moved_px=np.zeros(2), rested=rested, candidate=(np.nan, *candidate))
+    after = before.updated(LIGHT, ExaminedFrame(frame, None, True)).moved_px
     assert after is not None
     assert after.tolist() == list(rests)
 
@@ -651,54 +653,54 @@ FULL = (TOP, TOP, TOP)
 MODEL = replace(ProjectorModel.unknown(), covariance=np.zeros_like(ProjectorModel.unknown().covariance))
 
 
-def seen_light(
+def comparison_of(
     amounts: Amounts,
     codes: tuple[int, int, int] = FULL,
     before: tuple[tuple[int, int, int], Amounts | None] | None = None,
     plan: tuple[tuple[int, int, int], ...] = (),
-) -> judge._SeenLight:
+) -> judge._LightComparison:
     nothing = np.zeros(0)
     light = FrameLight(np.array(amounts), np.zeros((3, 3)), Residuals(nothing, nothing, nothing))
-    was = None if before is None else (None if before[1] is None else np.array(before[1]))
-    frame = None if before is None else Seen(before[0], measured(LIT), was)
-    return judge._SeenLight(MODEL, light, codes, frame, plan)
+    amounts_before = None if before is None else (None if before[1] is None else np.array(before[1]))
+    frame = None if before is None else RecentFrame(before[0], measured(LIT), amounts_before)
+    return judge._LightComparison(MODEL, light, codes, frame, plan)
 
 
 @pytest.mark.parametrize(
-    ("blue", "again", "before", "said"),
+    ("blue", "again", "before", "words"),
     [
         (0.96, True, (FULL, 0.96), ""),
-        (0.96, False, (FULL, 0.96), "is not the one ordered"),
+        (0.96, False, (FULL, 0.96), "is not the ordered"),
         (0.96, True, (FULL, 0.985), ""),  # 4.5 deviations of 0.004 · √2
-        (0.96, True, (FULL, 0.995), "is not the one ordered"),  # 6.2
-        (0.96, True, None, "is not the one ordered"),
-        (0.92, True, (FULL, 0.92), "is not the one ordered"),  # by 2.2°, of which 2 are lived with
-        (0.96, True, ((TOP, TOP, 200), 0.96), "light of the frame before"),
+        (0.96, True, (FULL, 0.995), "is not the ordered"),  # 6.2
+        (0.96, True, None, "is not the ordered"),
+        (0.92, True, (FULL, 0.92), "is not the ordered"),  # by 2.2°, of which 2° are accepted
+        (0.96, True, ((TOP, TOP, 200), 0.96), "the previous illuminant"),
         (1.0, False, ((TOP, TOP, 245), 1.001), ""),  # both fit
     ],
 )
-def test_a_light_of_another_colour_is_lived_with_where_it_is_shown_twice(
-    blue: float, again: bool, before: tuple[tuple[int, int, int], float] | None, said: str
+def test_accepts_small_colour_error_shown_twice(
+    blue: float, again: bool, before: tuple[tuple[int, int, int], float] | None, words: str
 ) -> None:
-    was = None if before is None else (before[0], (1.0, 1.0, before[1]))
-    light = seen_light((1, 1, blue), before=was)
-    reason, added = light.cause(blue < 1, 0.01, again=again)
-    assert (said in reason) if said else not reason
+    previous = None if before is None else (before[0], (1.0, 1.0, before[1]))
+    light = comparison_of((1, 1, blue), before=previous)
+    reason, added = light.cause(blue < 1, 0.01, was_refused=again)
+    assert (words in reason) if words else not reason
     assert added == 0
 
 
-def test_the_lamp_is_followed_where_it_is_shown_twice_alike_and_by_five_per_cent_at_most() -> None:
-    basis = begun().basis
+def test_accepts_lamp_step_shown_twice_up_to_limit() -> None:
+    basis = started_state().basis
     assert basis is not None
     step = SessionStep(20, "light", 0, Colour(*FULL))
 
     def lamp(level: float, before: float) -> tuple[bool, bool]:
-        light = seen_light((level, level, level)).light
-        state = replace(known(basis=basis, model=MODEL), candidate=(float(np.log(before)), np.nan, np.nan))
-        checks, seen = judge._judge_light(state, step, light, (), 0.5, 1.0)
+        light = comparison_of((level, level, level)).light
+        state = replace(base_state(basis=basis, model=MODEL), candidate=(float(np.log(before)), np.nan, np.nan))
+        checks, lamp_state = judge._judge_light(state, step, light, (), 0.5, 1.0)
         assert [check.name for check in checks] == ["off_codes_deg", "off_brightness"]
-        assert isinstance(seen, LampSeen)
-        return not checks[1].reason, seen.stepped
+        assert isinstance(lamp_state, LampState)
+        return not checks[1].reason, lamp_state.stepped
 
     # Six deviations of the lamp's level, √(0.004²/3 + 0.002² + …), are 1.84 %.
     assert lamp(0.985, 1.2) == (True, False)
@@ -709,20 +711,20 @@ def test_the_lamp_is_followed_where_it_is_shown_twice_alike_and_by_five_per_cent
     assert lamp(0.945, 0.945) == (False, False)
 
 
-def test_what_lamps_lean_by_is_as_sure_as_all_of_them() -> None:
+def test_detects_slow_change_in_several_frames() -> None:
     lamp = ((0.012, 0.003),)
-    assert judge.crept(Leaning(lamp * 2, ((0.0, 1.0),) * 2), 0.01)[0] == ""  # 6 deviations are 0.0127
-    assert "1.2 % stronger" in judge.crept(Leaning(lamp * 3, ((0.0, 1.0),) * 3), 0.01)[0]  # 0.0104
-    assert judge.crept(Leaning(lamp * 3, ((0.0, 1.0),) * 3), 0.0125)[0] == ""
-    assert judge.crept(Leaning(((0.0, 1.0),) * 2, ((0.0041, 0.001),) * 2), 0.01) == ("", pytest.approx(0.0041))
-    assert judge.crept(Leaning(((0.0, 1.0),) * 2, ((0.0039, 0.001),) * 2), 0.01) == ("", 0.0)
-    assert judge.crept(Leaning(((0.0, 1.0),) * 2, ((0.0041, 0.0014),) * 2), 0.01) == ("", 0.0)
+    assert judge.slow_change(Leaning(lamp * 2, ((0.0, 1.0),) * 2), 0.01)[0] == ""  # 6 deviations are 0.0127
+    assert "1.2 % stronger" in judge.slow_change(Leaning(lamp * 3, ((0.0, 1.0),) * 3), 0.01)[0]  # 0.0104
+    assert judge.slow_change(Leaning(lamp * 3, ((0.0, 1.0),) * 3), 0.0125)[0] == ""
+    assert judge.slow_change(Leaning(((0.0, 1.0),) * 2, ((0.0041, 0.001),) * 2), 0.01) == ("", pytest.approx(0.0041))
+    assert judge.slow_change(Leaning(((0.0, 1.0),) * 2, ((0.0039, 0.001),) * 2), 0.01) == ("", 0.0)
+    assert judge.slow_change(Leaning(((0.0, 1.0),) * 2, ((0.0041, 0.0014),) * 2), 0.01) == ("", 0.0)
 
 
 def moved(
     place: tuple[float, float], state: JudgeState | None = None, growth: float = 0.0
 ) -> tuple[Check, Check, list[float]]:
-    """Return what is said of movement and blur where the chart is found at a place, and the place."""
+    """Return the checks of movement and blur for a chart at a position, and the position."""
     anchor: Any = Mock()
     anchor.shift.return_value = Shift(*place, 0.0, 4, growth)
     # Green has the best signal to noise; of paper the others would be too dark.
@@ -755,7 +757,7 @@ def repeated(x: float, y: float) -> JudgeState:
         ((1.01, 0.0), repeated(1.01, 0.0), 1.01, False),
     ],
 )
-def test_a_chart_has_moved_by_more_than_its_limit_from_where_it_rests(
+def test_limits_movement_from_rest_position(
     place: tuple[float, float], state: JudgeState, value: float, passed: bool
 ) -> None:
     movement, _, at = moved(place, state)
@@ -767,13 +769,13 @@ def test_a_chart_has_moved_by_more_than_its_limit_from_where_it_rests(
     ("growth", "value", "reason"),
     [(0.29**2, 0.29, ""), (0.31**2, 0.31, "softer"), (-(0.59**2), -0.59, ""), (-(0.61**2), -0.61, "sharper")],
 )
-def test_blur_may_shrink_by_twice_what_it_may_grow(growth: float, value: float, reason: str) -> None:
+def test_limits_blur_asymmetrically(growth: float, value: float, reason: str) -> None:
     _, blur, _ = moved((0, 0), growth=growth)
     assert (blur.value, blur.low, blur.high) == (pytest.approx(value), -0.6, 0.3)
     assert (reason in blur.reason) if reason else not blur.reason
 
 
-def test_the_noise_of_two_frames_is_as_independent_as_it_is_not_correlated() -> None:
+def test_measures_independence_of_noise() -> None:
     random = np.random.default_rng(5)
     shared, own = random.normal(0, 20, (2, 40_000))
 
@@ -792,26 +794,26 @@ def test_the_noise_of_two_frames_is_as_independent_as_it_is_not_correlated() -> 
     assert judge._independence(one, frame((steps < 10) * 1.0)) is not None
 
 
-def test_causes_last_or_put_others_in_doubt() -> None:
+def test_causes_are_lasting_or_void_other_frames() -> None:
     light, grey = SessionStep(20, "light", 0, Colour(9, 9, 9)), SessionStep(3, "response", None, Colour(*FULL))
-    white = known()
+    white = base_state()
     lasting = judge._is_lasting
     assert {name for name in CAUSES if lasting(white, light, name)} == {"other_camera", "chart"}
     assert {name for name in CAUSES if lasting(JudgeState(), light, name)} == {"other_camera", "chart", "clipping"}
     assert {name for name in CAUSES if lasting(white, grey, name)} == {"other_camera", "chart", "white_drift"}
-    assert lasting(replace(white, refused=("off_codes_deg", 3)), light, "off_codes_deg")
-    assert not lasting(replace(white, refused=("off_codes_deg", 2)), light, "off_codes_deg")
+    assert lasting(replace(white, refusals=("off_codes_deg", 3)), light, "off_codes_deg")
+    assert not lasting(replace(white, refusals=("off_codes_deg", 2)), light, "off_codes_deg")
     voids = judge._voids_others
     hidden = {"stray_share", "dark_drift", "leak_share"}
     unmodelled = hidden | {"rows", "uniformity", "off_codes_deg", "off_brightness", "white_drift"}
     assert {name for name in CAUSES if voids(white, name)} == unmodelled
-    modelled = replace(white, basis=begun().basis, untold=frozenset({"blur"}))
+    modelled = replace(white, basis=started_state().basis, unmeasured=frozenset({"blur"}))
     assert {name for name in CAUSES if voids(modelled, name)} == hidden | {"blur"}
 
 
 @pytest.mark.parametrize(("step", "rows", "ragged"), [(0.019, 9, False), (0.021, 9, True), (0.021, 3, False)])
-def test_rows_of_several_places_differ_from_row_to_row(step: float, rows: int, ragged: bool) -> None:
-    """By a tenth of what they deviate by, 0.2; of three rows there are two steps, where three are asked."""
+def test_detects_rows_of_several_places(step: float, rows: int, ragged: bool) -> None:
+    """By a tenth of their deviation of 0.2; three rows have two steps, but three are needed."""
     signed = np.zeros((20, SEGMENTS))
     signed[4 : 4 + rows, 1] = 0.2 + step * (np.arange(rows) % 2) - step / 2
     rest = Residuals(np.abs(signed.ravel()), np.zeros(signed.size), signed.ravel())

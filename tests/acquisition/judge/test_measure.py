@@ -1,4 +1,4 @@
-"""Exposure is judged on counts: clipping, darkness, stray light; and where a frame is looked at without a chart."""
+"""Limits of the exposure, comparison of the exposure with the settings, and white paper without a chart."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ def mosaic_of(tmp_path: Path, level: int, clipped: int = 0) -> Mosaic:
     [
         (0.0, 8000, "light", None),
         (0.001, 8000, "light", None),
-        (0.0011, 8000, "light", "0.1% of the photosites are clipped, 0.1 % allowed"),
+        (0.0011, 8000, "light", "0.1% of the photosites are clipped, at most 0.1 % allowed"),
         (0.031, 8000, "white", "3.1% of the photosites are clipped"),
         (0.0, 99, "light", "are 99 counts above black, at least 100 expected"),
         (0.0, 100, "white", None),
         (0.0, 8, "dark", None),
-        (0.0, 0.06 * RANGE, "dark", "6.0% of saturation, 5 % allowed"),
+        (0.0, 0.06 * RANGE, "dark", "6.0% of saturation, at most 5 % allowed"),
     ],
 )
-def test_a_refusal_says_value_and_limit(clipped: float, brightest: float, kind: str, expected: str | None) -> None:
+def test_refusal_reports_value_and_limit(clipped: float, brightest: float, kind: str, expected: str | None) -> None:
     reason = refusal(Exposure(clipped, brightest, RANGE), kind, LIMITS)  # pyrefly: ignore[bad-argument-type]
     if expected is None:
         assert reason is None
@@ -61,11 +61,11 @@ def test_a_refusal_says_value_and_limit(clipped: float, brightest: float, kind: 
         assert expected in reason
 
 
-ASKED = ExposureSettings(iso=100, aperture=8, shutter_s=0.5)
+SETTINGS = ExposureSettings(iso=100, aperture=8, shutter_s=0.5)
 
 
 @pytest.mark.parametrize(
-    ("asked", "stated"),
+    ("settings", "values"),
     [  # nominal value on the dial, exact value in the file: 2^(n/8) s, 2^(n/16), 100 · 2^(n/8)
         ({"shutter_s": 30.0}, {"shutter_s": 32.0}),
         ({"shutter_s": 1 / 60}, {"shutter_s": 1 / 64}),
@@ -81,35 +81,35 @@ ASKED = ExposureSettings(iso=100, aperture=8, shutter_s=0.5)
         ({"aperture": None}, {"aperture": None}),
     ],
 )
-def test_a_nominal_value_agrees_with_the_exact_one_behind_it(
-    tmp_path: Path, asked: dict[str, float | None], stated: dict[str, float | None]
+def test_accepts_rounded_exposure_values(
+    tmp_path: Path, settings: dict[str, float | None], values: dict[str, float | None]
 ) -> None:
-    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyrefly: ignore[bad-argument-type]
-    assert disagreement(mosaic, replace(ASKED, **asked)) is None  # pyrefly: ignore[bad-argument-type]
+    mosaic = replace(mosaic_of(tmp_path, 4000), **values)  # pyrefly: ignore[bad-argument-type]
+    assert disagreement(mosaic, replace(SETTINGS, **settings)) is None  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.mark.parametrize(
-    ("stated", "expected"),
+    ("values", "expected"),
     [
-        ({"shutter_s": 0.4}, "the file states shutter time in s 0.4 instead of 0.5; was a dial of the camera turned?"),
+        ({"shutter_s": 0.4}, "the file states shutter time in s 0.4 instead of 0.5"),
         ({"shutter_s": 0.6}, "shutter time in s 0.6 instead of 0.5"),
         ({"aperture": 9.0}, "aperture 9 instead of 8"),
         ({"iso": 125}, "ISO speed 125 instead of 100"),
         ({"iso": 200, "shutter_s": 0.25}, "ISO speed 200 instead of 100, shutter time in s 0.25 instead of 0.5"),
     ],
 )
-def test_a_dial_turned_by_one_third_of_a_stop_is_seen(tmp_path: Path, stated: dict[str, float], expected: str) -> None:
-    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyrefly: ignore[bad-argument-type]
-    assert expected in (disagreement(mosaic, ASKED) or "")
+def test_reports_dial_turned_by_third_of_stop(tmp_path: Path, values: dict[str, float], expected: str) -> None:
+    mosaic = replace(mosaic_of(tmp_path, 4000), **values)  # pyrefly: ignore[bad-argument-type]
+    assert expected in (disagreement(mosaic, SETTINGS) or "")
 
 
-def test_a_lens_put_on_in_place_of_one_without_contacts_is_seen(tmp_path: Path) -> None:
+def test_reports_aperture_of_other_lens(tmp_path: Path) -> None:
     mosaic = replace(mosaic_of(tmp_path, 4000), aperture=5.6)
-    assert "aperture 5.6 instead of none" in (disagreement(mosaic, replace(ASKED, aperture=None)) or "")
+    assert "aperture 5.6 instead of none" in (disagreement(mosaic, replace(SETTINGS, aperture=None)) or "")
 
 
-def test_paper_that_does_not_change_is_as_bright_in_the_frame_that_its_places_were_chosen_in() -> None:
-    """As of the brightest of the noise it would be 1.2 % brighter there."""
+def test_paper_level_has_no_selection_bias() -> None:
+    """Selecting the brightest noise would make the first frame 1.2 % brighter."""
     random = np.random.default_rng(4)
     scene = np.full((400, 600), 200.0)
     middles = [(x, y) for y in range(20, 380, 20) for x in range(20, 580, 20)]
@@ -117,9 +117,9 @@ def test_paper_that_does_not_change_is_as_bright_in_the_frame_that_its_places_we
         # Light falls off by a quarter, as it does over a frame.
         scene[y - 5 : y + 6, x - 5 : x + 6] = 1000 * (1 - 0.25 * np.hypot(x - 300, y - 200) / 360)
     first, later = (np.asarray(scene + random.normal(0, 15, scene.shape), dtype=np.float32) for _ in range(2))
-    found = measure._paper(first, np.array(middles, dtype=np.float64))
-    x, y = found.T
-    assert len(found) == len(middles)
-    assert np.abs(found - middles).max() <= 2
+    centres = measure._paper(first, np.array(middles, dtype=np.float64))
+    x, y = centres.T
+    assert len(centres) == len(middles)
+    assert np.abs(centres - middles).max() <= 2
     levels = [np.mean([frame[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)]) for frame in (first, later)]
     assert levels[0] == pytest.approx(levels[1], rel=1.5e-3)

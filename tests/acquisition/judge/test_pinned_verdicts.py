@@ -55,26 +55,33 @@ def said(judgement: Judgement) -> dict[str, Any]:
 
 
 def failed(judgement: Judgement) -> dict[str, Any]:
-    """Return the checks that a frame fails, with their values."""
-    wrong = {one.name: one.value for one in judgement.checks if one.reason}
-    return {**wrong, "failed": len(wrong), "voids": judgement.voids, "lasting": judgement.lasting}
+    failures = {check.name: check.value for check in judgement.checks if check.reason}
+    return {**failures, "failed": len(failures), "voids": judgement.voids, "lasting": judgement.lasting}
 
 
-def known(now: JudgeState) -> dict[str, Any]:
-    """Return what a judge knows, but for pictures."""
-    model, first = now.model, now.first_white
+def state_numbers(state: JudgeState) -> dict[str, Any]:
+    """Return the state of a judge without its images."""
+    model, first = state.model, state.first_white
     return {
         "model": [model.state, model.covariance, model.chroma, model.brightness, model.overlap, model.curves()],
-        "moved": [now.moved_px, now.rested, now.lost, sorted(now.untold), now.refused, now.restarts, now.expected],
-        "candidate": now.candidate,
+        "moved": [
+            state.moved_px,
+            state.rested,
+            state.lost,
+            sorted(state.unmeasured),
+            state.refusals,
+            state.restarts,
+            state.restart_step,
+        ],
+        "candidate": state.candidate,
         "paper": None if first is None else first.paper,
-        "recent": [[one.codes, one.amounts] for one in now.recent],
-        "basis": None if now.basis is None else [now.basis.maps, now.basis.dark],
+        "recent": [[one.codes, one.amounts] for one in state.recent],
+        "basis": None if state.basis is None else [state.basis.maps, state.basis.dark],
     }
 
 
-def seen(measurement: bytes) -> Any:
-    frame = Frame.of_bytes(measurement)
+def frame_numbers(measurement: bytes) -> Any:
+    frame = Frame.from_bytes(measurement)
     if frame is None:
         return None
     one, anchor = frame.measured, frame.anchor
@@ -89,7 +96,7 @@ def seen(measurement: bytes) -> Any:
 
 @pytest.fixture
 def numbered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the noise of frames depend on this test alone."""
+    """Make the noise of frames independent of other tests."""
     monkeypatch.setattr(conftest, "FRAMES", itertools.count(70_000))
 
 
@@ -115,38 +122,42 @@ WRONG: dict[str, tuple[tuple[int, int, int], tuple[AnyDisturbance, ...]]] = {
     "other rows": (ORANGE, (ScrambledRows(top=0.3, bottom=0.35),)),
     "much": (ORANGE, (LampStep(percent=-4.0), Bump(px=0.5), Person(place=(0.3, 0.4, 0.5, 0.6), left=0.3))),
 }
-AGAIN = {"a small bump": 2, "a weaker lamp": 2, "another colour": 3, "much": 3}
-"""What is taken more than once: it is lived with, or lasts."""
+# Disturbances whose frames are repeated: accepted then, or lasting.
+REPEATS = {"a small bump": 2, "a weaker lamp": 2, "another colour": 3, "much": 3}
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("numbered")
-def test_a_session_is_judged_as_it_was(tmp_path: Path, pinned: Pinned) -> None:
+def test_judges_a_session(tmp_path: Path, pinned: Pinned) -> None:
     lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
     steps = [lab.take(step) for step in lab.steps]
     pinned("verdicts of a session", [said(one) for one in steps[::2]], same=1e-3, nothing=ROUNDED)
-    pinned("frames of a session as measured", [[one.seen, seen(one.measurement)] for one in steps[::4]], same=1e-4)
-    pinned("what the judge knows after a session", known(lab.judge.state), same=1e-4, nothing=1e-7)
-    wrong: dict[str, Any] = {}
+    pinned(
+        "frames of a session as measured",
+        [[one.seen, frame_numbers(one.measurement)] for one in steps[::4]],
+        same=1e-4,
+    )
+    pinned("what the judge knows after a session", state_numbers(lab.judge.state), same=1e-4, nothing=1e-7)
+    failures: dict[str, Any] = {}
     before = lab.fork()
     before.take(before.light(*SKY))
     for name, (codes, events) in WRONG.items():
         one = before.fork()
-        again = [one.take(one.light(*codes), *events, before=Colour(*SKY)) for _ in range(AGAIN.get(name, 1))]
-        wrong[name] = {str(number): failed(each) for number, each in enumerate(again)}
-        wrong[name] |= {"candidate": one.judge.state.candidate, "refused": one.judge.state.refused}
+        again = [one.take(one.light(*codes), *events, before=Colour(*SKY)) for _ in range(REPEATS.get(name, 1))]
+        failures[name] = {str(number): failed(each) for number, each in enumerate(again)}
+        failures[name] |= {"candidate": one.judge.state.candidate, "refused": one.judge.state.refusals}
     references = (
         (WHITE_STEP, ("a small bump", "a weaker lamp", "light in the room", "a hand", "a pop-up", "defocus")),
         (DARK_STEP, ("light in the room", "a pop-up")),
     )
     for step, titles in references:
         for title in titles:
-            wrong[f"{step.kind}, {title}"] = failed(lab.fork().take(step, *WRONG[title][1]))
-    pinned("verdicts of what goes wrong", wrong, same=1e-3, nothing=ROUNDED)
+            failures[f"{step.kind}, {title}"] = failed(lab.fork().take(step, *WRONG[title][1]))
+    pinned("verdicts of what goes wrong", failures, same=1e-3, nothing=ROUNDED)
 
 
 def learnt(seed: int, count: int) -> tuple[ProjectorModel, ProjectorModel]:
-    """Return a projector in which light does not add, and what is learnt of it from some lights."""
+    """Return a projector in which light does not add, and a model learnt from some illuminants."""
     random = np.random.default_rng(seed)
     truth = replace(ProjectorModel.unknown(), state=random.normal(size=len(ProjectorModel.unknown().state)) * 0.03)
     found = ProjectorModel.unknown()
@@ -158,7 +169,7 @@ def learnt(seed: int, count: int) -> tuple[ProjectorModel, ProjectorModel]:
     return truth, found
 
 
-def test_a_projector_is_learnt_as_it_was(pinned: Pinned) -> None:
+def test_learns_a_projector(pinned: Pinned) -> None:
     truth, found = learnt(5, 24)
     codes = ((0, 0, 0), (255, 255, 255), (250, 0, 0), (9, 0, 1), (113, 188, 255), (40, 41, 42), (0, 77, 3))
     fits = [found.compare(truth.predict(one).amounts * 1.02 + 1e-3, one, np.eye(3) * 1e-6) for one in codes]
@@ -175,7 +186,7 @@ def test_a_projector_is_learnt_as_it_was(pinned: Pinned) -> None:
 
 
 def lit_frame(seed: int, amounts: tuple[float, float, float], noise: float, hand: float = 1.0) -> Any:
-    """Return a frame of a light, brighter in the middle, some tiles of which a hand covers."""
+    """Return a frame of an illuminant, brighter in the middle, some tiles of which are covered."""
     random = np.random.default_rng(seed)
     tiles = len(measured(DARK).tiles)
     falloff = 1 - 0.4 * np.linspace(-1, 1, tiles)[:, None] ** 2
@@ -189,10 +200,10 @@ def lit_frame(seed: int, amounts: tuple[float, float, float], noise: float, hand
 
 
 @pytest.mark.slow
-def test_frames_are_held_against_pictures_as_they_were(pinned: Pinned) -> None:
+def test_compares_frames_with_a_basis(pinned: Pinned) -> None:
     dark, white = lit_frame(1, (0, 0, 0), 0.3), lit_frame(2, (1, 1, 1), 0.5)
     red, green, blue = (lit_frame(3 + k, tuple(np.eye(3)[k].tolist()), 0.4) for k in range(3))
-    bases = {"primaries": Basis.between((red, green, blue), dark), "white": Basis.of_white(white, dark)}
+    bases = {"primaries": Basis.from_primaries((red, green, blue), dark), "white": Basis.from_white(white, dark)}
     frames = {
         "white": white,
         "dim": lit_frame(7, (0.01, 0.004, 0.0), 0.2),
@@ -201,7 +212,7 @@ def test_frames_are_held_against_pictures_as_they_were(pinned: Pinned) -> None:
         "a glint": lit_frame(10, (0.5, 0.5, 0.6), 1.0, hand=1.03),
     }
     found: dict[str, Any] = {"with dark": bases["primaries"].with_dark(white).spread}
-    before = state.Seen((255, 0, 0), red, np.array([1.0, 0, 0]))
+    before = state.RecentFrame((255, 0, 0), red, np.array([1.0, 0, 0]))
     for name, frame in frames.items():
         for title, basis in bases.items():
             if title == "white" and name not in ("white", "a hand"):
@@ -223,7 +234,7 @@ def test_frames_are_held_against_pictures_as_they_were(pinned: Pinned) -> None:
     darks += [red, replace(darks[1], black_measured=False)]
     papers = [Frame(white, np.array(paper), np.zeros(2)) for paper in ([500.0, 900, 400], [590.0, 1000, 500])]
     found["references"] = {
-        "same": [[judge._same_light(a, b, scatter) for b in lights] for a in lights for scatter in (0.0, 0.003)],
+        "same": [[judge._light_distance(a, b, scatter) for b in lights] for a in lights for scatter in (0.0, 0.003)],
         "dark": [judge.judge_dark(now, one, 5.0, 0.2) for one in darks],
         "white": [judge.judge_white(papers[0], paper) for paper in papers],
         "primaries": [judge.judge_first_primary(now, one, k) for one in (red, green, white, dark) for k in (0, 1)],
@@ -233,19 +244,19 @@ def test_frames_are_held_against_pictures_as_they_were(pinned: Pinned) -> None:
             for frame in frames.values() for codes in ((255, 0, 0), (255, 20, 0), (0, 0, 255))
         ],
         "best": [judge._best_channel(frame) for frame in (white, red, blue, dark)],
-        "regions": [judge._by_region(white.tiles), judge._beside(bases["white"])],
+        "regions": [judge._by_region(white.tiles), judge._neighbour_contrast(bases["white"])],
     }  # fmt: skip
     pinned("frames held against pictures", found, nothing=1e-7)
 
 
 @pytest.mark.slow
-def test_lights_that_are_off_are_named_as_they_were(pinned: Pinned) -> None:
+def test_explains_wrong_illuminants(pinned: Pinned) -> None:
     _, model = learnt(3, 40)
     random, numbers = np.random.default_rng(8), list[float]()
     nothing = state.Residuals(np.zeros(0), np.zeros(0), np.zeros(0))
     plan = ((255, 255, 255), (0, 0, 0), (255, 0, 0), (200, 100, 50), (30, 60, 90), (0, 255, 0), (255, 128, 0))
     for number in range(80):
-        codes, other = (plan[int(k)] for k in random.integers(0, len(plan), 2))
+        codes, other_codes = (plan[int(k)] for k in random.integers(0, len(plan), 2))
         amounts = model.predict(codes).amounts
         match number % 10:
             case 0:
@@ -255,37 +266,44 @@ def test_lights_that_are_off_are_named_as_they_were(pinned: Pinned) -> None:
             case 2:
                 amounts = amounts * [1, 1, random.choice([0.0, 0.04, 0.5, 0.97])]
             case 3:
-                amounts = model.predict(other).amounts
+                amounts = model.predict(other_codes).amounts
             case 4:
-                amounts = 0.85 * amounts + 0.15 * model.predict(other).amounts
+                amounts = 0.85 * amounts + 0.15 * model.predict(other_codes).amounts
             case 5:
                 amounts = amounts + random.choice([0.004, 0.02, 0.11]) * np.array([1.0, 0.2, 0.1])
             case _:
                 amounts = amounts * (1 + 0.01 * random.normal(size=3))
         light = state.FrameLight(amounts, np.eye(3) * 1e-8, nothing)
-        seen = judge._SeenLight(
-            model, light, codes, state.Seen(other, measured(LIT), model.predict(other).amounts), plan
+        comparison = judge._LightComparison(
+            model, light, codes, state.RecentFrame(other_codes, measured(LIT), model.predict(other_codes).amounts), plan
         )
-        fit, added = seen.fit, [seen._added_of(one) or (-1.0, -1.0) for one in (None, seen.before)]
-        ways = [seen.cause(wrong, 0.01, again=again) for wrong in (True, False) for again in (True, False)]
-        numbers += [fit.distance, fit.angle_deg, fit.brightness, fit.brightness_sd, seen._coloured()]
-        numbers += [*seen.neutral_light(), *added[0], *added[1], *(light for _, light in ways)]
-        numbers.append(sum(bool(reason) for reason, _ in ways))
+        fit, added = (
+            comparison.fit,
+            [comparison._added_light(frame) or (-1.0, -1.0) for frame in (None, comparison.previous)],
+        )
+        causes = [
+            comparison.cause(wrong, 0.01, was_refused=again) for wrong in (True, False) for again in (True, False)
+        ]
+        numbers += [fit.distance, fit.angle_deg, fit.brightness, fit.brightness_sd, comparison._coloured_light()]
+        numbers += [*comparison.neutral_light(), *added[0], *added[1], *(light for _, light in causes)]
+        numbers.append(sum(bool(reason) for reason, _ in causes))
     pinned("lights that are off", np.array(numbers))
 
 
-def test_of_two_causes_those_are_named_that_were(pinned: Pinned) -> None:
-    """A value of 0.6 is less blur and movement than what stands for itself, one of 9 is plainly more."""
+def test_reports_one_of_two_causes(pinned: Pinned) -> None:
+    """A value of 0.6 is a small blur or movement, a value of 9 a large one."""
     named: dict[str, list[bool]] = {}
     for first, second in itertools.combinations(judge.CAUSES, 2):
         for value in (0.6, 9.0):
             found = [Check(name, value, None, 2.0, reason="wrong") for name in (first, second)]
-            named.setdefault(f"{first} {value:g}", []).extend(bool(check.reason) for check in judge._named_once(found))
+            named.setdefault(f"{first} {value:g}", []).extend(
+                bool(check.reason) for check in judge._without_consequences(found)
+            )
     pinned("causes of which one is named", named)
 
 
 @pytest.mark.slow
-def test_frames_are_measured_as_they_were(pinned: Pinned) -> None:
+def test_measures_random_frames(pinned: Pinned) -> None:
     random = np.random.default_rng(6)
     found: dict[str, Any] = {}
     for black, rows, columns, pattern in ((0.0, 160, 240, "RGGB"), (63.0, 97, 131, "BGGR"), (512.0, 65, 151, "GRBG")):

@@ -21,11 +21,11 @@ from typing import Any
 import pytest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-LIMIT_S = 60.0
-"""How long an answer may take on a machine that does other things."""
+LIMIT_S = 60.0  # time limit of an answer on a busy machine
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (Debian: chromium)")
 
+# Texts with a contrast below 4.5 : 1 (WCAG 2.2, success criterion 1.4.3, level AA).
 POOR_CONTRAST = """
 (() => {
   const linear = (code) => (code <= 0.04045 ? code / 12.92 : ((code + 0.055) / 1.055) ** 2.4);
@@ -52,16 +52,18 @@ POOR_CONTRAST = """
   return poor;
 })()
 """
-"""Texts whose contrast is below 4.5 : 1 (WCAG 2.2, success criterion 1.4.3, level AA)."""
 
+
+# Elements beyond the right edge of the window.
 TOO_WIDE = """
 [...document.querySelectorAll("body *")]
   .filter((one) => one.getBoundingClientRect().right > document.documentElement.clientWidth + 1)
   .filter((one) => !one.closest(".unseen, .skip, script, svg"))
   .map((one) => [one.tagName, one.id, one.className, one.getBoundingClientRect().right])
 """
-"""Elements that reach beyond the window's right edge."""
 
+
+# Controls and pictures without an accessible name (WCAG 2.2, 1.1.1 and 4.1.2).
 NAMELESS = """
 [...document.querySelectorAll("button, img, svg:not([aria-hidden]), [role=img], [role=group], section")]
   .filter((one) => !one.closest("[hidden]"))
@@ -69,17 +71,17 @@ NAMELESS = """
   .filter((one) => !one.textContent.trim())
   .map((one) => one.outerHTML)
 """
-"""Things to press or to look at that have no name for who cannot see them (WCAG 2.2, 1.1.1 and 4.1.2)."""
 
+
+# Requested addresses on other servers.
 OUTSIDE = """
 performance.getEntriesByType("resource").map((one) => one.name)
   .filter((name) => !name.startsWith("data:") && !name.startsWith(location.origin + "/"))
 """
-"""Addresses elsewhere that the page has asked."""
 
 
 class Tab:
-    """One tab of a browser that runs; what its page throws or logs as an error is in `errors`."""
+    """One tab of a running browser; uncaught and logged errors of its page are in `errors`."""
 
     def __init__(self, write_to: int, read_from: int) -> None:
         self._write_to, self._read_from = write_to, read_from
@@ -126,16 +128,16 @@ class Tab:
         return answer["result"].get("value")
 
     def wait_for(self, expression: str, *, limit_s: float = LIMIT_S) -> Any:
-        """Return the expression's value as soon as it is true."""
+        """Return the value of an expression as soon as it is true."""
         end = time.monotonic() + limit_s
-        while not (found := self.value(expression)):
+        while not (value := self.value(expression)):
             if time.monotonic() > end:
                 pytest.fail(f"{expression} did not come true within {limit_s:g} s; the page says: {self.text()[:600]}")
             time.sleep(0.05)
-        return found
+        return value
 
     def text(self) -> str:
-        """Return what a reader sees of the page."""
+        """Return the visible text of the page."""
         return str(self.value("document.body ? document.body.innerText : ''"))
 
     def drag(self, path: list[tuple[float, float]]) -> None:

@@ -1,4 +1,4 @@
-"""A session's folder as a run leaves it, made of numbers alone: no lab, no raw file, no judge."""
+"""Session folder of a run, made of numbers without a lab, raw files or a judge."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from foundation.colorimetry import decode_srgb
 
 BEGUN = datetime(2026, 3, 1, 22, 0, tzinfo=UTC)
 FRAME_S = 5.0
+# Camera RGB of the projector's primaries, in columns: each is visible in more than one channel.
 CROSSTALK = np.array([[0.80, 0.15, 0.02], [0.17, 0.75, 0.12], [0.03, 0.10, 0.86]])
-"""Camera RGB of the projector's primaries, in columns: a camera sees each of them in more than one channel."""
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, 40 * number, 0)) for number in range(4))
 

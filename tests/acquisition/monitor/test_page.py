@@ -1,4 +1,4 @@
-"""The page in a browser: what a person sees of a run that goes on, pauses, is killed, and of its report."""
+"""The page in a browser: a run that is active, pauses and is killed, and its report."""
 
 from __future__ import annotations
 
@@ -62,16 +62,16 @@ def _no_errors(tab: Tab) -> Iterator[None]:
 def run(tmp_path: Path) -> Iterator[MadeUpRun]:
     """Return a run of 27 lights and black bodies with a third of its frames, one refused, and one under way."""
     name = f"night {HOSTILE}".replace("/", "|")
-    made = MadeUpRun.begin(tmp_path / name, plan_illuminations(5, (3000, 6500)), response=True)
-    made.journal.record(f"camera {HOSTILE}", HOSTILE)
-    made.journal.note(made.clock, "warning", HOSTILE)
-    for step in made.steps[:28]:
+    new_run = MadeUpRun.begin(tmp_path / name, plan_illuminations(5, (3000, 6500)), response=True)
+    new_run.journal.record(f"camera {HOSTILE}", HOSTILE)
+    new_run.journal.note(new_run.clock, "warning", HOSTILE)
+    for step in new_run.steps[:28]:
         if step.number == 20:
-            made.take(step, f"the light is another one {HOSTILE}; close what covers it", value=9.0)
-        made.take(step)
-    made.expose(made.steps[28])
-    yield made
-    made.journal.close()
+            new_run.take(step, f"the light is another one {HOSTILE}; close what covers it", value=9.0)
+        new_run.take(step)
+    new_run.expose(new_run.steps[28])
+    yield new_run
+    new_run.journal.close()
 
 
 @contextmanager
@@ -91,7 +91,7 @@ def marks(tab: Tab, plane: str, state: str) -> int:
     return tab.value(f"document.querySelectorAll('#{plane} .mark.{state}').length")
 
 
-def test_a_run_is_followed_frame_by_frame(tab: Tab, run: MadeUpRun) -> None:
+def test_follows_run_frame_by_frame(tab: Tab, run: MadeUpRun) -> None:
     with shown(tab, run.folder):
         assert tab.value("document.getElementById('state').textContent") == "▶ running"
         lights = sum(step.kind == "light" for step in run.steps[:28])
@@ -116,7 +116,7 @@ def test_a_run_is_followed_frame_by_frame(tab: Tab, run: MadeUpRun) -> None:
         assert "undefined" not in tab.value("document.querySelector('main').innerHTML")
 
 
-def test_what_a_session_says_is_text_and_never_code(tab: Tab, run: MadeUpRun) -> None:
+def test_session_texts_are_never_code(tab: Tab, run: MadeUpRun) -> None:
     run.beat("paused", f"the camera: {HOSTILE}; mend it {HOSTILE}")
     with shown(tab, run.folder):
         tab.wait_for("document.getElementById('state').textContent === '‖ paused'")
@@ -130,7 +130,7 @@ def test_what_a_session_says_is_text_and_never_code(tab: Tab, run: MadeUpRun) ->
         assert way not in script
 
 
-def test_a_pause_is_a_banner_with_remedy_and_countdown(tab: Tab, run: MadeUpRun) -> None:
+def test_shows_pause_with_remedy_and_countdown(tab: Tab, run: MadeUpRun) -> None:
     fault = "the camera: it does not answer"
     run.beat("paused", f"{fault}; see to its cable (paused for 20 s; goes on by itself, ends in 9 min 40 s)")
     with shown(tab, run.folder):
@@ -143,7 +143,7 @@ def test_a_pause_is_a_banner_with_remedy_and_countdown(tab: Tab, run: MadeUpRun)
         tab.wait_for("document.getElementById('banner').hidden")
 
 
-def test_after_a_kill_it_says_that_the_run_was_killed(tab: Tab, tmp_path: Path) -> None:
+def test_reports_killed_run(tab: Tab, tmp_path: Path) -> None:
     folder = tmp_path / "night"
     child = subprocess.Popen([sys.executable, "-c", KILLED_RUN, str(folder)], stdout=subprocess.PIPE, cwd=ROOT)
     try:
@@ -168,7 +168,7 @@ def test_after_a_kill_it_says_that_the_run_was_killed(tab: Tab, tmp_path: Path) 
         child.stdout.close()
 
 
-def test_refused_frames_stand_with_picture_and_reason(tab: Tab, run: MadeUpRun) -> None:
+def test_shows_refused_frames_with_picture_and_reason(tab: Tab, run: MadeUpRun) -> None:
     with shown(tab, run.folder):
         card = "document.querySelector('.refusal')"
         assert "the light is another one" in tab.value(f"{card}.innerText")
@@ -180,13 +180,13 @@ def test_refused_frames_stand_with_picture_and_reason(tab: Tab, run: MadeUpRun) 
 
 @pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.parametrize("state", ["running", "paused"])
-def test_all_text_has_contrast(tab: Tab, run: MadeUpRun, dark: bool, state: str) -> None:
+def test_text_has_contrast(tab: Tab, run: MadeUpRun, dark: bool, state: str) -> None:
     run.beat(state, "the camera: it does not answer; see to its cable (paused for 20 s)")
     with shown(tab, run.folder, dark=dark):
         assert tab.value(POOR_CONTRAST) == []
 
 
-def test_it_can_be_used_without_seeing_it(tab: Tab, run: MadeUpRun) -> None:
+def test_is_accessible_to_screen_readers(tab: Tab, run: MadeUpRun) -> None:
     with shown(tab, run.folder):
         assert tab.value(NAMELESS) == []
         assert tab.value("document.documentElement.lang") == "en"
@@ -197,36 +197,36 @@ def test_it_can_be_used_without_seeing_it(tab: Tab, run: MadeUpRun) -> None:
         tab.wait_for("document.getElementById('said').textContent.includes('paused')")
 
 
-def test_a_page_that_gets_no_answer_says_that_it_is_old(tab: Tab, run: MadeUpRun) -> None:
+def test_reports_missing_answers(tab: Tab, run: MadeUpRun) -> None:
     with shown(tab, run.folder):
         assert tab.value("document.getElementById('offline').hidden")
         tab.value("answeredAt -= 60000; drawClock()")
         assert "has not answered since" in tab.value("document.getElementById('offline').innerText")
 
 
-def test_a_page_may_be_opened_before_the_session_is_there(tab: Tab, tmp_path: Path) -> None:
+def test_waits_for_session(tab: Tab, tmp_path: Path) -> None:
     with shown(tab, tmp_path / "later"):
         assert tab.value("document.getElementById('state').textContent") == "… not begun"
         assert "waits for it" in tab.value("document.getElementById('banner').innerText")
         for key in ("ArrowLeft", "ArrowRight", "Escape"):
             tab.press(key)
-        made = MadeUpRun.begin(tmp_path / "later")
+        new_run = MadeUpRun.begin(tmp_path / "later")
         tab.wait_for("document.getElementById('state').textContent === '▶ running'")
         assert marks(tab, "planned", "planned") == len(LIGHTS)
         tab.press("ArrowLeft")
-        made.take(made.steps[0])
+        new_run.take(new_run.steps[0])
         tab.wait_for("document.getElementById('frame-caption').innerText.includes('white frame 0')")
-        made.journal.close()
+        new_run.journal.close()
 
 
-def test_a_phone_is_shown_the_same_behind_the_token(tab: Tab, run: MadeUpRun) -> None:
+def test_serves_phone_with_token(tab: Tab, run: MadeUpRun) -> None:
     with shown(tab, run.folder, width=390, dark=True, host="0.0.0.0") as server:
         assert len(server.path) > 20
         assert marks(tab, "planned", "shown") == 1
         tab.wait_for("document.getElementById('picture').naturalWidth === 360")
 
 
-def test_the_report_shows_the_same_from_a_file(tab: Tab, run: MadeUpRun, tmp_path: Path) -> None:
+def test_report_shows_same_content(tab: Tab, run: MadeUpRun, tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     write_session_report(run.folder, path)
     tab.open(path.as_uri())

@@ -1,4 +1,4 @@
-"""What is shown of a night, and said of how it stands, number by number."""
+"""Views and states of a night in numbers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CHECKS = (
 )
 
 
-def test_a_session_stands_as_it_stood(pinned: Pinned) -> None:
+def test_states_of_a_session(pinned: Pinned) -> None:
     chance, found = random.Random(3), list[Any]()
     for number in range(40):
         count = chance.choice((0, 1, 2, 3, 5, 8, 8))
@@ -54,7 +54,7 @@ def test_a_session_stands_as_it_stood(pinned: Pinned) -> None:
 
 
 @pytest.mark.slow
-def test_a_night_is_shown_as_it_was(tmp_path: Path, pinned: Pinned) -> None:
+def test_view_of_a_night(tmp_path: Path, pinned: Pinned) -> None:
     run = whole_night(tmp_path / "night", 0.3, grid=3, previews=False)
     with closed(run):
         night = read_session(tmp_path / "night")

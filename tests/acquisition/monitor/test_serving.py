@@ -1,4 +1,4 @@
-"""The monitor's server: what it answers, and what it never does."""
+"""Server of the monitor: its answers, and its restrictions."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def state_of(monitor: MonitorServer, since: str = "") -> dict[str, Any]:
     return json.loads(body)
 
 
-def test_how_the_session_stands_is_told_to_scripts(still: MonitorServer) -> None:
+def test_serves_state_to_scripts(still: MonitorServer) -> None:
     told = json.loads(ask(still, "/status.json")[2])
     assert (told["state"], told["alive"]) == ("running", True)
     assert (told["done"], told["total"]) == (2, 8)
@@ -87,7 +87,7 @@ def test_how_the_session_stands_is_told_to_scripts(still: MonitorServer) -> None
     assert told["remaining_s"] == pytest.approx(6 * 5 * 3 / 2, abs=1), "two of three attempts gave a frame"
 
 
-def test_the_page_stands_alone_and_holds_no_markup_of_the_session(still: MonitorServer) -> None:
+def test_page_is_self_contained_without_session_markup(still: MonitorServer) -> None:
     status, headers, body = ask(still, "/")
     text = body.decode()
     assert status == 200
@@ -100,19 +100,19 @@ def test_the_page_stands_alone_and_holds_no_markup_of_the_session(still: Monitor
         assert elsewhere not in text
 
 
-def test_the_state_has_what_the_page_draws(opened: MonitorServer, run: MadeUpRun) -> None:
+def test_state_has_content_of_page(opened: MonitorServer, run: MadeUpRun) -> None:
     state = state_of(opened)
     assert len(state["session"]["lights"]) == 4
     refused = state["frames"][2]
     assert refused["verdict"] == "refused"
     assert refused["reason"] == f"{SCRIPT} in the light"
     assert ["off_codes_deg", "°", 8.0, None, 1.0, f"{SCRIPT} in the light"] in refused["checks"]
-    # Red at full, green by its crosstalk: the camera sees the red light less red than its codes.
+    # Because of crosstalk, the camera records the red illuminant less red than its codes.
     assert refused["seen_at"][0] < 1
     assert b"<script" not in ask(opened, "/state.json")[2]
 
 
-def test_nothing_new_is_no_content_and_what_is_new_comes_alone(opened: MonitorServer, run: MadeUpRun) -> None:
+def test_sends_only_changes(opened: MonitorServer, run: MadeUpRun) -> None:
     first = state_of(opened)
     assert ask(opened, f"/state.json?since={first['cursor']}")[0] == 204
     run.take(run.steps[2])
@@ -122,7 +122,7 @@ def test_nothing_new_is_no_content_and_what_is_new_comes_alone(opened: MonitorSe
     assert second["head"]["done"] == 3
 
 
-def test_a_picture_is_shown_only_as_such(opened: MonitorServer, run: MadeUpRun, tmp_path: Path) -> None:
+def test_serves_only_jpeg_pictures(opened: MonitorServer, run: MadeUpRun, tmp_path: Path) -> None:
     status, headers, body = ask(opened, "/frame/1.jpg")
     assert (status, headers["Content-Type"]) == (200, "image/jpeg")
     assert body == jpeg((255, 255, 255), "0000_white ")
@@ -137,7 +137,7 @@ def test_a_picture_is_shown_only_as_such(opened: MonitorServer, run: MadeUpRun, 
     assert ask(opened, "/frame/1.jpg")[0] == 404
 
 
-def test_no_row_of_a_journal_leads_out_of_the_previews(opened: MonitorServer, run: MadeUpRun) -> None:
+def test_serves_only_files_of_previews(opened: MonitorServer, run: MadeUpRun) -> None:
     (run.folder / "secret.jpg").write_bytes(b"\xff\xd8\xffsecret")
     attempt = run.take(run.steps[2])
     run.journal._connection.execute("UPDATE attempts SET file = 'previews/../../secret.cr2' WHERE id = ?", (attempt,))
@@ -145,23 +145,23 @@ def test_no_row_of_a_journal_leads_out_of_the_previews(opened: MonitorServer, ru
 
 
 @pytest.mark.parametrize("since", ["x", "..", "a.b.c", "%00", "0.-1.0", "'", "9" * 5000])
-def test_a_strange_cursor_gives_everything(still: MonitorServer, since: str) -> None:
+def test_sends_everything_for_unknown_cursor(still: MonitorServer, since: str) -> None:
     assert "session" in state_of(still, since)
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
-def test_nothing_can_be_changed(still: MonitorServer, method: str) -> None:
+def test_is_read_only(still: MonitorServer, method: str) -> None:
     status, headers, _ = ask(still, "/", method)
     assert (status, headers["Allow"]) == (405, "GET, HEAD")
 
 
-def test_a_large_answer_is_compressed_for_who_can_read_it(still: MonitorServer) -> None:
+def test_compresses_large_answers(still: MonitorServer) -> None:
     _, headers, body = ask(still, "/", Accept_Encoding="gzip")
     assert headers["Content-Encoding"] == "gzip"
     assert gzip.decompress(body) == ask(still, "/")[2]
 
 
-def test_a_session_may_be_deleted_and_come_back_under_the_open_page(opened: MonitorServer, run: MadeUpRun) -> None:
+def test_follows_deleted_and_restored_session(opened: MonitorServer, run: MadeUpRun) -> None:
     first = state_of(opened)
     away = run.folder.with_name("away")
     run.folder.rename(away)
@@ -175,7 +175,7 @@ def test_a_session_may_be_deleted_and_come_back_under_the_open_page(opened: Moni
     assert len(back["frames"]) == 3
 
 
-def test_a_damaged_journal_is_said_on_the_page(opened: MonitorServer, run: MadeUpRun) -> None:
+def test_reports_damaged_journal(opened: MonitorServer, run: MadeUpRun) -> None:
     run.journal.close()
     (run.folder / "journal.sqlite").write_bytes(b"SQLite format 3\0" + b"\xff" * 5000)
     head = state_of(opened)["head"]
@@ -183,7 +183,7 @@ def test_a_damaged_journal_is_said_on_the_page(opened: MonitorServer, run: MadeU
     assert "restore it from a copy" in head["sentence"]
 
 
-def test_a_session_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
+def test_waits_for_session(tmp_path: Path) -> None:
     folder = tmp_path / "later"
     with served(folder) as monitor:
         absent = state_of(monitor)
@@ -193,7 +193,7 @@ def test_a_session_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
         made.journal.close()
 
 
-def test_nothing_in_the_session_is_written_by_looking(run: MadeUpRun) -> None:
+def test_writes_nothing(run: MadeUpRun) -> None:
     run.journal.close()
     before = {path: path.stat() for path in sorted(run.folder.rglob("*"))}
     with served(run.folder) as monitor:
@@ -209,12 +209,12 @@ def test_nothing_in_the_session_is_written_by_looking(run: MadeUpRun) -> None:
         )
 
 
-def test_a_taken_port_is_said(run: MadeUpRun, opened: MonitorServer) -> None:
+def test_reports_used_port(run: MadeUpRun, opened: MonitorServer) -> None:
     with pytest.raises(InputError, match=f"port {opened.port}"):
         open_monitor(run.folder, opened.port)
 
 
-def test_a_folder_of_something_else_is_no_session(tmp_path: Path) -> None:
+def test_refuses_folder_without_session(tmp_path: Path) -> None:
     (tmp_path / "letter.txt").write_text("hello")
     with pytest.raises(FormatError):
         open_monitor(tmp_path, 0)
@@ -222,9 +222,7 @@ def test_a_folder_of_something_else_is_no_session(tmp_path: Path) -> None:
         open_monitor(tmp_path / "letter.txt", 0)
 
 
-def test_ctrl_c_is_its_proper_end(
-    run: MadeUpRun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ends_by_ctrl_c(run: MadeUpRun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", Mock(side_effect=KeyboardInterrupt))
     assert main(["monitor", str(run.folder), "--port", "0"]) == 0
     printed = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""How a session stands: what is said when it runs, pauses, ends, or is killed."""
+"""State of a session while it runs, pauses, has ended, or was killed."""
 
 from __future__ import annotations
 
@@ -69,26 +69,26 @@ def head(
 @pytest.mark.parametrize(
     ("ago", "state"), [(0.0, "running"), (49.0, "running"), (51.0, "late"), (329.0, "late"), (331.0, "silent")]
 )
-def test_a_run_that_hangs_is_late_and_then_silent(ago: float, state: str) -> None:
+def test_hanging_run_is_late_then_silent(ago: float, state: str) -> None:
     """Frames of five seconds: three of them, the five of a sign of life, and thirty; the sign was due within 300 s."""
     beat = heartbeat("running", ago=ago, within=300.0)
     stands = head(attempts(3), beat)
     assert stands.state == state
     assert stands.alive == (state != "silent")
     if state != "running":
-        since = "late since" if state == "late" else "no sign since"
+        since = "late since" if state == "late" else "no sign of life since"
         assert stands.sentence.startswith(f"{since} {beat.at.astimezone():%Y-%m-%d %H:%M:%S}")
         assert stands.eta is None, "no time of arrival rolls on"
 
 
-def test_a_step_that_hangs_is_late_by_what_the_run_says_of_it_and_then_silent() -> None:
+def test_hanging_step_is_late_then_silent() -> None:
     beat = replace(heartbeat("late", within=300.0), sentence="late since 23:00: the camera exposes light 3")
     view = SessionView("night", "night", STEPS, (), {}, attempts(3), (), beat, None)
     stands = head_of(view, NOW, True)
     assert (stands.state, stands.sentence, stands.cause) == ("late", beat.sentence, "the camera")
     after = head_of(view, NOW + timedelta(seconds=329), True)
     assert after.state == "silent"
-    assert "then: late since 23:00: the camera exposes light 3" in after.sentence
+    assert "last report: late since 23:00: the camera exposes light 3" in after.sentence
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_a_step_that_hangs_is_late_by_what_the_run_says_of_it_and_then_silent() 
         ("ended", "interrupted", 20, ("incomplete", "")),
     ],
 )
-def test_a_full_disk_is_said_as_such(state: RunState, sentence: str, free_mb: float, expected: tuple[str, str]) -> None:
+def test_reports_full_disk(state: RunState, sentence: str, free_mb: float, expected: tuple[str, str]) -> None:
     beat = replace(heartbeat(state), sentence=sentence)
     view = SessionView("night", "night", STEPS, (), {}, attempts(3), (), beat, None, frame_bytes=25_000_000)
     stands = head_of(view, NOW, True, free_bytes=round(free_mb * 1e6))
@@ -110,7 +110,7 @@ def test_a_full_disk_is_said_as_such(state: RunState, sentence: str, free_mb: fl
 
 
 @pytest.mark.parametrize("alive", [True, False, None])
-def test_a_copy_of_a_session_is_no_run(alive: bool | None) -> None:
+def test_recognises_copy_of_session(alive: bool | None) -> None:
     there, here = SessionPlace("/data/night", 5, 10, 11, 0), SessionPlace("/backup/night", 5, 20, 21, 0)
     beat = replace(heartbeat("running"), place=there)
     stands = head(attempts(3), beat, alive, here=here)
@@ -124,7 +124,7 @@ def test_a_copy_of_a_session_is_no_run(alive: bool | None) -> None:
     assert where_it_is.state == "running"
 
 
-def test_all_frames_there_and_nobody_at_work_is_complete_and_says_what_comes_next() -> None:
+def test_complete_session_names_next_command() -> None:
     for beat, alive in ((heartbeat("ended"), True), (heartbeat("running"), False), (None, None)):
         stands = head(attempts(8), beat, alive=alive)
         assert stands.state == "complete"
@@ -132,7 +132,7 @@ def test_all_frames_there_and_nobody_at_work_is_complete_and_says_what_comes_nex
     assert head(attempts(8), heartbeat("running")).state == "running"
 
 
-def test_a_clock_that_was_set_back_makes_no_time() -> None:
+def test_ignores_negative_intervals() -> None:
     views = [*attempts(4), replace(attempts(1)[0], id=5, step=4, started_at=NOW - timedelta(hours=1))]
     timed = with_seconds([replace(view, seconds=None) for view in views], [])
     assert [one.seconds for one in timed] == [None, 5.0, 5.0, 5.0, None]
@@ -156,7 +156,7 @@ def told(watch: SessionWatch, since: str = "") -> dict[str, Any]:
     return state
 
 
-def test_a_page_that_follows_has_in_the_end_what_one_has_that_is_opened_then(run: MadeUpRun) -> None:
+def test_changes_add_up_to_full_state(run: MadeUpRun) -> None:
     watch = SessionWatch(run.folder)
     state = told(watch)
     frames = {frame["id"]: frame for frame in state["frames"]}
@@ -204,7 +204,7 @@ def test_a_page_that_follows_has_in_the_end_what_one_has_that_is_opened_then(run
     assert min(sizes) < len(now["frames"])
 
 
-def test_many_pages_that_follow_at_once_all_get_everything(run: MadeUpRun) -> None:
+def test_serves_many_pages_completely(run: MadeUpRun) -> None:
     watch = SessionWatch(run.folder)
     over = threading.Event()
     followed: list[set[int]] = []
@@ -234,7 +234,7 @@ def test_many_pages_that_follow_at_once_all_get_everything(run: MadeUpRun) -> No
     assert followed == [set(range(1, len(run.steps) + 1))] * 4
 
 
-def test_a_preview_that_is_written_after_its_row_is_told(run: MadeUpRun) -> None:
+def test_sends_late_preview(run: MadeUpRun) -> None:
     run.previews = False
     watch = SessionWatch(run.folder)
     attempt = run.take(run.steps[4])
@@ -246,7 +246,7 @@ def test_a_preview_that_is_written_after_its_row_is_told(run: MadeUpRun) -> None
     assert [frame["id"] for frame in later["frames"] if "preview" in frame][-1] == attempt
 
 
-def test_a_failed_try_has_no_picture_even_if_the_next_bears_its_name(run: MadeUpRun) -> None:
+def test_failed_attempt_has_no_picture(run: MadeUpRun) -> None:
     failed = run.expose(run.steps[4])
     run.journal.fail(failed, run.clock, "no frame came")
     taken = run.take(run.steps[4])
@@ -257,7 +257,7 @@ def test_a_failed_try_has_no_picture_even_if_the_next_bears_its_name(run: MadeUp
     assert watch.picture(failed) == b""
 
 
-def test_more_steps_or_another_device_are_told_as_a_whole(run: MadeUpRun) -> None:
+def test_sends_everything_after_changed_plan_or_device(run: MadeUpRun) -> None:
     watch = SessionWatch(run.folder)
     state = told(watch)
     added = link_steps(len(run.steps))
@@ -268,7 +268,7 @@ def test_more_steps_or_another_device_are_told_as_a_whole(run: MadeUpRun) -> Non
     assert ["camera", "another one"] in told(watch, more["cursor"])["session"]["records"]
 
 
-def test_an_older_copy_put_back_is_told_as_a_whole(run: MadeUpRun, tmp_path: Path) -> None:
+def test_sends_everything_after_restored_copy(run: MadeUpRun, tmp_path: Path) -> None:
     run.journal.close()
     older = tmp_path / "older.sqlite"
     shutil.copy(run.folder / "journal.sqlite", older)
@@ -282,8 +282,8 @@ def test_an_older_copy_put_back_is_told_as_a_whole(run: MadeUpRun, tmp_path: Pat
     assert len(told(watch, state["cursor"])["frames"]) == 4
 
 
-def test_another_attempt_of_a_known_number_is_read_again(run: MadeUpRun, tmp_path: Path) -> None:
-    """As where an older copy was put back and taken up between two looks."""
+def test_reads_replaced_attempt_again(run: MadeUpRun, tmp_path: Path) -> None:
+    """An older copy was restored and resumed between two reads."""
     run.journal.close()
     older = (run.folder / "journal.sqlite").read_bytes()
     run.journal = Journal.open_for_run(run.folder / "journal.sqlite")
@@ -297,7 +297,7 @@ def test_another_attempt_of_a_known_number_is_read_again(run: MadeUpRun, tmp_pat
     assert told(watch, cursor)["frames"][-1]["step"] == 5
 
 
-def test_what_was_seen_is_held_against_the_white_before(run: MadeUpRun) -> None:
+def test_relates_colours_to_previous_white(run: MadeUpRun) -> None:
     frames = told(SessionWatch(run.folder))["frames"]
     white, light = frames[0], frames[2]
     assert white["seen_at"] == pytest.approx([1 / 3, 1 / 3])
@@ -305,7 +305,7 @@ def test_what_was_seen_is_held_against_the_white_before(run: MadeUpRun) -> None:
     assert light["seen_at"] == pytest.approx([ratio[0] / sum(ratio), ratio[2] / sum(ratio)], rel=1e-4)
 
 
-def test_places_in_the_plane() -> None:
+def test_computes_chromaticities() -> None:
     assert planned_places([(255, 255, 255), (255, 0, 0), (0, 0, 7), (0, 0, 0)]) == [
         pytest.approx([1 / 3, 1 / 3], rel=1e-5),
         [1, 0],
@@ -318,10 +318,10 @@ def test_places_in_the_plane() -> None:
     assert place_of(-1, 0.5, 0.2) is None
 
 
-def test_lights_are_shown_also_without_their_file(run: MadeUpRun) -> None:
+def test_shows_illuminants_without_their_file(run: MadeUpRun) -> None:
     (run.folder / "illuminations.csv").unlink()
     lights = told(SessionWatch(run.folder))["session"]["lights"]
-    # What a complete session lacks is said; one that is still taken needs its plan alone.
+    # Missing files are reported for a complete session; an active one needs only its plan.
     assert not read_session(run.folder).unreadable
     assert [light[4:] for light in lights] == [list(light.colour) for light in LIGHTS]
 
@@ -347,7 +347,7 @@ def data_of(path: Path) -> dict[str, Any]:
     return json.loads(found[1])
 
 
-def test_it_holds_the_session_and_its_pictures(finished_run: MadeUpRun, tmp_path: Path) -> None:
+def test_report_has_session_and_pictures(finished_run: MadeUpRun, tmp_path: Path) -> None:
     path = tmp_path / "out" / "night.html"
     write_session_report(finished_run.folder, path)
     data = data_of(path)
@@ -361,12 +361,12 @@ def test_it_holds_the_session_and_its_pictures(finished_run: MadeUpRun, tmp_path
         assert elsewhere not in text
 
 
-def test_a_run_that_writes_it_counts_as_ended_and_others_do_not(finished_run: MadeUpRun) -> None:
+def test_report_treats_own_run_as_ended(finished_run: MadeUpRun) -> None:
     path = write_session_report(finished_run.folder)
     assert path == finished_run.folder / "report.html"
     head = data_of(path)["head"]
     assert head["state"] == "incomplete"
-    assert head["sentence"] == "ended with 3 of 8 frames left; run the same command again"
+    assert head["sentence"] == "ended, 3 of 8 frames are missing; run the same command again"
     for step in finished_run.steps[5:]:
         finished_run.take(step)
     assert data_of(write_session_report(finished_run.folder))["head"]["state"] == "complete"
@@ -376,9 +376,7 @@ def test_a_run_that_writes_it_counts_as_ended_and_others_do_not(finished_run: Ma
     assert "chart.json" in head["sentence"]
 
 
-def test_a_full_disk_is_said_and_leaves_the_session_as_it_was(
-    finished_run: MadeUpRun, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_report_fails_cleanly_on_full_disk(finished_run: MadeUpRun, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(view, "write_atomic", Mock(side_effect=StorageError("no space")))
     assert main(["report", str(finished_run.folder)]) == StorageError.exit_code
     assert not (finished_run.folder / "report.html").exists()

@@ -1,7 +1,7 @@
-"""A session in a lab in which several things go wrong once each, by a seed: body, cable, screen, projector, disk.
+"""Sessions with several random faults of camera, cable, screen, projector and disk.
 
-The camera's files say which colour was on the screen and how many exposures there were before, so that a frame that is
-lost, taken for another, or counted twice is seen.
+The camera's files contain the colour on the screen and the number of earlier exposures, so that a lost, confused or
+doubly counted frame is detected.
 """
 
 from __future__ import annotations
@@ -50,8 +50,7 @@ SETTINGS = LabSettings.model_validate(
         "sequence": {"reference_every": 5, "warm_up_s": 30, "patience_s": 300},
     }
 )
-OPERATIONS = 1200
-"""Operations over the camera's cable in an undisturbed session, about: something happens at one of them."""
+OPERATIONS = 1200  # approximate number of operations on the camera's cable in an undisturbed session
 
 
 class ColourFilm:

@@ -1,4 +1,4 @@
-"""Devices that do as a script says, around a fresh session of two lights; simulated time."""
+"""Devices that follow a script, with a fresh session of two illuminants, in simulated time."""
 
 from __future__ import annotations
 

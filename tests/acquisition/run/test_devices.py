@@ -1,7 +1,4 @@
-"""The lamp in simulated time: lit, warm, watched; and what a projector in trouble makes the run say.
-
-On every end the screen goes black and the lamp's fate is decided and said; nothing of it hides why a run ended.
-"""
+"""The lamp in simulated time, pauses of a run, late steps, and the end of a run."""
 
 from __future__ import annotations
 
@@ -23,8 +20,8 @@ from acquisition.monitor.view import Head, read_session
 from acquisition.run import devices, run
 from acquisition.run.devices import (
     PAUSE_S,
+    REPORTED_LATE,
     RETRY_S,
-    TOLD_LATER,
     Devices,
     HealthWatch,
     RetryPolicy,
@@ -33,10 +30,10 @@ from acquisition.run.devices import (
     ask_all,
     await_health,
     health_fault,
-    lamp_fate,
     leave_lab,
     make_ready,
     pause_cause,
+    settle_lamp,
 )
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import take_session
@@ -82,7 +79,7 @@ ON, OFF = Power.ON, Power.COOLING
         (RunEnd.INTERRUPTED, SequenceSettings(switch_off=False, lamp_if_unfinished="on"), ON),
     ],
 )
-def test_the_lamp_s_fate_is_decided_and_said(end: RunEnd, settings: SequenceSettings, power: Power) -> None:
+def test_leaves_lamp_as_configured_and_reports_it(end: RunEnd, settings: SequenceSettings, power: Power) -> None:
     clock = SimulatedClock()
     projector, screen = SimulatedProjector(clock, power=ON), Screen()
     said: list[tuple[str, str]] = []
@@ -98,7 +95,7 @@ def test_the_lamp_s_fate_is_decided_and_said(end: RunEnd, settings: SequenceSett
 
 
 @pytest.mark.parametrize(("lost", "said"), [(2, "it was switched off"), (3, "it could not be switched off: no answer")])
-def test_an_answer_that_is_lost_does_not_let_the_lamp_burn(lost: int, said: str) -> None:
+def test_switches_lamp_off_despite_lost_answer(lost: int, said: str) -> None:
     class Deaf(SimulatedProjector):
         asked = 0
 
@@ -109,32 +106,32 @@ def test_an_answer_that_is_lost_does_not_let_the_lamp_burn(lost: int, said: str)
             return super().power()
 
     clock = SimulatedClock()
-    sentence = lamp_fate(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
+    sentence = settle_lamp(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
     assert sentence.startswith(said)
 
 
-def test_a_lamp_that_is_out_is_left_alone() -> None:
+def test_leaves_lamp_that_is_off() -> None:
     class Untouched(SimulatedProjector):
         def switch_off(self) -> None:
             raise AssertionError
 
     clock = SimulatedClock()
-    said = lamp_fate(Untouched(clock), RunEnd.COMPLETE, SequenceSettings(), clock)
-    assert said == "it is out already: the projector is in standby"
+    said = settle_lamp(Untouched(clock), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert said == "it is already off: the projector is in standby"
 
 
-def test_a_lamp_that_does_not_obey_is_said_to_burn() -> None:
+def test_reports_lamp_that_stays_on() -> None:
     class Deaf(SimulatedProjector):
         def switch_off(self) -> None: ...
 
     clock = SimulatedClock()
-    said = lamp_fate(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
-    assert "burns on though the projector was told" in said
+    said = settle_lamp(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert "still burns" in said
     assert "by hand" in said
     assert clock.monotonic() == 5
 
 
-def test_a_screen_that_fails_and_a_full_disk_raise_nothing() -> None:
+def test_end_raises_no_device_or_disk_error() -> None:
     class Broken(Screen):
         def show(self, colour: Colour) -> None:
             raise DeviceError("the display is gone")
@@ -153,7 +150,7 @@ def test_a_screen_that_fails_and_a_full_disk_raise_nothing() -> None:
         SequenceSettings(),
         report,
     )
-    assert said == ["screen: it could not be made black: the display is gone", "lamp: it was switched off"]
+    assert said == ["screen: it could not be set to black: the display is gone", "lamp: it was switched off"]
     assert projector.power() is OFF
 
 
@@ -235,7 +232,7 @@ def no_time(clock: SimulatedClock) -> RetryPolicy:
 
 
 @pytest.mark.parametrize(("fault", "said"), [("frozen", "frozen"), ("unplugged", "no signal")])
-def test_a_picture_that_does_not_follow_is_noticed(fault: str, said: str) -> None:
+def test_reports_unhealthy_projector(fault: str, said: str) -> None:
     beamer = Beamer(SimulatedClock())
     assert health_fault(beamer.projector) is None
     if fault == "frozen":
@@ -245,7 +242,7 @@ def test_a_picture_that_does_not_follow_is_noticed(fault: str, said: str) -> Non
     assert said in str(health_fault(beamer.projector))
 
 
-def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
+def test_lights_and_warms_cold_lamp() -> None:
     clock = SimulatedClock()
     projector = SimulatedProjector(clock)
     make_ready(projector, SEQUENCE, no_time(clock))
@@ -253,7 +250,7 @@ def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
     assert clock.monotonic() >= 600 + projector.traits.warm_up_s
 
 
-def test_a_warm_lamp_is_not_waited_for_though_the_answer_takes_its_time() -> None:
+def test_does_not_wait_for_warm_lamp() -> None:
     class Slow(SimulatedProjector):
         def power(self) -> Power:
             self.clock.sleep(0.1)
@@ -264,7 +261,7 @@ def test_a_warm_lamp_is_not_waited_for_though_the_answer_takes_its_time() -> Non
     assert clock.monotonic() < 1
 
 
-def test_a_projector_deaf_while_its_lamp_is_struck_is_waited_for() -> None:
+def test_waits_for_projector_that_is_silent_while_lighting() -> None:
     class Deaf(SimulatedProjector):
         def power(self) -> Power:
             if (power := super().power()) is Power.WARMING:
@@ -278,7 +275,7 @@ def test_a_projector_deaf_while_its_lamp_is_struck_is_waited_for() -> None:
 
 
 @pytest.mark.slow
-def test_a_lamp_that_goes_out_while_it_warms_up_gets_all_its_minutes_again() -> None:
+def test_repeats_warm_up_after_lamp_went_out() -> None:
     room = Room(power=Power.STANDBY)
     lit_again = 600.0
 
@@ -293,7 +290,7 @@ def test_a_lamp_that_goes_out_while_it_warms_up_gets_all_its_minutes_again() -> 
     assert room.clock.monotonic() >= lit_again + SEQUENCE.warm_up_s
 
 
-def test_a_picture_muted_while_the_lamp_warms_up_costs_no_minutes() -> None:
+def test_mute_does_not_extend_warm_up() -> None:
     room = Room(power=Power.STANDBY)
     room.at(200, lambda: room.beamer.device.set_muted(True))
     room.at(300, lambda: room.beamer.device.set_muted(False))
@@ -302,7 +299,7 @@ def test_a_picture_muted_while_the_lamp_warms_up_costs_no_minutes() -> None:
     assert room.clock.monotonic() <= 600 + room.beamer.device.traits.warm_up_s + 2 * PAUSE_S
 
 
-def test_a_projector_without_power_is_lit_again_if_asked_to() -> None:
+def test_relights_after_power_cut() -> None:
     room = Room()
     switched: list[float] = []
 
@@ -322,7 +319,7 @@ def test_a_projector_without_power_is_lit_again_if_asked_to() -> None:
     assert room.clock.monotonic() >= switched[0] + SEQUENCE.warm_up_s
 
 
-def test_a_lamp_that_does_not_light_is_not_switched_on_again_and_again() -> None:
+def test_relights_once_per_pause() -> None:
     room = Room()
     tries: list[float] = []
     room.beamer.device.switch_off()
@@ -332,7 +329,7 @@ def test_a_lamp_that_does_not_light_is_not_switched_on_again_and_again() -> None
     assert len(tries) == 1
 
 
-def test_a_projector_that_came_back_in_standby_is_said_to_be_so() -> None:
+def test_reports_standby_after_power_cut() -> None:
     room = Room()
 
     def power_back() -> None:
@@ -348,7 +345,7 @@ def test_a_projector_that_came_back_in_standby_is_said_to_be_so() -> None:
     assert "nothing listens" in room.said[1][1]
     assert "standby" in room.said[2][1]
     assert "warm-up" in room.said[3][1]
-    # What is said at any time is what holds then.
+    # Each message has the current cause.
     for at, _, sentence, _ in room.beats:
         if 70 < at < 195:
             assert "standby" in sentence
@@ -360,7 +357,7 @@ ALL = ["faults", "power", "muted", "picture_fault"]
 
 
 @pytest.mark.parametrize(("answer_s", "asked"), [(0.004, ALL), (0.02, ["faults"])])
-def test_a_slow_projector_is_asked_in_turn(answer_s: float, asked: list[str]) -> None:
+def test_asks_slow_projector_one_question_per_frame(answer_s: float, asked: list[str]) -> None:
     clock, projector, seen = SimulatedClock(), Mock(), list[str]()
 
     def answers(what: str, value: object) -> object:
@@ -387,7 +384,7 @@ def until(end_s: float, fault: CropError) -> Callable[[float], CropError | None]
 
 
 @pytest.mark.parametrize("limit_s", [0.1, 0.3, 1.0, 600.0, 601.7])
-def test_patience_ends_in_time_with_the_first_cause(limit_s: float) -> None:
+def test_ends_after_patience_with_first_cause(limit_s: float) -> None:
     room = PausedRoom(limit_s)
 
     def causes(now: float) -> CropError:
@@ -403,7 +400,7 @@ def test_patience_ends_in_time_with_the_first_cause(limit_s: float) -> None:
     assert len(room.tries) >= 2
 
 
-def test_what_waiting_does_not_cure_is_raised_at_once() -> None:
+def test_raises_incurable_faults_at_once() -> None:
     room = PausedRoom()
     fault = ConfigurationError("no such display")
     with pytest.raises(ConfigurationError) as caught:
@@ -418,7 +415,7 @@ def test_what_waiting_does_not_cure_is_raised_at_once() -> None:
     assert room.said == []
 
 
-def test_an_interruption_ends_a_pause_at_once() -> None:
+def test_interruption_ends_pause() -> None:
     room = PausedRoom()
 
     def stop(state: str, sentence: str, within_s: float) -> None:
@@ -431,7 +428,7 @@ def test_an_interruption_ends_a_pause_at_once() -> None:
     assert room.clock.monotonic() < 60 + 2 * PAUSE_S
 
 
-def test_a_full_disk_takes_the_notes_of_its_pause_when_there_is_space() -> None:
+def test_stores_notes_after_full_disk() -> None:
     room = PausedRoom()
     full = until(120, StorageError("the disk is full"))
 
@@ -446,7 +443,7 @@ def test_a_full_disk_takes_the_notes_of_its_pause_when_there_is_space() -> None:
     retry = RetryPolicy(room.clock, 600, report, on_wait=beat)
     assert retry.attempt(room.broken(full), "the disk") == "done"
     assert room.words == ["retry", "paused", "resumed"]
-    late = [sentence for _, sentence in room.said if TOLD_LATER in sentence]
+    late = [sentence for _, sentence in room.said if REPORTED_LATE in sentence]
     assert len(late) == 2, "that it was retried and paused, two minutes ago"
     assert pause_cause(late[1]) == "the disk is full"
 
@@ -456,7 +453,7 @@ def outlast(room: PausedRoom, retry: RetryPolicy, name: str = "the screen") -> N
     assert retry.attempt(room.broken(until(begun + 50, DeviceError("covered"))), name) == "done"
 
 
-def test_pauses_with_many_frames_between_them_have_each_their_time() -> None:
+def test_separate_pauses_have_separate_patience() -> None:
     room = PausedRoom(60.0)
     retry = room.retry
     for _ in range(3):
@@ -466,7 +463,7 @@ def test_pauses_with_many_frames_between_them_have_each_their_time() -> None:
     assert room.words == ["retry", "paused", "resumed"] * 3
 
 
-def test_what_fails_again_after_a_few_frames_has_one_patience() -> None:
+def test_recurring_fault_shares_patience() -> None:
     room = PausedRoom(60.0)
     retry = room.retry
     outlast(room, retry)
@@ -479,7 +476,7 @@ def test_what_fails_again_after_a_few_frames_has_one_patience() -> None:
     assert room.clock.monotonic() - begun == pytest.approx(10, abs=PAUSE_S + RETRY_S), "fifty of sixty are spent"
 
 
-def test_one_back_off_holds_across_pauses() -> None:
+def test_back_off_continues_across_pauses() -> None:
     """Tried again after 0, 5, 10, 20 … 300 s (docs/how-to/night-run.md), once more after one second."""
     room = PausedRoom(math.inf)
     retry = room.retry
@@ -496,7 +493,7 @@ def test_one_back_off_holds_across_pauses() -> None:
 
 
 @pytest.mark.slow
-def test_a_full_disk_never_loses_the_frame_in_the_camera(tmp_path: Path) -> None:
+def test_full_disk_keeps_frame_in_camera(tmp_path: Path) -> None:
     """The real driver, and a kernel that lets no file grow: the download is repeated when there is space again."""
     resource = pytest.importorskip("resource")
     chart, light = design_chart(1), Illumination(0, "uniform", None, WHITE)
@@ -533,7 +530,7 @@ def test_a_full_disk_never_loses_the_frame_in_the_camera(tmp_path: Path) -> None
     assert [path.name for path in session.frames_folder.iterdir()] == [received.path.name]
 
 
-def test_a_journal_that_another_program_held_for_the_whole_patience_is_not_waited_for_again() -> None:
+def test_does_not_wait_again_for_locked_journal() -> None:
     def held() -> None:
         raise BusyJournalError("cannot write journal.sqlite: database is locked")
 
@@ -544,7 +541,7 @@ def test_a_journal_that_another_program_held_for_the_whole_patience_is_not_waite
     assert clock.monotonic() == begun
 
 
-def test_a_wait_can_be_broken_off_and_a_try_cannot() -> None:
+def test_only_waits_can_be_interrupted() -> None:
     clock, inside, seen = SimulatedClock(), [0], list[tuple[str, int]]()
 
     @contextmanager
@@ -568,7 +565,7 @@ def test_a_wait_can_be_broken_off_and_a_try_cannot() -> None:
 
 
 class Time:
-    """Stands still but where it jumps."""
+    """Stands still, except for jumps."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -588,7 +585,7 @@ def events(lab: Lab) -> list[str]:
     return [event.detail for event in lab.session.journal.events() if event.what == "gap"]
 
 
-def test_a_frame_that_was_exposed_across_a_gap_is_taken_again(tmp_path: Path, time: Time) -> None:
+def test_repeats_frame_exposed_during_gap(tmp_path: Path, time: Time) -> None:
     lab = Lab(tmp_path / "session")
 
     def stopped() -> None:
@@ -602,7 +599,7 @@ def test_a_frame_that_was_exposed_across_a_gap_is_taken_again(tmp_path: Path, ti
     assert len(events(lab)) == 1
 
 
-def test_a_gap_between_frames_is_in_the_journal_and_costs_none(tmp_path: Path, time: Time) -> None:
+def test_records_gap_between_frames(tmp_path: Path, time: Time) -> None:
     lab = Lab(tmp_path / "session")
     show = lab.screen.show
 
@@ -616,9 +613,9 @@ def test_a_gap_between_frames_is_in_the_journal_and_costs_none(tmp_path: Path, t
     assert len(events(lab)) == 1
 
 
-def test_a_step_that_takes_too_long_is_told_once_with_its_device() -> None:
-    time, told = Time(), list[str]()
-    watch = RunWatch(lambda sentence, begun: told.append(sentence), time)
+def test_reports_late_step_once() -> None:
+    time, caught = Time(), list[str]()
+    watch = RunWatch(lambda sentence, begun: caught.append(sentence), time)
 
     def pass_s(seconds: float) -> None:
         """Let time pass in pieces that are no gap."""
@@ -628,29 +625,29 @@ def test_a_step_that_takes_too_long_is_told_once_with_its_device() -> None:
 
     with watch.step("the camera", "exposes light 3", 4.0, "expose"):
         pass_s(3 * 4 + 10)
-        assert not told
+        assert not caught
         pass_s(1)
-        assert len(told) == 1
+        assert len(caught) == 1
         pass_s(300)
-        assert len(told) == 1
-    assert "the camera exposes light 3, for which 4 s is expected" in told[0]
+        assert len(caught) == 1
+    assert "the camera exposes light 3, expected duration 4 s" in caught[0]
     pass_s(300)
     with watch.step("the camera", "exposes light 4", 4.0, "expose"):
         pass_s(3 * 4 + 10 + 1)
-    assert len(told) == 2, "what was late tells nothing of how long it takes"
+    assert len(caught) == 2, "what was late tells nothing of how long it takes"
     with watch.step("the camera", "sends light 4", 4.0, "download"):
         pass_s(20)
     with watch.step("the camera", "sends light 5", 4.0, "download"):
         pass_s(3 * 20 + 10)
-    assert len(told) == 2, "a slow cable stays slow"
+    assert len(caught) == 2, "a slow cable stays slow"
     with watch.step("the screen", "shows light 6", 0.5, "show"):
         pass_s(12)
-    assert "for which 0.5 s is expected" in told[2]
+    assert "expected duration 0.5 s" in caught[2]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("hangs", "cause"), [("expose", "the camera"), ("show", "the screen"), ("judge", "the disk")])
-def test_what_hangs_is_named_while_it_hangs(
+def test_reports_hanging_device(
     tmp_path: Path, time: Time, hangs: str, cause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab, heads = Lab(tmp_path / "session"), list[Head]()
@@ -664,11 +661,11 @@ def test_what_hangs_is_named_while_it_hangs(
             watches.append(self)
 
         @contextmanager
-        def step(self, device: str, doing: str, expected_s: float, kind: str) -> Generator[None]:
-            expected[kind] = expected_s
-            with super().step(device, doing, expected_s, kind):
+        def step(self, device: str, doing: str, expected_s: float, step_kind: str) -> Generator[None]:
+            expected[step_kind] = expected_s
+            with super().step(device, doing, expected_s, step_kind):
                 with entered:
-                    kinds[:] = [kind]
+                    kinds[:] = [step_kind]
                     entered.notify_all()
                 try:
                     yield
@@ -678,7 +675,7 @@ def test_what_hangs_is_named_while_it_hangs(
     def hanging(*given: object) -> object:
         calls[0] += 1
         if calls[0] == 4:
-            # Frames are judged beside the run, which comes to wait for the verdict.
+            # Frames are judged in another thread, and the run waits for the verdict.
             with entered:
                 assert entered.wait_for(lambda: kinds == [hangs], timeout=60)
             for _ in range(60):
@@ -694,13 +691,13 @@ def test_what_hangs_is_named_while_it_hangs(
     assert (head.state, head.cause) == ("late", cause)
     assert head.sentence.startswith("late since")
     assert not events(lab)
-    # Of half a second the camera's own dark frame takes as much again.
+    # After 0.5 s the camera's own dark frame takes the same time again.
     assert SETTINGS.camera.shutter_s == 0.5
     assert expected.items() >= {"expose": 1 + 3.0, "download": 10.0, "judge": 5.0, "show": 2.0}.items()
 
 
 @pytest.mark.parametrize("fault", [InputError("no such file"), ConfigurationError("line.baud is missing")])
-def test_all_faults_are_reported_and_settings_alone_end_with_2(fault: CropError) -> None:
+def test_reports_all_faults_with_exit_code(fault: CropError) -> None:
     def fails(error: CropError) -> Callable[[], object]:
         def ask() -> None:
             raise error
@@ -709,8 +706,8 @@ def test_all_faults_are_reported_and_settings_alone_end_with_2(fault: CropError)
 
     unplugged, nowhere = LinkClosed("no camera on USB"), ConfigurationError("lab.camera.host is missing")
     for camera, exit_code in ((unplugged, 3), (nowhere, 2)):
-        with pytest.raises(CropError) as told:
+        with pytest.raises(CropError) as caught:
             ask_all({"camera": fails(camera), "projector": fails(fault), "display": lambda: None})
-        assert told.value.exit_code == exit_code
-        assert str(camera) in str(told.value)
-        assert str(fault) in str(told.value)
+        assert caught.value.exit_code == exit_code
+        assert str(camera) in str(caught.value)
+        assert str(fault) in str(caught.value)

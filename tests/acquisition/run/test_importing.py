@@ -1,4 +1,4 @@
-"""Sessions from raw files taken by other means: what their list may say."""
+"""Import of raw files taken by other means, and contents of their list."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def write(folder: Path, rows: Sequence[Row]) -> None:
         writer.writerows([row.get(column, "") for column in FRAME_COLUMNS] for row in rows)
 
 
-def test_formats_that_cannot_be_checked_are_named_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lists_uncheckable_formats_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for number in (1, 2):
         (folder / f"{number}.RAF").write_bytes(raf(seed=number)[0])
     rows = [light(0), *(light(number, file=f"{number}.RAF") for number in (1, 2))]
@@ -65,22 +65,22 @@ def test_formats_that_cannot_be_checked_are_named_once(folder: Path, capsys: pyt
         assert all(frame.accepted for frame in session.frames())
 
 
-def test_listed_frames_make_a_session(folder: Path) -> None:
+def test_imports_listed_frames(folder: Path) -> None:
     rows = [light(0), light(1, verdict="refused: a hand"), light(2), light(2), {"kind": "white", "file": "0.cr2"}]
     imported = import_rows(folder, [*rows[:-1], {**rows[-1], "verdict": "accepted"}])
-    assert imported == Imported(("1.cr2: a hand",), ("light 1",), ())
+    assert imported == Imported(("1.cr2: a hand",), ("illuminant 1",), ())
     with Session.open(folder / "session") as session:
         assert [frame.accepted for frame in session.frames()] == [True, False, True, True, True]
         assert [frame.verdict for frame in session.frames()][1] == "refused: a hand"
 
 
-def test_it_is_told_whether_the_list_judged_a_frame_or_its_exposure(folder: Path) -> None:
+def test_records_source_of_verdict(folder: Path) -> None:
     import_rows(folder, [light(0), light(1, verdict="")])
     with Session.open(folder / "session") as session:
         assert [one.checks[0].name for one in session.journal.details().values()] == ["list", "exposure"]
 
 
-def test_a_damaged_file_is_refused_whatever_the_list_says_of_it(folder: Path) -> None:
+def test_refuses_damaged_file_despite_list(folder: Path) -> None:
     write_dng(folder / "1.cr2", np.where(np.arange(1024).reshape(32, 32) > 800, 0, 900).astype(np.uint16))
     (folder / "2.cr2").write_bytes(b"II*\0")
     filled, cut = import_rows(folder, [light(0), light(1), light(2)]).refused
@@ -89,7 +89,7 @@ def test_a_damaged_file_is_refused_whatever_the_list_says_of_it(folder: Path) ->
     assert "2.cr2: " in cut
 
 
-def test_two_lights_of_one_file_leave_nothing(folder: Path) -> None:
+def test_refuses_one_file_for_two_illuminants(folder: Path) -> None:
     (folder / "2.cr2").write_bytes((folder / "0.cr2").read_bytes())
     with pytest.raises(FormatError, match=r"0\.cr2 and 2\.cr2") as caught:
         import_rows(folder, [light(0), light(1), light(2)])
@@ -98,7 +98,7 @@ def test_two_lights_of_one_file_leave_nothing(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("exposure_s", ["nan", "inf", "-5"])
-def test_an_exposure_that_is_no_time_is_refused(folder: Path, exposure_s: str) -> None:
+def test_refuses_invalid_exposure_time(folder: Path, exposure_s: str) -> None:
     with pytest.raises(FormatError, match="exposure_s") as caught:
         import_rows(folder, [light(0), light(1, exposure_s=exposure_s)])
     assert str(caught.value.about).endswith("list.csv, line 3")
@@ -107,32 +107,32 @@ def test_an_exposure_that_is_no_time_is_refused(folder: Path, exposure_s: str) -
 
 
 @pytest.mark.parametrize("verdict", ["ok", "Accepted", "rubbish", "refused:dark"])
-def test_a_verdict_that_is_none_is_refused(folder: Path, verdict: str) -> None:
+def test_refuses_invalid_verdict(folder: Path, verdict: str) -> None:
     with pytest.raises(FormatError, match="line 2: verdict") as caught:
         import_rows(folder, [light(0, verdict=verdict)])
     assert caught.value.value == verdict
 
 
-def test_a_refusal_without_a_reason_is_one(folder: Path) -> None:
-    assert import_rows(folder, [light(0, verdict="refused")]).refused == ("0.cr2: for no reason that is listed",)
+def test_accepts_refusal_without_reason(folder: Path) -> None:
+    assert import_rows(folder, [light(0, verdict="refused")]).refused == ("0.cr2: the list gives no reason",)
 
 
-def test_a_list_that_is_missing_is_named_itself(tmp_path: Path) -> None:
+def test_reports_missing_list(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"nowhere\.csv: No such file"):
         import_session(tmp_path / "nowhere.csv", tmp_path / "chart.json", tmp_path / "session")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("verdict", "code"), [("refused: a hand", 4), ("accepted", 0)])
-def test_a_light_without_an_accepted_frame_is_told_by_the_exit_code(
+def test_exit_code_reports_missing_illuminant(
     folder: Path, verdict: str, code: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Another frame of the light may be refused."""
+    """Another frame of the illuminant may be refused."""
     write(folder, [light(0), light(1, verdict="refused: a hand"), light(1, verdict=verdict)])
     arguments = ("import", folder / "list.csv", folder / "chart.json", folder / "session")
     found = json_of(main, arguments, capsys, code)
     assert len(found["refused"]) == (3 if code else 2) - 1
-    assert found["left"] == (["light 1"] if code else [])
+    assert found["left"] == (["illuminant 1"] if code else [])
     shutil.rmtree(folder / "session")
     assert main(list(map(str, arguments))) == code
     assert ("accepted frame: light 1;" in capsys.readouterr().err) == (code == 4)

@@ -1,4 +1,4 @@
-"""How runs are planned, what they wait for, take again and tell, number by number and word by word."""
+"""Plans, waits, retakes and reports of runs, number by number."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.pinned import Pinned
 pytestmark = pytest.mark.slow
 
 
-def test_runs_are_planned_as_they_were(pinned: Pinned) -> None:
+def test_plans_runs(pinned: Pinned) -> None:
     chance, found = random.Random(5), list[Any]()
     supplies = [
         None,
@@ -75,7 +75,7 @@ def test_runs_are_planned_as_they_were(pinned: Pinned) -> None:
     pinned("plans of runs", [found, models, needs, offered])
 
 
-def test_shutter_times_hold_the_turns_that_they_held(pinned: Pinned) -> None:
+def test_counts_turns_in_shutter_times(pinned: Pinned) -> None:
     wheels = (24.0, 50.0, 59.94, 60.0, 120.0, 180.0)
     turns = {str(hz): [time for time in ENGRAVED_S if holds_whole_turns(time, 1 / hz)] for hz in wheels}
     odd = [[n, holds_whole_turns(n / 60, 1 / 60)] for n in (0.4, 0.5, 0.994, 0.995, 1.005, 1.0051, 30.14, 30.16, 300.9)]
@@ -104,7 +104,7 @@ def test_shutter_times_hold_the_turns_that_they_held(pinned: Pinned) -> None:
     )
 
 
-def test_what_fails_is_waited_for_as_it_was(pinned: Pinned) -> None:
+def test_waits_for_faults(pinned: Pinned) -> None:
     faults = [DeviceError("covered by 3 windows"), LinkClosed("nothing at 10.0.0.1"), DeviceFault("off; switch it on")]
     found: dict[str, Any] = {}
     for limit, takes, pattern in product(
@@ -134,7 +134,7 @@ def test_what_fails_is_waited_for_as_it_was(pinned: Pinned) -> None:
     pinned("waits for what fails", found)
 
 
-def test_steps_come_in_the_order_that_they_had(pinned: Pinned) -> None:
+def test_orders_steps(pinned: Pinned) -> None:
     chance, found = random.Random(2), list[Any]()
     for number in range(60):
         done = set(chance.sample(range(10), chance.randrange(9)))
@@ -147,7 +147,7 @@ def test_steps_come_in_the_order_that_they_had(pinned: Pinned) -> None:
     pinned("steps in their order", found)
 
 
-def test_changes_that_a_run_follows_are_told_as_they_were(pinned: Pinned) -> None:
+def test_reports_accepted_changes(pinned: Pinned) -> None:
     grey, found = Colour(250, 250, 250), list[Any]()
     first, light = SessionStep(3, "response", None, grey), SessionStep(5, "light", 0, grey)
     dark = SessionStep(1, "dark", None, BLACK)
@@ -155,7 +155,7 @@ def test_changes_that_a_run_follows_are_told_as_they_were(pinned: Pinned) -> Non
     for step, value in product(steps, (-2.0, -1.0, -0.2, 0.0, 0.2, 0.5, 0.51, 1.0, 1.01)):
         for name in ("movement", "off_brightness", "leak_share"):
             judged = Judgement((Check(name, value, -1.5, 1.5),))
-            found.append(len(list(pipeline._followed_changes(step, judged, steps, JudgeSettings()))))
+            found.append(len(list(pipeline._accepted_changes(step, judged, steps, JudgeSettings()))))
     pinned("changes that a run follows", found)
 
 
@@ -187,7 +187,7 @@ def journal_of(session: Session) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_a_run_takes_what_it_took(name: str, tmp_path: Path, pinned: Pinned) -> None:
+def test_takes_a_session(name: str, tmp_path: Path, pinned: Pinned) -> None:
     script, judged = SCRIPTS[name]
     lab = Lab(tmp_path / "session", dict(script), FOUR, 2)
     judge = ScriptedJudge(dict(judged)) if judged else None
@@ -202,7 +202,7 @@ def test_a_run_takes_what_it_took(name: str, tmp_path: Path, pinned: Pinned) -> 
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_run_with_mishaps_goes_as_it_went(seed: int, tmp_path: Path, pinned: Pinned) -> None:
+def test_takes_sessions_with_mishaps(seed: int, tmp_path: Path, pinned: Pinned) -> None:
     lab = TroubledLab(seed)
     with new_session(tmp_path / "session") as session:
         ended = lab.take(session)

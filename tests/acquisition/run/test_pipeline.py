@@ -1,4 +1,4 @@
-"""Frames one behind another against scripted devices: their order in time, refusals, voids, faults, and the end."""
+"""Order of frames with scripted devices: timing, refusals, voids, faults, and the end."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from foundation.errors import DeviceError, DeviceFault, LinkTimeout, QualityErro
 from tests.acquisition.run.scripted import DOWNLOAD_S, EXPOSE_S, GLARE, LIGHTS, NIGHT, SETTINGS, TURNED, WELL, Lab
 
 SETTLE_S = SETTINGS.sequence.settle_s
+# Each try in a pause costs rows on a disk; a minute has enough of them.
 PATIENT = SETTINGS.model_copy(update={"sequence": SETTINGS.sequence.model_copy(update={"patience_s": 60.0})})
-"""Each try in a pause costs rows on a disk; a minute has as many as are needed."""
 FOUR = tuple(Illumination(n, "uniform", None, Colour(255, 40 * n, 0)) for n in range(4))
 
 
@@ -57,7 +57,7 @@ def refused(reason: str, *, voids: bool = False, lasting: bool = False) -> Judge
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("percent", "doubted"), [(0.4, False), (0.6, True)])
-def test_light_in_the_room_is_doubted_once_and_lastingly(folder: Path, percent: float, doubted: bool) -> None:
+def test_doubts_room_light_once(folder: Path, percent: float, doubted: bool) -> None:
     class Lit(ScriptedJudge):
         def judge(self, file: Path, step: SessionStep) -> Judgement:
             known = super().judge(file, step)
@@ -77,7 +77,7 @@ def run(lab: Lab, judge: ScriptedJudge | None = None, **more: Any) -> RunOutcome
 
 
 class TestTime:
-    def test_every_light_is_shown_once_and_its_frame_kept(self, folder: Path) -> None:
+    def test_shows_every_illuminant_once(self, folder: Path) -> None:
         lab = Lab(folder)
         assert run(lab).complete
         assert lab.camera.exposed == [WHITE, BLACK, LIGHTS[0].colour, LIGHTS[1].colour, WHITE, BLACK]
@@ -85,7 +85,7 @@ class TestTime:
         assert lab.projector.power() is Power.COOLING, "a complete session switches the lamp off"
         assert lab.verdicts() == ["accepted"] * 6
 
-    def test_a_session_with_frames_left_leaves_the_lamp_as_its_settings_say(self, folder: Path) -> None:
+    def test_leaves_lamp_as_configured_after_incomplete_run(self, folder: Path) -> None:
         class NotThatLight(ScriptedJudge):
             def judge(self, file: Path, step: SessionStep) -> Judgement:
                 return refused("somebody passes each time") if step.number == 3 else super().judge(file, step)
@@ -96,7 +96,7 @@ class TestTime:
         assert not take_session(lab.session, lab.devices, left_on, NotThatLight()).complete
         assert lab.projector.power() is Power.ON
 
-    def test_no_light_is_exposed_before_it_has_settled(self, folder: Path) -> None:
+    def test_exposes_after_settling(self, folder: Path) -> None:
         lab = Lab(folder, {1: NIGHT, 3: NIGHT})
         shown: list[float] = []
         show = lab.screen.show
@@ -116,7 +116,7 @@ class TestTime:
         assert run(lab).complete
         assert min(settled) >= SETTLE_S - 1e-9
 
-    def test_every_step_of_an_attempt_has_its_time_in_the_journal(self, folder: Path) -> None:
+    def test_records_timings(self, folder: Path) -> None:
         lab = Lab(folder)
         run(lab)
         timings = {number: known.timings for number, known in lab.session.journal.details().items()}
@@ -135,7 +135,7 @@ class TestRefusals:
         ("bad", "reason"),
         [(NIGHT, "is the projector on"), (GLARE, "clipped"), (TURNED, "0.4 instead of 0.5"), (b"garbage", "raw")],
     )
-    def test_a_bad_frame_is_kept_refused_and_taken_again(self, folder: Path, bad: bytes, reason: str) -> None:
+    def test_repeats_refused_frame(self, folder: Path, bad: bytes, reason: str) -> None:
         lab = Lab(folder, {2: bad})
         assert run(lab).complete
         frames = [frame for frame in lab.session.frames() if not frame.accepted]
@@ -145,15 +145,13 @@ class TestRefusals:
         assert len(lab.session.frames()) == 7
 
     @pytest.mark.slow
-    def test_files_are_looked_for_behind_each_white_frame_and_in_the_end(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_looks_for_lost_files(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         look = Mock(return_value=[])
         monkeypatch.setattr(Session, "lost_files", look)
         assert run(Lab(folder, lights=FOUR, reference_every=2)).complete
         assert look.call_count == 3 + 1
 
-    def test_a_covered_screen_refuses_the_frame_and_the_judge_does_not_learn_from_it(self, folder: Path) -> None:
+    def test_refuses_covered_screen_without_judging(self, folder: Path) -> None:
         lab = Lab(folder)
         lab.screen.covered = {0}
         judge = ScriptedJudge()
@@ -163,14 +161,14 @@ class TestRefusals:
         assert all(frame.accepted for frame in rest)
         assert len(judge.judged) == len(rest)
 
-    def test_what_was_taken_since_the_last_good_reference_is_voided(self, folder: Path) -> None:
+    def test_voids_frames_since_good_reference(self, folder: Path) -> None:
         lab = Lab(folder, lights=FOUR, reference_every=2)
         # w0 d1 l2 l3 w4: the picture has been stuck since light 2.
         judge = ScriptedJudge({4: refused("the picture is stuck", voids=True)})
         left: list[int] = []
 
         def count(taken: Taken) -> None:
-            left.append(taken.left)
+            left.append(taken.remaining)
 
         assert run(lab, judge, observe=count).complete
         assert left[:5] == [9, 8, 7, 6, 8], "what was voided is left again"
@@ -185,7 +183,7 @@ class TestRefusals:
         assert sorted(accepted) == list(range(10)), "each step once"
 
     @pytest.mark.slow
-    def test_a_reference_that_voids_for_ever_ends_the_run_when_patience_does(self, folder: Path) -> None:
+    def test_ends_after_patience_with_bad_reference(self, folder: Path) -> None:
         class NoWhite(ScriptedJudge):
             def judge(self, file: Path, step: SessionStep) -> Judgement:
                 seen = super().judge(file, step)
@@ -198,7 +196,7 @@ class TestRefusals:
         assert run(lab, ScriptedJudge()).complete
 
     @pytest.mark.slow
-    def test_a_response_frame_voids_what_the_run_has_taken(self, folder: Path) -> None:
+    def test_response_frame_voids_frames_of_run(self, folder: Path) -> None:
         lab = Lab(folder, lights=FOUR, reference_every=2)
         ending = EndRequest(lambda sentence: None)
 
@@ -222,26 +220,26 @@ class TestRefusals:
         assert lab.verdicts()[:before] == ["accepted"] * before
 
     @pytest.mark.slow
-    def test_what_lasts_ends_the_run_when_patience_does(self, folder: Path) -> None:
+    def test_ends_after_patience_with_lasting_cause(self, folder: Path) -> None:
         lab = Lab(folder, dict.fromkeys(range(1000), NIGHT))
-        begun = lab.clock.monotonic()
+        start_next = lab.clock.monotonic()
         with pytest.raises(QualityError):
             run(lab)
-        assert lab.clock.monotonic() - begun >= PATIENT.sequence.patience_s
+        assert lab.clock.monotonic() - start_next >= PATIENT.sequence.patience_s
         assert len(lab.session.frames()) < 40, "a pause does not fill the disk"
         lab.camera.script = {}
         assert run(lab).complete
 
 
 class TestFaults:
-    def test_a_download_is_tried_again_while_the_body_holds_the_frame(self, folder: Path) -> None:
+    def test_repeats_download(self, folder: Path) -> None:
         lab = Lab(folder)
         lab.camera.downloads = {2: LinkTimeout("the cable")}
         assert run(lab).complete
         assert lab.verdicts() == ["accepted"] * 6
         assert lab.camera.captures == 6
 
-    def test_a_frame_that_cannot_be_fetched_is_exposed_again(self, folder: Path) -> None:
+    def test_exposes_lost_frame_again(self, folder: Path) -> None:
         lab = Lab(folder)
         download, calls = lab.camera.download, 0
 
@@ -257,7 +255,7 @@ class TestFaults:
         assert lab.verdicts().count("failed") == 1
         assert "holds no frame" in next(a.reason for a in lab.session.journal.attempts() if a.verdict == "failed")
 
-    def test_a_cut_transfer_is_noticed(self, folder: Path) -> None:
+    def test_detects_truncated_transfer(self, folder: Path) -> None:
         lab = Lab(folder)
         lab.camera.claims = len(WELL) + 1
         said: list[str] = []
@@ -265,7 +263,7 @@ class TestFaults:
         assert "bytes" in said[0]
         assert all(len(path.read_bytes()) in (len(WELL), len(NIGHT)) for path in (folder / "frames").iterdir())
 
-    def test_a_camera_that_exposes_and_never_delivers_ends_the_run(self, folder: Path) -> None:
+    def test_ends_if_camera_never_delivers(self, folder: Path) -> None:
         lab = Lab(folder)
 
         def never(into: Any) -> Any:
@@ -277,7 +275,7 @@ class TestFaults:
             run(lab)
         assert lab.clock.monotonic() < 2 * PATIENT.sequence.patience_s
 
-    def test_a_screen_that_fails_is_waited_for_and_costs_no_frame(self, folder: Path) -> None:
+    def test_waits_for_screen_without_losing_frames(self, folder: Path) -> None:
         lab = Lab(folder)
         lab.screen.fails = dict.fromkeys(range(2, 6), DeviceError("a screen saver covers the picture"))
         said: list[str] = []
@@ -287,7 +285,7 @@ class TestFaults:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("place", ["download", "save", "commit", "begin", "fail"])
-    def test_a_full_disk_is_waited_for(self, folder: Path, place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_waits_for_full_disk(self, folder: Path, place: str, monkeypatch: pytest.MonkeyPatch) -> None:
         lab = Lab(folder, {3: DeviceError("lost")})
         full = failing(StorageError("No space left on device"), calls=range(2, 5))
         if place == "download":
@@ -306,9 +304,7 @@ class TestFaults:
         if place in ("download", "commit", "begin", "fail"):
             assert lab.camera.captures == 7, "the frame in the camera was not lost"
 
-    def test_the_first_fault_is_kept_though_saving_what_was_taken_fails_too(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_keeps_first_of_two_faults(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         lab = Lab(folder)
         commits = 0
 
@@ -324,7 +320,7 @@ class TestFaults:
         assert raised.value.__notes__ == ["then: fault 2"]
 
     @pytest.mark.slow
-    def test_a_lamp_that_fails_ends_the_run_when_patience_does(self, folder: Path) -> None:
+    def test_ends_after_patience_with_failed_lamp(self, folder: Path) -> None:
         from drivers.projector import Severity
 
         lab = Lab(folder)
@@ -358,7 +354,7 @@ def failing(error: Exception, calls: Iterable[int]) -> Callable[..., Callable[..
 
 
 class TestEnding:
-    def test_the_first_request_ends_after_the_running_frame(self, folder: Path) -> None:
+    def test_first_request_ends_after_current_frame(self, folder: Path) -> None:
         lab = Lab(folder)
         said: list[str] = []
         ending = EndRequest(said.append)
@@ -372,7 +368,7 @@ class TestEnding:
         assert run(lab).complete
         assert lab.verdicts() == ["accepted"] * 6
 
-    def test_a_request_while_a_light_settles_exposes_no_more(self, folder: Path) -> None:
+    def test_request_during_settling_exposes_no_frame(self, folder: Path) -> None:
         lab = Lab(folder)
         ending = EndRequest(lambda sentence: None)
         sleep = lab.clock.sleep
@@ -388,7 +384,7 @@ class TestEnding:
         assert lab.camera.captures == 2
         assert lab.verdicts() == ["accepted"] * 2
 
-    def test_the_second_request_ends_at_once_and_loses_nothing_that_is_on_the_disk(self, folder: Path) -> None:
+    def test_second_request_ends_at_once_without_loss(self, folder: Path) -> None:
         lab = Lab(folder)
         ending = EndRequest(lambda sentence: None)
         download = lab.camera.download
@@ -408,7 +404,7 @@ class TestEnding:
         assert not [path for path in (folder / "frames").iterdir() if path.name.startswith(".")]
         assert run(lab).complete
 
-    def test_a_pause_ends_at_once(self, folder: Path) -> None:
+    def test_request_ends_pause(self, folder: Path) -> None:
         lab = Lab(folder, dict.fromkeys(range(2, 1000), LinkTimeout("no answer")))
         ending = EndRequest(lambda sentence: None)
         sleep = lab.clock.sleep
@@ -428,59 +424,59 @@ STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in
 """white 0, dark 1, light 2, 3, white 4, dark 5, light 6, 7, white 8, dark 9."""
 
 
-def queue_of(done: Collection[int], attempts: int = 3, **more: Any) -> StepQueue:
-    """Return a queue of `STEPS` that puts closing references behind them, from 10 on."""
-    behind: list[SessionStep] = []
+def queue_of(done_numbers: Collection[int], attempts: int = 3, **options: Any) -> StepQueue:
+    """Return a queue of `STEPS` that appends closing references from number 10 on."""
+    appended: list[SessionStep] = []
 
     def append(kind: FrameKind) -> SessionStep:
-        behind.append(SessionStep(len(STEPS) + len(behind), kind, None, WHITE if kind == "white" else BLACK))
-        return behind[-1]
+        appended.append(SessionStep(len(STEPS) + len(appended), kind, None, WHITE if kind == "white" else BLACK))
+        return appended[-1]
 
-    return StepQueue(STEPS, done, attempts, append=append, **more)
+    return StepQueue(STEPS, done_numbers, attempts, append=append, **options)
 
 
 def take(queue: StepQueue, refused: dict[int, int] | None = None) -> list[int]:
-    """Take all that is listed, one after another; `refused` maps steps to how often they are. Return the steps."""
-    left, taken = dict(refused or {}), list[int]()
+    """Take all steps in order and return their numbers; `refused` maps steps to their numbers of refusals."""
+    refusals, numbers = dict(refused or {}), list[int]()
     while (step := queue.next()) is not None:
         queue.begin(step)
-        taken.append(step.number)
-        if left.get(step.number, 0):
-            left[step.number] -= 1
+        numbers.append(step.number)
+        if refusals.get(step.number, 0):
+            refusals[step.number] -= 1
             queue.refuse(step, "dark")
         else:
             queue.accept(step)
-    return taken
+    return numbers
 
 
-def begun(queue: StepQueue) -> SessionStep:
-    """Return the next step, begun."""
+def start_next(queue: StepQueue) -> SessionStep:
+    """Start the next step and return it."""
     step = queue.next()
     assert step is not None
     queue.begin(step)
     return step
 
 
-def test_lights_of_an_earlier_run_are_closed_too() -> None:
+def test_closes_illuminants_of_earlier_run() -> None:
     assert unclosed_kinds(["white", "dark", "light", "white", "dark"]) == frozenset()
     unclosed = unclosed_kinds(["white", "dark", "white", "dark", "light"])
     queue = queue_of({step.number for step in STEPS} - {1}, unclosed=unclosed)
     assert take(queue) == [1, 10], "the dark frame that is open closes them as well"
 
 
-def test_a_kill_among_lights_that_are_taken_again_leaves_their_closing_frames_open() -> None:
+def test_kill_leaves_closing_references_open() -> None:
     queue = queue_of({step.number for step in STEPS} - {6})
-    queue.accept(begun(queue))
+    queue.accept(start_next(queue))
     assert len(queue) == 2, "the white and the dark frame are in the plan before the light is accepted"
 
 
-def test_many_lights_taken_again_in_a_row_have_references_between_them() -> None:
+def test_adds_references_between_repeated_illuminants() -> None:
     queue = queue_of({0, 1, 4, 5, 8, 9}, reference_every=2)
     assert take(queue) == [2, 3, 12, 13, 6, 7, 10, 11], "a refused one voids two of them at most"
     whole = queue_of(set(), reference_every=2)
     assert take(whole) == list(range(10)), "the plan has its own"
     ahead = queue_of(set(), reference_every=2)
-    before, order = begun(ahead), [0]
+    before, order = start_next(ahead), [0]
     while (step := ahead.next()) is not None or len(ahead):
         if step is not None:
             ahead.begin(step)
@@ -491,9 +487,9 @@ def test_many_lights_taken_again_in_a_row_have_references_between_them() -> None
 
 
 @pytest.mark.parametrize(("kind", "stuck"), [("dark", True), ("white", False)])
-def test_a_dark_frame_shows_nothing_of_the_light(kind: str, stuck: bool) -> None:
+def test_dark_frame_is_no_evidence(kind: str, stuck: bool) -> None:
     queue = queue_of({0, 1, 2, 3, 6, 7, 8, 9}, 1)
-    steps = {step.kind: step for step in (begun(queue), begun(queue))}
+    steps = {step.kind: step for step in (start_next(queue), start_next(queue))}
     for step in STEPS[2:4]:
         queue.void([step.number], "")
         queue.begin(step)

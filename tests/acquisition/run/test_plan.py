@@ -1,4 +1,4 @@
-"""The plan before action: what is printed holds, what would end a run is refused with its remedy, and nothing moves."""
+"""Plans: printed values, refusals with remedies, and no effect on devices and files."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def planned(
 
 
 class TestDisk:
-    def test_a_disk_that_is_too_small_names_what_is_missing(self) -> None:
+    def test_reports_missing_disk_space(self) -> None:
         enough = planned().needed_bytes
         assert planned(enough).faults == ()
         (fault,) = planned(enough - 3.25 * GB).faults
@@ -87,14 +87,14 @@ class TestDisk:
         (fault,) = planned(enough - 1).faults
         assert "0.1 MB" in str(fault), "a little too small is never nothing"
 
-    def test_a_disk_that_fails(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_reports_disk_errors(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(os, "statvfs", Mock(side_effect=OSError(errno.EIO, os.strerror(errno.EIO))))
         with pytest.raises(StorageError):
             free_bytes_at(tmp_path)
 
 
 class TestExposure:
-    def test_a_time_that_is_not_offered_names_the_nearest(self) -> None:
+    def test_proposes_nearest_shutter_times(self) -> None:
         settings = settings_with(camera={"shutter_s": 0.45})
         (fault,) = planned(settings=settings).faults
         assert isinstance(fault, DeviceRefused)
@@ -116,7 +116,7 @@ class TestExposure:
         (Supplies(card_free_bytes=None, saves_to_host=False), ""),
     ],
 )
-def test_a_low_battery_or_a_small_card_on_which_frames_stay_ends_a_night(supplies: Supplies, said: str) -> None:
+def test_refuses_low_battery_and_small_card(supplies: Supplies, said: str) -> None:
     faults = planned(answers=Answers(camera=EOS, supplies=supplies)).faults
     assert [type(found) for found in faults] == [DeviceFault] * bool(said)
     assert all(said in str(found) for found in faults)
@@ -145,7 +145,7 @@ class Unmoved(SimulatedProjector):
 
 
 class TestAsking:
-    def test_devices_are_asked_and_nothing_moves(self) -> None:
+    def test_asks_devices_without_moving_them(self) -> None:
         clock = SimulatedClock()
         answers = ask(Devices(silent(), silent(), Unmoved(clock), clock))
         assert answers.camera == EOS
@@ -155,7 +155,7 @@ class TestAsking:
         assert answers.warnings == ("night light is on: switch it off",)
         assert clock.monotonic() == 0
 
-    def test_a_camera_that_is_gone_is_asked_once_and_the_rest_all_the_same(self) -> None:
+    def test_asks_missing_camera_once(self) -> None:
         clock, camera = SimulatedClock(), silent()
         camera.identity.side_effect = DeviceError("no camera on USB")
         answers = ask(Devices(camera, silent(), Unmoved(clock, power=Power.ON), clock))
@@ -205,7 +205,7 @@ def small_disk(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("", "", "s3cret"),
     ],
 )
-def test_who_would_not_hear_what_he_is_told_is_doubted(target: str, said: str, unsaid: str, tmp_path: Path) -> None:
+def test_doubts_unusable_notice_targets(target: str, said: str, unsaid: str, tmp_path: Path) -> None:
     for name, mode in (("tell", 0o755), ("plain", 0o644)):
         (tmp_path / name).touch(mode)
     target, said = target.format(there=tmp_path), said.format(there=tmp_path)
@@ -218,7 +218,7 @@ def test_who_would_not_hear_what_he_is_told_is_doubted(target: str, said: str, u
         assert all(doubt.startswith(f"{key}: ") and said in doubt and unsaid not in doubt for doubt in doubts)
 
 
-def test_times_that_were_meant_otherwise_are_doubted() -> None:
+def test_doubts_unlikely_times() -> None:
     sequence, real = SETTINGS.sequence, parse_lab('rig = "lab"\nchart = "c"\nilluminations = "i"\n', "LAB.toml")
     control = real.model_copy(
         update={"lab": LabRig(projector=ProjectorCable(control="pjlink", host="h"))},
@@ -234,7 +234,7 @@ def test_times_that_were_meant_otherwise_are_doubted() -> None:
 
 
 class TestDryRun:
-    def test_a_new_session_is_printed_and_not_made(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_prints_new_session_without_creating_it(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         lab.write_text(lab.read_text() + '[notify]\nalive = "https://ping.example/s3cret"\n')
         before = contents(lab.parent)
         assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 0
@@ -247,7 +247,7 @@ class TestDryRun:
         assert "alive       to https://ping.example/…" in text
         assert "s3cret" not in text
 
-    def test_a_session_is_looked_at_and_not_changed(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_prints_session_without_changing_it(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         night = lab.parent / "night"
         found = json_of(main, ["run", lab, night], capsys)
         assert found == {
@@ -262,7 +262,7 @@ class TestDryRun:
             taken = sorted(frame.taken_at for frame in session.frames())
             frame_s = outline(load_lab(lab), night, session).frame_s
             session.retake("2")
-        # Frames overlap: the time of an attempt is not that from one frame to the next.
+        # Frames overlap: an attempt lasts longer than the interval between frames.
         assert frame_s is not None
         gaps = sorted(after - before for before, after in pairwise(taken))
         assert timedelta(seconds=frame_s) == gaps[len(gaps) // 2]
@@ -281,15 +281,13 @@ class TestDryRun:
         assert "median of the session so far" in text
 
     @pytest.mark.parametrize("dry", [["--dry-run"], []])
-    def test_nothing_is_taken_again_of_a_session_that_was_not_begun(
-        self, lab: Path, capsys: pytest.CaptureFixture[str], dry: list[str]
-    ) -> None:
+    def test_refuses_retake_in_new_session(self, lab: Path, capsys: pytest.CaptureFixture[str], dry: list[str]) -> None:
         assert main(["run", str(lab), str(lab.parent / "night"), "--retake", "1", *dry]) == 2
         assert "--retake" in capsys.readouterr().err
         assert not (lab.parent / "night").exists()
 
     @pytest.mark.usefixtures("small_disk")
-    def test_a_full_disk_is_printed_and_is_the_exit_code(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_full_disk_sets_exit_code(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 5
         said = capsys.readouterr()
         assert "the disk of" not in said.out, "a fault is said once"
@@ -300,7 +298,7 @@ class TestDryRun:
         (fault,) = found["faults"]
         assert fault.startswith("the disk of")
 
-    def test_a_session_that_was_begun_otherwise_is_refused(self, lab: Path) -> None:
+    def test_refuses_changed_settings(self, lab: Path) -> None:
         night = lab.parent / "night"
         settings = load_lab(lab)
         Session.create(night, settings.to_toml(), CHART, LIGHTS[:4], plan_steps(LIGHTS[:4], 25)).close()
@@ -308,23 +306,23 @@ class TestDryRun:
         with Session.open(night) as session, pytest.raises(ConfigurationError):
             outline(load_lab(lab), night, session)
 
-    def test_a_rig_that_cannot_be_opened_is_a_fault_of_the_plan(self, lab: Path) -> None:
+    def test_closed_rig_is_fault_of_plan(self, lab: Path) -> None:
         lab.write_text(lab.read_text().replace('"Test"', '"Box"'))
         plan = dry_run(load_lab(lab), lab.parent / "night")
-        assert plan.work.left == 8
+        assert plan.work.remaining == 8
         with pytest.raises(ConfigurationError):
             plan.require()
 
 
 @pytest.mark.usefixtures("small_disk")
-def test_a_run_checks_its_plan_before_anything_moves(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_checks_plan_first(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = contents(lab.parent)
     assert main(["run", str(lab), str(lab.parent / "night")]) == 5
     assert "are missing" in capsys.readouterr().err
     assert contents(lab.parent) == before
 
 
-def test_a_folder_in_place_of_the_lights_leaves_nothing_beside_it(tmp_path: Path) -> None:
+def test_refuses_folder_as_illuminants(tmp_path: Path) -> None:
     (tmp_path / "lights").mkdir()
     assert main(["illuminations", str(tmp_path / "lights")]) != 0
     assert [path.name for path in tmp_path.iterdir()] == ["lights"]

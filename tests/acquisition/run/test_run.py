@@ -1,4 +1,4 @@
-"""A session that is taken up again: its files, its devices, and what ties it to what was taken before."""
+"""Resumed sessions, notices, signs of life and the terminal."""
 
 from __future__ import annotations
 
@@ -88,20 +88,20 @@ def interrupt_after(lab: Lab, frames: int, first: tuple[int, ...] = ()) -> None:
         take_session(lab.session, lab.devices, SETTINGS, ending=ending, first=first)
 
 
-def test_nothing_is_tied_to_nothing(folder: Path) -> None:
+def test_new_session_needs_no_links(folder: Path) -> None:
     lab = lab_with_response(folder)
     assert link_runs(lab.session, lab.clock.now()) == ()
     assert take_session(lab.session, lab.devices, SETTINGS).complete
 
 
-def test_a_session_that_does_not_know_its_projector_is_not_tied(folder: Path) -> None:
+def test_session_without_primaries_needs_no_links(folder: Path) -> None:
     lab = Lab(folder)
     interrupt_after(lab, 3)
     assert link_runs(lab.session, lab.clock.now()) == ()
 
 
 @pytest.mark.slow
-def test_a_run_that_is_taken_up_shows_the_ties_first(folder: Path) -> None:
+def test_resumed_run_starts_with_links(folder: Path) -> None:
     lab = lab_with_response(folder)
     interrupt_after(lab, 5)
     first = link_runs(lab.session, lab.clock.now())
@@ -113,7 +113,7 @@ def test_a_run_that_is_taken_up_shows_the_ties_first(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ties_that_were_interrupted_are_taken_anew(folder: Path) -> None:
+def test_repeats_interrupted_links(folder: Path) -> None:
     lab = lab_with_response(folder)
     interrupt_after(lab, 5)
     interrupt_after(lab, 2, link_runs(lab.session, lab.clock.now()))
@@ -126,9 +126,7 @@ def test_ties_that_were_interrupted_are_taken_anew(folder: Path) -> None:
     assert link_runs(lab.session, lab.clock.now()) == (14, 15, 16, 17, 18, 19), "behind another light they are new"
 
 
-def test_a_run_that_begins_again_says_so_before_its_devices_are_open(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resumed_run_reports_before_opening_devices(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = Lab(folder)
     lab.session.journal.beat("running", "frames are taken", datetime.now(UTC) + timedelta(seconds=60))
     lab.session.close()
@@ -151,7 +149,7 @@ def test_a_run_that_begins_again_says_so_before_its_devices_are_open(
     assert [event.what for event in view.events].count("killed") == 1
 
 
-def test_another_camera_or_projector_is_refused(folder: Path) -> None:
+def test_refuses_other_camera_or_projector(folder: Path) -> None:
     lab = Lab(folder)
     require_same_devices(lab.session, lab.devices, SETTINGS)
     require_same_devices(lab.session, lab.devices, SETTINGS)
@@ -169,7 +167,7 @@ def test_another_camera_or_projector_is_refused(folder: Path) -> None:
     assert "new session" in caught.value.remedy
 
 
-def test_firmware_and_the_projectors_own_name_may_change(folder: Path) -> None:
+def test_accepts_changed_firmware_and_name(folder: Path) -> None:
     lab = Lab(folder)
     require_same_devices(lab.session, lab.devices, SETTINGS)
     body, beamer = lab.camera.identity(), lab.projector.identity()
@@ -178,7 +176,7 @@ def test_firmware_and_the_projectors_own_name_may_change(folder: Path) -> None:
     require_same_devices(lab.session, lab.devices, SETTINGS)
 
 
-def test_another_screen_of_a_real_lab_is_refused(folder: Path) -> None:
+def test_refuses_other_screen(folder: Path) -> None:
     lab = Lab(folder)
     one = LabSettings(rig="lab", chart=Path("c"), illuminations=Path("i"))
     require_same_devices(lab.session, lab.devices, one)
@@ -190,7 +188,7 @@ def test_another_screen_of_a_real_lab_is_refused(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_lights_taken_again_are_closed_by_a_pair_behind_the_plan(folder: Path) -> None:
+def test_closes_repeated_illuminants(folder: Path) -> None:
     lab = Lab(folder, lights=(*LIGHTS, Illumination(2, "uniform", None, Colour(9, 255, 3))))
     assert take_session(lab.session, lab.devices, SETTINGS).complete
     lab.session.retake("1")
@@ -200,7 +198,7 @@ def test_lights_taken_again_are_closed_by_a_pair_behind_the_plan(folder: Path) -
     assert len(lab.taken()) == 10, "and only once"
 
 
-def test_a_machine_whose_clock_was_set_back_between_two_runs_is_told(folder: Path) -> None:
+def test_reports_clock_set_back(folder: Path) -> None:
     lab = Lab(folder)
     ahead = datetime.now(UTC) + timedelta(hours=5)
     assert clock_note(lab.session, session_clock(lab.session)) == ""
@@ -211,7 +209,7 @@ def test_a_machine_whose_clock_was_set_back_between_two_runs_is_told(folder: Pat
     assert clock.now() >= ahead, "what is taken now lies behind it"
     said = clock_note(lab.session, clock)
     assert f"behind the last frame of {folder}" in said
-    assert "set the machine's clock right" in said
+    assert "set the clock" in said
     assert session_clock(None).behind_s == 0
 
 
@@ -220,7 +218,7 @@ ONE_AGAIN = ["accepted", "accepted", "refused", "accepted", "accepted", "accepte
 
 
 @pytest.mark.slow
-def test_a_muted_picture_pauses_the_run_until_it_is_released(folder: Path) -> None:
+def test_pauses_while_muted(folder: Path) -> None:
     lab = Lab(folder)
     lab.clock = clock = Hurried()
     lab.camera.clock = clock
@@ -241,12 +239,12 @@ def test_a_muted_picture_pauses_the_run_until_it_is_released(folder: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_frame_during_which_the_picture_was_muted_is_taken_again(folder: Path) -> None:
+def test_repeats_frame_taken_during_mute(folder: Path) -> None:
     lab = Lab(folder)
     lab.clock = clock = Hurried()
     lab.camera.clock = clock
     lab.projector = SimulatedProjector(clock, power=Power.ON)
-    # The scripted camera sleeps for its first frame: that is when somebody presses mute.
+    # The picture is muted during the first exposure, while the scripted camera sleeps.
     clock.calls = {EXPOSE_S: lambda: lab.projector.set_muted(True), PAUSE_S: lambda: lab.projector.set_muted(False)}
     assert take_session(lab.session, lab.devices, SETTINGS).complete
     assert lab.verdicts() == ["refused"] + ["accepted"] * 6
@@ -254,7 +252,7 @@ def test_a_frame_during_which_the_picture_was_muted_is_taken_again(folder: Path)
 
 
 @pytest.mark.slow
-def test_the_camera_is_spoken_to_while_the_lamp_warms_up(folder: Path) -> None:
+def test_keeps_camera_awake_during_warm_up(folder: Path) -> None:
     lab = Lab(folder)
     lab.projector = SimulatedProjector(lab.clock)
     spoken: list[float] = []
@@ -270,7 +268,7 @@ def test_the_camera_is_spoken_to_while_the_lamp_warms_up(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_lab_without_lamp_control_works(folder: Path) -> None:
+def test_runs_without_lamp_control(folder: Path) -> None:
     lab = Lab(folder)
     devices = Devices(lab.camera, lab.screen, None, lab.clock)
     assert take_session(lab.session, devices, SETTINGS).complete
@@ -286,7 +284,7 @@ def settings(**changes: object) -> LabSettings:
 
 
 @dataclass
-class Seen:
+class LatePictureJudge:
     """Sees the colours that the camera exposed, those of `late` exposures one exposure late.
 
     As the judge does: the same cause in three frames in a row is lasting, and a wrong white voids.
@@ -318,7 +316,7 @@ class Night:
     lab: Lab
     said: list[str] = field(default_factory=list[str])
 
-    def run(self, judge: Seen, **changes: object) -> RunOutcome:
+    def run(self, judge: LatePictureJudge, **changes: object) -> RunOutcome:
         return take_session(self.lab.session, self.lab.devices, settings(**changes), judge, announce=self.said.append)
 
     def of(self, word: str) -> list[str]:
@@ -335,29 +333,29 @@ def night(tmp_path: Path) -> Night:
 
 
 @pytest.mark.slow
-def test_a_picture_that_stays_one_frame_late_ends_the_run_within_its_patience(night: Night) -> None:
+def test_ends_with_permanently_late_picture(night: Night) -> None:
     with pytest.raises(QualityError):
-        night.run(Seen(night.lab, range(8, 10_000)))
+        night.run(LatePictureJudge(night.lab, range(8, 10_000)))
     clock = night.lab.clock
     assert clock.monotonic() < 2 * PATIENCE_S
     assert night.lab.verdicts().count(REFUSED) < 15
     assert len(night.of("paused")) == 1
     assert not night.of("resumed"), "a frame that follows itself shows nothing"
-    assert night.run(Seen(night.lab, judged=len(night.lab.camera.exposed))).complete
+    assert night.run(LatePictureJudge(night.lab, judged=len(night.lab.camera.exposed))).complete
     night.require_each_step_once()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("until", [12, 13, 14, 15])
-def test_a_picture_that_was_late_for_a_while_lets_the_run_go_on(night: Night, until: int) -> None:
-    assert night.run(Seen(night.lab, range(8, until))).complete
+def test_resumes_after_late_pictures(night: Night, until: int) -> None:
+    assert night.run(LatePictureJudge(night.lab, range(8, until))).complete
     assert len(night.of("paused")) == len(night.of("resumed"))
     night.require_each_step_once()
 
 
 @pytest.mark.slow
-def test_refused_files_have_a_budget_of_disk(night: Night) -> None:
-    class EachSecond(Seen):
+def test_limits_space_of_refused_frames(night: Night) -> None:
+    class EachSecond(LatePictureJudge):
         def judge(self, file: Path, step: SessionStep) -> Judgement:
             self.judged += 1
             return Judgement((Check("light", reason="dust" if self.judged % 2 else ""),))
@@ -366,54 +364,54 @@ def test_refused_files_have_a_budget_of_disk(night: Night) -> None:
         night.run(EachSecond(night.lab), refused_gb=5.5 * len(WELL) / 1e9)
     assert night.lab.verdicts().count(REFUSED) in (6, 7), "and the one that was under way"
     assert night.lab.session.journal.events()[-1].what == "ended"
-    assert night.run(Seen(night.lab, judged=len(night.lab.camera.exposed)), refused_gb=1e-9).complete
+    assert night.run(LatePictureJudge(night.lab, judged=len(night.lab.camera.exposed)), refused_gb=1e-9).complete
     night.require_each_step_once()
 
 
 @pytest.mark.slow
 class TestNotices:
-    def test_a_flapping_cause_is_told_once_an_hour(self) -> None:
-        clock, told = SimulatedClock(), list[tuple[str, str]]()
-        notices = PauseNotices(lambda event, sentence: told.append((event, sentence)), clock)
+    def test_notifies_recurring_cause_once_per_hour(self) -> None:
+        clock, sent = SimulatedClock(), list[tuple[str, str]]()
+        notices = PauseNotices(lambda event, sentence: sent.append((event, sentence)), clock)
         for minute in range(0, 180, 2):
             sentence = f"the camera: USB {minute} is gone (the run waits up to 9 min {minute % 60:02d} s)"
             notices.paused(sentence)
             notices.resumed("the camera is ready again")
             clock.sleep(120)
-        assert [event for event, _ in told] == ["paused", "resumed"] * 3
+        assert [event for event, _ in sent] == ["paused", "resumed"] * 3
 
-    def test_another_cause_is_told_at_once_and_all_frames_have_one(self) -> None:
-        clock, told = SimulatedClock(), list[str]()
-        notices = PauseNotices(lambda event, sentence: told.append(sentence), clock)
+    def test_notifies_new_cause_at_once(self) -> None:
+        clock, sent = SimulatedClock(), list[str]()
+        notices = PauseNotices(lambda event, sentence: sent.append(sentence), clock)
         for sentence in (
             "the camera: its battery is empty (the run waits up to 10 min 00 s)",
             "the camera: its card is full (the run waits up to 10 min 00 s)",
-            "the frames: light 3: another light is seen (the run waits up to 10 min 00 s)",
+            "the frames: illuminant 3: the frame shows another illuminant (the run waits up to 10 min 00 s)",
             "the frames: dark frame 4: the dark frame has 80 % of white (the run waits up to 10 min 00 s)",
         ):
             notices.paused(sentence)
             notices.resumed("")
-        assert [sentence for sentence in told if sentence] == [
-            sentence for sentence in told if sentence and "dark frame" not in sentence
+        assert [sentence for sentence in sent if sentence] == [
+            sentence for sentence in sent if sentence and "dark frame" not in sentence
         ]
-        assert len(told) == 6
+        assert len(sent) == 6
 
-    def test_a_pause_that_was_not_told_is_told_when_it_lasts(self) -> None:
-        clock, told = SimulatedClock(), list[str]()
-        notices = PauseNotices(lambda event, sentence: told.append(event), clock)
-        sentence = "the camera: gone (paused for 3 s; goes on by itself, waits for as long as it takes)"
+    def test_notifies_long_pause_later(self) -> None:
+        clock, sent = SimulatedClock(), list[str]()
+        notices = PauseNotices(lambda event, sentence: sent.append(event), clock)
+        sentence = "the camera: gone (paused for 3 s; resumes automatically, waits without limit)"
         notices.paused(sentence)
         notices.resumed("")
         clock.sleep(60)
         notices.paused(sentence)
-        assert told == ["paused", "resumed"]
+        assert sent == ["paused", "resumed"]
         clock.sleep(QUIET_S - 61)
         notices.paused(sentence)
-        assert told == ["paused", "resumed"]
+        assert sent == ["paused", "resumed"]
         clock.sleep(1)
         notices.paused(sentence)
         notices.paused(sentence)
-        assert told == ["paused", "resumed", "paused"]
+        assert sent == ["paused", "resumed", "paused"]
 
 
 AT = datetime(2026, 1, 1, 3, 12, 45, tzinfo=UTC)
@@ -467,7 +465,7 @@ def no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
 
 
-def told(target: str, *events: str) -> list[str]:
+def notices(target: str, *events: str) -> list[str]:
     """Tell a target some events; return the warnings."""
     warnings: list[str] = []
     told_by = Notices(target, "night", warnings.append)
@@ -479,9 +477,9 @@ def told(target: str, *events: str) -> list[str]:
 
 
 class TestWebhook:
-    def test_it_gets_json(self) -> None:
+    def test_posts_json(self) -> None:
         with served(Receiver()) as receiver:
-            assert told(f"http://127.0.0.1:{receiver.port}/lab?token=t", "paused", "resumed") == []
+            assert notices(f"http://127.0.0.1:{receiver.port}/lab?token=t", "paused", "resumed") == []
         (path, headers, body), (_, _, second) = receiver.got
         assert path == "/lab?token=t"
         assert headers["Content-Type"] == "application/json; charset=utf-8"
@@ -497,9 +495,9 @@ class TestWebhook:
         }
         assert second["event"] == "resumed"
 
-    def test_a_user_and_a_password_become_a_header(self) -> None:
+    def test_sends_credentials_in_header(self) -> None:
         with served(Receiver()) as receiver:
-            assert told(f"http://u%40x:p%3Aw@127.0.0.1:{receiver.port}/lab") == []
+            assert notices(f"http://u%40x:p%3Aw@127.0.0.1:{receiver.port}/lab") == []
         ((path, headers, _),) = receiver.got
         assert path == "/lab"
         assert "u%40x" not in headers["Host"]
@@ -513,39 +511,41 @@ class TestWebhook:
             (Receiver(302, {"Location": "/elsewhere"}), "it answered 302"),
         ],
     )
-    def test_a_refusal_is_said_once_and_without_the_secret(self, receiver: Receiver, why: str) -> None:
+    def test_reports_refusal_once_without_secret(self, receiver: Receiver, why: str) -> None:
         with served(receiver):
-            warnings = told(f"http://u:s3cret@127.0.0.1:{receiver.port}/s3cret?s3cret", "paused", "resumed")
-        assert warnings == [f"http://127.0.0.1:{receiver.port}/… could not be told: {why}; the run goes on without"]
+            warnings = notices(f"http://u:s3cret@127.0.0.1:{receiver.port}/s3cret?s3cret", "paused", "resumed")
+        assert warnings == [
+            f"http://127.0.0.1:{receiver.port}/… did not receive a notice: {why}; the run continues without it"
+        ]
         assert len(receiver.got) == 2
 
-    def test_a_server_that_is_not_there(self) -> None:
+    def test_reports_missing_server(self) -> None:
         with socket.create_server(("127.0.0.1", 0)) as unused:
             port = unused.getsockname()[1]
-        (warning,) = told(f"http://127.0.0.1:{port}/s3cret")
+        (warning,) = notices(f"http://127.0.0.1:{port}/s3cret")
         assert "Connection refused" in warning
         assert "s3cret" not in warning
 
     @pytest.mark.slow
-    def test_a_server_that_hangs_is_not_waited_for(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_does_not_wait_for_hanging_server(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(run, "LIMIT_S", 0.1)
         monkeypatch.setattr(run, "ENDING_S", 0.1)
         with served(Receiver(hangs=threading.Event())) as receiver:
-            warnings = told(f"http://127.0.0.1:{receiver.port}/s3cret", "paused", "resumed", "complete")
+            warnings = notices(f"http://127.0.0.1:{receiver.port}/s3cret", "paused", "resumed", "complete")
         assert warnings
         assert all("s3cret" not in warning for warning in warnings)
 
 
 class TestCommand:
     @pytest.mark.slow
-    def test_it_gets_json_and_variables(self, tmp_path: Path) -> None:
+    def test_passes_json_and_variables(self, tmp_path: Path) -> None:
         out = tmp_path / "got"
         program = (
             "import json, os, sys; body = json.load(sys.stdin);"
             "open(sys.argv[1], 'a').write(repr((body['message'], os.environ['CROP_EVENT'], os.environ['CROP_MESSAGE'],"
             "os.environ['CROP_SESSION'])) + '\\n')"
         )
-        assert told(shlex.join([sys.executable, "-c", program, str(out)]), "paused", "resumed") == []
+        assert notices(shlex.join([sys.executable, "-c", program, str(out)]), "paused", "resumed") == []
         said = "the screen is covered – 3 °C"
         lines = [repr((said, event, said, "night")) for event in ("paused", "resumed")]
         assert out.read_text().splitlines() == lines
@@ -558,27 +558,25 @@ class TestCommand:
             ("true s3cret", "", ""),
         ],
     )
-    def test_how_it_ends_is_said(self, target: str, label: str, why: str) -> None:
-        expected = [f"{label} could not be told: {why}; the run goes on without"] if why else []
-        assert told(target, "paused", "resumed") == expected
+    def test_reports_failed_command(self, target: str, label: str, why: str) -> None:
+        expected = [f"{label} did not receive a notice: {why}; the run continues without it"] if why else []
+        assert notices(target, "paused", "resumed") == expected
 
     @pytest.mark.slow
-    def test_one_that_hangs_is_ended_with_what_it_started(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_kills_hanging_command_with_children(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(run, "LIMIT_S", 0.5)
         numbers = tmp_path / "pids"
-        (warning,) = told(f"sh -c 'sleep 600 & echo $$ $! > {numbers}; wait'")
+        (warning,) = notices(f"sh -c 'sleep 600 & echo $$ $! > {numbers}; wait'")
         assert "within 0.5 s" in warning
         for number in numbers.read_text().split():
-            # It is gone, or what is left of it waits to be read by init.
+            # The process is gone, or a zombie.
             stat, until = Path(f"/proc/{number}/stat"), time.monotonic() + 10
             while stat.exists() and stat.read_text().rpartition(")")[2].split()[0] not in "ZX":
                 assert time.monotonic() < until
 
 
 @pytest.mark.slow
-def test_telling_takes_no_time_and_loses_what_nobody_takes() -> None:
+def test_notices_never_block() -> None:
     with served(Receiver(hangs=threading.Event())) as receiver:
         told_by = Notices(f"http://127.0.0.1:{receiver.port}/", "night")
         for number in range(3 * run.QUEUED):
@@ -623,7 +621,7 @@ def life(address: str, clock: SimulatedClock, **more: str) -> Life:
     return Life("", "night", lambda sentence: None, clock, {"NOTIFY_SOCKET": address, **more})
 
 
-def test_a_service_manager_is_fed_within_half_of_its_time(manager: Manager, address: str) -> None:
+def test_feeds_watchdog_in_time(manager: Manager, address: str) -> None:
     clock = SimulatedClock()
     one = life(address, clock, WATCHDOG_USEC="60000000")
     one.ready()
@@ -639,7 +637,7 @@ def test_a_service_manager_is_fed_within_half_of_its_time(manager: Manager, addr
     assert manager.got() == ["STOPPING=1\nSTATUS=complete: 0 of 6 frames left"]
 
 
-def test_a_run_tells_a_service_manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notifies_service_manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     manager = Manager(str(tmp_path / "notify"))
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     lab = Lab(tmp_path / "session")
@@ -659,7 +657,7 @@ def covered_lab(folder: Path) -> Lab:
 
 
 @pytest.mark.slow
-def test_who_could_not_be_told_is_noted_while_the_run_goes_on(tmp_path: Path) -> None:
+def test_notes_unreachable_target(tmp_path: Path) -> None:
     gone = str(tmp_path / "gone")
     sequence = SETTINGS.sequence.model_copy(update={"notify": f"{gone} s3cret"})
     settings = SETTINGS.model_copy(update={"sequence": sequence, "notify": NotifySettings(alive=f"{gone} s3cret")})
@@ -672,17 +670,17 @@ def test_who_could_not_be_told_is_noted_while_the_run_goes_on(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_a_dead_mans_switch_hears_of_frames_and_pauses_and_of_the_end(tmp_path: Path) -> None:
+def test_signals_dead_mans_switch(tmp_path: Path) -> None:
     heard = tmp_path / "heard"
     program = f"import sys; open({str(heard)!r}, 'a').write(sys.stdin.read() + chr(10))"
     target = shlex.join([sys.executable, "-S", "-c", program])
     settings = SETTINGS.model_copy(update={"notify": NotifySettings(alive=target)})
     lab = covered_lab(tmp_path / "session")
     assert take_session(lab.session, lab.devices, settings).complete
-    told: list[dict[str, Any]] = [json.loads(line) for line in heard.read_text().splitlines()]
-    assert [one["event"] for one in told] == ["alive"] * (len(told) - 1) + ["complete"]
-    assert 2 <= len(told) - 1 <= lab.clock.monotonic() / ALIVE_S + 1
-    assert any("screen saver" in one["message"] for one in told), "a run that waits is alive"
+    notices: list[dict[str, Any]] = [json.loads(line) for line in heard.read_text().splitlines()]
+    assert [one["event"] for one in notices] == ["alive"] * (len(notices) - 1) + ["complete"]
+    assert 2 <= len(notices) - 1 <= lab.clock.monotonic() / ALIVE_S + 1
+    assert any("screen saver" in one["message"] for one in notices), "a run that waits is alive"
 
 
 NOW = datetime(2026, 1, 1, 23, 30, tzinfo=UTC)
@@ -696,7 +694,7 @@ def last_words(block: Callable[[SignOfLife], None]) -> list[tuple[str, str]]:
     return said
 
 
-def test_a_run_that_comes_to_its_end_gives_no_cause() -> None:
+def test_complete_run_gives_no_cause() -> None:
     assert last_words(lambda alive: alive("")) == [
         ("waiting", BEGINS),
         ("running", "frames are taken"),
@@ -704,7 +702,7 @@ def test_a_run_that_comes_to_its_end_gives_no_cause() -> None:
     ]
 
 
-def test_what_ended_it_is_told() -> None:
+def test_reports_cause_of_end() -> None:
     def interrupted(alive: SignOfLife) -> None:
         raise KeyboardInterrupt
 
@@ -717,10 +715,10 @@ def test_what_ended_it_is_told() -> None:
     assert last_words(interrupted)[-1] == ("ended", "interrupted; run the same command again")
     assert last_words(unplugged)[-1] == ("ended", "the camera is gone; find it")
     assert last_words(mistaken)[-1][0] == "ended"
-    assert "mistake of the program" in last_words(mistaken)[-1][1]
+    assert "error in the program" in last_words(mistaken)[-1][1]
 
 
-def test_after_a_wait_the_first_frame_says_that_it_is_over(tmp_path: Path) -> None:
+def test_first_frame_ends_wait(tmp_path: Path) -> None:
     Journal.create(tmp_path / "journal.sqlite", ())
     with closing(Journal.open_for_run(tmp_path / "journal.sqlite")) as journal:
         with signs_of_life(journal.beat, journal.run_state, 60.0) as alive:
@@ -737,9 +735,7 @@ def test_after_a_wait_the_first_frame_says_that_it_is_over(tmp_path: Path) -> No
 STEP = SessionStep(7, "light", 5, Colour(1, 2, 3))
 
 
-def test_the_time_left_is_that_of_the_last_frames_without_pauses(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_estimates_time_without_pauses(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(run, "PLAIN_S", 0.0)
     now = [0.0]
     with Terminal(lambda: now[0]) as terminal:
@@ -748,7 +744,7 @@ def test_the_time_left_is_that_of_the_last_frames_without_pauses(
             """Return what is said of ten frames left after others that took so long."""
             for seconds in frames_s:
                 now[0] += seconds
-                terminal.taken(Taken(STEP, Judgement((Check("file", reason=reason),)), 10))
+                terminal.show_frame(Taken(STEP, Judgement((Check("file", reason=reason),)), 10))
             terminal.progress(0, 10)
             return capsys.readouterr().err
 
@@ -756,25 +752,25 @@ def test_the_time_left_is_that_of_the_last_frames_without_pauses(
         assert "left 20 s" in left(2, 2, 3)
         terminal.state("paused")
         assert "left 20 s" in left(600, 2)
-        # Each frame costs two attempts of late, as the page has it.
+        # Each frame has recently needed two attempts, as on the page.
         assert "left 40 s" in left(*[2] * 6, reason="too dark")
 
 
-def test_a_run_into_a_file_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
+def test_prints_lines_into_file(capsys: pytest.CaptureFixture[str]) -> None:
     now = [0.0]
     with Terminal(lambda: now[0]) as terminal:
         terminal.progress(0, 200)
         for done in range(1, 201):
             now[0] += 2.0
             checks = Check("movement", 0.031, None, 0.2, "px"), Check("off_codes_deg", 0.7, None, 0.5, "°")
-            terminal.taken(Taken(STEP, Judgement(checks), 200 - done))
+            terminal.show_frame(Taken(STEP, Judgement(checks), 200 - done))
             terminal.progress(done, 200)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 + int(400 // PLAIN_S) + 1
     assert "0 of 200 frames" in lines[0]
     numbers = "off_codes_deg 0.7° (beyond its limit), movement 0.031 px"
-    assert f"90 of 200 frames, left 3 min 40 s, light 5 accepted, {numbers}" in lines[6]
-    assert "200 of 200 frames, light 5 accepted" in lines[-1]
+    assert f"90 of 200 frames, left 3 min 40 s, illuminant 5 accepted, {numbers}" in lines[6]
+    assert "200 of 200 frames, illuminant 5 accepted" in lines[-1]
     assert "━" not in "".join(lines)
 
 
@@ -785,7 +781,7 @@ class FullOutput(io.StringIO):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_a_log_on_a_full_disk_ends_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_survives_full_disk_of_log(monkeypatch: pytest.MonkeyPatch) -> None:
     with Terminal() as terminal:
         monkeypatch.setattr("sys.stderr", FullOutput())
         terminal.announce("refused: light 5: too dark")

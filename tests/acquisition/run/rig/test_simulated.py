@@ -1,4 +1,4 @@
-"""The simulated lab is built from LAB.toml; what it does not know is named."""
+"""The simulated laboratory is built from LAB.toml; unknown settings are refused."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def settings(text: str) -> LabSettings:
     return parse_lab(HEAD + text, "LAB.toml")
 
 
-def test_the_room_takes_what_the_file_says() -> None:
+def test_room_has_parameters_of_file() -> None:
     room = simulated_room(settings("[simulated]\nseed = 5\n[simulated.room]\nwaviness_mm = 6\ntransfer = 2.2\n"))
     assert (room.seed, room.waviness_mm, room.transfer) == (5, 6.0, 2.2)
     assert simulated_room(settings("[simulated.room]\ntransfer = 'srgb'\n")).transfer == "srgb"
@@ -56,7 +56,7 @@ def test_the_room_takes_what_the_file_says() -> None:
         ("seed = 3", "unknown key 'simulated.room.seed'"),
     ],
 )
-def test_a_wrong_parameter_is_named_with_its_file(tmp_path: Path, text: str, expected: str) -> None:
+def test_refuses_wrong_parameter(tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "e.toml"
     path.write_text(f"{HEAD}[simulated.room]\n{text}\n")
     with pytest.raises(ConfigurationError) as caught:
@@ -65,12 +65,12 @@ def test_a_wrong_parameter_is_named_with_its_file(tmp_path: Path, text: str, exp
     assert str(caught.value).startswith(str(path))
 
 
-def test_an_unknown_body_is_named_with_the_known_ones() -> None:
+def test_refuses_unknown_body() -> None:
     with pytest.raises(ConfigurationError, match="EOS 550D, EOS 6D Mark II"):
         simulated_body(settings('[simulated]\nbody = "EOS 7D"\n'))
 
 
-def test_a_body_may_be_sensitivities_and_facts() -> None:
+def test_accepts_sensitivities_as_body() -> None:
     text = '[simulated]\nbody = "Canon_EOS_5DS"\n[simulated.camera]\npixels = [800, 556]\nelectrons_per_dn = 2.0\n'
     body = simulated_body(settings(text))
     assert (body.camera, body.sensitivities, body.half_size) == ("Canon EOS 5DS", "Canon_EOS_5DS", (278, 400))
@@ -80,7 +80,7 @@ def test_a_body_may_be_sensitivities_and_facts() -> None:
 
 
 @pytest.mark.slow
-def test_a_session_taken_with_such_a_body_and_a_lens_without_contacts_is_its(tmp_path: Path) -> None:
+def test_records_such_body_in_session(tmp_path: Path) -> None:
     design_chart(1, (148, 105)).save(tmp_path / "chart.json")
     save_illuminations(plan_illuminations(0, (3000, 6000)), tmp_path / "lights.csv")
     lab = LabSettings(
@@ -96,7 +96,7 @@ def test_a_session_taken_with_such_a_body_and_a_lens_without_contacts_is_its(tmp
         assert len(frames) == 2
         assert 'aperture = "none"' in session.settings_text()
         mosaic = read_raw(session.folder / frames[0].file)
-        # What a plan reckons with before there are frames.
+        # A plan needs the size before there are frames.
         assert simulated_frame_bytes(lab) == pytest.approx((session.folder / frames[0].file).stat().st_size, rel=0.02)
     assert mosaic.camera == "Canon EOS-1Ds Mark III"
     assert mosaic.counts.shape == (556, 800)
@@ -106,7 +106,7 @@ def test_a_session_taken_with_such_a_body_and_a_lens_without_contacts_is_its(tmp
     assert black == pytest.approx(FACTS["Canon_EOS-1Ds_Mark_III"].black, abs=1)
 
 
-def test_an_imported_session_cannot_be_taken() -> None:
+def test_refuses_imported_session() -> None:
     imported = LabSettings(rig="imported", chart=Path("c"), illuminations=Path("l"))
     with pytest.raises(ConfigurationError, match="other means"), open_rig(imported, design_chart(bits=1)):
         pass
@@ -120,23 +120,23 @@ def test_an_imported_session_cannot_be_taken() -> None:
         ('[lab.projector]\ncontrol = "serial"\nlanguage = "epson"\n', "lab.projector.device is missing"),
         ('[lab.projector]\ncontrol = "serial"\ndevice = "/dev/ttyS0"\n', "lab.projector.language is missing"),
         ('[lab.projector]\ncontrol = "serial"\nlanguage = "klingon"\n', "projector language 'klingon' does not exist"),
-        ('[lab.projector]\ncontrol = "pjlink"\ndevice = "/dev/ttyS0"\n', "PJLink goes by the network"),
+        ('[lab.projector]\ncontrol = "pjlink"\ndevice = "/dev/ttyS0"\n', "PJLink needs the network"),
         ('[lab.projector]\ncontrol = "serial"\nlanguage = "epson"\nhost = "h"\ndevice = "/dev/ttyS0"\n', "both given"),
         ('[lab.camera]\nhost = "1.2.3.4"\n', "connection is"),
         ("[camera]\nshutter_s = 0.51\n", "whole turns"),
     ],
 )
-def test_a_cable_that_is_not_named_is_said(text: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_incomplete_connection(text: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
     monkeypatch.setattr("acquisition.run.rig.lab.display_warnings", Mock(return_value=()))
-    # A camera that answers: its fault would be told with the settings', and is a device's.
+    # The camera must answer, because its fault would be reported together with that of the settings.
     monkeypatch.setattr("acquisition.run.rig.lab.CanonEos", Mock())
     real = parse_lab(HEAD.replace("simulated", "lab") + text, "LAB.toml")
     with pytest.raises(ConfigurationError, match=expected), open_rig(real, design_chart(bits=1)):
         pass
 
 
-def test_what_a_dry_run_opens_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dry_run_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", Mock(side_effect=AssertionError("the light was opened")))
     monkeypatch.setattr("acquisition.run.rig.lab.display_warnings", Mock(return_value=("a bent ramp",)))
     monkeypatch.setattr("acquisition.run.rig.lab.CanonEos", Mock())
@@ -148,9 +148,7 @@ def test_what_a_dry_run_opens_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names of sockets without files are Linux's")
-def test_a_lab_at_which_another_command_is_at_work_is_not_touched(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refuses_lab_in_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = tmp_path / "LAB.toml"
     lab.write_text(HEAD.replace("simulated", "lab"))
     place = lab.stat()
@@ -171,7 +169,7 @@ def test_a_lab_at_which_another_command_is_at_work_is_not_touched(
 
 
 @pytest.mark.slow
-def test_what_cannot_be_asked_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_unlistable_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(attached, "search", lambda: (FoundProjector("192.0.2.7", "00:00:5e:00:53:01"),))
