@@ -18,7 +18,7 @@ from foundation.folders import require_free
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from evaluation.experiments.comparing import Matched
+    from evaluation.experiments.comparing import MatchedErrors
     from evaluation.metrics import ErrorKind
     from evaluation.results.files import MethodErrors
 
@@ -83,7 +83,7 @@ def compare(
 
 def _pairs(
     runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str], wanted: Sequence[str] | None, error: ErrorKind
-) -> list[Matched]:
+) -> list[MatchedErrors]:
     """Return the pairs to compare: every two methods of one run, or each method of one run and of the other."""
     from evaluation.experiments.comparing import match
 

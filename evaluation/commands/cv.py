@@ -69,7 +69,7 @@ def cv(
     from evaluation.learning.constant_light import ConstantLight
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
-    from evaluation.results.result import indistinct
+    from evaluation.results.result import indistinct_methods
     from evaluation.results.tables import summary_table
 
     others, left_out = choose_beside_constant(split_names([method]))
@@ -86,7 +86,7 @@ def cv(
             f"cross-validated in {len(set(parts.tolist()))} folds, {origin}; seed {seed}",
             *left_out,
             *_parted_copies(found, parts),
-            *indistinct(results, found.truth_uncertainty_deg),
+            *indistinct_methods(results, found.truth_uncertainty_deg),
         )
         described = [describe_method(learner) for learner in learners]
         made = describe_run(found, results, described, {"seed": seed, "folds": origin}, parts, notes)

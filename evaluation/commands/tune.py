@@ -40,10 +40,10 @@ def tune(
     output: JsonOutput,
 ) -> None:
     """Choose a method's parameters on a data set."""
-    from evaluation.experiments.cross_validation import settings_of, tune_family, tuning_table
+    from evaluation.experiments.cross_validation import family_settings, tune_family, tuning_table
     from evaluation.reports.table_output import show_notes, show_tables
 
-    settings_of(family)  # A family that is none is told before a data set is opened.
+    family_settings(family)  # A family that is none is told before a data set is opened.
     found = open_data(data, read)
     count, threads = len(found.scenes), workers or processor_count()
     with image_steps(count) as step:

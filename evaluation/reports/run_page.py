@@ -224,11 +224,13 @@ def run_page(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes
     """Return the text of `report.html`."""
     kinds: tuple[ErrorKind, ErrorKind] = ("reproduction", "recovery")
     ordered = kinds if kind == "reproduction" else kinds[::-1]
-    tables = [summary_table(run.subject, run.results, each, further=True) for each in ordered]
+    tables = [summary_table(run.subject, run.results, each, with_further=True) for each in ordered]
     # What is said of images without a light holds for both tables.
     tables[1] = Table(tables[1].title, tables[1].columns, tables[1].rows)
     parts = [
-        pages.paragraph(f"{counted(len(run.subject.images), 'image')}, read from {run.place} (layout {run.layout})."),
+        pages.paragraph(
+            f"{counted(len(run.subject.images), 'image')}, read from {run.location} (layout {run.layout})."
+        ),
         *map(pages.paragraph, run.notes),
         *map(table_part, tables),
         *map(table_part, lights_tables(run.subject, run.results, kind)),

@@ -21,9 +21,9 @@ from evaluation.methods.method import Method
 from evaluation.methods.prepared import usable
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
-from evaluation.results.result import Result, SceneAnswer, read_light, results_of
+from evaluation.results.result import Result, SceneAnswer, collect_results, read_estimate
 from evaluation.results.tables import PAPER_COLUMNS, Table
-from evaluation.scene import Image, Scene, told_of
+from evaluation.scene import Image, Scene, report_progress
 from foundation.compiled import ordered_map
 from generator.files import Flash, fit_flash
 from generator.pictures.sources import clear_bits
@@ -129,12 +129,12 @@ def bits_removed(
         # Clipped pixels are known before the reduction only; they have their say in the operator, as in a camera.
         left_out = ~usable(image, scene.saturation, mask)
         versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
-        return [[read_light(method.estimate(version, None, left_out)) for method in methods] for version in versions]
+        return [[read_estimate(method.estimate(version, None, left_out)) for method in methods] for version in versions]
 
-    answers = list(told_of(ordered_map(answers_for, scenes, workers), on_scene))
+    answers = list(report_progress(ordered_map(answers_for, scenes, workers), on_scene))
     names = [method.name for method in methods]
     raw, *reduced = (
-        results_of(names, truths, [given[version] for given in answers]) for version in range(1 + len(bits))
+        collect_results(names, truths, [given[version] for given in answers]) for version in range(1 + len(bits))
     )
     return BitsResult(raw, dict(zip(bits, reduced, strict=True)))
 

@@ -29,7 +29,7 @@ from evaluation.experiments.paper.material import (
     rendered,
 )
 from evaluation.experiments.paper.published import TABLE1, TABLE2, Cell
-from evaluation.experiments.running import evaluate, fit_anew
+from evaluation.experiments.running import evaluate, fit_copy
 from evaluation.methods.method import Learner
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
@@ -319,7 +319,7 @@ def table2(
         raise InputError(f"{len(learners)} learners and {len(generated)} generated images: name at least one of each")
     chosen = list(learners.values())
     crossed = cross_validate(real, chosen, folds, seed, workers, on_scene)
-    fitted = [fit_anew(learner, generated, seed) for learner in chosen]
+    fitted = [fit_copy(learner, generated, seed) for learner in chosen]
     moved = evaluate(real, fitted, workers, on_scene)
     return tuple(Trained(name, *both) for name, *both in zip(learners, crossed, moved, strict=True))
 

@@ -25,7 +25,7 @@ from evaluation.experiments.bootstrap import (
     BoundedFigure,
     ErrorSample,
     bounded_figures,
-    ratio_of,
+    safe_ratio,
 )
 from evaluation.experiments.folds import folds_to_csv, groups_of
 from evaluation.experiments.transfer.plan import TransferPlan, is_generated
@@ -104,7 +104,7 @@ def figures_of(rows: Sequence[TransferRow], error: ErrorKind, groups: Sequence[s
 
     def numbers(counts: npt.NDArray[np.int64]) -> Floats:
         known = [np.mean([one.statistics(counts) for one in several], axis=0) for several in samples]
-        ratios = [ratio_of(known[row], known[base]) for several in pairs.values() for row, base in several]
+        ratios = [safe_ratio(known[row], known[base]) for several in pairs.values() for row, base in several]
         return np.concatenate([*known, *ratios], axis=1)
 
     made = _batches(bounded_figures(numbers, len(samples[0][0].order), groups))
@@ -473,7 +473,7 @@ def _described(data: SceneSet) -> dict[str, Any]:
     described: dict[str, Any] = {
         "name": data.name,
         "layout": data.layout,
-        "place": data.place,
+        "place": data.location,
         "images": len(data.scenes),
         "treatment": dict(data.treatment),
     }

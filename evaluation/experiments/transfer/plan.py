@@ -63,7 +63,7 @@ def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]
     """
     if _place(training) == _place(test):
         raise InputError(
-            f"{test.place} is both training and test; errors of a data set that is tested on itself are found by "
+            f"{test.location} is both training and test; errors of a data set that is tested on itself are found by "
             "cross-validation: evaluate cv"
         )
     made = [isinstance(some.scenes[0], GeneratedScene) for some in (training, test)]
@@ -121,7 +121,7 @@ def _keys(scenes: SceneSet, named: bool, seen: bool) -> list[tuple[str, list[_Ke
 
 
 def _place(scenes: SceneSet) -> str:
-    return scenes.place.rstrip("/") if "://" in scenes.place else str(Path(scenes.place).resolve())
+    return scenes.location.rstrip("/") if "://" in scenes.location else str(Path(scenes.location).resolve())
 
 
 @dataclass(frozen=True)

@@ -17,15 +17,15 @@ import numpy.typing as npt
 
 from evaluation.experiments.cross_validation import (
     AnyLearner,
+    Indices,
     Material,
-    Places,
+    collect_material,
     cross_fit,
     estimate_on,
     fit_on,
-    gather,
     result_of,
 )
-from evaluation.experiments.folds import require_apart
+from evaluation.experiments.folds import require_groups_together
 from evaluation.experiments.running import evaluate
 from evaluation.learning.adapting import LearnedAlone, adapt, learn_alone
 from evaluation.learning.constant_light import ConstantLight
@@ -125,7 +125,7 @@ class TransferRow:
         return (name,) if seeds == 1 else tuple(f"{name}, seed {seed}" for seed in range(seeds))
 
 
-def draw_images(count: int, wanted: int, seed: int) -> Places:
+def draw_images(count: int, wanted: int, seed: int) -> Indices:
     """Return which of `count` images to train on, (P,) int64 in ascending order, P = `wanted`, drawn by a seed.
 
     Data sets of equal counts get the same places, so that a generated set and its naive counterpart, or one under
@@ -172,10 +172,10 @@ def transfer(
     if not learners or not folds:
         raise InputError(f"{len(learners)} learned methods and {len(folds)} seeds: expected at least one of each")
     for each in folds:
-        require_apart(test, each)
+        require_groups_together(test, each)
     # All that may be refused is, before the first image is read.
     drawn = [_drawn(some, len(folds), images) for some in training]
-    trials = gather(test, learners, side, workers, on_scene)
+    trials = collect_material(test, learners, side, workers, on_scene)
     bench = _Bench(trials, folds)
     parts: list[TransferRow] = []
     for number, learner in enumerate(learners):
@@ -189,14 +189,16 @@ def transfer(
     for some, wanted in zip(training, drawn, strict=True):
         # Of a large set only what some seed wants is read.
         used = _used(wanted)
-        lessons = gather([some.scenes[int(place)] for place in used.tolist()], learners, side, workers, on_scene)
+        lessons = collect_material(
+            [some.scenes[int(place)] for place in used.tolist()], learners, side, workers, on_scene
+        )
         places = [np.searchsorted(used, each).astype(np.int64) for each in wanted]
         for number, learner in enumerate(learners):
             if isinstance(learner, ConstantLight) and some.kind in NAIVE:
                 continue
             taught = [fit_on(learner, number, lessons, each, seed) for seed, each in enumerate(places)]
             results = tuple(
-                result_of(learner.name, estimate_on(method, number, trials, trials.everything), trials.truths)
+                result_of(learner.name, estimate_on(method, number, trials, trials.all_indices), trials.truths)
                 for method in taught
             )
             row = TransferRow(learner.name, some.kind, some.data, images, results)
@@ -214,7 +216,7 @@ def transfer(
 
 
 # From learner, its number, places of N real images (N,) int64 and seed to a method.
-_Fit = Callable[[AnyLearner, int, Places, int], Method]
+_Fit = Callable[[AnyLearner, int, Indices, int], Method]
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,14 +252,14 @@ class _Bench:
             made.append(result_of(learner.name, listed, self.trials.truths))
         return tuple(made)
 
-    def alone(self, learner: AnyLearner, number: int, drawn: Places, seed: int) -> Method:
+    def alone(self, learner: AnyLearner, number: int, drawn: Indices, seed: int) -> Method:
         """Return what a learner learns of real images alone, at `drawn` (N,) int64."""
         if isinstance(learner, FeatureLearner):
             return self._learned(learner, number, drawn, seed).method
         return fit_on(learner, number, self.trials, drawn, seed)
 
     def adapted(
-        self, taught: Sequence[Method], learner: AnyLearner, number: int, drawn: Places, seed: int
+        self, taught: Sequence[Method], learner: AnyLearner, number: int, drawn: Indices, seed: int
     ) -> LearnedMethod:
         """Return what was learned elsewhere, for each seed, adapted to real images at `drawn` (N,) int64."""
         method = taught[seed]
@@ -265,7 +267,7 @@ class _Bench:
             raise TypeError(f"{learner.name} has no features to adapt by")
         return adapt(method, self._learned(learner, number, drawn, seed))
 
-    def _learned(self, learner: FeatureLearner, number: int, drawn: Places, seed: int) -> LearnedAlone:
+    def _learned(self, learner: FeatureLearner, number: int, drawn: Indices, seed: int) -> LearnedAlone:
         key = number, seed, drawn.tobytes()
         if key not in self.known:
             features = self.trials.features[number]
@@ -278,9 +280,9 @@ def _name_of(count: int | None) -> str:
     return "all" if count is None else str(count)
 
 
-def _drawn(some: TrainingSet, seeds: int, images: int) -> list[Places]:
+def _drawn(some: TrainingSet, seeds: int, images: int) -> list[Indices]:
     return [draw_images(len(some.scenes), images, seed) for seed in range(seeds)]
 
 
-def _used(drawn: Sequence[Places]) -> Places:
+def _used(drawn: Sequence[Indices]) -> Indices:
     return np.unique(np.concatenate(drawn))

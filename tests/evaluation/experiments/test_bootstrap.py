@@ -9,12 +9,12 @@ from scipy import stats
 
 from evaluation.experiments.bootstrap import (
     STATISTICS,
-    Compared,
     ErrorSample,
+    PairedStatistic,
     Statistic,
     bounded_figures,
-    numbered,
-    paired,
+    compare_paired,
+    group_numbers,
 )
 from evaluation.metrics import summarise
 from foundation.errors import InputError
@@ -37,7 +37,7 @@ def skewed(random: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
     return random.gamma(1.5, 2.0, count)
 
 
-def median(compared: tuple[Compared, ...]) -> Compared:
+def median(compared: tuple[PairedStatistic, ...]) -> PairedStatistic:
     return compared[STATISTICS.index("median")]
 
 
@@ -64,7 +64,7 @@ def test_interval_is_that_of_scipy() -> None:
         return float(np.median(first) / np.median(second))
 
     known = stats.bootstrap((one, other), ratio, n_resamples=9_000, paired=True, vectorized=False, rng=1)
-    found = median(paired(one, other, count=9_000)).ratio
+    found = median(compare_paired(one, other, count=9_000)).ratio
     width = np.ptp(known.confidence_interval)
     np.testing.assert_allclose(found[1:], known.confidence_interval, atol=0.04 * width)
 
@@ -87,9 +87,9 @@ def test_paired_differences_cover_and_pairing_narrows() -> None:
         hard = skewed(random, 60)
         one = hard * random.uniform(0.9, 1.3, 60)
         # The population's means are 3.3 and 3.
-        made = paired(one, hard, count=300)[0]
+        made = compare_paired(one, hard, count=300)[0]
         hits += [made.difference.low <= 0.3 <= made.difference.high, made.ratio.low <= 1.1 <= made.ratio.high]
-        apart = paired(random.permutation(one), hard, count=300)[0]
+        apart = compare_paired(random.permutation(one), hard, count=300)[0]
         widths += [np.ptp(made.difference[1:]), np.ptp(apart.difference[1:])]
     assert ((hits / WORLDS > 0.88) & (hits / WORLDS < 0.99)).all()
     assert widths[0] < 0.25 * widths[1]
@@ -98,12 +98,12 @@ def test_paired_differences_cover_and_pairing_narrows() -> None:
 def test_order_of_images_and_methods() -> None:
     random = np.random.default_rng(12)
     one, other = skewed(random, 90), skewed(random, 90)
-    for there, back in zip(paired(one, other), paired(other, one), strict=True):
+    for there, back in zip(compare_paired(one, other), compare_paired(other, one), strict=True):
         difference, low, high = there.difference
         turned = -back.difference[0], -back.difference[2], -back.difference[1]
         assert (difference, low, high) == pytest.approx(turned, abs=0.02)
         ours, theirs = (getattr(summarise(errors), there.statistic) for errors in (one, other))
-        assert (there.one, there.other) == pytest.approx((ours, theirs))
+        assert (there.value_a, there.value_b) == pytest.approx((ours, theirs))
         assert difference == pytest.approx(ours - theirs)
         assert there.ratio[0] == pytest.approx(ours / theirs)
 
@@ -122,9 +122,9 @@ def test_no_spread() -> None:
     assert np.isnan(intervals([2.5])["worst25"]).all()
     assert intervals([2.5] * 9)["avg"] == pytest.approx((2.5, 2.5))
     assert intervals([0, 0, 0])["avg"] == (0, 0)
-    assert all(np.isnan(compared.ratio).all() for compared in paired([1, 2, 3], [0, 0, 0]))
+    assert all(np.isnan(compared.ratio).all() for compared in compare_paired([1, 2, 3], [0, 0, 0]))
     # The best quarter of the other is 0 in some resamples: no upper end then, but a lower one.
-    value, low, high = median(paired(np.arange(1.0, 9), np.arange(8.0) * 0.1)).ratio
+    value, low, high = median(compare_paired(np.arange(1.0, 9), np.arange(8.0) * 0.1)).ratio
     assert np.isfinite([value, low]).all()
     assert high > value
 
@@ -141,12 +141,12 @@ def test_no_spread() -> None:
 )
 def test_what_is_no_pair_is_refused(one: list[float], other: list[float], groups: list[str] | None) -> None:
     with pytest.raises(InputError):
-        paired(one, other, groups=groups)
+        compare_paired(one, other, groups=groups)
 
 
 def test_groups_are_drawn_and_left_out_whole() -> None:
     names = [str(place) for place in np.random.default_rng(14).permutation(np.repeat(np.arange(7), np.arange(1, 8)))]
-    groups, seen = numbered(names), list[npt.NDArray[np.int64]]()
+    groups, seen = group_numbers(names), list[npt.NDArray[np.int64]]()
 
     def note(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         seen.append(counts)
@@ -171,7 +171,7 @@ def test_intervals_of_groups_cover_where_those_of_images_do_not() -> None:
         shift = np.repeat(random.normal(0.3, 1, 25), 8)
         hard = skewed(random, 200)
         for place, groups in enumerate((kinds, None)):
-            _, low, high = paired(hard + shift, hard, count=200, groups=groups)[0].difference
+            _, low, high = compare_paired(hard + shift, hard, count=200, groups=groups)[0].difference
             hits[place] += low <= 0.3 <= high
     assert 0.86 < hits[0] / WORLDS < 0.99
     assert hits[1] / WORLDS < 0.7

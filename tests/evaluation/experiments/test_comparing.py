@@ -12,7 +12,7 @@ import pytest
 
 from evaluation.experiments import comparing
 from evaluation.experiments.comparing import (
-    Matched,
+    MatchedErrors,
     compare,
     holm,
     images_table,
@@ -132,7 +132,7 @@ def test_images_of_one_picture_are_one_case() -> None:
     images = [f"{picture} {light}" for picture in range(12) for light in range(40)]
     groups = tuple(image.partition(" ")[0] for image in images)
     alarms = np.zeros(2)
-    matched: list[Matched] = []
+    matched: list[MatchedErrors] = []
     for _ in range(200):
         # Neither is better: which errs less on a picture is chance, and the same under every light.
         one, other = np.repeat(random.gamma(3, 1, (2, 12)), 40, axis=1) + random.uniform(0, 0.1, (2, 480))

@@ -16,7 +16,7 @@ from evaluation.experiments.folds import (
     folds_to_csv,
     group_of,
     read_folds,
-    require_apart,
+    require_groups_together,
 )
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError, InputError
@@ -81,10 +81,10 @@ def test_a_bad_file_of_folds_is_refused(tmp_path: Path, text: str, why: str) -> 
 
 def test_folds_that_leak_are_refused() -> None:
     scenes: Any = [SimpleNamespace(name=f"{number}.png", group=f"picture {number // 2}") for number in range(4)]
-    require_apart(scenes, np.array([0, 0, 1, 1]))
+    require_groups_together(scenes, np.array([0, 0, 1, 1]))
     with pytest.raises(InputError, match=r"picture 1 .*folds 0 and 1"):
-        require_apart(scenes, np.array([0, 0, 0, 1]))
+        require_groups_together(scenes, np.array([0, 0, 0, 1]))
     named: Any = [SimpleNamespace(name="same.png"), SimpleNamespace(name="same.png")]
     assert group_of(named[0]) == "same.png"
     with pytest.raises(InputError, match=r"same\.png"):
-        require_apart(named, np.array([0, 1]))
+        require_groups_together(named, np.array([0, 1]))

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.comparing import Matched, error_scatter
+from evaluation.experiments.comparing import MatchedErrors, error_scatter
 from evaluation.experiments.run_folder import describe_run
 from evaluation.experiments.running import evaluate
 from evaluation.methods import GrayEdge
@@ -43,7 +43,7 @@ def test_names_are_neither_mathematics_nor_left_out() -> None:
     ]
     curves = texts(error_curves(results, "recovery"))
     planes = texts(error_planes(results, random.random((5, 3)) + 0.1, "recovery"))
-    matched = Matched(("$a$", "_b"), "recovery", tuple("abcde"), random.random(5), random.random(5))
+    matched = MatchedErrors(("$a$", "_b"), "recovery", tuple("abcde"), random.random(5), random.random(5))
     scatter = texts(error_scatter(matched))
     assert all(name in curves and name in planes for name in NAMES)
     assert {"$a$: error, degrees", "_b: error, degrees"} <= set(scatter)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.bootstrap import ErrorSample, bounded_figures, paired
+from evaluation.experiments.bootstrap import ErrorSample, bounded_figures, compare_paired
 from evaluation.experiments.transfer.outcome import (
     beside_table,
     errors_table,
@@ -92,7 +92,7 @@ def test_one_seed_is_what_the_bootstrap_gives() -> None:
         for figure, known in zip(row.statistics, expected, strict=True):
             assert figure == pytest.approx(known)
     for ratios, base in ((found.to_real[0], REAL), (found.to_naive[0], THIRD)):
-        for compared, figure in zip(paired(OTHER, base), ratios.ratios, strict=True):
+        for compared, figure in zip(compare_paired(OTHER, base), ratios.ratios, strict=True):
             assert figure == pytest.approx(compared.ratio)
     assert [(one.row.kind, one.base.kind) for one in found.to_real] == [
         ("generated", "cross-validation"),
