@@ -114,8 +114,8 @@ def transfer(
         rows = run_transfer(
             *(tested.scenes, plan.training, learners, drawn, images, references),
             *(side, threads, step),
-            generated=tested.name if is_generated(tested) else "",
-            beside=counts,
+            generated_name=tested.name if is_generated(tested) else "",
+            real_counts=counts,
         )
     figures = figures_of(rows, error, groups=groups_of(tested.scenes))
     plan = replace(plan, notes=(*notes, *harm_notes(figures)))

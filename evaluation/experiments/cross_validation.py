@@ -151,17 +151,17 @@ def collect_material(
     return Material(tuple(scenes), truths, features)
 
 
-def fit_on(learner: AnyLearner, learner_index: int, material: Material, indices: Indices, seed: int) -> Method:
-    """Return the method fitted to the scenes with these indices (P,) int64."""
-    features, chosen_indices = material.features[learner_index], [int(index) for index in indices.tolist()]
+def fit_on(learner: AnyLearner, number: int, material: Material, indices: Indices, seed: int) -> Method:
+    """Return the method fitted to the scenes with these indices (P,) int64; `number` is the index of the learner."""
+    features, chosen_indices = material.features[number], [int(index) for index in indices.tolist()]
     if isinstance(learner, FeatureLearner) and features is not None:
         return fit_extracted(learner, [features[index] for index in chosen_indices], material.truths[indices], seed)
     return fit_copy(learner, [material.scenes[index] for index in chosen_indices], seed)
 
 
-def estimate_on(method: Method, learner_index: int, material: Material, indices: Indices) -> list[SceneAnswer]:
+def estimate_on(method: Method, number: int, material: Material, indices: Indices) -> list[SceneAnswer]:
     """Return the P answers of a fitted method for the scenes with these indices (P,) int64."""
-    features, chosen_indices = material.features[learner_index], [int(index) for index in indices.tolist()]
+    features, chosen_indices = material.features[number], [int(index) for index in indices.tolist()]
     if not isinstance(method, LearnedMethod) or features is None:
         return [answer for (answer,) in answer_scenes([material.scenes[index] for index in chosen_indices], [method])]
     usable = [
@@ -206,15 +206,13 @@ def cross_validate(
     return tuple(cross_fit(learner, index, material, folds, seed) for index, learner in enumerate(learners))
 
 
-def cross_fit(
-    learner: AnyLearner, learner_index: int, material: Material, folds: npt.NDArray[np.int64], seed: int
-) -> Result:
+def cross_fit(learner: AnyLearner, number: int, material: Material, folds: npt.NDArray[np.int64], seed: int) -> Result:
     """Return the result of one learner; each scene is estimated after a fit to the other folds, (N,) int64."""
     answers: dict[int, SceneAnswer] = {}
     for fold in np.unique(folds):
         test_indices = np.flatnonzero(folds == fold)
-        method = fit_on(learner, learner_index, material, np.flatnonzero(folds != fold), seed)
-        answers |= zip(test_indices.tolist(), estimate_on(method, learner_index, material, test_indices), strict=True)
+        method = fit_on(learner, number, material, np.flatnonzero(folds != fold), seed)
+        answers |= zip(test_indices.tolist(), estimate_on(method, number, material, test_indices), strict=True)
     return result_of(learner.name, [answers[index] for index in range(len(folds))], material.truths)
 
 

@@ -13,20 +13,20 @@ import pytest
 
 from evaluation.experiments.bootstrap import ErrorSample, bounded_figures, compare_paired
 from evaluation.experiments.transfer.outcome import (
-    beside_table,
+    adaptation_table,
     errors_table,
     figures_of,
     harm_notes,
     intervals_table,
 )
-from evaluation.experiments.transfer.rows import Kind, TransferRow, Way
+from evaluation.experiments.transfer.rows import RealUse, Training, TransferRow
 from evaluation.metrics import summarise
 from evaluation.results.result import Result
 
 ERRORS = np.arange(1.0, 41.0)
 
 
-def _plain_row(kind: Kind, *gains: float, guessed: int = 0, images: int = 9) -> TransferRow:
+def _plain_row(kind: Training, *gains: float, guessed: int = 0, images: int = 9) -> TransferRow:
     blind = np.arange(40) < guessed
     results = tuple(
         Result("Trees", np.ones((40, 3)), {"recovery": gain * ERRORS, "reproduction": ERRORS}, blind) for gain in gains
@@ -34,9 +34,9 @@ def _plain_row(kind: Kind, *gains: float, guessed: int = 0, images: int = 9) -> 
     return TransferRow("Trees", kind, "" if kind in ("cross-validation", "none") else "made", images, results)
 
 
-def _beside(kind: Kind, way: Way, gain: float, real: str = "20") -> TransferRow:
+def _beside(kind: Training, way: RealUse, gain: float, real: str = "20") -> TransferRow:
     data = "" if kind == "real" else "made"
-    return replace(_plain_row(kind, gain), data=data, way=way, real=real)
+    return replace(_plain_row(kind, gain), data=data, real_use=way, real=real)
 
 
 @pytest.mark.slow
@@ -64,17 +64,17 @@ def test_beside_real_images_a_row_is_held_to_the_better_of_what_it_was_made_of()
     # They are neither among the rows without real images nor in ratios of those.
     assert len(errors_table(found, "Real", 40).rows) == len(intervals_table(found, "Real").rows) == 3
     assert len(found.to_real) == 2
-    table = beside_table(found, "Real")
+    table = adaptation_table(found, "Real")
     assert table is not None
     assert table.texts()[0] == (*("Trees", "made: generated", "20", "82.00", "41.00", "36.90", "0.90 (0.90 – 0.90)"),)
-    assert beside_table(figures_of([_plain_row("generated", 1.0)], "recovery"), "Real") is None
+    assert adaptation_table(figures_of([_plain_row("generated", 1.0)], "recovery"), "Real") is None
 
 
 RANDOM = np.random.default_rng(3)
 REAL, OTHER, THIRD = (np.abs(RANDOM.normal(2, 1, 90)) for _ in range(3))
 
 
-def _row(kind: Kind, *errors: npt.NDArray[np.float64], method: str = "Trees") -> TransferRow:
+def _row(kind: Training, *errors: npt.NDArray[np.float64], method: str = "Trees") -> TransferRow:
     results = tuple(
         Result(method, np.ones((90, 3)), {"recovery": each, "reproduction": 2 * each}, np.zeros(90, bool))
         for each in errors

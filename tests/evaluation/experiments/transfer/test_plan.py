@@ -18,7 +18,7 @@ from evaluation.datasets.generated import GeneratedMixedScene, GeneratedScene
 from evaluation.datasets.thumbnails import Thumbnail
 from evaluation.experiments.transfer.plan import (
     NaiveScene,
-    find_sources,
+    find_source_pictures,
     naive_image,
     naive_scenes,
     plan_transfer,
@@ -65,7 +65,7 @@ def _generated(maker_scenes: tuple[object, ...]) -> list[GeneratedScene]:
 
 
 def _counterparts(made: list[GeneratedScene], pictures: Path) -> tuple[NaiveScene, ...]:
-    found, missing = find_sources(made[0].dataset, pictures)
+    found, missing = find_source_pictures(made[0].dataset, pictures)
     assert not missing
     return naive_scenes(made, found)
 
@@ -83,7 +83,7 @@ def test_a_table_that_is_naive_is_reproduced(maker: Maker) -> None:
 def test_a_table_behind_a_matrix_is_reproduced_with_it_and_not_without(tmp_path: Path) -> None:
     save_pictures(tmp_path / "pictures", ["a.png"])
     made = _generated(Maker(tmp_path, write_table(tmp_path / "lut", MATRIX)).make().scenes)
-    found, _ = find_sources(made[0].dataset, tmp_path / "pictures")
+    found, _ = find_source_pictures(made[0].dataset, tmp_path / "pictures")
     (one, _), (plain, _) = (
         naive_scenes(made, found, matrix) for matrix in (ColourMatrix("mine", MATRIX, "test"), None)
     )
@@ -102,7 +102,7 @@ def test_mixtures_and_masks_of_lights_are_reproduced(maker: Maker) -> None:
     choice = SimultaneousLights(ListedLights((0, 1)), 2, parse_masks("half-plane:angle=30,width=.2", 2, 0))
     (two, *_) = _generated(maker.make("two", choice).scenes)
     assert isinstance(two, GeneratedMixedScene)
-    found, _ = find_sources(two.dataset, maker.pictures)
+    found, _ = find_source_pictures(two.dataset, maker.pictures)
     (naive, *_) = naive_scenes([two], found)
     image, expected = naive.read()[0].astype(int), two.read()[0].astype(int)
     np.testing.assert_allclose(image, expected, atol=2)
@@ -172,14 +172,16 @@ def test_found_under_another_name_by_its_content(maker: Maker, tmp_path: Path) -
     # The names of the two are exchanged: content decides.
     shutil.copy(maker.pictures / "b.png", other / "c.png")
     shutil.copy(maker.pictures / "c.png", other / "b.png")
-    found, missing = find_sources(dataset, other)
+    found, missing = find_source_pictures(dataset, other)
     assert not missing
     assert {name: picture.path for name, picture in found.items()} == {
         "a.png": other / "deep" / "renamed.png",
         "b.png": other / "c.png",
         "c.png": other / "b.png",
     }
-    np.testing.assert_array_equal(found["b.png"].codes(), find_sources(dataset, maker.pictures)[0]["b.png"].codes())
+    np.testing.assert_array_equal(
+        found["b.png"].codes(), find_source_pictures(dataset, maker.pictures)[0]["b.png"].codes()
+    )
 
 
 def test_another_picture_of_that_name_is_missing(maker: Maker, tmp_path: Path) -> None:
@@ -187,7 +189,7 @@ def test_another_picture_of_that_name_is_missing(maker: Maker, tmp_path: Path) -
     other = tmp_path / "other"
     save_pictures(other, ["a.png"], seed=9)
     shutil.copy(maker.pictures / "c.png", other / "c.png")
-    found, missing = find_sources(dataset, other)
+    found, missing = find_source_pictures(dataset, other)
     assert missing == ("a.png", "b.png")
     assert list(found) == ["c.png"]
 
@@ -196,7 +198,7 @@ def test_random_colours_are_made_again(maker: Maker) -> None:
     place = maker.folder / "random"
     scenes = random_scenes(2, 7, 5, seed=4)
     made = generate_dataset(maker.lut, place, scenes, [0], seed=4, options=DatasetOptions(previews=False))
-    found, missing = find_sources(made, maker.pictures)
+    found, missing = find_source_pictures(made, maker.pictures)
     assert not missing
     np.testing.assert_array_equal(found["random-000001"].codes(), scenes[1].read().picture)
 
@@ -204,10 +206,10 @@ def test_random_colours_are_made_again(maker: Maker) -> None:
 def test_what_cannot_be_found_is_said(maker: Maker) -> None:
     dataset = _dataset(maker)
     with pytest.raises(InputError):
-        find_sources(dataset, maker.folder / "nowhere")
+        find_source_pictures(dataset, maker.folder / "nowhere")
     with pytest.raises(InputError):
-        find_sources(dataset, "s3://bucket/pictures")
-    found, _ = find_sources(dataset, maker.pictures)
+        find_source_pictures(dataset, "s3://bucket/pictures")
+    found, _ = find_source_pictures(dataset, maker.pictures)
     save_pictures(maker.pictures, ["a.png"], side=32)
     with pytest.raises(FormatError, match=r"32x32 px.*24x24"):
         found["a.png"].codes()
@@ -267,9 +269,9 @@ def test_real_sets_are_compared_by_their_pixels() -> None:
 def test_copies_are_kept_only_where_that_is_allowed() -> None:
     one, other = _real("1", "2", place="one.npz"), _real("3", "4", place="other.npz")
     said = "2 of 2 images of real are also in photos, by content: 1, 2"
-    assert trainable_images(one, other, called="photos") == ((), said)
+    assert trainable_images(one, other, test_name="photos") == ((), said)
     with pytest.raises(InputError, match=f"{said}.*--unseen"):
-        trainable_images(one, other, leave_out=False, called="photos")
+        trainable_images(one, other, leave_out=False, test_name="photos")
     # What shows the same scene by its name is no copy.
     named = _real("3", "5", place="named.npz", seed=1)
     assert trainable_images(named, other, leave_out=False)[0] == named.scenes

@@ -99,8 +99,8 @@ def test_images_are_drawn_without_repeats() -> None:
 
 def test_beside_real_images() -> None:
     tinted = TrainingSet("tinted", "generated", world(90, seed=2, cast=(1.0, 1.0, 0.7)))
-    rows = transfer(TEST, [tinted], LEARNERS, FOLDS, 80, beside=(10, None))
-    listed = [(row.method, row.kind, row.way, row.real, row.images) for row in rows if row.method == "Mean colour"]
+    rows = transfer(TEST, [tinted], LEARNERS, FOLDS, 80, real_counts=(10, None))
+    listed = [(row.method, row.kind, row.real_use, row.real, row.images) for row in rows if row.method == "Mean colour"]
     assert listed == [
         ("Mean colour", "cross-validation", "", "", 80),
         ("Mean colour", "real", "alone", "10", 10),
@@ -109,8 +109,8 @@ def test_beside_real_images() -> None:
         ("Mean colour", "generated", "adapted", "10", 80),
         ("Mean colour", "generated", "adapted", "all", 80),
     ]
-    assert [row.way for row in rows if row.method == "Constant light"] == ["", ""]
-    found = {(row.kind, row.way, row.real): row for row in rows if row.method == "Mean colour"}
+    assert [row.real_use for row in rows if row.method == "Constant light"] == ["", ""]
+    found = {(row.kind, row.real_use, row.real): row for row in rows if row.method == "Mean colour"}
     for one, other in zip(found["real", "alone", "all"].results, rows[0].results, strict=True):
         np.testing.assert_array_equal(one.estimates, other.estimates)
     mean = {key: np.mean([result.errors["recovery"].mean() for result in row.results]) for key, row in found.items()}
@@ -136,7 +136,7 @@ class Remembering(MeanLearner):
 
 def test_real_images_are_drawn_from_other_folds_fewer_among_more() -> None:
     learner = Remembering()
-    transfer(TEST, [], [learner], FOLDS[:1], 1, beside=(5, 20))
+    transfer(TEST, [], [learner], FOLDS[:1], 1, real_counts=(5, 20))
     folds = {scene.name: int(fold) for scene, fold in zip(TEST, FOLDS[0], strict=True)}
     alone = learner.seen[3:]
     assert [len(seen) for seen in alone] == [5] * 3 + [20] * 3
