@@ -210,13 +210,13 @@ def bits(
     output: JsonOutput,
 ) -> None:
     """Run methods on images whose colours were reduced."""
-    from evaluation.experiments.paper.colour_reduction import bits_methods, bits_removed
+    from evaluation.experiments.paper.colour_reduction import paper_methods, remove_bits
     from evaluation.experiments.paper.reporting import bits_report
 
     _require_free(out)
     opened = open_data(data, read)
     with image_steps(len(opened.scenes)) as step:
-        found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
+        found = remove_bits(opened.scenes, paper_methods(sigma), workers=workers or processor_count(), on_scene=step)
     first = f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px."
     conditions = (first, _treatment(opened))
     _finish(bits_report(found, error, opened.name, conditions), conditions, out, output)
@@ -308,7 +308,7 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
     """Return the source pictures at a place, what was done to get them, and their name."""
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
-    from evaluation.experiments.paper.material import developed
+    from evaluation.experiments.paper.material import develop_sources
     from generator import find_pictures
     from generator.rendering.matrices import choose_matrix
 
@@ -326,7 +326,7 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
         raise InputError(f"{place} was made by generate; name photographs, or a data set of real raw images")
     data = open_scenes(place, layout)
     how = f"with the colour matrix of {chosen.name}" if chosen else "without a colour matrix"
-    return developed(data, chosen), f"{len(data.scenes)} of {data.name}, developed to sRGB {how}", data.name
+    return develop_sources(data, chosen), f"{len(data.scenes)} of {data.name}, developed to sRGB {how}", data.name
 
 
 def _sides(text: str) -> list[int]:

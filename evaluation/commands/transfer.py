@@ -14,8 +14,8 @@ from evaluation.commands.options import (
     AngularError,
     Read,
     argument,
-    choose_beside_constant,
     choose_methods,
+    choose_without_constant,
     image_steps,
     is_learner,
     open_data,
@@ -141,7 +141,7 @@ def _learners(names: Sequence[str]) -> tuple[list[AnyLearner], list[str]]:
     """Return the learned methods of a list and the constant light, and why some of `all` are left out."""
     from evaluation.learning.constant_light import ConstantLight
 
-    chosen, left_out = choose_beside_constant(names)
+    chosen, left_out = choose_without_constant(names)
     titles = [each.name for each in chosen]
     for title in titles:
         if titles.count(title) > 1:

@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation.experiments.paper.colour_reduction import (
-    bits_methods,
-    bits_removed,
     clear_bits,
+    paper_methods,
     reduce_colours,
+    remove_bits,
 )
 from evaluation.experiments.running import evaluate
 from generator.files import fit_flash
@@ -82,8 +82,8 @@ def test_images_as_they_are_give_what_evaluate_gives() -> None:
     light = np.array([0.4, 1.0, 0.6])
     scenes = [Made("photo", light, photo(seed), 3.0, mask if seed % 2 else None) for seed in range(4)]
     assert any((scene.image >= 3.0).any() for scene in scenes)
-    methods = bits_methods(sigma=2)
-    found = bits_removed(scenes, methods, (0, 3), workers=2)
+    methods = paper_methods(sigma=2)
+    found = remove_bits(scenes, methods, (0, 3), workers=2)
     for ours, usual in zip(found.raw, evaluate(scenes, methods), strict=True):
         np.testing.assert_array_equal(ours.estimates, usual.estimates)
         for kind in ("recovery", "reproduction"):

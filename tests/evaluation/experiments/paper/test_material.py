@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from evaluation.experiments.paper.material import (
-    develop,
-    developed,
+    develop_image,
+    develop_sources,
     lights_at_random,
     lights_like,
     read_truths,
-    rendered,
+    render_scenes,
 )
 from evaluation.scene import SceneSet
 from foundation.colorimetry import decode_srgb, srgb_codes
@@ -41,41 +41,41 @@ def test_a_picture_photographed_and_developed_is_itself(camera: str) -> None:
     codes[:4] = 255  # more than one in a hundred pixels are white, so white is where it was
     light = np.array([0.5, 1.0, 0.7]) * 3000
     raw = decode_srgb(codes / 255) @ matrix.rows.T * light
-    assert np.abs(develop(raw, light * 17, matrix=matrix).astype(int) - codes).max() <= 1
-    assert np.abs(develop(raw, light, matrix=None).astype(int) - codes).max() > 10
+    assert np.abs(develop_image(raw, light * 17, matrix=matrix).astype(int) - codes).max() <= 1
+    assert np.abs(develop_image(raw, light, matrix=None).astype(int) - codes).max() > 10
     # The wrong light leaves a cast.
-    assert np.abs(develop(raw, light[::-1].copy(), matrix=matrix).astype(int) - codes).max() > 10
+    assert np.abs(develop_image(raw, light[::-1].copy(), matrix=matrix).astype(int) - codes).max() > 10
 
 
 def test_one_in_a_hundred_is_clipped() -> None:
     wedge = np.linspace(0, 1, 10000).reshape(100, 100, 1) * np.array([0.3, 1.0, 0.4])
-    picture = develop(wedge, np.array([0.3, 1.0, 0.4]))
+    picture = develop_image(wedge, np.array([0.3, 1.0, 0.4]))
     assert 0.01 <= (picture == 255).all(axis=2).mean() < 0.015
     # A masked highlight does not darken the picture.
     bright = wedge.copy()
     bright[:50] *= 40
     mask = np.zeros((100, 100), np.bool_)
     mask[:50] = True
-    alone = develop(bright[50:], np.array([0.3, 1.0, 0.4]))
-    np.testing.assert_array_equal(develop(bright, np.array([0.3, 1.0, 0.4]), mask)[50:], alone)
-    assert develop(bright, np.array([0.3, 1.0, 0.4]))[50:].max() < 128
+    alone = develop_image(bright[50:], np.array([0.3, 1.0, 0.4]))
+    np.testing.assert_array_equal(develop_image(bright, np.array([0.3, 1.0, 0.4]), mask)[50:], alone)
+    assert develop_image(bright, np.array([0.3, 1.0, 0.4]))[50:].max() < 128
 
 
 def test_a_clipped_sky_is_white() -> None:
     light = np.array([0.5, 1.0, 0.7])
     image = np.full((20, 20, 3), 200.0) * light
     image[:10] = 1000.0  # all channels at saturation: under this light as red and blue as no sky is
-    pink, white = (develop(image, light, saturation=level)[0, 0].tolist() for level in (None, 1000.0))
+    pink, white = (develop_image(image, light, saturation=level)[0, 0].tolist() for level in (None, 1000.0))
     assert pink == srgb_codes([1, 0.5, 0.5 / 0.7]).tolist()
     assert white == [255, 255, 255]
-    np.testing.assert_array_equal(develop(image, light, saturation=5000.0), develop(image, light))
+    np.testing.assert_array_equal(develop_image(image, light, saturation=5000.0), develop_image(image, light))
 
 
 def test_a_source_has_no_chart() -> None:
     mask = np.zeros((8, 8), np.bool_)
     mask[:3, :3] = True
     scene = Made("photo", np.array([1.0, 1.0, 1.0]), np.full((8, 8, 3), 500.0), None, mask)
-    (source,) = developed(SceneSet("made up", "none", "here", (scene,)), camera_matrix("EOS 550D"))
+    (source,) = develop_sources(SceneSet("made up", "none", "here", (scene,)), camera_matrix("EOS 550D"))
     picture = source.read().picture
     assert not picture[mask].any()
     assert (picture[~mask] == 255).all()
@@ -91,7 +91,7 @@ PLAIN = DatasetOptions(previews=False, rendering="codes")
 @pytest.mark.slow
 def test_random_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: Path) -> None:
     lut = make_table("Test", noise=0.05)
-    scenes = rendered(lut, SOURCES, lights_at_random(lut, 6, seed=9), seed=9)
+    scenes = render_scenes(lut, SOURCES, lights_at_random(lut, 6, seed=9), seed=9)
     made = generate_dataset(lut, tmp_path / "made", SOURCES, RandomLights(1, len(LIGHTS), 9), seed=9, options=PLAIN)
     assert len({scene.light for scene in scenes}) > 1
     for scene, entry in zip(scenes, made.entries, strict=True):
@@ -111,7 +111,7 @@ def test_near_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: 
     few = lights_like(lut, TRUTHS, 1).how
     assert few.startswith("nearest by angle to the first 1 of 3 ground truths, 1 different lights")
     assert few.split("angle to them")[1] == lights_like(lut, TRUTHS[:1], 1).how.split("angle to them")[1]
-    scenes = rendered(lut, SOURCES, chosen, seed=2)
+    scenes = render_scenes(lut, SOURCES, chosen, seed=2)
     lights = nearest_lights(lut, TRUTHS)
     made = generate_dataset(lut, tmp_path / "made", SOURCES, lights, seed=2, options=PLAIN)
     for scene, entry in zip(scenes, made.entries, strict=True):
