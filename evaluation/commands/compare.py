@@ -49,9 +49,7 @@ def compare(
         ),
     ] = None,
     error: Annotated[AngularError, typer.Option(help="Angular error to compare.")] = "reproduction",
-    out: Annotated[
-        Path | None, option("FOLDER", "Write tables and a page with scatter plots to this new folder.")
-    ] = None,
+    out: Annotated[Path | None, option("FOLDER", "Write tables and a page with scatters to this new folder.")] = None,
     *,
     output: JsonOutput,
 ) -> None:
@@ -91,28 +89,22 @@ def _pairs(
 
     run_a, run_b = runs[0], runs[-1]
     if len(runs) == 1:
-        name_pairs = list(
-            combinations(dict.fromkeys(_method_in_run(run_a, name, locations[0]) for name in names or run_a), 2)
-        )
+        chosen_names = [_method_in_run(run_a, name, locations[0]) for name in names or run_a]
+        pairs = list(combinations(dict.fromkeys(chosen_names), 2))
     elif names:
-        name_pairs_given = [
-            (name, name) if name in run_a and name in run_b else name.partition("=")[::2] for name in names
-        ]
-        name_pairs = [
-            (_method_in_run(run_a, a, locations[0]), _method_in_run(run_b, b or a, locations[1]))
-            for a, b in name_pairs_given
+        texts = [(name, name) if name in run_a and name in run_b else name.partition("=")[::2] for name in names]
+        pairs = [
+            (_method_in_run(run_a, a, locations[0]), _method_in_run(run_b, b or a, locations[1])) for a, b in texts
         ]
     elif len(run_a) == len(run_b) == 1:
-        name_pairs = [(next(iter(run_a)), next(iter(run_b)))]
+        pairs = [(next(iter(run_a)), next(iter(run_b)))]
     else:
-        name_pairs = [(name, name) for name in run_a if name in run_b]
-    if not name_pairs:
-        methods_text = " and ".join(
-            f"{location} has {', '.join(run)}" for location, run in zip(locations, runs, strict=True)
-        )
-        raise InputError(f"{methods_text}, expected two to compare; name one of each run: --method FIRST=SECOND")
+        pairs = [(name, name) for name in run_a if name in run_b]
+    if not pairs:
+        methods = " and ".join(f"{name} has {', '.join(run)}" for name, run in zip(locations, runs, strict=True))
+        raise InputError(f"{methods}, expected two to compare; name one of each run: --method FIRST=SECOND")
     suffixes = ["", ""] if len(runs) == 1 else [f" ({location})" for location in locations]
-    return [match(run_a[a], run_b[b], (a + suffixes[0], b + suffixes[1]), error) for a, b in dict.fromkeys(name_pairs)]
+    return [match(run_a[a], run_b[b], (a + suffixes[0], b + suffixes[1]), error) for a, b in dict.fromkeys(pairs)]
 
 
 def _method_in_run(run: Mapping[str, MethodErrors], name: str, location: str) -> str:
@@ -133,14 +125,9 @@ def _table_name(name: str) -> str:
 
 def _treatment_notes(locations: Sequence[str]) -> list[str]:
     # Runs with different treatments of the images differ in more than their methods.
-    treatment_a, treatment_b = (_treatment(location) for location in (locations[0], locations[-1]))
-    differences = [
-        aspect for aspect in treatment_a if aspect in treatment_b and treatment_a[aspect] != treatment_b[aspect]
-    ]
-    return [
-        f"the runs differ in {aspect}: first {treatment_a[aspect]}, second {treatment_b[aspect]}"
-        for aspect in differences
-    ]
+    first, second = (_treatment(location) for location in (locations[0], locations[-1]))
+    differences = [aspect for aspect in first if aspect in second and first[aspect] != second[aspect]]
+    return [f"the runs differ in {aspect}: first {first[aspect]}, second {second[aspect]}" for aspect in differences]
 
 
 def _treatment(location: str) -> dict[str, Any]:

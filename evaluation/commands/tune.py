@@ -40,7 +40,7 @@ def tune(
     output: JsonOutput,
 ) -> None:
     """Choose a method's parameters on a data set."""
-    from evaluation.experiments.cross_validation import tune_family, tuning_table
+    from evaluation.experiments.cross_validation import family_settings, tune_family, tuning_table
     from evaluation.reports.table_output import show_notes, show_tables
 
     family_settings(family)  # An unknown family is refused before a data set is opened.

@@ -68,7 +68,7 @@ class MatchedErrors:
     """
 
     names: tuple[str, str]
-    kind: ErrorKind
+    metric: ErrorKind
     images: tuple[str, ...]
     errors_a: npt.NDArray[np.float64]
     errors_b: npt.NDArray[np.float64]
@@ -123,46 +123,36 @@ class Comparison:
     statistics: tuple[PairedStatistic, ...]
 
 
-def match(errors_a: MethodErrors, errors_b: MethodErrors, names: tuple[str, str], kind: ErrorKind) -> MatchedErrors:
+def match(first: MethodErrors, second: MethodErrors, names: tuple[str, str], metric: ErrorKind) -> MatchedErrors:
     """Return the errors of two methods on the images with the same name."""
-    index_b = {image: index for index, image in enumerate(errors_b.images)}
-    index_pairs = [(index, index_b[image]) for index, image in enumerate(errors_a.images) if image in index_b]
-    if not index_pairs:
-        raise InputError(
-            f"{names[0]} and {names[1]} have no image in common, expected results on the same data set; compare runs "
-            "on the same data set"
-        )
-    indices_a, indices_b = np.array(index_pairs, dtype=np.int64).T
-    images = tuple(errors_a.images[index] for index in indices_a.tolist())
-    angles = angles_deg(errors_a.truths[indices_a], errors_b.truths[indices_b])
+    index_of = {image: index for index, image in enumerate(second.images)}
+    pairs = [(index, index_of[image]) for index, image in enumerate(first.images) if image in index_of]
+    if not pairs:
+        raise InputError(f"{names[0]} and {names[1]} have 0 common images, expected some; compare the same data set")
+    indices_a, indices_b = np.array(pairs, dtype=np.int64).T
+    images = tuple(first.images[index] for index in indices_a.tolist())
+    angles = angles_deg(first.truths[indices_a], second.truths[indices_b])
     worst = int(angles.argmax())
     if angles[worst] > _SAME_TRUTH_DEG:
         raise InputError(
             f"the ground truths of {images[worst]} in {names[0]} and {names[1]} differ by {angles[worst]:.2f} degrees, "
             f"expected at most {_SAME_TRUTH_DEG:g}; run both methods on the same data and ground truths"
         )
+    # Groups of the first file are used if it has some, else those of the second.
     groups: tuple[str, ...] = ()
-    for source, source_indices in ((errors_b, indices_b), (errors_a, indices_a)):
-        groups = groups if source.groups is None else tuple(source.groups[index] for index in source_indices.tolist())
+    for source, indices in ((second, indices_b), (first, indices_a)):
+        groups = groups if source.groups is None else tuple(source.groups[index] for index in indices.tolist())
     common = set(images)
     notes: list[str] = []
-    for name_without, name_with, source in ((*names, errors_b), (*reversed(names), errors_a)):
+    for name, other_name, source in ((*names, second), (*reversed(names), first)):
         missing = [image for image in source.images if image not in common]
         if missing:
             notes.append(
-                f"{name_without} does not contain {counted(len(missing), 'image')} of {name_with}, which are excluded: "
-                f"{first_of(missing)}"
+                f"{name} lacks {counted(len(missing), 'image')} of {other_name}, excluded here: {first_of(missing)}"
             )
-    shared_groups = groups if len(set(groups)) < len(groups) else None
-    return MatchedErrors(
-        names,
-        kind,
-        images,
-        errors_a.errors[kind][indices_a],
-        errors_b.errors[kind][indices_b],
-        shared_groups,
-        tuple(notes),
-    )
+    used_groups = groups if len(set(groups)) < len(groups) else None
+    errors_a, errors_b = first.errors[metric][indices_a], second.errors[metric][indices_b]
+    return MatchedErrors(names, metric, images, errors_a, errors_b, used_groups, tuple(notes))
 
 
 def signed_rank(errors_a: npt.ArrayLike, errors_b: npt.ArrayLike) -> SignedRank:
@@ -182,14 +172,10 @@ def signed_rank(errors_a: npt.ArrayLike, errors_b: npt.ArrayLike) -> SignedRank:
     if not wins + losses:
         return SignedRank(0, 0, len(difference), 1.0, 0.0)
     ranks = stats.rankdata(np.abs(difference))
-    rank_sum_wins, rank_sum_losses = float(ranks[difference < 0].sum()), float(ranks[difference > 0].sum())
+    win_ranks, loss_ranks = float(ranks[difference < 0].sum()), float(ranks[difference > 0].sum())
     p = float(stats.wilcoxon(difference, zero_method="pratt").pvalue)
     return SignedRank(
-        wins,
-        losses,
-        len(difference) - wins - losses,
-        p,
-        (rank_sum_losses - rank_sum_wins) / (rank_sum_losses + rank_sum_wins),
+        wins, losses, len(difference) - wins - losses, p, (loss_ranks - win_ranks) / (loss_ranks + win_ranks)
     )
 
 
@@ -238,42 +224,28 @@ def verdict(comparison: Comparison) -> str:
 def tests_table(comparisons: Sequence[Comparison]) -> Table:
     """Return the signed-rank tests, one row for each comparison."""
     return Table(
-        f"Paired {comparisons[0].matched.kind} errors",
+        f"Paired {comparisons[0].matched.metric} errors",
         ("First", "Second", "p", "p (Holm)", "Effect", "Images", "Groups", "First better", "Second better", "Equal"),
-        tuple(
-            (
-                *comparison.matched.names,
-                *_test_cells(comparison),
-                *comparison.matched.sizes,
-                comparison.test.wins,
-                comparison.test.losses,
-                comparison.test.ties,
-            )
-            for comparison in comparisons
-        ),
+        tuple(map(_test_row, comparisons)),
         notes=TEST_NOTES,
     )
 
 
-def _test_cells(comparison: Comparison) -> tuple[str, str, float]:
-    return f"{comparison.test.p:.2g}", f"{comparison.p_holm:.2g}", comparison.test.effect
+def _test_row(comparison: Comparison) -> tuple[Cell, ...]:
+    matched, test = comparison.matched, comparison.test
+    counts = (*matched.sizes, test.wins, test.losses, test.ties)
+    return (*matched.names, f"{test.p:.2g}", f"{comparison.p_holm:.2g}", test.effect, *counts)
 
 
 def statistics_table(comparisons: Sequence[Comparison]) -> Table:
     """Return every statistic of the comparisons, with difference and ratio."""
     return Table(
-        f"Statistics of {comparisons[0].matched.kind} errors, degrees",
+        f"Statistics of {comparisons[0].matched.metric} errors, degrees",
         ("First", "Second", "Statistic", *_VALUE_HEADS),
         tuple(
-            (
-                *comparison.matched.names,
-                _STATISTIC_HEADS[pair.statistic],
-                pair.value_a,
-                pair.value_b,
-                *_cells(*pair.difference, *pair.ratio),
-            )
-            for comparison in comparisons
-            for pair in comparison.statistics
+            (*item.matched.names, _STATISTIC_HEADS[pair.statistic], pair.value_a, pair.value_b, *_interval_cells(pair))
+            for item in comparisons
+            for pair in item.statistics
         ),
         digits=3,
         notes=(
@@ -286,18 +258,14 @@ def statistics_table(comparisons: Sequence[Comparison]) -> Table:
 def images_table(comparison: Comparison, count: int = 10) -> Table:
     """Return the images with the largest differences, in descending order; equal errors are omitted."""
     matched = comparison.matched
-    errors_a, errors_b = matched.errors_a.tolist(), matched.errors_b.tolist()
+    a, b = matched.errors_a.tolist(), matched.errors_b.tolist()
     differences = np.abs(matched.errors_a - matched.errors_b)
-    largest = [
-        index for index in np.argsort(-differences, kind="stable")[:count].tolist() if differences[index] >= TIE_DEG
-    ]
+    order = np.argsort(-differences, kind="stable")[:count].tolist()
+    largest = [index for index in order if differences[index] >= TIE_DEG]
     return Table(
         "{} against {}: the largest differences, degrees".format(*matched.names),
         ("Image", "First", "Second", "Difference"),
-        tuple(
-            (matched.images[index], errors_a[index], errors_b[index], errors_a[index] - errors_b[index])
-            for index in largest
-        ),
+        tuple((matched.images[index], a[index], b[index], a[index] - b[index]) for index in largest),
     )
 
 
@@ -321,22 +289,20 @@ def error_scatter(matched: MatchedErrors) -> bytes:
 
 def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str]) -> str:
     """Return the HTML page of comparisons."""
-    parts: list[Markup] = [pages.paragraph(text) for text in (*notes, *map(verdict, comparisons))]
-    parts += [table_part(tests_table(comparisons)), table_part(statistics_table(comparisons))]
+    elements: list[Markup] = [pages.paragraph(text) for text in (*notes, *map(verdict, comparisons))]
+    elements += [table_part(tests_table(comparisons)), table_part(statistics_table(comparisons))]
     for comparison in comparisons:
         name_a, name_b = comparison.matched.names
         caption = f"One point for each image: above the line (blue) {name_a} is better, below it (orange) {name_b}."
         figure = pages.figure(error_scatter(comparison.matched), caption)
-        parts += [
-            pages.heading(f"{name_a} against {name_b}"),
-            pages.row([figure, table_part(images_table(comparison, 10))]),
-        ]
-    return pages.page(f"Comparison of {comparisons[0].matched.kind} errors", parts)
+        table = table_part(images_table(comparison))
+        elements += [pages.heading(f"{name_a} against {name_b}"), pages.row([figure, table])]
+    return pages.page(f"Comparison of {comparisons[0].matched.metric} errors", elements)
 
 
-def _cells(*numbers: float) -> list[Cell]:
+def _interval_cells(pair: PairedStatistic) -> list[Cell]:
     # NaN is unknown; the upper end of a ratio may be infinite and stays.
-    return [None if np.isnan(number) else number for number in numbers]
+    return [None if np.isnan(number) else number for number in (*pair.difference, *pair.ratio)]
 
 
 def write_comparisons(folder: Path, comparisons: Sequence[Comparison], notes: Sequence[str]) -> None:

@@ -17,7 +17,7 @@ from evaluation.experiments.suspicions import suspicions
 from evaluation.learning.model_files import StoredMethod, TrainingRecord, scenes_sha256
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
-from evaluation.reports.run_page import MOST_SHOWN, chosen_images, developed, run_page
+from evaluation.reports.run_page import MAX_METHODS, chosen_images, developed_pictures, run_page
 from evaluation.reports.table_output import table_to_latex
 from evaluation.results.files import ERRORS_FILE, errors_csv, run_json, several_lights_csv
 from evaluation.results.method_records import describe_method
@@ -149,12 +149,12 @@ def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes])
 def _pictures(run: Run, scenes: Sequence[Scene], kind: ErrorKind, workers: int) -> dict[tuple[int, int], bytes]:
     # Each image is read once for all methods.
     methods_by_image: dict[int, list[int]] = {}
-    for method_index, result in enumerate(run.results[:MOST_SHOWN]):
+    for method_index, result in enumerate(run.results[:MAX_METHODS]):
         for image_index in sum(chosen_images(result, kind), ()):
             methods_by_image.setdefault(image_index, []).append(method_index)
 
     def develop(image_index: int) -> list[bytes]:
-        return developed(
+        return developed_pictures(
             scenes[image_index],
             [run.results[method_index].estimates[image_index] for method_index in methods_by_image[image_index]],
         )

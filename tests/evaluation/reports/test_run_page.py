@@ -18,7 +18,7 @@ from evaluation.experiments.comparing import MatchedErrors, error_scatter
 from evaluation.experiments.run_folder import describe_run
 from evaluation.experiments.running import evaluate
 from evaluation.methods import GrayEdge
-from evaluation.reports.run_page import chosen_images, developed, error_curves, error_planes, run_page
+from evaluation.reports.run_page import chosen_images, developed_pictures, error_curves, error_planes, run_page
 from evaluation.results.result import Result
 from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
 from tests.foundation.test_pages import checked
@@ -68,7 +68,7 @@ def cast(picture: npt.NDArray[Any]) -> float:
 
 def test_the_truth_removes_the_cast_and_a_wrong_estimate_does_not() -> None:
     scene = Wall("wall", np.array([2.0, 1.0, 0.5]))
-    (wrong, right) = developed(scene, [np.array([0.5, 1.0, 2.0]), scene.truth])
+    (wrong, right) = developed_pictures(scene, [np.array([0.5, 1.0, 2.0]), scene.truth])
     raw, by_wrong, by_truth = panels(wrong)
     assert cast(by_truth) < 3 < 40 < cast(raw) < cast(by_wrong)
     assert raw[..., 0].mean() > raw[..., 2].mean()
@@ -77,7 +77,7 @@ def test_the_truth_removes_the_cast_and_a_wrong_estimate_does_not() -> None:
 
 def test_several_lights_are_corrected_by_pixel() -> None:
     scene = MixedWall("mixed", np.array([[3.0, 1, 1], [1, 1, 3]]))
-    (jpeg,) = developed(scene, [scene.truth])
+    (jpeg,) = developed_pictures(scene, [scene.truth])
     _, by_mean, by_pixel = panels(jpeg)
     outer = np.s_[:, [4, -5]]
     assert cast(by_pixel[outer]) < 6
@@ -94,7 +94,7 @@ def test_masked_pixels_are_grey_and_do_not_set_the_exposure(monkeypatch: pytest.
         return image, mask
 
     monkeypatch.setattr(MixedWall, "read", glaring)
-    (jpeg,) = developed(scene, [np.ones(3)])
+    (jpeg,) = developed_pictures(scene, [np.ones(3)])
     raw = panels(jpeg)[0]
     assert raw[:, 5] == pytest.approx(118, abs=8)  # 0.18 in the curve of sRGB.
     assert raw[:, -5].min() > 240
@@ -106,7 +106,7 @@ def test_a_black_image_and_a_light_without_a_channel(value: float) -> None:
         def read(self) -> tuple[npt.NDArray[np.float32], None]:
             return np.full((5, 5, 3), value, np.float32), None
 
-    assert len(developed(Black("black", np.array([1.0, 1, 0])), [np.array([0.0, 1, 1])])) == 1
+    assert len(developed_pictures(Black("black", np.array([1.0, 1, 0])), [np.array([0.0, 1, 1])])) == 1
 
 
 def test_the_98th_percentile_becomes_white_and_what_is_masked_by_half_is_grey() -> None:
@@ -117,7 +117,7 @@ def test_the_98th_percentile_becomes_white_and_what_is_masked_by_half_is_grey() 
             mask[:20] = True
             return np.repeat(image, 3, axis=2) * np.array([2, 1, 0.5], np.float32), mask
 
-    (jpeg,) = developed(Ramp("ramp", np.array([2, 1, 0.5])), [np.array([1, 1, 0.5])])
+    (jpeg,) = developed_pictures(Ramp("ramp", np.array([2, 1, 0.5])), [np.array([1, 1, 0.5])])
     raw, seen, right = panels(jpeg)
     middle = right[100, :, 1]
     # sRGB of half of white is 188 (IEC 61966-2-1); white is reached two hundredths before the end.
@@ -148,7 +148,7 @@ def test_many_methods_and_images_make_a_page_that_closes() -> None:
     results = evaluate(data.scenes, METHODS)
     run = describe_run(data, results, [{"name": "A", "settings": {"p": [1] * 99}}, {"name": "B", "class": "x:Y"}])
     pictures = {
-        (number, place): developed(data.scenes[place], [result.estimates[place]])[0]
+        (number, place): developed_pictures(data.scenes[place], [result.estimates[place]])[0]
         for number, result in enumerate(results)
         for place in sum(chosen_images(result, "recovery"), ())
     }
