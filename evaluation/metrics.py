@@ -172,9 +172,8 @@ def measure_map(
         is_judged = np.isfinite(truth[rows]).all(axis=2)
         if mask is not None:
             is_judged &= ~mask[rows]
-        estimated = (
-            estimate[rows][is_judged] if estimate.ndim == 3 else np.broadcast_to(estimate, (int(is_judged.sum()), 3))
-        )
+        count = int(is_judged.sum())
+        estimated = estimate[rows][is_judged] if estimate.ndim == 3 else np.broadcast_to(estimate, (count, 3))
         estimated, true_colours = estimated.astype(np.float64), truth[rows][is_judged].astype(np.float64)
         judged_count += len(true_colours)
         sums[0] += recovery_error(estimated, true_colours).sum()
@@ -195,7 +194,7 @@ def measure_map(
         for index, (count, recovery, reproduction) in enumerate(region_sums)
         if count
     )
-    return MapError(*(float(part) for part in sums / judged_count), regions=regions)
+    return MapError(*(float(mean) for mean in sums / judged_count), regions=regions)
 
 
 def _row_bands(shape: tuple[int, ...]) -> Iterator[slice]:

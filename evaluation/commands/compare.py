@@ -89,13 +89,11 @@ def _pairs(
 
     run_a, run_b = runs[0], runs[-1]
     if len(runs) == 1:
-        chosen_names = [_method_in_run(run_a, name, locations[0]) for name in names or run_a]
+        chosen_names = [_run_method(run_a, name, locations[0]) for name in names or run_a]
         pairs = list(combinations(dict.fromkeys(chosen_names), 2))
     elif names:
         texts = [(name, name) if name in run_a and name in run_b else name.partition("=")[::2] for name in names]
-        pairs = [
-            (_method_in_run(run_a, a, locations[0]), _method_in_run(run_b, b or a, locations[1])) for a, b in texts
-        ]
+        pairs = [(_run_method(run_a, a, locations[0]), _run_method(run_b, b or a, locations[1])) for a, b in texts]
     elif len(run_a) == len(run_b) == 1:
         pairs = [(next(iter(run_a)), next(iter(run_b)))]
     else:
@@ -107,7 +105,7 @@ def _pairs(
     return [match(run_a[a], run_b[b], (a + suffixes[0], b + suffixes[1]), error) for a, b in dict.fromkeys(pairs)]
 
 
-def _method_in_run(run: Mapping[str, MethodErrors], name: str, location: str) -> str:
+def _run_method(run: Mapping[str, MethodErrors], name: str, location: str) -> str:
     """Return the name of the method in the run; upper and lower case are equal."""
     same_names = [method for method in run if method.lower() in (name.lower(), _table_name(name).lower())]
     if len(same_names) != 1 and name not in run:

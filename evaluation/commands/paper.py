@@ -92,9 +92,7 @@ def table1(
         ),
     ] = "none",
     side: Annotated[int, option("PX", "Longest side of every image.", min=1, max=65535)] = 512,
-    sizes: Annotated[
-        str, option("LIST", "Further image sides, px, separated by commas, to show their influence.")
-    ] = "",
+    sizes: Annotated[str, option("LIST", "Further image sides, px, separated by commas.")] = "",
     error: ErrorOption = "reproduction",
     seed: Annotated[int, option("N", "Seed of all random choices.", min=0)] = 0,
     out: Out = None,
@@ -321,31 +319,22 @@ def _pictures(location: str, matrix: str) -> tuple[Sequence[Source], str, str]:
         layout = None
     if layout is None:
         if colour_matrix is not None:
-            raise InputError(
-                f"--matrix {matrix} is given for {location}, expected a data set of raw images; omit --matrix"
-            )
+            raise InputError(f"--matrix {matrix} needs a data set of raw images, {location} is none; omit --matrix")
         pictures = find_pictures(location)
         return pictures, f"{len(pictures)} of {location}", Path(location).resolve().name
     if layout == "generated":
-        raise InputError(
-            f"{location} was made by generate, expected photographs or real raw images; give another --pictures"
-        )
+        raise InputError(f"{location} was made by generate, expected photographs or real raw images; use those")
     data = open_scenes(location, layout)
     matrix_text = f"with the colour matrix of {colour_matrix.name}" if colour_matrix else "without a colour matrix"
-    return (
-        develop_sources(data, colour_matrix),
-        f"{len(data.scenes)} of {data.name}, developed to sRGB {matrix_text}",
-        data.name,
-    )
+    text = f"{len(data.scenes)} of {data.name}, developed to sRGB {matrix_text}"
+    return develop_sources(data, colour_matrix), text, data.name
 
 
 def _sides(text: str) -> list[int]:
     sides = [side.strip() for side in text.split(",") if side.strip()]
     for side in sides:
         if not side.isdigit() or not 1 <= int(side) <= 65535:
-            raise InputError(
-                f"{side!r} is not a side of an image, expected whole numbers from 1 to 65535 px; correct it"
-            )
+            raise InputError(f"side {side!r} of an image: expected a whole number from 1 to 65535 px; correct it")
     return [int(side) for side in sides]
 
 

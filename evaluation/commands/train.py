@@ -5,15 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from evaluation.commands.options import (
-    Data,
-    Read,
-    argument,
-    choose_learners,
-    image_steps,
-    open_data,
-    thread_option,
-)
+from evaluation.commands.options import Data, Read, argument, choose_learners, image_steps, open_data, thread_option
 from foundation.clock import SystemClock
 from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, option, with_json
@@ -87,9 +79,8 @@ def train(
             fitted = fit_extracted(learner, features, truths, seed)
         else:
             fitted = adapting.adapt(base_model, adapting.learn_alone(learner, features, truths, seed))
-        record = provenance_of(
-            data_set, seed, SystemClock(), adapted_from=base_model.provenance if base_model else None
-        )
+        base_record = base_model.provenance if base_model else None
+        record = provenance_of(data_set, seed, SystemClock(), adapted_from=base_record)
         save_model(out, fitted, record)
     unused = sum(image_features is None for image_features in features)
     notes = [f"{unused} of {count} images have no usable pixel and were left out of the training"] if unused else []

@@ -73,8 +73,7 @@ def transfer(
         option("DATA", "Real images of another camera, relit to the illuminants of each TRAIN, for comparison."),
     ] = None,
     real: Annotated[
-        str | None,
-        option("LIST", "Numbers of real images used for training, separated by commas: 0,20,100,all."),
+        str | None, option("LIST", "Numbers of real images used for training, separated by commas: 0,20,100,all.")
     ] = None,
     seeds: Annotated[int, option("K", "Number of seeds of learners, training images and folds.", min=1)] = 1,
     error: Annotated[AngularError, typer.Option(help="Angular error of the statistics.")] = "reproduction",
@@ -153,9 +152,7 @@ def _parse_counts(real: str | None) -> tuple[int | None, ...]:
     """Return the numbers of --real without 0, whose rows exist in any case; None stands for all."""
     words = [] if real is None else [word.strip().lower() for word in real.split(",")]
     if not all(word == "all" or (word.isascii() and word.isdigit()) for word in words):
-        raise InputError(
-            f"--real is {real!r}, expected numbers of real images or all, separated by commas: 0,20,100,all; correct it"
-        )
+        raise InputError(f"--real is {real!r}, expected numbers of real images, such as 0,20,100,all; correct it")
     return tuple(None if word == "all" else int(word) for word in dict.fromkeys(words) if word != "0")
 
 
@@ -173,9 +170,8 @@ def _possible_counts(
 
 def _common_side(test: Sequence[Scene], plan: TransferPlan) -> tuple[int | None, list[str]]:
     """Return the longest side to which all images are reduced, and a note; None if sizes are similar."""
-    test_side, *training_sides = [
-        _median_side(scenes) for scenes in (test, *(training_set.scenes for training_set in plan.training))
-    ]
+    test_side = _median_side(test)
+    training_sides = [_median_side(training_set.scenes) for training_set in plan.training]
     side = min(test_side, *training_sides)
     if max(test_side, *training_sides) <= _MAX_SIZE_RATIO * side:
         return None, []

@@ -51,12 +51,12 @@ class BoundedFigure(NamedTuple):
     high: float
 
 
-def group_numbers(groups: Sequence[str]) -> Indices:
+def group_ids(groups: Sequence[str]) -> Indices:
     """Return the number of each image's group, (N,) int64 from 0, in the order of first occurrence.
 
     Examples
     --------
-    >>> group_numbers(["cat", "dog", "cat"])
+    >>> group_ids(["cat", "dog", "cat"])
     array([0, 1, 0])
     """
     numbers = {group: number for number, group in enumerate(dict.fromkeys(groups))}
@@ -76,7 +76,7 @@ def bounded_figures(
     images of a group are drawn together; None if every image is its own group. With a single group the ends are NaN,
     because nothing is known about other groups.
     """
-    group_indices = np.arange(images) if groups is None else group_numbers(groups)
+    group_indices = np.arange(images) if groups is None else group_ids(groups)
     group_count = int(group_indices.max()) + 1
 
     def resample_statistics(drawn: Indices, axis: int = -1) -> Floats:
@@ -180,7 +180,7 @@ class ErrorSample:
 
 
 @dataclass(frozen=True)
-class PairedStatistic:
+class PairedFigure:
     """One statistic of two sets of errors.
 
     - `value_a`, `value_b`: the two values, in the unit of the errors.
@@ -201,7 +201,7 @@ def compare_paired(
     seed: int = 0,
     count: int = RESAMPLES,
     groups: Sequence[str] | None = None,
-) -> tuple[PairedStatistic, ...]:
+) -> tuple[PairedFigure, ...]:
     """Return difference and ratio of every statistic for two methods on the same images.
 
     The same images are drawn for both, so that images that are difficult for both do not widen the intervals.
@@ -222,7 +222,7 @@ def compare_paired(
     figures = bounded_figures(statistics, images, groups, seed, count)
     values = zip(STATISTICS, sample_a.estimate().tolist(), sample_b.estimate().tolist(), strict=True)
     return tuple(
-        PairedStatistic(statistic, value_a, value_b, figures[index], figures[index + len(STATISTICS)])
+        PairedFigure(statistic, value_a, value_b, figures[index], figures[index + len(STATISTICS)])
         for index, (statistic, value_a, value_b) in enumerate(values)
     )
 

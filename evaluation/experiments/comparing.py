@@ -25,9 +25,9 @@ from evaluation.experiments.bootstrap import (
     RESAMPLES,
     STATISTICS,
     TIE_DEG,
-    PairedStatistic,
+    PairedFigure,
     compare_paired,
-    group_numbers,
+    group_ids,
 )
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
@@ -88,7 +88,7 @@ class MatchedErrors:
 
     def case_errors(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Return the errors (M,) float64 of both: the mean of each group, or of each image."""
-        numbers = group_numbers(self.groups or self.images)
+        numbers = group_ids(self.groups or self.images)
         sizes = np.bincount(numbers)
         return np.bincount(numbers, self.errors_a) / sizes, np.bincount(numbers, self.errors_b) / sizes
 
@@ -120,7 +120,7 @@ class Comparison:
     matched: MatchedErrors
     test: SignedRank
     p_holm: float
-    statistics: tuple[PairedStatistic, ...]
+    statistics: tuple[PairedFigure, ...]
 
 
 def match(first: MethodErrors, second: MethodErrors, names: tuple[str, str], metric: ErrorKind) -> MatchedErrors:
@@ -174,9 +174,8 @@ def signed_rank(errors_a: npt.ArrayLike, errors_b: npt.ArrayLike) -> SignedRank:
     ranks = stats.rankdata(np.abs(difference))
     win_ranks, loss_ranks = float(ranks[difference < 0].sum()), float(ranks[difference > 0].sum())
     p = float(stats.wilcoxon(difference, zero_method="pratt").pvalue)
-    return SignedRank(
-        wins, losses, len(difference) - wins - losses, p, (loss_ranks - win_ranks) / (loss_ranks + win_ranks)
-    )
+    effect = (loss_ranks - win_ranks) / (loss_ranks + win_ranks)
+    return SignedRank(wins, losses, len(difference) - wins - losses, p, effect)
 
 
 def holm(probabilities: Sequence[float]) -> list[float]:
@@ -300,7 +299,7 @@ def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str]) -> 
     return pages.page(f"Comparison of {comparisons[0].matched.metric} errors", elements)
 
 
-def _interval_cells(pair: PairedStatistic) -> list[Cell]:
+def _interval_cells(pair: PairedFigure) -> list[Cell]:
     # NaN is unknown; the upper end of a ratio may be infinite and stays.
     return [None if np.isnan(number) else number for number in (*pair.difference, *pair.ratio)]
 

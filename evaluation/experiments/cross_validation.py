@@ -153,24 +153,22 @@ def collect_material(
 
 def fit_on(learner: AnyLearner, number: int, material: Material, indices: Indices, seed: int) -> Method:
     """Return the method fitted to the scenes with these indices (P,) int64; `number` is the index of the learner."""
-    features, chosen_indices = material.features[number], [int(index) for index in indices.tolist()]
+    features, chosen = material.features[number], [int(index) for index in indices.tolist()]
     if isinstance(learner, FeatureLearner) and features is not None:
-        return fit_extracted(learner, [features[index] for index in chosen_indices], material.truths[indices], seed)
-    return fit_copy(learner, [material.scenes[index] for index in chosen_indices], seed)
+        return fit_extracted(learner, [features[index] for index in chosen], material.truths[indices], seed)
+    return fit_copy(learner, [material.scenes[index] for index in chosen], seed)
 
 
 def estimate_on(method: Method, number: int, material: Material, indices: Indices) -> list[SceneAnswer]:
     """Return the P answers of a fitted method for the scenes with these indices (P,) int64."""
-    features, chosen_indices = material.features[number], [int(index) for index in indices.tolist()]
+    features, chosen = material.features[number], [int(index) for index in indices.tolist()]
     if not isinstance(method, LearnedMethod) or features is None:
-        return [answer for (answer,) in answer_scenes([material.scenes[index] for index in chosen_indices], [method])]
-    usable = [
-        scene_features for scene_features in (features[index] for index in chosen_indices) if scene_features is not None
-    ]
+        return [answer for (answer,) in answer_scenes([material.scenes[index] for index in chosen], [method])]
+    usable = [item for item in (features[index] for index in chosen) if item is not None]
     lights = iter(method.model.lights(np.stack(usable)) if usable else ())
     return [
-        SceneAnswer(None, NO_PIXEL) if features[index] is None else read_estimate(unit(next(lights)))
-        for index in chosen_indices
+        read_estimate(unit(next(lights))) if features[index] is not None else SceneAnswer(None, NO_PIXEL)
+        for index in chosen
     ]
 
 
@@ -196,9 +194,7 @@ def cross_validate(
     truths_of(scenes)
     fold_count = len(np.unique(folds))
     if not learners or fold_count < 2:
-        raise InputError(
-            f"{len(learners)} methods in {fold_count} folds, expected at least one method and two folds; add some"
-        )
+        raise InputError(f"{len(learners)} methods in {fold_count} folds, expected at least 1 and 2; add some")
     for learner in learners:
         require_installed(learner)
     require_groups_together(scenes, folds)
@@ -248,7 +244,7 @@ class Tuning:
     settings: tuple[FamilySetting, ...]
     images: int
     counted: int
-    kind: ErrorKind | None
+    metric: ErrorKind | None
 
 
 def family_settings(family: str) -> tuple[tuple[str, Method], ...]:
@@ -268,7 +264,7 @@ def tune_family(
     family: str,
     data: str,
     scenes: Sequence[Scene],
-    kind: ErrorKind | None = None,
+    metric: ErrorKind | None = None,
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> Tuning:
@@ -279,22 +275,22 @@ def tune_family(
     texts, methods = zip(*family_settings(family), strict=True)
     tuned = tune(methods, scenes, on_scene, workers)
     errors: list[Summary | None] = [None] * len(methods)
-    if kind is not None:
+    if metric is not None:
         truths = require_truths(scenes, methods)[tuned.counted]
-        measure = recovery_error if kind == "recovery" else reproduction_error
+        measure = recovery_error if metric == "recovery" else reproduction_error
         errors = [summarise(measure(tuned.lights[:, index], truths)) for index in range(len(methods))]
     settings = [
         FamilySetting(text, method.name, spread, error)
         for text, method, spread, error in zip(texts, methods, tuned.spreads, errors, strict=True)
     ]
     ordered = tuple(sorted(settings, key=lambda setting: setting.spread))
-    return Tuning(family, data, ordered, len(scenes), len(tuned.lights), kind)
+    return Tuning(family, data, ordered, len(scenes), len(tuned.lights), metric)
 
 
 def tuning_table(tuning: Tuning) -> Table:
     """Return the table of settings: spreads × 1000, errors in degrees."""
-    error_columns = PAPER_COLUMNS[1:] if tuning.kind else ()
-    errors_text = f"; {tuning.kind} angular error, degrees" if tuning.kind else ""
+    error_columns = PAPER_COLUMNS[1:] if tuning.metric else ()
+    errors_text = f"; {tuning.metric} angular error, degrees" if tuning.metric else ""
     notes: list[str] = []
     if tuning.counted < tuning.images:
         notes.append(

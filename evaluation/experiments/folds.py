@@ -46,9 +46,7 @@ def choose_folds(data: SceneSet, text: str | None = None, seed: int = 0) -> tupl
         return np.asarray(data.folds, dtype=np.int64), "the data set's own"
     if text is not None and not re.fullmatch(r"[+-]?\d+", text):
         if is_number(text) or not (Path(text).suffix or Path(text).is_file()):
-            raise InputError(
-                f"--folds is {text!r}, expected a number from 2, or a CSV file with image,fold; correct it"
-            )
+            raise InputError(f"--folds is {text!r}, expected a number ≥ 2 or a CSV file with image,fold; correct it")
         return read_folds(Path(text), [scene.name for scene in data.scenes]), f"from {text}"
     groups = groups_of(data.scenes)
     origin = f"drawn by seed {seed}"
@@ -117,15 +115,9 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     repeated = [image for image, count in Counter(row["image"] for row in rows).items() if count > 1]
     missing = [name for name in names if not fold_texts.get(name)]
     unknown = sorted(set(fold_texts) - set(names))
-    for images, problem in (
-        (repeated, "in more than one line"),
-        (missing, "without a fold"),
-        (unknown, "that the data set does not contain"),
-    ):
+    for images, problem in ((repeated, "twice"), (missing, "without a fold"), (unknown, "not in the data set")):
         if images:
-            raise FormatError(
-                f"{path} has images {problem}: {first_of(images)}; expected each image of the data set once; correct it"
-            )
+            raise FormatError(f"{path} has images {problem}: {first_of(images)}; expected each once; correct it")
     fold_names, folds = np.unique([fold_texts[name] for name in names], return_inverse=True)
     if len(fold_names) < _MIN_FOLDS:
         raise FormatError(f"{path} has only the fold {first_of(list(fold_names))}; expected at least two; correct it")

@@ -54,11 +54,11 @@ def run_methods(
 
 
 def write_run(
-    run: Run, scenes: Sequence[Scene], folder: Path, kind: ErrorKind = "reproduction", workers: int = 1
+    run: Run, scenes: Sequence[Scene], folder: Path, metric: ErrorKind = "reproduction", workers: int = 1
 ) -> None:
     """Write results to a new results folder."""
     with whole_folder(folder, "the results") as partial:
-        for name, text in _files(run, kind, _pictures(run, scenes, kind, workers)).items():
+        for name, text in _files(run, metric, _pictures(run, scenes, metric, workers)).items():
             write_whole(partial / name, text)
 
 
@@ -110,9 +110,9 @@ def _training_note(name: str, record: TrainingRecord, data: SceneSet, sha256: st
     )
 
 
-def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> dict[str, str]:
+def _files(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> dict[str, str]:
     subject, results = run.subject, run.results
-    tables = [summary_table(subject, results, kind), *lights_tables(subject, results, kind)]
+    tables = [summary_table(subject, results, metric), *lights_tables(subject, results, metric)]
     pixels, regions = several_lights_csv(subject.images, results)
     content = {
         "data_set": {
@@ -137,7 +137,7 @@ def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes])
         "results.csv": table_to_csv(statistics_rows(subject, results)),
         ERRORS_FILE: errors_csv(subject.images, run.truths, results, subject.groups),
         "table.tex": "\n".join(map(table_to_latex, tables)),
-        "report.html": run_page(run, kind, pictures),
+        "report.html": run_page(run, metric, pictures),
     }
     if any(result.maps is not None for result in results):
         texts |= {"pixels.csv": pixels, "regions.csv": regions}
@@ -146,22 +146,20 @@ def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes])
     return texts
 
 
-def _pictures(run: Run, scenes: Sequence[Scene], kind: ErrorKind, workers: int) -> dict[tuple[int, int], bytes]:
+def _pictures(run: Run, scenes: Sequence[Scene], metric: ErrorKind, workers: int) -> dict[tuple[int, int], bytes]:
     # Each image is read once for all methods.
     methods_by_image: dict[int, list[int]] = {}
-    for method_index, result in enumerate(run.results[:MAX_METHODS]):
-        for image_index in sum(chosen_images(result, kind), ()):
-            methods_by_image.setdefault(image_index, []).append(method_index)
+    for number, result in enumerate(run.results[:MAX_METHODS]):
+        for image in sum(chosen_images(result, metric), ()):
+            methods_by_image.setdefault(image, []).append(number)
 
-    def develop(image_index: int) -> list[bytes]:
-        return developed_pictures(
-            scenes[image_index],
-            [run.results[method_index].estimates[image_index] for method_index in methods_by_image[image_index]],
-        )
+    def develop(image: int) -> list[bytes]:
+        estimates = [run.results[number].estimates[image] for number in methods_by_image[image]]
+        return developed_pictures(scenes[image], estimates)
 
     files = ordered_map(develop, methods_by_image, workers)
     return {
-        (method_index, image_index): file
-        for (image_index, method_indices), image_files in zip(methods_by_image.items(), files, strict=True)
-        for method_index, file in zip(method_indices, image_files, strict=True)
+        (number, image): file
+        for (image, method_indices), image_files in zip(methods_by_image.items(), files, strict=True)
+        for number, file in zip(method_indices, image_files, strict=True)
     }

@@ -105,9 +105,7 @@ class _MethodCall:
         if self.lock is None:
             return function(*arguments)
         with self.lock:
-            return function(
-                *(argument.copy() if isinstance(argument, np.ndarray) else argument for argument in arguments)
-            )
+            return function(*(item.copy() if isinstance(item, np.ndarray) else item for item in arguments))
 
 
 def _answer(scene: Scene, calls: Sequence[_MethodCall], needs_no_image: bool) -> tuple[SceneAnswer, ...]:
@@ -117,32 +115,28 @@ def _answer(scene: Scene, calls: Sequence[_MethodCall], needs_no_image: bool) ->
     truth = (scene.read_truth_map(), scene.read_weights()) if isinstance(scene, MixedScene) else None
     prepared = None if image is None else PreparedImage(image, scene.saturation, mask)
     answers: list[SceneAnswer] = []
-    for method_call in calls:
-        method = method_call.method
+    for runner in calls:
+        method = runner.method
         try:
             if isinstance(method, SceneMethod):
-                answer = read_estimate(method_call.call(method.estimate_scene, scene))
-            elif method_call.lock is None and prepared is not None and isinstance(method, PreparedMethod):
+                answer = read_estimate(runner.call(method.estimate_scene, scene))
+            elif runner.lock is None and prepared is not None and isinstance(method, PreparedMethod):
                 answer = read_estimate(method.estimate_prepared(prepared))
             else:
-                answer = read_estimate(method_call.call(method.estimate, image, scene.saturation, mask))
-            estimate_map = None
+                answer = read_estimate(runner.call(method.estimate, image, scene.saturation, mask))
+            local_map = None
             if is_mixed and isinstance(method, LocalMethod):
-                estimate_map, cause = _checked_map(
-                    method_call.call(method.estimate_map, image, scene.saturation, mask), image
-                )
+                local_map, cause = _checked_map(runner.call(method.estimate_map, image, scene.saturation, mask), image)
                 answer = SceneAnswer(answer.light, answer.cause or cause)
         except CropError:
             raise
         except (Exception, SystemExit) as error:
-            if method_call.lock is None:
+            if runner.lock is None:
                 error.add_note(f"method {method.name}, image {scene.name}")
                 raise
             raise InputError(f"{method.name} failed on {scene.name}: {_reason(error)}; {_remedy(method)}") from error
         if truth is not None and isinstance(scene, MixedScene) and image is not None:
-            answer = SceneAnswer(
-                answer.light, answer.cause, _map_error(scene, answer, estimate_map, truth, image, mask)
-            )
+            answer = SceneAnswer(answer.light, answer.cause, _map_error(scene, answer, local_map, truth, image, mask))
         answers.append(answer)
     return tuple(answers)
 
@@ -177,19 +171,16 @@ def fit_copy(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
 
 def _checked_map(returned_value: object, image: Any) -> tuple[npt.NDArray[np.floating[Any]], str]:
     """Return the estimates by pixel (H, W, 3) float with grey for missing ones, and a text that counts these."""
-    estimate_map = np.asarray(returned_value)
-    if estimate_map.shape != image.shape or not np.issubdtype(estimate_map.dtype, np.floating):
+    lights = np.asarray(returned_value)
+    if lights.shape != image.shape or not np.issubdtype(lights.dtype, np.floating):
         raise ValueError(
-            f"estimate_map returned {estimate_map.dtype} of shape {estimate_map.shape}, expected floats "
-            f"{tuple(image.shape)}"
+            f"estimate_map returned {lights.dtype} of shape {lights.shape}, expected floats {tuple(image.shape)}"
         )
-    is_missing = np.asarray(
-        ~(np.isfinite(estimate_map).all(axis=2) & (estimate_map >= 0).all(axis=2) & estimate_map.any(axis=2))
-    )
+    is_missing = np.asarray(~(np.isfinite(lights).all(axis=2) & (lights >= 0).all(axis=2) & lights.any(axis=2)))
     if not is_missing.any():
-        return estimate_map, ""
+        return lights, ""
     note = f"no estimate in {int(is_missing.sum())} of {is_missing.size} pixels of its map"
-    return np.where(is_missing[..., None], GREY, estimate_map), note
+    return np.where(is_missing[..., None], GREY, lights), note
 
 
 def _map_error(

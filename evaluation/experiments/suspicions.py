@@ -80,9 +80,8 @@ def _other_readings(images: Sequence[str]) -> dict[str, Callable[[_Lights], _Lig
 
 def _note(reading: str, cases: Sequence[tuple[str, float, float]], method_count: int) -> str:
     method, other_deg, median_deg = min(cases, key=lambda case: case[1])
-    start = (
-        f"{method}: {reading} its median recovery error would be {other_deg:.2f} instead of {median_deg:.2f} degrees"
-    )
+    numbers = f"{other_deg:.2f} instead of {median_deg:.2f} degrees"
+    start = f"{method}: {reading} its median recovery error would be {numbers}"
     if len(cases) > 1:
         return f"{start}; {len(cases) - 1} more of {method_count} methods improve too; check images and ground truths"
     return f"{start}; check how its estimates, or the ground truths, are written"

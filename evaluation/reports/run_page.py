@@ -259,11 +259,7 @@ def run_page(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], byt
 def _left_out(results: Sequence[Result]) -> str:
     # Methods after the first `MAX_METHODS` have no images.
     names = [result.method for result in results[MAX_METHODS:]]
-    return (
-        f" Only the first {MAX_METHODS} of {len(results)} methods are shown, without {', '.join(names)}."
-        if names
-        else ""
-    )
+    return f" Only {MAX_METHODS} of {len(results)} methods are shown, without {', '.join(names)}." if names else ""
 
 
 def _images(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> list[Markup]:

@@ -71,9 +71,7 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
             "evaluate run writes them; run the methods again"
         )
     if len(set(columns)) < len(columns):
-        raise FormatError(
-            f"{path} has the columns {', '.join(columns)}; expected each name once; rename or remove the others"
-        )
+        raise FormatError(f"{path} has the columns {', '.join(columns)}; expected each once; remove the others")
     lines_by_method: dict[str, dict[str, _Line]] = {}
     for row in rows:
         line_name = f"{path}, line {rows.line_num}"
@@ -89,9 +87,7 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
             raise FormatError(f"{line_name}: guessed is {row['guessed']!r}, expected 0 or 1; correct it")
         images = lines_by_method.setdefault(row["method"] or "", {})
         if row["image"] in images:
-            raise FormatError(
-                f"{line_name} has {row['method']} on {row['image']} again, expected each once; remove one line"
-            )
+            raise FormatError(f"{line_name} has {row['method']} on {row['image']} again, expected once; remove it")
         images[row["image"]] = numbers, row["guessed"] == "1", row.get("group") or ""
     if not lines_by_method:
         raise FormatError(f"{path} has no errors, expected a line for each image and method; run the methods again")
@@ -108,7 +104,7 @@ def _method_errors(method: str, images: Mapping[str, _Line]) -> MethodErrors:
         method=method,
         images=tuple(images),
         truths=numbers[:, 2:],
-        errors={kind: numbers[:, column_index] for column_index, kind in enumerate(_ERROR_KINDS)},
+        errors={metric: numbers[:, column] for column, metric in enumerate(_ERROR_KINDS)},
         guessed=np.array([line[1] for line in images.values()]),
         groups=groups if all(groups) else None,
     )
@@ -150,7 +146,7 @@ def errors_csv(
     for index, image in enumerate(images):
         for result, estimates in zip(results, estimate_shares, strict=True):
             numbers = (*estimates[index], *shares[index])
-            errors = (result.errors[kind][index] for kind in _ERROR_KINDS)
+            errors = (result.errors[metric][index] for metric in _ERROR_KINDS)
             cause = (result.causes or {}).get(index, "")
             rows.append(
                 (
@@ -193,6 +189,7 @@ def _degrees(error: float) -> str:
 
 
 _ESTIMATES_COLUMNS = ("image", *_ESTIMATE_COLUMNS)
+_ESTIMATES_TEXT = ",".join(_ESTIMATES_COLUMNS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +214,7 @@ class GivenEstimates:
 
 def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -> GivenEstimates:
     """Return the estimates of a file for the images of a data set; every image needs exactly one line."""
-    text = read_text(path, f"name a CSV file of estimates, {','.join(_ESTIMATES_COLUMNS)}")
+    text = read_text(path, f"name a CSV file of estimates, {_ESTIMATES_TEXT}")
     by_stem = _by_stem(images)
     image_names = set(images)
     lights: dict[str, npt.NDArray[np.float64]] = {}
@@ -243,9 +240,7 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
         if faulty_images
     ]
     if faults:
-        raise InputError(
-            f"{path}: {'; '.join(faults)}; expected one line for each of {counted(len(images), 'image')}; correct it"
-        )
+        raise InputError(f"{path}: {'; '.join(faults)}; expected one line for each image; correct it")
     return GivenEstimates(path.stem if name is None else name, path.name, file_sha256(path), lights)
 
 
@@ -267,13 +262,11 @@ def _parse_estimates(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.fl
     try:
         heads, *rows = list(csv.reader(lines, delimiter=separator, strict=True)) or [[]]
     except csv.Error as error:
-        raise FormatError(
-            f"{path} is not CSV text: {error}; expected {','.join(_ESTIMATES_COLUMNS)}; correct it"
-        ) from error
+        raise FormatError(f"{path} is not CSV text: {error}; expected {_ESTIMATES_TEXT}; correct it") from error
     heads = [head.strip().lower() for head in heads]
     if any(heads.count(column) != 1 for column in _ESTIMATES_COLUMNS):
         raise FormatError(
-            f"{path} begins with {separator.join(heads)[:60]!r}; expected {','.join(_ESTIMATES_COLUMNS)}, each once; "
+            f"{path} begins with {separator.join(heads)[:60]!r}; expected {_ESTIMATES_TEXT}, each once; "
             "correct its first line"
         )
     column_indices = [heads.index(column) for column in _ESTIMATES_COLUMNS]
@@ -287,7 +280,6 @@ def _parse_estimates(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.fl
             image, *light = (row[field_index].strip() for field_index in column_indices)
             estimates.append((image, np.array([float(channel) for channel in light])))
         except ValueError as error:
-            raise FormatError(
-                f"{path}, line {line_number}: {error}; expected a name and three numbers; correct it"
-            ) from error
+            line = f"{path}, line {line_number}"
+            raise FormatError(f"{line}: {error}; expected a name and three numbers; correct it") from error
     return estimates

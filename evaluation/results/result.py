@@ -51,7 +51,7 @@ class Result:
         return Result(
             self.method,
             self.estimates[indices],
-            {kind: errors[indices] for kind, errors in self.errors.items()},
+            {metric: errors[indices] for metric, errors in self.errors.items()},
             self.guessed[indices],
             None if causes is None else {new: causes[old] for new, old in enumerate(indices.tolist()) if old in causes},
         )
@@ -68,9 +68,9 @@ class Result:
         missing = int(self.guessed.sum())
         return f"{self.method} (no light: {missing} of {len(self.guessed)})" if missing else self.method
 
-    def summary(self, kind: ErrorKind) -> Summary:
+    def summary(self, metric: ErrorKind) -> Summary:
         """Return the statistics of one kind of error."""
-        return summarise(self.errors[kind])
+        return summarise(self.errors[metric])
 
 
 # Cause if a method of this suite returned no illuminant: the image is too small, clipped, black or uniform.
@@ -134,18 +134,16 @@ def collect_results(
     """Return one result for each method; `truths`: (N, 3) float64, ground truths of the scenes."""
     results: list[Result] = []
     for method_index, method in enumerate(methods):
-        method_answers = [scene_answers[method_index] for scene_answers in answers]
-        estimates = np.array(
-            [GREY if answer.light is None else answer.light for answer in method_answers], dtype=np.float64
-        )
+        answered = [scene_answers[method_index] for scene_answers in answers]
+        estimates = np.array([GREY if answer.light is None else answer.light for answer in answered], dtype=np.float64)
         results.append(
             Result(
                 method,
                 estimates,
                 {"recovery": recovery_error(estimates, truths), "reproduction": reproduction_error(estimates, truths)},
-                np.array([answer.light is None for answer in method_answers]),
-                {index: answer.cause for index, answer in enumerate(method_answers) if answer.cause},
-                {index: answer.by_pixel for index, answer in enumerate(method_answers) if answer.by_pixel} or None,
+                np.array([answer.light is None for answer in answered]),
+                {index: answer.cause for index, answer in enumerate(answered) if answer.cause},
+                {index: answer.by_pixel for index, answer in enumerate(answered) if answer.by_pixel} or None,
             )
         )
     return tuple(results)

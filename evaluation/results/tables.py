@@ -112,7 +112,7 @@ _NO_PIXEL_CAUSES = "too small for it, clipped, black or uniform"  # Reasons for 
 _NAMED_IMAGES = 3  # Images named in a note; errors.csv lists all
 
 
-def summary_table(subject: Subject, results: Sequence[Result], kind: ErrorKind, with_further: bool = False) -> Table:
+def summary_table(subject: Subject, results: Sequence[Result], metric: ErrorKind, with_further: bool = False) -> Table:
     """Return the table of the paper for one kind of error, with notes on images without an estimate.
 
     `with_further`: adds the 95th percentile, the maximum and the percentage below 3 degrees.
@@ -122,14 +122,14 @@ def summary_table(subject: Subject, results: Sequence[Result], kind: ErrorKind, 
     if mixed_count == len(subject.images):
         mixed_text = " under several illuminants, compared with their mean"
     return Table(
-        f"{subject.name}: {kind} angular error of {len(subject.images)} images{mixed_text}, degrees",
+        f"{subject.name}: {metric} angular error of {len(subject.images)} images{mixed_text}, degrees",
         (*PAPER_COLUMNS, *(FURTHER_COLUMNS if with_further else ())),
-        tuple((result.marked_name, *_statistics(result.errors[kind], with_further)) for result in results),
+        tuple((result.marked_name, *_statistics(result.errors[metric], with_further)) for result in results),
         notes=tuple(note for result in results for note in _notes(subject, result)),
     )
 
 
-def lights_tables(subject: Subject, results: Sequence[Result], kind: ErrorKind) -> tuple[Table, ...]:
+def lights_tables(subject: Subject, results: Sequence[Result], metric: ErrorKind) -> tuple[Table, ...]:
     """Return additional tables for images under several illuminants; none if there are no such images.
 
     The first table has the errors by pixel, by region and against the mean illuminant. The second has the statistics of
@@ -140,9 +140,11 @@ def lights_tables(subject: Subject, results: Sequence[Result], kind: ErrorKind) 
         return ()
     tables = [_mixed_table(subject, results)]
     if single.any():
-        title = f"{subject.name}: {kind} angular error of the {int(single.sum())} images under one illuminant, degrees"
+        title = (
+            f"{subject.name}: {metric} angular error of the {int(single.sum())} images under one illuminant, degrees"
+        )
         single_results = [result.at(np.flatnonzero(single)) for result in results]
-        rows = tuple((result.marked_name, *_statistics(result.errors[kind], False)) for result in single_results)
+        rows = tuple((result.marked_name, *_statistics(result.errors[metric], False)) for result in single_results)
         tables.append(Table(title, PAPER_COLUMNS, rows))
     return tuple(tables)
 
@@ -162,9 +164,9 @@ def statistics_rows(subject: Subject, results: Sequence[Result]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for result in results:
         for lights, in_subset in subsets:
-            for kind in kinds:
+            for metric in kinds:
                 missing = int(result.guessed[in_subset].sum())
-                rows.append(_row(result.method, kind, lights, result.errors[kind][in_subset], missing))
+                rows.append(_row(result.method, metric, lights, result.errors[metric][in_subset], missing))
         if result.maps is not None:
             missing = int(result.guessed[mixed].sum())
             errors_by_kind = _map_errors(result.maps).items()

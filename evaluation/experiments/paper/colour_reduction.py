@@ -136,14 +136,14 @@ def remove_bits(
     return BitsResult(raw, dict(zip(bits, reduced, strict=True)))
 
 
-def bits_table(bits_result: BitsResult, kind: ErrorKind, name: str) -> Table:
+def bits_table(bits_result: BitsResult, metric: ErrorKind, name: str) -> Table:
     """Return the six statistics of every method for the unchanged images and each number of bits."""
     versions = {"as it is": bits_result.raw, **{str(count): results for count, results in bits_result.reduced.items()}}
     return Table(
-        f"{name}: {kind} angular error after bits of the codes made by Flash were set to zero, degrees",
+        f"{name}: {metric} angular error after bits of the codes made by Flash were set to zero, degrees",
         ("Algorithm", "Bits set to zero", *PAPER_COLUMNS[1:]),
         tuple(
-            (results[index].method, label, *results[index].summary(kind).as_tuple())
+            (results[index].method, label, *results[index].summary(metric).as_tuple())
             for index in range(len(bits_result.raw))
             for label, results in versions.items()
         ),

@@ -118,11 +118,9 @@ def lights_like(lut: Lut, truths: npt.NDArray[np.float64], count: int) -> Chosen
     """
     matches = nearest_lights(lut, truths).matches
     numbers = tuple(matches[image % len(matches)].mixture.lights[0] for image in range(count))
-    used_matches = matches[:count]
-    angles = np.array([match.angle for match in used_matches])
-    truths_text = (
-        f"the first {len(used_matches)} of {len(truths)}" if len(used_matches) < len(truths) else f"{len(truths)}"
-    )
+    used = matches[:count]
+    angles = np.array([match.angle for match in used])
+    truths_text = f"the first {len(used)} of {len(truths)}" if len(used) < len(truths) else f"{len(truths)}"
     return ChosenLights(
         numbers,
         f"nearest by angle to {truths_text} ground truths, {len(set(numbers))} different illuminants; median angle "
@@ -142,13 +140,9 @@ def lights_at_random(lut: Lut, count: int, seed: int) -> ChosenLights:
 def render_scenes(lut: Lut, sources: Sequence[Source], lights: ChosenLights, seed: int) -> tuple[RenderedScene, ...]:
     """Return the scenes of the pictures under the chosen illuminants."""
     if len(sources) != len(lights.numbers):
-        raise InputError(
-            f"{len(sources)} pictures have {len(lights.numbers)} illuminants, expected the same number; choose one each"
-        )
-    source_lights = zip(sources, lights.numbers, strict=True)
-    return tuple(
-        RenderedScene(lut, source, light, number, seed) for number, (source, light) in enumerate(source_lights)
-    )
+        raise InputError(f"{len(sources)} pictures have {len(lights.numbers)} illuminants; choose one for each")
+    pairs = zip(sources, lights.numbers, strict=True)
+    return tuple(RenderedScene(lut, source, light, number, seed) for number, (source, light) in enumerate(pairs))
 
 
 WHITE_PERCENTILE: Final = 99.0  # Percentile that becomes white, as in dcraw ("99th-percentile white point")
@@ -184,9 +178,7 @@ def develop_image(
            [255, 255, 255]], dtype=uint8)
     """
     if not (np.isfinite(light).all() and light.min() > 0):
-        raise InputError(
-            f"the illuminant {light.tolist()} cannot be balanced, expected three numbers above 0; correct it"
-        )
+        raise InputError(f"the illuminant is {light.tolist()}, expected three numbers above 0; correct it")
     # Balanced with green unchanged, and cut where the first channel clips, so that clipped skies become white and not
     # pink (dcraw -H 0). Thumbnails do not record clipping; a few of theirs stay pink.
     linear: npt.NDArray[np.float64] = np.asarray(image, dtype=np.float64) * (light[1] / light)
@@ -264,8 +256,7 @@ def read_truths(location: str) -> Truths:
         return Truths(Path(file).stem, lights, tuple(names) if len(names) == len(lights) else ())
     if len(names) != len(lights):
         raise FormatError(
-            f"{file} has {len(lights)} ground truths and {len(names)} names, expected the same number to select "
-            f"{prefix!r}; correct it"
+            f"{file} has {len(lights)} ground truths, {len(names)} names, expected equal numbers; correct it"
         )
     is_chosen = np.array([name.startswith(prefix) for name in names])
     if not is_chosen.any():

@@ -96,17 +96,17 @@ _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 _DOT_WIDTH: Final = 0.004
 
 
-def _draw_bits(figure: Any, bits_result: BitsResult, kind: ErrorKind) -> None:
+def _draw_bits(figure: Any, bits_result: BitsResult, metric: ErrorKind) -> None:
     # The paper's figure: median of each method against the number of bits; unchanged images as a dotted line.
     axes = figure.add_subplot()
     counts = list(bits_result.reduced)
     for index, raw in enumerate(bits_result.raw):
         style = series_style(index)
-        medians = [results[index].summary(kind).median for results in bits_result.reduced.values()]
+        medians = [results[index].summary(metric).median for results in bits_result.reduced.values()]
         axes.plot(counts, medians, marker=_MARKERS[index % len(_MARKERS)], label=legend_label(raw.method), **style)
-        axes.axhline(raw.summary(kind).median, color=style["color"], linewidth=0.8, linestyle=":")
+        axes.axhline(raw.summary(metric).median, color=style["color"], linewidth=0.8, linestyle=":")
     axes.set_xlabel("bits of each sRGB code set to zero (dotted: unchanged linear images)")
-    axes.set_ylabel(f"median {kind} error, degrees")
+    axes.set_ylabel(f"median {metric} error, degrees")
     axes.set_xticks(counts)
     axes.set_ylim(bottom=0)
     axes.legend()
@@ -171,7 +171,7 @@ def _draw_chromaticities(figure: Any, luts: Sequence[Lut], sets: Mapping[str, np
 
 
 _TABLE1_CAPTION = (
-    "Performance of White-Patch, Gray-world and Shades-of-Gray on eight generated data sets, {kind} error in degrees"
+    "Performance of White-Patch, Gray-world and Shades-of-Gray on eight generated data sets, {metric} error in degrees"
 )
 
 
@@ -207,25 +207,25 @@ def table1_report(
     blocks: Sequence[Block],
     luts: Sequence[Lut],
     conditions: Sequence[str],
-    kind: ErrorKind,
+    metric: ErrorKind,
     sizes: Sequence[SizeRow] = (),
 ) -> PaperReport:
-    """Return the report of table 1 with both kinds of error, `kind` first; `sizes` may be empty."""
-    other_kind: ErrorKind = "recovery" if kind == "reproduction" else "reproduction"
-    tables_first, tables_other = (
-        [block_table(block, error_kind) for block in blocks] for error_kind in (kind, other_kind)
-    )
+    """Return the report of table 1 with both kinds of error, `metric` first; `sizes` may be empty."""
+    other_metric: ErrorKind = "recovery" if metric == "reproduction" else "reproduction"
+    tables_first, tables_other = ([block_table(block, name) for block in blocks] for name in (metric, other_metric))
     noise, print_colours = noise_table(luts), print_table(luts)
     files = {
         "table1.csv": table_to_csv(joint_table(blocks)).encode(),
-        "table1.tex": tables_to_latex(_TABLE1_CAPTION.format(kind=kind), tables_first).encode(),
-        f"table1_{other_kind}.tex": tables_to_latex(_TABLE1_CAPTION.format(kind=other_kind), tables_other).encode(),
+        "table1.tex": tables_to_latex(_TABLE1_CAPTION.format(metric=metric), tables_first).encode(),
+        f"table1_{other_metric}.tex": tables_to_latex(
+            _TABLE1_CAPTION.format(metric=other_metric), tables_other
+        ).encode(),
         "noise.csv": table_to_csv(noise).encode(),
         "print.csv": table_to_csv(print_colours).encode(),
     }
     elements = [
         *map(pages.paragraph, conditions),
-        pages.heading(f"{kind.capitalize()} error, degrees"),
+        pages.heading(f"{metric.capitalize()} error, degrees"),
         *map(table_part, tables_first),
     ]
     tables = [*tables_first, noise, print_colours]
@@ -239,7 +239,7 @@ def table1_report(
         )
         elements += [pages.heading("Images of other sizes"), pages.figure(size_plot, caption), table_part(table)]
     elements += [pages.heading("The tables"), table_part(noise), table_part(print_colours)]
-    elements += [pages.heading(f"{other_kind.capitalize()} error, degrees"), *map(table_part, tables_other)]
+    elements += [pages.heading(f"{other_metric.capitalize()} error, degrees"), *map(table_part, tables_other)]
     return PaperReport("Table 1: plain methods on generated data sets", tuple(tables), tuple(elements), files)
 
 
@@ -259,9 +259,9 @@ def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperRe
     return PaperReport("Table 2: trained on real and on generated images", tuple(tables), elements, files)
 
 
-def bits_report(bits_result: BitsResult, kind: ErrorKind, name: str, conditions: Sequence[str]) -> PaperReport:
+def bits_report(bits_result: BitsResult, metric: ErrorKind, name: str, conditions: Sequence[str]) -> PaperReport:
     """Return the report of colour reduction on the data set with this name."""
-    plot, table = svg_of(_draw_bits, bits_result, kind, inches=(6.4, 3.8)), bits_table(bits_result, kind, name)
+    plot, table = svg_of(_draw_bits, bits_result, metric, inches=(6.4, 3.8)), bits_table(bits_result, metric, name)
     caption = "Medians against the number of bits of each sRGB code set to zero; dotted: unchanged linear images."
     files = {"bits.svg": standalone(plot), **_table_files("bits", table)}
     elements = (*map(pages.paragraph, conditions), pages.figure(plot, caption), table_part(table))

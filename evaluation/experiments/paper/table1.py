@@ -161,10 +161,8 @@ def settings(
                 "Random": lights_at_random(lut, count, seed),
             }
             blocks += [
-                Block(
-                    (scenes, sensor_of(lut), lights), render_scenes(lut, sources, block_lights, seed), block_lights.how
-                )
-                for lights, block_lights in choices.items()
+                Block((scenes, sensor_of(lut), lights), render_scenes(lut, sources, choice, seed), choice.how)
+                for lights, choice in choices.items()
             ]
     return tuple(blocks)
 
@@ -199,12 +197,12 @@ def block_title(cell: Cell) -> str:
     return f"{scenes[0].upper()}{scenes[1:]} scenes, {sensor} sensor, {lights} illuminations"
 
 
-def block_table(block: Block, kind: ErrorKind) -> Table:
+def block_table(block: Block, metric: ErrorKind) -> Table:
     """Return the table of one data set: statistics of each method, followed by the published ones if there are any."""
     published = TABLE1.get(block.cell, {})
     rows: list[tuple[str | float | None, ...]] = []
     for result in block.results:
-        rows.append((result.marked_name, *result.summary(kind).as_tuple()))
+        rows.append((result.marked_name, *result.summary(metric).as_tuple()))
         if result.method in published:
             rows.append(("paper", *published[result.method].as_tuple()))
     notes = [f"{counted(len(block.scenes), 'image')}; lights {block.lights}."]
@@ -225,7 +223,7 @@ def joint_table(blocks: Sequence[Block]) -> Table:
         published = TABLE1.get(block.cell, {})
         for result in block.results:
             row_start = (*block.cell, len(block.scenes), result.method)
-            statistics = {str(kind): result.summary(kind).as_tuple() for kind in kinds}
+            statistics = {str(metric): result.summary(metric).as_tuple() for metric in kinds}
             if result.method in published:
                 statistics["paper"] = published[result.method].as_tuple()
             rows += [(*row_start, name, *numbers) for name, numbers in statistics.items()]
@@ -309,14 +307,12 @@ def table2(
     cross_validated = cross_validate(real, learner_list, folds, seed, workers, on_scene)
     fitted = [fit_copy(learner, generated, seed) for learner in learner_list]
     transferred = evaluate(real, fitted, workers, on_scene)
-    return tuple(
-        TrainingComparison(name, *results)
-        for name, *results in zip(learners, cross_validated, transferred, strict=True)
-    )
+    pairs = zip(learners, cross_validated, transferred, strict=True)
+    return tuple(TrainingComparison(*pair) for pair in pairs)
 
 
 def table2_tables(
-    comparisons: Sequence[TrainingComparison], kind: ErrorKind, name: str, with_published: bool = True
+    comparisons: Sequence[TrainingComparison], metric: ErrorKind, name: str, with_published: bool = True
 ) -> list[Table]:
     """Return the two halves of table 2, and the ratios of their medians."""
     titles: Mapping[str, str] = {
@@ -329,25 +325,21 @@ def table2_tables(
         published = TABLE2["real" if training == "real" else "generated"]
         for trained in comparisons:
             result = trained.real if training == "real" else trained.generated
-            rows.append((result.marked_name, *result.summary(kind).as_tuple()))
+            rows.append((result.marked_name, *result.summary(metric).as_tuple()))
             published_row = published.get(LEARNERS.get(trained.learner, ""))
             if published_row and with_published:
                 rows.append(("paper", *published_row.as_tuple()))
         tables.append(Table(title, PAPER_COLUMNS, tuple(rows)))
-    return [*tables, _ratio_table(comparisons, kind, name)]
+    return [*tables, _ratio_table(comparisons, metric, name)]
 
 
-def _ratio_table(comparisons: Sequence[TrainingComparison], kind: ErrorKind, name: str) -> Table:
+def _ratio_table(comparisons: Sequence[TrainingComparison], metric: ErrorKind, name: str) -> Table:
     rows: list[tuple[str | float | None, ...]] = []
     for trained in comparisons:
-        ratio = trained.generated.summary(kind).median / trained.real.summary(kind).median
-        published_name = LEARNERS.get(trained.learner)
-        published_ratio = (
-            TABLE2["generated"][published_name].median / TABLE2["real"][published_name].median
-            if published_name
-            else None
-        )
-        rows.append((trained.real.method, ratio, published_ratio))
+        ratio = trained.generated.summary(metric).median / trained.real.summary(metric).median
+        paper_name = LEARNERS.get(trained.learner)
+        published = TABLE2["generated"][paper_name].median / TABLE2["real"][paper_name].median if paper_name else None
+        rows.append((trained.real.method, ratio, published))
     return Table(
         f"Median trained on generated images over median trained on real ones, tested on {name}",
         ("Algorithm", "Ratio", "In the paper, on Cube+"),

@@ -90,18 +90,16 @@ def figures_of(rows: Sequence[TransferRow], error: ErrorKind, groups: Sequence[s
     group.
     """
     samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]
-    values = [np.mean([sample.estimate() for sample in by_seed], axis=0) for by_seed in samples]
+    values = [np.mean([sample.estimate() for sample in seeds], axis=0) for seeds in samples]
     pairs = _pairs(rows, [float(value[0]) for value in values])
 
     def statistics(counts: npt.NDArray[np.int64]) -> Floats:
-        means = [np.mean([sample.statistics(counts) for sample in by_seed], axis=0) for by_seed in samples]
+        means = [np.mean([sample.statistics(counts) for sample in seeds], axis=0) for seeds in samples]
         ratios = [safe_ratio(means[row], means[base]) for indices in pairs.values() for row, base in indices]
         return np.concatenate([*means, *ratios], axis=1)
 
     figures = _batches(bounded_figures(statistics, len(samples[0][0].order), groups))
-    entries = tuple(
-        RowFigures(row, next(figures), _spread(by_seed)) for row, by_seed in zip(rows, samples, strict=True)
-    )
+    entries = tuple(RowFigures(row, next(figures), _spread(seeds)) for row, seeds in zip(rows, samples, strict=True))
     ratios = {
         name: tuple(RowRatio(rows[row], rows[base], next(figures)) for row, base in indices)
         for name, indices in pairs.items()
@@ -145,10 +143,10 @@ def _unadapted_rows(rows: Sequence[TransferRow], adapted: TransferRow) -> list[i
     ]
 
 
-def _spread(by_seed: Sequence[ErrorSample]) -> tuple[float, ...] | None:
-    if len(by_seed) < 2:
+def _spread(seeds: Sequence[ErrorSample]) -> tuple[float, ...] | None:
+    if len(seeds) < 2:
         return None
-    deviations = np.std([sample.estimate() for sample in by_seed], axis=0, ddof=1)
+    deviations = np.std([sample.estimate() for sample in seeds], axis=0, ddof=1)
     return tuple(float(deviation) for deviation in deviations)
 
 
@@ -325,16 +323,14 @@ def adaptation_plot(figures: TransferFigures) -> bytes:
             if not entry.row.real_use and label.startswith(f"{entry.row.material}, "):
                 points[0] = entry.statistics[0]
     return svg_of(
-        _draw_adaptation,
+        _draw_panels,
         panels,
         figures.error,
         inches=(max(4.6, 3.1 * len(panels) + 0.4), 5.2 if len(panels) == 1 else 4.4),
     )
 
 
-def _draw_adaptation(
-    figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, BoundedFigure]]], error: str
-) -> None:
+def _draw_panels(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, BoundedFigure]]], error: str) -> None:
     grid = figure.subplots(1, len(panels), squeeze=False)[0]
     labels = list(dict.fromkeys(label for curves in panels.values() for label in curves))
     for axes, (method, curves) in zip(grid, panels.items(), strict=True):
@@ -342,9 +338,7 @@ def _draw_adaptation(
         for label, points in curves.items():
             style = series_style(labels.index(label))
             positions = np.array([counts.index(count) for count in sorted(points)]) + 0.06 * (labels.index(label) - 2)
-            values, lows, highs = (
-                np.array(column) for column in zip(*(points[n] for n in sorted(points)), strict=True)
-            )
+            values, lows, highs = (np.array(item) for item in zip(*(points[n] for n in sorted(points)), strict=True))
             axes.errorbar(
                 positions, values, [values - lows, highs - values], marker="o", markersize=3, label=label, **style
             )
@@ -439,9 +433,8 @@ def report_page(outcome: TransferOutcome) -> str:
     elements.append(pages.heading("Conditions"))
     elements += [pages.paragraph(note) for note in outcome.plan.notes]
     elements += [pages.paragraph(f"{test.name}, {name}: {text}.") for name, text in test.treatment.items()]
-    elements.append(
-        pages.paragraph(f"Settings: {json.dumps(dict(outcome.settings), ensure_ascii=False)}. {software()}.")
-    )
+    settings = json.dumps(dict(outcome.settings), ensure_ascii=False)
+    elements.append(pages.paragraph(f"Settings: {settings}. {software()}."))
     return pages.page(f"Transfer to {test.name}", elements)
 
 

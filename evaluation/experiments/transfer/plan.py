@@ -419,23 +419,20 @@ def _trainable(scene_set: SceneSet, test: SceneSet, notes: list[str]) -> tuple[S
         held_out_ids = {id(scene) for scene in held_out}
         trainable = tuple(scene for scene in trainable if id(scene) not in held_out_ids)
     if not trainable:
-        raise InputError(
-            f"{scene_set.name} has 0 images for training, expected at least one: all are shared with the test set or "
-            "in its validation and test parts; use another set"
-        )
+        raise InputError(f"{scene_set.name} has 0 images for training that are not in the test set; use another set")
     return trainable
 
 
 def _with_naive(
-    name: str, generated: Sequence[GeneratedScene], pictures: Path | str, notes: list[str]
+    name: str, images: Sequence[GeneratedScene], pictures: Path | str, notes: list[str]
 ) -> list[TrainingSet]:
     """Return the generated images with a picture in the folder, and their naive counterparts."""
-    dataset = generated[0].dataset
+    dataset = images[0].dataset
     if dataset.description.options.get("variation", {}).get("gradient"):
         # Counterparts have one brightness for the whole image.
         raise InputError(f"{name} was made with a gradient, expected none for naive images; omit --naive")
     found_pictures, missing = find_source_pictures(dataset, pictures)
-    with_picture = tuple(scene for scene in generated if scene.entry.source in found_pictures)
+    with_picture = tuple(scene for scene in images if scene.entry.source in found_pictures)
     if not with_picture:
         raise InputError(
             f"0 of {len(missing)} pictures of {name} are in {pictures}, by name and hash (missing: "
@@ -444,7 +441,7 @@ def _with_naive(
     if missing:
         notes.append(
             f"{name}: {len(missing)} of {len(missing) + len(found_pictures)} pictures are not in {pictures}: "
-            f"{first_of(missing)}; {len(generated) - len(with_picture)} images of them are excluded from all rows"
+            f"{first_of(missing)}; {len(images) - len(with_picture)} images of them are excluded from all rows"
         )
     sets = [
         TrainingSet(name, "generated", with_picture),

@@ -167,9 +167,7 @@ def transfer(
     `real_counts`: numbers N of real images; None for all that a fold leaves.
     """
     if not learners or not folds:
-        raise InputError(
-            f"{len(learners)} learned methods and {len(folds)} seeds, expected at least one each; add some"
-        )
+        raise InputError(f"{len(learners)} learned methods and {len(folds)} seeds, expected one each; add some")
     for seed_folds in folds:
         require_groups_together(test, seed_folds)
     # Everything that can be refused is refused before the first image is read.
@@ -190,9 +188,8 @@ def transfer(
     for train_set, seed_indices in zip(training, indices_by_set, strict=True):
         # Only the images that some seed needs are read.
         used_indices = _used_indices(seed_indices)
-        material = collect_material(
-            [train_set.scenes[int(index)] for index in used_indices.tolist()], learners, side, workers, on_scene
-        )
+        scenes = [train_set.scenes[int(index)] for index in used_indices.tolist()]
+        material = collect_material(scenes, learners, side, workers, on_scene)
         positions = [np.searchsorted(used_indices, indices).astype(np.int64) for indices in seed_indices]
         for number, learner in enumerate(learners):
             # Naive counterparts have the illuminants of the generated set: the row would be the same.
@@ -249,9 +246,8 @@ class _RealSubsets:
                 test_indices = np.flatnonzero(folds == fold)
                 indices = np.sort(order[folds[order] != fold][:real])
                 method = fit(learner, number, indices, seed)
-                answers |= zip(
-                    test_indices.tolist(), estimate_on(method, number, self.tests, test_indices), strict=True
-                )
+                estimates = estimate_on(method, number, self.tests, test_indices)
+                answers |= zip(test_indices.tolist(), estimates, strict=True)
             ordered = [answers[index] for index in range(len(folds))]
             results.append(result_of(learner.name, ordered, self.tests.truths))
         return tuple(results)

@@ -10,11 +10,11 @@ from scipy import stats
 from evaluation.experiments.bootstrap import (
     STATISTICS,
     ErrorSample,
-    PairedStatistic,
+    PairedFigure,
     Statistic,
     bounded_figures,
     compare_paired,
-    group_numbers,
+    group_ids,
 )
 from evaluation.metrics import summarise
 from foundation.errors import InputError
@@ -37,7 +37,7 @@ def skewed(random: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
     return random.gamma(1.5, 2.0, count)
 
 
-def median(compared: tuple[PairedStatistic, ...]) -> PairedStatistic:
+def median(compared: tuple[PairedFigure, ...]) -> PairedFigure:
     return compared[STATISTICS.index("median")]
 
 
@@ -146,7 +146,7 @@ def test_what_is_no_pair_is_refused(one: list[float], other: list[float], groups
 
 def test_groups_are_drawn_and_left_out_whole() -> None:
     names = [str(place) for place in np.random.default_rng(14).permutation(np.repeat(np.arange(7), np.arange(1, 8)))]
-    groups, seen = group_numbers(names), list[npt.NDArray[np.int64]]()
+    groups, seen = group_ids(names), list[npt.NDArray[np.int64]]()
 
     def note(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         seen.append(counts)
