@@ -116,7 +116,7 @@ def bounded_figures(
 
 def _hazen(count: Indices, percent: float) -> tuple[Indices, Indices, Floats]:
     position: Floats = np.clip(np.multiply(count, percent / 100) - 0.5, 0, np.subtract(count, 1))
-    # A percentile lies between two order statistics; the fraction is the weight of the upper one.
+    # A percentile lies between two order statistics; the fraction is the weight of the upper one
     low: Indices = position.astype(np.int64)
     return low, np.minimum(low + 1, np.subtract(count, 1)), position - low
 
@@ -181,18 +181,14 @@ class ErrorSample:
 
 @dataclass(frozen=True)
 class PairedFigure:
-    """One statistic of two sets of errors.
-
-    - `value_a`, `value_b`: the two values, in the unit of the errors.
-    - `difference`: value_a - value_b.
-    - `ratio`: value_a / value_b; all NaN if `value_b` is 0.
-    """
+    """One statistic of two sets of errors."""
 
     statistic: Statistic
+    # In the unit of the errors
     value_a: float
     value_b: float
-    difference: BoundedFigure
-    ratio: BoundedFigure
+    difference: BoundedFigure  # value_a - value_b
+    ratio: BoundedFigure  # value_a / value_b; all NaN if `value_b` is 0
 
 
 def compare_paired(

@@ -58,22 +58,17 @@ TEST_NOTES: Final = (
 
 @dataclass(frozen=True, eq=False)
 class MatchedErrors:
-    """Errors of two methods on their common images.
+    """Errors of two methods on their common images."""
 
-    - `names`: names of the two, for tables and figures.
-    - `images`: N names, in the order of the first method, at least one.
-    - `errors_a`, `errors_b`: (N,) float64, degrees.
-    - `groups`: group of each image, such as its source picture; None if every image is its own group.
-    - `notes`: a sentence for each of the two in which images of the other are missing.
-    """
-
-    names: tuple[str, str]
+    names: tuple[str, str]  # For tables and figures
     metric: ErrorKind
-    images: tuple[str, ...]
+    images: tuple[str, ...]  # N names, in the order of the first method, at least one
+    # Both (N,) float64, degrees
     errors_a: npt.NDArray[np.float64]
     errors_b: npt.NDArray[np.float64]
+    # Group of each image, such as its source picture; None if every image is its own group
     groups: tuple[str, ...] | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # A sentence for each of the two in which images of the other are missing
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -95,32 +90,24 @@ class MatchedErrors:
 
 @dataclass(frozen=True)
 class SignedRank:
-    """Wilcoxon's signed-rank test of paired errors.
+    """Wilcoxon's signed-rank test of paired errors."""
 
-    - `wins`, `losses`, `ties`: number of images, or groups, on which the first error is smaller, larger, equal.
-    - `p`: two-sided; equal errors are ranked, then excluded (J. W. Pratt, JASA 54 (1959) 655-667).
-    - `effect`: matched-pairs rank-biserial correlation, (losses - wins) as fractions of the rank sum.
-    """
-
+    # Number of images, or groups, on which the first error is smaller, larger, equal
     wins: int
     losses: int
     ties: int
-    p: float
-    effect: float
+    p: float  # Two-sided; equal errors are ranked, then excluded (J. W. Pratt, JASA 54 (1959) 655-667).
+    effect: float  # Matched-pairs rank-biserial correlation, (losses - wins) as fractions of the rank sum
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All results of a pair.
-
-    - `p_holm`: p of the test, corrected for all comparisons made together (`holm`).
-    - `statistics`: every statistic of both, with intervals of difference and ratio.
-    """
+    """All results of a pair."""
 
     matched: MatchedErrors
     test: SignedRank
-    p_holm: float
-    statistics: tuple[PairedFigure, ...]
+    p_holm: float  # p of the test, corrected for all comparisons made together (`holm`)
+    statistics: tuple[PairedFigure, ...]  # Every statistic of both, with intervals of difference and ratio
 
 
 def match(first: MethodErrors, second: MethodErrors, names: tuple[str, str], metric: ErrorKind) -> MatchedErrors:
@@ -138,7 +125,7 @@ def match(first: MethodErrors, second: MethodErrors, names: tuple[str, str], met
             f"the ground truths of {images[worst]} in {names[0]} and {names[1]} differ by {angles[worst]:.2f} degrees, "
             f"expected at most {_SAME_TRUTH_DEG:g}; run both methods on the same data and ground truths"
         )
-    # Groups of the first file are used if it has some, else those of the second.
+    # Groups of the first file are used if it has some, else those of the second
     groups: tuple[str, ...] = ()
     for source, indices in ((second, indices_b), (first, indices_a)):
         groups = groups if source.groups is None else tuple(source.groups[index] for index in indices.tolist())

@@ -41,20 +41,13 @@ _MIN_USABLE_AREA: Final = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class SmallScene:
-    """A scene reduced in size, in memory.
-
-    - `name`: name of the image.
-    - `truth`: (3,) float64, ground truth, linear camera RGB of any length.
-    - `image`: (H, W, 3) float32, linear camera RGB, in the unit of the original image.
-    - `mask`: (H, W) bool, True if no pixel was usable; None if all were.
-    - `saturation`: None if clipped pixels were excluded; that of the original if its size was not changed.
-    """
+    """A scene reduced in size, in memory."""
 
     name: str
-    truth: npt.NDArray[np.float64]
-    image: Image
-    mask: npt.NDArray[np.bool_] | None
-    saturation: float | None
+    truth: npt.NDArray[np.float64]  # (3,) float64, ground truth, linear camera RGB of any length
+    image: Image  # (H, W, 3) float32, linear camera RGB, in the unit of the original image
+    mask: npt.NDArray[np.bool_] | None  # (H, W) bool, True if no pixel was usable; None if all were
+    saturation: float | None  # None if clipped pixels were excluded; that of the original if its size was not changed
 
     def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
         """Return the image (H, W, 3) and its mask (H, W) bool."""
@@ -110,16 +103,12 @@ AnyLearner = Learner | FeatureLearner  # Learns from scenes, or from features of
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Scenes, with their features for some learners.
-
-    - `scenes`: N scenes.
-    - `truths`: (N, 3) float64, linear camera RGB of any length.
-    - `features`: for each learner, the features of each scene or None if it has no usable pixel; None for a learner
-      that reads the scenes itself.
-    """
+    """Scenes, with their features for some learners."""
 
     scenes: tuple[Scene, ...]
-    truths: npt.NDArray[np.float64]
+    truths: npt.NDArray[np.float64]  # (N, 3) float64, linear camera RGB of any length
+    # For each learner, the features of each scene or None if it has no usable pixel; None for a learner that reads the
+    # scenes itself.
     features: tuple[Sequence[Features | None] | None, ...]
 
     @property
@@ -214,18 +203,12 @@ def cross_fit(learner: AnyLearner, number: int, material: Material, folds: npt.N
 
 @dataclass(frozen=True)
 class FamilySetting:
-    """One set of parameters of a family, with its results.
+    """One set of parameters of a family, with its results."""
 
-    - `text`: value of `--method` for it: "gray-edge-1:p=4:sigma=2".
-    - `name`: name of the method in tables.
-    - `spread`: standard deviation of the green chromaticity g / (r + g + b) of its estimates.
-    - `errors`: its errors on the counted images, degrees; None if not requested.
-    """
-
-    text: str
-    name: str
-    spread: float
-    errors: Summary | None
+    text: str  # Value of `--method` for it: "gray-edge-1:p=4:sigma=2"
+    name: str  # Name of the method in tables
+    spread: float  # Standard deviation of the green chromaticity g / (r + g + b) of its estimates
+    errors: Summary | None  # Its errors on the counted images, degrees; None if not requested
 
 
 @dataclass(frozen=True)
@@ -236,7 +219,7 @@ class Tuning:
     - `data`: name of the data set.
     - `settings`: all sets of parameters by rising spread; the first is chosen.
     - `images`, `counted`: number of images, and of those for which every setting gives an estimate.
-    - `kind`: kind of the errors shown for comparison; None for no errors.
+    - `metric`: kind of the errors shown for comparison; None for no errors.
     """
 
     family: str
@@ -270,7 +253,7 @@ def tune_family(
 ) -> Tuning:
     """Return the sets of parameters of a family, sorted by the spread of their estimates in green chromaticity.
 
-    `kind`: kind of errors to add for comparison; with None no ground truth is read.
+    `metric`: kind of errors to add for comparison; with None no ground truth is read.
     """
     texts, methods = zip(*family_settings(family), strict=True)
     tuned = tune(methods, scenes, on_scene, workers)

@@ -194,17 +194,12 @@ _ESTIMATES_TEXT = ",".join(_ESTIMATES_COLUMNS)
 
 @dataclass(frozen=True, eq=False)
 class GivenEstimates:
-    """Estimates from a file, used like a method.
+    """Estimates from a file, used like a method."""
 
-    - `name`: name in the tables.
-    - `file`: name of the file.
-    - `sha256`: hash of its bytes.
-    - `lights`: name of the image to its estimate (3,) float64 as in the file; values are not checked.
-    """
-
-    name: str
-    file: str
-    sha256: str
+    name: str  # Name in the tables
+    file: str  # Name of the file
+    sha256: str  # Hash of its bytes
+    # Name of the image to its estimate (3,) float64 as in the file; values are not checked
     lights: Mapping[str, npt.NDArray[np.float64]]
 
     def estimate_scene(self, scene: Scene) -> npt.NDArray[np.float64]:

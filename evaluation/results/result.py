@@ -79,16 +79,13 @@ NO_PIXEL = "no usable pixel"
 
 @dataclass(frozen=True)
 class SceneAnswer:
-    """Answer of one method for one image.
+    """Answer of one method for one image."""
 
-    - `light`: estimate, camera RGB of length 1; None if there is none, and grey replaces it.
-    - `cause`: reason for no estimate: "no usable pixel", or the returned value; "" if every pixel has an estimate.
-    - `by_pixel`: errors by pixel and region, if several illuminants reach the image.
-    """
-
+    # Estimate, camera RGB of length 1; None if there is none, and grey replaces it
     light: tuple[float, float, float] | None = None
+    # Reason for no estimate: "no usable pixel", or the returned value; "" if every pixel has an estimate
     cause: str = ""
-    by_pixel: MapError | None = None
+    by_pixel: MapError | None = None  # Errors by pixel and region, if several illuminants reach the image
 
 
 def read_estimate(returned_value: object, grey: npt.NDArray[np.float64] = GREY) -> SceneAnswer:
@@ -151,49 +148,35 @@ def collect_results(
 
 @dataclass(frozen=True)
 class Subject:
-    """Data set of the results.
-
-    - `name`: name of the data set.
-    - `images`: names of the images.
-    - `mixed`: for each image, whether several illuminants reach it.
-    - `groups`: for each image, the group of related images, for example from the same source picture; None if every
-      image is its own group.
-    """
+    """Data set of the results."""
 
     name: str
     images: tuple[str, ...]
-    mixed: tuple[bool, ...]
+    mixed: tuple[bool, ...]  # For each image, whether several illuminants reach it
+    # For each image, the group of related images, for example from the same source picture; None if every image is its
+    # own group.
     groups: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Methods on a data set, with their results.
-
-    - `subject`: name of the data set and of its images.
-    - `layout`, `location`, `treatment`: see `scene.SceneSet`.
-    - `data_sha256`: hash of image names and ground truths; see `learning.model_files.scenes_sha256`.
-    - `truths`: (N, 3) float64, camera RGB of any length.
-    - `results`: one for each method.
-    - `methods`: a JSON object for each method; see `method_records.describe_method`.
-    - `settings`: other settings of the run, such as a seed, as JSON.
-    - `folds`: (N,) int64, fold of each image if the methods were cross-validated, else None.
-    - `notes`: sentences printed with the results.
-    - `software`: name and version of the software.
-    """
+    """Methods on a data set, with their results."""
 
     subject: Subject
+    # As in `scene.SceneSet`
     layout: str
     location: str
     treatment: Mapping[str, str]
-    data_sha256: str
-    truths: npt.NDArray[np.float64]
-    results: tuple[Result, ...]
-    methods: tuple[Mapping[str, Any], ...]
+    data_sha256: str  # Hash of image names and ground truths; see `learning.model_files.scenes_sha256`
+    truths: npt.NDArray[np.float64]  # (N, 3) float64, camera RGB of any length
+    results: tuple[Result, ...]  # One for each method
+    methods: tuple[Mapping[str, Any], ...]  # A JSON object for each method; see `method_records.describe_method`
+    # Other settings of the run, such as a seed, as JSON
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    # (N,) int64, fold of each image if the methods were cross-validated, else None
     folds: npt.NDArray[np.int64] | None = None
-    notes: tuple[str, ...] = ()
-    software: str = ""
+    notes: tuple[str, ...] = ()  # Sentences printed with the results
+    software: str = ""  # Name and version of the software
     truth_uncertainty_deg: float | None = None
 
 

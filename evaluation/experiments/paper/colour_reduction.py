@@ -57,16 +57,11 @@ def reduce_colours(
 
 @dataclass(frozen=True, eq=False)
 class FittedCodes:
-    """Codes of a linear image after Flash.
+    """Codes of a linear image after Flash."""
 
-    - `codes`: (H, W, 3) uint8.
-    - `operator`: the fitted operator, for values relative to `largest`.
-    - `largest`: largest unmasked value, in the unit of the image; 0 for a black image.
-    """
-
-    codes: npt.NDArray[np.uint8]
-    operator: Flash
-    largest: float
+    codes: npt.NDArray[np.uint8]  # (H, W, 3) uint8
+    operator: Flash  # The fitted operator, for values relative to `largest`
+    largest: float  # Largest unmasked value, in the unit of the image; 0 for a black image
 
 
 def fit_codes(image: Image, mask: npt.NDArray[np.bool_] | None = None) -> FittedCodes:
@@ -98,14 +93,10 @@ def paper_methods(sigma: float = GRAY_EDGE_SIGMA) -> tuple[Method, ...]:
 
 @dataclass(frozen=True, eq=False)
 class BitsResult:
-    """Results on the images of a data set without and with bits set to zero.
+    """Results on the images of a data set without and with bits set to zero."""
 
-    - `raw`: one result for each method on the unchanged images.
-    - `reduced`: number of bits set to zero to the results of the methods.
-    """
-
-    raw: tuple[Result, ...]
-    reduced: Mapping[int, tuple[Result, ...]]
+    raw: tuple[Result, ...]  # One result for each method on the unchanged images
+    reduced: Mapping[int, tuple[Result, ...]]  # Number of bits set to zero to the results of the methods
 
 
 def remove_bits(

@@ -35,18 +35,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RenderedScene:
-    """A picture rendered under one illuminant of a look-up table (LUT).
-
-    - `light`: index of the illuminant in the LUT.
-    - `number`: index of the image in its set.
-    - `seed`: 0 … 2⁶⁴ − 1; selects the samples.
-    """
+    """A picture rendered under one illuminant of a look-up table (LUT)."""
 
     lut: Lut
     source: Source
-    light: int
-    number: int
-    seed: int = 0
+    light: int  # Index of the illuminant in the LUT
+    number: int  # Index of the image in its set
+    seed: int = 0  # 0 … 2⁶⁴ − 1; selects the samples
 
     @property
     def name(self) -> str:
@@ -101,14 +96,10 @@ class ScaledSource:
 
 @dataclass(frozen=True)
 class ChosenLights:
-    """One illuminant of a LUT for each image.
+    """One illuminant of a LUT for each image."""
 
-    - `numbers`: index of the illuminant of each image.
-    - `how`: method of selection, as text.
-    """
-
-    numbers: tuple[int, ...]
-    how: str
+    numbers: tuple[int, ...]  # Index of the illuminant of each image
+    how: str  # Method of selection, as text
 
 
 def lights_like(lut: Lut, truths: npt.NDArray[np.float64], count: int) -> ChosenLights:
@@ -230,16 +221,11 @@ _TEXT_EXTENSIONS = (".csv", ".txt")  # File extensions of text files with ground
 
 @dataclass(frozen=True, eq=False)
 class Truths:
-    """Ground truths with a name for tables and legends.
+    """Ground truths with a name for tables and legends."""
 
-    - `name`: name of their source.
-    - `lights`: (N, 3) float64 ≥ 0, linear camera RGB of any length.
-    - `images`: names of their N images; empty if unknown.
-    """
-
-    name: str
-    lights: npt.NDArray[np.float64]
-    images: tuple[str, ...] = ()
+    name: str  # Name of their source
+    lights: npt.NDArray[np.float64]  # (N, 3) float64 ≥ 0, linear camera RGB of any length
+    images: tuple[str, ...] = ()  # Names of their N images; empty if unknown
 
 
 def read_truths(location: str) -> Truths:

@@ -177,18 +177,12 @@ _TABLE1_CAPTION = (
 
 @dataclass(frozen=True, eq=False)
 class PaperReport:
-    """Report of one experiment.
+    """Report of one experiment."""
 
-    - `title`: title of the page.
-    - `tables`: printed tables, in order.
-    - `elements`: HTML elements of the page.
-    - `files`: name to content of the other files.
-    """
-
-    title: str
-    tables: tuple[Table, ...]
-    elements: tuple[Markup, ...]
-    files: Mapping[str, bytes]
+    title: str  # Title of the page
+    tables: tuple[Table, ...]  # Printed tables, in order
+    elements: tuple[Markup, ...]  # HTML elements of the page
+    files: Mapping[str, bytes]  # Name to content of the other files
 
 
 def write_report(report: PaperReport, folder: Path) -> None:

@@ -114,18 +114,14 @@ _BLOCK_COLUMNS: Final = ("scenes", "sensor", "illuminations", "images", "method"
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One of the eight data sets, with the results of the methods.
+    """One of the eight data sets, with the results of the methods."""
 
-    - `cell`: scenes, sensor and illuminants as the paper names them: ``("C1", "6D", "Random")``. Published numbers are
-      looked up by it, so other scenes and illuminants need other names.
-    - `lights`: method of choosing the illuminants, as text.
-    - `results`: one for each method, in the order of `METHODS`; empty before evaluation.
-    """
-
+    # Scenes, sensor and illuminants as the paper names them: ``("C1", "6D", "Random")``. Published numbers are looked
+    # up by it, so other scenes and illuminants need other names.
     cell: Cell
     scenes: tuple[RenderedScene, ...]
-    lights: str
-    results: tuple[Result, ...] = ()
+    lights: str  # Method of choosing the illuminants, as text
+    results: tuple[Result, ...] = ()  # One for each method, in the order of `METHODS`; empty before evaluation
 
 
 def sensor_of(lut: Lut) -> str:
@@ -232,15 +228,11 @@ def joint_table(blocks: Sequence[Block]) -> Table:
 
 @dataclass(frozen=True)
 class SizeRow:
-    """Median errors of the methods on one data set with images of one size.
-
-    - `side`: longest side of the images, px.
-    - `medians`: median reproduction error by method, degrees.
-    """
+    """Median errors of the methods on one data set with images of one size."""
 
     cell: Cell
-    side: int
-    medians: Mapping[str, float]
+    side: int  # Longest side of the images, px
+    medians: Mapping[str, float]  # Median reproduction error by method, degrees
 
 
 def size_dependence(

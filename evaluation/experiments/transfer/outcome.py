@@ -39,47 +39,35 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RowFigures:
-    """Statistics of one row.
-
-    - `statistics`: in the order of `bootstrap.STATISTICS`, degrees.
-    - `spread`: standard deviation of each statistic over the seeds, degrees; None with a single seed.
-    """
+    """Statistics of one row."""
 
     row: TransferRow
-    statistics: tuple[BoundedFigure, ...]
+    statistics: tuple[BoundedFigure, ...]  # In the order of `bootstrap.STATISTICS`, degrees
+    # Standard deviation of each statistic over the seeds, degrees; None with a single seed
     spread: tuple[float, ...] | None
 
 
 @dataclass(frozen=True)
 class RowRatio:
-    """Statistics of a row relative to those of another row with the same method, paired by image.
+    """Statistics of a row relative to those of another row with the same method, paired by image."""
 
-    - `row`, `base`: numerator and denominator.
-    - `ratios`: in the order of `bootstrap.STATISTICS`.
-    """
-
+    # Numerator and denominator of the ratios
     row: TransferRow
     base: TransferRow
-    ratios: tuple[BoundedFigure, ...]
+    ratios: tuple[BoundedFigure, ...]  # In the order of `bootstrap.STATISTICS`
 
 
 @dataclass(frozen=True)
 class TransferFigures:
-    """All figures of the rows.
-
-    - `error`: kind of error.
-    - `rows`: every row with its statistics.
-    - `to_real`: rows trained on other data, relative to real cross-validation of the same method.
-    - `to_naive`: generated rows relative to the naive rows of the same pictures and illuminants.
-    - `to_better`: adapted rows relative to the better (by mean error) of real images alone and the set alone.
-    - `to_naive_adapted`: adapted generated rows relative to naive rows adapted to the same images.
-    """
+    """All figures of the rows."""
 
     error: ErrorKind
-    rows: tuple[RowFigures, ...]
-    to_real: tuple[RowRatio, ...]
-    to_naive: tuple[RowRatio, ...]
+    rows: tuple[RowFigures, ...]  # Every row with its statistics
+    to_real: tuple[RowRatio, ...]  # Rows trained on other data, relative to real cross-validation of the same method
+    to_naive: tuple[RowRatio, ...]  # Generated rows relative to the naive rows of the same pictures and illuminants
+    # Adapted rows relative to the better (by mean error) of real images alone and the set alone
     to_better: tuple[RowRatio, ...] = ()
+    # Adapted generated rows relative to naive rows adapted to the same images
     to_naive_adapted: tuple[RowRatio, ...] = ()
 
 
@@ -354,21 +342,15 @@ def _draw_panels(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, B
 
 @dataclass(frozen=True, eq=False)
 class TransferOutcome:
-    """Results of a transfer.
+    """Results of a transfer."""
 
-    - `test`: the test set, N images.
-    - `plan`: training sets and notes.
-    - `rows`, `figures`: results and their statistics.
-    - `folds`: for each seed the fold of each test image, (N,) int64.
-    - `settings`: settings of the command, as JSON.
-    """
-
-    test: SceneSet
-    plan: TransferPlan
+    test: SceneSet  # The test set, N images
+    plan: TransferPlan  # Training sets and notes
+    # Results and their statistics
     rows: tuple[TransferRow, ...]
     figures: TransferFigures
-    folds: tuple[npt.NDArray[np.int64], ...]
-    settings: Mapping[str, Any]
+    folds: tuple[npt.NDArray[np.int64], ...]  # For each seed the fold of each test image, (N,) int64
+    settings: Mapping[str, Any]  # Settings of the command, as JSON
 
     def tables(self) -> tuple[Table, ...]:
         """Return the tables in display order."""

@@ -44,18 +44,12 @@ from generator.rendering.matrices import ColourMatrix, camera_matrix
 
 @dataclass(frozen=True)
 class SharedImage:
-    """A training image that shows the same as a test image.
+    """A training image that shows the same as a test image."""
 
-    - `position`: index in the training set, from 0.
-    - `name`: its name, or that of its source picture.
-    - `test`: name of the test image, or of its source picture.
-    - `by`: identified by "name" or by "content".
-    """
-
-    position: int
-    name: str
-    test: str
-    by: str
+    position: int  # Index in the training set, from 0
+    name: str  # Its name, or that of its source picture
+    test: str  # Name of the test image, or of its source picture
+    by: str  # Identified by "name" or by "content"
 
 
 def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]:
@@ -128,16 +122,11 @@ def _resolved_location(scenes: SceneSet) -> str:
 
 @dataclass(frozen=True)
 class FoundPicture:
-    """A source picture of a data set, located in a folder.
-
-    - `name`: its name in the data set.
-    - `path`: its file; None for a picture of random colours, which is generated again.
-    - `height`, `width`: its size in the data set, px.
-    - `preparation`: settings of its preparation.
-    """
+    """A source picture of a data set, located in a folder."""
 
     name: str
-    path: Path | None
+    path: Path | None  # Its file; None for a picture of random colours, which is generated again
+    # Its size in the data set, px
     height: int
     width: int
     preparation: Preparation
@@ -225,15 +214,11 @@ def naive_image(
 
 @dataclass(frozen=True, eq=False)
 class NaiveScene:
-    """Naive counterpart of a generated image; it is computed when it is read.
-
-    - `generated`: the generated image.
-    - `matrix`: colour matrix of the camera, or None.
-    """
+    """Naive counterpart of a generated image; it is computed when it is read."""
 
     generated: GeneratedScene
     picture: FoundPicture
-    matrix: ColourMatrix | None = None
+    matrix: ColourMatrix | None = None  # Colour matrix of the camera, or None
 
     @property
     def name(self) -> str:
@@ -312,18 +297,12 @@ def naive_scenes(
 
 @dataclass(frozen=True, eq=False)
 class RelitScene:
-    """A real scene of another camera under the illuminant of a generated image, by von Kries scaling.
-
-    - `scene`: the real scene.
-    - `truth`: (3,) float64, ground truth of the generated image, linear camera RGB.
-    - `name`: its own name, because a scene may be used several times.
-    - `saturation`: None; clipped pixels are masked, because channels are scaled differently.
-    """
+    """A real scene of another camera under the illuminant of a generated image, by von Kries scaling."""
 
     scene: Scene
-    truth: npt.NDArray[np.float64]
-    name: str
-    saturation: None = None
+    truth: npt.NDArray[np.float64]  # (3,) float64, ground truth of the generated image, linear camera RGB
+    name: str  # Its own name, because a scene may be used several times
+    saturation: None = None  # None; clipped pixels are masked, because channels are scaled differently
 
     def read(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_] | None]:
         """Return the image (H, W, 3) float32, and its mask (H, W) bool."""
@@ -348,17 +327,12 @@ def relit_scenes(scenes: Sequence[Scene], lights: Sequence[npt.NDArray[np.float6
 
 @dataclass(frozen=True, eq=False)
 class TransferPlan:
-    """Training sets of a transfer, and the notes on their preparation.
+    """Training sets of a transfer, and the notes on their preparation."""
 
-    - `training`: each set and, if it was generated and pictures are given, its naive counterparts, without excluded
-      images.
-    - `sets`: the data sets as opened.
-    - `notes`: excluded images, colour matrices and cautions, as sentences.
-    """
-
+    # Each set and, if it was generated and pictures are given, its naive counterparts, without excluded images
     training: tuple[TrainingSet, ...]
-    sets: tuple[SceneSet, ...]
-    notes: tuple[str, ...]
+    sets: tuple[SceneSet, ...]  # The data sets as opened
+    notes: tuple[str, ...]  # Excluded images, colour matrices and cautions, as sentences
 
 
 def is_generated(scene_set: SceneSet) -> bool:

@@ -48,36 +48,25 @@ NAIVE: Final[tuple[Training, ...]] = ("naive", "naive with matrix")  # Both naiv
 
 @dataclass(frozen=True, eq=False)
 class TrainingSet:
-    """Images for training.
+    """Images for training."""
 
-    - `data`: name of the data set of the images, or of the images that these are counterparts of.
-    - `kind`: kind of the images.
-    - `scenes`: the images; counterparts are in the order of the generated images.
-    """
-
-    data: str
+    data: str  # Name of the data set of the images, or of the images that these are counterparts of
     kind: Training
-    scenes: tuple[Scene, ...]
+    scenes: tuple[Scene, ...]  # The images; counterparts are in the order of the generated images
 
 
 @dataclass(frozen=True, eq=False)
 class TransferRow:
-    """Results on the test images of one method with one training.
-
-    - `method`: name of the method.
-    - `kind`: training data.
-    - `data`: name of the training data set; for cross-validation only if the test set was generated.
-    - `images`: number of training images; for cross-validation, of the smallest training part; 0 without learning.
-    - `results`: one for each seed, or one if the seed has no influence; in the order of the test images.
-    - `real_use`, `real`: use and number ("all" or a number) of real images of the other folds; empty if none were used.
-      They are counted in `images` only if they were used alone.
-    """
+    """Results on the test images of one method with one training."""
 
     method: str
-    kind: Training
-    data: str
-    images: int
+    kind: Training  # Its training data
+    data: str  # Name of the training data set; for cross-validation only if the test set was generated
+    images: int  # Number of training images; for cross-validation, of the smallest training part; 0 without learning
+    # One for each seed, or one if the seed has no influence; in the order of the test images
     results: tuple[Result, ...]
+    # Use and number ("all" or a number) of real images of the other folds; empty if none were used. They are counted in
+    # `images` only if they were used alone.
     real_use: RealUse = ""
     real: str = ""
 
