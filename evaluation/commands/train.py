@@ -51,24 +51,22 @@ def train(
 
     learners = choose_learners([method])
     if len(learners) != 1:
-        raise InputError(f"{method} are {len(learners)} methods, a model file holds one; name one")
+        raise InputError(f"METHOD is {method}, {len(learners)} methods, expected one for a model file; name one")
     (learner,) = learners
     if not isinstance(learner, FeatureLearner):
         raise InputError(
-            f"{method} is a class of your own, which a model file cannot hold: evaluate cv {method} {data} trains and "
-            "evaluates it; let its fit write a file of its own if it is to be kept"
+            f"{method} is your own class, expected a method of this suite for a model file; use evaluate cv {method} "
+            f"{data} to train and test it, and let its fit write its own file to keep it"
         )
     if out.suffix != ".npz":
-        raise InputError(f"--out is {out}, expected a name that ends in .npz, by which evaluate run knows a model")
+        raise InputError(f"--out is {out}, expected a name that ends in .npz, as evaluate run requires; rename it")
     require_free_file(out, "the model")
     require_installed(learner)
     base_model = None if adapt is None else load_model(adapt)
     if base_model is not None:
         if base_model.learner.key != learner.key:
-            raise InputError(
-                f"{adapt} is of {base_model.learner.key}, {method} was asked for; name a model of the same method"
-            )
-        # With the settings of then, which those of today need not be.
+            raise InputError(f"{adapt} is a model of {base_model.learner.key}, expected {method}; name one of {method}")
+        # Its settings apply, which may differ from the present defaults.
         learner = base_model.learner
     data_set = open_data(data, read)
     truths = truths_of(data_set.scenes)
@@ -83,11 +81,11 @@ def train(
         record = provenance_of(data_set, seed, SystemClock(), adapted_from=base_record)
         save_model(out, fitted, record)
     unused = sum(image_features is None for image_features in features)
-    notes = [f"{unused} of {count} images have no usable pixel and were left out of the training"] if unused else []
+    notes = [f"{unused} of {count} images have no usable pixel and were excluded from the training"] if unused else []
     output.add(model=out, method=learner.name, data_set=data_set.name, images=count, unused=unused, seed=seed)
     if isinstance(fitted.model, adapting.BlendedModel):
         share = float(fitted.model.share)
         output.add(adapted_from=adapt, share=share)
-        notes.append(f"{adapt} answers with a share of {share:.2f}, what these images teach alone with {1 - share:.2f}")
+        notes.append(f"weights of the blend: {adapt} {share:.2f}, training on these images alone {1 - share:.2f}")
     print(f"{out}: {learner.name}, {record.sentence()}")
     show_notes(output, notes, data_set.treatment)

@@ -1,4 +1,4 @@
-"""Tables of 512 colours whose samples are made up."""
+"""Look-up tables of 512 colours with given samples."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WHITE_LEVEL = 9000
 def write_lut(
     folder: Path, samples: Sequence[npt.NDArray[np.float64]], lights: npt.NDArray[np.float64], camera: str = "Test"
 ) -> Lut:
-    """Write the samples (512, S, 3) under each light; from the third on lights are black bodies."""
+    """Write the samples (512, S, 3) under each illuminant; from the third on illuminants are black bodies."""
     folder.mkdir(parents=True)
     writer = LutWriter(folder, len(lights), len(CODES), samples[0].shape[1])
     for number, values in enumerate(samples):

@@ -1,4 +1,4 @@
-"""What every command prints and writes of small data sets, to the last digits: no change may move it unseen."""
+"""Pinned numbers that the commands print and write for small data sets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def made_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a generated set, its pictures and table, two sets of thumbnails, and copies of layouts."""
+    """Return a folder with a generated set, its pictures and LUT, two sets of thumbnails, and copies of layouts."""
     folder = tmp_path_factory.mktemp("place")
     save_pictures(folder / "pictures", [f"{number}.png" for number in range(6)])
     Maker(folder, write_table(folder / "lut")).make()

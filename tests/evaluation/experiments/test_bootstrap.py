@@ -1,4 +1,4 @@
-"""Intervals hold what they promise, and are of the statistics that the tables state."""
+"""Bootstrap intervals: coverage, agreement with scipy, and the same statistics as in the tables."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ WORLDS = 100
 
 
 def intervals(errors: npt.ArrayLike, seed: int = 0, count: int = 2000) -> dict[Statistic, tuple[float, float]]:
-    """Return the confidence interval of every statistic of errors (N,), from the same resamples."""
+    """Return the confidence interval of every statistic of errors (N,)."""
     sample = ErrorSample.of(errors)
     made = bounded_figures(sample.statistics, len(sample.order), seed=seed, count=count)
     return {name: (one.low, one.high) for name, one in zip(STATISTICS, made, strict=True)}
 
 
 def skewed(random: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
-    """Return errors distributed as those of colour constancy: their mean is above their median."""
+    """Return errors with the distribution of colour constancy errors: the mean exceeds the median."""
     return random.gamma(1.5, 2.0, count)
 
 
@@ -42,7 +42,7 @@ def median(compared: tuple[PairedFigure, ...]) -> PairedFigure:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 17, 64])
-def test_statistics_of_resamples_are_those_of_the_metrics(count: int) -> None:
+def test_resample_statistics_match_metrics(count: int) -> None:
     random = np.random.default_rng(count)
     # Rounded, so that many errors are equal.
     errors = random.gamma(1.5, 2.0, count).round(1) + 0.1
@@ -53,7 +53,7 @@ def test_statistics_of_resamples_are_those_of_the_metrics(count: int) -> None:
     np.testing.assert_allclose(ErrorSample.of(errors).statistics(counts), expected, rtol=1e-12)
 
 
-def test_interval_is_that_of_scipy() -> None:
+def test_interval_matches_scipy() -> None:
     random = np.random.default_rng(5)
     one, other = skewed(random, 80), skewed(random, 80)
     known = stats.bootstrap((one,), np.mean, n_resamples=20_000, method="BCa", rng=1).confidence_interval
@@ -69,7 +69,7 @@ def test_interval_is_that_of_scipy() -> None:
     np.testing.assert_allclose(found[1:], known.confidence_interval, atol=0.04 * width)
 
 
-def test_intervals_cover_the_population_as_often_as_they_say() -> None:
+def test_intervals_have_nominal_coverage() -> None:
     random = np.random.default_rng(8)
     truth = dict(zip(STATISTICS, summarise(skewed(random, 1_000_000)).as_tuple(), strict=True))
     hits = dict.fromkeys(truth, 0)
@@ -79,7 +79,7 @@ def test_intervals_cover_the_population_as_often_as_they_say() -> None:
     assert {name: hit for name, hit in hits.items() if not 0.88 < hit / WORLDS < 0.99} == {}
 
 
-def test_paired_differences_cover_and_pairing_narrows() -> None:
+def test_pairing_narrows_intervals_and_keeps_coverage() -> None:
     random = np.random.default_rng(10)
     hits = np.zeros(2)
     widths = np.zeros(2)
@@ -95,7 +95,7 @@ def test_paired_differences_cover_and_pairing_narrows() -> None:
     assert widths[0] < 0.25 * widths[1]
 
 
-def test_order_of_images_and_methods() -> None:
+def test_order_of_images_and_methods_does_not_matter() -> None:
     random = np.random.default_rng(12)
     one, other = skewed(random, 90), skewed(random, 90)
     for there, back in zip(compare_paired(one, other), compare_paired(other, one), strict=True):
@@ -108,17 +108,17 @@ def test_order_of_images_and_methods() -> None:
         assert there.ratio[0] == pytest.approx(ours / theirs)
 
 
-def test_ends_are_the_same_every_time_and_at_any_piece_size(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interval_is_reproducible_for_any_batch_size(monkeypatch: pytest.MonkeyPatch) -> None:
     errors = skewed(np.random.default_rng(13), 70)
     first = intervals(errors, seed=4)
     assert intervals(errors, seed=4) == first
     assert intervals(errors, seed=5) != first
-    monkeypatch.setattr("evaluation.experiments.bootstrap._AT_ONCE", 1)
+    monkeypatch.setattr("evaluation.experiments.bootstrap._COUNTS_AT_ONCE", 1)
     for name, ends in intervals(errors, seed=4).items():
         assert ends == pytest.approx(first[name], rel=1e-12)
 
 
-def test_no_spread() -> None:
+def test_equal_errors_give_interval_without_width() -> None:
     assert np.isnan(intervals([2.5])["worst25"]).all()
     assert intervals([2.5] * 9)["avg"] == pytest.approx((2.5, 2.5))
     assert intervals([0, 0, 0])["avg"] == (0, 0)
@@ -139,12 +139,12 @@ def test_no_spread() -> None:
         ([1, 2], [1, 2], ["a"]),
     ],
 )
-def test_what_is_no_pair_is_refused(one: list[float], other: list[float], groups: list[str] | None) -> None:
+def test_refuses_unpaired_errors(one: list[float], other: list[float], groups: list[str] | None) -> None:
     with pytest.raises(InputError):
         compare_paired(one, other, groups=groups)
 
 
-def test_groups_are_drawn_and_left_out_whole() -> None:
+def test_draws_whole_groups() -> None:
     names = [str(place) for place in np.random.default_rng(14).permutation(np.repeat(np.arange(7), np.arange(1, 8)))]
     groups, seen = group_ids(names), list[npt.NDArray[np.int64]]()
 
@@ -162,7 +162,7 @@ def test_groups_are_drawn_and_left_out_whole() -> None:
     assert sorted(left_out.tolist()) == sorted((1 - np.eye(7, dtype=np.int64)).tolist())
 
 
-def test_intervals_of_groups_cover_where_those_of_images_do_not() -> None:
+def test_group_intervals_cover_dependent_images() -> None:
     random = np.random.default_rng(15)
     hits = np.zeros(2)
     kinds = [str(number // 8) for number in range(200)]

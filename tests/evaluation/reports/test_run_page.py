@@ -1,7 +1,4 @@
-"""The report of a run: figures and pictures show what the numbers say.
-
-Figures show names as they are written.
-"""
+"""Report of a run: its figures and pictures."""
 
 from __future__ import annotations
 
@@ -33,7 +30,7 @@ def texts(svg: bytes) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
-def test_names_are_neither_mathematics_nor_left_out() -> None:
+def test_figures_show_names_literally() -> None:
     random = np.random.default_rng(0)
     results = [
         Result(
@@ -66,7 +63,7 @@ def cast(picture: npt.NDArray[Any]) -> float:
     return float(means.max() - means.min())
 
 
-def test_the_truth_removes_the_cast_and_a_wrong_estimate_does_not() -> None:
+def test_only_correct_estimate_removes_cast() -> None:
     scene = Wall("wall", np.array([2.0, 1.0, 0.5]))
     (wrong, right) = developed_pictures(scene, [np.array([0.5, 1.0, 2.0]), scene.truth])
     raw, by_wrong, by_truth = panels(wrong)
@@ -75,7 +72,7 @@ def test_the_truth_removes_the_cast_and_a_wrong_estimate_does_not() -> None:
     np.testing.assert_allclose(panels(right)[1], by_truth, atol=12)
 
 
-def test_several_lights_are_corrected_by_pixel() -> None:
+def test_corrects_several_illuminants_by_pixel() -> None:
     scene = MixedWall("mixed", np.array([[3.0, 1, 1], [1, 1, 3]]))
     (jpeg,) = developed_pictures(scene, [scene.truth])
     _, by_mean, by_pixel = panels(jpeg)
@@ -84,7 +81,7 @@ def test_several_lights_are_corrected_by_pixel() -> None:
     assert cast(by_mean[:, 4]) > 20
 
 
-def test_masked_pixels_are_grey_and_do_not_set_the_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_masked_pixels_are_grey_and_ignored_in_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = MixedWall("masked", np.array([[1.0, 1, 1], [1, 1, 1]]), masked=True)
     read = MixedWall.read
 
@@ -101,7 +98,7 @@ def test_masked_pixels_are_grey_and_do_not_set_the_exposure(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-9])
-def test_a_black_image_and_a_light_without_a_channel(value: float) -> None:
+def test_black_image_and_estimate_with_zero_channel(value: float) -> None:
     class Black(Wall):
         def read(self) -> tuple[npt.NDArray[np.float32], None]:
             return np.full((5, 5, 3), value, np.float32), None
@@ -109,7 +106,7 @@ def test_a_black_image_and_a_light_without_a_channel(value: float) -> None:
     assert len(developed_pictures(Black("black", np.array([1.0, 1, 0])), [np.array([0.0, 1, 1])])) == 1
 
 
-def test_the_98th_percentile_becomes_white_and_what_is_masked_by_half_is_grey() -> None:
+def test_white_percentile_and_half_masked_pixels() -> None:
     class Ramp(Wall):
         def read(self) -> Any:
             image = np.repeat(np.linspace(0, 1, 200, dtype=np.float32)[None, :, None], 170, axis=0)
@@ -131,7 +128,7 @@ def test_the_98th_percentile_becomes_white_and_what_is_masked_by_half_is_grey() 
     assert right[4, 20:180] == pytest.approx(np.full((160, 3), 118), abs=3)
 
 
-def test_worst_and_median_images_are_chosen() -> None:
+def test_chooses_worst_and_median_images() -> None:
     def chosen(*errors: float) -> tuple[tuple[int, ...], tuple[int, ...]]:
         given, count = np.array(errors), len(errors)
         return chosen_images(Result("M", np.ones((count, 3)), {"recovery": given}, given < 0), "recovery")
@@ -143,7 +140,7 @@ def test_worst_and_median_images_are_chosen() -> None:
 
 
 @pytest.mark.slow
-def test_many_methods_and_images_make_a_page_that_closes() -> None:
+def test_page_of_many_methods_is_closed() -> None:
     data = as_set((*walls(6), MixedWall("mixed & <odd>", np.array([[2.0, 1, 1], [1, 1, 1]]))))
     results = evaluate(data.scenes, METHODS)
     run = describe_run(data, results, [{"name": "A", "settings": {"p": [1] * 99}}, {"name": "B", "class": "x:Y"}])
@@ -156,6 +153,6 @@ def test_many_methods_and_images_make_a_page_that_closes() -> None:
     found = checked(text)
     assert text.count("<details") == len(METHODS)
     assert len(re.findall(r"src='data:image/jpeg", text)) == len(pictures)
-    for words in ("White <Patch>", "as it was drawn", "MAE_illum", "1 of them under several lights", "mixed & <odd>"):
+    for words in ("White <Patch>", "as it was drawn", "MAE_illum", "1 under several illuminants", "mixed & <odd>"):
         assert words in found.text
-    assert "Shown are the first" not in found.text
+    assert "methods are shown" not in found.text

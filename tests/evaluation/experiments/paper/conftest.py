@@ -1,4 +1,4 @@
-"""Small made-up tables of the paper's two cameras."""
+"""Small simulated look-up tables of the paper's two cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TableMaker = Callable[..., Lut]
 
 @pytest.fixture
 def make_table(tmp_path: Path) -> TableMaker:
-    """Return a maker of tables whose colours reflect as their code, with noise of that share of the value."""
+    """Return a function that makes LUTs whose colours reflect as their codes, with relative noise."""
 
     def make(camera: str, noise: float = 0.0, samples: int = 25) -> Lut:
         random = np.random.default_rng(5)

@@ -1,9 +1,4 @@
-"""Bits set to zero in tone-mapped codes, and what methods then make of the images.
-
-Flash and its inverse in files: what methods make of the files is what the experiment makes of images in memory.
-
-The picture with bits set to zero.
-"""
+"""Colour reduction: the codes after reduction, and estimates on the reduced images."""
 
 from __future__ import annotations
 
@@ -27,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 
 def photo(seed: int, side: int = 40) -> npt.NDArray[np.float64]:
-    """Return smooth colours under a light, with a range of brightness as photographs have."""
+    """Return smooth colours under an illuminant, with the brightness range of a photograph."""
     rng = np.random.default_rng(seed)
     grid = np.linspace(0, 3, side)
     waves = [np.sin(np.add.outer(a * grid, b * grid)) for a, b in rng.uniform(-2, 2, (3, 2))]
@@ -35,13 +30,13 @@ def photo(seed: int, side: int = 40) -> npt.NDArray[np.float64]:
 
 
 @given(code=st.integers(0, 255), bits=st.integers(0, 8))
-def test_cleared_codes_are_whole_steps_below(code: int, bits: int) -> None:
+def test_cleared_codes_are_next_lower_step(code: int, bits: int) -> None:
     (cleared,) = clear_bits(np.array([code], np.uint8), bits)
     assert cleared == code // 2**bits * 2**bits
 
 
 @given(seed=st.integers(0, 2**32), scale=st.floats(1e-3, 1e5))
-def test_the_operator_is_undone_to_rounding(seed: int, scale: float) -> None:
+def test_operator_is_inverted_within_rounding(seed: int, scale: float) -> None:
     image = photo(seed, 12)
     image /= image.max()
     operator = fit_flash(image)
@@ -53,7 +48,7 @@ def test_the_operator_is_undone_to_rounding(seed: int, scale: float) -> None:
 
 
 @given(seed=st.integers(0, 2**32))
-def test_no_bit_is_unchanged_within_quantisation(seed: int) -> None:
+def test_zero_bits_change_only_quantisation(seed: int) -> None:
     image = photo(seed, 12)
     image /= image.max()
     operator = fit_flash(image)
@@ -64,7 +59,7 @@ def test_no_bit_is_unchanged_within_quantisation(seed: int) -> None:
     assert np.abs(again - codes).max() <= 0.51
 
 
-def test_a_masked_pixel_has_no_say() -> None:
+def test_masked_pixel_does_not_influence_operator() -> None:
     image, mask = photo(2), np.zeros((40, 40), np.bool_)
     mask[:5] = True
     dark, bright = image.copy(), image.copy()
@@ -76,7 +71,7 @@ def test_a_masked_pixel_has_no_say() -> None:
     assert np.abs(without[~mask] - with_mask[~mask]).max() > 1e-3
 
 
-def test_images_as_they_are_give_what_evaluate_gives() -> None:
+def test_unchanged_images_give_results_of_evaluate() -> None:
     mask = np.zeros((40, 40), np.bool_)
     mask[:, :8] = True
     light = np.array([0.4, 1.0, 0.6])

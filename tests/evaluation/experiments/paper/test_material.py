@@ -1,9 +1,4 @@
-"""Pictures developed from raw images with their ground truths.
-
-Scenes in memory are those that `generate` writes.
-
-Ground truths from files and data sets.
-"""
+"""Pictures developed from raw images, scenes rendered in memory, and ground truths from files and data sets."""
 
 from __future__ import annotations
 
@@ -33,7 +28,7 @@ from tests.evaluation.made_scenes import Made
 
 
 @pytest.mark.parametrize("camera", ["Canon EOS 550D", "Canon EOS-1Ds Mark III", "Canon EOS 600D"])
-def test_a_picture_photographed_and_developed_is_itself(camera: str) -> None:
+def test_development_inverts_rendering(camera: str) -> None:
     matrix = camera_matrix(camera)
     assert matrix is not None
     rng = np.random.default_rng(7)
@@ -47,7 +42,7 @@ def test_a_picture_photographed_and_developed_is_itself(camera: str) -> None:
     assert np.abs(develop_image(raw, light[::-1].copy(), matrix=matrix).astype(int) - codes).max() > 10
 
 
-def test_one_in_a_hundred_is_clipped() -> None:
+def test_clips_one_percent() -> None:
     wedge = np.linspace(0, 1, 10000).reshape(100, 100, 1) * np.array([0.3, 1.0, 0.4])
     picture = develop_image(wedge, np.array([0.3, 1.0, 0.4]))
     assert 0.01 <= (picture == 255).all(axis=2).mean() < 0.015
@@ -61,7 +56,7 @@ def test_one_in_a_hundred_is_clipped() -> None:
     assert develop_image(bright, np.array([0.3, 1.0, 0.4]))[50:].max() < 128
 
 
-def test_a_clipped_sky_is_white() -> None:
+def test_clipped_sky_is_white() -> None:
     light = np.array([0.5, 1.0, 0.7])
     image = np.full((20, 20, 3), 200.0) * light
     image[:10] = 1000.0  # all channels at saturation: under this light as red and blue as no sky is
@@ -71,7 +66,7 @@ def test_a_clipped_sky_is_white() -> None:
     np.testing.assert_array_equal(develop_image(image, light, saturation=5000.0), develop_image(image, light))
 
 
-def test_a_source_has_no_chart() -> None:
+def test_masked_chart_is_black() -> None:
     mask = np.zeros((8, 8), np.bool_)
     mask[:3, :3] = True
     scene = Made("photo", np.array([1.0, 1.0, 1.0]), np.full((8, 8, 3), 500.0), None, mask)
@@ -89,7 +84,7 @@ PLAIN = DatasetOptions(previews=False, rendering="codes")
 
 
 @pytest.mark.slow
-def test_random_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: Path) -> None:
+def test_random_illuminants_match_generate(make_table: TableMaker, tmp_path: Path) -> None:
     lut = make_table("Test", noise=0.05)
     scenes = render_scenes(lut, SOURCES, lights_at_random(lut, 6, seed=9), seed=9)
     made = generate_dataset(lut, tmp_path / "made", SOURCES, RandomLights(1, len(LIGHTS), 9), seed=9, options=PLAIN)
@@ -102,15 +97,15 @@ def test_random_lights_are_those_of_the_command(make_table: TableMaker, tmp_path
 
 
 @pytest.mark.slow
-def test_near_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: Path) -> None:
+def test_nearest_illuminants_match_generate(make_table: TableMaker, tmp_path: Path) -> None:
     lut = make_table("Test", noise=0.05)
     chosen = lights_like(lut, TRUTHS, 6)
     assert chosen.numbers == (0, 3, 1, 0, 3, 1)
-    assert chosen.how.startswith("nearest by angle to 3 ground truths, 3 different lights")
+    assert chosen.how.startswith("nearest by angle to 3 ground truths, 3 different illuminants")
     # The angles are those of the lights that images have.
     few = lights_like(lut, TRUTHS, 1).how
-    assert few.startswith("nearest by angle to the first 1 of 3 ground truths, 1 different lights")
-    assert few.split("angle to them")[1] == lights_like(lut, TRUTHS[:1], 1).how.split("angle to them")[1]
+    assert few.startswith("nearest by angle to the first 1 of 3 ground truths, 1 different illuminants")
+    assert few.split("median angle")[1] == lights_like(lut, TRUTHS[:1], 1).how.split("median angle")[1]
     scenes = render_scenes(lut, SOURCES, chosen, seed=2)
     lights = nearest_lights(lut, TRUTHS)
     made = generate_dataset(lut, tmp_path / "made", SOURCES, lights, seed=2, options=PLAIN)
@@ -121,7 +116,7 @@ def test_near_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: 
 TEXT = "File,GT_R,GT_G,GT_B\nA/1.png,1,2,3\nB/1.png,4,5,6\n\nA/2.png,7,8,9\n"
 
 
-def test_rows_of_one_camera(tmp_path: Path) -> None:
+def test_selects_rows_by_prefix(tmp_path: Path) -> None:
     path = tmp_path / "eight.csv"
     path.write_text(TEXT)
     everything = read_truths(str(path))

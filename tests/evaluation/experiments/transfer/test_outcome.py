@@ -1,7 +1,4 @@
-"""The tables say what was found, and what it does not hold for.
-
-Statistics, intervals and ratios of rows.
-"""
+"""Outcome of a transfer: statistics, intervals and ratios of rows, and their tables."""
 
 from __future__ import annotations
 
@@ -34,22 +31,22 @@ def _plain_row(kind: Training, *gains: float, guessed: int = 0, images: int = 9)
     return TransferRow("Trees", kind, "" if kind in ("cross-validation", "none") else "made", images, results)
 
 
-def _beside(kind: Training, way: RealUse, gain: float, real: str = "20") -> TransferRow:
+def _adapted_row(kind: Training, way: RealUse, gain: float, real: str = "20") -> TransferRow:
     data = "" if kind == "real" else "made"
     return replace(_plain_row(kind, gain), data=data, real_use=way, real=real)
 
 
 @pytest.mark.slow
-def test_beside_real_images_a_row_is_held_to_the_better_of_what_it_was_made_of() -> None:
+def test_adapted_row_is_relative_to_better_part() -> None:
     rows = [
         _plain_row("cross-validation", 1.0),
-        _beside("real", "alone", 4.0),
-        _beside("real", "alone", 1.5, "all"),
+        _adapted_row("real", "alone", 4.0),
+        _adapted_row("real", "alone", 1.5, "all"),
         _plain_row("generated", 2.0),
         _plain_row("naive", 3.0),
-        _beside("generated", "adapted", 1.8),
-        _beside("generated", "adapted", 1.2, "all"),
-        _beside("naive", "adapted", 3.6),
+        _adapted_row("generated", "adapted", 1.8),
+        _adapted_row("generated", "adapted", 1.2, "all"),
+        _adapted_row("naive", "adapted", 3.6),
     ]
     found = figures_of(rows, "recovery")
     held = {(one.row.kind, one.row.real): (one.base.kind, one.ratios[0].value) for one in found.to_better}
@@ -83,7 +80,7 @@ def _row(kind: Training, *errors: npt.NDArray[np.float64], method: str = "Trees"
 
 
 @pytest.mark.slow
-def test_one_seed_is_what_the_bootstrap_gives() -> None:
+def test_one_seed_matches_bootstrap() -> None:
     rows = [_row("cross-validation", REAL), _row("generated", OTHER), _row("naive", THIRD)]
     found = figures_of(rows, "recovery")
     for row, errors in zip(found.rows, (REAL, OTHER, THIRD), strict=True):
@@ -101,7 +98,7 @@ def test_one_seed_is_what_the_bootstrap_gives() -> None:
     assert [row.spread for row in found.rows] == [None] * 3
 
 
-def test_several_seeds_are_the_mean_of_their_statistics() -> None:
+def test_several_seeds_are_averaged() -> None:
     found = figures_of([_row("cross-validation", REAL), _row("generated", OTHER, THIRD)], "reproduction")
     both = np.array([summarise(2 * errors).as_tuple() for errors in (OTHER, THIRD)])
     row = found.rows[1]
@@ -115,7 +112,7 @@ def test_several_seeds_are_the_mean_of_their_statistics() -> None:
     assert once.rows[0].statistics == twice.rows[0].statistics
 
 
-def test_methods_are_held_to_themselves_only() -> None:
+def test_ratios_compare_same_method() -> None:
     rows = [
         _row("cross-validation", REAL),
         _row("cross-validation", OTHER, method="Cat"),
@@ -128,6 +125,6 @@ def test_methods_are_held_to_themselves_only() -> None:
     assert not found.to_naive
 
 
-def test_a_faultless_base_has_no_ratio() -> None:
+def test_base_without_error_has_no_ratio() -> None:
     found = figures_of([_row("cross-validation", np.zeros(90)), _row("generated", OTHER)], "recovery")
     assert all(np.isnan(figure.value) and np.isnan(figure.low) for figure in found.to_real[0].ratios)

@@ -1,9 +1,4 @@
-"""What may be trained on: nothing that the test set shows, and all rows the same images.
-
-The naive baseline: by hand on tiny pictures, and exact where the table is naive itself.
-
-Source pictures are found by name and hash, wherever they lie, and never mistaken.
-"""
+"""Plan of a transfer: exclusion of test images, the naive baseline, and identification of source pictures."""
 
 from __future__ import annotations
 
@@ -44,7 +39,7 @@ pytestmark = pytest.mark.slow
 MATRIX = np.array([[0.6, 0.3, 0.1], [0.1, 0.7, 0.2], [-0.2, 0.4, 0.8]])
 
 
-def test_arithmetic_by_hand() -> None:
+def test_naive_image_matches_hand_calculation() -> None:
     # 188 is (188 / 255 + .055) / 1.055 to the 2.4 = .502886…, 10 is below the knee: 10 / 255 / 12.92 = .003035.
     codes = np.array([[[188, 10, 255]]], np.uint8)
     light = np.array([1000.0, 2000.0, 3000.0])
@@ -53,7 +48,7 @@ def test_arithmetic_by_hand() -> None:
     np.testing.assert_array_equal(naive_image(codes, light, 5000, MATRIX), [[[403, 505, 2102]]])
 
 
-def test_white_is_the_light_and_what_is_brighter_is_clipped() -> None:
+def test_white_is_illuminant_and_clips() -> None:
     white = np.full((2, 2, 3), 255, np.uint8)
     light = np.array([1000.0, 2000.4, 500.0])
     for matrix in (None, MATRIX):
@@ -70,7 +65,7 @@ def _counterparts(made: list[GeneratedScene], pictures: Path) -> tuple[NaiveScen
     return naive_scenes(made, found)
 
 
-def test_a_table_that_is_naive_is_reproduced(maker: Maker) -> None:
+def test_naive_table_is_reproduced(maker: Maker) -> None:
     made = _generated(maker.make().scenes)
     naive = _counterparts(made, maker.pictures)
     assert [scene.name for scene in naive] == [scene.name for scene in made]
@@ -80,7 +75,7 @@ def test_a_table_that_is_naive_is_reproduced(maker: Maker) -> None:
         np.testing.assert_allclose(one.read()[0].astype(int), other.read()[0].astype(int), atol=1)
 
 
-def test_a_table_behind_a_matrix_is_reproduced_with_it_and_not_without(tmp_path: Path) -> None:
+def test_matrix_table_needs_matrix(tmp_path: Path) -> None:
     save_pictures(tmp_path / "pictures", ["a.png"])
     made = _generated(Maker(tmp_path, write_table(tmp_path / "lut", MATRIX)).make().scenes)
     found, _ = find_source_pictures(made[0].dataset, tmp_path / "pictures")
@@ -92,7 +87,7 @@ def test_a_table_behind_a_matrix_is_reproduced_with_it_and_not_without(tmp_path:
     assert np.abs(plain.read()[0].astype(int) - image).max() > 500
 
 
-def test_mixtures_and_masks_of_lights_are_reproduced(maker: Maker) -> None:
+def test_mixtures_and_masks_are_reproduced(maker: Maker) -> None:
     mixed = mixture_of({0: 1, 1: 3})
     (single, *_) = _generated(maker.make("mixed", ListedLights((mixed,))).scenes)
     (naive,) = _counterparts([single], maker.pictures)
@@ -122,13 +117,13 @@ RANDOM_CROP = Preparation(crop=(9, 7), crop_at="random", seed=3)
         ({"preparation": RANDOM_CROP, "seed": 8}, 1),
     ],
 )
-def test_pictures_are_prepared_and_lit_as_they_were(maker: Maker, how: dict[str, Any], away: int) -> None:
+def test_repeats_preparation_and_illuminants(maker: Maker, how: dict[str, Any], away: int) -> None:
     made = _generated(maker.make(**how).scenes)
     for naive, scene in zip(_counterparts(made, maker.pictures), made, strict=True):
         np.testing.assert_allclose(naive.read()[0].astype(int), scene.read()[0].astype(int), atol=away)
 
 
-def test_every_crop_has_the_counterpart_of_its_own_place(maker: Maker) -> None:
+def test_each_crop_has_its_counterpart(maker: Maker) -> None:
     made = _generated(maker.make(preparation=Preparation(crop=(9, 7), crops=3)).scenes)
     naive = [scene.read()[0].astype(int) for scene in _counterparts(made, maker.pictures)]
     for image, scene in zip(naive, made, strict=True):
@@ -136,7 +131,7 @@ def test_every_crop_has_the_counterpart_of_its_own_place(maker: Maker) -> None:
     assert any(np.abs(image - naive[0]).max() > 500 for image in naive[2:6:2])
 
 
-def test_a_counterpart_under_several_lights_has_their_maps(maker: Maker) -> None:
+def test_counterpart_has_illuminant_maps(maker: Maker) -> None:
     choice = SimultaneousLights(BOTH, 2, parse_masks("soft-edge:angle=70,width=.6", 2, 0))
     (made, *_) = _generated(maker.make(lights=choice).scenes)
     (naive,) = _counterparts([made], maker.pictures)
@@ -152,7 +147,7 @@ def test_a_counterpart_under_several_lights_has_their_maps(maker: Maker) -> None
     assert not isinstance(plain, MixedScene)
 
 
-def test_a_set_under_a_gradient_has_no_counterpart(maker: Maker) -> None:
+def test_refuses_set_with_gradient(maker: Maker) -> None:
     made = maker.make(gradient="smooth:stops=2")
     with pytest.raises(InputError):
         plan_transfer(_real("x"), [made], maker.pictures)
@@ -164,7 +159,7 @@ def _dataset(maker: Maker) -> Dataset:
     return scene.dataset
 
 
-def test_found_under_another_name_by_its_content(maker: Maker, tmp_path: Path) -> None:
+def test_identifies_renamed_picture_by_content(maker: Maker, tmp_path: Path) -> None:
     dataset = _dataset(maker)
     other = tmp_path / "other"
     (other / "deep").mkdir(parents=True)
@@ -184,7 +179,7 @@ def test_found_under_another_name_by_its_content(maker: Maker, tmp_path: Path) -
     )
 
 
-def test_another_picture_of_that_name_is_missing(maker: Maker, tmp_path: Path) -> None:
+def test_reports_replaced_picture_as_missing(maker: Maker, tmp_path: Path) -> None:
     dataset = _dataset(maker)
     other = tmp_path / "other"
     save_pictures(other, ["a.png"], seed=9)
@@ -194,7 +189,7 @@ def test_another_picture_of_that_name_is_missing(maker: Maker, tmp_path: Path) -
     assert list(found) == ["c.png"]
 
 
-def test_random_colours_are_made_again(maker: Maker) -> None:
+def test_generates_random_colours_again(maker: Maker) -> None:
     place = maker.folder / "random"
     scenes = random_scenes(2, 7, 5, seed=4)
     made = generate_dataset(maker.lut, place, scenes, [0], seed=4, options=DatasetOptions(previews=False))
@@ -203,7 +198,7 @@ def test_random_colours_are_made_again(maker: Maker) -> None:
     np.testing.assert_array_equal(found["random-000001"].codes(), scenes[1].read().picture)
 
 
-def test_what_cannot_be_found_is_said(maker: Maker) -> None:
+def test_refuses_missing_sources(maker: Maker) -> None:
     dataset = _dataset(maker)
     with pytest.raises(InputError):
         find_source_pictures(dataset, maker.folder / "nowhere")
@@ -221,7 +216,7 @@ def _real(*names: str, place: str = "real.npz", seed: int = 0) -> SceneSet:
     return SceneSet("real", "thumbnails", place, tuple(scenes))
 
 
-def test_a_data_set_is_not_tested_on_itself(maker: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_test_on_training_set(maker: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
     made = maker.make()
     monkeypatch.chdir(maker.folder)
     same = SceneSet("made", "generated", "pictures/../made", made.scenes)
@@ -229,7 +224,7 @@ def test_a_data_set_is_not_tested_on_itself(maker: Maker, monkeypatch: pytest.Mo
         plan_transfer(same, [made])
 
 
-def test_a_source_that_is_a_test_image_is_found_by_name(maker: Maker) -> None:
+def test_identifies_test_image_by_source_name(maker: Maker) -> None:
     made, test = maker.make(), _real("B.PNG", "other")
     found = shared_images(made, test)
     assert [(one.position, one.name, one.test, one.by) for one in found] == [
@@ -243,11 +238,11 @@ def test_a_source_that_is_a_test_image_is_found_by_name(maker: Maker) -> None:
         "000004.png",
         "000005.png",
     ]
-    assert plan.notes == ("2 of 6 images of made are also in the test set, by name: b.png, b.png; left out",)
+    assert plan.notes == ("2 of 6 images of made are also in the test set, by name: b.png, b.png; excluded",)
     assert not plan_transfer(_real("other"), [made]).notes
 
 
-def test_generated_sets_are_compared_by_the_content_of_their_pictures(maker: Maker, tmp_path: Path) -> None:
+def test_compares_generated_sets_by_picture_content(maker: Maker, tmp_path: Path) -> None:
     other = tmp_path / "other"
     save_pictures(other, ["x.png", "a.png"], seed=5)
     shutil.copy(maker.pictures / "c.png", other / "renamed.png")
@@ -257,7 +252,7 @@ def test_generated_sets_are_compared_by_the_content_of_their_pictures(maker: Mak
     assert {(one.name, one.test, one.by) for one in found} == {("c.png", "renamed.png", "content")}
 
 
-def test_real_sets_are_compared_by_their_pixels() -> None:
+def test_compares_real_sets_by_pixels() -> None:
     one, other = _real("1", "2", place="one.npz"), _real("3", "4", place="other.npz")
     assert [(shared.name, shared.test, shared.by) for shared in shared_images(one, other)] == [
         ("1", "3", "content"),
@@ -266,7 +261,7 @@ def test_real_sets_are_compared_by_their_pixels() -> None:
     assert not shared_images(one, _real("3", "4", place="other.npz", seed=1))
 
 
-def test_copies_are_kept_only_where_that_is_allowed() -> None:
+def test_keeps_copies_only_if_allowed() -> None:
     one, other = _real("1", "2", place="one.npz"), _real("3", "4", place="other.npz")
     said = "2 of 2 images of real are also in photos, by content: 1, 2"
     assert trainable_images(one, other, test_name="photos") == ((), said)
@@ -278,7 +273,7 @@ def test_copies_are_kept_only_where_that_is_allowed() -> None:
     assert trainable_images(named, other)[0] == named.scenes[1:]
 
 
-def test_naive_counterparts_are_of_the_same_images(maker: Maker, tmp_path: Path) -> None:
+def test_naive_counterparts_match_images(maker: Maker, tmp_path: Path) -> None:
     made, some = maker.make(), tmp_path / "some"
     some.mkdir()
     for name in ("a.png", "c.png"):
@@ -293,15 +288,15 @@ def test_naive_counterparts_are_of_the_same_images(maker: Maker, tmp_path: Path)
         assert [scene.name for scene in each.scenes] == ["000000.png", "000001.png", "000004.png", "000005.png"]
         np.testing.assert_array_equal(each.scenes[2].truth, made.scenes[4].truth)
     assert "1 of 3 pictures are not in" in plan.notes[0]
-    assert "b.png; 2 images of them are left out" in plan.notes[0]
+    assert "b.png; 2 images of them are excluded" in plan.notes[0]
     assert "Canon EOS 550D, ColorMatrix2" in plan.notes[1]
     shutil.rmtree(some)
     save_pictures(some, ["b.png"], seed=8)
-    with pytest.raises(InputError, match="3 pictures of made"):
+    with pytest.raises(InputError, match="0 of 3 pictures of made"):
         plan_transfer(_real("x"), [made], pictures=some)
 
 
-def test_parts_that_are_set_apart_stay_apart(maker: Maker, tmp_path: Path) -> None:
+def test_excludes_validation_and_test_parts(maker: Maker, tmp_path: Path) -> None:
     save_pictures(tmp_path / "many", [f"{number}.png" for number in range(12)], seed=2)
     made = maker.make("divided", pictures=tmp_path / "many", split=(0.5, 0.0, 0.5))
     plan = plan_transfer(_real("x"), [made])
@@ -312,7 +307,7 @@ def test_parts_that_are_set_apart_stay_apart(maker: Maker, tmp_path: Path) -> No
     assert f"{24 - len(train)} images of its parts validation and test" in plan.notes[0]
 
 
-def test_what_cannot_be_planned_is_said(maker: Maker) -> None:
+def test_refuses_impossible_plans(maker: Maker) -> None:
     made = maker.make()
     with pytest.raises(InputError):
         plan_transfer(_real("x"), [made, made])
@@ -322,7 +317,7 @@ def test_what_cannot_be_planned_is_said(maker: Maker) -> None:
         plan_transfer(_real("a", "b", "c"), [made])
 
 
-def test_relit_scenes_have_the_lights_of_the_generated_images(maker: Maker) -> None:
+def test_relit_scenes_have_generated_illuminants(maker: Maker) -> None:
     made = maker.make()
     pixels = np.full((2, 2, 3), [80, 20, 20], np.float32)
     pixels[1, 1] = 79, 20, 20

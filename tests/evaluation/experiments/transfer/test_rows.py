@@ -1,4 +1,4 @@
-"""Rows of a transfer: right in worlds where the answer is known."""
+"""Rows of a transfer in simulated worlds with a known answer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _ratio(found: TransferFigures, method: str, data: str, place: int = 1) -> tu
     return figure.value, figure.low, figure.high
 
 
-def test_what_comes_from_the_same_world_is_worth_as_much() -> None:
+def test_same_world_gives_ratio_one() -> None:
     found = figures_of(_rows(TrainingSet("same", "generated", world(200, seed=2))), "reproduction")
     for place in range(6):
         for method in ("Mean colour", "Constant light"):
@@ -44,7 +44,7 @@ def test_what_comes_from_the_same_world_is_worth_as_much() -> None:
             assert high > 0.95
 
 
-def test_lights_elsewhere_and_surfaces_of_another_kind_are_found_out() -> None:
+def test_other_worlds_increase_errors() -> None:
     elsewhere = TrainingSet("elsewhere", "generated", world(200, seed=2, centre=COOL))
     tinted = TrainingSet("tinted", "generated", world(200, seed=2, cast=(1.0, 1.0, 0.7)))
     found = figures_of(_rows(elsewhere, tinted), "reproduction")
@@ -56,7 +56,7 @@ def test_lights_elsewhere_and_surfaces_of_another_kind_are_found_out() -> None:
     assert _ratio(found, "Constant light", "tinted")[2] < 1.3
 
 
-def test_the_rows_and_their_order() -> None:
+def test_order_of_rows() -> None:
     same = world(90, seed=2)
     rows = _rows(TrainingSet("a", "generated", same), TrainingSet("a", "naive", same), images=50)
     assert [(row.method, row.kind, row.images, len(row.results)) for row in rows] == [
@@ -73,7 +73,7 @@ def test_the_rows_and_their_order() -> None:
     assert (rows[1].results[0].estimates != rows[1].results[1].estimates).any()
 
 
-def test_a_learner_that_reads_scenes_itself() -> None:
+def test_learner_without_features() -> None:
     training = world(30, seed=2)
     rows = transfer(TEST, [TrainingSet("a", "generated", training)], [MeanLearner()], FOLDS, 30)
     assert [row.kind for row in rows] == ["cross-validation", "generated"]
@@ -81,23 +81,23 @@ def test_a_learner_that_reads_scenes_itself() -> None:
     np.testing.assert_allclose(rows[1].results[0].estimates, np.tile(expected, (120, 1)))
 
 
-def test_an_image_without_a_usable_pixel_is_guessed() -> None:
+def test_image_without_usable_pixel_is_guessed() -> None:
     black = (replace(TEST[0], cast=(0.0, 0.0, 0.0)), *TEST[1:])
     for row in transfer(black, [TrainingSet("a", "generated", world(40, seed=2))], [MeanColour()], FOLDS, 40):
         assert row.results[0].guessed.nonzero()[0].tolist() == [0]
         np.testing.assert_allclose(row.results[0].estimates[0], 3**-0.5)
 
 
-def test_images_are_drawn_without_repeats() -> None:
+def test_draws_images_without_repetition() -> None:
     drawn = [draw_images(1000, 100, seed) for seed in (0, 0, 1)]
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert len(np.unique(drawn[2])) == 100
     assert len(np.intersect1d(drawn[0], drawn[2])) < 30
-    with pytest.raises(InputError, match="11 training images of 10"):
+    with pytest.raises(InputError, match="11 training images requested, expected 1 to 10"):
         draw_images(10, 11, 0)
 
 
-def test_beside_real_images() -> None:
+def test_rows_with_real_images() -> None:
     tinted = TrainingSet("tinted", "generated", world(90, seed=2, cast=(1.0, 1.0, 0.7)))
     rows = transfer(TEST, [tinted], LEARNERS, FOLDS, 80, real_counts=(10, None))
     listed = [(row.method, row.kind, row.real_use, row.real, row.images) for row in rows if row.method == "Mean colour"]
@@ -121,12 +121,12 @@ def test_beside_real_images() -> None:
 
 
 @dataclass(frozen=True)
-class Remembering(MeanLearner):
-    """Writes down what it was trained on."""
+class RecordsTraining(MeanLearner):
+    """Records its training images."""
 
     seen: list[frozenset[str]] = field(default_factory=list)
 
-    def __deepcopy__(self, memory: object) -> Remembering:
+    def __deepcopy__(self, memory: object) -> RecordsTraining:
         return self
 
     def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Method:
@@ -134,8 +134,8 @@ class Remembering(MeanLearner):
         return super().fit(scenes, seed)
 
 
-def test_real_images_are_drawn_from_other_folds_fewer_among_more() -> None:
-    learner = Remembering()
+def test_real_images_are_nested_and_from_other_folds() -> None:
+    learner = RecordsTraining()
     transfer(TEST, [], [learner], FOLDS[:1], 1, real_counts=(5, 20))
     folds = {scene.name: int(fold) for scene, fold in zip(TEST, FOLDS[0], strict=True)}
     alone = learner.seen[3:]
