@@ -270,7 +270,7 @@ def summarise(errors: npt.ArrayLike) -> Summary:
     values = np.asarray(errors, dtype=np.float64).ravel()
     if not values.size or not np.isfinite(values).all():
         raise InputError(
-            f"{values.size} errors, {int((~np.isfinite(values)).sum())} of them NaN or infinite; expected at least one "
+            f"{values.size} errors, {int((~np.isfinite(values)).sum())} of them NaN or infinite, expected at least one "
             "error, all finite; correct or remove the others"
         )
     q1, q2, q3, p95 = (float(level) for level in percentiles(values, (25, 50, 75, 95)))

@@ -32,7 +32,7 @@ def argument(metavar: str, text: str) -> Any:
 
 def thread_option(text: str = "") -> Any:
     """Return the option --workers; `text` is added to its help."""
-    return option("N", f"Threads{text}. \\[default: one a processor]", min=1)
+    return option("N", f"Threads{text}. \\[default: one per processor]", min=1)
 
 
 # Arguments and options that several commands share.

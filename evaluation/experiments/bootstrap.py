@@ -134,7 +134,7 @@ class ErrorSample:
         values = np.asarray(errors, dtype=np.float64).ravel()
         if not values.size or not np.isfinite(values).all():
             raise InputError(
-                f"{values.size} errors, {int((~np.isfinite(values)).sum())} of them NaN or infinite; expected one "
+                f"{values.size} errors, {int((~np.isfinite(values)).sum())} of them NaN or infinite, expected one "
                 "finite error for each image; leave out images without one"
             )
         order = np.argsort(values, kind="stable")

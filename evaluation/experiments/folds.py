@@ -70,7 +70,7 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
     """
     names = [str(index) for index in range(count)] if groups is None else list(groups)
     if len(names) != count:
-        raise ValueError(f"{len(names)} groups of {count} images; expected one for each image")
+        raise ValueError(f"{len(names)} groups of {count} images, expected one for each image")
     group_names, group_indices, sizes = np.unique(names, return_inverse=True, return_counts=True)
     if not _MIN_FOLDS <= folds <= len(group_names):
         available = f"{count} images" + ("" if groups is None else f" in {len(group_names)} groups that stay together")
@@ -79,7 +79,7 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
             expectation = f"expected at least {_MIN_FOLDS} {units} for cross-validation; add images"
         else:
             possible = f"2 to {len(group_names)}" if len(group_names) > _MIN_FOLDS else "2"
-            expectation = f"expected {possible}, at least {unit} in each fold; choose a possible number (--folds)"
+            expectation = f"expected {possible} folds, at least {unit} in each; choose another number (--folds)"
         raise InputError(f"{counted(folds, 'fold')} of {available}: {expectation}")
     order = np.random.default_rng(seed).permutation(len(group_names))
     # Largest groups first, each into the emptiest fold: fold sizes then differ by less than the largest group.
@@ -110,17 +110,17 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     columns, rows = read_csv(path, "expected CSV, image,fold a line", "folds from")
     if not {"image", "fold"} <= set(columns):
         column_text = ",".join(columns) or "of an empty file"
-        raise FormatError(f"{path} has the columns {column_text}; expected image,fold; correct its first line")
+        raise FormatError(f"{path} has the columns {column_text}, expected image,fold; correct its first line")
     fold_texts = {row["image"]: row["fold"].strip() for row in rows}
     repeated = [image for image, count in Counter(row["image"] for row in rows).items() if count > 1]
     missing = [name for name in names if not fold_texts.get(name)]
     unknown = sorted(set(fold_texts) - set(names))
     for images, problem in ((repeated, "twice"), (missing, "without a fold"), (unknown, "not in the data set")):
         if images:
-            raise FormatError(f"{path} has images {problem}: {first_of(images)}; expected each once; correct it")
+            raise FormatError(f"{path} has images {problem}: {first_of(images)}, expected each once; correct it")
     fold_names, folds = np.unique([fold_texts[name] for name in names], return_inverse=True)
     if len(fold_names) < _MIN_FOLDS:
-        raise FormatError(f"{path} has only the fold {first_of(list(fold_names))}; expected at least two; correct it")
+        raise FormatError(f"{path} has only the fold {first_of(list(fold_names))}, expected at least two; correct it")
     return folds.astype(np.int64)
 
 

@@ -150,7 +150,7 @@ def fit_copy(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
         fresh = copy.deepcopy(learner)
     except Exception as error:
         raise InputError(
-            f"{learner.name} cannot be copied ({error}); expected a constructor that stores plain values only, so that "
+            f"{learner.name} cannot be copied ({error}), expected a constructor that stores plain values only, so that "
             "each training starts from the same state; open files and models in fit"
         ) from error
     try:
@@ -195,7 +195,7 @@ def _map_error(
     if lights.shape != image.shape or weights.shape[:2] != image.shape[:2]:
         raise FormatError(
             f"{scene.name} is {image.shape[1]}x{image.shape[0]} px, its map of illuminants {lights.shape[1]}x"
-            f"{lights.shape[0]}, its weights {weights.shape[1]}x{weights.shape[0]}; expected the same size; correct it"
+            f"{lights.shape[0]}, its weights {weights.shape[1]}x{weights.shape[0]}, expected the same size; correct it"
         )
     estimate = estimate_map if estimate_map is not None else np.array(GREY if answer.light is None else answer.light)
     return measure_map(estimate, lights, weights, scene.lights, image, scene.saturation, mask)

@@ -67,11 +67,11 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
     missing = [name for name in ("image", "method", *_NUMBER_COLUMNS, "guessed") if name not in columns]
     if missing:
         raise FormatError(
-            f"{path} has the columns {', '.join(columns) or 'of an empty file'}; expected {', '.join(missing)} too, as "
+            f"{path} has the columns {', '.join(columns) or 'of an empty file'}, expected {', '.join(missing)} too, as "
             "evaluate run writes them; run the methods again"
         )
     if len(set(columns)) < len(columns):
-        raise FormatError(f"{path} has the columns {', '.join(columns)}; expected each once; remove the others")
+        raise FormatError(f"{path} has the columns {', '.join(columns)}, expected each once; remove the others")
     lines_by_method: dict[str, dict[str, _Line]] = {}
     for row in rows:
         line_name = f"{path}, line {rows.line_num}"
@@ -80,7 +80,7 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
         numbers = [_finite_number(row[name], name, line_name) for name in _NUMBER_COLUMNS]
         if min(numbers) < 0 or not any(numbers[2:]):
             raise FormatError(
-                f"{line_name}: {row['image']} has {dict(zip(_NUMBER_COLUMNS, numbers, strict=True))}; expected no "
+                f"{line_name}: {row['image']} has {dict(zip(_NUMBER_COLUMNS, numbers, strict=True))}, expected no "
                 "value below 0, and a ground truth above 0; correct it"
             )
         if row["guessed"] not in ("0", "1"):
@@ -235,7 +235,7 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
         if faulty_images
     ]
     if faults:
-        raise InputError(f"{path}: {'; '.join(faults)}; expected one line for each image; correct it")
+        raise InputError(f"{path}: {' and '.join(faults)}, expected one line for each image; correct it")
     return GivenEstimates(path.stem if name is None else name, path.name, file_sha256(path), lights)
 
 
@@ -257,11 +257,11 @@ def _parse_estimates(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.fl
     try:
         heads, *rows = list(csv.reader(lines, delimiter=separator, strict=True)) or [[]]
     except csv.Error as error:
-        raise FormatError(f"{path} is not CSV text: {error}; expected {_ESTIMATES_TEXT}; correct it") from error
+        raise FormatError(f"{path} is not CSV text: {error}, expected {_ESTIMATES_TEXT}; correct it") from error
     heads = [head.strip().lower() for head in heads]
     if any(heads.count(column) != 1 for column in _ESTIMATES_COLUMNS):
         raise FormatError(
-            f"{path} begins with {separator.join(heads)[:60]!r}; expected {_ESTIMATES_TEXT}, each once; "
+            f"{path} begins with {separator.join(heads)[:60]!r}, expected {_ESTIMATES_TEXT}, each once; "
             "correct its first line"
         )
     column_indices = [heads.index(column) for column in _ESTIMATES_COLUMNS]
@@ -276,5 +276,5 @@ def _parse_estimates(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.fl
             estimates.append((image, np.array([float(channel) for channel in light])))
         except ValueError as error:
             line = f"{path}, line {line_number}"
-            raise FormatError(f"{line}: {error}; expected a name and three numbers; correct it") from error
+            raise FormatError(f"{line}: {error}, expected a name and three numbers; correct it") from error
     return estimates

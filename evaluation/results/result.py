@@ -63,10 +63,10 @@ class Result:
         Examples
         --------
         >>> Result("Mine", np.eye(3), {}, np.array([True, False, True])).marked_name
-        'Mine (no light: 2 of 3)'
+        'Mine (no estimate: 2 of 3)'
         """
         missing = int(self.guessed.sum())
-        return f"{self.method} (no light: {missing} of {len(self.guessed)})" if missing else self.method
+        return f"{self.method} (no estimate: {missing} of {len(self.guessed)})" if missing else self.method
 
     def summary(self, metric: ErrorKind) -> Summary:
         """Return the statistics of one kind of error."""

@@ -204,7 +204,7 @@ def _mixed_table(subject: Subject, results: Sequence[Result]) -> Table:
         rows.append((mixed.marked_name, *(cell for column in columns for cell in _mean_and_median(column))))
     unjudged_note = (f"{unjudged} images are excluded: all of their pixels are masked or have no ground truth",)
     return Table(
-        f"{subject.name}: recovery angular error of the {sum(subject.mixed)} images under several lights, degrees",
+        f"{subject.name}: recovery angular error of the {sum(subject.mixed)} images under several illuminants, degrees",
         ("Algorithm", *("MAE_illum", "med.", "MAE_rgb", "med.", "By region", "med.", "Mean light", "med.")),
         tuple(rows),
         notes=(

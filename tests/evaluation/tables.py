@@ -27,7 +27,7 @@ def write_lut(
     writer = LutWriter(folder, len(lights), len(CODES), samples[0].shape[1])
     for number, values in enumerate(samples):
         writer.put(number, np.rint(values).astype(np.uint16))
-    known = Provenance(
+    names = Provenance(
         camera=camera, bits=3, white_level=WHITE_LEVEL, session_sha256="0", chart_sha256="0", software="test"
     )
     plan = [
@@ -36,5 +36,5 @@ def write_lut(
         else Illumination(number, "blackbody", 3000.0 + number, Colour(1, 2, 3))
         for number in range(len(lights))
     ]
-    writer.finish(plan, lights, known)
+    writer.finish(plan, lights, names)
     return open_lut(folder)

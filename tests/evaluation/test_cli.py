@@ -34,9 +34,9 @@ def test_counts_images_without_usable_pixel(
     make_dataset: Callable[[int, int], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([str(make_dataset(12, 12))]) == 0
-    after = capsys.readouterr().out.rpartition("┘")[2].partition("black level: ")[0]
-    reason = "no usable pixel in 16 of 16 images (too small for it, clipped, black or even)"
-    assert after.split("\n") == [
+    notes = capsys.readouterr().out.rpartition("┘")[2].partition("black level: ")[0]
+    reason = "no usable pixel in 16 of 16 images (too small for it, clipped, black or uniform)"
+    assert notes.split("\n") == [
         "",
         f"General Gray-world: {reason}; grey was used as their estimate",
         f"1st-order Gray-Edge: {reason}; grey was used as their estimate",
@@ -63,10 +63,10 @@ def test_refuses_with_one_sentence(
     monkeypatch.chdir(dataset.parent)
     monkeypatch.setattr(run_folder, "evaluate", Mock(side_effect=AssertionError("the work must not begin")))
     Path("empty").mkdir()
-    before = {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")}
+    files = {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")}
     assert main([*arguments]) == 2
     assert message in capsys.readouterr().err
-    assert {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")} == before
+    assert {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")} == files
 
 
 def test_run_refuses_learner_and_suggests_train(capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,5 +24,5 @@ def test_examples(name: str) -> None:
 
 @pytest.mark.slow
 def test_finds_examples() -> None:
-    found = [test for name in MODULES for test in doctest.DocTestFinder().find(import_module(name)) if test.examples]
-    assert len(found) >= 12
+    modules = [test for name in MODULES for test in doctest.DocTestFinder().find(import_module(name)) if test.examples]
+    assert len(modules) >= 12

@@ -57,21 +57,21 @@ RED, WHITE = np.array([1.0, 0.5, 0.5]), np.array([1.0, 1, 1])
 LIGHTS = np.stack([RED, WHITE])
 
 
-def halves(height: int = 6, width: int = 8, left: int = 2) -> npt.NDArray[np.float64]:
+def halves(height: int = 6, width: int = 8, red_columns: int = 2) -> npt.NDArray[np.float64]:
     """Return weights (H, W, 2): red alone in the left columns, white alone in the others."""
     weights = np.zeros((height, width, 2))
-    weights[:, :left, 0] = weights[:, left:, 1] = 1
+    weights[:, :red_columns, 0] = weights[:, red_columns:, 1] = 1
     return weights
 
 
 def test_one_illuminant_for_all_pixels() -> None:
     weights = halves()
     error = measure_map(WHITE, weights @ LIGHTS, weights, LIGHTS, image=weights @ LIGHTS)
-    off = float(recovery_error(WHITE, RED))
-    assert error.recovery == pytest.approx(off / 4)
+    angle = float(recovery_error(WHITE, RED))
+    assert error.recovery == pytest.approx(angle / 4)
     assert error.reproduction == pytest.approx(float(reproduction_error(WHITE, RED)) / 4)
     assert [(region.light, region.share) for region in error.regions] == [(0, 0.25), (1, 0.75)]
-    assert [region.recovery for region in error.regions] == pytest.approx([off, 0])
+    assert [region.recovery for region in error.regions] == pytest.approx([angle, 0])
 
 
 def test_perfect_map_has_no_error() -> None:
@@ -110,13 +110,13 @@ def test_bands_do_not_change_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(1)
     weights = random.dirichlet((1, 1), (30, 20))
     image, estimate = random.random((30, 20, 3)), random.random((30, 20, 3)) + 0.1
-    whole = measure_map(estimate, weights @ LIGHTS, weights, LIGHTS, image, 0.8)
+    unbanded = measure_map(estimate, weights @ LIGHTS, weights, LIGHTS, image, 0.8)
     monkeypatch.setattr(maps, "_PIXELS_AT_ONCE", 40)
     banded = measure_map(estimate, weights @ LIGHTS, weights, LIGHTS, image, 0.8)
-    assert banded.recovery == pytest.approx(whole.recovery)
-    assert banded.rgb == pytest.approx(whole.rgb)
+    assert banded.recovery == pytest.approx(unbanded.recovery)
+    assert banded.rgb == pytest.approx(unbanded.rgb)
     assert [region.reproduction for region in banded.regions] == pytest.approx(
-        [region.reproduction for region in whole.regions]
+        [region.reproduction for region in unbanded.regions]
     )
 
 
@@ -128,14 +128,14 @@ def test_rgb_error_follows_lsmi() -> None:
     image[0, 0] = 0
     truth, estimate = weights @ LIGHTS, random.random((9, 11, 3)) + 0.2
     angles: list[float] = []
-    for place in np.ndindex(9, 11):
+    for index in np.ndindex(9, 11):
         corrected: list[npt.NDArray[np.float64]] = []
-        for light in (estimate[place], truth[place]):
-            red, green, blue = image[place]
+        for light in (estimate[index], truth[index]):
+            red, green, blue = image[index]
             colour = [red / (light[0] / light[1]), green, blue / (light[2] / light[1])]
             corrected.append(np.minimum(colour, 1023) + 1e-4)
-        one, other = corrected
-        cosine = one @ other / math.sqrt(float(one @ one) * float(other @ other))
+        first, second = corrected
+        cosine = first @ second / math.sqrt(float(first @ first) * float(second @ second))
         angles.append(math.degrees(math.acos(min(1.0, cosine))))
     error = measure_map(estimate, truth, weights, LIGHTS, image, saturation=1023)
     assert error.rgb == pytest.approx(np.mean(angles), abs=1e-4)

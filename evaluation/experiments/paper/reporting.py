@@ -232,9 +232,11 @@ def table1_report(
             "White-Patch uses the largest value, which increases with the number of pixels: of noise, and of whites."
         )
         elements += [pages.heading("Images of other sizes"), pages.figure(size_plot, caption), table_part(table)]
-    elements += [pages.heading("The tables"), table_part(noise), table_part(print_colours)]
+    elements += [pages.heading("Look-up tables"), table_part(noise), table_part(print_colours)]
     elements += [pages.heading(f"{other_metric.capitalize()} error, degrees"), *map(table_part, tables_other)]
-    return PaperReport("Table 1: plain methods on generated data sets", tuple(tables), tuple(elements), files)
+    return PaperReport(
+        "Table 1: statistics-based methods on generated data sets", tuple(tables), tuple(elements), files
+    )
 
 
 def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperReport:
@@ -294,4 +296,4 @@ def chromaticities_report(luts: Sequence[Lut], sets: Sequence[Truths]) -> PaperR
         tables.append(coverage)
         elements.append(table_part(coverage))
         files |= _table_files("coverage", coverage)
-    return PaperReport("Chromaticities of the lights", tuple(tables), tuple(elements), files)
+    return PaperReport("Chromaticities of the illuminants", tuple(tables), tuple(elements), files)

@@ -144,7 +144,7 @@ def settings(
     """
     count = len(pictures)
     if not count:
-        raise InputError("there is no picture to print; name some")
+        raise InputError("there are 0 pictures, expected at least one; name some")
     sets: dict[str, Sequence[Source]] = {
         names[0]: [ScaledSource(picture, side) for picture in pictures],
         "Random": random_scenes(count, side, side, seed),
@@ -201,10 +201,10 @@ def block_table(block: Block, metric: ErrorKind) -> Table:
         rows.append((result.marked_name, *result.summary(metric).as_tuple()))
         if result.method in published:
             rows.append(("paper", *published[result.method].as_tuple()))
-    notes = [f"{counted(len(block.scenes), 'image')}; lights {block.lights}."]
+    notes = [f"{counted(len(block.scenes), 'image')}; illuminants {block.lights}."]
     notes += [
-        f"{result.method}: no usable pixel in {counted(int(result.guessed.sum()), 'image')}, whose light "
-        "was taken to be grey."
+        f"{result.method}: no usable pixel in {counted(int(result.guessed.sum()), 'image')}; grey was used as "
+        "their estimate."
         for result in block.results
         if result.guessed.any()
     ]
@@ -294,7 +294,9 @@ def table2(
 ) -> tuple[TrainingComparison, ...]:
     """Return the results of each learner, trained on real and on generated images; `folds`: (N,) int64."""
     if not generated or not learners:
-        raise InputError(f"{len(learners)} learners and {len(generated)} generated images: name at least one of each")
+        raise InputError(
+            f"{len(learners)} learners and {len(generated)} generated images, expected at least one each; name some"
+        )
     learner_list = list(learners.values())
     cross_validated = cross_validate(real, learner_list, folds, seed, workers, on_scene)
     fitted = [fit_copy(learner, generated, seed) for learner in learner_list]

@@ -92,7 +92,7 @@ def trainable_images(
         shared_positions = {image.position for image in shared_list}
         return tuple(scene for position, scene in enumerate(training.scenes) if position not in shared_positions), note
     if any(image.by == "content" for image in shared_list):
-        raise InputError(f"{note}; expected test images that are not in the training set; use --unseen to exclude them")
+        raise InputError(f"{note}, expected test images that are not in the training set; use --unseen to exclude them")
     return training.scenes, note
 
 
@@ -245,7 +245,7 @@ class NaiveScene:
             mixture = parse_mixture(label)
             if not levels.keys() >= set(mixture.lights):
                 raise FormatError(
-                    f"{entry.image} is under illuminant {label}, which its data set does not list; expected a listed "
+                    f"{entry.image} is under illuminant {label}, which its data set does not list, expected a listed "
                     "one; generate the data set again"
                 )
             level = sum(weight * levels[light] for light, weight in zip(mixture.lights, mixture.weights, strict=True))
@@ -393,7 +393,10 @@ def _trainable(scene_set: SceneSet, test: SceneSet, notes: list[str]) -> tuple[S
         held_out_ids = {id(scene) for scene in held_out}
         trainable = tuple(scene for scene in trainable if id(scene) not in held_out_ids)
     if not trainable:
-        raise InputError(f"{scene_set.name} has 0 images for training that are not in the test set; use another set")
+        raise InputError(
+            f"0 of {len(scene_set.scenes)} images of {scene_set.name} may be used for training: all are in the test "
+            "set, or in its own validation and test parts; use another set"
+        )
     return trainable
 
 
@@ -410,7 +413,7 @@ def _with_naive(
     if not with_picture:
         raise InputError(
             f"0 of {len(missing)} pictures of {name} are in {pictures}, by name and hash (missing: "
-            f"{first_of(missing, 3)}); expected the folder that the data set was made from; use that folder"
+            f"{first_of(missing, 3)}), expected the folder that the data set was made from; use that folder"
         )
     if missing:
         notes.append(

@@ -37,23 +37,23 @@ def runs(tmp_path: Path) -> tuple[str, str]:
 def test_two_runs(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", *runs]) == 0
     printed = capsys.readouterr().out
-    one, two = runs
-    assert f"A ({two}) lacks 1 image of A ({one}), excluded here: im 29" in printed
-    assert f"A ({two}) on 0 of 29 images, larger on 29, equal on 0: A ({two}) is better" in printed
-    assert f"B <i> ({two}) on 0 of 29 images, larger on 0, equal on 29: not" in printed
+    first, second = runs
+    assert f"A ({second}) lacks 1 image of A ({first}), excluded here: im 29" in printed
+    assert f"A ({second}) on 0 of 29 images, larger on 29, equal on 0: A ({second}) is better" in printed
+    assert f"B <i> ({second}) on 0 of 29 images, larger on 0, equal on 29: not" in printed
 
 
 def test_accepts_short_method_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = ("Gray-world", "PCA bright and dark", "Shades-of-Gray (p=4)", "Own")
     lines = [
-        f"im {number},{name},1,2,1,1.5,{1 + place + number / 10},0\n"
+        f"im {number},{name},1,2,1,1.5,{1 + index + number / 10},0\n"
         for number in range(9)
-        for place, name in enumerate(names)
+        for index, name in enumerate(names)
     ]
     (tmp_path / "errors.csv").write_text(HEAD + "".join(lines))
     assert main(["compare", str(tmp_path), "--method", "pca", "--method", "shades-of-gray:p=4"]) == 0
-    chosen = capsys.readouterr().out
-    assert "PCA bright and dark has smaller errors than Shades-of-Gray (p=4) on 9 of 9 images" in chosen
+    output = capsys.readouterr().out
+    assert "PCA bright and dark has smaller errors than Shades-of-Gray (p=4) on 9 of 9 images" in output
 
 
 def test_refuses_runs_without_common_method(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,12 +80,12 @@ def test_compares_results_folders(dataset: Path, tmp_path: Path, capsys: pytest.
 
 
 def test_reports_different_treatments(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    for place, black in zip(runs, ("0", "500"), strict=True):
+    for folder, black in zip(runs, ("0", "500"), strict=True):
         record = {"data_set": {"place": "photos"}, "treatment": {"black level": black, "mask": "none"}}
-        (Path(place) / "run.json").write_text(json.dumps(record))
+        (Path(folder) / "run.json").write_text(json.dumps(record))
     assert main(["compare", *runs]) == 0
-    told = [line for line in capsys.readouterr().out.splitlines() if "the runs differ in" in line]
-    assert told == ["the runs differ in black level: first 0, second 500"]
+    notes = [line for line in capsys.readouterr().out.splitlines() if "the runs differ in" in line]
+    assert notes == ["the runs differ in black level: first 0, second 500"]
 
 
 def test_writes_tables_and_page(runs: tuple[str, str], tmp_path: Path) -> None:

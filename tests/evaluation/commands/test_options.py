@@ -32,13 +32,13 @@ def test_all_contains_each_method_once() -> None:
 
 
 def test_default_methods_are_the_seven_standard_ones(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    chosen = choose_methods([" Standard"])
-    assert [method.name for method in chosen] == [standard_methods()[name].name for name in STANDARD]
-    assert len(chosen) == 7
+    methods = choose_methods([" Standard"])
+    assert [method.name for method in methods] == [standard_methods()[name].name for name in STANDARD]
+    assert len(methods) == 7
     assert len(choose_methods(["standard", "all", "pca"])) == len(standard_methods())
     assert main(["run", str(dataset), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["errors"]
-    assert list(dict.fromkeys(row["method"] for row in rows)) == [method.name for method in chosen]
+    assert list(dict.fromkeys(row["method"] for row in rows)) == [method.name for method in methods]
 
 
 LEARNER = """
@@ -79,9 +79,9 @@ def test_run_suggests_cv_for_untrained_class(dataset: Path, tmp_path: Path, caps
         "        return self\n\n    def estimate(self, image, saturation=None, mask=None):\n        return self.light\n"
     )
     assert main(["run", str(dataset), "--method", f"{file}:Own"]) == 2
-    said = capsys.readouterr().err
-    assert "AttributeError" in said
-    assert "use evaluate cv" in said
+    error = capsys.readouterr().err
+    assert "AttributeError" in error
+    assert "use evaluate cv" in error
 
 
 @pytest.mark.parametrize(

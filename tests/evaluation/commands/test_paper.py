@@ -55,25 +55,25 @@ def test_refuses_matrix_for_photographs(
     (tmp_path / "pictures").mkdir()
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "pictures" / "black.png")
     lut = str(make_table("Test").folder)
-    given = ("--pictures", str(tmp_path / "pictures"), "--lights-like", str(truths), "--side", "16")
-    assert main(["paper", "table1", lut, *given, "--matrix", "Canon EOS 550D"]) == 2
+    options = ("--pictures", str(tmp_path / "pictures"), "--lights-like", str(truths), "--side", "16")
+    assert main(["paper", "table1", lut, *options, "--matrix", "Canon EOS 550D"]) == 2
     assert "needs a data set of raw images" in capsys.readouterr().err
 
 
 def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    made, out = tmp_path / "made", tmp_path / "out"
+    generated_set, out = tmp_path / "made", tmp_path / "out"
     scenes = random_scenes(12, 30, 30)
     options = DatasetOptions(previews=False)
-    generate_dataset(make_table("Test"), made, scenes, RandomLights(1, len(LIGHTS), 0), options=options)
-    wish = ("--generated", str(made), "--method", "smart-color-cat", "--out", str(out))
-    assert main(["paper", "table2", str(thumbnails), *wish]) == 0
+    generate_dataset(make_table("Test"), generated_set, scenes, RandomLights(1, len(LIGHTS), 0), options=options)
+    arguments = ("--generated", str(generated_set), "--method", "smart-color-cat", "--out", str(out))
+    assert main(["paper", "table2", str(thumbnails), *arguments]) == 0
     printed = capsys.readouterr().out
     assert "The paper's table is for Cube+" in printed
     real, generated = (rows_of(out / f"trained_on_{name}.csv") for name in ("real", "generated"))
     (ratio,) = rows_of(out / "ratios.csv")
     assert float(ratio["Ratio"]) == pytest.approx(float(generated[0]["Med."]) / float(real[0]["Med."]))
     assert float(ratio["In the paper, on Cube+"]) == pytest.approx(1.43 / 1.35)
-    assert main(["paper", "table2", str(thumbnails), "--generated", str(made), "--method", "magic"]) == 2
+    assert main(["paper", "table2", str(thumbnails), "--generated", str(generated_set), "--method", "magic"]) == 2
     assert "'magic' is not a learned method" in capsys.readouterr().err
     copy = thumbnails.with_name("copy.npz")
     copy.write_bytes(thumbnails.read_bytes())
@@ -82,7 +82,7 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("unseen", "message"),
     [((), "They were kept, as in the paper"), (("--unseen",), "Generated: made, 4 images")],
 )
 def test_table2_excludes_test_pictures_only_with_unseen(
@@ -90,8 +90,8 @@ def test_table2_excludes_test_pictures_only_with_unseen(
     thumbnails: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    given: tuple[str, ...],
-    said: str,
+    unseen: tuple[str, ...],
+    message: str,
 ) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
@@ -101,10 +101,10 @@ def test_table2_excludes_test_pictures_only_with_unseen(
     options = DatasetOptions(previews=False)
     lights = RandomLights(2, len(LIGHTS), 0)
     generate_dataset(make_table("Test"), tmp_path / "made", find_pictures(str(pictures)), lights, options=options)
-    wish = ("--generated", str(tmp_path / "made"), "--method", "constant-light", *given)
-    assert main(["paper", "table2", str(thumbnails), *wish]) == 0
+    arguments = ("--generated", str(tmp_path / "made"), "--method", "constant-light", *unseen)
+    assert main(["paper", "table2", str(thumbnails), *arguments]) == 0
     printed = capsys.readouterr()
-    assert said in printed.out
+    assert message in printed.out
     assert "4 of 8 images of made are also in photos, by name: p0.png" in printed.out + printed.err
 
 
@@ -113,9 +113,9 @@ def test_keeps_results_if_output_is_closed(tmp_path: Path) -> None:
     reader, writer = os.pipe()
     os.close(reader)
     call = [sys.executable, "-m", "evaluation.cli", "paper", "reduction", "noise.png", "--out", "out"]
-    done = subprocess.run(call, cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    process = subprocess.run(call, cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
-    assert (done.returncode, (tmp_path / "out" / "report.html").is_file()) == (0, True), done.stderr
+    assert (process.returncode, (tmp_path / "out" / "report.html").is_file()) == (0, True), process.stderr
 
 
 @pytest.mark.parametrize(

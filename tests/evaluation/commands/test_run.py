@@ -30,9 +30,9 @@ def thumbnails(tmp_path: Path) -> Path:
 
 def write_example(folder: Path) -> None:
     """Write the example of the how-to page into a folder."""
-    found = re.search(r"```python (\w+\.py)\n(.*?)```", HOW_TO.read_text(encoding="utf-8"), re.DOTALL)
-    assert found is not None
-    (folder / found[1]).write_text(found[2], encoding="utf-8")
+    match = re.search(r"```python (\w+\.py)\n(.*?)```", HOW_TO.read_text(encoding="utf-8"), re.DOTALL)
+    assert match is not None
+    (folder / match[1]).write_text(match[2], encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -61,8 +61,8 @@ def test_evaluates_estimates_of_another_program(
     lines = [f"{scene.name.removesuffix('.png')},1,1,1" for scene in scenes]
     (tmp_path / "grey.csv").write_text("image,r,g,b\n" + "\n".join(lines[::-1]))
     (tmp_path / "bad.csv").write_text("\n".join(["image,r,g,b", f"{scenes[0].name},nan,1,1", *lines[1:]]))
-    given = ("--method", f"{tmp_path}/grey.csv,NoNo={tmp_path}/bad.csv")
-    assert main(["run", str(thumbnails), *given, "--error", "recovery", "--json"]) == 0
+    options = ("--method", f"{tmp_path}/grey.csv,NoNo={tmp_path}/bad.csv")
+    assert main(["run", str(thumbnails), *options, "--error", "recovery", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     expected = summarise(recovery_error([1, 1, 1], np.stack([scene.truth for scene in scenes])))
     for row in printed["errors"]:
@@ -72,10 +72,10 @@ def test_evaluates_estimates_of_another_program(
             assert row["below3"] == pytest.approx(expected.below3)
             assert row["no_estimate"] == (row["method"] == "NoNo")
     assert printed["notes"] == []
-    assert main(["run", str(thumbnails), *given]) == 0
-    taken = "grey was used as their estimate"
+    assert main(["run", str(thumbnails), *options]) == 0
+    replaced = "grey was used as their estimate"
     out = capsys.readouterr().out
-    assert f"NoNo: no estimate for 1 of 9 images (image 0.png returned nan 1 1); {taken}" in out
+    assert f"NoNo: no estimate for 1 of 9 images (image 0.png returned nan 1 1); {replaced}" in out
     assert "Gray-world" not in out  # Nothing but what was asked for.
 
 

@@ -41,20 +41,27 @@ def test_trains_saves_and_uses_model(data: Path, tmp_path: Path, capsys: pytest.
 
 
 def test_adapts_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before, after = tmp_path / "before.npz", tmp_path / "after.npz"
+    base_file, adapted_file = tmp_path / "before.npz", tmp_path / "after.npz"
     with np.load(data) as content:
         few: dict[str, Any] = {name: content[name][:6] for name in content.files}
     few["names"] = np.array([f"few {number}" for number in range(6)])
     np.savez(tmp_path / "few.npz", **few)
-    assert main(["train", "kernel-ridge", str(data), "--out", str(before)]) == 0
+    assert main(["train", "kernel-ridge", str(data), "--out", str(base_file)]) == 0
     capsys.readouterr()
-    assert main(["train", "kernel-ridge", str(tmp_path / "few.npz"), "--adapt", str(before), "--out", str(after)]) == 0
+    assert (
+        main(
+            ["train", "kernel-ridge", str(tmp_path / "few.npz"), "--adapt", str(base_file), "--out", str(adapted_file)]
+        )
+        == 0
+    )
     printed = " ".join(capsys.readouterr().out.split())
-    assert "before.npz 0." in printed
+    assert "weights of the blend: " in printed
     # Images of either training are reported as training images.
-    assert main(["run", str(data), "--method", str(after)]) == 0
+    assert main(["run", str(data), "--method", str(adapted_file)]) == 0
     assert ": 12 of 12 images were used for training" in " ".join(capsys.readouterr().out.split())
-    assert main(["train", "smart-color-cat", str(data), "--adapt", str(before), "--out", str(tmp_path / "no.npz")]) == 2
+    assert (
+        main(["train", "smart-color-cat", str(data), "--adapt", str(base_file), "--out", str(tmp_path / "no.npz")]) == 2
+    )
     assert "is a model of kernel-ridge, expected smart-color-cat" in " ".join(capsys.readouterr().err.split())
 
 
@@ -69,11 +76,11 @@ def test_trains_user_class(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
         "    def estimate(self, image, saturation=None, mask=None):\n"
         "        return self.light\n"
     )
-    mine = f"{tmp_path / 'mine.py'}:Mean"
-    assert main(["cv", mine, str(data)]) == 0
+    class_file = f"{tmp_path / 'class_file.py'}:Mean"
+    assert main(["cv", class_file, str(data)]) == 0
     assert "My mean" in capsys.readouterr().out
-    assert main(["train", mine, str(data), "--out", str(tmp_path / "model.npz")]) == 2
-    assert "is a class of your own, which a model file cannot hold: evaluate cv" in capsys.readouterr().err
+    assert main(["train", class_file, str(data), "--out", str(tmp_path / "model.npz")]) == 2
+    assert "is your own class" in capsys.readouterr().err
 
 
 def test_all_omits_learners_that_are_not_installed(
@@ -91,7 +98,7 @@ def test_all_omits_learners_that_are_not_installed(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "why"),
+    ("arguments", "message"),
     [
         (["cv", "smart-color-cat", "DATA", "--folds", "none.csv"], "none.csv"),
         (["train", "all", "DATA", "--out", "x.npz"], "expected one for a model file"),
@@ -100,14 +107,14 @@ def test_all_omits_learners_that_are_not_installed(
 )
 def test_refuses_wrong_arguments(
     arguments: list[str],
-    why: str,
+    message: str,
     data: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(data.parent)
     assert main([str(data) if argument == "DATA" else argument for argument in arguments]) == 2
-    assert why in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert [path.name for path in data.parent.iterdir()] == ["world.npz"]
 
 

@@ -28,8 +28,8 @@ WORLDS = 100
 def intervals(errors: npt.ArrayLike, seed: int = 0, count: int = 2000) -> dict[Statistic, tuple[float, float]]:
     """Return the confidence interval of every statistic of errors (N,)."""
     sample = ErrorSample.of(errors)
-    made = bounded_figures(sample.statistics, len(sample.order), seed=seed, count=count)
-    return {name: (one.low, one.high) for name, one in zip(STATISTICS, made, strict=True)}
+    figures = bounded_figures(sample.statistics, len(sample.order), seed=seed, count=count)
+    return {name: (figure.low, figure.high) for name, figure in zip(STATISTICS, figures, strict=True)}
 
 
 def skewed(random: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
@@ -55,18 +55,18 @@ def test_resample_statistics_match_metrics(count: int) -> None:
 
 def test_interval_matches_scipy() -> None:
     random = np.random.default_rng(5)
-    one, other = skewed(random, 80), skewed(random, 80)
-    known = stats.bootstrap((one,), np.mean, n_resamples=20_000, method="BCa", rng=1).confidence_interval
-    ours = intervals(one, count=20_000)["mean"]
-    np.testing.assert_allclose(ours, known, atol=0.02 * (known.high - known.low))
+    errors_a, errors_b = skewed(random, 80), skewed(random, 80)
+    expected = stats.bootstrap((errors_a,), np.mean, n_resamples=20_000, method="BCa", rng=1).confidence_interval
+    ours = intervals(errors_a, count=20_000)["mean"]
+    np.testing.assert_allclose(ours, expected, atol=0.02 * (expected.high - expected.low))
 
     def ratio(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> float:
         return float(np.median(first) / np.median(second))
 
-    known = stats.bootstrap((one, other), ratio, n_resamples=9_000, paired=True, vectorized=False, rng=1)
-    found = median(compare_paired(one, other, count=9_000)).ratio
-    width = np.ptp(known.confidence_interval)
-    np.testing.assert_allclose(found[1:], known.confidence_interval, atol=0.04 * width)
+    expected = stats.bootstrap((errors_a, errors_b), ratio, n_resamples=9_000, paired=True, vectorized=False, rng=1)
+    figure = median(compare_paired(errors_a, errors_b, count=9_000)).ratio
+    width = np.ptp(expected.confidence_interval)
+    np.testing.assert_allclose(figure[1:], expected.confidence_interval, atol=0.04 * width)
 
 
 def test_intervals_have_nominal_coverage() -> None:
@@ -85,27 +85,30 @@ def test_pairing_narrows_intervals_and_keeps_coverage() -> None:
     widths = np.zeros(2)
     for _ in range(WORLDS):
         hard = skewed(random, 60)
-        one = hard * random.uniform(0.9, 1.3, 60)
+        errors_a = hard * random.uniform(0.9, 1.3, 60)
         # The population's means are 3.3 and 3.
-        made = compare_paired(one, hard, count=300)[0]
-        hits += [made.difference.low <= 0.3 <= made.difference.high, made.ratio.low <= 1.1 <= made.ratio.high]
-        apart = compare_paired(random.permutation(one), hard, count=300)[0]
-        widths += [np.ptp(made.difference[1:]), np.ptp(apart.difference[1:])]
+        compared = compare_paired(errors_a, hard, count=300)[0]
+        hits += [
+            compared.difference.low <= 0.3 <= compared.difference.high,
+            compared.ratio.low <= 1.1 <= compared.ratio.high,
+        ]
+        apart = compare_paired(random.permutation(errors_a), hard, count=300)[0]
+        widths += [np.ptp(compared.difference[1:]), np.ptp(apart.difference[1:])]
     assert ((hits / WORLDS > 0.88) & (hits / WORLDS < 0.99)).all()
     assert widths[0] < 0.25 * widths[1]
 
 
 def test_order_of_images_and_methods_does_not_matter() -> None:
     random = np.random.default_rng(12)
-    one, other = skewed(random, 90), skewed(random, 90)
-    for there, back in zip(compare_paired(one, other), compare_paired(other, one), strict=True):
-        difference, low, high = there.difference
+    errors_a, errors_b = skewed(random, 90), skewed(random, 90)
+    for reversed_pair, back in zip(compare_paired(errors_a, errors_b), compare_paired(errors_b, errors_a), strict=True):
+        difference, low, high = reversed_pair.difference
         turned = -back.difference[0], -back.difference[2], -back.difference[1]
         assert (difference, low, high) == pytest.approx(turned, abs=0.02)
-        ours, theirs = (getattr(summarise(errors), there.statistic) for errors in (one, other))
-        assert (there.value_a, there.value_b) == pytest.approx((ours, theirs))
+        ours, theirs = (getattr(summarise(errors), reversed_pair.statistic) for errors in (errors_a, errors_b))
+        assert (reversed_pair.value_a, reversed_pair.value_b) == pytest.approx((ours, theirs))
         assert difference == pytest.approx(ours - theirs)
-        assert there.ratio[0] == pytest.approx(ours / theirs)
+        assert reversed_pair.ratio[0] == pytest.approx(ours / theirs)
 
 
 def test_interval_is_reproducible_for_any_batch_size(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +133,7 @@ def test_equal_errors_give_interval_without_width() -> None:
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "groups"),
+    ("errors_a", "errors_b", "groups"),
     [
         ([], [], None),
         ([1, np.nan], [1, 2], None),
@@ -139,26 +142,26 @@ def test_equal_errors_give_interval_without_width() -> None:
         ([1, 2], [1, 2], ["a"]),
     ],
 )
-def test_refuses_unpaired_errors(one: list[float], other: list[float], groups: list[str] | None) -> None:
+def test_refuses_unpaired_errors(errors_a: list[float], errors_b: list[float], groups: list[str] | None) -> None:
     with pytest.raises(InputError):
-        compare_paired(one, other, groups=groups)
+        compare_paired(errors_a, errors_b, groups=groups)
 
 
 def test_draws_whole_groups() -> None:
-    names = [str(place) for place in np.random.default_rng(14).permutation(np.repeat(np.arange(7), np.arange(1, 8)))]
-    groups, seen = group_ids(names), list[npt.NDArray[np.int64]]()
+    names = [str(index) for index in np.random.default_rng(14).permutation(np.repeat(np.arange(7), np.arange(1, 8)))]
+    groups, collected = group_ids(names), list[npt.NDArray[np.int64]]()
 
     def note(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-        seen.append(counts)
+        collected.append(counts)
         return counts[:, :1].astype(np.float64)
 
     bounded_figures(note, len(names), names, count=40)
-    drawn = np.concatenate(seen)
-    each = np.stack([drawn[:, groups == number][:, 0] for number in range(7)], axis=1)
-    assert all((drawn[:, groups == number] == each[:, [number]]).all() for number in range(7))
+    drawn = np.concatenate(collected)
+    row = np.stack([drawn[:, groups == number][:, 0] for number in range(7)], axis=1)
+    assert all((drawn[:, groups == number] == row[:, [number]]).all() for number in range(7))
     # Seven groups of the whole and of resamples, six of the jackknife.
-    assert sorted(set(each.sum(axis=1).tolist())) == [6, 7]
-    left_out = each[each.sum(axis=1) == 6]
+    assert sorted(set(row.sum(axis=1).tolist())) == [6, 7]
+    left_out = row[row.sum(axis=1) == 6]
     assert sorted(left_out.tolist()) == sorted((1 - np.eye(7, dtype=np.int64)).tolist())
 
 
@@ -170,8 +173,8 @@ def test_group_intervals_cover_dependent_images() -> None:
         # 25 pictures under 8 lights: what a picture adds to a method's error is the same under each.
         shift = np.repeat(random.normal(0.3, 1, 25), 8)
         hard = skewed(random, 200)
-        for place, groups in enumerate((kinds, None)):
+        for index, groups in enumerate((kinds, None)):
             _, low, high = compare_paired(hard + shift, hard, count=200, groups=groups)[0].difference
-            hits[place] += low <= 0.3 <= high
+            hits[index] += low <= 0.3 <= high
     assert 0.86 < hits[0] / WORLDS < 0.99
     assert hits[1] / WORLDS < 0.7

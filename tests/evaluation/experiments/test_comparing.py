@@ -30,13 +30,13 @@ def errors(
     images: Sequence[str], values: npt.ArrayLike, truths: npt.NDArray[np.float64] | None = None, method: str = "Mine"
 ) -> MethodErrors:
     """Return errors of images named by letters; recovery errors are half the reproduction errors."""
-    given = np.asarray(values, dtype=np.float64)
+    all_truths = np.asarray(values, dtype=np.float64)
     return MethodErrors(
         method,
         tuple(images),
-        np.ones((len(given), 3)) if truths is None else truths,
-        {"recovery": given / 2, "reproduction": given},
-        np.zeros(len(given), bool),
+        np.ones((len(all_truths), 3)) if truths is None else truths,
+        {"recovery": all_truths / 2, "reproduction": all_truths},
+        np.zeros(len(all_truths), bool),
     )
 
 
@@ -44,9 +44,9 @@ def exact_p_value(difference: list[float]) -> float:
     """Return the exact two-sided p of the signed-rank test: fraction of sign patterns at least as uneven."""
     ranks = np.argsort(np.argsort(np.abs(difference))) + 1
     middle = ranks.sum() / 2
-    seen = abs(ranks[np.array(difference) > 0].sum() - middle)
+    observed = abs(ranks[np.array(difference) > 0].sum() - middle)
     sums = [ranks[np.array(signs)].sum() for signs in itertools.product([True, False], repeat=len(ranks))]
-    return float(np.mean([abs(total - middle) >= seen for total in sums]))
+    return float(np.mean([abs(total - middle) >= observed for total in sums]))
 
 
 @pytest.mark.parametrize("difference", [[1, 2, -3, 4, 5, 6.5], [-1, 2, 3, 4, 5, 6, 7, 8.5], [1, -2, 3, -4, 5.5]])
@@ -67,14 +67,14 @@ def test_wins_losses_and_effect() -> None:
 
 def test_equal_errors_keep_their_ranks() -> None:
     difference = np.concatenate([np.zeros(10), [1, 2, -3, 4, 5, 6, -7, 8, 9, 10, 11, 12]])
-    made = signed_rank(20 + difference, np.full(22, 20.0))
-    assert (made.wins, made.losses, made.ties) == (2, 10, 10)
+    test = signed_rank(20 + difference, np.full(22, 20.0))
+    assert (test.wins, test.losses, test.ties) == (2, 10, 10)
     # Pratt: ten zeros have the ranks 1 to 10, so the others have 11 to 22; wins are 13 and 17 of their sum of 198.
-    assert made.effect == pytest.approx((198 - 2 * 30) / 198)
+    assert test.effect == pytest.approx((198 - 2 * 30) / 198)
     ranks = np.arange(11, 23)
     sums = np.array([ranks[np.array(signs)].sum() for signs in itertools.product([True, False], repeat=12)])
     exact = np.mean(abs(sums - 99) >= abs(30 - 99))
-    assert made.p == pytest.approx(exact, rel=0.25)
+    assert test.p == pytest.approx(exact, rel=0.25)
 
 
 @pytest.mark.slow
@@ -104,8 +104,15 @@ def test_verdict_names_better_method_only_if_significant() -> None:
     assert second.p_holm >= second.test.p > 0.05
     assert re.search("A .*26 of 26 images.*: A is better", verdict(first))
     assert "not significant" in verdict(second)
-    assert [made.statistic for made in first.statistics] == ["mean", "median", "trimean", "best25", "worst25", "avg"]
-    assert all(tuple(made.ratio) == pytest.approx((0.8, 0.8, 0.8)) for made in first.statistics)
+    assert [figure.statistic for figure in first.statistics] == [
+        "mean",
+        "median",
+        "trimean",
+        "best25",
+        "worst25",
+        "avg",
+    ]
+    assert all(tuple(figure.ratio) == pytest.approx((0.8, 0.8, 0.8)) for figure in first.statistics)
 
 
 def test_rounding_does_not_make_a_difference() -> None:
@@ -113,17 +120,17 @@ def test_rounding_does_not_make_a_difference() -> None:
     for off_deg, is_same in ((0.009, True), (0.011, False)):
         # Away from white by an angle: its tangent times the length of 1 1 1, across it.
         turned = lights + np.tan(np.radians(off_deg)) * np.sqrt(3 / 2) * np.array([1, -1, 0])
-        one, other = errors("abc", base, lights), errors("abc", base, turned)
+        first, second = errors("abc", base, lights), errors("abc", base, turned)
         if is_same:
-            match(one, other, ("A", "B"), "recovery")
+            match(first, second, ("A", "B"), "recovery")
         else:
             with pytest.raises(InputError):
-                match(one, other, ("A", "B"), "recovery")
+                match(first, second, ("A", "B"), "recovery")
     # Files hold six decimals, so that the last may differ by one on either side.
-    found = signed_rank(np.add(base, [1.9e-6, 2.1e-6, -2.1e-6]), base)
-    assert (found.wins, found.losses, found.ties) == (1, 1, 1)
-    made = match(errors("abc", np.add(base, [1.9e-6, 2.1e-6, 0])), errors("abc", base), ("", ""), "reproduction")
-    assert [row[0] for row in images_table(compare([made])[0]).rows] == ["b"]
+    matched = signed_rank(np.add(base, [1.9e-6, 2.1e-6, -2.1e-6]), base)
+    assert (matched.wins, matched.losses, matched.ties) == (1, 1, 1)
+    comparison = match(errors("abc", np.add(base, [1.9e-6, 2.1e-6, 0])), errors("abc", base), ("", ""), "reproduction")
+    assert [row[0] for row in images_table(compare([comparison])[0]).rows] == ["b"]
 
 
 @pytest.mark.slow
@@ -136,10 +143,12 @@ def test_images_of_one_picture_count_as_one_case() -> None:
     matched: list[MatchedErrors] = []
     for _ in range(200):
         # Neither is better: the order of both on a picture is random, but equal under every illuminant.
-        one, other = np.repeat(random.gamma(3, 1, (2, 12)), 40, axis=1) + random.uniform(0, 0.1, (2, 480))
-        told = [replace(errors(images, 2 * each), groups=groups) for each in (one, other)]
-        matched.append(made := match(told[0], told[1], ("A", "B"), "recovery"))
-        alarms += [signed_rank(*made.case_errors()).p < 0.05, signed_rank(one, other).p < 0.05]
+        first, second = np.repeat(random.gamma(3, 1, (2, 12)), 40, axis=1) + random.uniform(0, 0.1, (2, 480))
+        alarm_counts = [
+            replace(errors(images, 2 * picture_errors), groups=groups) for picture_errors in (first, second)
+        ]
+        matched.append(tested := match(alarm_counts[0], alarm_counts[1], ("A", "B"), "recovery"))
+        alarms += [signed_rank(*tested.case_errors()).p < 0.05, signed_rank(first, second).p < 0.05]
     assert alarms[0] / 200 < 0.1
     assert alarms[1] / 200 > 0.5
     (comparison,) = compare(matched[-1:])
@@ -151,9 +160,9 @@ def test_images_of_one_picture_count_as_one_case() -> None:
 
 
 def test_single_group_has_no_interval() -> None:
-    mine = replace(errors("abcdefghi", np.arange(9.0) + 1), groups=("cat.png",) * 9)
-    made = match(mine, errors("abcdefghi", np.arange(9.0) + 2), ("A", "B"), "recovery")
-    (comparison,) = compare([made])
+    method_errors = replace(errors("abcdefghi", np.arange(9.0) + 1), groups=("cat.png",) * 9)
+    result = match(method_errors, errors("abcdefghi", np.arange(9.0) + 2), ("A", "B"), "recovery")
+    (comparison,) = compare([result])
     assert comparison.test.p == 1
     assert "not significant" in verdict(comparison)
     assert np.isnan(comparison.statistics[0].difference[1:]).all()
@@ -161,8 +170,8 @@ def test_single_group_has_no_interval() -> None:
 
 
 def test_groups_of_one_image_do_not_change_results() -> None:
-    mine, others = errors("abcdef", [1, 2, 3, 4, 5, 7]), errors("abcdef", [2, 1, 4, 6, 7, 8])
-    plain = compare([match(mine, others, ("A", "B"), "recovery")])[0]
-    grouped = compare([match(replace(mine, groups=tuple("uvwxyz")), others, ("A", "B"), "recovery")])[0]
+    method_errors, other_errors = errors("abcdef", [1, 2, 3, 4, 5, 7]), errors("abcdef", [2, 1, 4, 6, 7, 8])
+    plain = compare([match(method_errors, other_errors, ("A", "B"), "recovery")])[0]
+    grouped = compare([match(replace(method_errors, groups=tuple("uvwxyz")), other_errors, ("A", "B"), "recovery")])[0]
     assert grouped.test == plain.test
     assert grouped.statistics == plain.statistics

@@ -51,8 +51,10 @@ def test_shrinking_excludes_clipped_and_masked_pixels() -> None:
     assert empty[0, 0]
     assert empty[6, 9]
     assert not empty[3:5].any()
-    seen = small[~empty]
-    np.testing.assert_allclose(seen / seen.sum(axis=1, keepdims=True), np.tile(light / 9, (len(seen), 1)), rtol=1e-5)
+    values = small[~empty]
+    np.testing.assert_allclose(
+        values / values.sum(axis=1, keepdims=True), np.tile(light / 9, (len(values), 1)), rtol=1e-5
+    )
     assert not small[empty].any()
 
 
@@ -64,14 +66,14 @@ class Memory:
     """User class that knows the illuminants of its training images, and no others."""
 
     name: str = "Memory"
-    known: dict[bytes, npt.NDArray[np.float64]] = field(default_factory=dict[bytes, Any])
+    lights: dict[bytes, npt.NDArray[np.float64]] = field(default_factory=dict[bytes, Any])
 
     def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Memory:
-        return Memory(known={np.asarray(scene.read()[0]).tobytes(): scene.truth for scene in scenes})
+        return Memory(lights={np.asarray(scene.read()[0]).tobytes(): scene.truth for scene in scenes})
 
     def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> npt.NDArray[np.float64]:
-        known = self.known.get(np.asarray(image).tobytes())
-        return GREY if known is None else unit(known)
+        lights = self.lights.get(np.asarray(image).tobytes())
+        return GREY if lights is None else unit(lights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +106,8 @@ def test_trains_on_other_folds() -> None:
     (result,) = cross_validate(SCENES, [learner], FOLDS, seed=5)
     for fold in range(3):
         method = learner.fit([scene for scene, where in zip(SCENES, FOLDS, strict=True) if where != fold], seed=5)
-        for place in np.flatnonzero(fold == FOLDS):
-            np.testing.assert_allclose(result.estimates[place], method.estimate(SCENES[place].image), rtol=1e-14)
+        for index in np.flatnonzero(fold == FOLDS):
+            np.testing.assert_allclose(result.estimates[index], method.estimate(SCENES[index].image), rtol=1e-14)
 
 
 def test_reads_each_image_once() -> None:
@@ -117,14 +119,14 @@ def test_reads_each_image_once() -> None:
     assert sorted(log) == sorted(scene.name for scene in SCENES)
     assert len(steps) == len(SCENES)
     parallel = cross_validate(SCENES, learners, FOLDS, workers=3)
-    for one, other in zip(results, parallel, strict=True):
-        np.testing.assert_array_equal(one.estimates, other.estimates)
+    for first, second in zip(results, parallel, strict=True):
+        np.testing.assert_array_equal(first.estimates, second.estimates)
 
 
 def test_marks_image_without_usable_pixel() -> None:
     black = replace(SCENES[3], image=np.zeros_like(SCENES[3].image))
     (result,) = cross_validate([*SCENES[:3], black, *SCENES[4:]], [RegressionTrees(windows=1)], FOLDS)
-    assert result.guessed.tolist() == [place == 3 for place in range(24)]
+    assert result.guessed.tolist() == [index == 3 for index in range(24)]
     np.testing.assert_allclose(result.estimates[3], 3**-0.5)
     assert result.errors["recovery"][3] > 1
 
@@ -154,7 +156,7 @@ class Hoarder:
         return self
 
     def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
-        return self.known.get(np.asarray(image).tobytes())
+        return self.lights.get(np.asarray(image).tobytes())
 
 
 def test_each_fold_starts_from_fresh_copy() -> None:
@@ -241,18 +243,20 @@ BLIND = [Shop(number) for number in range(8)]
 def test_tuning_does_not_read_ground_truths() -> None:
     tuned = tune_family("shades-of-gray", "shops", BLIND)
     assert tuned.settings[0].text == "shades-of-gray:p=15"
-    assert [one.spread for one in tuned.settings] == sorted(one.spread for one in tuned.settings)
-    assert {one.errors for one in tuned.settings} == {None}
+    assert [unread.spread for unread in tuned.settings] == sorted(unread.spread for unread in tuned.settings)
+    assert {unread.errors for unread in tuned.settings} == {None}
     assert (tuned.images, tuned.counted) == (8, 8)
 
 
 def test_wrong_ground_truths_do_not_change_choice() -> None:
     right = [Shop(scene.number, tuple(scene.light.tolist())) for scene in BLIND]
-    wrong = [Shop(scene.number, (1, 0.1, 0.1)) for scene in BLIND]
+    wrong_scenes = [Shop(scene.number, (1, 0.1, 0.1)) for scene in BLIND]
     blind = tune_family("shades-of-gray", "shops", BLIND)
-    good, bad = (tune_family("shades-of-gray", "shops", scenes, "recovery") for scenes in (right, wrong))
-    for other in (good, bad):
-        assert [(one.text, one.spread) for one in other.settings] == [(one.text, one.spread) for one in blind.settings]
+    good, bad = (tune_family("shades-of-gray", "shops", scenes, "recovery") for scenes in (right, wrong_scenes))
+    for wrong_tuning in (good, bad):
+        assert [(right_tuning.text, right_tuning.spread) for right_tuning in wrong_tuning.settings] == [
+            (right_tuning.text, right_tuning.spread) for right_tuning in blind.settings
+        ]
     assert good.settings[0].errors is not None
     assert bad.settings[0].errors is not None
     assert good.settings[0].errors.median < bad.settings[0].errors.median - 20

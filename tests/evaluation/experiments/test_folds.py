@@ -28,7 +28,7 @@ def test_uses_published_folds_by_default(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     scenes: Any = tuple(SimpleNamespace(name=name, truth=np.ones(3), saturation=None) for name in NAMES)
     data = SceneSet("Four", "plain", "four", scenes, folds=(1, 0, 1, 0))
-    assert [part if isinstance(part, str) else part.tolist() for part in choose_folds(data)] == [
+    assert [item if isinstance(item, str) else item.tolist() for item in choose_folds(data)] == [
         [1, 0, 1, 0],
         "the data set's own",
     ]
@@ -42,7 +42,7 @@ def test_uses_published_folds_by_default(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
-    ("text", "why"),
+    ("text", "message"),
     [
         ("-2", "expected 2 to 4"),
         ("+-2", "'[+]-2', expected a number"),
@@ -50,10 +50,10 @@ def test_uses_published_folds_by_default(tmp_path: Path, monkeypatch: pytest.Mon
         ("two.csv", "cannot read folds from two.csv"),
     ],
 )
-def test_refuses_invalid_folds_option(text: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_invalid_folds_option(text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     scenes: Any = tuple(SimpleNamespace(name=name, truth=np.ones(3), saturation=None) for name in NAMES)
-    with pytest.raises((InputError, FormatError), match=why):
+    with pytest.raises((InputError, FormatError), match=message):
         choose_folds(SceneSet("Four", "plain", "four", scenes), text)
 
 
@@ -66,16 +66,16 @@ def test_fold_file_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "why"),
+    ("text", "message"),
     [
         ('image,fold\na.png,0\nb.png,1\nc.png\n"d, e.png",1\n', "without a fold: c.png"),
         ('image,fold\na.png,7\nb.png,7\nc.png,7\n"d, e.png",7\n', "only the fold 7"),
     ],
 )
-def test_refuses_invalid_fold_file(tmp_path: Path, text: str, why: str) -> None:
+def test_refuses_invalid_fold_file(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "folds.csv"
     path.write_text(text)
-    with pytest.raises(FormatError, match=why):
+    with pytest.raises(FormatError, match=message):
         read_folds(path, NAMES)
 
 
@@ -84,7 +84,7 @@ def test_refuses_folds_that_separate_groups() -> None:
     require_groups_together(scenes, np.array([0, 0, 1, 1]))
     with pytest.raises(InputError, match=r"picture 1 .*folds 0 and 1"):
         require_groups_together(scenes, np.array([0, 0, 0, 1]))
-    named: Any = [SimpleNamespace(name="same.png"), SimpleNamespace(name="same.png")]
-    assert group_of(named[0]) == "same.png"
+    same_names: Any = [SimpleNamespace(name="same.png"), SimpleNamespace(name="same.png")]
+    assert group_of(same_names[0]) == "same.png"
     with pytest.raises(InputError, match=r"same\.png"):
-        require_groups_together(named, np.array([0, 1]))
+        require_groups_together(same_names, np.array([0, 1]))

@@ -45,9 +45,9 @@ def test_files_do_not_depend_on_workers(tmp_path: Path) -> None:
         run = run_methods(mixed_set(), METHODS, workers, lambda: counts.append(1))
         write_run(run, mixed_set().scenes, tmp_path / str(workers), workers=workers)
     assert len(counts) == 2 * 5
-    one, other = content(tmp_path / "1"), content(tmp_path / "3")
-    assert one == other
-    assert set(one) == {
+    first, second = content(tmp_path / "1"), content(tmp_path / "3")
+    assert first == second
+    assert set(first) == {
         *("run.json", "results.csv", "errors.csv", "table.tex", "report.html", "pixels.csv", "regions.csv"),
     }
 
@@ -55,10 +55,10 @@ def test_files_do_not_depend_on_workers(tmp_path: Path) -> None:
 def test_interrupted_writing_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, write_whole = tmp_path / "out", run_folder.write_whole
     run = run_methods(mixed_set(), METHODS)
-    left = iter(range(4))
+    remaining = iter(range(4))
 
     def writes(path: Path, text: str) -> None:
-        if next(left, None) is None:
+        if next(remaining, None) is None:
             raise Killed
         write_whole(path, text)
 
@@ -94,20 +94,20 @@ class Flat:
 
 
 def test_reports_model_tested_on_training_data() -> None:
-    data, other = as_set(walls(3)), as_set(walls(4))
+    data, larger_set = as_set(walls(3)), as_set(walls(4))
     record = provenance_of(data, 0, SystemClock())
     learner = standard_learners()["regression-trees"]
     model = StoredMethod(learner, Flat(), data.name, record)
-    (part,) = run_methods(other, [model]).notes
-    assert ": 3 of 4 images were used for training, by name and ground truth or by source picture" in part
+    (first_note,) = run_methods(larger_set, [model]).notes
+    assert ": 3 of 4 images were used for training, by name and ground truth or by source picture" in first_note
     # The name of the data set, the order of its images and their file extensions may differ.
     renamed = tuple(Wall(f"copies/{Path(wall.name).stem.upper()}.TIF", wall.truth) for wall in reversed(walls(4)))
     assert (
         ": 3 of 4 images were used for training"
         in run_methods(replace(as_set(renamed), name="Others"), [model]).notes[0]
     )
-    others = tuple(Wall(f"other {wall.name}", wall.truth) for wall in walls(4))
-    assert "no image was identified as a training image" in run_methods(as_set(others), [model]).notes[0]
-    assert run_methods(replace(as_set(others), name="Others"), [model]).notes == ()
+    renamed_scenes = tuple(Wall(f"other {wall.name}", wall.truth) for wall in walls(4))
+    assert "no image was identified as a training image" in run_methods(as_set(renamed_scenes), [model]).notes[0]
+    assert run_methods(replace(as_set(renamed_scenes), name="Others"), [model]).notes == ()
     (note,) = run_methods(data, [model]).notes
     assert note.startswith(f"{learner.name} (trained on Walls) was trained on these images")

@@ -121,9 +121,9 @@ IMAGE = (np.random.default_rng(0).random((6, 6, 3)) + 0.1).astype(np.float32)
 def test_method_cannot_change_images_of_others() -> None:
     scenes = [InMemory("one", np.ones(3)), InMemory("two", np.ones(3))]
     alone = evaluate(scenes, [GRAY_WORLD])[0].estimates
-    both = evaluate(scenes, [ChangesImage(), GRAY_WORLD])
-    np.testing.assert_array_equal(both[1].estimates, alone)
-    assert both[0].errors["recovery"][1] == both[0].errors["recovery"][0]
+    results = evaluate(scenes, [ChangesImage(), GRAY_WORLD])
+    np.testing.assert_array_equal(results[1].estimates, alone)
+    assert results[0].errors["recovery"][1] == results[0].errors["recovery"][0]
 
 
 class SingleThreaded:
@@ -143,9 +143,9 @@ class SingleThreaded:
 
 def test_user_method_runs_in_one_thread_at_a_time() -> None:
     scenes = walls(40)
-    (one,) = evaluate(scenes, [SingleThreaded()], workers=1)
-    (four,) = evaluate(scenes, [SingleThreaded()], workers=4)
-    np.testing.assert_array_equal(one.estimates, four.estimates)
+    (single,) = evaluate(scenes, [SingleThreaded()], workers=1)
+    (threaded,) = evaluate(scenes, [SingleThreaded()], workers=4)
+    np.testing.assert_array_equal(single.estimates, threaded.estimates)
 
 
 class HalfRight:
@@ -157,38 +157,38 @@ class HalfRight:
         return np.ones(3)
 
     def estimate_map(self, image: Any, saturation: float | None = None, mask: Any = None) -> npt.NDArray[np.float32]:
-        found = np.full(image.shape, 1 / 3, np.float32)
-        found[:, :4] = (0.5, 0.25, 0.25)
-        return found
+        lights = np.full(image.shape, 1 / 3, np.float32)
+        lights[:, :4] = (0.5, 0.25, 0.25)
+        return lights
 
 
 def test_errors_by_pixel_and_region() -> None:
     scenes: list[Scene] = [*walls(1), MixedWall("mixed", LIGHTS)]
-    whole, local = evaluate(scenes, [FixedValues((1, 1, 1), (1, 1, 1)), HalfRight()], workers=1)
-    off = float(recovery_error(LIGHTS[0], LIGHTS[1]))
-    ((place, error),) = (whole.maps or {}).items()
-    assert place == 1
-    assert error.recovery == pytest.approx(off / 4, abs=1e-4)
-    assert [region.recovery for region in error.regions] == pytest.approx([off, 0], abs=1e-4)
+    global_result, local = evaluate(scenes, [FixedValues((1, 1, 1), (1, 1, 1)), HalfRight()], workers=1)
+    angle = float(recovery_error(LIGHTS[0], LIGHTS[1]))
+    ((index, error),) = (global_result.maps or {}).items()
+    assert index == 1
+    assert error.recovery == pytest.approx(angle / 4, abs=1e-4)
+    assert [region.recovery for region in error.regions] == pytest.approx([angle, 0], abs=1e-4)
     assert [region.share for region in error.regions] == pytest.approx([0.25, 0.75])
     error = (local.maps or {})[1]
     assert (error.recovery, error.rgb) == pytest.approx((0, 0), abs=1e-4)
     # The single estimates of both are compared with the mean illuminant.
-    assert local.errors["recovery"][1] == whole.errors["recovery"][1] > 1
+    assert local.errors["recovery"][1] == global_result.errors["recovery"][1] > 1
 
 
-def _two_pixels(found: Any) -> Any:
-    found[0, 0] = np.nan
-    found[0, 1] = 0
-    return found
+def _two_pixels(lights: Any) -> Any:
+    lights[0, 0] = np.nan
+    lights[0, 1] = 0
+    return lights
 
 
-def _half(found: Any) -> Any:
-    return found[:6]
+def _half(lights: Any) -> Any:
+    return lights[:6]
 
 
-def _integers(found: Any) -> Any:
-    return (found * 100).astype(np.uint8)
+def _integers(lights: Any) -> Any:
+    return (lights * 100).astype(np.uint8)
 
 
 def altered(monkeypatch: pytest.MonkeyPatch, change: Callable[[Any], Any]) -> HalfRight:

@@ -25,7 +25,9 @@ NAMES = ["a $\\bad{x$ b", "$y_1$", "_mine"]
 
 def texts(svg: bytes) -> list[str]:
     """Return the texts of an SVG in their order."""
-    return [unescape(re.sub("<[^>]+>", "", each)).strip() for each in re.findall(r"(?s)<text.*?</text>", svg.decode())]
+    return [
+        unescape(re.sub("<[^>]+>", "", element)).strip() for element in re.findall(r"(?s)<text.*?</text>", svg.decode())
+    ]
 
 
 @pytest.mark.slow
@@ -54,7 +56,7 @@ def panels(jpeg: bytes) -> list[npt.NDArray[Any]]:
     row = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert row is not None
     side = (row.shape[1] - 12) // 3
-    return [row[:, left : left + side, ::-1].astype(int) for left in (0, side + 6, 2 * side + 12)]
+    return [row[:, start : start + side, ::-1].astype(int) for start in (0, side + 6, 2 * side + 12)]
 
 
 def cast(picture: npt.NDArray[Any]) -> float:
@@ -65,8 +67,8 @@ def cast(picture: npt.NDArray[Any]) -> float:
 
 def test_only_correct_estimate_removes_cast() -> None:
     scene = Wall("wall", np.array([2.0, 1.0, 0.5]))
-    (wrong, right) = developed_pictures(scene, [np.array([0.5, 1.0, 2.0]), scene.truth])
-    raw, by_wrong, by_truth = panels(wrong)
+    (wrong_picture, right) = developed_pictures(scene, [np.array([0.5, 1.0, 2.0]), scene.truth])
+    raw, by_wrong, by_truth = panels(wrong_picture)
     assert cast(by_truth) < 3 < 40 < cast(raw) < cast(by_wrong)
     assert raw[..., 0].mean() > raw[..., 2].mean()
     np.testing.assert_allclose(panels(right)[1], by_truth, atol=12)
@@ -115,7 +117,7 @@ def test_white_percentile_and_half_masked_pixels() -> None:
             return np.repeat(image, 3, axis=2) * np.array([2, 1, 0.5], np.float32), mask
 
     (jpeg,) = developed_pictures(Ramp("ramp", np.array([2, 1, 0.5])), [np.array([1, 1, 0.5])])
-    raw, seen, right = panels(jpeg)
+    raw, codes, right = panels(jpeg)
     middle = right[100, :, 1]
     # sRGB of half of white is 188 (IEC 61966-2-1); white is reached two hundredths before the end.
     assert middle[round(0.98 * 199 / 2)] == pytest.approx(188, abs=3)
@@ -123,15 +125,15 @@ def test_white_percentile_and_half_masked_pixels() -> None:
     # By an estimate with half the red, red stays twice as bright: a quarter of white, 137, is then a half.
     at = round(0.98 * 199 / 4)
     assert right[100, at] == pytest.approx([137] * 3, abs=4)
-    assert seen[100, at] == pytest.approx([188, 137, 137], abs=5)
+    assert codes[100, at] == pytest.approx([188, 137, 137], abs=5)
     assert raw[100, at] == pytest.approx([188, 137, 99], abs=5)
     assert right[4, 20:180] == pytest.approx(np.full((160, 3), 118), abs=3)
 
 
 def test_chooses_worst_and_median_images() -> None:
     def chosen(*errors: float) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        given, count = np.array(errors), len(errors)
-        return chosen_images(Result("M", np.ones((count, 3)), {"recovery": given}, given < 0), "recovery")
+        values, count = np.array(errors), len(errors)
+        return chosen_images(Result("M", np.ones((count, 3)), {"recovery": values}, values < 0), "recovery")
 
     assert chosen(5, 1, 9, 3, 2, 8, 4) == ((2, 5, 0), (6, 3))  # The median is 4; 5 is shown already.
     assert chosen(1.0) == ((0,), ())
@@ -145,14 +147,14 @@ def test_page_of_many_methods_is_closed() -> None:
     results = evaluate(data.scenes, METHODS)
     run = describe_run(data, results, [{"name": "A", "settings": {"p": [1] * 99}}, {"name": "B", "class": "x:Y"}])
     pictures = {
-        (number, place): developed_pictures(data.scenes[place], [result.estimates[place]])[0]
+        (number, index): developed_pictures(data.scenes[index], [result.estimates[index]])[0]
         for number, result in enumerate(results)
-        for place in sum(chosen_images(result, "recovery"), ())
+        for index in sum(chosen_images(result, "recovery"), ())
     }
     text = run_page(run, "recovery", pictures)
-    found = checked(text)
+    page = checked(text)
     assert text.count("<details") == len(METHODS)
     assert len(re.findall(r"src='data:image/jpeg", text)) == len(pictures)
     for words in ("White <Patch>", "as it was drawn", "MAE_illum", "1 under several illuminants", "mixed & <odd>"):
-        assert words in found.text
-    assert "methods are shown" not in found.text
+        assert words in page.text
+    assert "methods are shown" not in page.text

@@ -21,16 +21,16 @@ def write_errors(folder: Path, *lines: str, head: str = HEAD) -> Path:
 
 def test_reads_columns_by_name(tmp_path: Path) -> None:
     head = "guessed,reproduction,image,note,method,truth_r,truth_g,truth_b,recovery"
-    mine = read_errors(write_errors(tmp_path, "1,7,a.png,x,Mine,1,2,3,2", "0,7,b.png,x,Mine,1,2,3,2", head=head))[
-        "Mine"
-    ]
-    assert mine.truths.tolist() == [[1, 2, 3]] * 2
-    assert (mine.errors["recovery"][0], mine.errors["reproduction"][0]) == (2, 7)
-    assert mine.guessed.tolist() == [True, False]
+    method_errors = read_errors(
+        write_errors(tmp_path, "1,7,a.png,x,Mine,1,2,3,2", "0,7,b.png,x,Mine,1,2,3,2", head=head)
+    )["Mine"]
+    assert method_errors.truths.tolist() == [[1, 2, 3]] * 2
+    assert (method_errors.errors["recovery"][0], method_errors.errors["reproduction"][0]) == (2, 7)
+    assert method_errors.guessed.tolist() == [True, False]
 
 
 @pytest.mark.parametrize(
-    ("line", "says"),
+    ("line", "message"),
     [
         ("a,Mine,1,1,1,1,1,1,x,2,0", "line 2: recovery is 'x'"),
         ("a,Mine,1,1,1,1,1,1,nan,2,0", "line 2: recovery is 'nan'"),
@@ -43,8 +43,8 @@ def test_reads_columns_by_name(tmp_path: Path) -> None:
         ("", "has no errors"),
     ],
 )
-def test_refuses_faulty_lines(tmp_path: Path, line: str, says: str) -> None:
-    with pytest.raises(FormatError, match=says):
+def test_refuses_faulty_lines(tmp_path: Path, line: str, message: str) -> None:
+    with pytest.raises(FormatError, match=message):
         read_errors(write_errors(tmp_path, line))
 
 
@@ -78,9 +78,9 @@ def write_estimates(tmp_path: Path, text: str) -> Path:
     ],
 )
 def test_matches_names_with_and_without_extension(tmp_path: Path, text: str) -> None:
-    found = read_estimates(write_estimates(tmp_path, text), IMAGES)
-    assert found.name == "other"
-    assert {image: light.tolist() for image, light in found.lights.items()} == {
+    estimates = read_estimates(write_estimates(tmp_path, text), IMAGES)
+    assert estimates.name == "other"
+    assert {image: light.tolist() for image, light in estimates.lights.items()} == {
         "a/one.png": [1, 2, 3],
         "a/two.png": [4, 5, 6],
         "three.v1.png": [7, 8, 9],
@@ -88,10 +88,10 @@ def test_matches_names_with_and_without_extension(tmp_path: Path, text: str) -> 
 
 
 def test_keeps_invalid_estimates(tmp_path: Path) -> None:
-    found = read_estimates(
+    estimates = read_estimates(
         write_estimates(tmp_path, "image,r,g,b\na/one,nan,1,1\na/two,0,0,0\nthree.v1,-1,1,1\n"), IMAGES
     )
-    np.testing.assert_array_equal(found.lights["a/one.png"], [np.nan, 1, 1])
+    np.testing.assert_array_equal(estimates.lights["a/one.png"], [np.nan, 1, 1])
 
 
 def test_refuses_ambiguous_name_without_extension(tmp_path: Path) -> None:
@@ -102,7 +102,7 @@ def test_refuses_ambiguous_name_without_extension(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "begins with ''; expected image,r,g,b"),
+        ("", "begins with '', expected image,r,g,b"),
         ("name,red,green,blue\na,1,1,1", "begins with 'name,red,green,blue'"),
         ("image,r,g,b\na/one,1,1\n", "line 2: 3 fields, the first line has 4"),
         ("image,r,g,b\na/one,0,68,0,85,0,22\n", "line 2: 7 fields, the first line has 4"),

@@ -41,14 +41,14 @@ def test_separates_images_under_several_illuminants() -> None:
     subject = subject_of(scenes)
     title = summary_table(subject, results, "recovery").title
     assert "2 under several illuminants" in title
-    several, one = lights_tables(subject, results, "recovery")
-    off = float(recovery_error(*LIGHTS))
+    several, single = lights_tables(subject, results, "recovery")
+    angle = float(recovery_error(*LIGHTS))
     row = dict(zip(several.columns[1::2], several.rows[0][1::2], strict=True))
-    assert row["MAE_illum"] == pytest.approx(off / 4, abs=1e-4)
-    assert row["By region"] == pytest.approx(off / 2, abs=1e-4)
+    assert row["MAE_illum"] == pytest.approx(angle / 4, abs=1e-4)
+    assert row["By region"] == pytest.approx(angle / 2, abs=1e-4)
     assert row["Mean light"] == pytest.approx(float(recovery_error((1, 1, 1), scenes[3].truth)), abs=1e-4)
     alone = recovery_error((1, 1, 1), np.stack([scene.truth for scene in scenes[:3]]))
-    assert one.rows[0][1:] == pytest.approx(summarise(alone).as_tuple())
+    assert single.rows[0][1:] == pytest.approx(summarise(alone).as_tuple())
     title = summary_table(subject_of(scenes[3:]), evaluate(scenes[3:], [White()]), "recovery").title
     assert "2 images under several illuminants" in title
 

@@ -24,7 +24,7 @@ def make_table(tmp_path: Path) -> TableMaker:
     def make(camera: str, noise: float = 0.0, samples: int = 25) -> Lut:
         random = np.random.default_rng(5)
         bright = [(CODES / 7 * light)[:, None].repeat(samples, axis=1) for light in LIGHTS]
-        noisy = [np.maximum(one * (1 + noise * random.standard_normal(one.shape)), 0) for one in bright]
+        noisy = [np.maximum(sample * (1 + noise * random.standard_normal(sample.shape)), 0) for sample in bright]
         return write_lut(tmp_path / camera.replace(" ", "-"), noisy, LIGHTS, camera)
 
     return make

@@ -42,9 +42,9 @@ def test_operator_is_inverted_within_rounding(seed: int, scale: float) -> None:
     operator = fit_flash(image)
     np.testing.assert_allclose(operator.invert(operator.apply(image)), image, rtol=1e-9)
     # The unit does not matter: images are taken relative to their largest value.
-    for ours, other in zip(reduce_colours(image, (0, 3)), reduce_colours(image * scale, (0, 3)), strict=True):
-        np.testing.assert_allclose(ours, other, atol=0.02)
-        assert (np.abs(ours - other) > 1e-6).mean() < 0.01
+    for ours, scaled in zip(reduce_colours(image, (0, 3)), reduce_colours(image * scale, (0, 3)), strict=True):
+        np.testing.assert_allclose(ours, scaled, atol=0.02)
+        assert (np.abs(ours - scaled) > 1e-6).mean() < 0.01
 
 
 @given(seed=st.integers(0, 2**32))
@@ -55,8 +55,8 @@ def test_zero_bits_change_only_quantisation(seed: int) -> None:
     codes = operator.apply(image)
     (restored,) = reduce_colours(image, 0)
     # Half a code away in every channel at most: between what the codes just below and above stand for.
-    again = operator.apply(restored.astype(np.float64))
-    assert np.abs(again - codes).max() <= 0.51
+    unchanged = operator.apply(restored.astype(np.float64))
+    assert np.abs(unchanged - codes).max() <= 0.51
 
 
 def test_masked_pixel_does_not_influence_operator() -> None:
@@ -64,8 +64,8 @@ def test_masked_pixel_does_not_influence_operator() -> None:
     mask[:5] = True
     dark, bright = image.copy(), image.copy()
     dark[mask], bright[mask] = 0, 1e6
-    for one, other in zip(reduce_colours(dark, (0, 4), mask), reduce_colours(bright, (0, 4), mask), strict=True):
-        np.testing.assert_array_equal(one[~mask], other[~mask])
+    for reduced, masked in zip(reduce_colours(dark, (0, 4), mask), reduce_colours(bright, (0, 4), mask), strict=True):
+        np.testing.assert_array_equal(reduced[~mask], masked[~mask])
     (without,) = reduce_colours(dark, 4)
     (with_mask,) = reduce_colours(dark, 4, mask)
     assert np.abs(without[~mask] - with_mask[~mask]).max() > 1e-3
@@ -78,13 +78,13 @@ def test_unchanged_images_give_results_of_evaluate() -> None:
     scenes = [Made("photo", light, photo(seed), 3.0, mask if seed % 2 else None) for seed in range(4)]
     assert any((scene.image >= 3.0).any() for scene in scenes)
     methods = paper_methods(sigma=2)
-    found = remove_bits(scenes, methods, (0, 3), workers=2)
-    for ours, usual in zip(found.raw, evaluate(scenes, methods), strict=True):
+    bits_result = remove_bits(scenes, methods, (0, 3), workers=2)
+    for ours, usual in zip(bits_result.raw, evaluate(scenes, methods), strict=True):
         np.testing.assert_array_equal(ours.estimates, usual.estimates)
-        for kind in ("recovery", "reproduction"):
-            np.testing.assert_array_equal(ours.errors[kind], usual.errors[kind])
+        for metric in ("recovery", "reproduction"):
+            np.testing.assert_array_equal(ours.errors[metric], usual.errors[metric])
     # Rounded to codes the images are nearly the same, with bits at zero they are not.
-    for raw, exact, coarse in zip(found.raw, found.reduced[0], found.reduced[3], strict=True):
+    for raw, exact, coarse in zip(bits_result.raw, bits_result.reduced[0], bits_result.reduced[3], strict=True):
         near = np.abs(exact.errors["recovery"] - raw.errors["recovery"]).max()
         assert near < 0.15
         assert np.abs(coarse.errors["recovery"] - raw.errors["recovery"]).max() > near

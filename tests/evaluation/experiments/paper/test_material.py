@@ -87,10 +87,10 @@ PLAIN = DatasetOptions(previews=False, rendering="codes")
 def test_random_illuminants_match_generate(make_table: TableMaker, tmp_path: Path) -> None:
     lut = make_table("Test", noise=0.05)
     scenes = render_scenes(lut, SOURCES, lights_at_random(lut, 6, seed=9), seed=9)
-    made = generate_dataset(lut, tmp_path / "made", SOURCES, RandomLights(1, len(LIGHTS), 9), seed=9, options=PLAIN)
+    dataset = generate_dataset(lut, tmp_path / "made", SOURCES, RandomLights(1, len(LIGHTS), 9), seed=9, options=PLAIN)
     assert len({scene.light for scene in scenes}) > 1
-    for scene, entry in zip(scenes, made.entries, strict=True):
-        np.testing.assert_array_equal(scene.read()[0], made.read_image(entry))
+    for scene, entry in zip(scenes, dataset.entries, strict=True):
+        np.testing.assert_array_equal(scene.read()[0], dataset.read_image(entry))
         np.testing.assert_allclose(scene.truth, entry.truth, atol=1e-9)
         assert Path(entry.image).stem == scene.name
         assert scene.saturation == 9000
@@ -99,18 +99,18 @@ def test_random_illuminants_match_generate(make_table: TableMaker, tmp_path: Pat
 @pytest.mark.slow
 def test_nearest_illuminants_match_generate(make_table: TableMaker, tmp_path: Path) -> None:
     lut = make_table("Test", noise=0.05)
-    chosen = lights_like(lut, TRUTHS, 6)
-    assert chosen.numbers == (0, 3, 1, 0, 3, 1)
-    assert chosen.how.startswith("nearest by angle to 3 ground truths, 3 different illuminants")
+    nearest = lights_like(lut, TRUTHS, 6)
+    assert nearest.numbers == (0, 3, 1, 0, 3, 1)
+    assert nearest.how.startswith("nearest by angle to 3 ground truths, 3 different illuminants")
     # The angles are those of the lights that images have.
     few = lights_like(lut, TRUTHS, 1).how
     assert few.startswith("nearest by angle to the first 1 of 3 ground truths, 1 different illuminants")
     assert few.split("median angle")[1] == lights_like(lut, TRUTHS[:1], 1).how.split("median angle")[1]
-    scenes = render_scenes(lut, SOURCES, chosen, seed=2)
+    scenes = render_scenes(lut, SOURCES, nearest, seed=2)
     lights = nearest_lights(lut, TRUTHS)
-    made = generate_dataset(lut, tmp_path / "made", SOURCES, lights, seed=2, options=PLAIN)
-    for scene, entry in zip(scenes, made.entries, strict=True):
-        np.testing.assert_array_equal(scene.read()[0], made.read_image(entry))
+    dataset = generate_dataset(lut, tmp_path / "made", SOURCES, lights, seed=2, options=PLAIN)
+    for scene, entry in zip(scenes, dataset.entries, strict=True):
+        np.testing.assert_array_equal(scene.read()[0], dataset.read_image(entry))
 
 
 TEXT = "File,GT_R,GT_G,GT_B\nA/1.png,1,2,3\nB/1.png,4,5,6\n\nA/2.png,7,8,9\n"
@@ -122,10 +122,10 @@ def test_selects_rows_by_prefix(tmp_path: Path) -> None:
     everything = read_truths(str(path))
     assert everything.name == "eight"
     assert everything.lights.tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
-    one = read_truths(f"{path}#A/")
-    assert one.name == "A"
-    assert one.lights.tolist() == [[1, 2, 3], [7, 8, 9]]
-    assert one.images == ("A/1.png", "A/2.png")
+    truths = read_truths(f"{path}#A/")
+    assert truths.name == "A"
+    assert truths.lights.tolist() == [[1, 2, 3], [7, 8, 9]]
+    assert truths.images == ("A/1.png", "A/2.png")
     assert everything.images == ("A/1.png", "B/1.png", "A/2.png")
     with pytest.raises(InputError, match=r"'C'.*'A/1.png'"):
         read_truths(f"{path}#C")

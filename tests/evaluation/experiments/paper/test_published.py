@@ -38,22 +38,22 @@ def test_numbers_match_paper_source(path: Path) -> None:
     blocks = printed(path.read_text())
     assert len(blocks) == len(TABLE1) + len(TABLE2) == 10
     for (head, rows), (cell, ours) in zip(blocks, TABLE1.items(), strict=False):
-        words = [part.strip("~ ") for part in head.split(",")]
+        words = [value.strip("~ ") for value in head.split(",")]
         assert [word.split()[0] for word in words] == list(cell)
         assert [word.split()[1] for word in words] == ["scenes", "sensor", "illuminations"]
         assert rows == ours
-    (head, rows), (other, moved) = blocks[8:]
+    (head, rows), (theirs, moved) = blocks[8:]
     assert "cross-validation" in head
-    assert "generated" in other
+    assert "generated" in theirs
     assert rows == TABLE2["real"]
     assert moved == TABLE2["generated"]
 
 
 @pytest.mark.parametrize(("name", "row"), ALL, ids=[name for name, _ in ALL])
 def test_average_is_geometric_mean(name: str, row: PublishedRow) -> None:
-    *parts, average = row.as_tuple()
-    low = math.prod(part - 0.005 for part in parts) ** 0.2
-    high = math.prod(part + 0.005 for part in parts) ** 0.2
+    *values, average = row.as_tuple()
+    low = math.prod(value - 0.005 for value in values) ** 0.2
+    high = math.prod(value + 0.005 for value in values) ** 0.2
     assert low - 0.005 <= average <= high + 0.005
     assert row.best25 < row.median < row.worst25
 

@@ -53,16 +53,16 @@ def small(make_table: TableMaker, noise: tuple[float, float] = (0.0, 0.0)) -> tu
 
 
 def test_data_sets_are_in_paper_order(make_table: TableMaker) -> None:
-    chosen = small(make_table)
-    assert [part.cell for part in chosen] == list(TABLE1)
-    assert all(len(part.scenes) == 5 for part in chosen)
-    images = [part.scenes[0].read()[0] for part in chosen]
+    blocks = small(make_table)
+    assert [block.cell for block in blocks] == list(TABLE1)
+    assert all(len(block.scenes) == 5 for block in blocks)
+    images = [block.scenes[0].read()[0] for block in blocks]
     assert [image.shape for image in images] == [(32, 48, 3)] * 4 + [(48, 48, 3)] * 4
     # Nearest to the ground truths in turn, and drawn: not the same lights.
-    assert [scene.light for scene in chosen[0].scenes] == [0, 3, 0, 3, 0]
-    assert [scene.light for scene in chosen[1].scenes] != [scene.light for scene in chosen[0].scenes]
+    assert [scene.light for scene in blocks[0].scenes] == [0, 3, 0, 3, 0]
+    assert [scene.light for scene in blocks[1].scenes] != [scene.light for scene in blocks[0].scenes]
     # Both tables show the same scenes: what differs is the sensor.
-    np.testing.assert_array_equal(chosen[4].scenes[1].source.read().picture, chosen[6].scenes[1].source.read().picture)
+    np.testing.assert_array_equal(blocks[4].scenes[1].source.read().picture, blocks[6].scenes[1].source.read().picture)
 
 
 def test_white_pixel_is_illuminant_without_noise(make_table: TableMaker) -> None:
@@ -92,7 +92,7 @@ FOLDS = np.array([0, 0, 1, 1, 2, 2])
 
 def test_table2_separates_training_data() -> None:
     (trained,) = table2(REAL, MADE, {"regression-trees": MeanLearner()}, FOLDS)
-    for place, light in enumerate(REAL_LIGHTS):
-        others = np.mean([unit(one) for one in REAL_LIGHTS[place // 2 != FOLDS]], axis=0)
-        assert trained.real.errors["recovery"][place] == pytest.approx(float(recovery_error(others, light)))
-        assert trained.generated.errors["recovery"][place] == pytest.approx(float(recovery_error([2, 1, 1], light)))
+    for index, light in enumerate(REAL_LIGHTS):
+        generated = np.mean([unit(result) for result in REAL_LIGHTS[index // 2 != FOLDS]], axis=0)
+        assert trained.real.errors["recovery"][index] == pytest.approx(float(recovery_error(generated, light)))
+        assert trained.generated.errors["recovery"][index] == pytest.approx(float(recovery_error([2, 1, 1], light)))

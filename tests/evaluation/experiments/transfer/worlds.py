@@ -73,8 +73,8 @@ class StraightMap:
     map: npt.NDArray[np.float64]
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
-        found = np.maximum(np.asarray(features, dtype=np.float64) @ self.map, 1e-6)
-        return found / found.sum(axis=1, keepdims=True)
+        estimates = np.maximum(np.asarray(features, dtype=np.float64) @ self.map, 1e-6)
+        return estimates / estimates.sum(axis=1, keepdims=True)
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
         return {"map": self.map}
