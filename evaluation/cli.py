@@ -1,4 +1,4 @@
-"""The command `evaluate`: methods on data sets, and the paper's experiments."""
+"""The command `evaluate`: methods on data sets, and the experiments of the paper."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 app = new_app(
-    f"""Evaluate methods of illumination estimation.
+    f"""Evaluate methods of illuminant estimation.
 
 `evaluate DATA` is short for `evaluate run DATA`.
 
@@ -35,17 +35,18 @@ app.command("tune", help=tune_command.HELP)(tune_command.tune)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with `argv`, by default the process's own, and return one of `foundation.console.EXIT_CODES`."""
-    whole = _with_command(sys.argv[1:] if argv is None else argv)
-    return run(lambda: app(whole, prog_name="evaluate"), is_resumable=False)
+    """Run the command with `argv`, by default that of the process; return one of `foundation.console.EXIT_CODES`."""
+    arguments = _with_command(sys.argv[1:] if argv is None else argv)
+    return run(lambda: app(arguments, prog_name="evaluate"), is_resumable=False)
 
 
-def _with_command(given: Sequence[str]) -> list[str]:
+def _with_command(arguments: Sequence[str]) -> list[str]:
+    # Options that all commands share may precede the name of the command.
     commands = {command.name for command in app.registered_commands} | {group.name for group in app.registered_groups}
-    own = ("-h", "--help", "--version", "--install-completion", "--show-completion")
-    first = next((at for at, word in enumerate(given) if not is_common_option(word)), len(given))
-    short = first < len(given) and given[first] not in commands and given[first] not in own
-    return [*given[:first], *(["run"] if short else []), *given[first:]]
+    app_options = ("-h", "--help", "--version", "--install-completion", "--show-completion")
+    index = next((index for index, word in enumerate(arguments) if not is_common_option(word)), len(arguments))
+    is_shortened = index < len(arguments) and arguments[index] not in (*commands, *app_options)
+    return [*arguments[:index], *(["run"] if is_shortened else []), *arguments[index:]]
 
 
 if __name__ == "__main__":

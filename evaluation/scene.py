@@ -1,4 +1,4 @@
-"""What an image of a data set is to everything that uses it: pixels, a mask, and the light that is to be estimated."""
+"""One image of a data set as all programs use it: pixels, mask and the illuminant to be estimated."""
 
 from __future__ import annotations
 
@@ -9,87 +9,87 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-# (H, W, 3), linear camera RGB ≥ 0 with black subtracted, in any unit.
+# (H, W, 3), linear camera RGB ≥ 0, black level subtracted, in any unit.
 Image = npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
 
 class Scene(Protocol):
-    """One image of a data set with its ground truth; the image is read from its file by `read`."""
+    """One image of a data set with its ground truth; `read` decodes the image file."""
 
     @property
     def name(self) -> str:
-        """The image's name, unique in its data set."""
+        """Name of the image, unique in its data set."""
         ...
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, linear camera RGB of any length: the ground truth.
+        """Ground truth: the illuminant (3,) float64, linear camera RGB of any length.
 
-        Where several lights fall on the image, the mean over its pixels, which single-light methods are held to.
+        If several illuminants reach the image, their mean over the pixels; estimates of one illuminant are compared
+        with it.
         """
         ...
 
     @property
     def saturation(self) -> float | None:
-        """Value of the image from which a pixel is clipped; None if none is."""
+        """Value from which a pixel is clipped; None if no pixel is."""
         ...
 
     def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
-        """Return the image (H, W, 3), linear camera RGB with black subtracted, and its mask.
+        """Return the image (H, W, 3), linear camera RGB without black level, and its mask.
 
-        The mask is (H, W) bool, True where a pixel must not be used, or None if every pixel may be.
+        The mask is (H, W) bool, True for pixels that must not be used; None if all pixels may be used.
         """
         ...
 
 
 @runtime_checkable
 class MixedScene(Scene, Protocol):
-    """A scene that several lights fall on."""
+    """A scene under several illuminants."""
 
     @property
     def lights(self) -> npt.NDArray[np.float64]:
-        """The lights (K, 3) float64, linear camera RGB of any length, K ≥ 2."""
+        """The illuminants (K, 3) float64, linear camera RGB of any length, K ≥ 2."""
         ...
 
     def read_weights(self) -> npt.NDArray[np.float32]:
-        """Return the share of each light in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
+        """Return the fraction of each illuminant in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
         ...
 
     def read_truth_map(self) -> npt.NDArray[np.float32]:
-        """Return the light of each pixel: (H, W, 3) float32, r + g + b = 1; NaN where it is not known."""
+        """Return the illuminant of each pixel: (H, W, 3) float32, r + g + b = 1; NaN if unknown."""
         ...
 
 
-_Made = TypeVar("_Made")
+_Item = TypeVar("_Item")
 
 
-def told_of(made: Iterable[_Made], on_scene: Callable[[], None] | None) -> Iterator[_Made]:
-    """Yield what is made of one scene after another; `on_scene` is called when each was taken."""
-    for one in made:
-        yield one
+def report_progress(items: Iterable[_Item], on_scene: Callable[[], None] | None) -> Iterator[_Item]:
+    """Yield the items; `on_scene` is called after the consumer has used each."""
+    for item in items:
+        yield item
         if on_scene:
             on_scene()
 
 
 @dataclass(frozen=True)
 class SceneSet:
-    """The images of a data set, and what was done to them before a method sees them.
+    """Images of a data set and their treatment before a method receives them.
 
-    - `name`: the data set's name as its authors write it, for the heads of tables: "Cube+".
-    - `layout`: the name of the layout it was read by: "cube-plus".
-    - `place`: its folder, file or URL as it was given.
-    - `scenes`: its images, in the data set's own order; at least one.
-    - `treatment`: stated with every result: "black level", "saturation", "mask" and "ground truth", each with a
-      sentence that gives the value applied and its source. "reader" stands beside them where the layout's reader was
-      never tried on a published copy.
-    - `folds`: the fold of each scene, counted from 0, where the data set's authors divide it; else None.
-    - `truth_uncertainty_deg`: what the direction of a ground truth may be off by at worst, degrees, expanded (k = 2),
-      where the data set states it; else None.
+    - `name`: name of the data set as its authors write it, for headings: "Cube+".
+    - `layout`: name of the layout, by which its reader was chosen: "cube-plus".
+    - `location`: folder, file or URL as given.
+    - `scenes`: images in the data set's own order; at least one.
+    - `treatment`: printed with every result. "black level", "saturation", "mask" and "ground truth", each with the
+      applied value and its source; "reader" if the reader was never tested on a published copy.
+    - `folds`: fold of each scene, from 0, as the authors of the data set divide it; else None.
+    - `truth_uncertainty_deg`: largest uncertainty of a ground truth's direction, degrees, expanded (k = 2); None if the
+      data set does not report it.
     """
 
     name: str
     layout: str
-    place: str
+    location: str
     scenes: tuple[Scene, ...]
     treatment: Mapping[str, str] = field(default_factory=dict[str, str])
     folds: tuple[int, ...] | None = None

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 import cv2
 
 from evaluation.datasets import open_scenes
-from evaluation.experiments.paper.material import ScaledSource, developed
+from evaluation.experiments.paper.material import ScaledSource, develop_sources
 from generator.rendering.matrices import choose_matrix
 
 
@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--matrix", default="none", help="colour matrix: a camera, or a file of 3 x 3 numbers")
     parser.add_argument("--side", type=int, help="longest side, px; as it is by default")
     chosen = parser.parse_args()
-    sources = developed(open_scenes(chosen.data), choose_matrix(chosen.matrix))
+    sources = develop_sources(open_scenes(chosen.data), choose_matrix(chosen.matrix))
     chosen.folder.mkdir(parents=True)
     for source in sources:
         picture = (ScaledSource(source, chosen.side) if chosen.side else source).read().picture

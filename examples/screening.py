@@ -31,7 +31,7 @@ import numpy.typing as npt
 from scipy.spatial import Delaunay, cKDTree
 from scipy.stats import gaussian_kde
 
-from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, Statistic, bounded_figures, ratio_of
+from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, Statistic, bounded_figures, safe_ratio
 from evaluation.learning.feature_learner import FeatureLearner
 from evaluation.learning.standard import standard_learners
 from evaluation.metrics import recovery_error
@@ -289,7 +289,7 @@ def ratios_of(one: Floats, other: Floats) -> list[tuple[float, float, float]]:
 
     def ratios(counts: npt.NDArray[np.int64]) -> Floats:
         known = [np.mean([sample.statistics(counts) for sample in several], axis=0) for several in samples]
-        return ratio_of(*known)
+        return safe_ratio(*known)
 
     return list(bounded_figures(ratios, one.shape[1]))
 

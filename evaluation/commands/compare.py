@@ -1,4 +1,4 @@
-"""`evaluate compare`: two methods on the same images, or a method in two runs."""
+"""`evaluate compare`: two methods on the same images, or one method in two runs."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from foundation.folders import require_free
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from evaluation.experiments.comparing import Matched
+    from evaluation.experiments.comparing import MatchedErrors
     from evaluation.metrics import ErrorKind
     from evaluation.results.files import MethodErrors
 
-# Of more comparisons only the tests and sentences are printed.
-_FEW = 3
+# Most comparisons with details; with more, only tests and verdicts are printed.
+_MAX_DETAILED = 3
 
-HELP = f"""Compare two methods on the same images, or a method in two runs, image by image.
+HELP = f"""Compare two methods on the same images, or one method in two runs, image by image.
 
-Reads one or two RESULTS: results folders, or the errors.csv in them. Of one, every two of its methods are compared; of
-two, each method that both have. Images of one group, such as one picture under several lights, count as one.
+Reads one or two RESULTS: results folders, or their errors.csv. With one, all pairs of its methods are compared; with
+two, each common method. Images of one group, such as one picture under several illuminants, count as one case.
 
-Prints Wilcoxon's signed-rank test; of up to three comparisons also each statistic's difference and ratio with bootstrap
-intervals, and the images that differ most. Writes nothing unless asked with --out.
+Prints Wilcoxon's signed-rank test. For up to three comparisons also prints differences and ratios of all statistics
+with bootstrap intervals, and the images with the largest differences. Writes files only with --out.
 
 {EXIT_CODES}
 """
@@ -44,8 +44,8 @@ def compare(
         list[str] | None,
         option(
             "NAME",
-            "Method to compare, as the tables call it or by its name for evaluate run; give it more than once for "
-            "several. With two RESULTS, FIRST=SECOND compares methods of different names. \\[default: all]",
+            "Method to compare, by its name in the tables or for evaluate run; repeat the option for several methods. "
+            "With two RESULTS, FIRST=SECOND compares methods of different names. \\[default: all]",
         ),
     ] = None,
     error: Annotated[AngularError, typer.Option(help="Angular error to compare.")] = "reproduction",
@@ -59,77 +59,78 @@ def compare(
     from evaluation.results.files import read_errors
 
     if len(results) > 2:
-        raise InputError(f"{len(results)} results; compare two, or the methods of one")
+        raise InputError(f"{len(results)} RESULTS are given, expected one or two; omit the others")
     if out is not None:
         require_free(out, "the comparison")
-    runs = [read_errors(place) for place in results]
+    runs = [read_errors(location) for location in results]
     pairs = _pairs(runs, results, method, error)
     comparisons = comparing.compare(pairs)
-    notes = [*dict.fromkeys(note for pair in pairs for note in pair.notes), *_other_treatments(results)]
+    notes = [*dict.fromkeys(note for pair in pairs for note in pair.notes), *_treatment_notes(results)]
     if out is not None:
         comparing.write_comparisons(out, comparisons, notes)
     show_notes(output, notes)
-    verdicts = [comparing.verdict(made) for made in comparisons]
+    verdicts = [comparing.verdict(comparison) for comparison in comparisons]
     output.add(results=results, error=error, verdicts=verdicts)
     show_tables(output, [comparing.tests_table(comparisons)])
     for sentence in verdicts:
         print(sentence)
-    if output.is_requested or len(comparisons) <= _FEW:
+    if output.is_requested or len(comparisons) <= _MAX_DETAILED:
         show_tables(output, [comparing.statistics_table(comparisons)])
-        show_tables(output, [comparing.images_table(made, 5) for made in comparisons])
+        show_tables(output, [comparing.images_table(comparison, 5) for comparison in comparisons])
     if out is not None:
         print(f"written to {out}: report.html, tests.csv, statistics.csv, tables.tex")
 
 
 def _pairs(
-    runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str], wanted: Sequence[str] | None, error: ErrorKind
-) -> list[Matched]:
-    """Return the pairs to compare: every two methods of one run, or each method of one run and of the other."""
+    runs: Sequence[Mapping[str, MethodErrors]], locations: Sequence[str], names: Sequence[str] | None, error: ErrorKind
+) -> list[MatchedErrors]:
+    """Return the pairs to compare: all pairs of one run, or each method of one run with that of the other."""
     from evaluation.experiments.comparing import match
 
-    one, other = runs[0], runs[-1]
+    run_a, run_b = runs[0], runs[-1]
     if len(runs) == 1:
-        chosen = list(combinations(dict.fromkeys(_named(one, name, places[0]) for name in wanted or one), 2))
-    elif wanted:
-        split = [(name, name) if name in one and name in other else name.partition("=")[::2] for name in wanted]
-        chosen = [(_named(one, a, places[0]), _named(other, b or a, places[1])) for a, b in split]
-    elif len(one) == len(other) == 1:
-        chosen = [(next(iter(one)), next(iter(other)))]
+        chosen_names = [_run_method(run_a, name, locations[0]) for name in names or run_a]
+        pairs = list(combinations(dict.fromkeys(chosen_names), 2))
+    elif names:
+        texts = [(name, name) if name in run_a and name in run_b else name.partition("=")[::2] for name in names]
+        pairs = [(_run_method(run_a, a, locations[0]), _run_method(run_b, b or a, locations[1])) for a, b in texts]
+    elif len(run_a) == len(run_b) == 1:
+        pairs = [(next(iter(run_a)), next(iter(run_b)))]
     else:
-        chosen = [(name, name) for name in one if name in other]
-    if not chosen:
-        known = " and ".join(f"{place} has {', '.join(run)}" for place, run in zip(places, runs, strict=True))
-        raise InputError(f"{known}: name two methods to compare, or one of each run: --method FIRST=SECOND")
-    ends = ["", ""] if len(runs) == 1 else [f" ({place})" for place in places]
-    return [match(one[a], other[b], (a + ends[0], b + ends[1]), error) for a, b in dict.fromkeys(chosen)]
+        pairs = [(name, name) for name in run_a if name in run_b]
+    if not pairs:
+        methods = " and ".join(f"{name} has {', '.join(run)}" for name, run in zip(locations, runs, strict=True))
+        raise InputError(f"{methods}, expected two to compare; name one of each run: --method FIRST=SECOND")
+    suffixes = ["", ""] if len(runs) == 1 else [f" ({location})" for location in locations]
+    return [match(run_a[a], run_b[b], (a + suffixes[0], b + suffixes[1]), error) for a, b in dict.fromkeys(pairs)]
 
 
-def _named(run: Mapping[str, MethodErrors], name: str, place: str) -> str:
-    """Return the method's name as the run writes it; letters large or small are the same."""
-    alike = [known for known in run if known.lower() in (name.lower(), _title(name).lower())]
-    if len(alike) != 1 and name not in run:
-        raise InputError(f"{place} has no method {name!r}; it has {', '.join(run)}")
-    return name if name in run else alike[0]
+def _run_method(run: Mapping[str, MethodErrors], name: str, location: str) -> str:
+    """Return the name of the method in the run; upper and lower case are equal."""
+    same_names = [method for method in run if method.lower() in (name.lower(), _table_name(name).lower())]
+    if len(same_names) != 1 and name not in run:
+        raise InputError(f"{location} has no method {name!r}, expected one of {', '.join(run)}; correct --method")
+    return name if name in run else same_names[0]
 
 
-def _title(name: str) -> str:
-    """Return the name in tables of a method of this suite that has a short name: "pca"; any other name as it is."""
+def _table_name(name: str) -> str:
+    """Return the name in tables of a method of this suite ("pca"); other names unchanged."""
     for choose in (choose_methods, choose_learners):
         with suppress(InputError):
             return choose([name])[0].name
     return name
 
 
-def _other_treatments(places: Sequence[str]) -> list[str]:
-    """Return what two runs did differently to the images: then not only the methods differ."""
-    one, other = (_treatment(place) for place in (places[0], places[-1]))
-    differing = [what for what in one if what in other and one[what] != other[what]]
-    return [f"the runs differ in their {what}: first {one[what]}, second {other[what]}" for what in differing]
+def _treatment_notes(locations: Sequence[str]) -> list[str]:
+    # Runs with different treatments of the images differ in more than their methods.
+    first, second = (_treatment(location) for location in (locations[0], locations[-1]))
+    differences = [aspect for aspect in first if aspect in second and first[aspect] != second[aspect]]
+    return [f"the runs differ in {aspect}: first {first[aspect]}, second {second[aspect]}" for aspect in differences]
 
 
-def _treatment(place: str) -> dict[str, Any]:
-    """Return which images a run used and what it did to them, by its run.json; nothing if that cannot be read."""
-    path = Path(place) if Path(place).is_dir() else Path(place).parent
+def _treatment(location: str) -> dict[str, Any]:
+    """Return images and treatment of a run from its run.json; empty if it cannot be read."""
+    path = Path(location) if Path(location).is_dir() else Path(location).parent
     try:
         record = json.loads((path / "run.json").read_text(encoding="utf-8"))
         return {"images": record["data_set"]["place"], **record["treatment"]}

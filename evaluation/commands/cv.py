@@ -1,4 +1,4 @@
-"""`evaluate cv`: learned methods on a data set, each image estimated by a model that has not seen it."""
+"""`evaluate cv`: cross-validation of learned methods on a data set."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from evaluation.commands.options import (
     PrintedError,
     Read,
     argument,
-    choose_beside_constant,
+    choose_without_constant,
     image_steps,
     open_data,
     split_names,
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
     from evaluation.scene import SceneSet
 
-HELP = f"""Cross-validate methods that learn: train on all folds but one and estimate the images of that one, for each.
+HELP = f"""Cross-validate learned methods: train on all folds but one and estimate the images of that one, in turn.
 
-METHOD is {LEARNERS_HELP}, all, or a class of your own with fit(scenes, seed), as module:Class or file.py:Class; several
-stand between commas. The constant light, the median of the training lights, always stands beside them: a method that
-does not beat it has learned nothing from images. Images of one group, such as one picture under several lights, stay
-in one fold.
+METHOD is {LEARNERS_HELP}, all, or your own class with fit(scenes, seed), as module:Class or file.py:Class. Separate
+several methods by commas. The constant illuminant (median of the training illuminants) is always added: a method that
+is not better has learned nothing from the images. Images of one group, such as one picture under several illuminants,
+stay in one fold.
 
-Reads DATA, a data set of any layout that evaluate run reads. Folds are the data set's own where its authors made some,
-else three that --seed draws; --folds takes a number of folds to draw, or a CSV file with the columns image,fold. Prints
-the table of evaluate run; writes nothing unless asked: --out writes the results folder of evaluate run with folds.csv.
+Reads DATA in any layout of evaluate run. Uses the folds published with the data set, otherwise three folds drawn with
+--seed; --folds sets their number or reads them from a CSV file with the columns image,fold. Prints the table of
+evaluate run. Writes files only with --out: the results folder of evaluate run with folds.csv.
 
 {EXIT_CODES}
 """
@@ -52,13 +52,13 @@ def cv(
         str | None,
         option(
             "N|FILE.csv",
-            "Number of folds to draw, or a file with the columns image,fold. \\[default: the data's own, or 3]",
+            "Number of folds to draw, or a file with the columns image,fold. \\[default: published folds, or 3]",
         ),
     ] = None,
-    seed: Annotated[int, option("N", "Of the folds and of all that is random in the training.", min=0)] = 0,
+    seed: Annotated[int, option("N", "Seed of the folds and of the training.", min=0)] = 0,
     error: PrintedError = "reproduction",
-    out: Annotated[Path | None, option("RESULTS", "Write everything to this new folder.")] = None,
-    workers: Annotated[int | None, thread_option(" that read images; no number depends on it")] = None,
+    out: Annotated[Path | None, option("RESULTS", "Write all results to this new folder.")] = None,
+    workers: Annotated[int | None, thread_option(" that read images; results do not depend on it")] = None,
     read: Read = None,
     output: JsonOutput,
 ) -> None:
@@ -69,47 +69,47 @@ def cv(
     from evaluation.learning.constant_light import ConstantLight
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
-    from evaluation.results.result import indistinct
+    from evaluation.results.result import indistinct_methods
     from evaluation.results.tables import summary_table
 
-    others, left_out = choose_beside_constant(split_names([method]))
-    learners = [ConstantLight(), *others]
+    trained_learners, left_out = choose_without_constant(split_names([method]))
+    learners = [ConstantLight(), *trained_learners]
     if out is not None:
         require_free(out, "the results")
-    found = open_data(data, read)
-    parts, origin = choose_folds(found, folds, seed)
-    count, threads = len(found.scenes), workers or processor_count()
+    data_set = open_data(data, read)
+    image_folds, origin = choose_folds(data_set, folds, seed)
+    count, threads = len(data_set.scenes), workers or processor_count()
     with orderly_end():
         with image_steps(count) as step:
-            results = cross_validate(found.scenes, learners, parts, seed, threads, step)
+            results = cross_validate(data_set.scenes, learners, image_folds, seed, threads, step)
         notes = (
-            f"cross-validated in {len(set(parts.tolist()))} folds, {origin}; seed {seed}",
+            f"cross-validated in {len(set(image_folds.tolist()))} folds, {origin}; seed {seed}",
             *left_out,
-            *_parted_copies(found, parts),
-            *indistinct(results, found.truth_uncertainty_deg),
+            *_separated_copies(data_set, image_folds),
+            *indistinct_methods(results, data_set.truth_uncertainty_deg),
         )
-        described = [describe_method(learner) for learner in learners]
-        made = describe_run(found, results, described, {"seed": seed, "folds": origin}, parts, notes)
+        records = [describe_method(learner) for learner in learners]
+        result_run = describe_run(data_set, results, records, {"seed": seed, "folds": origin}, image_folds, notes)
         if out is not None:
-            write_run(made, found.scenes, out, error, threads)
-    output.add(data_set=found.name, images=count, folds=len(set(parts.tolist())), seed=seed, error=error)
-    show_tables(output, [summary_table(made.subject, results, error, output.is_requested)])
-    show_notes(output, made.notes, made.treatment)
+            write_run(result_run, data_set.scenes, out, error, threads)
+    output.add(data_set=data_set.name, images=count, folds=len(set(image_folds.tolist())), seed=seed, error=error)
+    show_tables(output, [summary_table(result_run.subject, results, error, output.is_requested)])
+    show_notes(output, result_run.notes, result_run.treatment)
 
 
-def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
-    """Return a sentence where images (N,) int64 by their folds are copies of images of other folds."""
+def _separated_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
+    """Return a note if images are copies of images in other folds; `folds`: (N,) int64."""
     from evaluation.datasets.identity import first_copies
 
     names = [scene.name for scene in data.scenes]
-    apart = [
-        f"{names[place]} of {names[first]}"
-        for place, first in enumerate(first_copies(data.scenes))
-        if folds[place] != folds[first]
+    separated = [
+        f"{names[index]} of {names[original]}"
+        for index, original in enumerate(first_copies(data.scenes))
+        if folds[index] != folds[original]
     ]
-    if not apart:
+    if not separated:
         return []
     return [
-        f"{counted(len(apart), 'image is a copy', 'images are copies')} of images of other folds ({first_few(apart)}): "
-        "tested on what was trained on"
+        f"{counted(len(separated), 'image is a copy', 'images are copies')} of images in other folds "
+        f"({first_few(separated)}): they are tested on their own training data"
     ]

@@ -1,4 +1,4 @@
-"""`evaluate run`: the errors of methods on a data set."""
+"""`evaluate run`: errors of methods on a data set."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, option, with_json
 from foundation.folders import require_free
 
-HELP = f"""Estimate the light of every image of a data set and sum up the errors.
+HELP = f"""Estimate the illuminant of every image of a data set and summarise the errors.
 
-Reads DATA: a dataset made by generate (folder or URL), or a real data set in the layout of its authors. Methods are the
-suite's own, classes of yours, trained models, and estimates that any other program has made; with none named, the
-seven standard ones. Prints a table in the paper's order: mean, median, trimean, best 25 %, worst 25 % and Avg., their
-geometric mean, all in degrees; where several lights fall on images, the errors by pixel and region too; and what was
-done to the images. Writes nothing unless asked with --out.
+Reads DATA: a data set made by generate (folder or URL), or a real data set in its published layout. Methods are those
+of this suite, your own classes, trained models, and estimates of other programs; by default the seven standard ones.
+Prints mean, median, trimean, best 25 %, worst 25 % and Avg. (their geometric mean) in degrees, as in the paper. With
+several illuminants in an image also prints errors by pixel and region. Prints how the images were treated. Writes files
+only with --out.
 
 {EXIT_CODES}
 """
@@ -39,21 +39,21 @@ def run(
         list[str] | None,
         option(
             "LIST",
-            "Methods, between commas or by giving it more than once. standard: white-patch, gray-world, "
+            "Methods, separated by commas or in repeated options. standard: white-patch, gray-world, "
             "shades-of-gray, general-gray-world, gray-edge-1, gray-edge-2, pca. all: these and improved-white-patch, "
-            "color-sparrow, local-surface-reflectance, grayness-index, mean-shifted-gray-pixel, opencv-grayworld, of "
-            "which some take seconds on large images. With parameters: shades-of-gray:p=4, gray-edge-1:p=4:sigma=2. "
-            "MODEL.npz of evaluate train. module:Class, or file.py:Class, of your own. FILE.csv or NAME=FILE.csv: "
-            "estimates of another program, columns image,r,g,b. \\[default: standard]",
+            "color-sparrow, local-surface-reflectance, grayness-index, mean-shifted-gray-pixel, opencv-grayworld; some "
+            "take seconds on large images. With parameters: shades-of-gray:p=4, gray-edge-1:p=4:sigma=2. MODEL.npz of "
+            "evaluate train. Your own module:Class or file.py:Class. FILE.csv or NAME=FILE.csv: estimates of another "
+            "program with the columns image,r,g,b. \\[default: standard]",
         ),
     ] = None,
     error: PrintedError = "reproduction",
     out: Annotated[
         Path | None,
-        option("RESULTS", "Write everything to this new folder: tables, each image's errors, report.html, LaTeX."),
+        option("RESULTS", "Write tables, the errors of all images, report.html and LaTeX to this new folder."),
     ] = None,
     workers: Annotated[
-        int | None, thread_option(", one image each; classes of yours are called by one at a time")
+        int | None, thread_option(", one image each; your own classes run in one thread at a time")
     ] = None,
     read: Read = None,
     *,
@@ -66,22 +66,22 @@ def run(
 
     names = split_names(method or ["standard"])
     files = [name for name in names if name.endswith(".csv")]
-    chosen = choose_methods(name for name in names if name not in files)
+    methods = choose_methods(name for name in names if name not in files)
     if out is not None:
         require_free(out, "the results")
-    found = open_data(data, read)
-    given = choose_estimates(files, [scene.name for scene in found.scenes])
+    data_set = open_data(data, read)
+    estimates = choose_estimates(files, [scene.name for scene in data_set.scenes])
     threads = workers or processor_count()
-    with image_steps(len(found.scenes)) as step:
-        made = run_methods(found, [*chosen, *given], threads, step)
+    with image_steps(len(data_set.scenes)) as step:
+        result_run = run_methods(data_set, [*methods, *estimates], threads, step)
         if out is not None:
-            write_run(made, found.scenes, out, error, threads)
+            write_run(result_run, data_set.scenes, out, error, threads)
     if output.is_requested:
-        table = statistics_rows(made.subject, made.results)
-        output.add(data_set=made.subject.name, images=len(made.subject.images))
+        table = statistics_rows(result_run.subject, result_run.results)
+        output.add(data_set=result_run.subject.name, images=len(result_run.subject.images))
         output.add(errors=[dict(zip(table.columns, row, strict=True)) for row in table.rows])
     else:
-        print_table(summary_table(made.subject, made.results, error))
-        for table in lights_tables(made.subject, made.results, error):
+        print_table(summary_table(result_run.subject, result_run.results, error))
+        for table in lights_tables(result_run.subject, result_run.results, error):
             print_table(table)
-    show_notes(output, made.notes, made.treatment)
+    show_notes(output, result_run.notes, result_run.treatment)

@@ -1,4 +1,4 @@
-"""`evaluate transfer`: what generated images are worth as training data for real ones."""
+"""`evaluate transfer`: benefit of generated images as training data for real images."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from evaluation.commands.options import (
     AngularError,
     Read,
     argument,
-    choose_beside_constant,
     choose_methods,
+    choose_without_constant,
     image_steps,
     is_learner,
     open_data,
@@ -37,19 +37,19 @@ if TYPE_CHECKING:
     from evaluation.experiments.transfer.plan import TransferPlan
     from evaluation.scene import Scene
 
-# Ratio of sizes from which all images are made small: learned methods reduce images by up to 2 themselves.
-_ALIKE = 2.0
-_LOOKED_AT = 25  # Images of a set whose sizes are read at most
+# Ratio of image sizes above which all images are reduced: learned methods reduce images by up to 2 themselves.
+_MAX_SIZE_RATIO = 2.0
+_MAX_MEASURED = 25  # Images of a set whose sizes are read, at most
 
 HELP = f"""Train learned methods on generated images and test them on real ones.
 
-Reads data sets of any layout that evaluate run reads; trains each method on each TRAIN and tests it on TEST, beside
-real cross-validation of the same method, the constant light (median of the training lights), and methods that learn
-nothing. With --naive also trained without a table: the same pictures, linear sRGB times the same lights, with and
-without the camera's colour matrix. With --real also beside N real images of the other folds: on them alone, and on each
-set first and then adapted to them. Prints mean, median, trimean, best and worst quarter, their bootstrap intervals,
-and their ratios to real cross-validation, paired by image. Training images that share a picture with the test set, by
-name or content, are left out. Writes nothing unless asked with --out.
+Reads data sets in any layout of evaluate run. Trains each method on each TRAIN and tests it on TEST. For comparison:
+real cross-validation of the same method, the constant illuminant (median of the training illuminants), and methods
+without training. --naive adds training without a look-up table: linear sRGB of the same pictures times the same
+illuminants, with and without the camera's colour matrix. --real adds N real images of the other folds: training on them
+alone, and training on each set followed by adaptation to them. Prints mean, median, trimean, best and worst 25 %,
+bootstrap intervals, and ratios to real cross-validation, paired by image. Training images that share a picture with the
+test set, by name or content, are excluded. Writes files only with --out.
 
 {EXIT_CODES}
 """
@@ -57,27 +57,26 @@ name or content, are left out. Writes nothing unless asked with --out.
 
 @with_json("evaluate transfer")
 def transfer(
-    test: Annotated[str, argument("TEST", "Real data set to test on; --read is about it.")],
-    train: Annotated[list[str], argument("TRAIN", "Data sets to train on, made by generate.")],
+    test: Annotated[str, argument("TEST", "Real data set for the test; --read applies to it.")],
+    train: Annotated[list[str], argument("TRAIN", "Data sets for training, made by generate.")],
     method: Annotated[
         list[str] | None,
         option(
             "LIST",
-            "Methods between commas: names of evaluate cv (all: all of them), and of evaluate run for reference. "
+            "Methods, separated by commas: names of evaluate cv (all: all of them), and of evaluate run for reference. "
             "\\[default: all, gray-world, shades-of-gray, gray-edge-1]",
         ),
     ] = None,
-    naive: Annotated[Path | None, option("PICTURES", "Folder of the pictures that TRAIN was generated from.")] = None,
+    naive: Annotated[Path | None, option("PICTURES", "Folder of the source pictures of TRAIN.")] = None,
     relit: Annotated[
         str | None,
-        option("DATA", "Real images of another camera, to train on under the lights of each TRAIN, as a yardstick."),
+        option("DATA", "Real images of another camera, relit to the illuminants of each TRAIN, for comparison."),
     ] = None,
     real: Annotated[
-        str | None,
-        option("LIST", "Numbers of real images to train beside, between commas, as 0,20,100,all."),
+        str | None, option("LIST", "Numbers of real images used for training, separated by commas: 0,20,100,all.")
     ] = None,
-    seeds: Annotated[int, option("K", "Seeds of learners, training images and folds.", min=1)] = 1,
-    error: Annotated[AngularError, typer.Option(help="Angular error to sum up.")] = "reproduction",
+    seeds: Annotated[int, option("K", "Number of seeds of learners, training images and folds.", min=1)] = 1,
+    error: Annotated[AngularError, typer.Option(help="Angular error of the statistics.")] = "reproduction",
     out: Annotated[Path | None, option("FOLDER", "Write tables, errors and a report to this new folder.")] = None,
     workers: Annotated[int | None, thread_option()] = None,
     read: Read = None,
@@ -101,87 +100,88 @@ def transfer(
     learned = [name for name in names if name.lower() == "all" or is_learner(name)]
     learners, left_out = _learners(learned)
     references = choose_methods(name for name in names if name not in learned)
-    asked = _counts(real)
-    tested = open_data(test, read)
-    others = None if relit is None else open_scenes(relit)
-    plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, others)
-    drawn = tuple(choose_folds(tested, None, seed)[0] for seed in range(seeds))
-    counts, too_many = _within(asked, drawn)
-    side, made_small = _side(tested.scenes, plan)
-    notes = [*plan.notes, *made_small, *left_out, *too_many]
-    images = min(len(some.scenes) for some in plan.training)
-    with image_steps(count_images(tested.scenes, plan.training, len(drawn), images)) as step:
+    requested_counts = _parse_counts(real)
+    test_set = open_data(test, read)
+    relit_set = None if relit is None else open_scenes(relit)
+    plan = plan_transfer(test_set, [open_scenes(location) for location in train], naive, relit_set)
+    folds = tuple(choose_folds(test_set, None, seed)[0] for seed in range(seeds))
+    counts, count_notes = _possible_counts(requested_counts, folds)
+    side, size_notes = _common_side(test_set.scenes, plan)
+    notes = [*plan.notes, *size_notes, *left_out, *count_notes]
+    images = min(len(training_set.scenes) for training_set in plan.training)
+    with image_steps(count_images(test_set.scenes, plan.training, len(folds), images)) as step:
         rows = run_transfer(
-            *(tested.scenes, plan.training, learners, drawn, images, references),
+            *(test_set.scenes, plan.training, learners, folds, images, references),
             *(side, threads, step),
-            generated=tested.name if is_generated(tested) else "",
-            beside=counts,
+            generated_name=test_set.name if is_generated(test_set) else "",
+            real_counts=counts,
         )
-    figures = figures_of(rows, error, groups=groups_of(tested.scenes))
+    figures = figures_of(rows, error, groups=groups_of(test_set.scenes))
     plan = replace(plan, notes=(*notes, *harm_notes(figures)))
     settings: dict[str, Any] = {
-        "methods": [describe_method(each) for each in (*learners, *references)],
+        "methods": [describe_method(method_or_learner) for method_or_learner in (*learners, *references)],
         "images": images,
         "seeds": list(range(seeds)),
         "real": real,
-        "relit": None if others is None else others.name,
+        "relit": None if relit_set is None else relit_set.name,
         "side": side,
         "error": error,
         "read": list(read or ()),
     }
-    outcome = TransferOutcome(tested, plan, rows, figures, drawn, settings)
+    outcome = TransferOutcome(test_set, plan, rows, figures, folds, settings)
     if out is not None:
         save_outcome(outcome, out)
-    output.add(test=tested.name, error=error, settings=settings)
+    output.add(test=test_set.name, error=error, settings=settings)
     show_tables(output, list(outcome.tables()), "")
     show_notes(output, plan.notes)
 
 
 def _learners(names: Sequence[str]) -> tuple[list[AnyLearner], list[str]]:
-    """Return the learned methods of a list and the constant light, and why some of `all` are left out."""
     from evaluation.learning.constant_light import ConstantLight
 
-    chosen, left_out = choose_beside_constant(names)
-    titles = [each.name for each in chosen]
+    learners, left_out = choose_without_constant(names)
+    titles = [learner.name for learner in learners]
     for title in titles:
         if titles.count(title) > 1:
-            raise InputError(f"two methods are called {title}; give one another name: names head the rows")
-    return [*chosen, ConstantLight()], left_out
+            raise InputError(f"two methods have the name {title}, expected different names; rename or omit one")
+    # The constant illuminant is always added as the baseline.
+    return [*learners, ConstantLight()], left_out
 
 
-def _counts(real: str | None) -> tuple[int | None, ...]:
-    """Return the numbers of --real; None for all, without 0: of no real images there are rows in any case."""
+def _parse_counts(real: str | None) -> tuple[int | None, ...]:
+    """Return the numbers of --real without 0, whose rows exist in any case; None stands for all."""
     words = [] if real is None else [word.strip().lower() for word in real.split(",")]
     if not all(word == "all" or (word.isascii() and word.isdigit()) for word in words):
-        raise InputError(f"--real is {real!r}, expected numbers of real images between commas, or all: 0,20,100,all")
+        raise InputError(f"--real is {real!r}, expected numbers of real images, such as 0,20,100,all; correct it")
     return tuple(None if word == "all" else int(word) for word in dict.fromkeys(words) if word != "0")
 
 
-def _within(
+def _possible_counts(
     counts: Sequence[int | None], folds: Sequence[npt.NDArray[np.int64]]
 ) -> tuple[tuple[int | None, ...], list[str]]:
-    """Return the numbers of real images that every fold (N,) int64 leaves, and why others are left out."""
+    """Return the numbers of real images that every fold (N,) int64 leaves, and notes on the others."""
     import numpy as np
 
-    least = min(len(each) - int(np.bincount(each).max()) for each in folds)
-    left_out = [count for count in counts if count is not None and count > least]
-    notes = [f"No rows beside {count} real images: a fold that is tested leaves {least}" for count in left_out]
+    max_count = min(len(fold_numbers) - int(np.bincount(fold_numbers).max()) for fold_numbers in folds)
+    left_out = [count for count in counts if count is not None and count > max_count]
+    notes = [f"No rows with {count} real images: the other folds have only {max_count}" for count in left_out]
     return tuple(count for count in counts if count not in left_out), notes
 
 
-def _side(test: Sequence[Scene], plan: TransferPlan) -> tuple[int | None, list[str]]:
-    """Return the longest side that all images are made small to, and why; None if their sizes are alike."""
-    tested, *trained = [_median_side(scenes) for scenes in (test, *(some.scenes for some in plan.training))]
-    side = min(tested, *trained)
-    if max(tested, *trained) <= _ALIKE * side:
+def _common_side(test: Sequence[Scene], plan: TransferPlan) -> tuple[int | None, list[str]]:
+    """Return the longest side to which all images are reduced, and a note; None if sizes are similar."""
+    test_side = _median_side(test)
+    training_sides = [_median_side(training_set.scenes) for training_set in plan.training]
+    side = min(test_side, *training_sides)
+    if max(test_side, *training_sides) <= _MAX_SIZE_RATIO * side:
         return None, []
     return side, [
-        f"Half of the test images have sides of up to {tested} px, half of the images of each training set up to "
-        f"{', '.join(map(str, dict.fromkeys(trained)))} px: all were made small to at most {side} px by averaging "
-        "areas without clipped and masked pixels"
+        f"Longest sides (median): test images {test_side} px, training sets "
+        f"{', '.join(map(str, dict.fromkeys(training_sides)))} px. All images were reduced to at most {side} px by "
+        "area averages without clipped and masked pixels"
     ]
 
 
 def _median_side(scenes: Sequence[Scene]) -> int:
-    """Return the median of the longest sides of up to `_LOOKED_AT` images of a set, evenly spaced in its order, px."""
-    return median_low(max(scene.read()[0].shape) for scene in scenes[:: ceil(len(scenes) / _LOOKED_AT)])
+    # Images evenly spaced in the set's order: an order by size would bias the first ones.
+    return median_low(max(scene.read()[0].shape) for scene in scenes[:: ceil(len(scenes) / _MAX_MEASURED)])

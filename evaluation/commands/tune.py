@@ -1,4 +1,4 @@
-"""`evaluate tune`: parameters of a statistics method for the images of a data set, without their ground truths."""
+"""`evaluate tune`: parameters of a statistics-based method from the images of a data set, without ground truths."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from evaluation.commands.options import AngularError, Data, Read, image_steps, o
 from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, with_json
 
-FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"  # The families, for the help
+FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"  # Names for help texts
 
-HELP = f"""Choose a method's parameters on images whose lights nobody knows, by the green stability assumption.
+HELP = f"""Choose parameters of a method without ground truths, by the green stability assumption.
 
-Reads DATA, a data set of any layout that evaluate run reads: images of one camera under many lights. Lights differ much
-in red and blue chromaticity and little in green, so the parameters are taken whose estimates spread least in green
-(Banić, Lončarić 2018; a reconstruction). FAMILY is {FAMILIES_HELP}; with @PIXELS behind it on images shrunk to that
-size: gray-edge-2@360.
+Reads DATA in any layout of evaluate run: images of one camera under many illuminants. Illuminants differ much in red
+and blue chromaticity and little in green; the chosen parameters give estimates with the smallest spread in green
+(Banić, Lončarić 2018; reconstructed). FAMILY is {FAMILIES_HELP}. FAMILY@PIXELS reduces images to that size first:
+gray-edge-2@360.
 
-Ground truths have no part in the choice; --errors shows errors beside it. Prints every setting, the chosen one first;
-evaluate run DATA --method SETTING evaluates one. Writes nothing.
+Ground truths do not influence the choice; --errors prints errors for comparison. Prints every setting, the chosen one
+first; evaluate run DATA --method SETTING evaluates one. Writes no files.
 
 {EXIT_CODES}
 """
@@ -33,29 +33,29 @@ def tune(
     *,
     errors: Annotated[
         AngularError | None,
-        typer.Option(help="Show these errors beside the criterion; the choice stays without them.", show_default=False),
+        typer.Option(help="Print these errors for comparison; they do not influence the choice.", show_default=False),
     ] = None,
-    workers: Annotated[int | None, thread_option(", one image each; no number depends on it")] = None,
+    workers: Annotated[int | None, thread_option(", one image each; results do not depend on it")] = None,
     read: Read = None,
     output: JsonOutput,
 ) -> None:
     """Choose a method's parameters on a data set."""
-    from evaluation.experiments.cross_validation import settings_of, tune_family, tuning_table
+    from evaluation.experiments.cross_validation import family_settings, tune_family, tuning_table
     from evaluation.reports.table_output import show_notes, show_tables
 
-    settings_of(family)  # A family that is none is told before a data set is opened.
-    found = open_data(data, read)
-    count, threads = len(found.scenes), workers or processor_count()
+    family_settings(family)  # An unknown family is refused before a data set is opened.
+    data_set = open_data(data, read)
+    count, threads = len(data_set.scenes), workers or processor_count()
     with image_steps(count) as step:
-        tuned = tune_family(family, found.name, found.scenes, errors, threads, step)
+        tuned = tune_family(family, data_set.name, data_set.scenes, errors, threads, step)
     show_tables(output, [tuning_table(tuned)])
     best = tuned.settings[0]
-    output.add(data_set=found.name, images=count, family=family, chosen=best.text, spread=best.spread)
-    print(f"chosen: {best.text}, whose estimates spread least in green chromaticity ({best.spread:.5f})")
+    output.add(data_set=data_set.name, images=count, family=family, chosen=best.text, spread=best.spread)
+    print(f"chosen: {best.text}, with the smallest spread of estimates in green chromaticity ({best.spread:.5f})")
     print(
         "ground truths: not used for the choice"
-        + (", shown beside it only" if errors else "")
-        + "; on other images the setting is evaluated as --method "
+        + (", printed for comparison" if errors else "")
+        + "; to evaluate the setting on other images, use --method "
         + best.text
     )
-    show_notes(output, [], found.treatment)
+    show_notes(output, [], data_set.treatment)

@@ -70,7 +70,7 @@ def open_ffcc(place: str, options: DataOptions, listed: Folder | None = None) ->
     return SceneSet(
         name=folder.path.resolve().name,
         layout="ffcc",
-        place=place,
+        location=place,
         scenes=tuple(scenes),
         treatment={
             "images": str(len(scenes)),

@@ -89,7 +89,7 @@ def open_generated(place: Path | str, subset: str | None = None) -> SceneSet:
     return SceneSet(
         name=_name_of(str(place)) + (f" {part}" if part else ""),
         layout="generated",
-        place=masked(str(place)),
+        location=masked(str(place)),
         scenes=tuple(
             (GeneratedScene if len(entry.lights) == 1 else GeneratedMixedScene)(dataset, entry)
             for entry in dataset.entries

@@ -125,7 +125,7 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
     return SceneSet(
         name=folder.resolve().name,
         layout="folder",
-        place=place,
+        location=place,
         scenes=tuple(scenes),
         treatment={
             "images": str(len(scenes))

@@ -80,7 +80,7 @@ def open_thumbnails(path: Path | str, saturation: float | None = None) -> SceneS
     return SceneSet(
         name=Path(path).stem,
         layout="thumbnails",
-        place=str(path),
+        location=str(path),
         scenes=tuple(
             Thumbnail(name, truth, np.maximum(image, 0) if below else image, saturation)
             for name, truth, image in zip(titles, truths, images, strict=True)

@@ -1,4 +1,4 @@
-"""What can be asked of methods and data sets: runs, cross-validation, transfer, comparisons, the paper."""
+"""Experiments: runs of methods, cross-validation, transfer, comparisons, and the experiments of the paper."""
 
 from evaluation.experiments.running import evaluate
 

@@ -1,14 +1,11 @@
-"""Confidence intervals of error statistics by the bootstrap: the range that other images would give.
+"""Confidence intervals of error statistics by the bootstrap: the range expected for other images of the same kind.
 
-Intervals are bias-corrected and accelerated (BCa) and made by `scipy.stats.bootstrap`. Errors of colour constancy are
-skewed, and plain percentiles of a mean or of the worst quarter are then too low.
+Intervals are bias-corrected and accelerated (BCa), computed by `scipy.stats.bootstrap`. Errors of colour constancy are
+skewed; plain percentile intervals of a mean or of the worst 25 % would be too low.
 
-Images that belong together, such as one picture under several lights, are drawn and left out together (the cluster
-bootstrap: A. C. Davison, D. V. Hinkley, *Bootstrap Methods and their Application* (1997), section 3.8). Drawn one by
-one, such images make intervals too narrow.
-
-A resample is a count of each image. Its statistics are read from the cumulative counts along the sorted errors, so
-errors are sorted once. They are those of `evaluation.metrics.summarise`, ties and percentiles included.
+Related images, such as one picture under several illuminants, are drawn together (cluster bootstrap: A. C. Davison,
+D. V. Hinkley, *Bootstrap Methods and their Application* (1997), section 3.8). Drawing them separately would give
+intervals that are too narrow.
 """
 
 from __future__ import annotations
@@ -24,42 +21,42 @@ from scipy import stats
 
 from foundation.errors import InputError
 
-# Errors are equal up to twice the last of the six decimals that files hold.
+# Errors are equal up to twice the last of the six decimals in files.
 TIE_DEG: Final = 2e-6
 
-# Counts drawn at once, resamples times images: arrays of 1.6 MB stay in a processor's cache.
-_AT_ONCE: Final = 200_000
+# Counts drawn at once (resamples × images): arrays of 1.6 MB stay in the processor's cache.
+_COUNTS_AT_ONCE: Final = 200_000
 
-# The ends of a 95 % interval then vary by some 2 % of its length (one standard deviation) between seeds.
+# The ends of a 95 % interval then vary by about 2 % of its length (one standard deviation) between seeds.
 RESAMPLES: Final = 2000
 
-# Confidence of an interval: the usual one.
+# Confidence level of all intervals, as usual in the field.
 LEVEL: Final = 0.95
 
 Floats = npt.NDArray[np.float64]
-Places = npt.NDArray[np.int64]
+Indices = npt.NDArray[np.int64]
 
-# The numbers of `evaluation.metrics.Summary`, by their names there.
+# Statistics by their names in `evaluation.metrics.Summary`.
 Statistic = Literal["mean", "median", "trimean", "best25", "worst25", "avg"]
 
-# All of them, in the order of the paper's tables.
+# All statistics in the order of the paper's tables.
 STATISTICS: tuple[Statistic, ...] = ("mean", "median", "trimean", "best25", "worst25", "avg")
 
 
 class BoundedFigure(NamedTuple):
-    """A number with the ends of its confidence interval; NaN if it is not known."""
+    """A value with the ends of its confidence interval; NaN if unknown."""
 
     value: float
     low: float
     high: float
 
 
-def numbered(groups: Sequence[str]) -> Places:
-    """Return the group of each image by number, (N,) int64 from 0, in the order in which the groups first come.
+def group_ids(groups: Sequence[str]) -> Indices:
+    """Return the number of each image's group, (N,) int64 from 0, in the order of first occurrence.
 
     Examples
     --------
-    >>> numbered(["cat", "dog", "cat"])
+    >>> group_ids(["cat", "dog", "cat"])
     array([0, 1, 0])
     """
     numbers = {group: number for number, group in enumerate(dict.fromkeys(groups))}
@@ -67,172 +64,166 @@ def numbered(groups: Sequence[str]) -> Places:
 
 
 def bounded_figures(
-    statistics: Callable[[Places], Floats],
+    statistics: Callable[[Indices], Floats],
     images: int,
     groups: Sequence[str] | None = None,
     seed: int = 0,
     count: int = RESAMPLES,
 ) -> tuple[BoundedFigure, ...]:
-    """Return K numbers of a sample of images, each with the ends of its confidence interval.
+    """Return K statistics of a sample of images with their confidence intervals.
 
-    `statistics`: from counts (B, N) int64 of the N images in B resamples to (B, K) float64. `groups`: what each image
-    shares with others; images of one group are drawn together. None: every image is its own group. The ends are NaN
-    if there is one group only, which says nothing of others.
+    `statistics`: maps counts (B, N) int64 of N images in B resamples to (B, K) float64. `groups`: group of each image;
+    images of a group are drawn together; None if every image is its own group. With a single group the ends are NaN,
+    because nothing is known about other groups.
     """
-    members = np.arange(images) if groups is None else numbered(groups)
-    cases = int(members.max()) + 1
+    group_indices = np.arange(images) if groups is None else group_ids(groups)
+    group_count = int(group_indices.max()) + 1
 
-    def of_resamples(drawn: Places, axis: int = -1) -> Floats:
+    def resample_statistics(drawn: Indices, axis: int = -1) -> Floats:
         rows = drawn.reshape(-1, drawn.shape[axis])
-        shifted = rows + np.arange(len(rows))[:, None] * cases
-        counts = np.bincount(shifted.ravel(), minlength=len(rows) * cases).reshape(-1, cases)
-        # Rounded, since resamples that agree but for their last digit must count as equal.
-        found = np.round(statistics(counts if groups is None else counts[:, members]), 12)
-        return found.T.reshape(-1, *drawn.shape[:-1])
+        shifted = rows + np.arange(len(rows))[:, None] * group_count
+        counts = np.bincount(shifted.ravel(), minlength=len(rows) * group_count).reshape(-1, group_count)
+        # Rounded, because resamples that differ only in the last digit must count as equal.
+        rounded = np.round(statistics(counts if groups is None else counts[:, group_indices]), 12)
+        return rounded.T.reshape(-1, *drawn.shape[:-1])
 
-    everything = np.arange(cases)
-    if cases == 1:
-        alone = of_resamples(everything)
+    all_groups = np.arange(group_count)
+    if group_count == 1:
+        single_values = resample_statistics(all_groups)
         return tuple(
-            BoundedFigure(float(value), np.nan, np.nan) for value in np.where(np.isfinite(alone), alone, np.nan)
+            BoundedFigure(float(value), np.nan, np.nan)
+            for value in np.where(np.isfinite(single_values), single_values, np.nan)
         )
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", stats.DegenerateDataWarning)
-        values = of_resamples(everything)
-        made: Any = stats.bootstrap(
-            (everything,),
-            of_resamples,
+        values = resample_statistics(all_groups)
+        bootstrap: Any = stats.bootstrap(
+            (all_groups,),
+            resample_statistics,
             n_resamples=count,
-            batch=max(1, _AT_ONCE // images),
+            batch=max(1, _COUNTS_AT_ONCE // images),
             confidence_level=LEVEL,
             method="BCa",
             rng=np.random.default_rng(seed),
         )
-        # BCa has no ends if all resamples agree, or if a ratio is infinite in some: percentiles have.
-        shares = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
-        plain = np.quantile(made.bootstrap_distribution, shares, axis=-1, method="inverted_cdf")
-    ends = np.where(np.isnan(made.confidence_interval), plain, made.confidence_interval)
+        # BCa has no ends if all resamples are equal, or if a ratio is infinite in some; percentiles replace them.
+        probabilities = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
+        percentile_ends = np.quantile(bootstrap.bootstrap_distribution, probabilities, axis=-1, method="inverted_cdf")
+    ends = np.where(np.isnan(bootstrap.confidence_interval), percentile_ends, bootstrap.confidence_interval)
     rows = np.where(np.isfinite(values), [values, *ends], np.nan).T
     return tuple(BoundedFigure(*map(float, row)) for row in rows)
 
 
-def _hazen(count: Places, percent: float) -> tuple[Places, Places, Floats]:
-    """Return the places of the two order statistics that a percentile lies between, and the weight of the second."""
-    place: Floats = np.clip(np.multiply(count, percent / 100) - 0.5, 0, np.subtract(count, 1))
-    low: Places = place.astype(np.int64)
-    return low, np.minimum(low + 1, np.subtract(count, 1)), place - low
+def _hazen(count: Indices, percent: float) -> tuple[Indices, Indices, Floats]:
+    position: Floats = np.clip(np.multiply(count, percent / 100) - 0.5, 0, np.subtract(count, 1))
+    # A percentile lies between two order statistics; the fraction is the weight of the upper one
+    low: Indices = position.astype(np.int64)
+    return low, np.minimum(low + 1, np.subtract(count, 1)), position - low
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorSample:
-    """Errors, sorted once.
+    """Errors, sorted once; `order` (N,) int64 is the image index of each of the sorted `errors` (N,) float64."""
 
-    - `order`: (N,) int64: the image at each place of the sorted errors.
-    - `errors`: (N,) float64, sorted.
-    """
-
-    order: Places
+    order: Indices
     errors: Floats
 
     @classmethod
     def of(cls, errors: npt.ArrayLike) -> ErrorSample:
-        """Return errors (N,) float sorted; an InputError if there is none, or one is NaN or infinite."""
+        """Return the sorted errors (N,) float; InputError if there is none, or if one is NaN or infinite."""
         values = np.asarray(errors, dtype=np.float64).ravel()
         if not values.size or not np.isfinite(values).all():
             raise InputError(
-                f"{values.size} errors, {int((~np.isfinite(values)).sum())} of them not finite; expected one finite "
-                "error an image: leave out images without one"
+                f"{values.size} errors, {int((~np.isfinite(values)).sum())} of them NaN or infinite, expected one "
+                "finite error for each image; leave out images without one"
             )
         order = np.argsort(values, kind="stable")
         return cls(order, values[order])
 
     def estimate(self) -> Floats:
-        """Return the statistics (6,) float64 of the errors themselves."""
+        """Return the statistics (6,) float64 of the sample itself."""
         return self.statistics(np.ones((1, len(self.order)), np.int64))[0]
 
-    def statistics(self, counts: Places) -> Floats:
-        """Return the statistics (B, 6) float64 of resamples given as counts (B, N) of the images, not sorted."""
+    def statistics(self, counts: Indices) -> Floats:
+        """Return the statistics (B, 6) float64 of resamples, given as counts (B, N) of the images in original order."""
+        # Statistics follow `evaluation.metrics.summarise`, with its percentiles and its treatment of equal errors.
         rows, images = counts.shape
         counts = counts[:, self.order]
-        reached = np.cumsum(counts, axis=1)
+        cumulative_counts = np.cumsum(counts, axis=1)
         sums = np.cumsum(counts * self.errors, axis=1)
-        # Row after row with its total added, the cumulative counts are one ascending list, to be searched at once.
-        row: Places = np.arange(rows, dtype=np.int64)
-        number: Places = reached[:, -1]
-        before: Places = np.cumsum(number) - number
-        ascending: Places = (reached + before[:, None]).ravel()
+        # With the totals of earlier rows added, the cumulative counts of all rows form one ascending list, which is
+        # searched once.
+        row: Indices = np.arange(rows, dtype=np.int64)
+        totals: Indices = cumulative_counts[:, -1]
+        offsets: Indices = np.cumsum(totals) - totals
+        ascending: Indices = (cumulative_counts + offsets[:, None]).ravel()
 
         def quantile(percent: float) -> Floats:
-            low, high, weight = _hazen(number, percent)
-            first, second = (
-                self.errors[np.searchsorted(ascending, before + place, side="right") - row * images]
-                for place in (low, high)
+            low, high, weight = _hazen(totals, percent)
+            lower, upper = (
+                self.errors[np.searchsorted(ascending, offsets + position, side="right") - row * images]
+                for position in (low, high)
             )
-            return first + (second - first) * weight
+            return lower + (upper - lower) * weight
 
         q1, q2, q3 = (quantile(percent) for percent in (25, 50, 75))
-        upto = np.searchsorted(self.errors, q1, side="right") - 1
-        below = np.searchsorted(self.errors, q3, side="left") - 1
-        best = sums[row, upto] / reached[row, upto]
-        under_sum = np.where(below >= 0, sums[row, below], 0)
-        under_count = np.where(below >= 0, reached[row, below], 0)
-        worst = (sums[:, -1] - under_sum) / (number - under_count)
-        five = np.stack([sums[:, -1] / number, q2, (q1 + 2 * q2 + q3) / 4, best, worst], axis=-1)
-        # Sums that cancel may leave a negative last digit if all errors are 0.
-        above = np.where(five < 0, np.nan, five)
-        return np.concatenate([five, np.prod(above**0.2, axis=-1, keepdims=True)], axis=-1)
+        best_end = np.searchsorted(self.errors, q1, side="right") - 1
+        worst_start = np.searchsorted(self.errors, q3, side="left") - 1
+        best_mean = sums[row, best_end] / cumulative_counts[row, best_end]
+        sum_below = np.where(worst_start >= 0, sums[row, worst_start], 0)
+        count_below = np.where(worst_start >= 0, cumulative_counts[row, worst_start], 0)
+        worst_mean = (sums[:, -1] - sum_below) / (totals - count_below)
+        five = np.stack([sums[:, -1] / totals, q2, (q1 + 2 * q2 + q3) / 4, best_mean, worst_mean], axis=-1)
+        # If all errors are 0, rounding of sums may leave a small negative value.
+        non_negative = np.where(five < 0, np.nan, five)
+        return np.concatenate([five, np.prod(non_negative**0.2, axis=-1, keepdims=True)], axis=-1)
 
 
 @dataclass(frozen=True)
-class Compared:
-    """A statistic of one set of errors against that of another.
-
-    - `one`, `other`: its values, in the unit of the errors.
-    - `difference`: one - other.
-    - `ratio`: one / other; all NaN if `other` is 0.
-    """
+class PairedFigure:
+    """One statistic of two sets of errors."""
 
     statistic: Statistic
-    one: float
-    other: float
-    difference: BoundedFigure
-    ratio: BoundedFigure
+    # In the unit of the errors
+    value_a: float
+    value_b: float
+    difference: BoundedFigure  # value_a - value_b
+    ratio: BoundedFigure  # value_a / value_b; all NaN if `value_b` is 0
 
 
-def paired(
+def compare_paired(
     errors_a: npt.ArrayLike,
     errors_b: npt.ArrayLike,
     seed: int = 0,
     count: int = RESAMPLES,
     groups: Sequence[str] | None = None,
-) -> tuple[Compared, ...]:
+) -> tuple[PairedFigure, ...]:
     """Return difference and ratio of every statistic for two methods on the same images.
 
-    The same images are drawn for both, so what makes an image hard for both methods does not widen the intervals.
-    `errors_a`, `errors_b`: (N,) float each, N ≥ 1, finite, in the same order of images. `groups`: see
-    `bounded_figures`.
+    The same images are drawn for both, so that images that are difficult for both do not widen the intervals.
+    `errors_a`, `errors_b`: (N,) float, N ≥ 1, finite, in the same order of images. `groups`: see `bounded_figures`.
     """
-    one, other = ErrorSample.of(errors_a), ErrorSample.of(errors_b)
-    images = len(one.order)
-    if images != len(other.order) or (groups is not None and images != len(groups)):
+    sample_a, sample_b = ErrorSample.of(errors_a), ErrorSample.of(errors_b)
+    images = len(sample_a.order)
+    if images != len(sample_b.order) or (groups is not None and images != len(groups)):
         raise InputError(
-            f"{images} errors of one method, {len(other.order)} of the other and {len(groups or ())} groups; expected "
-            "those of the same images in the same order: match them by name first"
+            f"{images} errors of one method, {len(sample_b.order)} of the other and {len(groups or ())} groups; "
+            "expected the same images in the same order; match them by name first"
         )
 
-    def statistics(counts: Places) -> Floats:
-        first, second = one.statistics(counts), other.statistics(counts)
-        return np.concatenate([first - second, ratio_of(first, second)], axis=-1)
+    def statistics(counts: Indices) -> Floats:
+        value_a, value_b = sample_a.statistics(counts), sample_b.statistics(counts)
+        return np.concatenate([value_a - value_b, safe_ratio(value_a, value_b)], axis=-1)
 
-    made = bounded_figures(statistics, images, groups, seed, count)
-    values = zip(STATISTICS, one.estimate().tolist(), other.estimate().tolist(), strict=True)
+    figures = bounded_figures(statistics, images, groups, seed, count)
+    values = zip(STATISTICS, sample_a.estimate().tolist(), sample_b.estimate().tolist(), strict=True)
     return tuple(
-        Compared(statistic, first, second, made[place], made[place + len(STATISTICS)])
-        for place, (statistic, first, second) in enumerate(values)
+        PairedFigure(statistic, value_a, value_b, figures[index], figures[index + len(STATISTICS)])
+        for index, (statistic, value_a, value_b) in enumerate(values)
     )
 
 
-def ratio_of(one: Floats, other: Floats) -> Floats:
-    """Return one / other; infinite, or NaN for 0 / 0, if `other` is 0 but for the rounding of angles."""
+def safe_ratio(numerator: Floats, denominator: Floats) -> Floats:
+    """Return the ratio; infinite, or NaN for 0 / 0, if the denominator is 0 within the rounding of angles."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return one / np.where(np.abs(other) > TIE_DEG, other, 0)
+        return numerator / np.where(np.abs(denominator) > TIE_DEG, denominator, 0)

@@ -1,11 +1,11 @@
 """Compare the errors of two methods, or of one method in two runs, image by image.
 
-Both are on the same images, so everything is paired: Wilcoxon's signed-rank test, recommended for colour constancy by
-S. D. Hordley, G. D. Finlayson, JOSA A 23 (2006) 1008-1020; intervals of the differences and ratios of all statistics
-(`bootstrap.paired`); and the images on which the two differ most.
+All results are paired by image: Wilcoxon's signed-rank test, recommended for colour constancy by S. D. Hordley,
+G. D. Finlayson, JOSA A 23 (2006) 1008-1020; intervals of differences and ratios of all statistics
+(`bootstrap.compare_paired`); and the images with the largest differences.
 
-Images of one picture or place are not independent. If results say which images belong together, the test is of the
-groups' mean errors and the bootstrap draws whole groups: a thousand images of fifteen pictures are fifteen cases.
+Images of one picture or scene are not independent. If results have groups, the test uses the mean error of each group
+and the bootstrap draws whole groups: 1000 images of 15 pictures are 15 cases.
 """
 
 from __future__ import annotations
@@ -20,7 +20,15 @@ import numpy.typing as npt
 from markupsafe import Markup
 from scipy import stats
 
-from evaluation.experiments.bootstrap import LEVEL, RESAMPLES, STATISTICS, TIE_DEG, Compared, numbered, paired
+from evaluation.experiments.bootstrap import (
+    LEVEL,
+    RESAMPLES,
+    STATISTICS,
+    TIE_DEG,
+    PairedFigure,
+    compare_paired,
+    group_ids,
+)
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import MethodErrors
@@ -31,124 +39,113 @@ from foundation.errors import InputError, counted, first_few
 from foundation.folders import atomic_folder
 from foundation.plots import FAINT, SERIES, draw_svg
 
-# Smaller errors are drawn here: a logarithmic axis has no zero, and no ground truth is known better.
+# Smaller errors are drawn at this value, degrees: a logarithmic axis has no zero, and no ground truth is more accurate.
 _FLOOR_DEG: Final = 0.01
 
-# Ground truths of the same image are equal but for the rounding of files.
+# Ground truths of the same image agree within the rounding of files, degrees.
 _SAME_TRUTH_DEG: Final = 0.01
 
-_HEADS: Final = dict(zip(STATISTICS, PAPER_COLUMNS[1:], strict=True))
+_STATISTIC_HEADS: Final = dict(zip(STATISTICS, PAPER_COLUMNS[1:], strict=True))
 
-_VALUES: Final = ("Of first", "Of second", "Difference", "from", "to", "Ratio", "ratio from", "ratio to")
+_VALUE_HEADS: Final = ("Of first", "Of second", "Difference", "from", "to", "Ratio", "ratio from", "ratio to")
 
-METHOD: Final = (
-    "Wilcoxon signed-rank test, two-sided; equal errors are ranked and then left out (Pratt).",
-    "Effect: matched-pairs rank-biserial correlation, -1: the first errs less on every one; 1: more on every one.",
-    "p (Holm) is corrected for all comparisons here. Of groups the mean errors are tested, and counts are of groups.",
+TEST_NOTES: Final = (
+    "Wilcoxon signed-rank test, two-sided; equal errors are ranked, then excluded (Pratt).",
+    "Effect: matched-pairs rank-biserial correlation; -1: the first is better on every image, 1: worse on every image.",
+    "p (Holm) is corrected for all comparisons here. With groups, mean errors of groups are tested and counted.",
 )
 
 
 @dataclass(frozen=True, eq=False)
-class Matched:
-    """The errors of two methods on the images that both have.
+class MatchedErrors:
+    """Errors of two methods on their common images."""
 
-    - `names`: of the two, for tables and figures.
-    - `images`: N names, in the first's order, at least one.
-    - `one`, `other`: (N,) float64 each, degrees.
-    - `groups`: what each image shares with others, such as its picture; None if every image is its own group.
-    - `notes`: a sentence for each of the two that lacks images of the other.
-    """
-
-    names: tuple[str, str]
-    kind: ErrorKind
-    images: tuple[str, ...]
-    one: npt.NDArray[np.float64]
-    other: npt.NDArray[np.float64]
+    names: tuple[str, str]  # For tables and figures
+    metric: ErrorKind
+    images: tuple[str, ...]  # N names, in the order of the first method, at least one
+    # Both (N,) float64, degrees
+    errors_a: npt.NDArray[np.float64]
+    errors_b: npt.NDArray[np.float64]
+    # Group of each image, such as its source picture; None if every image is its own group
     groups: tuple[str, ...] | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # A sentence for each of the two in which images of the other are missing
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """The number of images, and that of their groups."""
+        """Number of images, and number of their groups."""
         return len(self.images), len(set(self.groups or self.images))
 
     @property
     def cases(self) -> str:
-        """What the test counts, in words: images, or groups of them."""
+        """Text that counts the cases of the test: images, or groups of images."""
         images = counted(len(self.images), "image")
         return images if self.groups is None else f"{counted(self.sizes[1], 'group')} of {images}"
 
     def case_errors(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return the errors (M,) float64 of both: the mean of each group, or the images' own."""
-        numbers = numbered(self.groups or self.images)
+        """Return the errors (M,) float64 of both: the mean of each group, or of each image."""
+        numbers = group_ids(self.groups or self.images)
         sizes = np.bincount(numbers)
-        return np.bincount(numbers, self.one) / sizes, np.bincount(numbers, self.other) / sizes
+        return np.bincount(numbers, self.errors_a) / sizes, np.bincount(numbers, self.errors_b) / sizes
 
 
 @dataclass(frozen=True)
 class SignedRank:
-    """Wilcoxon's signed-rank test of paired errors.
+    """Wilcoxon's signed-rank test of paired errors."""
 
-    - `wins`, `losses`, `ties`: images, or groups of them, on which the one's error is smaller, larger, equal.
-    - `p`: two-sided; equal errors are ranked and then left out (J. W. Pratt, JASA 54 (1959) 655-667).
-    - `effect`: matched-pairs rank-biserial correlation, (losses - wins) as shares of the rank sum.
-    """
-
+    # Number of images, or groups, on which the first error is smaller, larger, equal
     wins: int
     losses: int
     ties: int
-    p: float
-    effect: float
+    p: float  # Two-sided; equal errors are ranked, then excluded (J. W. Pratt, JASA 54 (1959) 655-667).
+    effect: float  # Matched-pairs rank-biserial correlation, (losses - wins) as fractions of the rank sum
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All results of a pair.
+    """All results of a pair."""
 
-    - `p_holm`: p of the test, corrected for all comparisons made together (`holm`).
-    - `statistics`: each statistic of the one against that of the other, with intervals.
-    """
-
-    matched: Matched
+    matched: MatchedErrors
     test: SignedRank
-    p_holm: float
-    statistics: tuple[Compared, ...]
+    p_holm: float  # p of the test, corrected for all comparisons made together (`holm`)
+    statistics: tuple[PairedFigure, ...]  # Every statistic of both, with intervals of difference and ratio
 
 
-def match(one: MethodErrors, other: MethodErrors, names: tuple[str, str], kind: ErrorKind) -> Matched:
-    """Return the errors of two methods on the images of the same name."""
-    places = {image: place for place, image in enumerate(other.images)}
-    both = [(place, places[image]) for place, image in enumerate(one.images) if image in places]
-    if not both:
-        raise InputError(f"{names[0]} and {names[1]} have no image in common; compare runs on the same data set")
-    mine, its = np.array(both, dtype=np.int64).T
-    images = tuple(one.images[place] for place in mine.tolist())
-    angles = angles_deg(one.truths[mine], other.truths[its])
+def match(first: MethodErrors, second: MethodErrors, names: tuple[str, str], metric: ErrorKind) -> MatchedErrors:
+    """Return the errors of two methods on the images with the same name."""
+    index_of = {image: index for index, image in enumerate(second.images)}
+    pairs = [(index, index_of[image]) for index, image in enumerate(first.images) if image in index_of]
+    if not pairs:
+        raise InputError(f"{names[0]} and {names[1]} have 0 common images, expected some; compare the same data set")
+    indices_a, indices_b = np.array(pairs, dtype=np.int64).T
+    images = tuple(first.images[index] for index in indices_a.tolist())
+    angles = angles_deg(first.truths[indices_a], second.truths[indices_b])
     worst = int(angles.argmax())
     if angles[worst] > _SAME_TRUTH_DEG:
         raise InputError(
-            f"the ground truths of {images[worst]} in {names[0]} and {names[1]} are {angles[worst]:.2f} degrees apart, "
-            f"at most {_SAME_TRUTH_DEG:g} expected; run both methods on the same data and ground truths"
+            f"the ground truths of {images[worst]} in {names[0]} and {names[1]} differ by {angles[worst]:.2f} degrees, "
+            f"expected at most {_SAME_TRUTH_DEG:g}; run both methods on the same data and ground truths"
         )
+    # Groups of the first file are used if it has some, else those of the second
     groups: tuple[str, ...] = ()
-    for side, chosen in ((other, its), (one, mine)):
-        groups = groups if side.groups is None else tuple(side.groups[place] for place in chosen.tolist())
+    for source, indices in ((second, indices_b), (first, indices_a)):
+        groups = groups if source.groups is None else tuple(source.groups[index] for index in indices.tolist())
     common = set(images)
     notes: list[str] = []
-    for lacking, whose, side in ((*names, other), (*reversed(names), one)):
-        missing = [image for image in side.images if image not in common]
+    for name, other_name, source in ((*names, second), (*reversed(names), first)):
+        missing = [image for image in source.images if image not in common]
         if missing:
             notes.append(
-                f"{lacking} lacks {counted(len(missing), 'image')} of {whose}, left out here: {first_few(missing)}"
+                f"{name} lacks {counted(len(missing), 'image')} of {other_name}, excluded here: {first_few(missing)}"
             )
-    known = groups if len(set(groups)) < len(groups) else None
-    return Matched(names, kind, images, one.errors[kind][mine], other.errors[kind][its], known, tuple(notes))
+    used_groups = groups if len(set(groups)) < len(groups) else None
+    errors_a, errors_b = first.errors[metric][indices_a], second.errors[metric][indices_b]
+    return MatchedErrors(names, metric, images, errors_a, errors_b, used_groups, tuple(notes))
 
 
-def signed_rank(one: npt.ArrayLike, other: npt.ArrayLike) -> SignedRank:
+def signed_rank(errors_a: npt.ArrayLike, errors_b: npt.ArrayLike) -> SignedRank:
     """Return the signed-rank test of paired errors.
 
-    `one`, `other`: (N,) float each, degrees, in the same order of images, which are independent of each other.
+    `errors_a`, `errors_b`: (N,) float, degrees, in the same order of images, which must be independent of each other.
 
     Examples
     --------
@@ -156,19 +153,20 @@ def signed_rank(one: npt.ArrayLike, other: npt.ArrayLike) -> SignedRank:
     >>> test.wins, test.losses, test.ties, round(test.effect, 3), round(test.p, 4)
     (5, 1, 0, -0.905, 0.0625)
     """
-    difference = np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
+    difference = np.asarray(errors_a, dtype=np.float64) - np.asarray(errors_b, dtype=np.float64)
     difference = np.where(np.abs(difference) < TIE_DEG, 0, difference)
     wins, losses = int((difference < 0).sum()), int((difference > 0).sum())
     if not wins + losses:
         return SignedRank(0, 0, len(difference), 1.0, 0.0)
     ranks = stats.rankdata(np.abs(difference))
-    under, over = float(ranks[difference < 0].sum()), float(ranks[difference > 0].sum())
+    win_ranks, loss_ranks = float(ranks[difference < 0].sum()), float(ranks[difference > 0].sum())
     p = float(stats.wilcoxon(difference, zero_method="pratt").pvalue)
-    return SignedRank(wins, losses, len(difference) - wins - losses, p, (over - under) / (over + under))
+    effect = (loss_ranks - win_ranks) / (loss_ranks + win_ranks)
+    return SignedRank(wins, losses, len(difference) - wins - losses, p, effect)
 
 
 def holm(probabilities: Sequence[float]) -> list[float]:
-    """Return p-values of tests made together, corrected so that one false alarm among all of them has that chance.
+    """Return p-values corrected for several tests: the chance of any false alarm is then at most the level.
 
     S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statistics 6 (1979) 65-70.
 
@@ -178,94 +176,95 @@ def holm(probabilities: Sequence[float]) -> list[float]:
     [0.03, 0.06, 0.06]
     """
     corrected = [1.0] * len(probabilities)
-    least = 0.0
-    for rank, place in enumerate(sorted(range(len(probabilities)), key=lambda place: probabilities[place])):
-        least = max(least, min(1.0, (len(probabilities) - rank) * probabilities[place]))
-        corrected[place] = least
+    smallest = 0.0
+    for rank, index in enumerate(sorted(range(len(probabilities)), key=lambda index: probabilities[index])):
+        smallest = max(smallest, min(1.0, (len(probabilities) - rank) * probabilities[index]))
+        corrected[index] = smallest
     return corrected
 
 
-def compare(pairs: Sequence[Matched]) -> tuple[Comparison, ...]:
-    """Return the comparison of each pair; their p-values are corrected for one another."""
+def compare(pairs: Sequence[MatchedErrors]) -> tuple[Comparison, ...]:
+    """Return the comparison of each pair; p-values are corrected for all pairs together."""
     tests = [signed_rank(*pair.case_errors()) for pair in pairs]
     corrected = holm([test.p for test in tests])
     return tuple(
-        Comparison(pair, test, p, paired(pair.one, pair.other, groups=pair.groups))
+        Comparison(pair, test, p, compare_paired(pair.errors_a, pair.errors_b, groups=pair.groups))
         for pair, test, p in zip(pairs, tests, corrected, strict=True)
     )
 
 
 def verdict(comparison: Comparison) -> str:
-    """Return in one sentence which of the two errs less, and whether chance explains it."""
+    """Return one sentence: which of the two has the smaller errors, and whether the difference is significant."""
     matched, test = comparison.matched, comparison.test
-    one, other = matched.names
+    name_a, name_b = matched.names
     counts = (
-        f"{one} errs less than {other} on {test.wins} of {matched.cases}, more on {test.losses}, equal on {test.ties}"
+        f"{name_a} has smaller errors than {name_b} on {test.wins} of {matched.cases}, larger on {test.losses}, equal "
+        f"on {test.ties}"
     )
     if comparison.p_holm > 1 - LEVEL:
         return f"{counts}: not significant (Holm-corrected p = {comparison.p_holm:.2g})."
-    better = one if test.effect < 0 else other
-    return f"{counts}: {better} errs less (Holm-corrected p = {comparison.p_holm:.2g}, effect {test.effect:+.2f})."
+    better = name_a if test.effect < 0 else name_b
+    return f"{counts}: {better} is better (Holm-corrected p = {comparison.p_holm:.2g}, effect {test.effect:+.2f})."
 
 
 def tests_table(comparisons: Sequence[Comparison]) -> Table:
-    """Return the signed-rank tests, a row a comparison."""
+    """Return the signed-rank tests, one row for each comparison."""
     return Table(
-        f"Paired {comparisons[0].matched.kind} errors",
+        f"Paired {comparisons[0].matched.metric} errors",
         ("First", "Second", "p", "p (Holm)", "Effect", "Images", "Groups", "First better", "Second better", "Equal"),
-        tuple(
-            (*made.matched.names, *_chance(made), *made.matched.sizes, made.test.wins, made.test.losses, made.test.ties)
-            for made in comparisons
-        ),
-        notes=METHOD,
+        tuple(map(_test_row, comparisons)),
+        notes=TEST_NOTES,
     )
 
 
-def _chance(made: Comparison) -> tuple[str, str, float]:
-    return f"{made.test.p:.2g}", f"{made.p_holm:.2g}", made.test.effect
+def _test_row(comparison: Comparison) -> tuple[Cell, ...]:
+    matched, test = comparison.matched, comparison.test
+    counts = (*matched.sizes, test.wins, test.losses, test.ties)
+    return (*matched.names, f"{test.p:.2g}", f"{comparison.p_holm:.2g}", test.effect, *counts)
 
 
 def statistics_table(comparisons: Sequence[Comparison]) -> Table:
-    """Return every statistic of comparisons, with difference and ratio."""
+    """Return every statistic of the comparisons, with difference and ratio."""
     return Table(
-        f"Statistics of {comparisons[0].matched.kind} errors, degrees",
-        ("First", "Second", "Statistic", *_VALUES),
+        f"Statistics of {comparisons[0].matched.metric} errors, degrees",
+        ("First", "Second", "Statistic", *_VALUE_HEADS),
         tuple(
-            (*made.matched.names, _HEADS[one.statistic], one.one, one.other, *_cells(*one.difference, *one.ratio))
-            for made in comparisons
-            for one in made.statistics
+            (*item.matched.names, _STATISTIC_HEADS[pair.statistic], pair.value_a, pair.value_b, *_interval_cells(pair))
+            for item in comparisons
+            for pair in item.statistics
         ),
         digits=3,
         notes=(
             f"Intervals of {LEVEL:.0%}: BCa bootstrap over images, or groups of images, {RESAMPLES} resamples, the "
-            "same for both. None for a single group, which says nothing of others.",
+            "same for both methods. A single group has no interval.",
         ),
     )
 
 
 def images_table(comparison: Comparison, count: int = 10) -> Table:
-    """Return the images on which the two differ most, the largest difference first; equal errors are left out."""
+    """Return the images with the largest differences, in descending order; equal errors are omitted."""
     matched = comparison.matched
-    one, other = matched.one.tolist(), matched.other.tolist()
-    size = np.abs(matched.one - matched.other)
-    largest = [place for place in np.argsort(-size, kind="stable")[:count].tolist() if size[place] >= TIE_DEG]
+    a, b = matched.errors_a.tolist(), matched.errors_b.tolist()
+    differences = np.abs(matched.errors_a - matched.errors_b)
+    order = np.argsort(-differences, kind="stable")[:count].tolist()
+    largest = [index for index in order if differences[index] >= TIE_DEG]
     return Table(
         "{} against {}: the largest differences, degrees".format(*matched.names),
         ("Image", "First", "Second", "Difference"),
-        tuple((matched.images[place], one[place], other[place], one[place] - other[place]) for place in largest),
+        tuple((matched.images[index], a[index], b[index], a[index] - b[index]) for index in largest),
     )
 
 
-def error_scatter(matched: Matched) -> bytes:
-    """Return a figure as SVG: the error of the other against that of the one, with the line of equal errors."""
+def error_scatter(matched: MatchedErrors) -> bytes:
+    """Return a figure as SVG: errors of the second method against errors of the first, with the line of equality."""
 
     def draw(figure: Any) -> None:
-        x, y = np.maximum(matched.one, _FLOOR_DEG), np.maximum(matched.other, _FLOOR_DEG)
+        x, y = np.maximum(matched.errors_a, _FLOOR_DEG), np.maximum(matched.errors_b, _FLOOR_DEG)
         ends = [min(x.min(), y.min()) / 1.15, max(x.max(), y.max()) * 1.15]
         axes = figure.add_subplot()
         axes.plot(ends, ends, color=FAINT, linewidth=1, zorder=1)
-        for colour, chosen in ((SERIES[0], x <= y), (SERIES[1], x > y)):
-            axes.scatter(x[chosen], y[chosen], s=14, color=colour, alpha=0.8, linewidths=0, zorder=2)
+        for colour, is_drawn in ((SERIES[0], x <= y), (SERIES[1], x > y)):
+            axes.scatter(x[is_drawn], y[is_drawn], s=14, color=colour, alpha=0.8, linewidths=0, zorder=2)
         labels = [f"{name}: error, degrees" for name in matched.names]
         axes.set(xscale="log", yscale="log", xlim=ends, ylim=ends, aspect="equal", xlabel=labels[0], ylabel=labels[1])
         axes.xaxis.set_major_formatter("{x:g}")
@@ -276,19 +275,20 @@ def error_scatter(matched: Matched) -> bytes:
 
 def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str]) -> str:
     """Return the HTML page of comparisons."""
-    parts: list[Markup] = [pages.paragraph(text) for text in (*notes, *map(verdict, comparisons))]
-    parts += [table_part(tests_table(comparisons)), table_part(statistics_table(comparisons))]
-    for made in comparisons:
-        one, other = made.matched.names
-        caption = f"An image a point: above the line (blue) {one} errs less, below it (orange) more."
-        figure = pages.figure(error_scatter(made.matched), caption)
-        parts += [pages.heading(f"{one} against {other}"), pages.row([figure, table_part(images_table(made, 10))])]
-    return pages.page(f"Comparison of {comparisons[0].matched.kind} errors", parts)
+    elements: list[Markup] = [pages.paragraph(text) for text in (*notes, *map(verdict, comparisons))]
+    elements += [table_part(tests_table(comparisons)), table_part(statistics_table(comparisons))]
+    for comparison in comparisons:
+        name_a, name_b = comparison.matched.names
+        caption = f"One point for each image: above the line (blue) {name_a} is better, below it (orange) {name_b}."
+        figure = pages.figure(error_scatter(comparison.matched), caption)
+        table = table_part(images_table(comparison))
+        elements += [pages.heading(f"{name_a} against {name_b}"), pages.row([figure, table])]
+    return pages.page(f"Comparison of {comparisons[0].matched.metric} errors", elements)
 
 
-def _cells(*numbers: float) -> list[Cell]:
-    """Return numbers as cells: None for NaN; a ratio's upper end may be infinite."""
-    return [None if np.isnan(number) else number for number in numbers]
+def _interval_cells(pair: PairedFigure) -> list[Cell]:
+    # NaN is unknown; the upper end of a ratio may be infinite and stays.
+    return [None if np.isnan(number) else number for number in (*pair.difference, *pair.ratio)]
 
 
 def write_comparisons(folder: Path, comparisons: Sequence[Comparison], notes: Sequence[str]) -> None:
@@ -297,6 +297,6 @@ def write_comparisons(folder: Path, comparisons: Sequence[Comparison], notes: Se
     texts = {name: table_to_csv(table) for name, table in tables.items()}
     texts["tables.tex"] = "\n".join(map(table_to_latex, tables.values()))
     texts["report.html"] = comparison_page(comparisons, notes)
-    with atomic_folder(folder, "the comparison") as place:
+    with atomic_folder(folder, "the comparison") as partial_folder:
         for name, text in texts.items():
-            (place / name).write_text(text, encoding="utf-8")
+            (partial_folder / name).write_text(text, encoding="utf-8")

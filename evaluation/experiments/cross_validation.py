@@ -1,7 +1,7 @@
-"""Learned methods on parts of data sets, and parameters of methods tuned without ground truth.
+"""Cross-validation of learned methods, and tuning of statistics-based methods without ground truth.
 
-Cross-validation estimates every image by a model that has not seen it. Images may be made small first, so that
-training and test images are of one size, noise and fine detail averaged alike.
+In cross-validation each image is estimated by a model that was not trained on it. Images may be reduced first, so that
+training and test images have the same size, noise and detail.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.folds import require_apart
-from evaluation.experiments.running import answer_scenes, fit_anew, require_truths
+from evaluation.experiments.folds import require_groups_together
+from evaluation.experiments.running import answer_scenes, fit_copy, require_truths
 from evaluation.learning.feature_learner import (
     FeatureLearner,
     Features,
@@ -29,154 +29,141 @@ from evaluation.methods.method import Learner, Method
 from evaluation.methods.naming import find_method
 from evaluation.methods.prepared import shrink, unit
 from evaluation.metrics import ErrorKind, Summary, recovery_error, reproduction_error, summarise
-from evaluation.results.result import NO_PIXEL, Result, SceneAnswer, read_light, results_of
+from evaluation.results.result import NO_PIXEL, Result, SceneAnswer, collect_results, read_estimate
 from evaluation.results.tables import PAPER_COLUMNS, Cell, Table
-from evaluation.scene import Image, Scene, told_of
+from evaluation.scene import Image, Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
-# Share of a pixel's area of which more must be usable; less is rounding of areas rather than a colour.
-_COVERED: Final = 1e-3
+# Least usable fraction of a reduced pixel's area; below it, rounding of areas dominates the colour.
+_MIN_USABLE_AREA: Final = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class SmallScene:
-    """A scene made small, in memory.
-
-    - `name`: the image's name.
-    - `truth`: (3,) float64, linear camera RGB of the light, of any length.
-    - `image`: (H, W, 3) float32, linear camera RGB, in the unit of the image that it was.
-    - `mask`: (H, W) bool, True where no pixel was usable; None if every one was.
-    - `saturation`: none where clipped pixels were left out; that of the image where it was small already.
-    """
+    """A scene reduced in size, in memory."""
 
     name: str
-    truth: npt.NDArray[np.float64]
-    image: Image
-    mask: npt.NDArray[np.bool_] | None
-    saturation: float | None
+    truth: npt.NDArray[np.float64]  # (3,) float64, ground truth, linear camera RGB of any length
+    image: Image  # (H, W, 3) float32, linear camera RGB, in the unit of the original image
+    mask: npt.NDArray[np.bool_] | None  # (H, W) bool, True if no pixel was usable; None if all were
+    saturation: float | None  # None if clipped pixels were excluded; that of the original if its size was not changed
 
     def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
         """Return the image (H, W, 3) and its mask (H, W) bool."""
         return self.image, self.mask
 
 
-def make_small(
+def shrink_scenes(
     scenes: Sequence[Scene], side: int, workers: int = 1, on_scene: Callable[[], None] | None = None
 ) -> tuple[SmallScene, ...]:
-    """Return scenes of which no side is longer than `side`, px; see `shrink_image`.
+    """Return the scenes with a longest side of at most `side` px; see `shrink_image`."""
 
-    `side`: longest side allowed, px.
-    """
-
-    def small(scene: Scene) -> SmallScene:
+    def shrink_scene(scene: Scene) -> SmallScene:
         image, mask = scene.read()
         if max(image.shape[:2]) <= side:
             return SmallScene(scene.name, scene.truth, image, mask, scene.saturation)
         return SmallScene(scene.name, scene.truth, *shrink_image(image, side, scene.saturation, mask), None)
 
-    return tuple(told_of(ordered_map(small, scenes, workers), on_scene))
+    return tuple(report_progress(ordered_map(shrink_scene, scenes, workers), on_scene))
 
 
 def shrink_image(
     image: Image, side: int, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """Return an image made small by averaging areas, without clipped and masked pixels.
+    """Return a reduced image: averages of areas, without clipped and masked pixels.
 
     `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB. `side`: longest side of the result, px.
-    `saturation`: value from which a channel is clipped; None if none is. `mask`: (H, W) bool, True where a pixel must
-    not be used, or None. Returns the image (h, w, 3) float32, and (h, w) bool, True where no pixel was usable; the
+    `saturation`: value from which a channel is clipped; None for no clipping. `mask`: (H, W) bool, True for pixels that
+    must not be used. Returns the image (h, w, 3) float32, and (h, w) bool, True if no pixel of the area was usable; the
     image is 0 there.
 
     Examples
     --------
     >>> image = np.zeros((2, 4, 3), np.float32)
     >>> image[:, 0], image[:, 1], image[0, 2] = 10, 30, 900
-    >>> small, mask = shrink_image(image, side=2, saturation=900)
-    >>> small[..., 0], mask
+    >>> shrunk, mask = shrink_image(image, side=2, saturation=900)
+    >>> shrunk[..., 0], mask
     (array([[20.,  0.]], dtype=float32), array([[False, False]]))
     """
-    usable = np.ones(image.shape[:2], dtype=bool)
+    is_usable = np.ones(image.shape[:2], dtype=bool)
     if saturation is not None:
-        usable &= (image < saturation).all(axis=2)
+        is_usable &= (image < saturation).all(axis=2)
     if mask is not None:
-        usable &= ~mask
-    small, empty = shrink(image, usable, side, _COVERED)
-    small[empty] = 0
-    return small, empty
+        is_usable &= ~mask
+    shrunk, is_empty = shrink(image, is_usable, side, _MIN_USABLE_AREA)
+    shrunk[is_empty] = 0
+    return shrunk, is_empty
 
 
-Places = npt.NDArray[np.int64]  # (P,) int64: which scenes of a data set, from 0
+Indices = npt.NDArray[np.int64]  # (P,) int64: indices of scenes in a data set, from 0
 
-AnyLearner = Learner | FeatureLearner  # A learner of either kind: of scenes, or of features
+AnyLearner = Learner | FeatureLearner  # Learns from scenes, or from features of scenes
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Scenes with all that some learners take from them.
-
-    - `scenes`: N scenes.
-    - `truths`: (N, 3) float64, linear camera RGB of any length.
-    - `features`: for each learner its features of each scene, (...) of its own dtype or None where no pixel is usable;
-      None for a learner that reads the scenes itself.
-    """
+    """Scenes, with their features for some learners."""
 
     scenes: tuple[Scene, ...]
-    truths: npt.NDArray[np.float64]
+    truths: npt.NDArray[np.float64]  # (N, 3) float64, linear camera RGB of any length
+    # For each learner, the features of each scene or None if it has no usable pixel; None for a learner that reads the
+    # scenes itself.
     features: tuple[Sequence[Features | None] | None, ...]
 
     @property
-    def everything(self) -> Places:
-        """All places, (N,) int64."""
+    def all_indices(self) -> Indices:
+        """Indices of all scenes, (N,) int64."""
         return np.arange(len(self.scenes))
 
 
-def gather(
+def collect_material(
     scenes: Sequence[Scene],
     learners: Sequence[AnyLearner],
     side: int | None = None,
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> Material:
-    """Return the material of scenes for learners; each image is read once for all that extract features.
+    """Return the material of scenes for learners; each image is read once for all learners that extract features.
 
-    `side`: longest side that images are made small to first, px, in memory; None leaves them as they are.
+    `side`: longest side to which images are reduced first, px; None keeps their size.
     """
     truths = truths_of(scenes)
     if side is not None:
-        scenes, on_scene = make_small(scenes, side, workers, on_scene), None
+        scenes, on_scene = shrink_scenes(scenes, side, workers, on_scene), None
     extracting = [learner for learner in learners if isinstance(learner, FeatureLearner)]
-    given = iter(extract(scenes, extracting, workers, on_scene) if extracting else ())
-    features = tuple(next(given) if isinstance(learner, FeatureLearner) else None for learner in learners)
+    extracted = iter(extract(scenes, extracting, workers, on_scene) if extracting else ())
+    features = tuple(next(extracted) if isinstance(learner, FeatureLearner) else None for learner in learners)
     if on_scene and not extracting:
         for _ in scenes:
             on_scene()
     return Material(tuple(scenes), truths, features)
 
 
-def fit_on(learner: AnyLearner, number: int, material: Material, places: Places, seed: int) -> Method:
-    """Return the learner fitted to the scenes at `places` (P,) int64; `number` is its place among the learners."""
-    features, chosen = material.features[number], [int(place) for place in places.tolist()]
+def fit_on(learner: AnyLearner, number: int, material: Material, indices: Indices, seed: int) -> Method:
+    """Return the method fitted to the scenes with these indices (P,) int64; `number` is the index of the learner."""
+    features, chosen = material.features[number], [int(index) for index in indices.tolist()]
     if isinstance(learner, FeatureLearner) and features is not None:
-        return fit_extracted(learner, [features[place] for place in chosen], material.truths[places], seed)
-    return fit_anew(learner, [material.scenes[place] for place in chosen], seed)
+        return fit_extracted(learner, [features[index] for index in chosen], material.truths[indices], seed)
+    return fit_copy(learner, [material.scenes[index] for index in chosen], seed)
 
 
-def estimate_on(method: Method, number: int, material: Material, places: Places) -> list[SceneAnswer]:
-    """Return what a fitted method answers for the scenes at `places` (P,) int64, P answers."""
-    features, chosen = material.features[number], [int(place) for place in places.tolist()]
+def estimate_on(method: Method, number: int, material: Material, indices: Indices) -> list[SceneAnswer]:
+    """Return the P answers of a fitted method for the scenes with these indices (P,) int64."""
+    features, chosen = material.features[number], [int(index) for index in indices.tolist()]
     if not isinstance(method, LearnedMethod) or features is None:
-        return [answer for (answer,) in answer_scenes([material.scenes[place] for place in chosen], [method])]
-    usable = [given for given in (features[place] for place in chosen) if given is not None]
+        return [answer for (answer,) in answer_scenes([material.scenes[index] for index in chosen], [method])]
+    usable = [item for item in (features[index] for index in chosen) if item is not None]
     lights = iter(method.model.lights(np.stack(usable)) if usable else ())
     return [
-        SceneAnswer(None, NO_PIXEL) if features[place] is None else read_light(unit(next(lights))) for place in chosen
+        read_estimate(unit(next(lights))) if features[index] is not None else SceneAnswer(None, NO_PIXEL)
+        for index in chosen
     ]
 
 
 def result_of(name: str, answers: Sequence[SceneAnswer], truths: npt.NDArray[np.float64]) -> Result:
-    """Return the result that N answers make, held to truths (N, 3) float64."""
-    (result,) = results_of([name], truths, [[answer] for answer in answers])
+    """Return the result of N answers; `truths`: (N, 3) float64."""
+    (result,) = collect_results([name], truths, [[answer] for answer in answers])
     return result
 
 
@@ -188,60 +175,51 @@ def cross_validate(
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[Result, ...]:
-    """Return the estimates and errors of learned methods, each image by the model trained on the other folds.
+    """Return the estimates and errors of learned methods; each image is estimated by a model of the other folds.
 
-    Images are read once for all learners that extract features, and again in each fold by those that only have
-    `fit(scenes, seed)`.
-
-    `folds`: (N,) int64, the fold of each image, of at least two kinds.
+    Images are read once for all learners that extract features, and again in each fold by learners that only have
+    `fit(scenes, seed)`. `folds`: (N,) int64, fold of each image, at least two different.
     """
     truths_of(scenes)
-    kinds = len(np.unique(folds))
-    if not learners or kinds < 2:
-        raise InputError(f"{len(learners)} methods in {kinds} folds: expected at least one method and two folds")
+    fold_count = len(np.unique(folds))
+    if not learners or fold_count < 2:
+        raise InputError(f"{len(learners)} methods in {fold_count} folds, expected ≥ 1 method and ≥ 2 folds; add some")
     for learner in learners:
         require_installed(learner)
-    require_apart(scenes, folds)
-    material = gather(scenes, learners, workers=workers, on_scene=on_scene)
-    return tuple(cross_fit(learner, number, material, folds, seed) for number, learner in enumerate(learners))
+    require_groups_together(scenes, folds)
+    material = collect_material(scenes, learners, workers=workers, on_scene=on_scene)
+    return tuple(cross_fit(learner, index, material, folds, seed) for index, learner in enumerate(learners))
 
 
 def cross_fit(learner: AnyLearner, number: int, material: Material, folds: npt.NDArray[np.int64], seed: int) -> Result:
-    """Return what a learner makes of scenes, each estimated after a fit to those of the other folds, (N,) int64."""
+    """Return the result of one learner; each scene is estimated after a fit to the other folds, (N,) int64."""
     answers: dict[int, SceneAnswer] = {}
     for fold in np.unique(folds):
-        held = np.flatnonzero(folds == fold)
+        test_indices = np.flatnonzero(folds == fold)
         method = fit_on(learner, number, material, np.flatnonzero(folds != fold), seed)
-        answers |= zip(held.tolist(), estimate_on(method, number, material, held), strict=True)
-    return result_of(learner.name, [answers[place] for place in range(len(folds))], material.truths)
+        answers |= zip(test_indices.tolist(), estimate_on(method, number, material, test_indices), strict=True)
+    return result_of(learner.name, [answers[index] for index in range(len(folds))], material.truths)
 
 
 @dataclass(frozen=True)
 class FamilySetting:
-    """One set of parameters of a family, and how it did.
+    """One set of parameters of a family, with its results."""
 
-    - `text`: what `--method` takes for it: "gray-edge-1:p=4:sigma=2".
-    - `name`: the method's name in tables.
-    - `spread`: standard deviation of the green chromaticity g / (r + g + b) of its estimates.
-    - `errors`: its errors on the images that count, degrees; None where nobody asked.
-    """
-
-    text: str
-    name: str
-    spread: float
-    errors: Summary | None
+    text: str  # Value of `--method` for it: "gray-edge-1:p=4:sigma=2"
+    name: str  # Name of the method in tables
+    spread: float  # Standard deviation of the green chromaticity g / (r + g + b) of its estimates
+    errors: Summary | None  # Its errors on the counted images, degrees; None if not requested
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """What tuning a family on a data set found.
+    """Result of tuning a family on a data set.
 
-    - `family`: what was asked for: "gray-edge-1", or "gray-edge-1@360".
-    - `data`: the data set's name.
-    - `settings`: all sets of parameters, the chosen one first, by rising spread.
-    - `images`, `counted`: number of images, and of those for which every setting gives a light: the others do not
-      count.
-    - `kind`: which errors stand beside; None if none do.
+    - `family`: name of the family: "gray-edge-1", or "gray-edge-1@360".
+    - `data`: name of the data set.
+    - `settings`: all sets of parameters by rising spread; the first is chosen.
+    - `images`, `counted`: number of images, and of those for which every setting gives an estimate.
+    - `metric`: kind of the errors shown for comparison; None for no errors.
     """
 
     family: str
@@ -249,19 +227,19 @@ class Tuning:
     settings: tuple[FamilySetting, ...]
     images: int
     counted: int
-    kind: ErrorKind | None
+    metric: ErrorKind | None
 
 
-def settings_of(family: str) -> tuple[tuple[str, Method], ...]:
-    """Return what `--method` takes for each set of parameters of a family, and its method.
+def family_settings(family: str) -> tuple[tuple[str, Method], ...]:
+    """Return the value of `--method` and the method of each set of parameters of a family.
 
     Examples
     --------
-    >>> [(text, method.name) for text, method in settings_of("shades-of-gray@90")][1]
+    >>> [(text, method.name) for text, method in family_settings("shades-of-gray@90")][1]
     ('shades-of-gray:p=2@90', 'Shades-of-Gray (p=2) at 90 px')
     """
-    name, at, around = family.strip().partition("@")
-    texts = (f"{text}{at}{around}" for text in family_names(name))
+    name, separator, pixels = family.strip().partition("@")
+    texts = (f"{text}{separator}{pixels}" for text in family_names(name))
     return tuple((text, cast("Method", find_method(text))) for text in texts)
 
 
@@ -269,44 +247,44 @@ def tune_family(
     family: str,
     data: str,
     scenes: Sequence[Scene],
-    kind: ErrorKind | None = None,
+    metric: ErrorKind | None = None,
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> Tuning:
-    """Return the sets of parameters of a family by how much their estimates spread in green chromaticity.
+    """Return the sets of parameters of a family, sorted by the spread of their estimates in green chromaticity.
 
-    `kind`: which errors to state beside; None reads no ground truth.
+    `metric`: kind of errors to add for comparison; with None no ground truth is read.
     """
-    texts, methods = zip(*settings_of(family), strict=True)
+    texts, methods = zip(*family_settings(family), strict=True)
     tuned = tune(methods, scenes, on_scene, workers)
     errors: list[Summary | None] = [None] * len(methods)
-    if kind is not None:
+    if metric is not None:
         truths = require_truths(scenes, methods)[tuned.counted]
-        measure = recovery_error if kind == "recovery" else reproduction_error
-        errors = [summarise(measure(tuned.lights[:, place], truths)) for place in range(len(methods))]
+        measure = recovery_error if metric == "recovery" else reproduction_error
+        errors = [summarise(measure(tuned.lights[:, index], truths)) for index in range(len(methods))]
     settings = [
         FamilySetting(text, method.name, spread, error)
         for text, method, spread, error in zip(texts, methods, tuned.spreads, errors, strict=True)
     ]
     ordered = tuple(sorted(settings, key=lambda setting: setting.spread))
-    return Tuning(family, data, ordered, len(scenes), len(tuned.lights), kind)
+    return Tuning(family, data, ordered, len(scenes), len(tuned.lights), metric)
 
 
 def tuning_table(tuning: Tuning) -> Table:
-    """Return the table of settings for people: spreads in thousandths, errors in degrees."""
-    heads = PAPER_COLUMNS[1:] if tuning.kind else ()
-    what = f"; {tuning.kind} angular error, degrees" if tuning.kind else ""
+    """Return the table of settings: spreads × 1000, errors in degrees."""
+    error_columns = PAPER_COLUMNS[1:] if tuning.metric else ()
+    errors_text = f"; {tuning.metric} angular error, degrees" if tuning.metric else ""
     notes: list[str] = []
     if tuning.counted < tuning.images:
         notes.append(
-            f"{tuning.images - tuning.counted} of {tuning.images} images give no light with some setting and do not "
-            "count for any."
+            f"{tuning.images - tuning.counted} of {tuning.images} images are excluded for all settings, because some "
+            "setting gives no estimate for them."
         )
     return Table(
         f"{tuning.data}: {tuning.family} by the spread of green chromaticity on {tuning.counted} images, "
-        f"thousandths{what}",
-        ("Setting", "Spread", *heads),
-        tuple((one.text, 1000 * one.spread, *_errors(one)) for one in tuning.settings),
+        f"× 1000{errors_text}",
+        ("Setting", "Spread", *error_columns),
+        tuple((setting.text, 1000 * setting.spread, *_errors(setting)) for setting in tuning.settings),
         digits=2,
         notes=tuple(notes),
     )

@@ -1,4 +1,4 @@
-"""A run of methods on a data set, and its results folder, which appears whole or not at all."""
+"""Runs of methods on a data set, and their results folders, which are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from evaluation.experiments.suspicions import suspicions
 from evaluation.learning.model_files import StoredMethod, TrainingRecord, scenes_sha256
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
-from evaluation.reports.run_page import MOST_SHOWN, chosen_images, developed, run_page
+from evaluation.reports.run_page import MAX_METHODS, chosen_images, developed_pictures, run_page
 from evaluation.reports.table_output import table_to_latex
 from evaluation.results.files import ERRORS_FILE, errors_csv, run_json, several_lights_csv
 from evaluation.results.method_records import describe_method
-from evaluation.results.result import Result, Run, Subject, indistinct
+from evaluation.results.result import Result, Run, Subject, indistinct_methods
 from evaluation.results.tables import lights_tables, statistics_rows, summary_table, table_to_csv
 from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.compiled import ordered_map
@@ -39,26 +39,26 @@ def run_methods(
 ) -> Run:
     """Return the estimates and errors of methods on a data set; `on_scene` is called for each finished image."""
     names = [method.name for method in methods]
-    twice = [name for number, name in enumerate(names) if name in names[:number]]
-    if twice:
-        raise InputError(f"two methods are called {twice[0]!r}; give one another name, or leave one out")
+    repeated = [name for index, name in enumerate(names) if name in names[:index]]
+    if repeated:
+        raise InputError(f"two methods have the name {repeated[0]!r}, expected different names; rename or omit one")
     truths = require_truths(data.scenes, methods)
-    # Methods are described before they run, since they may keep or import something while they do.
+    # Methods are recorded before they run, because a run may change their attributes.
     run = describe_run(data, (), [describe_method(method) for method in methods])
-    records = {one.name: one.provenance for one in methods if isinstance(one, StoredMethod) and one.provenance}
-    trained = [_trained_on(name, record, data, run.data_sha256) for name, record in records.items()]
+    records = {item.name: item.provenance for item in methods if isinstance(item, StoredMethod) and item.provenance}
+    training_notes = [_training_note(name, record, data, run.data_sha256) for name, record in records.items()]
     results = evaluate(data.scenes, methods, workers, on_scene)
-    odd = suspicions(run.subject.images, truths, results)
-    notes = (*filter(None, trained), *odd, *indistinct(results, data.truth_uncertainty_deg))
+    convention_notes = suspicions(run.subject.images, truths, results)
+    notes = (*filter(None, training_notes), *convention_notes, *indistinct_methods(results, data.truth_uncertainty_deg))
     return replace(run, results=results, notes=notes)
 
 
 def write_run(
-    run: Run, scenes: Sequence[Scene], folder: Path, kind: ErrorKind = "reproduction", workers: int = 1
+    run: Run, scenes: Sequence[Scene], folder: Path, metric: ErrorKind = "reproduction", workers: int = 1
 ) -> None:
     """Write results to a new results folder."""
     with atomic_folder(folder, "the results") as partial:
-        for name, text in _files(run, kind, _pictures(run, scenes, kind, workers)).items():
+        for name, text in _files(run, metric, _pictures(run, scenes, metric, workers)).items():
             write_atomic(partial / name, text)
 
 
@@ -70,10 +70,7 @@ def describe_run(
     folds: npt.NDArray[np.int64] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Run:
-    """Return results as a run.
-
-    `folds`: (N,) int64, the fold of each image; None where the methods were not cross-validated.
-    """
+    """Return the results as a run; `folds`: (N,) int64, fold of each image, None without cross-validation."""
     return Run(
         subject=Subject(
             data.name,
@@ -82,7 +79,7 @@ def describe_run(
             groups_of(data.scenes),
         ),
         layout=data.layout,
-        place=data.place,
+        location=data.location,
         treatment=data.treatment,
         data_sha256=scenes_sha256(data.scenes),
         truths=np.stack([scene.truth for scene in data.scenes]),
@@ -96,33 +93,32 @@ def describe_run(
     )
 
 
-def _trained_on(name: str, record: TrainingRecord, data: SceneSet, sha256: str) -> str:
-    """Return a sentence if a model was, or may have been, trained on images of a data set, else ""."""
+def _training_note(name: str, record: TrainingRecord, data: SceneSet, sha256: str) -> str:
     if record.sha256 == sha256:
-        return f"{name} was trained on these very images: its errors say nothing of others"
-    common = known_again(data.scenes, record.images)
-    if common:
+        return f"{name} was trained on these images: its errors are not valid for other images"
+    shared = known_again(data.scenes, record.images)
+    if shared:
         return (
-            f"{name}: {len(common)} of {len(data.scenes)} images were trained on, by name and light or by source "
-            f"picture: {first_few(common, 3)}; their errors say nothing of images that it has not seen"
+            f"{name}: {len(shared)} of {len(data.scenes)} images were used for training, by name and ground truth or "
+            f"by source picture: {first_few(shared, 3)}; its errors are not valid for other images"
         )
     if record.data_name != data.name:
         return ""
     return (
-        f"{name} was trained on {record.scenes} images of a data set of the same name: none of these has the name and "
-        "light, or the source picture, of one of them"
+        f"{name} was trained on {record.scenes} images of a data set of the same name; no image was identified as a "
+        "training image by name and ground truth or by source picture"
     )
 
 
-def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> dict[str, str]:
+def _files(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> dict[str, str]:
     subject, results = run.subject, run.results
-    tables = [summary_table(subject, results, kind), *lights_tables(subject, results, kind)]
+    tables = [summary_table(subject, results, metric), *lights_tables(subject, results, metric)]
     pixels, regions = several_lights_csv(subject.images, results)
     content = {
         "data_set": {
             "name": subject.name,
             "layout": run.layout,
-            "place": run.place,
+            "place": run.location,
             "images": len(subject.images),
             "images_under_several_lights": sum(subject.mixed),
             "groups": len(set(subject.groups or subject.images)),
@@ -141,7 +137,7 @@ def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes])
         "results.csv": table_to_csv(statistics_rows(subject, results)),
         ERRORS_FILE: errors_csv(subject.images, run.truths, results, subject.groups),
         "table.tex": "\n".join(map(table_to_latex, tables)),
-        "report.html": run_page(run, kind, pictures),
+        "report.html": run_page(run, metric, pictures),
     }
     if any(result.maps is not None for result in results):
         texts |= {"pixels.csv": pixels, "regions.csv": regions}
@@ -150,19 +146,20 @@ def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes])
     return texts
 
 
-def _pictures(run: Run, scenes: Sequence[Scene], kind: ErrorKind, workers: int) -> dict[tuple[int, int], bytes]:
-    """Return the pictures of each method's worst and median images; each image is read once."""
-    shown: dict[int, list[int]] = {}
-    for number, result in enumerate(run.results[:MOST_SHOWN]):
-        for place in sum(chosen_images(result, kind), ()):
-            shown.setdefault(place, []).append(number)
+def _pictures(run: Run, scenes: Sequence[Scene], metric: ErrorKind, workers: int) -> dict[tuple[int, int], bytes]:
+    # Each image is read once for all methods.
+    methods_by_image: dict[int, list[int]] = {}
+    for number, result in enumerate(run.results[:MAX_METHODS]):
+        for image in sum(chosen_images(result, metric), ()):
+            methods_by_image.setdefault(image, []).append(number)
 
-    def develop(place: int) -> list[bytes]:
-        return developed(scenes[place], [run.results[number].estimates[place] for number in shown[place]])
+    def develop(image: int) -> list[bytes]:
+        estimates = [run.results[number].estimates[image] for number in methods_by_image[image]]
+        return developed_pictures(scenes[image], estimates)
 
-    made = ordered_map(develop, shown, workers)
+    files = ordered_map(develop, methods_by_image, workers)
     return {
-        (number, place): picture
-        for (place, numbers), those in zip(shown.items(), made, strict=True)
-        for number, picture in zip(numbers, those, strict=True)
+        (number, image): file
+        for (image, method_indices), image_files in zip(methods_by_image.items(), files, strict=True)
+        for number, file in zip(method_indices, image_files, strict=True)
     }

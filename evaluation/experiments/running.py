@@ -1,9 +1,8 @@
-"""Run methods on the scenes of a data set: each image is decoded once, whatever the number of methods.
+"""Run methods on the scenes of a data set; each image is decoded once for all methods.
 
-What a method may do wrong is dealt with here. A value that is no light (None, a channel that is NaN, infinite or below
-0, or nothing but zeros) is no estimate for that image: it is counted and named, and grey stands in for it, so that a
-method gains nothing by leaving out what it finds hard. An exception, or a value that is not three numbers, ends the
-run with the name of the method and the image, and the line of the method's file.
+A method has no estimate for an image if it returns None, or values that are negative, NaN, infinite or all 0. Such
+images are counted and listed, and grey is used as the estimate. An exception, or a value that is not three numbers,
+ends the run with the name of the method and the image, and the line in the user's file.
 """
 
 from __future__ import annotations
@@ -22,26 +21,26 @@ import numpy.typing as npt
 from evaluation.methods.method import Learner, LocalMethod, Method
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod
 from evaluation.metrics import MapError, measure_map
-from evaluation.results.result import Result, SceneAnswer, read_light, results_of
-from evaluation.scene import MixedScene, Scene, told_of
+from evaluation.results.result import Result, SceneAnswer, collect_results, read_estimate
+from evaluation.scene import MixedScene, Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import CropError, FormatError, InputError
 
-# This package's folder: what lies outside of it, and is no installed library, is the user's.
-_HOUSE = Path(__file__).parents[1]
+# Folder of this package: code outside it that is not an installed library is the user's.
+_PACKAGE_FOLDER = Path(__file__).parents[1]
 
 
 @runtime_checkable
 class SceneMethod(Protocol):
-    """What knows a scene's light without its pixels, such as estimates that another program has made."""
+    """Source of estimates that needs no pixels, such as estimates of another program."""
 
     @property
     def name(self) -> str:
-        """Its name in tables."""
+        """Name in tables."""
         ...
 
     def estimate_scene(self, scene: Scene) -> npt.NDArray[np.float64] | None:
-        """Return the estimated light (3,) float64 of a scene, camera RGB of any length; None if there is none."""
+        """Return the estimate (3,) float64 for a scene, camera RGB of any length; None if there is none."""
         ...
 
 
@@ -55,8 +54,8 @@ def evaluate(
 
     Examples
     --------
-    Any value with a name, a ground truth, a saturation and `read` is a scene. Gray-world is right on an image that is
-    grey on average under its light:
+    Any object with a name, a ground truth, a saturation and `read` is a scene. Gray-world is exact on an image that is
+    grey on average under its illuminant:
 
     >>> from evaluation.methods.standard import standard_methods
     >>> class Wall:
@@ -69,92 +68,90 @@ def evaluate(
     'Gray-world: 0.00 degrees'
     """
     truths = require_truths(scenes, methods)
-    answers = list(told_of(answer_scenes(scenes, methods, workers), on_scene))
-    return results_of([method.name for method in methods], truths, answers)
+    answers = list(report_progress(answer_scenes(scenes, methods, workers), on_scene))
+    return collect_results([method.name for method in methods], truths, answers)
 
 
 def require_truths(scenes: Sequence[Scene], methods: Sequence[object]) -> npt.NDArray[np.float64]:
-    """Return the ground truths (N, 3) float64 of scenes, camera RGB of any length."""
+    """Return the ground truths (N, 3) float64 of scenes, camera RGB of any length; refuse invalid ones."""
     if not scenes or not methods:
-        raise InputError(f"{len(methods)} methods on {len(scenes)} images: name at least one of each")
-    return np.stack([_light(scene) for scene in scenes])
+        raise InputError(f"{len(methods)} methods on {len(scenes)} images, expected at least one of each; name some")
+    return np.stack([_checked_truth(scene) for scene in scenes])
 
 
 def answer_scenes(
     scenes: Sequence[Scene], methods: Sequence[Method | SceneMethod], workers: int = 1
 ) -> Iterator[tuple[SceneAnswer, ...]]:
-    """Yield what the methods answer for each scene, one answer a method, in the scenes' order.
+    """Yield the answers of all methods for each scene, in the order of the scenes.
 
-    Methods of this suite are called by several threads at once. Others are called by one thread at a time and get a
-    copy of the image, which they may change; with one worker everything runs in the calling thread.
+    Methods of this suite run in several threads at once. A method of the user runs in one thread at a time and
+    receives copies of the image, which it may change; with one worker it runs in the calling thread.
     """
-    runners = [
-        _Runner(method, None if type(method).__module__.startswith("evaluation.") else Lock()) for method in methods
+    calls = [
+        _MethodCall(method, None if type(method).__module__.startswith("evaluation.") else Lock()) for method in methods
     ]
-    blind = all(isinstance(method, SceneMethod) for method in methods)
-    yield from ordered_map(lambda scene: _answer(scene, runners, blind), scenes, workers)
+    needs_no_image = all(isinstance(method, SceneMethod) for method in methods)
+    yield from ordered_map(lambda scene: _answer(scene, calls, needs_no_image), scenes, workers)
 
 
 @dataclass(frozen=True)
-class _Runner:
-    """A method, and how it is called: `lock` where it is one of the user's."""
+class _MethodCall:
+    """A method, with a lock if it is the user's."""
 
     method: Method | SceneMethod
     lock: Any | None
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function of the method; a method of the user's one at a time, with its own copies of arrays."""
         if self.lock is None:
             return function(*arguments)
         with self.lock:
-            return function(*(one.copy() if isinstance(one, np.ndarray) else one for one in arguments))
+            return function(*(item.copy() if isinstance(item, np.ndarray) else item for item in arguments))
 
 
-def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[SceneAnswer, ...]:
-    """Return the answers for one scene; its image is left unread where no method wants it and one light falls on it."""
-    mixed = isinstance(scene, MixedScene)
-    image, mask = (None, None) if blind and not mixed else scene.read()
+def _answer(scene: Scene, calls: Sequence[_MethodCall], needs_no_image: bool) -> tuple[SceneAnswer, ...]:
+    # An image is not read if no method needs its pixels and one illuminant reaches it.
+    is_mixed = isinstance(scene, MixedScene)
+    image, mask = (None, None) if needs_no_image and not is_mixed else scene.read()
     truth = (scene.read_truth_map(), scene.read_weights()) if isinstance(scene, MixedScene) else None
     prepared = None if image is None else PreparedImage(image, scene.saturation, mask)
     answers: list[SceneAnswer] = []
-    for runner in runners:
+    for runner in calls:
         method = runner.method
         try:
             if isinstance(method, SceneMethod):
-                answer = read_light(runner.call(method.estimate_scene, scene))
+                answer = read_estimate(runner.call(method.estimate_scene, scene))
             elif runner.lock is None and prepared is not None and isinstance(method, PreparedMethod):
-                answer = read_light(method.estimate_prepared(prepared))
+                answer = read_estimate(method.estimate_prepared(prepared))
             else:
-                answer = read_light(runner.call(method.estimate, image, scene.saturation, mask))
-            field = None
-            if mixed and isinstance(method, LocalMethod):
-                field, cause = _field(runner.call(method.estimate_map, image, scene.saturation, mask), image)
+                answer = read_estimate(runner.call(method.estimate, image, scene.saturation, mask))
+            local_map = None
+            if is_mixed and isinstance(method, LocalMethod):
+                local_map, cause = _checked_map(runner.call(method.estimate_map, image, scene.saturation, mask), image)
                 answer = SceneAnswer(answer.light, answer.cause or cause)
         except CropError:
             raise
         except (Exception, SystemExit) as error:
             if runner.lock is None:
-                error.add_note(f"while {method.name} was on {scene.name}")
+                error.add_note(f"method {method.name}, image {scene.name}")
                 raise
-            raise InputError(f"{method.name} fails on {scene.name}: {_reason(error)}; {_remedy(method)}") from error
+            raise InputError(f"{method.name} failed on {scene.name}: {_reason(error)}; {_remedy(method)}") from error
         if truth is not None and isinstance(scene, MixedScene) and image is not None:
-            answer = SceneAnswer(answer.light, answer.cause, _map_error(scene, answer, field, truth, image, mask))
+            answer = SceneAnswer(answer.light, answer.cause, _map_error(scene, answer, local_map, truth, image, mask))
         answers.append(answer)
     return tuple(answers)
 
 
-def fit_anew(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
-    """Return the method that a copy of a learner has learned from scenes.
+def fit_copy(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
+    """Return the method that a copy of the learner is fitted to.
 
-    The learner itself stays as it is: one that keeps in itself what it learns would take it along from fold to fold,
-    and with it the images that it is tested on.
+    A learner may store its training data in itself; without the copy, later folds would contain their test images.
     """
     try:
         fresh = copy.deepcopy(learner)
     except Exception as error:
         raise InputError(
-            f"{learner.name} cannot be copied ({error}), so that it would begin each training with what it learned in "
-            "the one before; let its constructor keep plain values, and open files and models in fit"
+            f"{learner.name} cannot be copied ({error}), expected a constructor that stores plain values only, so that "
+            "each training starts from the same state; open files and models in fit"
         ) from error
     try:
         method = fresh.fit(scenes, seed)
@@ -162,33 +159,34 @@ def fit_anew(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
         raise
     except (Exception, SystemExit) as error:
         raise InputError(
-            f"{learner.name} fails to learn from {len(scenes)} images: {_reason(error)}; correct it and run again"
+            f"{learner.name} failed in training on {len(scenes)} images: {_reason(error)}; correct it and run again"
         ) from error
     if not callable(getattr(method, "estimate", None)):
         raise InputError(
-            f"{learner.name} returns {type(method).__name__} from fit, expected a method with estimate(image, "
-            "saturation, mask); a class that keeps what it has learned in itself returns itself"
+            f"{learner.name}.fit returned {type(method).__name__}, expected a method with estimate(image, saturation, "
+            "mask); return self if the class itself is the fitted method"
         )
     return method
 
 
-def _field(given: object, image: Any) -> tuple[npt.NDArray[np.floating[Any]], str]:
-    """Return a map of lights (H, W, 3) float, grey where a pixel has none, and in words how many those are."""
-    field = np.asarray(given)
-    if field.shape != image.shape or not np.issubdtype(field.dtype, np.floating):
+def _checked_map(returned_value: object, image: Any) -> tuple[npt.NDArray[np.floating[Any]], str]:
+    """Return the estimates by pixel (H, W, 3) float with grey for missing ones, and a text that counts these."""
+    lights = np.asarray(returned_value)
+    if lights.shape != image.shape or not np.issubdtype(lights.dtype, np.floating):
         raise ValueError(
-            f"estimate_map returned {field.dtype} of shape {field.shape}, expected floats {tuple(image.shape)}"
+            f"estimate_map returned {lights.dtype} of shape {lights.shape}, expected floats {tuple(image.shape)}"
         )
-    bad = np.asarray(~(np.isfinite(field).all(axis=2) & (field >= 0).all(axis=2) & field.any(axis=2)))
-    if not bad.any():
-        return field, ""
-    return np.where(bad[..., None], GREY, field), f"no light in {int(bad.sum())} of {bad.size} pixels of its map"
+    is_missing = np.asarray(~(np.isfinite(lights).all(axis=2) & (lights >= 0).all(axis=2) & lights.any(axis=2)))
+    if not is_missing.any():
+        return lights, ""
+    note = f"no estimate in {int(is_missing.sum())} of {is_missing.size} pixels of its map"
+    return np.where(is_missing[..., None], GREY, lights), note
 
 
 def _map_error(
     scene: MixedScene,
     answer: SceneAnswer,
-    field: npt.NDArray[np.floating[Any]] | None,
+    estimate_map: npt.NDArray[np.floating[Any]] | None,
     truth: tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]],
     image: npt.NDArray[Any],
     mask: npt.NDArray[np.bool_] | None,
@@ -196,34 +194,35 @@ def _map_error(
     lights, weights = truth
     if lights.shape != image.shape or weights.shape[:2] != image.shape[:2]:
         raise FormatError(
-            f"{scene.name} is {image.shape[1]}x{image.shape[0]} px, its map of lights {lights.shape[1]}x"
-            f"{lights.shape[0]}, its shares {weights.shape[1]}x{weights.shape[0]}; expected the same size of each"
+            f"{scene.name} is {image.shape[1]}x{image.shape[0]} px, its map of illuminants {lights.shape[1]}x"
+            f"{lights.shape[0]}, its weights {weights.shape[1]}x{weights.shape[0]}, expected the same size; correct it"
         )
-    estimate = field if field is not None else np.array(GREY if answer.light is None else answer.light)
+    estimate = estimate_map if estimate_map is not None else np.array(GREY if answer.light is None else answer.light)
     return measure_map(estimate, lights, weights, scene.lights, image, scene.saturation, mask)
 
 
 def _reason(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
-    foreign = [frame for frame in frames if _HOUSE not in Path(frame.filename).parents]
-    own = [frame for frame in foreign if "site-packages" not in Path(frame.filename).parts] or foreign
-    place = f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
-    name = type(error).__name__
-    return f"{error}{place}" if isinstance(error, ValueError) and not own else f"{name}: {error}{place}"
+    outside = [frame for frame in frames if _PACKAGE_FOLDER not in Path(frame.filename).parents]
+    user_frames = [frame for frame in outside if "site-packages" not in Path(frame.filename).parts] or outside
+    line_text = f" ({Path(user_frames[-1].filename).name}, line {user_frames[-1].lineno})" if user_frames else ""
+    # A ValueError of this package's own checks is a complete message; its type would add nothing.
+    is_complete = isinstance(error, ValueError) and not user_frames
+    return f"{error}{line_text}" if is_complete else f"{type(error).__name__}: {error}{line_text}"
 
 
 def _remedy(method: object) -> str:
-    """Return what to do about a method that fails; one that has `fit` lacks, more often than not, what that learns."""
     if callable(getattr(method, "fit", None)):
-        return "it has fit: if it learns first, give it to evaluate cv, which trains it; else correct it and run again"
+        # A class with `fit` fails here most often because it was not trained.
+        return "if it must be trained first, use evaluate cv; else correct it and run again"
     return "correct it and run again"
 
 
-def _light(scene: Scene) -> npt.NDArray[np.float64]:
+def _checked_truth(scene: Scene) -> npt.NDArray[np.float64]:
     truth = scene.truth
     if not (np.isfinite(truth).all() and truth.min() >= 0 and truth.any()):
         raise InputError(
-            f"the ground truth of {scene.name} is {' '.join(f'{part:g}' for part in truth)}, expected red, green and "
-            "blue of a light: none below 0, not all 0; correct it"
+            f"the ground truth of {scene.name} is {' '.join(f'{channel:g}' for channel in truth)}, expected red, green "
+            "and blue of an illuminant, all ≥ 0 and not all 0; correct it"
         )
     return truth

@@ -1,8 +1,8 @@
-"""What results look like when lights were written otherwise than they are read: notes for people, no number changes.
+"""Detect estimates or ground truths that were probably written in another convention.
 
-Lights that are written blue first, as gains (the reciprocals of lights), or in another order of the images have errors
-like those of a bad method, and nothing in the files tells. Read the other way round they would fit far better: that is
-what is looked for, in the estimates of each method against the ground truths.
+Illuminants written with red and blue exchanged, as gains (reciprocals), or in another order of images give errors like
+those of a poor method. If another reading of the estimates fits the ground truths far better, a note is printed; no
+number changes.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from evaluation.results.result import Result
 
 _Lights = npt.NDArray[np.float64]
 
-_LEAST_IMAGES: Final = 8  # Images below which a median says too little
+_MIN_IMAGES: Final = 8  # A median of fewer images is not reliable
 
-# Median error below which lights are read rightly: all ways of reading lights near grey fit about as well.
-_LEAST_DEG: Final = 5.0
+# Median error, degrees, below which estimates are read correctly; near grey, all readings fit about equally.
+_MIN_MEDIAN_DEG: Final = 5.0
 
-# Share of the median error that another way of reading must leave at most; right data never come near it.
-_BETTER: Final = 0.5
+# Largest ratio of the median errors of another and of the present reading; correct data stay far above it.
+_MAX_RATIO: Final = 0.5
 
-# Median error that another way of reading must leave at most: one that is bad too is not how lights were written.
-_GOOD_DEG: Final = 8.0
+# Largest median error of another reading, degrees; a poor fit is no evidence for it.
+_MAX_OTHER_DEG: Final = 8.0
 
-_FLOOR: Final = 1e-9  # What replaces a channel at 0, over the largest, where a light is inverted
+_MIN_CHANNEL: Final = 1e-9  # Replaces a channel at 0 before inversion, relative to the largest
 
 
 def suspicions(images: Sequence[str], truths: npt.NDArray[np.float64], results: Sequence[Result]) -> tuple[str, ...]:
-    """Return a sentence for each other way of reading lights under which results would be far better.
+    """Return a note for each other reading of the estimates that fits the ground truths far better.
 
     `truths`: (N, 3) float64, linear camera RGB of any length.
 
@@ -44,44 +44,44 @@ def suspicions(images: Sequence[str], truths: npt.NDArray[np.float64], results: 
     >>> suspicions(list("abcdefghi"), truths, [swapped])[0][:86]
     'Mine: with red and blue exchanged its median recovery error would be 0.00 instead of 4'
     """
-    if len(images) < _LEAST_IMAGES:
+    if len(images) < _MIN_IMAGES:
         return ()
-    found: dict[str, list[tuple[str, float, float]]] = {}
+    better_readings: dict[str, list[tuple[str, float, float]]] = {}
     for result in results:
-        known = ~result.guessed
-        if int(known.sum()) < _LEAST_IMAGES:
+        has_estimate = ~result.guessed
+        if int(has_estimate.sum()) < _MIN_IMAGES:
             continue
-        is_now = float(np.median(recovery_error(result.estimates[known], truths[known])))
-        if is_now < _LEAST_DEG:
+        median_deg = float(np.median(recovery_error(result.estimates[has_estimate], truths[has_estimate])))
+        if median_deg < _MIN_MEDIAN_DEG:
             continue
-        for how, read in _ways(images).items():
-            other = float(np.median(recovery_error(read(result.estimates)[known], truths[known])))
-            if other <= min(_BETTER * is_now, _GOOD_DEG):
-                found.setdefault(how, []).append((result.method, other, is_now))
-    return tuple(_sentence(how, those, len(results)) for how, those in found.items())
+        for reading, convert in _other_readings(images).items():
+            other_deg = float(np.median(recovery_error(convert(result.estimates)[has_estimate], truths[has_estimate])))
+            if other_deg <= min(_MAX_RATIO * median_deg, _MAX_OTHER_DEG):
+                better_readings.setdefault(reading, []).append((result.method, other_deg, median_deg))
+    return tuple(_note(reading, cases, len(results)) for reading, cases in better_readings.items())
 
 
-def _ways(images: Sequence[str]) -> dict[str, Callable[[_Lights], _Lights]]:
-    """Return other ways of reading lights (N, 3), each by what it is called."""
-    by_text = np.array(sorted(range(len(images)), key=lambda place: images[place]))
-    ways: dict[str, Callable[[_Lights], _Lights]] = {
+def _other_readings(images: Sequence[str]) -> dict[str, Callable[[_Lights], _Lights]]:
+    text_order = np.array(sorted(range(len(images)), key=lambda index: images[index]))
+    readings: dict[str, Callable[[_Lights], _Lights]] = {
         "with red and blue exchanged": lambda lights: lights[:, ::-1],
-        "as gains, the reciprocals of lights,": lambda lights: (
-            1 / np.maximum(lights, _FLOOR * lights.max(axis=1, keepdims=True))
+        "as gains, the reciprocals of illuminants,": lambda lights: (
+            1 / np.maximum(lights, _MIN_CHANNEL * lights.max(axis=1, keepdims=True))
         ),
-        "given to the image before": lambda lights: np.roll(lights, -1, axis=0),
-        "given to the image after": lambda lights: np.roll(lights, 1, axis=0),
+        "assigned to the image before": lambda lights: np.roll(lights, -1, axis=0),
+        "assigned to the image after": lambda lights: np.roll(lights, 1, axis=0),
     }
-    if (by_text != np.arange(len(images))).any():
-        back = np.argsort(by_text)
-        ways["in the order of names as text (1, 10, 2)"] = lambda lights: lights[by_text]
-        ways["in the order of names as numbers (1, 2, 10)"] = lambda lights: lights[back]
-    return ways
+    if (text_order != np.arange(len(images))).any():
+        number_order = np.argsort(text_order)
+        readings["in the order of names as text (1, 10, 2)"] = lambda lights: lights[text_order]
+        readings["in the order of names as numbers (1, 2, 10)"] = lambda lights: lights[number_order]
+    return readings
 
 
-def _sentence(how: str, those: Sequence[tuple[str, float, float]], methods: int) -> str:
-    name, other, is_now = min(those, key=lambda one: one[1])
-    told = f"{name}: {how} its median recovery error would be {other:.2f} instead of {is_now:.2f} degrees"
-    if len(those) > 1:
-        return f"{told}, and {len(those) - 1} more of {methods} methods gain likewise; check images and ground truths"
-    return f"{told}; check how its lights, or the ground truths, are written"
+def _note(reading: str, cases: Sequence[tuple[str, float, float]], method_count: int) -> str:
+    method, other_deg, median_deg = min(cases, key=lambda case: case[1])
+    numbers = f"{other_deg:.2f} instead of {median_deg:.2f} degrees"
+    start = f"{method}: {reading} its median recovery error would be {numbers}"
+    if len(cases) > 1:
+        return f"{start}; {len(cases) - 1} more of {method_count} methods improve too; check images and ground truths"
+    return f"{start}; check how its estimates, or the ground truths, are written"

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY, unit
-from evaluation.scene import Image, Scene, told_of
+from evaluation.scene import Image, Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
@@ -138,7 +138,7 @@ def extract(
         image, mask = scene.read()
         return [learner.features(image, scene.saturation, mask) for learner in learners]
 
-    rows = list(told_of(ordered_map(of_one, scenes, workers), on_scene))
+    rows = list(report_progress(ordered_map(of_one, scenes, workers), on_scene))
     return tuple([row[place] for row in rows] for place in range(len(learners)))
 
 

@@ -102,7 +102,7 @@ def provenance_of(
     images = identities(data.scenes)
     return TrainingRecord(
         data_name=data.name,
-        data_place=data.place,
+        data_place=data.location,
         data_layout=data.layout,
         treatment=dict(data.treatment),
         scenes=len(data.scenes),

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from evaluation.methods.method import Method
 from evaluation.methods.naming import FAMILIES
 from evaluation.methods.prepared import GREY, estimate_all
-from evaluation.scene import Scene, told_of
+from evaluation.scene import Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
@@ -76,7 +76,7 @@ def tune(
         lights = estimate_all(candidates, image, scene.saturation, mask)
         return [np.full(3, np.nan) if light is GREY else light for light in lights]
 
-    every = np.array(list(told_of(ordered_map(estimates, scenes, workers), on_scene)))
+    every = np.array(list(report_progress(ordered_map(estimates, scenes, workers), on_scene)))
     counted = np.asarray(np.isfinite(every).all(axis=(1, 2)))
     given = every[counted]
     if len(given) < _FEWEST_IMAGES:

@@ -1,1 +1,1 @@
-"""Results for people: pages, figures and tables for papers."""
+"""Reports for people: tables, figures and pages."""

@@ -1,8 +1,8 @@
-"""A table of results as people read it: on a terminal, as LaTeX, as a piece of a page.
+"""Output of result tables for people: terminal, LaTeX, HTML.
 
-On a terminal names are folded where it is narrow, numbers are never cut. LaTeX has the layout of the paper's tables 1
-and 2 and needs no package: floats with a caption, heads of several words stacked; several tables with the same heads
-become one, each under its title.
+On a narrow terminal names are folded; numbers are never cut. LaTeX follows tables 1 and 2 of the paper and needs no
+package: floats with a caption, headings of several words stacked, and tables with the same columns joined, each with
+its title.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from evaluation.results.tables import Table
 from foundation import pages
 from foundation.console import JsonOutput
 
-_WIDE = 10_000  # Columns of a terminal that no table fills: the table is measured as wide as it likes to be
+_UNLIMITED_WIDTH = 10_000  # Terminal columns, more than any table needs, for measuring the natural width of a table
 
 
 def print_table(table: Table) -> None:
-    """Print a table to standard output: its title, its rows, its notes.
+    """Print a table with title and notes to standard output.
 
-    A terminal narrower than the table folds text between words; a file or pipe gets the table in full width.
+    Text is folded only on a terminal that is narrower than the table; files and pipes get the full width.
     """
     from rich.console import Console
     from rich.table import Table as Grid
@@ -29,43 +29,43 @@ def print_table(table: Table) -> None:
 
     texts, numeric = table.texts(), table.numeric()
     grid = Grid()
-    for place, head in enumerate(table.columns):
-        words = [head, *(row[place] for row in texts)]
-        if numeric[place]:
+    for index, head in enumerate(table.columns):
+        words = [head, *(row[index] for row in texts)]
+        if numeric[index]:
             grid.add_column(Text(head), justify="right", no_wrap=True, min_width=max(map(len, words)))
         else:
-            least = max((len(part) for word in words for part in word.split()), default=1)
-            grid.add_column(Text(head), min_width=least)
+            min_width = max((len(word_part) for word in words for word_part in word.split()), default=1)
+            grid.add_column(Text(head), min_width=min_width)
     for row in texts:
-        # Text, not str: a name with square brackets is no markup.
+        # Text, not str: square brackets in a name are not markup.
         grid.add_row(*map(Text, row))
     console = Console()
-    needed = Console(width=_WIDE).measure(grid)
-    # A file or pipe has no width, but rich would take that of the terminal on stdin or stderr.
-    console.width = max(console.width, needed.minimum) if console.is_terminal else needed.maximum
-    # Rich ends the process where the reader of its output left; our own printing is judged by `foundation.console.run`.
-    with console.capture() as drawn:
+    natural_width = Console(width=_UNLIMITED_WIDTH).measure(grid)
+    # A file or pipe has no width; rich would use that of the terminal on stdin or stderr.
+    console.width = max(console.width, natural_width.minimum) if console.is_terminal else natural_width.maximum
+    # Rich would end the process if the reader of its output is gone; `foundation.console.run` handles our own output.
+    with console.capture() as captured:
         console.print(grid)
-    print(f"{table.title}\n{drawn.get()}", end="")
+    print(f"{table.title}\n{captured.get()}", end="")
     for note in table.notes:
         print(note)
 
 
-def show_tables(output: JsonOutput, tables: Sequence[Table], between: str | None = None) -> None:
-    """Print tables, or add them to `tables` of the JSON object where one is asked for."""
+def show_tables(output: JsonOutput, tables: Sequence[Table], separator: str | None = None) -> None:
+    """Print the tables, or add them to `tables` of the JSON output."""
     for table in tables:
         if output.is_requested:
             rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
-            whole = {"title": table.title, "columns": table.columns, "rows": rows, "notes": table.notes}
-            output.append("tables", whole)
+            table_object = {"title": table.title, "columns": table.columns, "rows": rows, "notes": table.notes}
+            output.append("tables", table_object)
             continue
         print_table(table)
-        if between is not None:
-            print(between)
+        if separator is not None:
+            print(separator)
 
 
 def show_notes(output: JsonOutput, notes: Sequence[str], treatment: Mapping[str, str] | None = None) -> None:
-    """Print notes and what was done to the images, or add them to the JSON object where one is asked for."""
+    """Print notes and treatment of the images, or add them to the JSON output."""
     if output.is_requested:
         output.add(notes=list(notes))
         if treatment is not None:
@@ -73,12 +73,12 @@ def show_notes(output: JsonOutput, notes: Sequence[str], treatment: Mapping[str,
         return
     for note in notes:
         print(note)
-    for what, how in (treatment or {}).items():
-        print(f"{what}: {how}")
+    for aspect, treatment_text in (treatment or {}).items():
+        print(f"{aspect}: {treatment_text}")
 
 
-# Characters that LaTeX reads as commands or that its default fonts lack, and what sets them.
-_SPECIAL = {
+# Characters that are LaTeX commands or missing in its default fonts, with their replacements.
+_LATEX_TEXTS = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
@@ -110,22 +110,22 @@ _SPECIAL = {
 }
 
 
-_WIDE_COLUMNS = 7  # Columns of the paper's tables; with more a table is set smaller, to fit a page's text
+_NORMAL_COLUMNS = 7  # Columns of the paper's tables; wider tables use a smaller font to fit the text width
 
 
 def escape_latex(text: str) -> str:
-    r"""Return LaTeX that sets a text as it is.
+    r"""Return LaTeX that prints the text unchanged.
 
     Examples
     --------
     >>> print(escape_latex("A_1 & 25% of σ"))
     A\_1 \& 25\% of $\sigma$
     """
-    return "".join(_SPECIAL.get(mark, mark) for mark in text)
+    return "".join(_LATEX_TEXTS.get(mark, mark) for mark in text)
 
 
 def table_to_latex(table: Table) -> str:
-    r"""Return a table as a LaTeX float: its title the caption, its notes below it.
+    r"""Return the table as a LaTeX float, with its title as caption and its notes below.
 
     Examples
     --------
@@ -143,51 +143,51 @@ def table_to_latex(table: Table) -> str:
     \end{tabular}
     \end{table}
     """
-    return _float(table.title, table, [_heads(table), *_rows(table)], table.notes)
+    return _float(table.title, table, [_head_row(table), *_rows(table)], table.notes)
 
 
 def tables_to_latex(caption: str, tables: Sequence[Table]) -> str:
-    r"""Return several tables of as many columns as one LaTeX float, as the paper's Table 1: each under its title."""
+    r"""Return tables with the same number of columns as one LaTeX float, each with its title, as in the paper."""
     widths = sorted({len(table.columns) for table in tables})
     if len(widths) != 1:
         raise ValueError(
-            f"{len(tables)} tables of {widths} columns; expected at least one, and the same columns in each"
+            f"{len(tables)} tables with {widths} columns, expected at least one, all with the same number of columns"
         )
     lines: list[str] = []
-    for number, table in enumerate(tables):
+    for index, table in enumerate(tables):
         title = f"\\multicolumn{{{len(table.columns)}}}{{|c|}}{{{escape_latex(table.title)}}}\\\\"
-        lines += ["\\hline", "\\hline"] if number else []
-        lines += [title, "\\hline", _heads(table), *_rows(table)]
+        lines += ["\\hline", "\\hline"] if index else []
+        lines += [title, "\\hline", _head_row(table), *_rows(table)]
     return _float(caption, tables[0], lines, [note for table in tables for note in table.notes])
 
 
-def _float(caption: str, like: Table, lines: Sequence[str], notes: Sequence[str]) -> str:
-    kinds = ["r" if number else "l" for number in like.numeric()]
-    said = " ".join(f"{note.rstrip('.')}." for note in dict.fromkeys(notes))
-    below = [f"\\\\[.3em]\\parbox{{\\linewidth}}{{\\footnotesize {escape_latex(said)}}}"] if notes else []
+def _float(caption: str, layout: Table, lines: Sequence[str], notes: Sequence[str]) -> str:
+    alignments = ["r" if is_number else "l" for is_number in layout.numeric()]
+    note_text = " ".join(f"{note.rstrip('.')}." for note in dict.fromkeys(notes))
+    note_lines = [f"\\\\[.3em]\\parbox{{\\linewidth}}{{\\footnotesize {escape_latex(note_text)}}}"] if notes else []
     return "\n".join(
         [
             "\\begin{table}[ht]",
             "\\centering",
             f"\\caption{{{escape_latex(caption)}}}",
-            *(["\\scriptsize\\setlength{\\tabcolsep}{3pt}"] if len(kinds) > _WIDE_COLUMNS else []),
-            f"\\begin{{tabular}}{{|{kinds[0]}|{''.join(kinds[1:])}{'|' if kinds[1:] else ''}}}",
+            *(["\\scriptsize\\setlength{\\tabcolsep}{3pt}"] if len(alignments) > _NORMAL_COLUMNS else []),
+            f"\\begin{{tabular}}{{|{alignments[0]}|{''.join(alignments[1:])}{'|' if alignments[1:] else ''}}}",
             "\\hline",
             *lines,
             "\\hline",
             "\\end{tabular}",
-            *below,
+            *note_lines,
             "\\end{table}",
             "",
         ]
     )
 
 
-def _heads(table: Table) -> str:
-    """Return the row of heads; a head of several words over numbers is stacked, as the numbers are narrow."""
+def _head_row(table: Table) -> str:
+    # Columns of numbers are narrow, so their headings are stacked.
     heads = [
-        _stacked(head) if numeric else f"\\textbf{{{escape_latex(head)}}}"
-        for head, numeric in zip(table.columns, table.numeric(), strict=True)
+        _stacked(head) if is_number else f"\\textbf{{{escape_latex(head)}}}"
+        for head, is_number in zip(table.columns, table.numeric(), strict=True)
     ]
     return f"{' & '.join(heads)}\\\\\n\\hline"
 
@@ -203,5 +203,5 @@ def _rows(table: Table) -> list[str]:
 
 
 def table_part(table: Table) -> Markup:
-    """Return a table with its title and notes."""
+    """Return the table with title and notes as HTML."""
     return pages.table(table.title, table.columns, table.texts(), table.numeric(), table.notes)

@@ -1,4 +1,4 @@
-"""What methods made of data sets: values, and the folder that holds them."""
+"""Results of methods on data sets, and the files of a results folder."""
 
 from evaluation.results.result import Result
 

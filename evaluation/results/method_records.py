@@ -1,7 +1,7 @@
-"""What a method was, for a results folder: its class, its settings, its file.
+"""Records of methods for a results folder: class, settings and source file.
 
-The record says whether two runs had the same method, so nothing in it may differ from process to process. What a class
-reads while it runs, such as the weights of a network, is seen where the object holds it as an array.
+Two runs used the same method if its records are equal, so a record must not depend on the process. Data that a class
+reads while it runs, such as the weights of a network, are recorded only if the object holds them as an array.
 """
 
 from __future__ import annotations
@@ -19,47 +19,50 @@ import numpy.typing as npt
 from evaluation.results.files import GivenEstimates
 from foundation.files import file_sha256, sha256_of
 
-# Levels of values within values that are followed: settings are flat, and a graph of objects may have a circle.
-_DEEPEST = 6
+# Levels of nested values that are recorded: settings are flat, and a graph of objects may contain a cycle.
+_MAX_DEPTH = 6
 
 
 def describe_method(method: object) -> dict[str, Any]:
-    """Return a JSON object of a method: its name, class and settings, and the file of a class that is not this suite's.
+    """Return a JSON object with name, class and settings of a method, and the file of a class outside this suite.
 
     Examples
     --------
     >>> from evaluation.methods.standard import standard_methods
-    >>> found = describe_method(standard_methods()["white-patch"])
-    >>> found["name"], found["class"], found["settings"]["p"]
+    >>> record = describe_method(standard_methods()["white-patch"])
+    >>> record["name"], record["class"], record["settings"]["p"]
     ('White-Patch', 'evaluation.methods.gray_edge:GrayEdge', 'inf')
     """
     if isinstance(method, GivenEstimates):
         return {"name": method.name, "estimates": {"file": method.file, "sha256": method.sha256}}
-    kind = type(method)
-    found: dict[str, Any] = {"name": getattr(method, "name", ""), "class": f"{kind.__module__}:{kind.__qualname__}"}
+    method_class = type(method)
+    record: dict[str, Any] = {
+        "name": getattr(method, "name", ""),
+        "class": f"{method_class.__module__}:{method_class.__qualname__}",
+    }
     settings = _settings(method, 0)
     settings.pop("name", None)
     if settings:
-        found["settings"] = settings
-    if not kind.__module__.startswith("evaluation."):
-        # The name under which a file was loaded comes from its whole path; the file's own name says more.
-        found |= _source(kind)
-    return found
+        record["settings"] = settings
+    if not method_class.__module__.startswith("evaluation."):
+        # The module name of a loaded file is made from its whole path; the file name is clearer.
+        record |= _source_file(method_class)
+    return record
 
 
-def _source(kind: type) -> dict[str, Any]:
+def _source_file(method_class: type) -> dict[str, Any]:
     try:
-        path = Path(inspect.getfile(kind)).resolve()
-        found = {"class": f"{path.name}:{kind.__qualname__}", "file_sha256": file_sha256(path)}
+        path = Path(inspect.getfile(method_class)).resolve()
+        source_record = {"class": f"{path.name}:{method_class.__qualname__}", "file_sha256": file_sha256(path)}
     except (OSError, TypeError):
         return {}
-    return found
+    return source_record
 
 
-def _settings(thing: object, depth: int) -> dict[str, Any]:
-    if is_dataclass(thing):
-        return {part.name: _value(getattr(thing, part.name), depth + 1) for part in fields(thing)}
-    return {name: _value(value, depth + 1) for name, value in sorted(getattr(thing, "__dict__", {}).items())}
+def _settings(instance: object, depth: int) -> dict[str, Any]:
+    if is_dataclass(instance):
+        return {item.name: _value(getattr(instance, item.name), depth + 1) for item in fields(instance)}
+    return {name: _value(value, depth + 1) for name, value in sorted(getattr(instance, "__dict__", {}).items())}
 
 
 def _value(value: object, depth: int) -> Any:
@@ -73,14 +76,14 @@ def _value(value: object, depth: int) -> Any:
         case np.ndarray():
             array = cast("npt.NDArray[Any]", value)
             return {"shape": list(array.shape), "dtype": str(array.dtype), "sha256": _hash(array)}
-        case _ if depth >= _DEEPEST:
+        case _ if depth >= _MAX_DEPTH:
             return type(value).__qualname__
         case Mapping():
-            return {str(key): _value(one, depth + 1) for key, one in cast("Mapping[Any, Any]", value).items()}
+            return {str(key): _value(item, depth + 1) for key, item in cast("Mapping[Any, Any]", value).items()}
         case bytes():
             return {"bytes": len(value), "sha256": sha256_of(value)}
         case Sequence():
-            return [_value(one, depth + 1) for one in cast("Sequence[Any]", value)]
+            return [_value(item, depth + 1) for item in cast("Sequence[Any]", value)]
         case _ if is_dataclass(value) and not isinstance(value, type):
             return {"class": type(value).__qualname__, **_settings(value, depth)}
         case _:

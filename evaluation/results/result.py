@@ -1,4 +1,4 @@
-"""A run as values: what methods answered for each image, the results that answers make, and the run of them."""
+"""Values of a run: the answers of methods for each image, their results, and the run itself."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from foundation.errors import first_few
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Estimates and errors of one method on one dataset.
+    """Estimates and errors of one method on one data set.
 
-    - `method`: the method's name.
+    - `method`: name of the method.
     - `estimates`: (N, 3) float64, camera RGB of length 1, in the order of the scenes.
-    - `errors`: kind of error to (N,) float64, degrees; of an image under several lights the error against their mean.
-    - `guessed`: (N,) bool, True where the method gave no light and grey stands in for it.
-    - `causes`: why it gave none, or none for some pixels, by the image's number among the scenes; None where nobody
-      asked.
-    - `maps`: the errors on images under several lights by pixel and region, by the image's number, rising; None where
-      no image is, or none was measured.
+    - `errors`: kind of error to (N,) float64, degrees; under several illuminants, the error against their mean.
+    - `guessed`: (N,) bool, True if the method returned no illuminant and grey replaces it.
+    - `causes`: index of the image to the reason why the image, or some of its pixels, has no estimate; None if not
+      recorded.
+    - `maps`: index of the image to its errors by pixel and region, ascending; None if no image has several illuminants,
+      or if none was measured.
     """
 
     method: str
@@ -37,8 +37,8 @@ class Result:
     causes: Mapping[int, str] | None = None
     maps: Mapping[int, MapError] | None = None
 
-    def at(self, places: npt.NDArray[np.int64]) -> Result:
-        """Return what was made of the scenes at `places` (P,) int64 alone, in that order; errors by pixel are left out.
+    def at(self, indices: npt.NDArray[np.int64]) -> Result:
+        """Return the results of the scenes with these indices (P,) int64, in this order, without `maps`.
 
         Examples
         --------
@@ -50,104 +50,97 @@ class Result:
         causes = self.causes
         return Result(
             self.method,
-            self.estimates[places],
-            {kind: errors[places] for kind, errors in self.errors.items()},
-            self.guessed[places],
-            None if causes is None else {new: causes[old] for new, old in enumerate(places.tolist()) if old in causes},
+            self.estimates[indices],
+            {metric: errors[indices] for metric, errors in self.errors.items()},
+            self.guessed[indices],
+            None if causes is None else {new: causes[old] for new, old in enumerate(indices.tolist()) if old in causes},
         )
 
     @property
     def marked_name(self) -> str:
-        """The method's name as tables for people have it: with how often grey stands in, so that a row says it alone.
+        """Name of the method for tables, with the number of images without an estimate.
 
         Examples
         --------
         >>> Result("Mine", np.eye(3), {}, np.array([True, False, True])).marked_name
-        'Mine (no light: 2 of 3)'
+        'Mine (no estimate: 2 of 3)'
         """
         missing = int(self.guessed.sum())
-        return f"{self.method} (no light: {missing} of {len(self.guessed)})" if missing else self.method
+        return f"{self.method} (no estimate: {missing} of {len(self.guessed)})" if missing else self.method
 
-    def summary(self, kind: ErrorKind) -> Summary:
-        """Return the numbers that sum up one kind of error, the six of the paper's tables among them."""
-        return summarise(self.errors[kind])
+    def summary(self, metric: ErrorKind) -> Summary:
+        """Return the statistics of one kind of error."""
+        return summarise(self.errors[metric])
 
 
-# The cause where a method of the suite gave no light: too small an image for it, clipped, black or even.
+# Cause if a method of this suite returned no illuminant: the image is too small, clipped, black or uniform.
 NO_PIXEL = "no usable pixel"
 
 
 @dataclass(frozen=True)
 class SceneAnswer:
-    """What one method answered for one image.
+    """Answer of one method for one image."""
 
-    - `light`: the estimate, camera RGB of length 1; None where there is none, and grey is taken for it.
-    - `cause`: why there is none: "no usable pixel", or what was returned; empty where there is an estimate for every
-      pixel.
-    - `by_pixel`: the errors by pixel and region, where several lights fall on the image.
-    """
-
+    # Estimate, camera RGB of length 1; None if there is none, and grey replaces it
     light: tuple[float, float, float] | None = None
+    # Reason for no estimate: "no usable pixel", or the returned value; "" if every pixel has an estimate
     cause: str = ""
-    by_pixel: MapError | None = None
+    by_pixel: MapError | None = None  # Errors by pixel and region, if several illuminants reach the image
 
 
-def read_light(given: object, grey: npt.NDArray[np.float64] = GREY) -> SceneAnswer:
-    """Return the answer that a returned value is.
+def read_estimate(returned_value: object, grey: npt.NDArray[np.float64] = GREY) -> SceneAnswer:
+    """Return the answer for the value that a method returned: (3,) numbers, or None.
 
-    `given`: what a method returned: (3,) numbers, or None. `grey`: (3,) float64, the very array that methods return for
-    an image without a usable pixel.
+    `grey`: the array object that methods return for an image without a usable pixel; it is compared by identity.
 
     Examples
     --------
-    >>> read_light([3, 0, 4]).light
+    >>> read_estimate([3, 0, 4]).light
     (0.6, 0.0, 0.8)
-    >>> read_light([1, float("nan"), 1]).cause
+    >>> read_estimate([1, float("nan"), 1]).cause
     'returned 1 nan 1'
     """
-    if given is grey:
+    if returned_value is grey:
         return SceneAnswer(None, NO_PIXEL)
-    if given is None:
+    if returned_value is None:
         return SceneAnswer(None, "returned None")
-    kind = ""
+    dtype_text = ""
     try:
-        plain = np.asarray(given)  # Of complex, boolean and masked numbers nothing is to be lost silently.
-        kind = f" of {plain.dtype}" if plain.dtype.kind in "bc" else ""
-        if plain.dtype.kind not in "iufO" or hasattr(given, "mask"):
-            raise TypeError(plain.dtype)
-        light = plain.astype(np.float64)
+        # Complex, boolean and masked numbers are refused, because a conversion would lose a part without a warning.
+        array = np.asarray(returned_value)
+        dtype_text = f" of {array.dtype}" if array.dtype.kind in "bc" else ""
+        if array.dtype.kind not in "iufO" or hasattr(returned_value, "mask"):
+            raise TypeError(array.dtype)
+        light = array.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"returned {type(given).__name__}{kind}, expected three real numbers: red, green, blue"
+            f"returned {type(returned_value).__name__}{dtype_text}, expected three real numbers: red, green, blue"
         ) from error
     if light.shape != (3,):
         raise ValueError(f"returned an array of shape {light.shape}, expected (3,): red, green, blue")
     length = math.hypot(*light)
     if not (math.isfinite(length) and length > 0 and light.min() >= 0):
-        return SceneAnswer(None, f"returned {' '.join(f'{part:g}' for part in light)}")
-    red, green, blue = (float(part) / length for part in light)
+        return SceneAnswer(None, f"returned {' '.join(f'{channel:g}' for channel in light)}")
+    red, green, blue = (float(channel) / length for channel in light)
     return SceneAnswer((red, green, blue))
 
 
-def results_of(
+def collect_results(
     methods: Sequence[str], truths: npt.NDArray[np.float64], answers: Sequence[Sequence[SceneAnswer]]
 ) -> tuple[Result, ...]:
-    """Return the results that answers make.
-
-    `truths`: (N, 3) float64, the true lights of the scenes.
-    """
+    """Return one result for each method; `truths`: (N, 3) float64, ground truths of the scenes."""
     results: list[Result] = []
-    for place, method in enumerate(methods):
-        own = [given[place] for given in answers]
-        estimates = np.array([GREY if answer.light is None else answer.light for answer in own], dtype=np.float64)
+    for method_index, method in enumerate(methods):
+        answered = [scene_answers[method_index] for scene_answers in answers]
+        estimates = np.array([GREY if answer.light is None else answer.light for answer in answered], dtype=np.float64)
         results.append(
             Result(
                 method,
                 estimates,
                 {"recovery": recovery_error(estimates, truths), "reproduction": reproduction_error(estimates, truths)},
-                np.array([answer.light is None for answer in own]),
-                {number: answer.cause for number, answer in enumerate(own) if answer.cause},
-                {number: answer.by_pixel for number, answer in enumerate(own) if answer.by_pixel} or None,
+                np.array([answer.light is None for answer in answered]),
+                {index: answer.cause for index, answer in enumerate(answered) if answer.cause},
+                {index: answer.by_pixel for index, answer in enumerate(answered) if answer.by_pixel} or None,
             )
         )
     return tuple(results)
@@ -155,67 +148,53 @@ def results_of(
 
 @dataclass(frozen=True)
 class Subject:
-    """What results are of.
-
-    - `name`: the data set's name.
-    - `images`: the images' names.
-    - `mixed`: whether several lights fall on each image.
-    - `groups`: what each image shares with others, such as the picture that it was made from; None if every image is
-      one of its own.
-    """
+    """Data set of the results."""
 
     name: str
     images: tuple[str, ...]
-    mixed: tuple[bool, ...]
+    mixed: tuple[bool, ...]  # For each image, whether several illuminants reach it
+    # For each image, the group of related images, for example from the same source picture; None if every image is its
+    # own group.
     groups: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Methods on a data set, and their results.
-
-    - `subject`: the data set's name and its images.
-    - `layout`, `place`, `treatment`: see `scene.SceneSet`.
-    - `data_sha256`: of the images' names and ground truths; see `learning.model_files.scenes_sha256`.
-    - `truths`: (N, 3) float64, camera RGB of any length.
-    - `results`: one a method.
-    - `methods`: a JSON object each; see `method_records.describe_method`.
-    - `settings`: what else the results depend on, such as a seed: JSON.
-    - `folds`: (N,) int64, the fold of each image, where the methods were cross-validated; else None.
-    - `notes`: sentences that belong beside the results.
-    - `software`: name and version of what made them.
-    """
+    """Methods on a data set, with their results."""
 
     subject: Subject
+    # As in `scene.SceneSet`
     layout: str
-    place: str
+    location: str
     treatment: Mapping[str, str]
-    data_sha256: str
-    truths: npt.NDArray[np.float64]
-    results: tuple[Result, ...]
-    methods: tuple[Mapping[str, Any], ...]
+    data_sha256: str  # Hash of image names and ground truths; see `learning.model_files.scenes_sha256`
+    truths: npt.NDArray[np.float64]  # (N, 3) float64, camera RGB of any length
+    results: tuple[Result, ...]  # One for each method
+    methods: tuple[Mapping[str, Any], ...]  # A JSON object for each method; see `method_records.describe_method`
+    # Other settings of the run, such as a seed, as JSON
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    # (N,) int64, fold of each image if the methods were cross-validated, else None
     folds: npt.NDArray[np.int64] | None = None
-    notes: tuple[str, ...] = ()
-    software: str = ""
+    notes: tuple[str, ...] = ()  # Sentences printed with the results
+    software: str = ""  # Name and version of the software
     truth_uncertainty_deg: float | None = None
 
 
-def indistinct(results: Sequence[Result], uncertainty_deg: float | None) -> tuple[str, ...]:
-    """Return a sentence on methods whose medians differ by less than ground truths may be off by, if there are any.
+def indistinct_methods(results: Sequence[Result], uncertainty_deg: float | None) -> tuple[str, ...]:
+    """Return a note on methods that cannot be ranked, if there are any.
 
-    `uncertainty_deg`: expanded (k = 2), degrees; None where the data set does not state it.
+    `uncertainty_deg`: expanded uncertainty (k = 2) of ground truths, degrees; None if the data set does not report it.
     """
     if uncertainty_deg is None:
         return ()
     medians = [(result.method, result.summary("reproduction").median) for result in results]
     pairs = [
-        f"{one} and {other}"
-        for (one, first), (other, second) in combinations(medians, 2)
-        if abs(first - second) < uncertainty_deg
+        f"{name_a} and {name_b}"
+        for (name_a, median_a), (name_b, median_b) in combinations(medians, 2)
+        if abs(median_a - median_b) < uncertainty_deg
     ]
-    told = (
-        f"ground truths may be off by {uncertainty_deg:.2g} degrees (k = 2), more than the medians of "
-        f"{first_few(pairs, 3)} differ by: they do not tell these apart"
+    note = (
+        f"medians of {first_of(pairs, 3)} differ by less than {uncertainty_deg:.2g} degrees, the uncertainty of ground "
+        "truths (k = 2); this data set cannot rank these methods"
     )
-    return (told,) if pairs else ()
+    return (note,) if pairs else ()

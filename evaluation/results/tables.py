@@ -1,7 +1,7 @@
-"""A table of results as a value: what commands print, pages show, papers set and other programs read.
+"""Tables of results as values, printed by commands, shown on pages and written as CSV.
 
-Every command of `evaluate` makes one of these and hands it to `reports.table_output`; as CSV it is written here. So are
-the tables that sum up results: the paper's six columns, every statistic, and errors under several lights.
+Contains the general `Table`, its CSV text, and the tables of errors: the six columns of the paper, all statistics, and
+errors under several illuminants. `reports.table_output` prints tables for people.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from evaluation.results.result import NO_PIXEL, Result, Subject
 from foundation.errors import first_few
 from foundation.files import csv_text
 
-Cell = str | float | None  # A name, a number (an `int` stays one), or nothing known
+Cell = str | float | None  # A name, a number (an `int` stays one), or unknown
 
-MISSING = "–"  # What stands for `None` where people read; in CSV the field is empty
+MISSING = "–"  # Shown for `None`; CSV has an empty field
 
 
 @dataclass(frozen=True)
 class Table:
     """A table with a title.
 
-    - `title`: what it shows, with the unit of its numbers: "Cube+: reproduction angular error of 1707 images, degrees".
-    - `columns`: heads of the columns, at least one.
-    - `rows`: as many cells as columns each. A column whose cells are numbers or None is set as numbers.
-    - `digits`: decimals of a float where people read; CSV has them all.
+    - `title`: content and unit: "Cube+: reproduction angular error of 1707 images, degrees".
+    - `columns`: headings of the columns, at least one.
+    - `rows`: as many values as columns each. A column of numbers and None is aligned as numbers.
+    - `digits`: decimals shown of a float; CSV has nine significant digits.
     - `notes`: sentences below the table.
 
     Examples
@@ -48,15 +48,17 @@ class Table:
     def __post_init__(self) -> None:
         lengths = {len(row) for row in self.rows} | {len(self.columns)}
         if len(lengths) > 1 or not self.columns:
-            raise ValueError(f"{self.title}: rows of {sorted(lengths)} cells under {len(self.columns)} heads")
+            raise ValueError(
+                f"{self.title}: rows of {sorted(lengths)} values, expected {len(self.columns)}, one a column"
+            )
 
     def texts(self) -> tuple[tuple[str, ...], ...]:
-        """Return the rows as people read them, numbers rounded to `digits`."""
+        """Return the rows as text, numbers rounded to `digits`."""
         return tuple(tuple(_text(cell, self.digits) for cell in row) for row in self.rows)
 
     def numeric(self) -> tuple[bool, ...]:
-        """Return for each column whether it holds numbers: at least one, and no text."""
-        columns = [[row[place] for row in self.rows] for place in range(len(self.columns))]
+        """Return for each column whether it contains numbers and no text."""
+        columns = [[row[index] for row in self.rows] for index in range(len(self.columns))]
         return tuple(
             not any(isinstance(cell, str) for cell in column) and any(cell is not None for cell in column)
             for column in columns
@@ -64,7 +66,7 @@ class Table:
 
 
 def finite_or_none(number: float) -> float | None:
-    """Return a number as a cell has it: None where it is not finite."""
+    """Return the number; None if it is not finite."""
     return number if math.isfinite(number) else None
 
 
@@ -79,9 +81,9 @@ def _text(cell: Cell, digits: int) -> str:
 
 
 def table_to_csv(table: Table) -> str:
-    """Return the columns and rows as CSV text (RFC 4180, lines end with LF): numbers to nine significant digits.
+    """Return columns and rows as CSV text (RFC 4180, lines end with LF), without title and notes.
 
-    Title and notes are left out, so that the text is a table and nothing else; an unknown value is an empty field.
+    Numbers have nine significant digits; an unknown value is an empty field.
 
     Examples
     --------
@@ -97,75 +99,78 @@ def table_to_csv(table: Table) -> str:
     return csv_text([table.columns, *cells])
 
 
-PAPER_COLUMNS = ("Algorithm", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")  # Heads of the paper's tables
+PAPER_COLUMNS = ("Algorithm", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")  # Columns of the paper's tables
 
-# Heads of the statistics beyond them: 95th percentile, maximum, and percentage of errors below 3 degrees.
+# Further statistics: 95th percentile, maximum, and percentage of errors below 3 degrees.
 FURTHER_COLUMNS = ("95%", "Max.", "< 3° (%)")
 
-# Heads of all statistics in files for programs; `below3` is a share, 0 … 1.
+# Names of all statistics in files for programs; `below3` is a fraction, 0 … 1.
 STATISTICS_COLUMNS = ("mean", "median", "trimean", "best25", "worst25", "avg", "p95", "maximum", "below3")
 
-_NO_PIXEL_CAUSES = "too small for it, clipped, black or even"  # Why an image has no usable pixel for a method
+_NO_PIXEL_CAUSES = "too small for it, clipped, black or uniform"  # Reasons for an image without a usable pixel
 
-_NAMED = 3  # Images that a note names: all of them stand in errors.csv
+_NAMED_IMAGES = 3  # Images named in a note; errors.csv lists all
 
 
-def summary_table(subject: Subject, results: Sequence[Result], kind: ErrorKind, further: bool = False) -> Table:
-    """Return the table of the paper for one kind of error, with notes on images for which a method gave no light.
+def summary_table(subject: Subject, results: Sequence[Result], metric: ErrorKind, with_further: bool = False) -> Table:
+    """Return the table of the paper for one kind of error, with notes on images without an estimate.
 
-    `further`: whether to add the 95th percentile, the maximum and the percentage below 3 degrees.
+    `with_further`: adds the 95th percentile, the maximum and the percentage below 3 degrees.
     """
-    several = sum(subject.mixed)
-    held = f" ({several} of them under several lights, held to the mean of these)" if several else ""
-    held = " under several lights, held to the mean of these" if several == len(subject.images) else held
+    mixed_count = sum(subject.mixed)
+    mixed_text = f" ({mixed_count} under several illuminants, compared with their mean)" if mixed_count else ""
+    if mixed_count == len(subject.images):
+        mixed_text = " under several illuminants, compared with their mean"
     return Table(
-        f"{subject.name}: {kind} angular error of {len(subject.images)} images{held}, degrees",
-        (*PAPER_COLUMNS, *(FURTHER_COLUMNS if further else ())),
-        tuple((result.marked_name, *_statistics(result.errors[kind], further)) for result in results),
+        f"{subject.name}: {metric} angular error of {len(subject.images)} images{mixed_text}, degrees",
+        (*PAPER_COLUMNS, *(FURTHER_COLUMNS if with_further else ())),
+        tuple((result.marked_name, *_statistics(result.errors[metric], with_further)) for result in results),
         notes=tuple(note for result in results for note in _notes(subject, result)),
     )
 
 
-def lights_tables(subject: Subject, results: Sequence[Result], kind: ErrorKind) -> tuple[Table, ...]:
-    """Return what is to stand beside the summary where several lights fall on images; nothing where they do not.
+def lights_tables(subject: Subject, results: Sequence[Result], metric: ErrorKind) -> tuple[Table, ...]:
+    """Return additional tables for images under several illuminants; none if there are no such images.
 
-    The first table has the errors by pixel, by region and against the mean light of the images under several lights;
-    the second, where there are any, the paper's statistics of the other images alone.
+    The first table has the errors by pixel, by region and against the mean illuminant. The second has the statistics of
+    the images under one illuminant, if there are any.
     """
     single = np.array([not mixed for mixed in subject.mixed])
     if single.all() or any(result.maps is None for result in results):
         return ()
-    tables = [_several(subject, results)]
+    tables = [_mixed_table(subject, results)]
     if single.any():
-        title = f"{subject.name}: {kind} angular error of the {int(single.sum())} images under one light, degrees"
-        alone = [result.at(np.flatnonzero(single)) for result in results]
-        rows = tuple((result.marked_name, *_statistics(result.errors[kind], False)) for result in alone)
+        title = (
+            f"{subject.name}: {metric} angular error of the {int(single.sum())} images under one illuminant, degrees"
+        )
+        single_results = [result.at(np.flatnonzero(single)) for result in results]
+        rows = tuple((result.marked_name, *_statistics(result.errors[metric], False)) for result in single_results)
         tables.append(Table(title, PAPER_COLUMNS, rows))
     return tuple(tables)
 
 
 def statistics_rows(subject: Subject, results: Sequence[Result]) -> Table:
-    """Return every statistic of every kind of error as one long table for programs: `results.csv`.
+    """Return every statistic of every kind of error as one table for programs: `results.csv`.
 
-    Its `error` is recovery or reproduction, or, of images under several lights, one of these with `pixel_` or `region_`
-    before it, or `pixel_rgb`: LSMI's MAE_illum is pixel_recovery, its MAE_rgb pixel_rgb. `lights` says of which images
-    the row is: "all", "one" or "several" lights. `count` are the images, of regions the regions.
+    Column `error`: recovery or reproduction; with the prefix `pixel_` or `region_` under several illuminants; or
+    `pixel_rgb`. LSMI's MAE_illum is pixel_recovery, its MAE_rgb pixel_rgb. Column `lights`: images under "all", "one"
+    or "several" illuminants. Column `count`: number of images, or of regions.
     """
     mixed = np.array(subject.mixed)
-    parts: list[tuple[str, npt.NDArray[np.bool_]]] = [("all", np.ones(len(mixed), bool))]
+    subsets: list[tuple[str, npt.NDArray[np.bool_]]] = [("all", np.ones(len(mixed), bool))]
     if mixed.any():
-        parts += [(name, which) for name, which in (("one", ~mixed), ("several", mixed)) if which.any()]
+        subsets += [(name, in_subset) for name, in_subset in (("one", ~mixed), ("several", mixed)) if in_subset.any()]
     kinds: tuple[ErrorKind, ...] = ("recovery", "reproduction")
     rows: list[tuple[Cell, ...]] = []
     for result in results:
-        for lights, which in parts:
-            for kind in kinds:
-                missing = int(result.guessed[which].sum())
-                rows.append(_row(result.method, kind, lights, result.errors[kind][which], missing))
+        for lights, in_subset in subsets:
+            for metric in kinds:
+                missing = int(result.guessed[in_subset].sum())
+                rows.append(_row(result.method, metric, lights, result.errors[metric][in_subset], missing))
         if result.maps is not None:
             missing = int(result.guessed[mixed].sum())
-            named = _by_place(result.maps).items()
-            rows += [_row(result.method, name, "several", errors, missing) for name, errors in named]
+            errors_by_kind = _map_errors(result.maps).items()
+            rows += [_row(result.method, name, "several", errors, missing) for name, errors in errors_by_kind]
     return Table(
         f"{subject.name}: errors, degrees",
         ("method", "error", "lights", "count", *STATISTICS_COLUMNS, "no_estimate"),
@@ -173,86 +178,82 @@ def statistics_rows(subject: Subject, results: Sequence[Result]) -> Table:
     )
 
 
-def _by_place(maps: Mapping[int, MapError]) -> dict[str, npt.NDArray[np.float64]]:
-    """Return the errors by pixel and by region of images under several lights, by their names in files."""
+def _map_errors(maps: Mapping[int, MapError]) -> dict[str, npt.NDArray[np.float64]]:
     regions = [region for error in maps.values() for region in error.regions]
-    found = {
+    errors_by_kind = {
         "pixel_recovery": [error.recovery for error in maps.values()],
         "pixel_reproduction": [error.reproduction for error in maps.values()],
         "pixel_rgb": [error.rgb for error in maps.values()],
         "region_recovery": [region.recovery for region in regions],
         "region_reproduction": [region.reproduction for region in regions],
     }
-    return {name: np.array(errors, dtype=np.float64) for name, errors in found.items()}
+    return {name: np.array(errors, dtype=np.float64) for name, errors in errors_by_kind.items()}
 
 
-def _several(subject: Subject, results: Sequence[Result]) -> Table:
+def _mixed_table(subject: Subject, results: Sequence[Result]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     unjudged = 0
     for result in results:
         maps = result.maps
         assert maps is not None
-        errors = _by_place(maps)
+        errors = _map_errors(maps)
         unjudged = max(unjudged, int(np.isnan(errors["pixel_rgb"]).sum()))
         columns = [errors[name] for name in ("pixel_recovery", "pixel_rgb", "region_recovery")]
         mixed = result.at(np.array(list(maps), np.int64))
         columns.append(mixed.errors["recovery"])
         rows.append((mixed.marked_name, *(cell for column in columns for cell in _mean_and_median(column))))
-    none_left = (f"{unjudged} images have no pixel whose light is known and that is not masked: they are left out",)
+    unjudged_note = (f"{unjudged} images are excluded: all of their pixels are masked or have no ground truth",)
     return Table(
-        f"{subject.name}: recovery angular error of the {sum(subject.mixed)} images under several lights, degrees",
-        (
-            "Algorithm",
-            *("MAE_illum", "med.", "MAE_rgb", "med.", "By region", "med.", "Mean light", "med."),
-        ),
+        f"{subject.name}: recovery angular error of the {sum(subject.mixed)} images under several illuminants, degrees",
+        ("Algorithm", *("MAE_illum", "med.", "MAE_rgb", "med.", "By region", "med.", "Mean light", "med.")),
         tuple(rows),
         notes=(
-            "Each column is the mean over images, that by region over all regions; beside it the median",
+            "Each column is the mean over images (by region: over all regions), followed by the median",
             "MAE_illum and MAE_rgb: by pixel, averaged over pixels and then over images, as LSMI defines them (Kim et "
             "al., ICCV 2021)",
-            "By region: against the light that gives more than half of a pixel's light; every region counts the same",
-            "Mean light: the one estimate for the whole image against the mean of its lights, as in the table above",
-            *(none_left if unjudged else ()),
+            "By region: against the illuminant that gives more than half of a pixel's light; all regions count equally",
+            "Mean light: one estimate for the whole image against the mean of its illuminants, as in the table above",
+            *(unjudged_note if unjudged else ()),
         ),
     )
 
 
 def _mean_and_median(errors: npt.NDArray[np.float64]) -> tuple[float | None, float | None]:
-    known = errors[np.isfinite(errors)]
-    return (float(known.mean()), float(np.median(known))) if len(known) else (None, None)
+    measured = errors[np.isfinite(errors)]
+    return (float(measured.mean()), float(np.median(measured))) if len(measured) else (None, None)
 
 
 def _row(method: str, error: str, lights: str, errors: npt.NDArray[np.float64], missing: int) -> tuple[Cell, ...]:
-    known = errors[np.isfinite(errors)]
-    if not len(known):
+    measured = errors[np.isfinite(errors)]
+    if not len(measured):
         return (method, error, lights, 0, *(None for _ in STATISTICS_COLUMNS), missing)
-    summary = summarise(known)
+    summary = summarise(measured)
     return (
-        *(method, error, lights, len(known)),
+        *(method, error, lights, len(measured)),
         *(float(getattr(summary, name)) for name in STATISTICS_COLUMNS),
         missing,
     )
 
 
-def _statistics(errors: npt.NDArray[np.float64], further: bool) -> Iterable[float]:
+def _statistics(errors: npt.NDArray[np.float64], with_further: bool) -> Iterable[float]:
     summary = summarise(errors)
-    return (*summary.as_tuple(), *((summary.p95, summary.maximum, 100 * summary.below3) if further else ()))
+    return (*summary.as_tuple(), *((summary.p95, summary.maximum, 100 * summary.below3) if with_further else ()))
 
 
 def _notes(subject: Subject, result: Result) -> Iterable[str]:
-    """Yield what is to be said of images for which a method gave no light, or none for some pixels."""
     count, causes = len(subject.images), result.causes or {}
-    missing = [int(number) for number in np.flatnonzero(result.guessed)]
-    blind = [number for number in missing if causes.get(number, NO_PIXEL) == NO_PIXEL]
-    wrong = [number for number in missing if causes.get(number, NO_PIXEL) != NO_PIXEL]
-    taken = "their light was taken to be grey"
-    if blind:
-        counted = f"{len(blind)} of {count} images"
-        yield f"{result.method}: no usable pixel in {counted} ({_NO_PIXEL_CAUSES}); {taken}"
-    if wrong:
-        named = first_few([f"{subject.images[number]} {causes[number]}" for number in wrong], _NAMED)
-        yield f"{result.method}: no light for {len(wrong)} of {count} images ({named}); {taken}"
-    partly = [number for number in causes if not result.guessed[number]]
-    if partly:
-        named = first_few([f"{subject.images[number]}: {causes[number]}" for number in partly], _NAMED)
-        yield f"{result.method}: no light for pixels of {len(partly)} images ({named}); they were taken to be grey"
+    missing = [int(index) for index in np.flatnonzero(result.guessed)]
+    without_pixel = [index for index in missing if causes.get(index, NO_PIXEL) == NO_PIXEL]
+    without_light = [index for index in missing if causes.get(index, NO_PIXEL) != NO_PIXEL]
+    # Grey is a defined answer: a method must not gain by leaving out difficult images.
+    replaced = "grey was used as their estimate"
+    if without_pixel:
+        fraction = f"{len(without_pixel)} of {count} images"
+        yield f"{result.method}: no usable pixel in {fraction} ({_NO_PIXEL_CAUSES}); {replaced}"
+    if without_light:
+        examples = first_few([f"{subject.images[index]} {causes[index]}" for index in without_light], _NAMED_IMAGES)
+        yield f"{result.method}: no estimate for {len(without_light)} of {count} images ({examples}); {replaced}"
+    incomplete = [index for index in causes if not result.guessed[index]]
+    if incomplete:
+        examples = first_few([f"{subject.images[index]}: {causes[index]}" for index in incomplete], _NAMED_IMAGES)
+        yield f"{result.method}: no estimate for pixels of {len(incomplete)} images ({examples}); grey was used instead"

@@ -25,14 +25,14 @@ def dataset(make_dataset: Callable[[int, int], Path]) -> Path:
 
 @pytest.fixture
 def made_lut(tmp_path: Path) -> Path:
-    """Return a table in which colours reflect as their code, under two lights, no noise."""
+    """Return a LUT in which colours reflect as their codes, under two illuminants, without noise."""
     samples = [(CODES / 7 * light)[:, None].repeat(2, axis=1) for light in LIGHTS]
     return write_lut(tmp_path / "lut", samples, LIGHTS).folder
 
 
 @pytest.fixture
 def make_dataset(made_lut: Path, tmp_path: Path) -> Callable[[int, int], Path]:
-    """Return a maker of datasets of 8 random scenes under the lights of that table."""
+    """Return a function that makes data sets of 8 random scenes under the illuminants of this LUT."""
 
     def make(width: int, height: int) -> Path:
         scenes = random_scenes(8, width, height)

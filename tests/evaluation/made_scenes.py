@@ -1,4 +1,4 @@
-"""Scenes of given pixels, made up for tests."""
+"""Scenes of given pixels for tests."""
 
 from __future__ import annotations
 

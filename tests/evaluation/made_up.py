@@ -1,4 +1,4 @@
-"""Scenes in memory for tests: flat walls, and walls under two lights."""
+"""Scenes in memory for tests: flat walls, and walls under two illuminants."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def no_log() -> list[str]:
 
 @dataclass(frozen=True)
 class Wall:
-    """A wall that reflects as random greys under one light; `log` gets its name whenever it is read."""
+    """A wall of random greys under one illuminant; each `read` appends its name to `log`."""
 
     name: str
     truth: Array
@@ -34,7 +34,7 @@ class Wall:
 
 @dataclass(frozen=True)
 class MixedWall:
-    """A wall whose left quarter is under the first light, the rest under the second."""
+    """A wall whose left quarter is under the first illuminant, the rest under the second."""
 
     name: str
     lights: Array
@@ -61,7 +61,7 @@ class MixedWall:
 
 
 def walls(count: int, log: list[str] | None = None) -> tuple[Scene, ...]:
-    """Return walls under lights of different colours."""
+    """Return walls under illuminants of different colours."""
     random = np.random.default_rng(7)
     return tuple(
         Wall(f"wall {number}.png", random.random(3) + 0.3, number, log=no_log() if log is None else log)

@@ -1,4 +1,4 @@
-"""Numbers of tables, files and figures that commands and reports make, to be pinned."""
+"""Numbers of tables, files and figures of commands and reports, for pinning."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def contents(path: Path) -> Any:
 
 
 def recorded_figures(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, list[float]]]:
-    """Return a list that collects the numbers of each figure that is saved; saving itself would take half a second."""
+    """Return a list that collects the numbers of each saved figure; saving itself would take half a second."""
     seen: list[dict[str, list[float]]] = []
 
     def savefig(self: Figure, stream: BinaryIO, **options: Any) -> None:

@@ -1,4 +1,4 @@
-"""Tables of 512 colours whose samples are made up."""
+"""Look-up tables of 512 colours with given samples."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ WHITE_LEVEL = 9000
 def write_lut(
     folder: Path, samples: Sequence[npt.NDArray[np.float64]], lights: npt.NDArray[np.float64], camera: str = "Test"
 ) -> Lut:
-    """Write the samples (512, S, 3) under each light; from the third on lights are black bodies."""
+    """Write the samples (512, S, 3) under each illuminant; from the third on illuminants are black bodies."""
     folder.mkdir(parents=True)
     writer = LutWriter(folder, len(lights), len(CODES), samples[0].shape[1])
     for number, values in enumerate(samples):
         writer.put(number, np.rint(values).astype(np.uint16))
-    known = Provenance(
+    names = Provenance(
         camera=camera, bits=3, white_level=WHITE_LEVEL, session_sha256="0", chart_sha256="0", software="test"
     )
     plan = [
@@ -36,5 +36,5 @@ def write_lut(
         else Illumination(number, "blackbody", 3000.0 + number, Colour(1, 2, 3))
         for number in range(len(lights))
     ]
-    writer.finish(plan, lights, known)
+    writer.finish(plan, lights, names)
     return open_lut(folder)

@@ -1,4 +1,4 @@
-"""The command `evaluate` as a user meets it: what it prints, writes and returns."""
+"""The command `evaluate`: output, files and exit codes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evaluation.experiments import run_folder
 pytestmark = pytest.mark.slow
 
 
-def test_a_dataset_on_a_store(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_reads_dataset_from_object_store(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(dataset), "--method", "white-patch"]) == 0
     table = capsys.readouterr().out.splitlines()[1:]
     store, top = url_to_fs("memory://evaluated/set")
@@ -30,16 +30,16 @@ def test_a_dataset_on_a_store(dataset: Path, capsys: pytest.CaptureFixture[str])
     assert "memory://evaluated/nothing is no dataset" in capsys.readouterr().err
 
 
-def test_the_command_counts_images_without_a_usable_pixel(
+def test_counts_images_without_usable_pixel(
     make_dataset: Callable[[int, int], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([str(make_dataset(12, 12))]) == 0
-    after = capsys.readouterr().out.rpartition("┘")[2].partition("black level: ")[0]
-    reason = "no usable pixel in 16 of 16 images (too small for it, clipped, black or even)"
-    assert after.split("\n") == [
+    notes = capsys.readouterr().out.rpartition("┘")[2].partition("black level: ")[0]
+    reason = "no usable pixel in 16 of 16 images (too small for it, clipped, black or uniform)"
+    assert notes.split("\n") == [
         "",
-        f"General Gray-world: {reason}; their light was taken to be grey",
-        f"1st-order Gray-Edge: {reason}; their light was taken to be grey",
+        f"General Gray-world: {reason}; grey was used as their estimate",
+        f"1st-order Gray-Edge: {reason}; grey was used as their estimate",
         "",
     ]
 
@@ -53,7 +53,7 @@ def test_the_command_counts_images_without_a_usable_pixel(
         (("made", "--method", "lut/illuminations.csv"), "expected image,r,g,b"),
     ],
 )
-def test_what_cannot_be_done_is_one_sentence(
+def test_refuses_with_one_sentence(
     dataset: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -63,12 +63,12 @@ def test_what_cannot_be_done_is_one_sentence(
     monkeypatch.chdir(dataset.parent)
     monkeypatch.setattr(run_folder, "evaluate", Mock(side_effect=AssertionError("the work must not begin")))
     Path("empty").mkdir()
-    before = {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")}
+    files = {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")}
     assert main([*arguments]) == 2
     assert message in capsys.readouterr().err
-    assert {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")} == before
+    assert {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")} == files
 
 
-def test_who_runs_a_learner_is_told_to_train_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_refuses_learner_and_suggests_train(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["split", "--method", "kernel-ridge"]) == 2
     assert "evaluate cv kernel-ridge" in " ".join(capsys.readouterr().err.split())

@@ -1,4 +1,4 @@
-"""The examples in the docstrings do what they say."""
+"""Examples in docstrings."""
 
 from __future__ import annotations
 
@@ -23,6 +23,6 @@ def test_examples(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_there_are_examples() -> None:
-    found = [test for name in MODULES for test in doctest.DocTestFinder().find(import_module(name)) if test.examples]
-    assert len(found) >= 12
+def test_finds_examples() -> None:
+    modules = [test for name in MODULES for test in doctest.DocTestFinder().find(import_module(name)) if test.examples]
+    assert len(modules) >= 12

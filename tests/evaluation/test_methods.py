@@ -1,4 +1,4 @@
-"""Plain methods against figures of real photographs that were computed apart from this code."""
+"""Statistics-based methods, compared with numbers of real photographs that were computed with other programs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ ARCHIVES = available(*(f"benchmark/{name}.npz" for name in THUMBNAILS))
 
 
 def half_size(path: Path) -> npt.NDArray[np.float32]:
-    """Return (H / 2, W / 2, 3) float32 of an RGGB raw file, black subtracted, the greens averaged."""
+    """Return (H / 2, W / 2, 3) float32 of an RGGB raw file without black level, greens averaged."""
     mosaic = read_raw(path)
     assert mosaic.pattern == "RGGB"
     planes = np.maximum(mosaic.block_planes() - mosaic.black[:, :, None, None], 0)
@@ -56,7 +56,7 @@ def half_size(path: Path) -> npt.NDArray[np.float32]:
 
 
 @pytest.mark.slow
-def test_plain_methods_on_parts_of_photographs() -> None:
+def test_statistics_methods_on_parts_of_photographs() -> None:
     images: list[npt.NDArray[np.float32]] = []
     truths: list[npt.NDArray[np.float64]] = []
     for name, (patch, row) in PLACES.items():
@@ -64,8 +64,8 @@ def test_plain_methods_on_parts_of_photographs() -> None:
         truth = picture[patch].mean(axis=(0, 1), dtype=np.float64)
         picture[row] = 0  # What is zero adds to no norm.
         height, width = picture.shape[0] // 4, picture.shape[1] // 6
-        for top, left in np.ndindex(4, 6):
-            images.append(picture[top * height :, left * width :][:height, :width])
+        for top, x in np.ndindex(4, 6):
+            images.append(picture[top * height :, x * width :][:height, :width])
             truths.append(truth)
     for name, expected in PHOTOGRAPHS.items():
         errors = recovery_error(np.stack([standard_methods()[name].estimate(image) for image in images]), truths)
@@ -74,12 +74,12 @@ def test_plain_methods_on_parts_of_photographs() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ARCHIVES, ids=lambda path: path.stem)
-def test_plain_methods_on_thumbnails(path: Path) -> None:
+def test_statistics_methods_on_thumbnails(path: Path) -> None:
     with np.load(path) as data:
         images, truths, names = data["images"], data["gt"], data["names"]
-    for part, figures in THUMBNAILS[path.stem].items():
-        chosen = np.char.find(names.astype(str), part) >= 0
+    for value, figures in THUMBNAILS[path.stem].items():
+        indices = np.char.find(names.astype(str), value) >= 0
         for name, expected in figures.items():
-            lights = np.stack([standard_methods()[name].estimate(image) for image in images[chosen]])
-            summary = summarise(recovery_error(lights, truths[chosen])).as_tuple()
-            assert summary[: len(expected)] == pytest.approx(expected, abs=0.00501), (part, name)
+            lights = np.stack([standard_methods()[name].estimate(image) for image in images[indices]])
+            summary = summarise(recovery_error(lights, truths[indices])).as_tuple()
+            assert summary[: len(expected)] == pytest.approx(expected, abs=0.00501), (value, name)

@@ -157,7 +157,7 @@ def open_cube_plus(place: str, options: DataOptions, listed: Folder | None = Non
     return SceneSet(
         name=name,
         layout="cube-plus",
-        place=place,
+        location=place,
         scenes=tuple(
             CubePlusScene(
                 f"{number + 1}.PNG", images[str(number + 1)], lights[number], black, options.saturation, peaks
@@ -252,7 +252,7 @@ def open_cube_plus_plus(place: str, options: DataOptions, listed: Folder | None 
     return SceneSet(
         name="Cube++",
         layout="cube++",
-        place=place,
+        location=place,
         scenes=scenes,
         treatment={
             "images": note + _of_published("Cube++", len(kept)),
@@ -296,7 +296,7 @@ def open_simple_cube(place: str, options: DataOptions, listed: Folder | None = N
     return SceneSet(
         name="SimpleCube++",
         layout="simple-cube++",
-        place=place,
+        location=place,
         scenes=tuple(scenes),
         treatment={
             "images": ", ".join(notes) + _of_published("SimpleCube++", len(scenes)),

@@ -148,7 +148,7 @@ def open_gehler_shi(place: str, options: DataOptions, listed: Folder | None = No
     return SceneSet(
         name="Gehler-Shi" + (f" {camera}" if camera else ""),
         layout="gehler-shi",
-        place=place,
+        location=place,
         scenes=scenes,
         treatment={
             "images": note,

@@ -64,7 +64,7 @@ def open_intel_tau(place: str, options: DataOptions, listed: Folder | None = Non
     return SceneSet(
         name="INTEL-TAU" + "".join(f" {chosen}" for chosen in (camera, subset) if chosen),
         layout="intel-tau",
-        place=place,
+        location=place,
         scenes=tuple(scenes),
         treatment={
             "images": ", ".join(counts)

@@ -156,7 +156,7 @@ def open_lsmi(place: str, options: DataOptions, listed: Folder | None = None) ->
     return SceneSet(
         name="LSMI" + "".join(f" {chosen}" for chosen in (camera, options.subset) if chosen),
         layout="lsmi",
-        place=place,
+        location=place,
         scenes=tuple(scenes),
         treatment={
             "images": ", ".join(notes),

@@ -204,7 +204,7 @@ def open_nus8(place: str, options: DataOptions, listed: Folder | None = None) ->
     return SceneSet(
         name=f"NUS {camera}" if camera else ("NUS 8" if len(tables) > 1 else f"NUS {next(iter(tables))}"),
         layout="nus8",
-        place=place,
+        location=place,
         scenes=tuple(scenes),
         treatment={
             "images": ", ".join(notes),

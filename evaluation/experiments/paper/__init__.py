@@ -1,1 +1,1 @@
-"""The experiments of the paper's section 4, each with the paper's numbers beside ours."""
+"""Experiments of section 4 of the paper, with the published numbers next to the results."""

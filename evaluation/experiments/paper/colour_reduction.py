@@ -1,9 +1,7 @@
-"""Influence of colour reduction: linear images after bits of their sRGB codes were set to zero (section 4.2).
+"""Influence of colour reduction: estimates on linear images after low bits of their codes were set to zero (4.2).
 
-Real linear images are tone mapped by Flash to codes of 8 bits, the lowest n bits of each code are set to zero, and the
-reversed operator takes them back to linear; then methods estimate their lights. Flash's k and scale are those of the
-image before (`generator.files`), so that with n = 0 only the rounding to whole codes is left. Masked pixels
-have no say in k and scale.
+Real linear images are tone mapped by Flash to 8-bit codes, the lowest n bits are set to zero, and the inverse operator
+gives linear images for the methods. With n = 0 only the rounding to codes remains.
 """
 
 from __future__ import annotations
@@ -21,26 +19,25 @@ from evaluation.methods.method import Method
 from evaluation.methods.prepared import usable
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
-from evaluation.results.result import Result, SceneAnswer, read_light, results_of
+from evaluation.results.result import Result, SceneAnswer, collect_results, read_estimate
 from evaluation.results.tables import PAPER_COLUMNS, Table
-from evaluation.scene import Image, Scene, told_of
+from evaluation.scene import Image, Scene, report_progress
 from foundation.compiled import ordered_map
 from generator.files import Flash, fit_flash
 from generator.pictures.sources import clear_bits
 
-BITS: Final = tuple(range(8))  # Numbers of bits set to zero, as in the paper's figure
+BITS: Final = tuple(range(8))  # Numbers of bits set to zero, as in the figure of the paper
 
-GRAY_EDGE_SIGMA: Final = 6.0  # Scale of Gray-Edge, px: that of its entry in the NUS tables, for images of full size
+GRAY_EDGE_SIGMA: Final = 6.0  # Scale of Gray-Edge in the NUS tables, px, for images of full size
 
 
 def reduce_colours(
     image: Image, bits: int | Sequence[int], mask: npt.NDArray[np.bool_] | None = None
 ) -> list[npt.NDArray[np.float32]]:
-    """Return a linear image after `bits` bits of its tone-mapped codes were set to zero, for each of these numbers.
+    """Return the linear image after each of the numbers of bits of its tone-mapped codes was set to zero.
 
-    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit. `mask`: (H, W) bool, True where a
-    pixel has no say in the operator. Returns for each number (H, W, 3) float32, in units of the image's largest
-    unmasked value.
+    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit. `mask`: (H, W) bool, True for
+    pixels that do not influence the operator. Returns (H, W, 3) float32 images, relative to the largest unmasked value.
 
     Examples
     --------
@@ -54,118 +51,108 @@ def reduce_colours(
             [0.   , 0.023, 0.   ]]], dtype=float32)
     """
     counts = (bits,) if isinstance(bits, int) else tuple(bits)
-    found = fitted_codes(image, mask)
-    return [found.operator.invert(clear_bits(found.codes, count)).astype(np.float32) for count in counts]
+    fitted = fit_codes(image, mask)
+    return [fitted.operator.invert(clear_bits(fitted.codes, count)).astype(np.float32) for count in counts]
 
 
 @dataclass(frozen=True, eq=False)
 class FittedCodes:
-    """A linear image after Flash.
+    """Codes of a linear image after Flash."""
 
-    - `codes`: (H, W, 3) uint8.
-    - `operator`: that made them, of values relative to `largest`.
-    - `largest`: largest value that is not masked, in the image's unit; 0 of a black image.
+    codes: npt.NDArray[np.uint8]  # (H, W, 3) uint8
+    operator: Flash  # The fitted operator, for values relative to `largest`
+    largest: float  # Largest unmasked value, in the unit of the image; 0 for a black image
+
+
+def fit_codes(image: Image, mask: npt.NDArray[np.bool_] | None = None) -> FittedCodes:
+    """Return the 8-bit codes of a linear image, by an operator fitted to it.
+
+    `image`, `mask`: as in `reduce_colours`.
     """
-
-    codes: npt.NDArray[np.uint8]
-    operator: Flash
-    largest: float
-
-
-def fitted_codes(image: Image, mask: npt.NDArray[np.bool_] | None = None) -> FittedCodes:
-    """Return the codes of 8 bits of a linear image, by the operator that is fitted to it.
-
-    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit. `mask`: (H, W) bool, True where a
-    pixel has no say in the operator.
-    """
+    # k and scale of Flash are fitted to the image before reduction (`generator.files`).
     values = np.asarray(image, dtype=np.float64)
-    seen = values.reshape(-1, 3) if mask is None else values[~mask]
-    largest = float(seen.max(initial=0.0))
+    judged = values.reshape(-1, 3) if mask is None else values[~mask]
+    largest = float(judged.max(initial=0.0))
     if not largest:
         return FittedCodes(np.zeros(values.shape, np.uint8), Flash(1.0, 255.0, 1.0), 0.0)
-    operator = fit_flash(seen / largest)
+    operator = fit_flash(judged / largest)
     codes = np.clip(np.rint(operator.apply(values / largest)), 0, 255).astype(np.uint8)
     return FittedCodes(codes, operator, largest)
 
 
-def bits_methods(sigma: float = GRAY_EDGE_SIGMA) -> tuple[Method, ...]:
-    """Return the methods of the paper's figure: Gray-world, Shades-of-Gray, Gray-Edge of order 1 at a scale in px."""
-    known = standard_methods()
-    edge = (
-        known["gray-edge-1"]
+def paper_methods(sigma: float = GRAY_EDGE_SIGMA) -> tuple[Method, ...]:
+    """Return the methods of the paper's figure: Gray-world, Shades-of-Gray, and first-order Gray-Edge, sigma in px."""
+    methods = standard_methods()
+    gray_edge = (
+        methods["gray-edge-1"]
         if sigma == GRAY_EDGE_SIGMA
         else GrayEdge(f"1st-order Gray-Edge (σ={sigma:g})", 1, 1, sigma)
     )
-    return (known["gray-world"], known["shades-of-gray"], edge)
+    return (methods["gray-world"], methods["shades-of-gray"], gray_edge)
 
 
 @dataclass(frozen=True, eq=False)
 class BitsResult:
-    """What methods made of a data set's images, as they are and after bits were set to zero.
+    """Results on the images of a data set without and with bits set to zero."""
 
-    - `raw`: one result a method, on the images as they are.
-    - `reduced`: the same by the number of bits set to zero.
-    """
-
-    raw: tuple[Result, ...]
-    reduced: Mapping[int, tuple[Result, ...]]
+    raw: tuple[Result, ...]  # One result for each method on the unchanged images
+    reduced: Mapping[int, tuple[Result, ...]]  # Number of bits set to zero to the results of the methods
 
 
-def bits_removed(
+def remove_bits(
     scenes: Sequence[Scene],
     methods: Sequence[Method],
     bits: Sequence[int] = BITS,
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> BitsResult:
-    """Return errors of methods on images with bits set to zero; each image is read once.
-
-    `scenes`: real linear images with their ground truths, at least one.
-    """
+    """Return errors of methods on images with bits set to zero; each image is read once."""
     truths = require_truths(scenes, methods)
 
     def answers_for(scene: Scene) -> list[list[SceneAnswer]]:
         image, mask = scene.read()
-        # Clipped pixels are known before the reduction only; they have their say in the operator, as in a camera.
-        left_out = ~usable(image, scene.saturation, mask)
+        # Clipping is visible only before the reduction. Clipped pixels still influence the operator, as in a camera.
+        is_excluded = ~usable(image, scene.saturation, mask)
         versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
-        return [[read_light(method.estimate(version, None, left_out)) for method in methods] for version in versions]
+        return [
+            [read_estimate(method.estimate(version, None, is_excluded)) for method in methods] for version in versions
+        ]
 
-    answers = list(told_of(ordered_map(answers_for, scenes, workers), on_scene))
+    answers = list(report_progress(ordered_map(answers_for, scenes, workers), on_scene))
     names = [method.name for method in methods]
     raw, *reduced = (
-        results_of(names, truths, [given[version] for given in answers]) for version in range(1 + len(bits))
+        collect_results(names, truths, [scene_answers[version] for scene_answers in answers])
+        for version in range(1 + len(bits))
     )
     return BitsResult(raw, dict(zip(bits, reduced, strict=True)))
 
 
-def bits_table(found: BitsResult, kind: ErrorKind, name: str) -> Table:
-    """Return the six numbers of every method for the images as they are and each number of bits."""
-    versions = {"as it is": found.raw, **{str(count): results for count, results in found.reduced.items()}}
+def bits_table(bits_result: BitsResult, metric: ErrorKind, name: str) -> Table:
+    """Return the six statistics of every method for the unchanged images and each number of bits."""
+    versions = {"as it is": bits_result.raw, **{str(count): results for count, results in bits_result.reduced.items()}}
     return Table(
-        f"{name}: {kind} angular error after bits of the codes that Flash makes were set to zero, degrees",
+        f"{name}: {metric} angular error after bits of the codes made by Flash were set to zero, degrees",
         ("Algorithm", "Bits set to zero", *PAPER_COLUMNS[1:]),
         tuple(
-            (results[place].method, label, *results[place].summary(kind).as_tuple())
-            for place in range(len(found.raw))
+            (results[index].method, label, *results[index].summary(metric).as_tuple())
+            for index in range(len(bits_result.raw))
             for label, results in versions.items()
         ),
-        notes=("0 bits: rounded to codes of 8 bits and taken back, nothing set to zero.",),
+        notes=("0 bits: only rounded to 8-bit codes.",),
     )
 
 
-PANEL: Final = 200  # Longest side of a panel, px: eight of them fit a page, and the steps of 3 bits can still be seen
+PANEL: Final = 200  # Longest side of a panel, px: eight fit a page, and the steps of 3 bits are still visible
 
-_GAP: Final = 6  # White between panels, px
+_GAP: Final = 6  # White gap between panels, px
 
-_COLUMNS: Final = 4  # Panels side by side
+_PANELS_IN_ROW: Final = 4  # Panels in a row
 
 
 def reduction_strip(picture: npt.NDArray[np.uint8], bits: Sequence[int] = BITS) -> npt.NDArray[np.uint8]:
-    """Return the panels of a picture with bits set to zero, four in a row, white between them.
+    """Return the panels of a picture with bits set to zero, four in a row, as (h, w, 3) uint8, sRGB codes.
 
-    `picture`: (H, W, 3) uint8, sRGB codes; made smaller first if a side is above `PANEL`. Returns (h, w, 3) uint8, sRGB
-    codes.
+    `picture`: (H, W, 3) uint8, sRGB codes; it is reduced if a side is longer than `PANEL`.
     """
     import cv2
 
@@ -173,18 +160,18 @@ def reduction_strip(picture: npt.NDArray[np.uint8], bits: Sequence[int] = BITS) 
     size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
     small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     width, height = size
-    rows = -(-len(bits) // _COLUMNS)
-    columns = min(_COLUMNS, len(bits))
+    rows = -(-len(bits) // _PANELS_IN_ROW)
+    columns = min(_PANELS_IN_ROW, len(bits))
     shape = (rows * (height + _GAP) - _GAP, columns * (width + _GAP) - _GAP, 3)
     strip = np.full(shape, 255, np.uint8)
-    for place, count in enumerate(bits):
-        top, left = place // _COLUMNS * (height + _GAP), place % _COLUMNS * (width + _GAP)
-        strip[top : top + height, left : left + width] = clear_bits(small, count)
+    for index, count in enumerate(bits):
+        y, x = index // _PANELS_IN_ROW * (height + _GAP), index % _PANELS_IN_ROW * (width + _GAP)
+        strip[y : y + height, x : x + width] = clear_bits(small, count)
     return strip
 
 
 def reduction_table(picture: npt.NDArray[np.uint8], bits: Sequence[int] = BITS) -> Table:
-    """Return what is left of a picture (H, W, 3) uint8, sRGB codes: its colours and its distance from the original."""
+    """Return colours and peak signal-to-noise ratio of a picture (H, W, 3) uint8, sRGB codes, after each reduction."""
     rows: list[tuple[str | float | None, ...]] = []
     for count in bits:
         reduced = clear_bits(picture, count)

@@ -1,20 +1,10 @@
-"""What table 1 is made of: pictures, ground truths for lights like theirs, and scenes generated in memory.
+"""Material of the paper's experiments: pictures, ground truths, illuminants and scenes generated in memory.
 
-Image number i of a set shows source i under the i-th light that was chosen. Its samples are chosen as `generate` with
-the same seed chooses them, so a set that is worth keeping can be written by that command, to the same numbers.
+Image i of a set shows source i under the i-th chosen illuminant. Samples are drawn as by `generate` with the same
+seed, so that command can write the same images to files.
 
-Pictures come from real raw images whose light is known: sRGB codes as a raw converter would make them. The paper
-prints "the sRGB images of the Canon 1Ds Mark III" (section 4.3), which the camera or a program of its maker
-had developed; nobody has published how. Ours, with the ground truth at hand:
-
-1. the image is divided by its light, green kept, and cut where the first channel clips, so that clipped skies become
-   white and not pink (dcraw's ``-H 0``); thumbnails do not show what was clipped, and keep a few pink ones;
-2. the camera's colour matrix takes it to linear sRGB (`generator.rendering.matrices`: white stays white);
-3. it is scaled so that one in a hundred of the values of the channel that reaches highest lies above 1, dcraw's
-   "99th-percentile white point", and cut to 0 … 1;
-4. the curve of IEC 61966-2-1 and eight bits.
-
-Ground truths come from a file of text, or from the data set itself.
+The paper prints "the sRGB images of the Canon 1Ds Mark III" (section 4.3). Their development is not published; here,
+pictures are developed from linear raw images with known ground truth (`develop_image`).
 """
 
 from __future__ import annotations
@@ -45,37 +35,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RenderedScene:
-    """A picture printed, lit by a light of a table, and photographed.
-
-    - `light`: number of the light in the table.
-    - `number`: the image's number in its set.
-    - `seed`: 0 … 2⁶⁴ − 1; chooses the samples.
-    """
+    """A picture rendered under one illuminant of a look-up table (LUT)."""
 
     lut: Lut
     source: Source
-    light: int
-    number: int
-    seed: int = 0
+    light: int  # Index of the illuminant in the LUT
+    number: int  # Index of the image in its set
+    seed: int = 0  # 0 … 2⁶⁴ − 1; selects the samples
 
     @property
     def name(self) -> str:
-        """The image's number, as in the names of files that `generate` writes."""
+        """Index of the image, as in file names of `generate`."""
         return f"{self.number:06d}"
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, linear camera RGB, r + g + b = 1."""
+        """Ground truth (3,) float64, linear camera RGB, r + g + b = 1."""
         return self.lut.ground_truth[self.light]
 
     @property
     def saturation(self) -> float:
-        """White level of the table, in the units of the image."""
+        """Saturation level of the LUT, in the unit of the image."""
         return float(self.lut.provenance.white_level)
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
         """Return the image (H, W, 3) uint16, linear camera RGB, and no mask."""
-        # The publication's rendering.
+        # The paper renders by codes.
         picture = self.source.read().picture
         image = render(self.lut, picture, self.light, rendering="codes", seed=self.seed, image=self.number)
         return image, None
@@ -83,108 +68,100 @@ class RenderedScene:
 
 @dataclass(frozen=True, eq=False)
 class ScaledSource:
-    """A picture scaled to a longest side, up or down.
-
-    `side`: longest side, px.
-    """
+    """A picture scaled up or down to a longest side of `side` px."""
 
     source: Source
     side: int
 
     @property
     def name(self) -> str:
-        """The picture's name."""
+        """Name of the picture."""
         return self.source.name
 
     def to_json(self) -> dict[str, Any]:
-        """Return how the picture is made, as a JSON object."""
+        """Return a JSON object that describes the picture."""
         return {**self.source.to_json(), "side": self.side}
 
     def read(self) -> SourcePicture:
-        """Return the picture, codes (H, W, 3) uint8: smaller by the mean of areas, larger by linear interpolation."""
+        """Return the picture, codes (H, W, 3) uint8: area averages if reduced, linear interpolation if enlarged."""
         import cv2
 
         picture = self.source.read().picture
         height, width = picture.shape[:2]
         scale = self.side / max(height, width)
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-        return SourcePicture(np.asarray(cv2.resize(picture, size, interpolation=how), dtype=np.uint8))
+        interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        return SourcePicture(np.asarray(cv2.resize(picture, size, interpolation=interpolation), dtype=np.uint8))
 
 
 @dataclass(frozen=True)
 class ChosenLights:
-    """A light of a table for each image.
+    """One illuminant of a LUT for each image."""
 
-    - `numbers`: the light of each image.
-    - `how`: how they were chosen, in words.
-    """
-
-    numbers: tuple[int, ...]
-    how: str
+    numbers: tuple[int, ...]  # Index of the illuminant of each image
+    how: str  # Method of selection, as text
 
 
 def lights_like(lut: Lut, truths: npt.NDArray[np.float64], count: int) -> ChosenLights:
-    """Return for each of `count` images the light nearest to its ground truth, of another camera or not.
+    """Return for each image the illuminant nearest by angle to its ground truth.
 
-    `truths`: (N, 3) float64 ≥ 0, linear camera RGB of any length; image i has truth i mod N.
+    `truths`: (N, 3) float64 ≥ 0, linear camera RGB of any length and any camera; image i has ground truth i mod N.
     """
     matches = nearest_lights(lut, truths).matches
     numbers = tuple(matches[image % len(matches)].mixture.lights[0] for image in range(count))
     used = matches[:count]
     angles = np.array([match.angle for match in used])
-    among = f"the first {len(used)} of {len(truths)}" if len(used) < len(truths) else f"{len(truths)}"
+    truths_text = f"the first {len(used)} of {len(truths)}" if len(used) < len(truths) else f"{len(truths)}"
     return ChosenLights(
         numbers,
-        f"nearest by angle to {among} ground truths, {len(set(numbers))} different lights; angle to them "
-        f"{np.median(angles):.2f}° in the median, {angles.max():.2f}° at most",
+        f"nearest by angle to {truths_text} ground truths, {len(set(numbers))} different illuminants; median angle "
+        f"{np.median(angles):.2f}°, largest {angles.max():.2f}°",
     )
 
 
 def lights_at_random(lut: Lut, count: int, seed: int) -> ChosenLights:
-    """Return for each of `count` images a light drawn from all of the table, as `generate --random 1` does."""
+    """Return for each image an illuminant drawn from all of the LUT, as `generate --random 1` does."""
     choice = RandomLights(1, len(lut.white), seed)
     numbers = tuple(choice.lightings_of(image)[0].mixtures[0].lights[0] for image in range(count))
     return ChosenLights(
-        numbers, f"drawn from all {len(lut.white)} lights with seed {seed}, {len(set(numbers))} different"
+        numbers, f"drawn from all {len(lut.white)} illuminants with seed {seed}, {len(set(numbers))} different"
     )
 
 
-def rendered(lut: Lut, sources: Sequence[Source], lights: ChosenLights, seed: int) -> tuple[RenderedScene, ...]:
-    """Return the scenes of pictures under the lights chosen for them."""
+def render_scenes(lut: Lut, sources: Sequence[Source], lights: ChosenLights, seed: int) -> tuple[RenderedScene, ...]:
+    """Return the scenes of the pictures under the chosen illuminants."""
     if len(sources) != len(lights.numbers):
-        raise InputError(f"{len(sources)} pictures have {len(lights.numbers)} lights, expected one each")
+        raise InputError(f"{len(sources)} pictures have {len(lights.numbers)} illuminants; choose one for each")
     pairs = zip(sources, lights.numbers, strict=True)
     return tuple(RenderedScene(lut, source, light, number, seed) for number, (source, light) in enumerate(pairs))
 
 
-WHITE_PERCENTILE: Final = 99.0  # Percentile that becomes white; dcraw's
+WHITE_PERCENTILE: Final = 99.0  # Percentile that becomes white, as in dcraw ("99th-percentile white point")
 
-_DARKEST: Final = 1e-12  # What replaces a white level of 0: an image that is black stays black
+_MIN_WHITE: Final = 1e-12  # Replaces a white of 0: a black image stays black
 
 
-def develop(
+def develop_image(
     image: Image,
     light: npt.NDArray[np.float64],
     mask: npt.NDArray[np.bool_] | None = None,
     matrix: ColourMatrix | None = None,
     saturation: float | None = None,
 ) -> npt.NDArray[np.uint8]:
-    """Return the sRGB picture of a raw image; the steps stand at the head of this file.
+    """Return the sRGB picture (H, W, 3) uint8 of a raw image.
 
-    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, black subtracted, any unit. `light`: (3,)
-    float64 > 0, linear camera RGB of any length: the ground truth. `mask`: (H, W) bool, True where a pixel has no say
-    in the white level; None if all have. `matrix`: of the camera; None takes balanced camera RGB for linear sRGB.
-    `saturation`: value of the image from which a channel is clipped; None if none is. Returns (H, W, 3) uint8, sRGB
-    codes.
+    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, black level subtracted, any unit. `light`:
+    (3,) float64 > 0, ground truth, linear camera RGB of any length. `mask`: (H, W) bool, True for pixels that do not
+    influence the white; None for no mask. `matrix`: colour matrix of the camera; None uses balanced camera RGB as
+    linear sRGB. `saturation`: value from which a channel is clipped; None for no clipping.
 
     Examples
     --------
-    A grey wedge stays grey, whatever the light and the camera; one in a hundred values is clipped:
+    A grey wedge stays grey for every illuminant and camera; one in a hundred values is clipped:
 
     >>> from generator.rendering.matrices import camera_matrix
     >>> wedge = np.linspace(0, 1, 5)[:, None, None] * np.array([400.0, 1000.0, 700.0])
-    >>> develop(wedge, np.array([0.4, 1.0, 0.7]), matrix=camera_matrix("EOS 550D"))[:, 0]
+    >>> develop_image(wedge, np.array([0.4, 1.0, 0.7]), matrix=camera_matrix("EOS 550D"))[:, 0]
     array([[  0,   0,   0],
            [138, 138, 138],
            [188, 188, 188],
@@ -192,22 +169,25 @@ def develop(
            [255, 255, 255]], dtype=uint8)
     """
     if not (np.isfinite(light).all() and light.min() > 0):
-        raise InputError(f"a picture cannot be balanced for the light {light.tolist()}; expected three numbers above 0")
+        raise InputError(f"the illuminant is {light.tolist()}, expected three numbers above 0; correct it")
+    # Balanced with green unchanged, and cut where the first channel clips, so that clipped skies become white and not
+    # pink (dcraw -H 0). Thumbnails do not record clipping; a few of theirs stay pink.
     linear: npt.NDArray[np.float64] = np.asarray(image, dtype=np.float64) * (light[1] / light)
     if saturation is not None:
         linear = np.minimum(linear, saturation * float((light[1] / light).min()))
     if matrix is not None:
+        # The matrix keeps white.
         linear = np.asarray(linear @ np.linalg.inv(matrix.rows).T, dtype=np.float64)
-    seen = linear.reshape(-1, 3) if mask is None else linear[~mask]
-    white = float(np.percentile(seen, WHITE_PERCENTILE, axis=0).max()) if len(seen) else 0.0
-    return srgb_codes(linear / max(white, _DARKEST))
+    judged = linear.reshape(-1, 3) if mask is None else linear[~mask]
+    white = float(np.percentile(judged, WHITE_PERCENTILE, axis=0).max()) if len(judged) else 0.0
+    return srgb_codes(linear / max(white, _MIN_WHITE))
 
 
 @dataclass(frozen=True, eq=False)
 class DevelopedSource:
-    """A real image as a source picture of the generator, developed with its ground truth.
+    """A real image as source picture of the generator, developed with its ground truth.
 
-    `matrix`: of its camera; None for none.
+    `matrix`: colour matrix of its camera, or None.
     """
 
     scene: Scene
@@ -215,62 +195,59 @@ class DevelopedSource:
 
     @property
     def name(self) -> str:
-        """The image's name."""
+        """Name of the image."""
         return self.scene.name
 
     def to_json(self) -> dict[str, Any]:
-        """Return how the picture is made, as a JSON object."""
+        """Return a JSON object that describes the picture."""
         return {"developed": self.scene.name, "matrix": self.matrix and self.matrix.name}
 
     def read(self) -> SourcePicture:
         """Return the picture, codes (H, W, 3) uint8; masked pixels are black."""
         image, mask = self.scene.read()
-        picture = develop(image, self.scene.truth, mask, self.matrix, self.scene.saturation)
+        picture = develop_image(image, self.scene.truth, mask, self.matrix, self.scene.saturation)
         if mask is not None:
             picture[mask] = 0
         return SourcePicture(picture)
 
 
-def developed(data: SceneSet, matrix: ColourMatrix | None) -> tuple[DevelopedSource, ...]:
-    """Return the images of a data set as source pictures, developed with the colour matrix of its camera or none."""
+def develop_sources(data: SceneSet, matrix: ColourMatrix | None) -> tuple[DevelopedSource, ...]:
+    """Return the images of a data set as source pictures, developed with the camera's colour matrix or without one."""
     return tuple(DevelopedSource(scene, matrix) for scene in data.scenes)
 
 
-_TEXTS = (".csv", ".txt")  # Endings of files of text
+_TEXT_EXTENSIONS = (".csv", ".txt")  # File extensions of text files with ground truths
 
 
 @dataclass(frozen=True, eq=False)
 class Truths:
-    """Ground truths with a name for tables and legends.
+    """Ground truths with a name for tables and legends."""
 
-    - `name`: where they come from.
-    - `lights`: (N, 3) float64 ≥ 0, linear camera RGB of any length.
-    - `images`: the names of their N images; empty where they have none.
-    """
-
-    name: str
-    lights: npt.NDArray[np.float64]
-    images: tuple[str, ...] = ()
+    name: str  # Name of their source
+    lights: npt.NDArray[np.float64]  # (N, 3) float64 ≥ 0, linear camera RGB of any length
+    images: tuple[str, ...] = ()  # Names of their N images; empty if unknown
 
 
-def read_truths(place: str) -> Truths:
-    """Return the ground truths at a place."""
-    file, _, start = place.partition("#")
-    if not file.lower().endswith(_TEXTS):
-        data = open_scenes(place)
+def read_truths(location: str) -> Truths:
+    """Return the ground truths of a text file, FILE or FILE#PREFIX of image names, or of a data set."""
+    file, _, prefix = location.partition("#")
+    if not file.lower().endswith(_TEXT_EXTENSIONS):
+        data = open_scenes(location)
         return Truths(
             data.name, np.stack([scene.truth for scene in data.scenes]), tuple(scene.name for scene in data.scenes)
         )
     lights = load_ground_truths(Path(file))
     names = _first_column(Path(file))
-    if not start:
+    if not prefix:
         return Truths(Path(file).stem, lights, tuple(names) if len(names) == len(lights) else ())
     if len(names) != len(lights):
-        raise FormatError(f"{file} has {len(lights)} ground truths and {len(names)} names; {start!r} cannot choose")
-    chosen = np.array([name.startswith(start) for name in names])
-    if not chosen.any():
-        raise InputError(f"no row of {file} begins with {start!r}; the first begins with {names[0]!r}")
-    return Truths(start.strip("/_"), lights[chosen], tuple(name for name in names if name.startswith(start)))
+        raise FormatError(
+            f"{file} has {len(lights)} ground truths, {len(names)} names, expected equal numbers; correct it"
+        )
+    is_chosen = np.array([name.startswith(prefix) for name in names])
+    if not is_chosen.any():
+        raise InputError(f"no row of {file} begins with {prefix!r}, expected a prefix such as {names[0]!r}; correct it")
+    return Truths(prefix.strip("/_"), lights[is_chosen], tuple(name for name in names if name.startswith(prefix)))
 
 
 def _first_column(path: Path) -> list[str]:

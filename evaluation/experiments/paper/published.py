@@ -1,11 +1,7 @@
-"""The numbers that the paper prints, to stand beside ours.
+"""Numbers published in the paper, for comparison with results.
 
 N. Banić, K. Koščević, M. Subašić, S. Lončarić, "CroP: Color constancy benchmark dataset generator", tables 1 and 2. The
-figures have no numbers in the paper's source.
-
-The text (section 4.1) calls the errors reproduction errors. Those of the first table cannot all be: the largest
-reproduction error is arccos(1/√3) = 54.74°, and White-Patch's worst quarter under random lights has a mean of 59.80°.
-So the commands give both kinds.
+source of the paper contains no numbers of its figures.
 """
 
 from __future__ import annotations
@@ -19,7 +15,7 @@ from typing import Final, Literal
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """Six numbers of a method as printed, degrees; what they are says `evaluation.metrics.Summary`."""
+    """Statistics of a method as published, degrees; see `evaluation.metrics.Summary`."""
 
     mean: float
     median: float
@@ -29,13 +25,15 @@ class PublishedRow:
     avg: float
 
     def as_tuple(self) -> tuple[float, ...]:
-        """Return the six numbers."""
+        """Return the six statistics."""
         return astuple(self)
 
 
-Cell = tuple[str, str, str]  # Scenes, sensor and illuminations of a data set of the first table
+Cell = tuple[str, str, str]  # Scenes, sensor and illuminants of a data set of table 1
 
-# Table 1: by data set and method, in the paper's order. C1 is the Canon 1Ds Mark III of the NUS data set.
+# Table 1, by data set and method in the order of the paper. C1 is the Canon 1Ds Mark III of the NUS data set.
+# Section 4.1 calls its errors reproduction errors. Not all can be: the largest possible reproduction error is
+# arccos(1/√3) = 54.74°, but one worst 25 % is 59.80°. The commands therefore give both kinds of error.
 TABLE1: Final[Mapping[Cell, Mapping[str, PublishedRow]]] = {
     ("C1", "6D", "C1"): {
         "White-Patch": PublishedRow(2.61, 2.59, 2.50, 1.03, 4.38, 2.38),
@@ -79,13 +77,13 @@ TABLE1: Final[Mapping[Cell, Mapping[str, PublishedRow]]] = {
     },
 }
 
-# Names of C1's images in every copy of the data set, without folder and ending.
+# Names of C1's images in every copy of the data set, without folder and extension.
 _C1_NAME: Final = re.compile(r"Canon1DsMkIII_\d{4}")
-_C1_IMAGES: Final = 259  # Images of C1: a part of them has other numbers than the whole
+_C1_IMAGES: Final = 259  # Images of C1: statistics of a part of them would differ from the published ones
 
 
 def is_c1(images: Sequence[str]) -> bool:
-    """Return whether names of images are those of the whole of C1, in any order.
+    """Return whether the names are those of all images of C1, in any order.
 
     Examples
     --------
@@ -98,7 +96,7 @@ def is_c1(images: Sequence[str]) -> bool:
 
 
 def cell_name(name: str, images: Sequence[str]) -> str:
-    """Return what pictures or lights are called in the first table: C1 only if they are.
+    """Return the name of pictures or illuminants in table 1: "C1" only for the images of C1.
 
     Examples
     --------
@@ -110,7 +108,7 @@ def cell_name(name: str, images: Sequence[str]) -> str:
     return f'"{name}"' if name in ("C1", "Random") else name
 
 
-# Table 2: by what the methods were trained on, tested on Cube+; ``real`` by cross-validation on Cube+ itself.
+# Table 2, by training data, tested on Cube+; "real": cross-validation on Cube+.
 TABLE2: Final[Mapping[Literal["real", "generated"], Mapping[str, PublishedRow]]] = {
     "real": {
         "Smart Color Cat": PublishedRow(2.27, 1.35, 1.61, 0.34, 5.72, 1.58),

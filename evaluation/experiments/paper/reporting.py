@@ -1,8 +1,7 @@
-"""Each experiment's results as a folder: a page, tables as CSV and LaTeX, figures as SVG or PNG.
+"""Reports of the paper's experiments as folders: a page, tables as CSV and LaTeX, figures as SVG or PNG.
 
-Chromaticities of lights (sections 3.1 and 3.3) are those of the white under each light of a table, as its camera sees
-it: what the paper's two figures show for the EOS 550D and the 6D Mark II, and beside them the ground truths of real
-data sets, to see which of their lights a table can stand for.
+The figures of chromaticities (sections 3.1 and 3.3) show the white under each illuminant of a look-up table (LUT), in
+camera RGB, with the ground truths of real data sets for comparison.
 """
 
 from __future__ import annotations
@@ -40,50 +39,51 @@ if TYPE_CHECKING:
     from generator import Lut
 
 
-def rb_of(lights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the rb-chromaticities (N, 2) float64 of lights (N, 3) float64, linear camera RGB of any length.
+def rb_chromaticities(lights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the rb-chromaticities (N, 2) float64 of illuminants (N, 3) float64, linear camera RGB of any length.
 
     Examples
     --------
-    >>> rb_of(np.array([[1.0, 2.0, 1.0]]))
+    >>> rb_chromaticities(np.array([[1.0, 2.0, 1.0]]))
     array([[0.25, 0.25]])
     """
     return (lights / lights.sum(axis=1, keepdims=True))[:, [0, 2]]
 
 
 def chromaticity_rows(luts: Sequence[Lut]) -> Table:
-    """Return every light of tables with its kind and chromaticity, for CSV."""
+    """Return every illuminant of the LUTs with kind and chromaticity, for CSV."""
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:
-        for light, (r, b) in zip(lut.illuminations, rb_of(lut.white), strict=True):
+        for light, (r, b) in zip(lut.illuminations, rb_chromaticities(lut.white), strict=True):
             rows.append((lut.provenance.camera, light.index, light.kind, light.cct_k, float(r), float(b)))
-    return Table("rb-chromaticities of lights", ("camera", "light", "kind", "cct_k", "r", "b"), tuple(rows), digits=4)
+    columns = ("camera", "light", "kind", "cct_k", "r", "b")
+    return Table("rb-chromaticities of illuminants", columns, tuple(rows), digits=4)
 
 
 def coverage_table(luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float64]]) -> Table:
-    """Return how near the lights of tables come to the ground truths of data sets.
+    """Return the angles from ground truths of data sets to the nearest illuminants of LUTs.
 
-    `sets`: name of a data set to its ground truths, (N, 3) float64, linear camera RGB of any length.
+    `sets`: name of a data set to its ground truths (N, 3) float64, linear camera RGB of any length.
     """
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:
         for name, truths in sets.items():
             matches = nearest_lights(lut, truths).matches
             angles = np.array([match.angle for match in matches])
-            different = len({match.mixture.label for match in matches})
+            nearest_count = len({match.mixture.label for match in matches})
             rows.append(
                 (
                     lut.provenance.camera,
                     name,
                     len(truths),
-                    different,
+                    nearest_count,
                     float(np.median(angles)),
                     float(np.percentile(angles, 95, method="hazen")),
                     float(angles.max()),
                 )
             )
     return Table(
-        "Angle from ground truths to the nearest light of a table, degrees",
+        "Angle from ground truths to the nearest illuminant of a look-up table (LUT), degrees",
         ("Table", "Data set", "Ground truths", "Lights that are nearest", "Median", "95th percentile", "Largest"),
         tuple(rows),
     )
@@ -92,37 +92,36 @@ def coverage_table(luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float6
 # Markers of series, so that they differ in print without colour.
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 
-# Width of a dot in the figure of chromaticities; of points in one square of that width one is drawn.
-_SEEN: Final = 0.004
+# Width of a dot in the figure of chromaticities; of all points in a square of this width only one is drawn.
+_DOT_WIDTH: Final = 0.004
 
 
-def _draw_bits(figure: Any, found: BitsResult, kind: ErrorKind) -> None:
-    """Draw the paper's figure of bits removal: each method's median against the bits; the raw image's as a line."""
+def _draw_bits(figure: Any, bits_result: BitsResult, metric: ErrorKind) -> None:
+    # The paper's figure: median of each method against the number of bits; unchanged images as a dotted line.
     axes = figure.add_subplot()
-    counts = list(found.reduced)
-    for place, raw in enumerate(found.raw):
-        style = series_style(place)
-        medians = [results[place].summary(kind).median for results in found.reduced.values()]
-        axes.plot(counts, medians, marker=_MARKERS[place % len(_MARKERS)], label=legend_label(raw.method), **style)
-        axes.axhline(raw.summary(kind).median, color=style["color"], linewidth=0.8, linestyle=":")
-    axes.set_xlabel("bits of each sRGB code set to zero (dotted: the linear image as it is)")
-    axes.set_ylabel(f"median {kind} error, degrees")
+    counts = list(bits_result.reduced)
+    for index, raw in enumerate(bits_result.raw):
+        style = series_style(index)
+        medians = [results[index].summary(metric).median for results in bits_result.reduced.values()]
+        axes.plot(counts, medians, marker=_MARKERS[index % len(_MARKERS)], label=legend_label(raw.method), **style)
+        axes.axhline(raw.summary(metric).median, color=style["color"], linewidth=0.8, linestyle=":")
+    axes.set_xlabel("bits of each sRGB code set to zero (dotted: unchanged linear images)")
+    axes.set_ylabel(f"median {metric} error, degrees")
     axes.set_xticks(counts)
     axes.set_ylim(bottom=0)
     axes.legend()
 
 
 def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:
-    """Draw a method's median error against the images' side, a line for each data set."""
     axes = figure.add_subplot()
-    for place, cell in enumerate(dict.fromkeys(row.cell for row in rows)):
-        of_cell = [row for row in rows if row.cell == cell]
+    for index, cell in enumerate(dict.fromkeys(row.cell for row in rows)):
+        cell_rows = [row for row in rows if row.cell == cell]
         axes.plot(
-            [row.side for row in of_cell],
-            [row.medians[method] for row in of_cell],
-            marker=_MARKERS[place % len(_MARKERS)],
+            [row.side for row in cell_rows],
+            [row.medians[method] for row in cell_rows],
+            marker=_MARKERS[index % len(_MARKERS)],
             label=legend_label(block_title(cell)),
-            **series_style(place),
+            **series_style(index),
         )
     sides = sorted({row.side for row in rows})
     axes.set_xscale("log", base=2)
@@ -135,21 +134,21 @@ def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:
 
 
 def _draw_chromaticities(figure: Any, luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float64]]) -> None:
-    """Draw the paper's figures of lights in camera RGB side by side, over ground truths (N, 3) of named data sets."""
-    reach = max(float(rb_of(lut.white).max()) for lut in luts) * 1.04
-    for place, lut in enumerate(luts):
-        axes = figure.add_subplot(1, len(luts), place + 1)
+    # The paper's figures of illuminants, one for each camera, over the ground truths of data sets.
+    axis_end = max(float(rb_chromaticities(lut.white).max()) for lut in luts) * 1.04
+    for index, lut in enumerate(luts):
+        axes = figure.add_subplot(1, len(luts), index + 1)
         black_body = np.array([light.kind == "blackbody" for light in lut.illuminations], dtype=np.bool_)
-        uniform, bodies = rb_of(lut.white[~black_body]), rb_of(lut.white[black_body])
+        uniform, bodies = rb_chromaticities(lut.white[~black_body]), rb_chromaticities(lut.white[black_body])
         if len(uniform):
             axes.scatter(*uniform.T, s=7, color=FAINT, linewidths=0, label=f"uniform ({len(uniform)})", zorder=2)
-        for number, (name, truths) in enumerate(sets.items()):
-            style = series_style(number)
-            points = rb_of(truths)
-            _, first = np.unique((points / _SEEN).round(), axis=0, return_index=True)
-            seen = points[first]
+        for set_index, (name, truths) in enumerate(sets.items()):
+            style = series_style(set_index)
+            points = rb_chromaticities(truths)
+            _, first_indices = np.unique((points / _DOT_WIDTH).round(), axis=0, return_index=True)
+            dots = points[first_indices]
             axes.scatter(
-                *seen.T, s=5, color=style["color"], linewidths=0, alpha=0.6, label=legend_label(name), zorder=3
+                *dots.T, s=5, color=style["color"], linewidths=0, alpha=0.6, label=legend_label(name), zorder=3
             )
         if len(bodies):
             axes.scatter(
@@ -165,42 +164,36 @@ def _draw_chromaticities(figure: Any, luts: Sequence[Lut], sets: Mapping[str, np
         axes.set_title(lut.provenance.camera)
         axes.set_xlabel("r")
         axes.set_ylabel("b")
-        axes.set_xlim(0, reach)
-        axes.set_ylim(0, reach)
+        axes.set_xlim(0, axis_end)
+        axes.set_ylim(0, axis_end)
         axes.set_aspect("equal")
         axes.legend(loc="upper right", fontsize=8, markerscale=1.6, handletextpad=0.2)
 
 
-_TABLE1 = (
-    "Performance of White-Patch, Gray-world and Shades-of-Gray on eight generated data sets, {kind} error in degrees"
+_TABLE1_CAPTION = (
+    "Performance of White-Patch, Gray-world and Shades-of-Gray on eight generated data sets, {metric} error in degrees"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class PaperReport:
-    """What an experiment leaves.
+    """Report of one experiment."""
 
-    - `title`: of the page.
-    - `tables`: what is printed, in order.
-    - `files`: beside the page: name to content.
-    """
-
-    title: str
-    tables: tuple[Table, ...]
-    parts: tuple[Markup, ...]
-    files: Mapping[str, bytes]
+    title: str  # Title of the page
+    tables: tuple[Table, ...]  # Printed tables, in order
+    elements: tuple[Markup, ...]  # HTML elements of the page
+    files: Mapping[str, bytes]  # Name to content of the other files
 
 
 def write_report(report: PaperReport, folder: Path) -> None:
-    """Write a report to a new folder, whole or not at all; its page is `report.html`."""
+    """Write a report to a new folder, completely or not at all; its page is `report.html`."""
     with atomic_folder(folder, "the report") as partial:
-        (partial / "report.html").write_text(pages.page(report.title, report.parts), encoding="utf-8")
+        (partial / "report.html").write_text(pages.page(report.title, report.elements), encoding="utf-8")
         for name, content in report.files.items():
             (partial / name).write_bytes(content)
 
 
 def _table_files(name: str, table: Table) -> dict[str, bytes]:
-    """Return a table's files by their names: CSV and LaTeX."""
     return {f"{name}.csv": table_to_csv(table).encode(), f"{name}.tex": table_to_latex(table).encode()}
 
 
@@ -208,45 +201,46 @@ def table1_report(
     blocks: Sequence[Block],
     luts: Sequence[Lut],
     conditions: Sequence[str],
-    kind: ErrorKind,
+    metric: ErrorKind,
     sizes: Sequence[SizeRow] = (),
 ) -> PaperReport:
-    """Return the report of table 1, first with one kind of error, then with the other.
-
-    `sizes`: the errors for other sizes of images; may be empty.
-    """
-    other: ErrorKind = "recovery" if kind == "reproduction" else "reproduction"
-    first, second = ([block_table(block, one) for block in blocks] for one in (kind, other))
-    noise, prints = noise_table(luts), print_table(luts)
+    """Return the report of table 1 with both kinds of error, `metric` first; `sizes` may be empty."""
+    other_metric: ErrorKind = "recovery" if metric == "reproduction" else "reproduction"
+    tables_first, tables_other = ([block_table(block, name) for block in blocks] for name in (metric, other_metric))
+    noise, print_colours = noise_table(luts), print_table(luts)
     files = {
         "table1.csv": table_to_csv(joint_table(blocks)).encode(),
-        "table1.tex": tables_to_latex(_TABLE1.format(kind=kind), first).encode(),
-        f"table1_{other}.tex": tables_to_latex(_TABLE1.format(kind=other), second).encode(),
+        "table1.tex": tables_to_latex(_TABLE1_CAPTION.format(metric=metric), tables_first).encode(),
+        f"table1_{other_metric}.tex": tables_to_latex(
+            _TABLE1_CAPTION.format(metric=other_metric), tables_other
+        ).encode(),
         "noise.csv": table_to_csv(noise).encode(),
-        "print.csv": table_to_csv(prints).encode(),
+        "print.csv": table_to_csv(print_colours).encode(),
     }
-    parts = [
+    elements = [
         *map(pages.paragraph, conditions),
-        pages.heading(f"{kind.capitalize()} error, degrees"),
-        *map(table_part, first),
+        pages.heading(f"{metric.capitalize()} error, degrees"),
+        *map(table_part, tables_first),
     ]
-    tables = [*first, noise, prints]
+    tables = [*tables_first, noise, print_colours]
     if sizes:
-        drawn = draw_svg(_draw_sizes, sizes, "White-Patch", inches=(7.6, 4.8))
+        size_plot = draw_svg(_draw_sizes, sizes, "White-Patch", inches=(7.6, 4.8))
         table = size_table(sizes)
         tables.append(table)
-        files |= {"sizes.csv": table_to_csv(table).encode(), "sizes.svg": standalone_svg(drawn)}
+        files |= {"sizes.csv": table_to_csv(table).encode(), "sizes.svg": standalone_svg(size_plot)}
         caption = (
-            "White-Patch takes the largest of all values, of which a larger image has more: of noise, and of whites."
+            "White-Patch uses the largest value, which increases with the number of pixels: of noise, and of whites."
         )
-        parts += [pages.heading("Images of other sizes"), pages.figure(drawn, caption), table_part(table)]
-    parts += [pages.heading("The tables"), table_part(noise), table_part(prints)]
-    parts += [pages.heading(f"{other.capitalize()} error, degrees"), *map(table_part, second)]
-    return PaperReport("Table 1: plain methods on generated data sets", tuple(tables), tuple(parts), files)
+        elements += [pages.heading("Images of other sizes"), pages.figure(size_plot, caption), table_part(table)]
+    elements += [pages.heading("Look-up tables"), table_part(noise), table_part(print_colours)]
+    elements += [pages.heading(f"{other_metric.capitalize()} error, degrees"), *map(table_part, tables_other)]
+    return PaperReport(
+        "Table 1: statistics-based methods on generated data sets", tuple(tables), tuple(elements), files
+    )
 
 
 def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperReport:
-    """Return the report of table 2: both halves as one table, then the ratios."""
+    """Return the report of table 2: both halves as one table, then the ratios of medians."""
     *halves, ratios = tables
     caption = "Comparison of performance of learning-based methods with respect to the training"
     files = {
@@ -257,49 +251,49 @@ def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperRe
             for name, half in zip(("real", "generated"), halves, strict=True)
         },
     }
-    parts = (*map(pages.paragraph, conditions), *map(table_part, tables))
-    return PaperReport("Table 2: trained on real and on generated images", tuple(tables), parts, files)
+    elements = (*map(pages.paragraph, conditions), *map(table_part, tables))
+    return PaperReport("Table 2: trained on real and on generated images", tuple(tables), elements, files)
 
 
-def bits_report(found: BitsResult, kind: ErrorKind, name: str, conditions: Sequence[str]) -> PaperReport:
-    """Return the report of bits removal on a data set of that name."""
-    drawn, table = draw_svg(_draw_bits, found, kind, inches=(6.4, 3.8)), bits_table(found, kind, name)
-    caption = "Medians against the bits of each sRGB code that were set to zero; dotted, the linear images as they are."
-    files = {"bits.svg": standalone_svg(drawn), **_table_files("bits", table)}
-    parts = (*map(pages.paragraph, conditions), pages.figure(drawn, caption), table_part(table))
-    return PaperReport("The effect of colour reduction on illumination estimation", (table,), parts, files)
+def bits_report(bits_result: BitsResult, metric: ErrorKind, name: str, conditions: Sequence[str]) -> PaperReport:
+    """Return the report of colour reduction on the data set with this name."""
+    plot, table = draw_svg(_draw_bits, bits_result, metric, inches=(6.4, 3.8)), bits_table(bits_result, metric, name)
+    caption = "Medians against the number of bits of each sRGB code set to zero; dotted: unchanged linear images."
+    files = {"bits.svg": standalone_svg(plot), **_table_files("bits", table)}
+    elements = (*map(pages.paragraph, conditions), pages.figure(plot, caption), table_part(table))
+    return PaperReport("The effect of colour reduction on illumination estimation", (table,), elements, files)
 
 
 def reduction_report(picture: npt.NDArray[np.uint8], name: str) -> PaperReport:
-    """Return the report of a picture (H, W, 3) uint8, sRGB codes, with 0 … 7 bits of its codes set to zero."""
+    """Return the report of one picture (H, W, 3) uint8, sRGB codes, with 0 … 7 bits of its codes set to zero."""
     import cv2
 
     table = reduction_table(picture)
     strip = reduction_strip(picture)
-    drawn = bytes(np.asarray(cv2.imencode(".png", strip[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]))
-    caption = f"{name} with 0 to 7 bits of each code set to zero, row by row; the tables of the paper keep 5 of 8 bits."
-    files = {"reduction.png": drawn, "reduction.csv": table_to_csv(table).encode()}
+    png = bytes(np.asarray(cv2.imencode(".png", strip[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]))
+    caption = f"{name} with 0 to 7 bits of each code set to zero, row by row; the LUTs of the paper keep 5 of 8 bits."
+    files = {"reduction.png": png, "reduction.csv": table_to_csv(table).encode()}
     return PaperReport(
-        "Influence of colour reduction", (table,), (pages.figure(drawn, caption), table_part(table)), files
+        "Influence of colour reduction", (table,), (pages.figure(png, caption), table_part(table)), files
     )
 
 
 def chromaticities_report(luts: Sequence[Lut], sets: Sequence[Truths]) -> PaperReport:
-    """Return the report of the lights of tables, beside the ground truths of data sets."""
-    truths = {found.name: found.lights for found in sets}
-    drawn = draw_svg(_draw_chromaticities, luts, truths, inches=(4.6 * len(luts), 4.7))
+    """Return the report of the illuminants of LUTs, with ground truths of data sets."""
+    truths = {ground_truths.name: ground_truths.lights for ground_truths in sets}
+    plot = draw_svg(_draw_chromaticities, luts, truths, inches=(4.6 * len(luts), 4.7))
     caption = (
-        "rb-chromaticities, r = R / (R + G + B) and b = B / (R + G + B) in linear RGB of each table's camera, of the "
-        "white under each light of the table; in colour the ground truths of data sets, each in its own camera's RGB."
+        "rb-chromaticities, r = R / (R + G + B) and b = B / (R + G + B), of the white under each illuminant of a "
+        "look-up table (LUT), in linear camera RGB; in colour, ground truths of data sets in their own camera RGB."
     )
-    parts, tables = [pages.figure(drawn, caption)], list[Table]()
+    elements, tables = [pages.figure(plot, caption)], list[Table]()
     files = {
-        "chromaticities.svg": standalone_svg(drawn),
+        "chromaticities.svg": standalone_svg(plot),
         "chromaticities.csv": table_to_csv(chromaticity_rows(luts)).encode(),
     }
     if truths:
         coverage = coverage_table(luts, truths)
         tables.append(coverage)
-        parts.append(table_part(coverage))
+        elements.append(table_part(coverage))
         files |= _table_files("coverage", coverage)
-    return PaperReport("Chromaticities of the lights", tuple(tables), tuple(parts), files)
+    return PaperReport("Chromaticities of the illuminants", tuple(tables), tuple(elements), files)

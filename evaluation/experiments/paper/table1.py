@@ -1,13 +1,9 @@
-"""The paper's tables: plain methods on eight generated data sets (4.3), learned ones on real images (4.4).
+"""The paper's tables: statistics-based methods on eight generated data sets (4.3), learned methods (4.4).
 
-Two sets of scenes (pictures that are given, and pictures of random codes), two tables, two choices of lights (nearest
-to the ground truths of a real data set, and drawn from all of the table) make eight data sets. The paper names neither
-the size nor the number of its images, nor how many lights it drew. Ours: as many random scenes as pictures, squares of
-`side` px; pictures scaled to a longest side of `side` px; one light for each image.
-
-Two more tables explain the row: how noisy the print's white is, and how grey the print is. The paper's 550D tables give
-White-Patch mean errors of 9 to 26°, which noise cannot: a hot photosite can be above every white of its channel. `sim
-table --hot` makes tables with some.
+Two sets of scenes (given pictures, random codes), two look-up tables (LUT) and two choices of illuminants (nearest to
+the ground truths of a real data set, drawn from the LUT) make eight data sets. The paper does not give the size and
+number of its images, nor the number of drawn illuminants. Here, there are as many random scenes as pictures, with a
+longest side of `side` px, each under one illuminant.
 """
 
 from __future__ import annotations
@@ -26,10 +22,10 @@ from evaluation.experiments.paper.material import (
     ScaledSource,
     lights_at_random,
     lights_like,
-    rendered,
+    render_scenes,
 )
 from evaluation.experiments.paper.published import TABLE1, TABLE2, Cell
-from evaluation.experiments.running import evaluate, fit_anew
+from evaluation.experiments.running import evaluate, fit_copy
 from evaluation.methods.method import Learner
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
@@ -45,16 +41,18 @@ if TYPE_CHECKING:
     from generator import Lut
 
 
-# The black body, kelvin, under which the print's colours are looked at: near what pictures are balanced for.
+# Colour temperature of the black body that prints are judged under, K: close to the white balance of pictures.
 DAYLIGHT_K: Final = 5600.0
 
 
 def noise_table(luts: Sequence[Lut]) -> Table:
-    """Return how bright and noisy the white of tables' prints is, percent: what White-Patch lives on.
+    """Return level and noise of the white patch in LUTs, percent; they determine the errors of White-Patch.
 
-    Medians over the lights: of the white cell's brightest channel over saturation, of the standard deviation of its
-    samples over their mean, and of the largest of them over their mean, less 1.
+    Medians over the illuminants: brightest channel over saturation level; standard deviation of the samples over their
+    mean; largest sample over their mean, minus 1.
     """
+    # The White-Patch errors of the paper's 550D LUTs (means of 9 to 26°) are too large for noise. A hot photosite can
+    # exceed every white of its channel; `sim table --hot` makes LUTs with hot photosites.
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:
         white = np.asarray(lut.samples[:, -1], dtype=np.float64)
@@ -62,77 +60,72 @@ def noise_table(luts: Sequence[Lut]) -> Table:
         level = np.median(mean.max(axis=1)) / lut.provenance.white_level
         spread = np.median(white.std(axis=1, ddof=1) / mean, axis=0)
         largest = np.median(white.max(axis=1) / mean - 1, axis=0)
-        rows.append((lut.provenance.camera, len(white), *(100 * float(part) for part in (level, *spread, *largest))))
+        rows.append((lut.provenance.camera, len(white), *(100 * float(value) for value in (level, *spread, *largest))))
     columns = ("Camera", "Lights", "White, % of saturation", "Spread of its samples R, %", "G, %", "B, %")
     return Table(
-        "The print's white in the tables: medians over the lights",
+        "White of the print in the look-up tables: medians over the illuminants",
         (*columns, "Largest sample above the mean R, %", "G, %", "B, %"),
         tuple(rows),
     )
 
 
 def print_table(luts: Sequence[Lut]) -> Table:
-    """Return the mean and root mean square of all colours of tables' prints: what Gray-world and its like see.
+    """Return mean and root mean square of all colours of prints; they determine the errors of Gray-world and its kind.
 
-    Percent of the white of the black body nearest to `DAYLIGHT_K`, or of the table's first light; with the angle from
-    grey.
+    Percent of the white of the black body nearest to `DAYLIGHT_K`, or of the first illuminant; and the angle from grey.
     """
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:
-        away = [abs(light.cct_k - DAYLIGHT_K) if light.cct_k else np.inf for light in lut.illuminations]
-        light = int(np.argmin(away))
+        distances_k = [abs(light.cct_k - DAYLIGHT_K) if light.cct_k else np.inf for light in lut.illuminations]
+        light = int(np.argmin(distances_k))
         reflected = np.asarray(lut.samples[light], dtype=np.float64).reshape(-1, 3) / lut.white[light]
         means = {"mean": reflected.mean(axis=0), "root mean square": np.sqrt((reflected**2).mean(axis=0))}
         for name, values in means.items():
             angle = float(angles_deg(values, (1.0, 1.0, 1.0)))
-            rows.append((lut.provenance.camera, light, name, *(100 * float(part) for part in values), angle))
+            rows.append((lut.provenance.camera, light, name, *(100 * float(value) for value in values), angle))
     return Table(
-        "All colours of the print together, % of the light's white",
+        "All colours of the print together, % of the white",
         ("Camera", "Light", "Of all colours", "R, %", "G, %", "B, %", "From grey, degrees"),
         tuple(rows),
     )
 
 
-_Thing = TypeVar("_Thing")
+_Item = TypeVar("_Item")
 
-# The methods of the table, by their names on the command line.
+# Methods of table 1, by their names on the command line.
 METHODS: Final = ("white-patch", "gray-world", "shades-of-gray")
 
-# Side of an image, px; White-Patch takes the largest of so many noisy values, and its error grows with them.
+# Default side of an image, px. White-Patch takes the largest of noisy values, so its error grows with the side.
 SIDE: Final = 512
 
-# Most images of a data set on which sizes and hot photosites are studied: their medians differ by more than chance
-# among 64, and every image of 1024 px is drawn for each of them.
-STUDIED: Final = 64
+# Most images for the study of image sizes. Among 64, medians differ by more than chance; more would cost time, because
+# every image of 1024 px is drawn again for each size.
+MAX_STUDIED: Final = 64
 
-# The paper's names of its cameras, by those that tables have.
+# Camera name in a LUT to the name of the sensor in the paper.
 SENSORS: Final[Mapping[str, str]] = {"Canon EOS 550D": "550D", "Canon EOS 6D Mark II": "6D"}
 
-# Names of pictures and of ground truths of which nothing is said: the paper has no numbers of them.
-OWN: Final = ("Given", "Given")
+# Names of pictures and of ground truths without published numbers.
+UNPUBLISHED: Final = ("Given", "Given")
 
-# What a row of numbers is about, in CSV.
-_HEAD: Final = ("scenes", "sensor", "illuminations", "images", "method", "error")
+# Columns of a CSV row before the statistics.
+_BLOCK_COLUMNS: Final = ("scenes", "sensor", "illuminations", "images", "method", "error")
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One of the eight data sets and what the methods made of it.
+    """One of the eight data sets, with the results of the methods."""
 
-    - `cell`: scenes, sensor and illuminations, as the paper names them: ``("C1", "6D", "Random")``; the paper's numbers
-      are found by it, so other scenes and lights have names of their own.
-    - `lights`: how their lights were chosen, in words.
-    - `results`: one a method, in the order of `METHODS`; empty before it is evaluated.
-    """
-
+    # Scenes, sensor and illuminants as the paper names them: ``("C1", "6D", "Random")``. Published numbers are looked
+    # up by it, so other scenes and illuminants need other names.
     cell: Cell
     scenes: tuple[RenderedScene, ...]
-    lights: str
-    results: tuple[Result, ...] = ()
+    lights: str  # Method of choosing the illuminants, as text
+    results: tuple[Result, ...] = ()  # One for each method, in the order of `METHODS`; empty before evaluation
 
 
 def sensor_of(lut: Lut) -> str:
-    """Return the paper's name of a table's camera, or the camera's own."""
+    """Return the paper's name of a LUT's camera, else the camera's own name."""
     return SENSORS.get(lut.provenance.camera, lut.provenance.camera)
 
 
@@ -142,77 +135,76 @@ def settings(
     truths: npt.NDArray[np.float64],
     side: int = SIDE,
     seed: int = 0,
-    names: tuple[str, str] = OWN,
+    names: tuple[str, str] = UNPUBLISHED,
 ) -> tuple[Block, ...]:
-    """Return the data sets of the table in the paper's order: scenes, then tables, then lights.
+    """Return the data sets of table 1 in the order of the paper: scenes, then LUTs, then illuminants.
 
-    `truths`: (N, 3) float64 ≥ 0, the ground truths that the first choice of lights is to be like; linear camera RGB of
-    any length, taken as they are although another camera saw them, as in the paper. `side`: longest side of every
-    image, px.
+    `truths`: (N, 3) float64 ≥ 0, ground truths for the first choice of illuminants; linear camera RGB of any length,
+    used unchanged although they are from another camera, as in the paper. `side`: longest side of every image, px.
     """
     count = len(pictures)
     if not count:
-        raise InputError("there is no picture to print; name some")
+        raise InputError("there are 0 pictures, expected at least one; name some")
     sets: dict[str, Sequence[Source]] = {
         names[0]: [ScaledSource(picture, side) for picture in pictures],
         "Random": random_scenes(count, side, side, seed),
     }
-    found: list[Block] = []
+    blocks: list[Block] = []
     for scenes, sources in sets.items():
         for lut in luts:
             choices: dict[str, ChosenLights] = {
                 names[1]: lights_like(lut, truths, count),
                 "Random": lights_at_random(lut, count, seed),
             }
-            found += [
-                Block((scenes, sensor_of(lut), lights), rendered(lut, sources, chosen, seed), chosen.how)
-                for lights, chosen in choices.items()
+            blocks += [
+                Block((scenes, sensor_of(lut), lights), render_scenes(lut, sources, choice, seed), choice.how)
+                for lights, choice in choices.items()
             ]
-    return tuple(found)
+    return tuple(blocks)
 
 
-def thinned(things: Sequence[_Thing], most: int = STUDIED) -> Sequence[_Thing]:
-    """Return at most `most` of the things, evenly spaced.
+def evenly_spaced(items: Sequence[_Item], max_count: int = MAX_STUDIED) -> Sequence[_Item]:
+    """Return at most `max_count` of the items, evenly spaced.
 
     Examples
     --------
-    >>> [source.number for source in thinned(random_scenes(7, 4, 4), 3)]
+    >>> [source.number for source in evenly_spaced(random_scenes(7, 4, 4), 3)]
     [0, 2, 4]
     """
-    count = min(len(things), most)
-    return [things[place * len(things) // count] for place in range(count)]
+    count = min(len(items), max_count)
+    return [items[index * len(items) // count] for index in range(count)]
 
 
-def table1(chosen: Sequence[Block], workers: int = 1, on_scene: Callable[[], None] | None = None) -> tuple[Block, ...]:
-    """Return the data sets with what the methods make of each."""
+def table1(blocks: Sequence[Block], workers: int = 1, on_scene: Callable[[], None] | None = None) -> tuple[Block, ...]:
+    """Return the data sets with the results of the methods."""
     methods = [standard_methods()[name] for name in METHODS]
-    return tuple(replace(part, results=evaluate(part.scenes, methods, workers, on_scene)) for part in chosen)
+    return tuple(replace(block, results=evaluate(block.scenes, methods, workers, on_scene)) for block in blocks)
 
 
 def block_title(cell: Cell) -> str:
-    """Return the paper's head of a data set.
+    """Return the title of a data set as in the paper.
 
     Examples
     --------
     >>> block_title(("C1", "6D", "Random"))
     'C1 scenes, 6D sensor, random illuminations'
     """
-    scenes, sensor, lights = (part.lower() if part == "Random" else part for part in cell)
+    scenes, sensor, lights = (name.lower() if name == "Random" else name for name in cell)
     return f"{scenes[0].upper()}{scenes[1:]} scenes, {sensor} sensor, {lights} illuminations"
 
 
-def block_table(block: Block, kind: ErrorKind) -> Table:
-    """Return the table of one data set: each method's six numbers, and below them the paper's where it has some."""
+def block_table(block: Block, metric: ErrorKind) -> Table:
+    """Return the table of one data set: statistics of each method, followed by the published ones if there are any."""
     published = TABLE1.get(block.cell, {})
     rows: list[tuple[str | float | None, ...]] = []
     for result in block.results:
-        rows.append((result.marked_name, *result.summary(kind).as_tuple()))
+        rows.append((result.marked_name, *result.summary(metric).as_tuple()))
         if result.method in published:
             rows.append(("paper", *published[result.method].as_tuple()))
-    notes = [f"{counted(len(block.scenes), 'image')}; lights {block.lights}."]
+    notes = [f"{counted(len(block.scenes), 'image')}; illuminants {block.lights}."]
     notes += [
-        f"{result.method}: no usable pixel in {counted(int(result.guessed.sum()), 'image')}, whose light "
-        "was taken to be grey."
+        f"{result.method}: no usable pixel in {counted(int(result.guessed.sum()), 'image')}; grey was used as "
+        "their estimate."
         for result in block.results
         if result.guessed.any()
     ]
@@ -220,35 +212,27 @@ def block_table(block: Block, kind: ErrorKind) -> Table:
 
 
 def joint_table(blocks: Sequence[Block]) -> Table:
-    """Return all data sets, both kinds of error and the paper's numbers as one table, for CSV."""
+    """Return all data sets, both kinds of error and the published numbers as one table, for CSV."""
     kinds: tuple[ErrorKind, ...] = ("reproduction", "recovery")
     rows: list[tuple[str | float | None, ...]] = []
     for block in blocks:
         published = TABLE1.get(block.cell, {})
         for result in block.results:
-            head = (*block.cell, len(block.scenes), result.method)
-            given = {str(kind): result.summary(kind).as_tuple() for kind in kinds}
+            row_start = (*block.cell, len(block.scenes), result.method)
+            statistics = {str(metric): result.summary(metric).as_tuple() for metric in kinds}
             if result.method in published:
-                given["paper"] = published[result.method].as_tuple()
-            rows += [(*head, name, *numbers) for name, numbers in given.items()]
-    return Table(
-        "Errors on generated data sets, degrees",
-        (*_HEAD, *STATISTICS_COLUMNS[:6]),
-        tuple(rows),
-    )
+                statistics["paper"] = published[result.method].as_tuple()
+            rows += [(*row_start, name, *numbers) for name, numbers in statistics.items()]
+    return Table("Errors on generated data sets, degrees", (*_BLOCK_COLUMNS, *STATISTICS_COLUMNS[:6]), tuple(rows))
 
 
 @dataclass(frozen=True)
 class SizeRow:
-    """Median errors of the methods on one data set whose images have one side.
-
-    - `side`: longest side of the images, px.
-    - `medians`: median reproduction errors, degrees, by method.
-    """
+    """Median errors of the methods on one data set with images of one size."""
 
     cell: Cell
-    side: int
-    medians: Mapping[str, float]
+    side: int  # Longest side of the images, px
+    medians: Mapping[str, float]  # Median reproduction error by method, degrees
 
 
 def size_dependence(
@@ -258,22 +242,22 @@ def size_dependence(
     sides: Sequence[int],
     seed: int = 0,
     workers: int = 1,
-    names: tuple[str, str] = OWN,
+    names: tuple[str, str] = UNPUBLISHED,
 ) -> tuple[SizeRow, ...]:
-    """Return the methods' median reproduction errors for images of several sizes, of `STUDIED` pictures at most.
+    """Return the median reproduction errors for images of several sizes, of at most `MAX_STUDIED` pictures.
 
-    `truths`: (N, 3) float64, as of `settings`. `sides`: longest sides of the images, px.
+    `truths`: as in `settings`. `sides`: longest sides of the images, px.
     """
     rows: list[SizeRow] = []
     for side in sides:
-        for block in table1(settings(luts, thinned(pictures), truths, side, seed, names), workers):
+        for block in table1(settings(luts, evenly_spaced(pictures), truths, side, seed, names), workers):
             medians = {result.method: result.summary("reproduction").median for result in block.results}
             rows.append(SizeRow(block.cell, side, medians))
     return tuple(rows)
 
 
 def size_table(rows: Sequence[SizeRow]) -> Table:
-    """Return the medians of `size_dependence` as a table."""
+    """Return the table of median errors by image size."""
     names = list(dict.fromkeys(name for row in rows for name in row.medians))
     return Table(
         "Median reproduction error for images of several sizes, degrees",
@@ -282,7 +266,7 @@ def size_table(rows: Sequence[SizeRow]) -> Table:
     )
 
 
-# The learners of the table: our short names, and the paper's names.
+# Learners of table 2: names of this suite, and names in the paper.
 LEARNERS: Final[Mapping[str, str]] = {
     "regression-trees": "Regression trees (simple features)",
     "smart-color-cat": "Smart Color Cat",
@@ -291,11 +275,8 @@ LEARNERS: Final[Mapping[str, str]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Trained:
-    """What one learner reaches, trained on real and on generated images.
-
-    `real`, `generated`: its results on the real images.
-    """
+class TrainingComparison:
+    """Results of one learner on the real images, trained on `real` images (cross-validated) and on `generated` ones."""
 
     learner: str
     real: Result
@@ -310,47 +291,49 @@ def table2(
     seed: int = 0,
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
-) -> tuple[Trained, ...]:
-    """Return the results of each learner, trained on real and on generated images.
-
-    `folds`: (N,) int64, the fold of each real image.
-    """
+) -> tuple[TrainingComparison, ...]:
+    """Return the results of each learner, trained on real and on generated images; `folds`: (N,) int64."""
     if not generated or not learners:
-        raise InputError(f"{len(learners)} learners and {len(generated)} generated images: name at least one of each")
-    chosen = list(learners.values())
-    crossed = cross_validate(real, chosen, folds, seed, workers, on_scene)
-    fitted = [fit_anew(learner, generated, seed) for learner in chosen]
-    moved = evaluate(real, fitted, workers, on_scene)
-    return tuple(Trained(name, *both) for name, *both in zip(learners, crossed, moved, strict=True))
+        raise InputError(
+            f"{len(learners)} learners and {len(generated)} generated images, expected at least one each; name some"
+        )
+    learner_list = list(learners.values())
+    cross_validated = cross_validate(real, learner_list, folds, seed, workers, on_scene)
+    fitted = [fit_copy(learner, generated, seed) for learner in learner_list]
+    transferred = evaluate(real, fitted, workers, on_scene)
+    pairs = zip(learners, cross_validated, transferred, strict=True)
+    return tuple(TrainingComparison(*pair) for pair in pairs)
 
 
-def table2_tables(found: Sequence[Trained], kind: ErrorKind, name: str, with_published: bool = True) -> list[Table]:
-    """Return the two halves of the paper's table, and the ratios of their medians."""
-    heads: Mapping[str, str] = {
+def table2_tables(
+    comparisons: Sequence[TrainingComparison], metric: ErrorKind, name: str, with_published: bool = True
+) -> list[Table]:
+    """Return the two halves of table 2, and the ratios of their medians."""
+    titles: Mapping[str, str] = {
         "real": f"Trained and tested on {name} (through cross-validation)",
         "generated": f"Trained on the generated data set and tested on {name}",
     }
     tables: list[Table] = []
-    for training, title in heads.items():
+    for training, title in titles.items():
         rows: list[tuple[str | float | None, ...]] = []
         published = TABLE2["real" if training == "real" else "generated"]
-        for trained in found:
+        for trained in comparisons:
             result = trained.real if training == "real" else trained.generated
-            rows.append((result.marked_name, *result.summary(kind).as_tuple()))
-            known = published.get(LEARNERS.get(trained.learner, ""))
-            if known and with_published:
-                rows.append(("paper", *known.as_tuple()))
+            rows.append((result.marked_name, *result.summary(metric).as_tuple()))
+            published_row = published.get(LEARNERS.get(trained.learner, ""))
+            if published_row and with_published:
+                rows.append(("paper", *published_row.as_tuple()))
         tables.append(Table(title, PAPER_COLUMNS, tuple(rows)))
-    return [*tables, _ratios(found, kind, name)]
+    return [*tables, _ratio_table(comparisons, metric, name)]
 
 
-def _ratios(found: Sequence[Trained], kind: ErrorKind, name: str) -> Table:
+def _ratio_table(comparisons: Sequence[TrainingComparison], metric: ErrorKind, name: str) -> Table:
     rows: list[tuple[str | float | None, ...]] = []
-    for trained in found:
-        ours = trained.generated.summary(kind).median / trained.real.summary(kind).median
-        paper = LEARNERS.get(trained.learner)
-        theirs = TABLE2["generated"][paper].median / TABLE2["real"][paper].median if paper else None
-        rows.append((trained.real.method, ours, theirs))
+    for trained in comparisons:
+        ratio = trained.generated.summary(metric).median / trained.real.summary(metric).median
+        paper_name = LEARNERS.get(trained.learner)
+        published = TABLE2["generated"][paper_name].median / TABLE2["real"][paper_name].median if paper_name else None
+        rows.append((trained.real.method, ratio, published))
     return Table(
         f"Median trained on generated images over median trained on real ones, tested on {name}",
         ("Algorithm", "Ratio", "In the paper, on Cube+"),

@@ -1,1 +1,1 @@
-"""What generated data are worth: methods trained on them and tested on real images, beside what they are held to."""
+"""Benefit of generated training data: methods trained on them and tested on real images, with baselines."""

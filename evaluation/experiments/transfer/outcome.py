@@ -1,8 +1,7 @@
-"""What a transfer comes to: statistics with their intervals, ratios of rows, their tables, and the results folder.
+"""Outcome of a transfer: statistics with intervals, ratios of rows, tables, and the results folder.
 
-With several seeds a statistic is the mean of the statistics of the seeds, not that of their errors together, and a
-resample is of images: one that is drawn counts in every seed. So the interval states what other test images would have
-given; the spread over seeds is stated apart.
+With several seeds, a statistic is the mean over the seeds of their statistics. A resample draws images, which are then
+used for every seed. The interval therefore describes other test images; the spread over seeds is given separately.
 """
 
 from __future__ import annotations
@@ -19,14 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.generated import GeneratedScene
-from evaluation.experiments.bootstrap import (
-    LEVEL,
-    STATISTICS,
-    BoundedFigure,
-    ErrorSample,
-    bounded_figures,
-    ratio_of,
-)
+from evaluation.experiments.bootstrap import LEVEL, STATISTICS, BoundedFigure, ErrorSample, bounded_figures, safe_ratio
 from evaluation.experiments.folds import folds_to_csv, groups_of
 from evaluation.experiments.transfer.plan import TransferPlan, is_generated
 from evaluation.experiments.transfer.rows import NAIVE, TransferRow
@@ -47,48 +39,35 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RowFigures:
-    """What one row comes to.
-
-    - `statistics`: in the order of `bootstrap.STATISTICS`, degrees.
-    - `spread`: standard deviation of each statistic over the seeds, degrees; None with a single one.
-    """
+    """Statistics of one row."""
 
     row: TransferRow
-    statistics: tuple[BoundedFigure, ...]
+    statistics: tuple[BoundedFigure, ...]  # In the order of `bootstrap.STATISTICS`, degrees
+    # Standard deviation of each statistic over the seeds, degrees; None with a single seed
     spread: tuple[float, ...] | None
 
 
 @dataclass(frozen=True)
 class RowRatio:
-    """What a row comes to in parts of another with the same method, image by image on the same resamples.
+    """Statistics of a row relative to those of another row with the same method, paired by image."""
 
-    - `row`, `base`: the row, and what it is held to.
-    - `ratios`: in the order of `bootstrap.STATISTICS`.
-    """
-
+    # Numerator and denominator of the ratios
     row: TransferRow
     base: TransferRow
-    ratios: tuple[BoundedFigure, ...]
+    ratios: tuple[BoundedFigure, ...]  # In the order of `bootstrap.STATISTICS`
 
 
 @dataclass(frozen=True)
 class TransferFigures:
-    """All that is told of the rows.
-
-    - `error`: the kind of error.
-    - `rows`: every row with its statistics.
-    - `to_real`: every row that was trained elsewhere against the same method's real cross-validation.
-    - `to_naive`: every generated row against the naive rows of the same pictures and lights.
-    - `to_better`: every row adapted to N real images against the better in the mean of real images alone and of its set
-      alone.
-    - `to_naive_adapted`: every adapted generated row against its naive ones, adapted to the same images.
-    """
+    """All figures of the rows."""
 
     error: ErrorKind
-    rows: tuple[RowFigures, ...]
-    to_real: tuple[RowRatio, ...]
-    to_naive: tuple[RowRatio, ...]
+    rows: tuple[RowFigures, ...]  # Every row with its statistics
+    to_real: tuple[RowRatio, ...]  # Rows trained on other data, relative to real cross-validation of the same method
+    to_naive: tuple[RowRatio, ...]  # Generated rows relative to the naive rows of the same pictures and illuminants
+    # Adapted rows relative to the better (by mean error) of real images alone and the set alone
     to_better: tuple[RowRatio, ...] = ()
+    # Adapted generated rows relative to naive rows adapted to the same images
     to_naive_adapted: tuple[RowRatio, ...] = ()
 
 
@@ -99,130 +78,125 @@ def figures_of(rows: Sequence[TransferRow], error: ErrorKind, groups: Sequence[s
     group.
     """
     samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]
-    values = [np.mean([one.estimate() for one in several], axis=0) for several in samples]
+    values = [np.mean([sample.estimate() for sample in seeds], axis=0) for seeds in samples]
     pairs = _pairs(rows, [float(value[0]) for value in values])
 
-    def numbers(counts: npt.NDArray[np.int64]) -> Floats:
-        known = [np.mean([one.statistics(counts) for one in several], axis=0) for several in samples]
-        ratios = [ratio_of(known[row], known[base]) for several in pairs.values() for row, base in several]
-        return np.concatenate([*known, *ratios], axis=1)
+    def statistics(counts: npt.NDArray[np.int64]) -> Floats:
+        means = [np.mean([sample.statistics(counts) for sample in seeds], axis=0) for seeds in samples]
+        ratios = [safe_ratio(means[row], means[base]) for indices in pairs.values() for row, base in indices]
+        return np.concatenate([*means, *ratios], axis=1)
 
-    made = _batches(bounded_figures(numbers, len(samples[0][0].order), groups))
-    listed = tuple(RowFigures(row, next(made), _spread(several)) for row, several in zip(rows, samples, strict=True))
+    figures = _batches(bounded_figures(statistics, len(samples[0][0].order), groups))
+    entries = tuple(RowFigures(row, next(figures), _spread(seeds)) for row, seeds in zip(rows, samples, strict=True))
     ratios = {
-        name: tuple(RowRatio(rows[row], rows[base], next(made)) for row, base in several)
-        for name, several in pairs.items()
+        name: tuple(RowRatio(rows[row], rows[base], next(figures)) for row, base in indices)
+        for name, indices in pairs.items()
     }
-    return TransferFigures(error, listed, **ratios)
+    return TransferFigures(error, entries, **ratios)
 
 
 def _batches(figures: Sequence[BoundedFigure]) -> Iterator[tuple[BoundedFigure, ...]]:
-    several = iter(figures)
-    while batch := tuple(itertools.islice(several, len(STATISTICS))):
+    remaining = iter(figures)
+    while batch := tuple(itertools.islice(remaining, len(STATISTICS))):
         yield batch
 
 
 def _pairs(rows: Sequence[TransferRow], means: Sequence[float]) -> dict[str, list[tuple[int, int]]]:
-    """Return the places of each row and of what it is held to, by the name of the ratios in `TransferFigures`."""
-    pairs: dict[str, list[tuple[int, int]]] = {
-        "to_real": [],
-        "to_naive": [],
-        "to_better": [],
-        "to_naive_adapted": [],
-    }
-    for place, row in enumerate(rows):
-        for base, other in enumerate(rows):
-            if other.method != row.method:
+    """Return the indices of row and base of each ratio, by the field of `TransferFigures`."""
+    pairs: dict[str, list[tuple[int, int]]] = {"to_real": [], "to_naive": [], "to_better": [], "to_naive_adapted": []}
+    for index, row in enumerate(rows):
+        for base, base_row in enumerate(rows):
+            if base_row.method != row.method:
                 continue
-            if other.kind == "cross-validation" and row.kind not in ("cross-validation", "none") and not row.way:
-                pairs["to_real"].append((place, base))
-            if row.kind == "generated" and other.kind in NAIVE and other.data == row.data:
-                if not row.way and not other.way:
-                    pairs["to_naive"].append((place, base))
-                elif row.way == other.way == "adapted" and row.real == other.real:
-                    pairs["to_naive_adapted"].append((place, base))
-        if row.way == "adapted":
-            pairs["to_better"].append((place, min(_alone(rows, row), key=lambda base: means[base])))
+            has_other_training = row.kind not in ("cross-validation", "none") and not row.real_use
+            if base_row.kind == "cross-validation" and has_other_training:
+                pairs["to_real"].append((index, base))
+            if row.kind == "generated" and base_row.kind in NAIVE and base_row.data == row.data:
+                if not row.real_use and not base_row.real_use:
+                    pairs["to_naive"].append((index, base))
+                elif row.real_use == base_row.real_use == "adapted" and row.real == base_row.real:
+                    pairs["to_naive_adapted"].append((index, base))
+        if row.real_use == "adapted":
+            pairs["to_better"].append((index, min(_unadapted_rows(rows, row), key=lambda base: means[base])))
     return pairs
 
 
-def _alone(rows: Sequence[TransferRow], adapted: TransferRow) -> list[int]:
-    """Return the places of the rows of what an adapted row was made of: real images alone, and its set alone."""
-    wanted = {("alone", adapted.real, "real", ""), ("", "", adapted.kind, adapted.data)}
+def _unadapted_rows(rows: Sequence[TransferRow], adapted: TransferRow) -> list[int]:
+    row_keys = {("alone", adapted.real, "real", ""), ("", "", adapted.kind, adapted.data)}
     return [
-        number
-        for number, row in enumerate(rows)
+        index
+        for index, row in enumerate(rows)
         if row.method == adapted.method
-        and (row.way, row.real, row.kind, "" if row.kind == "real" else row.data) in wanted
+        and (row.real_use, row.real, row.kind, "" if row.kind == "real" else row.data) in row_keys
     ]
 
 
-def _spread(several: Sequence[ErrorSample]) -> tuple[float, ...] | None:
-    if len(several) < 2:
+def _spread(seeds: Sequence[ErrorSample]) -> tuple[float, ...] | None:
+    if len(seeds) < 2:
         return None
-    deviations = np.std([one.estimate() for one in several], axis=0, ddof=1)
-    return tuple(float(part) for part in deviations)
+    deviations = np.std([sample.estimate() for sample in seeds], axis=0, ddof=1)
+    return tuple(float(deviation) for deviation in deviations)
 
 
-# All six statistics stand in every table, since any one of them misleads alone.
-HEADS: Final = PAPER_COLUMNS[1:]
+# All six statistics are in every table, because a single one can mislead.
+STATISTIC_HEADS: Final = PAPER_COLUMNS[1:]
 
 
-def errors_table(found: TransferFigures, name: str, images: int) -> Table:
-    """Return the statistics of every row; of several seeds their means."""
-    without = [row for row in found.rows if not row.row.way]
+def errors_table(figures: TransferFigures, name: str, images: int) -> Table:
+    """Return the statistics of every row; with several seeds, their means."""
+    unadapted = [row for row in figures.rows if not row.row.real_use]
     notes = [
-        f"{row.row.method}, {row.row.training}: no light in {guessed.sum()} images; grey stands in for it"
-        for row in found.rows
+        f"{row.row.method}, {row.row.training}: no estimate for {guessed.sum()} images; grey was used instead"
+        for row in figures.rows
         if (guessed := row.row.results[0].guessed).any()
     ]
-    if any(row.spread for row in found.rows):
-        median = [row.spread[1] for row in found.rows if row.spread]
+    if any(row.spread for row in figures.rows):
+        median = [row.spread[1] for row in figures.rows if row.spread]
         notes.append(
             f"Means over seeds; the standard deviation of a median over seeds is up to {max(median):.2f} degrees."
         )
     return Table(
-        f"{name}: {found.error} angular error of {images} images, degrees",
-        ("Method", "Trained on", "Images", *HEADS),
-        tuple((*_heads(row.row), *(figure.value for figure in row.statistics)) for row in without),
+        f"{name}: {figures.error} angular error of {images} images, degrees",
+        ("Method", "Trained on", "Images", *STATISTIC_HEADS),
+        tuple((*_row_start(row.row), *(statistic.value for statistic in row.statistics)) for row in unadapted),
         notes=tuple(notes),
     )
 
 
-def intervals_table(found: TransferFigures, name: str) -> Table:
+def intervals_table(figures: TransferFigures, name: str) -> Table:
     """Return the confidence intervals of every row's statistics."""
     return Table(
         f"{name}: {LEVEL * 100:.0f} % intervals of these errors, degrees",
-        ("Method", "Trained on", "Images", *HEADS),
+        ("Method", "Trained on", "Images", *STATISTIC_HEADS),
         tuple(
-            (*_heads(row.row), *(f"{figure.low:.2f} – {figure.high:.2f}" for figure in row.statistics))
-            for row in found.rows
-            if not row.row.way
+            (*_row_start(row.row), *(f"{statistic.low:.2f} – {statistic.high:.2f}" for statistic in row.statistics))
+            for row in figures.rows
+            if not row.row.real_use
         ),
-        notes=("BCa bootstrap over the test images: what other images of the same kind would have given.",),
+        notes=("BCa bootstrap over the test images: range expected for other images of the same kind.",),
     )
 
 
-def real_ratios_table(found: TransferFigures, name: str) -> Table:
-    """Return every row in parts of the same method's cross-validation on the test images, real ones or not."""
-    made = any(one.base.data for one in found.to_real)
-    base = f"cross-validation on {name} (generated)" if made else "real cross-validation"
-    good = "as good as images of the test set, which are generated, not real" if made else "as good as real images"
+def real_ratios_table(figures: TransferFigures, name: str) -> Table:
+    """Return every row relative to cross-validation of the same method on the test images."""
+    is_generated_base = any(ratio.base.data for ratio in figures.to_real)
+    base_text = f"cross-validation on {name} (generated)" if is_generated_base else "real cross-validation"
+    meaning = f"as good as {'images of the generated test set' if is_generated_base else 'real images'}"
     return _ratios_table(
-        f"{name}: errors in parts of the same method's {base}",
-        [(one, one.row.training) for one in found.to_real],
-        f"With {LEVEL * 100:.0f} % intervals, paired by test image. 1: {good}.",
+        f"{name}: errors relative to the same method's {base_text}",
+        [(ratio, ratio.row.training) for ratio in figures.to_real],
+        f"With {LEVEL * 100:.0f} % intervals, paired by test image. 1: {meaning}.",
     )
 
 
-def naive_ratios_table(found: TransferFigures, name: str) -> Table | None:
-    """Return the generated rows in parts of the naive ones; None if there was no naive baseline."""
-    if not found.to_naive:
+def naive_ratios_table(figures: TransferFigures, name: str) -> Table | None:
+    """Return the generated rows relative to the naive rows; None without a naive baseline."""
+    if not figures.to_naive:
         return None
     return _ratios_table(
-        f"{name}: errors with generated images in parts of those with the same pictures and lights, but no table",
-        [(one, one.base.training) for one in found.to_naive],
-        "Paired by test image. Below 1: the table is worth something to this method.",
+        f"{name}: errors with generated images relative to those with the same pictures and illuminants without a LUT",
+        [(ratio, ratio.base.training) for ratio in figures.to_naive],
+        "Paired by test image. Below 1: the LUT improves this method.",
         "In parts of",
     )
 
@@ -231,181 +205,180 @@ def _ratios_table(
     title: str, ratios: Sequence[tuple[RowRatio, str]], note: str, second_head: str = "Trained on"
 ) -> Table:
     rows = tuple(
-        (one.row.method, said, one.row.images or None, one.base.images or None, *map(_written, one.ratios))
-        for one, said in ratios
+        (pair.row.method, label, pair.row.images or None, pair.base.images or None, *map(_ratio_text, pair.ratios))
+        for pair, label in ratios
     )
-    return Table(title, ("Method", second_head, "Images", "Base", *HEADS), rows, notes=(note, _BASE))
+    return Table(title, ("Method", second_head, "Images", "Base", *STATISTIC_HEADS), rows, notes=(note, _BASE_NOTE))
 
 
-_BASE: Final = "Images and Base: training images of the row, and of what it is held to."
+_BASE_NOTE: Final = "Images and Base: training images of the row, and of the row that it is relative to."
 
 
-def _written(figure: BoundedFigure) -> str:
+def _ratio_text(figure: BoundedFigure) -> str:
     return f"{figure.value:.2f} ({figure.low:.2f} – {figure.high:.2f})" if math.isfinite(figure.value) else "–"
 
 
-def beside_table(found: TransferFigures, name: str) -> Table | None:
-    """Return the mean errors beside N real images; None if there were none."""
-    known = {(row.row.method, row.row.training): row.statistics[0].value for row in found.rows}
-    better = {(one.row.method, one.row.training): _written(one.ratios[0]) for one in found.to_better}
-    of_real = next((one.row.data for one in found.rows if one.row.kind == "real"), "")
+def adaptation_table(figures: TransferFigures, name: str) -> Table | None:
+    """Return the mean errors with N real images; None if no real images were used."""
+    means = {(row.row.method, row.row.training): row.statistics[0].value for row in figures.rows}
+    ratios = {(ratio.row.method, ratio.row.training): _ratio_text(ratio.ratios[0]) for ratio in figures.to_better}
+    real_data = next((ratio.row.data for ratio in figures.rows if ratio.row.kind == "real"), "")
     rows: list[tuple[str | float | None, ...]] = []
-    for row in (each.row for each in found.rows if each.row.way == "adapted"):
-        alone = known.get((row.method, replace(row, kind="real", data=of_real, way="alone").training))
-        own = row.method, row.training
-        rows.append((*own[:1], row.material, row.real, alone, known[row.method, row.material], known[own], better[own]))
+    for row in (entry.row for entry in figures.rows if entry.row.real_use == "adapted"):
+        real_mean = means.get((row.method, replace(row, kind="real", data=real_data, real_use="alone").training))
+        key = row.method, row.training
+        set_mean = means[row.method, row.material]
+        rows.append((row.method, row.material, row.real, real_mean, set_mean, means[key], ratios[key]))
     if not rows:
         return None
     return Table(
-        f"{name}: mean {found.error} error beside N real images, degrees",
+        f"{name}: mean {figures.error} error with N real images, degrees",
         ("Method", "Set", "N", "N alone", "Set alone", "Adapted", "Adapted in parts of the better alone"),
         tuple(rows),
         notes=(
-            "The N are drawn from the other folds. Adapted: trained on the set, then adapted to N. All statistics are "
+            "N images of the other folds. Adapted: trained on the set, then adapted to N. All statistics are "
             "in results.csv.",
         ),
     )
 
 
-def harm_notes(found: TransferFigures) -> list[str]:
-    """Return what the reader is told of rows whose adapting made the mean error larger, beyond chance."""
+def harm_notes(figures: TransferFigures) -> list[str]:
+    """Return a note for each row whose adaptation increased the mean error significantly."""
     return [
-        f"{one.row.method}, {one.row.training}: adapting does harm, {_written(one.ratios[0])} of the mean error of "
-        f"{one.base.training} alone; use that"
-        for one in found.to_better
-        if one.ratios[0].low > 1
+        f"{ratio.row.method}, {ratio.row.training}: adaptation increases the mean error, "
+        f"{_ratio_text(ratio.ratios[0])} relative to {ratio.base.training} alone; use that instead"
+        for ratio in figures.to_better
+        if ratio.ratios[0].low > 1
     ]
 
 
-def naive_adapted_table(found: TransferFigures, name: str) -> Table | None:
-    """Return adapted generated rows in parts of adapted naive ones; None if there are none."""
-    if not found.to_naive_adapted:
+def naive_adapted_table(figures: TransferFigures, name: str) -> Table | None:
+    """Return adapted generated rows relative to adapted naive rows; None if there are none."""
+    if not figures.to_naive_adapted:
         return None
     rows = tuple(
-        (one.row.method, one.base.material, one.row.real, *map(_written, one.ratios)) for one in found.to_naive_adapted
+        (ratio.row.method, ratio.base.material, ratio.row.real, *map(_ratio_text, ratio.ratios))
+        for ratio in figures.to_naive_adapted
     )
     return Table(
-        f"{name}: errors with generated images in parts of those with naive ones, both adapted to N real images",
-        ("Method", "In parts of", "N", *HEADS),
+        f"{name}: errors with generated images relative to naive ones, both adapted to N real images",
+        ("Method", "In parts of", "N", *STATISTIC_HEADS),
         rows,
-        notes=("Paired by test image. Below 1: beside N real images the table is still worth something.",),
+        notes=("Paired by test image. Below 1: with N real images, the LUT still improves this method.",),
     )
 
 
-def long_table(found: TransferFigures) -> Table:
+def long_table(figures: TransferFigures) -> Table:
     """Return all numbers for other programs: a row for each method, training and statistic."""
-    to_real = {(one.row.method, one.row.training): one for one in found.to_real}
+    to_real = {(row_ratio.row.method, row_ratio.row.training): row_ratio for row_ratio in figures.to_real}
     rows: list[tuple[str | float | None, ...]] = []
-    for row in found.rows:
+    for row in figures.rows:
         ratio = to_real.get((row.row.method, row.row.training))
-        for place, statistic in enumerate(STATISTICS):
-            spread = row.spread[place] if row.spread else None
-            parts = map(finite_or_none, ratio.ratios[place]) if ratio else (None, None, None)
-            who = (row.row.method, row.row.kind, row.row.data, row.row.images, len(row.row.results))
-            beside = row.row.way, row.row.real
+        for index, statistic in enumerate(STATISTICS):
+            spread = row.spread[index] if row.spread else None
+            ratio_values = map(finite_or_none, ratio.ratios[index]) if ratio else (None, None, None)
+            row_columns = (row.row.method, row.row.kind, row.row.data, row.row.images, len(row.row.results))
+            numbers = *map(finite_or_none, row.statistics[index]), spread
             rows.append(
-                (*who, found.error, statistic, *map(finite_or_none, row.statistics[place]), spread, *parts, *beside)
+                (*row_columns, figures.error, statistic, *numbers, *ratio_values, row.row.real_use, row.row.real)
             )
-    return Table("All numbers", _LONG, tuple(rows))
+    return Table("All numbers", _LONG_COLUMNS, tuple(rows))
 
 
-# Columns of the file for other programs; empty where a row has no such number.
-_LONG: Final = (
+# Columns of results.csv; empty if a row has no such number.
+_LONG_COLUMNS: Final = (
     *("method", "training", "data", "images", "seeds", "error", "statistic"),
     *("degrees", "low", "high", "seed_sd", "ratio_to_real", "ratio_low", "ratio_high"),
     *("way", "real"),
 )
 
 
-def _heads(row: TransferRow) -> tuple[str, str, int | None]:
+def _row_start(row: TransferRow) -> tuple[str, str, int | None]:
     return row.method, row.training, row.images or None
 
 
-def beside_plot(found: TransferFigures) -> bytes:
-    """Return the mean error against N real images as SVG: a panel for each method, with 95 % intervals."""
+def adaptation_plot(figures: TransferFigures) -> bytes:
+    """Return the mean error against the number of real images as SVG: one panel for each method, 95 % intervals."""
     panels: dict[str, dict[str, dict[float, BoundedFigure]]] = {}
-    for each in found.rows:
-        row = each.row
-        label = "real alone" if row.way == "alone" else f"{row.material}, {row.way}"
-        if row.way:
-            place = math.inf if row.real == "all" else int(row.real)
-            panels.setdefault(row.method, {}).setdefault(label, {})[place] = each.statistics[0]
-    for each in found.rows:
-        for label, points in panels.get(each.row.method, {}).items():
-            if not each.row.way and label.startswith(f"{each.row.material}, "):
-                points[0] = each.statistics[0]
+    for entry in figures.rows:
+        row = entry.row
+        label = "real alone" if row.real_use == "alone" else f"{row.material}, {row.real_use}"
+        if row.real_use:
+            real_count = math.inf if row.real == "all" else int(row.real)
+            panels.setdefault(row.method, {}).setdefault(label, {})[real_count] = entry.statistics[0]
+    for entry in figures.rows:
+        for label, points in panels.get(entry.row.method, {}).items():
+            if not entry.row.real_use and label.startswith(f"{entry.row.material}, "):
+                points[0] = entry.statistics[0]
     return draw_svg(
-        _draw_beside, panels, found.error, inches=(max(4.6, 3.1 * len(panels) + 0.4), 5.2 if len(panels) == 1 else 4.4)
+        _draw_panels,
+        panels,
+        figures.error,
+        inches=(max(4.6, 3.1 * len(panels) + 0.4), 5.2 if len(panels) == 1 else 4.4),
     )
 
 
-def _draw_beside(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, BoundedFigure]]], error: str) -> None:
+def _draw_panels(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, BoundedFigure]]], error: str) -> None:
     grid = figure.subplots(1, len(panels), squeeze=False)[0]
     labels = list(dict.fromkeys(label for curves in panels.values() for label in curves))
     for axes, (method, curves) in zip(grid, panels.items(), strict=True):
         counts = sorted({count for points in curves.values() for count in points})
         for label, points in curves.items():
             style = series_style(labels.index(label))
-            places = np.array([counts.index(count) for count in sorted(points)]) + 0.06 * (labels.index(label) - 2)
-            values, lows, highs = (np.array(part) for part in zip(*(points[n] for n in sorted(points)), strict=True))
+            positions = np.array([counts.index(count) for count in sorted(points)]) + 0.06 * (labels.index(label) - 2)
+            values, lows, highs = (np.array(item) for item in zip(*(points[n] for n in sorted(points)), strict=True))
             axes.errorbar(
-                places, values, [values - lows, highs - values], marker="o", markersize=3, label=label, **style
+                positions, values, [values - lows, highs - values], marker="o", markersize=3, label=label, **style
             )
         axes.set_xticks(range(len(counts)), ["all" if math.isinf(count) else f"{count:g}" for count in counts])
         axes.set(title=method, xlabel="real images")
     grid[0].set_ylabel(f"mean {error} error, degrees")
-    handles, named = grid[0].get_legend_handles_labels()
-    # Names are long: beside one another they need the width of two panels.
+    handles, names = grid[0].get_legend_handles_labels()
+    # Names are long: two columns need the width of two panels.
     columns = min(2, len(panels))
-    labelled = [legend_label(name) for name in named]
+    labelled = [legend_label(name) for name in names]
     figure.legend(handles, labelled, loc="outside lower center", ncols=columns, fontsize=8)
 
 
 @dataclass(frozen=True, eq=False)
 class TransferOutcome:
-    """Everything that a transfer came to.
+    """Results of a transfer."""
 
-    - `test`: the test set, N images.
-    - `plan`: what was trained on.
-    - `rows`, `figures`: the results and what they come to.
-    - `folds`: for each seed the fold of each test image, (N,) int64.
-    - `settings`: what was asked for, as JSON has it.
-    """
-
-    test: SceneSet
-    plan: TransferPlan
+    test: SceneSet  # The test set, N images
+    plan: TransferPlan  # Training sets and notes
+    # Results and their statistics
     rows: tuple[TransferRow, ...]
     figures: TransferFigures
-    folds: tuple[npt.NDArray[np.int64], ...]
-    settings: Mapping[str, Any]
+    folds: tuple[npt.NDArray[np.int64], ...]  # For each seed the fold of each test image, (N,) int64
+    settings: Mapping[str, Any]  # Settings of the command, as JSON
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the tables in the order in which they are shown."""
-        found, name = self.figures, self.test.name
-        made = (
-            errors_table(found, name, len(self.test.scenes)),
-            intervals_table(found, name),
-            real_ratios_table(found, name),
-            naive_ratios_table(found, name),
-            beside_table(found, name),
-            naive_adapted_table(found, name),
+        """Return the tables in display order."""
+        figures, name = self.figures, self.test.name
+        tables = (
+            errors_table(figures, name, len(self.test.scenes)),
+            intervals_table(figures, name),
+            real_ratios_table(figures, name),
+            naive_ratios_table(figures, name),
+            adaptation_table(figures, name),
+            naive_adapted_table(figures, name),
         )
-        return tuple(table for table in made if table is not None)
+        return tuple(table for table in tables if table is not None)
 
 
 def labelled_results(rows: Sequence[TransferRow]) -> tuple[Result, ...]:
-    """Return the results of all rows, each under a name of its own: method, training and, of several, the seed."""
-    named: list[Result] = []
+    """Return the results of all rows with unique names: method, training and, with several seeds, the seed."""
+    labelled: list[Result] = []
     for row in rows:
         labels = row.labels(len(row.results))
-        named += [replace(result, method=label) for result, label in zip(row.results, labels, strict=True)]
-    return tuple(named)
+        labelled += [replace(result, method=label) for result, label in zip(row.results, labels, strict=True)]
+    return tuple(labelled)
 
 
 def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
-    """Write the result folder: `results.csv`, `errors.csv`, `folds.csv`, `tables.tex`, `report.html`, `run.json`.
+    """Write the results folder: results.csv, errors.csv, folds_SEED.csv, tables.tex, report.html, run.json.
 
-    Beside N real images `beside_real.svg`, too.
+    With real images also beside_real.svg.
     """
     names = [scene.name for scene in outcome.test.scenes]
     truths = np.stack([scene.truth for scene in outcome.test.scenes])
@@ -418,39 +391,39 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
         write_atomic(partial / "tables.tex", "\n".join(map(table_to_latex, outcome.tables())))
         write_atomic(partial / "report.html", report_page(outcome))
         if outcome.figures.to_better:
-            write_atomic(partial / "beside_real.svg", standalone_svg(beside_plot(outcome.figures)))
+            write_atomic(partial / "beside_real.svg", standalone_svg(adaptation_plot(outcome.figures)))
         write_atomic(partial / "run.json", json.dumps(_provenance(outcome), indent=2, ensure_ascii=False) + "\n")
 
 
 def report_page(outcome: TransferOutcome) -> str:
-    """Return the report as the text of one HTML file."""
+    """Return the report as HTML text."""
     test = outcome.test
-    parts = [
+    elements = [
         pages.paragraph(
             f"Learned methods trained on {_training_sets(outcome)} and tested on {len(test.scenes)} images of "
-            f"{test.name}{' (generated)' if is_generated(test) else ''}, beside the same methods cross-validated on "
-            "these images. Each row was trained on as many images as its column says."
+            f"{test.name}{' (generated)' if is_generated(test) else ''}, compared with cross-validation of the same "
+            "methods on these images. Column Images is the number of training images."
         ),
         *(table_part(table) for table in outcome.tables()),
     ]
     if outcome.figures.to_better:
-        parts.append(
+        elements.append(
             pages.figure(
-                beside_plot(outcome.figures), "Mean error against the number of real images; 0: the set alone."
+                adaptation_plot(outcome.figures), "Mean error against the number of real images; 0: the set alone."
             )
         )
-    parts.append(pages.heading("Conditions"))
-    parts += [pages.paragraph(note) for note in outcome.plan.notes]
-    parts += [pages.paragraph(f"{test.name}, {what}: {sentence}.") for what, sentence in test.treatment.items()]
-    parts.append(pages.paragraph(f"Settings: {json.dumps(dict(outcome.settings), ensure_ascii=False)}. {software()}."))
-    return pages.page(f"Transfer to {test.name}", parts)
+    elements.append(pages.heading("Conditions"))
+    elements += [pages.paragraph(note) for note in outcome.plan.notes]
+    elements += [pages.paragraph(f"{test.name}, {name}: {text}.") for name, text in test.treatment.items()]
+    settings = json.dumps(dict(outcome.settings), ensure_ascii=False)
+    elements.append(pages.paragraph(f"Settings: {settings}. {software()}."))
+    return pages.page(f"Transfer to {test.name}", elements)
 
 
 def _training_sets(outcome: TransferOutcome) -> str:
-    """Return the names of what was trained on, each said to be generated where it was."""
-    named = {some.data: some.kind for some in reversed(outcome.plan.training)}
-    listed = [f"{name} ({'not generated' if named[name] == 'other' else 'generated'})" for name in sorted(named)]
-    return ", ".join(listed)
+    kinds = {training_set.data: training_set.kind for training_set in reversed(outcome.plan.training)}
+    set_texts = [f"{name} ({'not generated' if kinds[name] == 'other' else 'generated'})" for name in sorted(kinds)]
+    return ", ".join(set_texts)
 
 
 def _provenance(outcome: TransferOutcome) -> dict[str, Any]:
@@ -459,30 +432,31 @@ def _provenance(outcome: TransferOutcome) -> dict[str, Any]:
         "version": 1,
         "software": software(),
         "settings": dict(outcome.settings),
-        "test": _described(outcome.test),
+        "test": _set_record(outcome.test),
         "training": [
-            {"data": some.data, "kind": some.kind, "images": len(some.scenes)} for some in outcome.plan.training
+            {"data": data_set.data, "kind": data_set.kind, "images": len(data_set.scenes)}
+            for data_set in outcome.plan.training
         ],
-        "training_sets": [_described(some) for some in outcome.plan.sets],
+        "training_sets": [_set_record(data_set) for data_set in outcome.plan.sets],
         "notes": list(outcome.plan.notes),
     }
 
 
-def _described(data: SceneSet) -> dict[str, Any]:
+def _set_record(data: SceneSet) -> dict[str, Any]:
     first = data.scenes[0]
-    described: dict[str, Any] = {
+    record: dict[str, Any] = {
         "name": data.name,
         "layout": data.layout,
-        "place": data.place,
+        "place": data.location,
         "images": len(data.scenes),
         "treatment": dict(data.treatment),
     }
     if isinstance(first, GeneratedScene):
-        about = first.dataset.description
-        described["generated"] = {
-            "software": about.software,
-            "table": about.table.model_dump(mode="json"),
-            "seed": about.seed,
-            "options": about.options,
+        description = first.dataset.description
+        record["generated"] = {
+            "software": description.software,
+            "table": description.table.model_dump(mode="json"),
+            "seed": description.seed,
+            "options": description.options,
         }
-    return described
+    return record

@@ -1,16 +1,18 @@
-"""What a transfer is to be: data sets opened, compared and cut to what may be trained on, before the work begins.
+"""Plan a transfer: open and compare data sets, and select the images that may be used for training.
 
-A method that has seen a test image, or its scene, is not tested. Generated images are compared by their source
-pictures: with another generated set by the hash of the file, with real images by the name, since a print of a
-photograph that is a test image shows the test image's scene. Real images are compared by name and by their pixels. A
-name is compared without folder and ending, capitals and case being one.
+A method must not have seen a test image or its scene. Images are compared by their sources:
 
-The naive baseline is, for each image of a generated data set, a scene of the same picture under the same light, as
-bright and as finely quantised, without a print, a camera or noise: codes become linear light by the sRGB curve, colours
-those of the camera by its matrix if one is given, and each channel is multiplied by the light. What a learned method
-gains by training on the generated image instead is what the table is worth. Several lights share the pixels of the
-counterpart by the masks of the generated image. What `generate --exposure` and `--iso` did to the generated image is
-not done to its counterpart, and a set under a gradient has none. Pictures are found again by name and hash.
+- two generated sets: by the hash of the source picture;
+- a generated and a real set: by name, because a generated image of a test photograph shows the same scene;
+- two real sets: by name and by pixels.
+
+Names are compared without folder and extension; upper and lower case are equal.
+
+The naive baseline is a counterpart of each generated image: the same picture under the same illuminant, equally bright
+and equally quantised, but without print, camera and noise. Its codes become linear light by the sRGB curve, optionally
+camera RGB by a colour matrix, and each channel is multiplied by the illuminant. The advantage of training on generated
+images over training on their counterparts is the benefit of the look-up table (LUT). Masks of several illuminants are
+those of the generated image. `generate --exposure` and `--iso` are not applied to counterparts.
 """
 
 from __future__ import annotations
@@ -42,106 +44,95 @@ from generator.rendering.matrices import ColourMatrix, camera_matrix
 
 @dataclass(frozen=True)
 class SharedImage:
-    """A training image that shows what a test image shows.
+    """A training image that shows the same as a test image."""
 
-    - `position`: its place in the training set, from 0.
-    - `name`: its name there, or that of its source picture.
-    - `test`: the test image's name, or that of its source picture.
-    - `by`: how it was found out: by "name" or by "content".
-    """
-
-    position: int
-    name: str
-    test: str
-    by: str
+    position: int  # Index in the training set, from 0
+    name: str  # Its name, or that of its source picture
+    test: str  # Name of the test image, or of its source picture
+    by: str  # Identified by "name" or by "content"
 
 
 def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]:
-    """Return the training images that test images share a picture or a scene with.
+    """Return the training images that share a picture or a scene with test images.
 
-    Pixels are read where both sets are real ones.
+    Pixels are read only if both sets are real.
     """
-    if _place(training) == _place(test):
+    if _resolved_location(training) == _resolved_location(test):
         raise InputError(
-            f"{test.place} is both training and test; errors of a data set that is tested on itself are found by "
-            "cross-validation: evaluate cv"
+            f"{test.location} is both training and test set, expected different sets; use evaluate cv to "
+            "cross-validate on one set"
         )
-    made = [isinstance(some.scenes[0], GeneratedScene) for some in (training, test)]
-    # Hashes of source pictures are always at hand; names and pixels are asked where one has none.
-    named, seen = not all(made), not any(made)
-    tests = {key: name for name, keys in _keys(test, named, seen) for key in keys}
+    are_generated = [isinstance(scene_set.scenes[0], GeneratedScene) for scene_set in (training, test)]
+    # Hashes of source pictures are always available; names and pixels are compared if one set has none.
+    with_names, with_pixels = not all(are_generated), not any(are_generated)
+    tests = {key: name for name, keys in _image_keys(test, with_names, with_pixels) for key in keys}
     shared: list[SharedImage] = []
-    for position, (name, keys) in enumerate(_keys(training, named, seen)):
-        found = next(((tests[key], key[0]) for key in keys if key in tests), None)
-        if found:
-            shared.append(SharedImage(position, name, *found))
+    for position, (name, keys) in enumerate(_image_keys(training, with_names, with_pixels)):
+        match = next(((tests[key], key[0]) for key in keys if key in tests), None)
+        if match:
+            shared.append(SharedImage(position, name, *match))
     return tuple(shared)
 
 
 def trainable_images(
-    training: SceneSet, test: SceneSet, leave_out: bool = True, called: str = "the test set"
+    training: SceneSet, test: SceneSet, leave_out: bool = True, test_name: str = "the test set"
 ) -> tuple[tuple[Scene, ...], str]:
-    """Return the images of a set that may be trained on, and in words what it shares with the test, "" for nothing.
+    """Return the images of a set that may be used for training, and a note on images shared with the test ("" if none).
 
-    `leave_out`: whether images that show a picture of the test are left out. If not, copies of test images are refused.
+    `leave_out`: excludes images that show a picture of the test; otherwise copies of test images are refused.
     """
-    common = shared_images(training, test)
-    if not common:
+    shared_list = shared_images(training, test)
+    if not shared_list:
         return training.scenes, ""
-    shared = (
-        f"{len(common)} of {len(training.scenes)} images of {training.name} are also in {called}, by {common[0].by}: "
-        f"{first_few([one.name for one in common], 3)}"
+    note = (
+        f"{len(shared_list)} of {len(training.scenes)} images of {training.name} are also in {test_name}, by "
+        f"{shared_list[0].by}: {first_few([image.name for image in shared_list], 3)}"
     )
     if leave_out:
-        dropped = {one.position for one in common}
-        return tuple(scene for place, scene in enumerate(training.scenes) if place not in dropped), shared
-    if any(one.by == "content" for one in common):
-        raise InputError(f"{shared}; what is tested must be unseen: --unseen trains without them")
-    return training.scenes, shared
+        shared_positions = {image.position for image in shared_list}
+        return tuple(scene for position, scene in enumerate(training.scenes) if position not in shared_positions), note
+    if any(image.by == "content" for image in shared_list):
+        raise InputError(f"{note}, expected test images that are not in the training set; use --unseen to exclude them")
+    return training.scenes, note
 
 
-_Key = tuple[str, str]  # How an image is known, "name" or "content", and by what
+_Key = tuple[str, str]  # "name" or "content", and the name or the hash
 
 
-def _keys(scenes: SceneSet, named: bool, seen: bool) -> list[tuple[str, list[_Key]]]:
-    """Return the name of each image, or of its source, and the keys that it is known by."""
-    known: dict[int, Mapping[str, str]] = {}
-    listed: list[tuple[str, list[_Key]]] = []
+def _image_keys(scenes: SceneSet, with_names: bool, with_pixels: bool) -> list[tuple[str, list[_Key]]]:
+    """Return the name of each image, or of its source picture, with its keys for comparison."""
+    digests: dict[int, Mapping[str, str]] = {}
+    image_keys: list[tuple[str, list[_Key]]] = []
     for scene in scenes.scenes:
         if isinstance(scene, GeneratedScene):
             name = scene.entry.source
-            keys: list[_Key] = [("content", source_marks(scene.dataset, known)[name])]
+            keys: list[_Key] = [("content", source_marks(scene.dataset, digests)[name])]
         else:
             name = scene.name
-            keys = [("content", sha256_of(np.ascontiguousarray(scene.read()[0], np.float32)))] if seen else []
-        if named:
+            keys = [("content", sha256_of(np.ascontiguousarray(scene.read()[0], np.float32)))] if with_pixels else []
+        if with_names:
             keys.append(("name", PurePosixPath(name).stem.lower()))
-        listed.append((name, keys))
-    return listed
+        image_keys.append((name, keys))
+    return image_keys
 
 
-def _place(scenes: SceneSet) -> str:
-    return scenes.place.rstrip("/") if "://" in scenes.place else str(Path(scenes.place).resolve())
+def _resolved_location(scenes: SceneSet) -> str:
+    return scenes.location.rstrip("/") if "://" in scenes.location else str(Path(scenes.location).resolve())
 
 
 @dataclass(frozen=True)
 class FoundPicture:
-    """A source picture of a data set that was found again.
-
-    - `name`: its name in the data set.
-    - `path`: its file; None for a picture of random colours, which is made again.
-    - `height`, `width`: its size in the data set, px.
-    - `preparation`: how it was prepared.
-    """
+    """A source picture of a data set, located in a folder."""
 
     name: str
-    path: Path | None
+    path: Path | None  # Its file; None for a picture of random colours, which is generated again
+    # Its size in the data set, px
     height: int
     width: int
     preparation: Preparation
 
     def codes(self, crop: int = 0) -> npt.NDArray[np.uint8]:
-        """Return the sRGB codes (H, W, 3) uint8 that images of the data set were made of: those of one of its crops."""
+        """Return the sRGB codes (H, W, 3) uint8 from which images of the data set, or one of its crops, were made."""
         if self.path is None:
             number = int(self.name.rpartition("-")[2])
             return RandomScene(number, self.width, self.height, self.preparation.seed).read().picture
@@ -149,51 +140,51 @@ class FoundPicture:
         picture = reading.cuts[crop].picture if reading.cuts else reading.picture
         if picture.shape[:2] != (self.height, self.width):
             raise FormatError(
-                f"{self.path} comes to {picture.shape[1]}x{picture.shape[0]} px where images of it are "
-                f"{self.width}x{self.height}; use the release that made the data set"
+                f"{self.path} is prepared to {picture.shape[1]}x{picture.shape[0]} px, expected "
+                f"{self.width}x{self.height} px, as in the data set; use the release that made the data set"
             )
         return picture
 
 
-def find_sources(dataset: Dataset, place: Path | str) -> tuple[Mapping[str, FoundPicture], tuple[str, ...]]:
-    """Return the source pictures of a data set that a folder holds, by name, and the names of those that it lacks.
+def find_source_pictures(dataset: Dataset, folder: Path | str) -> tuple[Mapping[str, FoundPicture], tuple[str, ...]]:
+    """Return the source pictures of a data set in a folder, by name, and the names of missing ones.
 
-    A picture is the one that is meant if its bytes have the hash that the data set records; a file of that name is
-    tried first, then files of other names. Pictures of random colours need no file.
+    A file is the right one if its hash is the recorded one; the file with the recorded name is tried first. Pictures of
+    random colours need no file.
     """
     preparation = preparation_of(dataset.description)
-    if "://" in str(place):
-        raise InputError(f"{place} is no folder of this machine; copy the pictures to one")
-    # A set of random colours needs no folder, but one that is named must be there.
-    files = {file.name: Path(file.location) for file in find_pictures(place)}
+    if "://" in str(folder):
+        raise InputError(f"{folder} is a URL, expected a folder of this machine; copy the pictures to one")
+    # A set of random colours needs no folder, but a folder that is given must exist.
+    files = {file.name: Path(file.location) for file in find_pictures(folder)}
 
     @cache
     def hash_of(name: str) -> str:
         try:
             return file_sha256(files[name])
         except OSError as error:
-            told = os.strerror(error.errno or 0)
-            raise InputError(f"cannot read {files[name]}: {told}; name another folder") from error
+            reason = os.strerror(error.errno or 0)
+            raise InputError(f"cannot read {files[name]}: {reason}; name another folder") from error
 
     @cache
     def by_hash() -> Mapping[str, Path]:
         return {hash_of(name): path for name, path in files.items()}
 
-    found: dict[str, FoundPicture] = {}
+    found_pictures: dict[str, FoundPicture] = {}
     missing: list[str] = []
     for record in dataset.sources:
         path = None
         if record.sha256 is not None:
-            same = record.name in files and hash_of(record.name) == record.sha256
-            path = files[record.name] if same else by_hash().get(record.sha256)
+            is_same_file = record.name in files and hash_of(record.name) == record.sha256
+            path = files[record.name] if is_same_file else by_hash().get(record.sha256)
         if path is None and record.sha256 is not None:
             missing.append(record.name)
         else:
-            found[record.name] = FoundPicture(record.name, path, record.height, record.width, preparation)
-    return found, tuple(missing)
+            found_pictures[record.name] = FoundPicture(record.name, path, record.height, record.width, preparation)
+    return found_pictures, tuple(missing)
 
 
-_LINEAR: Final = decode_srgb(np.arange(256) / 255)  # Linear light 0 … 1 of each code
+_LINEAR_OF_CODE: Final = decode_srgb(np.arange(256) / 255)  # Linear light 0 … 1 of each code
 
 
 def naive_image(
@@ -202,11 +193,10 @@ def naive_image(
     saturation: float,
     matrix: npt.NDArray[np.float64] | None = None,
 ) -> npt.NDArray[np.uint16]:
-    """Return the naive raw image of a picture under a light.
+    """Return the naive raw image (H, W, 3) uint16 of a picture under an illuminant: whole counts, 0 … `saturation`.
 
-    `codes`: (H, W, 3) uint8, sRGB codes. `light`: (3,) or (H, W, 3) float, linear camera RGB that code 255, 255, 255 is
-    to have, in counts. `matrix`: (3, 3) float64, linear sRGB to camera RGB with rows of sum 1; None leaves colours as
-    they are. Returns (H, W, 3) uint16, rounded to whole counts, 0 … `saturation`.
+    `codes`: (H, W, 3) uint8, sRGB. `light`: (3,) or (H, W, 3) float, camera RGB of code 255, 255, 255, counts.
+    `matrix`: (3, 3) float64, linear sRGB to camera RGB with rows of sum 1; None keeps linear sRGB.
 
     Examples
     --------
@@ -215,43 +205,39 @@ def naive_image(
     array([[[1000, 1800,  500],
             [ 503,    0,  500]]], dtype=uint16)
     """
-    linear = _LINEAR[codes]
+    linear = _LINEAR_OF_CODE[codes]
     if matrix is not None:
-        # A colour outside of what the camera tells apart would be darker than black.
+        # A colour outside the camera's gamut would be negative.
         linear = np.maximum(linear @ matrix.T, 0)
     return np.clip(np.rint(linear * light), 0, np.floor(saturation)).astype(np.uint16)
 
 
 @dataclass(frozen=True, eq=False)
 class NaiveScene:
-    """The naive counterpart of an image of a generated data set; made when it is read.
-
-    - `generated`: the image whose counterpart it is.
-    - `matrix`: the camera's colour matrix, or None.
-    """
+    """Naive counterpart of a generated image; it is computed when it is read."""
 
     generated: GeneratedScene
     picture: FoundPicture
-    matrix: ColourMatrix | None = None
+    matrix: ColourMatrix | None = None  # Colour matrix of the camera, or None
 
     @property
     def name(self) -> str:
-        """The name of the generated image."""
+        """Name of the generated image."""
         return self.generated.name
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64 of the generated image, linear camera RGB, r + g + b = 1."""
+        """Ground truth (3,) float64 of the generated image, linear camera RGB, r + g + b = 1."""
         return self.generated.truth
 
     @property
     def saturation(self) -> float:
-        """The white level of the generated image, counts."""
+        """Saturation level of the generated image, counts."""
         return self.generated.saturation
 
     @cached_property
     def whites(self) -> npt.NDArray[np.float64]:
-        """The lights (K, 3) float64 of the image, counts of the table's white reference."""
+        """Illuminants (K, 3) float64 of the image, in counts of the white reference of the LUT."""
         entry, description = self.generated.entry, self.generated.dataset.description
         levels = {light.illumination: sum(light.white) for light in description.lights}
         whites: list[npt.NDArray[np.float64]] = []
@@ -259,7 +245,8 @@ class NaiveScene:
             mixture = parse_mixture(label)
             if not levels.keys() >= set(mixture.lights):
                 raise FormatError(
-                    f"{entry.image} is under light {label}, which its data set does not list; make it again"
+                    f"{entry.image} is under illuminant {label}, which its data set does not list, expected a listed "
+                    "one; generate the data set again"
                 )
             level = sum(weight * levels[light] for light, weight in zip(mixture.lights, mixture.weights, strict=True))
             whites.append(np.array(truth) * level)
@@ -267,7 +254,6 @@ class NaiveScene:
 
     @property
     def _details(self) -> Mapping[str, str]:
-        """What options did to the generated image, by column of `images.csv`."""
         return self.generated.dataset.details.get(self.generated.entry.image, {})
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
@@ -280,91 +266,78 @@ class NaiveScene:
         return naive_image(codes, light, self.saturation, matrix), None
 
 
+# Variation by options of `generate` is recorded by column in images.csv; only the crop applies to a counterpart.
 @dataclass(frozen=True, eq=False)
 class NaiveMixedScene(NaiveScene):
-    """The naive counterpart of an image that several lights fall on."""
+    """Naive counterpart of an image under several illuminants."""
 
     @property
     def lights(self) -> npt.NDArray[np.float64]:
-        """The lights (K, 3) float64, linear camera RGB, r + g + b = 1."""
+        """Illuminants (K, 3) float64, linear camera RGB, r + g + b = 1."""
         return np.array(self.generated.entry.truths)
 
     def read_weights(self) -> npt.NDArray[np.float32]:
-        """Return the share of each light in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
+        """Return the weight of each illuminant in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
         return self.generated.dataset.read_weights(self.generated.entry)
 
     def read_truth_map(self) -> npt.NDArray[np.float32]:
-        """Return the light of each pixel: (H, W, 3) float32, r + g + b = 1."""
+        """Return the illuminant of each pixel: (H, W, 3) float32, r + g + b = 1."""
         return self.generated.dataset.read_ground_truth_map(self.generated.entry)
 
 
 def naive_scenes(
-    scenes: Sequence[GeneratedScene], found: Mapping[str, FoundPicture], matrix: ColourMatrix | None = None
+    scenes: Sequence[GeneratedScene], pictures: Mapping[str, FoundPicture], matrix: ColourMatrix | None = None
 ) -> tuple[NaiveScene, ...]:
-    """Return the naive counterparts of generated images, in their order; images without a picture must be left out.
-
-    `matrix`: the camera's colour matrix, or None.
-    """
+    """Return the naive counterparts of generated images, in their order; every image needs a picture."""
     return tuple(
-        (NaiveScene if len(scene.entry.lights) == 1 else NaiveMixedScene)(scene, found[scene.entry.source], matrix)
+        (NaiveScene if len(scene.entry.lights) == 1 else NaiveMixedScene)(scene, pictures[scene.entry.source], matrix)
         for scene in scenes
     )
 
 
 @dataclass(frozen=True, eq=False)
 class RelitScene:
-    """A real scene of another camera under a light of a generated image, by von Kries: over its own light, times that.
-
-    - `scene`: the real scene.
-    - `truth`: (3,) float64, the generated image's ground truth, linear camera RGB.
-    - `name`: a name of its own, since a scene may be lit several times.
-    - `saturation`: none: what was clipped is masked, since channels were scaled apart.
-    """
+    """A real scene of another camera under the illuminant of a generated image, by von Kries scaling."""
 
     scene: Scene
-    truth: npt.NDArray[np.float64]
-    name: str
-    saturation: None = None
+    truth: npt.NDArray[np.float64]  # (3,) float64, ground truth of the generated image, linear camera RGB
+    name: str  # Its own name, because a scene may be used several times
+    saturation: None = None  # None; clipped pixels are masked, because channels are scaled differently
 
     def read(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_] | None]:
         """Return the image (H, W, 3) float32, and its mask (H, W) bool."""
         image, mask = self.scene.read()
-        own = self.scene.truth / self.scene.truth.sum()
+        own_illuminant = self.scene.truth / self.scene.truth.sum()
         if self.scene.saturation is not None:
             clipped: npt.NDArray[np.bool_] = np.asarray((image >= self.scene.saturation).any(axis=2))
             mask = clipped if mask is None else mask | clipped
-        return (image * (self.truth / self.truth.sum() / own)).astype(np.float32), mask
+        return (image * (self.truth / self.truth.sum() / own_illuminant)).astype(np.float32), mask
 
 
 def relit_scenes(scenes: Sequence[Scene], lights: Sequence[npt.NDArray[np.float64]]) -> tuple[RelitScene, ...]:
-    """Return a scene for each light (3,) float64, in the lights' order; each scene is lit about equally often."""
+    """Return one relit scene for each illuminant (3,) float64; all scenes are used about equally often."""
     random = np.random.default_rng(0)
     rounds = [random.permutation(len(scenes)) for _ in range(-(-len(lights) // len(scenes)))]
-    places: list[int] = np.concatenate(rounds)[: len(lights)].tolist()
+    scene_indices: list[int] = np.concatenate(rounds)[: len(lights)].tolist()
     return tuple(
-        RelitScene(scenes[place], light, f"{number}_{scenes[place].name}")
-        for number, (place, light) in enumerate(zip(places, lights, strict=True))
+        RelitScene(scenes[scene_index], light, f"{index}_{scenes[scene_index].name}")
+        for index, (scene_index, light) in enumerate(zip(scene_indices, lights, strict=True))
     )
 
 
 @dataclass(frozen=True, eq=False)
 class TransferPlan:
-    """Training sets that may be trained on, and what was done to make them so.
+    """Training sets of a transfer, and the notes on their preparation."""
 
-    - `training`: for each set itself and, where it was generated and there are pictures, its naive counterparts; images
-      that were left out are in none of them.
-    - `sets`: the data sets as they were opened.
-    - `notes`: sentences for the reader: images left out, matrices used, cautions.
-    """
-
+    # Each set and, if it was generated and pictures are given, its naive counterparts, without excluded images
     training: tuple[TrainingSet, ...]
-    sets: tuple[SceneSet, ...]
-    notes: tuple[str, ...]
+    sets: tuple[SceneSet, ...]  # The data sets as opened
+    notes: tuple[str, ...]  # Excluded images, colour matrices and cautions, as sentences
 
 
-def is_generated(some: SceneSet) -> bool:
-    """Return whether images of a set were made by `generate`."""
-    return any(isinstance(scene, GeneratedScene) for scene in some.scenes)
+def is_generated(scene_set: SceneSet) -> bool:
+    """Return whether images of the set were made by `generate`."""
+    return any(isinstance(scene, GeneratedScene) for scene in scene_set.scenes)
 
 
 def plan_transfer(
@@ -372,83 +345,90 @@ def plan_transfer(
 ) -> TransferPlan:
     """Return the training sets of a transfer.
 
-    `pictures`: folder of the source pictures of the generated sets, for the naive baseline; None for no such baseline.
-    `relit`: real scenes of another camera, to be lit by the lights of each generated set; None for no such yardstick.
+    `pictures`: folder of the source pictures of the generated sets, for the naive baseline; None for no baseline.
+    `relit`: real scenes of another camera, relit to the illuminants of each generated set, for comparison; or None.
     """
-    names = [some.name for some in sets]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    names = [scene_set.name for scene_set in sets]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
         raise InputError(
-            f"two training sets are called {first_few(twice)}; rename the folder of one: names head the rows"
+            f"two training sets have the name {first_few(repeated)}, expected different names; rename one folder"
         )
     training: list[TrainingSet] = []
     notes: list[str] = []
     if is_generated(test):
-        notes.append(f"The test set {test.name} was made by generate: nothing here says what is reached on real images")
-    for some in sets:
-        scenes = _trainable(some, test, notes)
-        made = tuple(scene for scene in scenes if isinstance(scene, GeneratedScene))
-        if not made:
-            training.append(TrainingSet(some.name, "other", scenes))
-            notes.append(f"{some.name} was not made by generate: its rows say nothing of generated images")
+        notes.append(f"The test set {test.name} was made by generate: no number here is a result on real images")
+    for scene_set in sets:
+        scenes = _trainable(scene_set, test, notes)
+        generated = tuple(scene for scene in scenes if isinstance(scene, GeneratedScene))
+        if not generated:
+            training.append(TrainingSet(scene_set.name, "other", scenes))
+            notes.append(f"{scene_set.name} was not made by generate: its rows are no results of generated images")
         elif pictures is None:
-            training.append(TrainingSet(some.name, "generated", made))
+            training.append(TrainingSet(scene_set.name, "generated", generated))
         else:
-            training += _with_naive(some.name, made, pictures, notes)
-        if made and relit is not None:
-            others = _trainable(relit, test, notes)
+            training += _with_naive(scene_set.name, generated, pictures, notes)
+        if generated and relit is not None:
+            relit_sources = _trainable(relit, test, notes)
             lights = [scene.truth for scene in training[-1].scenes]
-            training.append(TrainingSet(some.name, "relit", relit_scenes(others, lights)))
+            training.append(TrainingSet(scene_set.name, "relit", relit_scenes(relit_sources, lights)))
             notes.append(
-                f"{some.name}: {len(others)} scenes of {relit.name}, relit to the lights of its {len(lights)} images"
+                f"{scene_set.name}: {len(relit_sources)} scenes of {relit.name}, relit to the illuminants of its "
+                f"{len(lights)} images"
             )
-    if pictures is not None and all(each.kind == "other" for each in training):
-        raise InputError("--naive is for sets made by generate, and TRAIN names none; leave it out")
+    if pictures is not None and all(training_set.kind == "other" for training_set in training):
+        raise InputError("--naive is given without a TRAIN made by generate, expected at least one; omit --naive")
     return TransferPlan(tuple(training), tuple(sets), tuple(notes))
 
 
-def _trainable(some: SceneSet, test: SceneSet, notes: list[str]) -> tuple[Scene, ...]:
-    kept, shared = trainable_images(some, test)
-    if shared:
-        notes.append(f"{shared}; left out")
-    divided = [
-        scene for scene in kept if isinstance(scene, GeneratedScene) and scene.entry.split not in (None, "train")
+def _trainable(scene_set: SceneSet, test: SceneSet, notes: list[str]) -> tuple[Scene, ...]:
+    trainable, shared_note = trainable_images(scene_set, test)
+    if shared_note:
+        notes.append(f"{shared_note}; excluded")
+    held_out = [
+        scene for scene in trainable if isinstance(scene, GeneratedScene) and scene.entry.split not in (None, "train")
     ]
-    if divided:
-        notes.append(f"{some.name}: {len(divided)} images of its parts validation and test are not trained on")
-        left_out = {id(scene) for scene in divided}
-        kept = tuple(scene for scene in kept if id(scene) not in left_out)
-    if not kept:
-        raise InputError(f"{some.name} has no image left to train on: all are shared with the test set or set apart")
-    return kept
-
-
-def _with_naive(name: str, made: Sequence[GeneratedScene], pictures: Path | str, notes: list[str]) -> list[TrainingSet]:
-    """Return a generated set's images and their naive counterparts, all of the pictures that were found."""
-    dataset = made[0].dataset
-    if dataset.description.options.get("variation", {}).get("gradient"):
-        raise InputError(f"{name} was made with a gradient, which naive images have not; leave out --naive")
-    found, missing = find_sources(dataset, pictures)
-    kept = tuple(scene for scene in made if scene.entry.source in found)
-    if not kept:
+    if held_out:
+        notes.append(f"{scene_set.name}: {len(held_out)} images of its validation and test parts are excluded")
+        held_out_ids = {id(scene) for scene in held_out}
+        trainable = tuple(scene for scene in trainable if id(scene) not in held_out_ids)
+    if not trainable:
         raise InputError(
-            f"none of the {len(missing)} pictures of {name} is in {pictures}, by name and hash: "
-            f"{first_few(missing, 3)}; name the folder that the data set was made from"
+            f"0 of {len(scene_set.scenes)} images of {scene_set.name} may be used for training: all are in the test "
+            "set, or in its own validation and test parts; use another set"
+        )
+    return trainable
+
+
+def _with_naive(
+    name: str, images: Sequence[GeneratedScene], pictures: Path | str, notes: list[str]
+) -> list[TrainingSet]:
+    """Return the generated images with a picture in the folder, and their naive counterparts."""
+    dataset = images[0].dataset
+    if dataset.description.options.get("variation", {}).get("gradient"):
+        # Counterparts have one brightness for the whole image.
+        raise InputError(f"{name} was made with a gradient, expected none for naive images; omit --naive")
+    found_pictures, missing = find_source_pictures(dataset, pictures)
+    with_picture = tuple(scene for scene in images if scene.entry.source in found_pictures)
+    if not with_picture:
+        raise InputError(
+            f"0 of {len(missing)} pictures of {name} are in {pictures}, by name and hash (missing: "
+            f"{first_few(missing, 3)}), expected the folder that the data set was made from; use that folder"
         )
     if missing:
         notes.append(
-            f"{name}: {len(missing)} of {len(missing) + len(found)} pictures are not in {pictures}: "
-            f"{first_few(missing)}; {len(made) - len(kept)} images of them are left out of its every row"
+            f"{name}: {len(missing)} of {len(missing) + len(found_pictures)} pictures are not in {pictures}: "
+            f"{first_few(missing)}; {len(images) - len(with_picture)} images of them are excluded from all rows"
         )
     sets = [
-        TrainingSet(name, "generated", kept),
-        TrainingSet(name, "naive", naive_scenes(kept, found)),
+        TrainingSet(name, "generated", with_picture),
+        TrainingSet(name, "naive", naive_scenes(with_picture, found_pictures)),
     ]
     camera = dataset.description.table.camera
     matrix = camera_matrix(camera)
     if matrix is None:
-        notes.append(f"{name}: no colour matrix is known for {camera}, so no row has one")
+        notes.append(f"{name}: no colour matrix of {camera} is available, so there is no row with a matrix")
         return sets
-    rows = "; ".join(" ".join(f"{part:.3f}" for part in row) for row in matrix.rows)
+    rows = "; ".join(" ".join(f"{value:.3f}" for value in row) for row in matrix.rows)
     notes.append(f"{name}: colour matrix of {matrix.name}, {matrix.source}, rows of sum 1: {rows}")
-    return [*sets, TrainingSet(name, "naive with matrix", naive_scenes(kept, found, matrix))]
+    return [*sets, TrainingSet(name, "naive with matrix", naive_scenes(with_picture, found_pictures, matrix))]

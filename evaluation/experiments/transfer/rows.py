@@ -1,8 +1,8 @@
-"""Train on one data set, test on another: a row of results for each method and each way of training it.
+"""Train on one data set, test on another: one row of results for each method and each kind of training.
 
-Beside N real images a method is trained on them alone, and on a set first and then adapted to them. The N are drawn
-from the training part of each fold of real cross-validation, so that every test image is unseen by what estimates it;
-those of a smaller N are among those of a larger one.
+A method can also use N real images: it is trained on them alone, or trained on a set and then adapted to them. The N
+images are drawn from the training part of each fold of real cross-validation, so every test image is unseen by the
+model that estimates it. The images of a smaller N are among those of a larger N.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ import numpy.typing as npt
 
 from evaluation.experiments.cross_validation import (
     AnyLearner,
+    Indices,
     Material,
-    Places,
+    collect_material,
     cross_fit,
     estimate_on,
     fit_on,
-    gather,
     result_of,
 )
-from evaluation.experiments.folds import require_apart
+from evaluation.experiments.folds import require_groups_together
 from evaluation.experiments.running import evaluate
 from evaluation.learning.adapting import LearnedAlone, adapt, learn_alone
 from evaluation.learning.constant_light import ConstantLight
@@ -35,56 +35,45 @@ from evaluation.results.result import Result, SceneAnswer
 from evaluation.scene import Scene
 from foundation.errors import InputError
 
-# How a method was trained: on other folds of the test set, on generated images, on their naive counterparts, on real
-# scenes of another camera under their lights, on a data set that was not generated, on N images of the test set's
-# other folds alone, or not at all.
-Kind = Literal["cross-validation", "generated", "naive", "naive with matrix", "relit", "other", "real", "none"]
+# Training data of a method: other folds of the test set; generated images; their naive counterparts; real scenes of
+# another camera under their illuminants; a data set that was not generated; N images of the other folds of the test set
+# alone; or no training.
+Training = Literal["cross-validation", "generated", "naive", "naive with matrix", "relit", "other", "real", "none"]
 
-# What was done with N real images: nothing; trained on them alone; trained on a set, and then adapted to them.
-Way = Literal["", "alone", "adapted"]
+# Use of N real images: none; training on them alone; adaptation to them after training on a set.
+RealUse = Literal["", "alone", "adapted"]
 
-NAIVE: Final[tuple[Kind, ...]] = ("naive", "naive with matrix")  # The kinds of the naive baseline
+NAIVE: Final[tuple[Training, ...]] = ("naive", "naive with matrix")  # Both naive baselines
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingSet:
-    """Images to train on.
+    """Images for training."""
 
-    - `data`: name of the data set that they are, or are the counterparts of.
-    - `kind`: what they are.
-    - `scenes`: the images; counterparts in the order of the generated ones.
-    """
-
-    data: str
-    kind: Kind
-    scenes: tuple[Scene, ...]
+    data: str  # Name of the data set of the images, or of the images that these are counterparts of
+    kind: Training
+    scenes: tuple[Scene, ...]  # The images; counterparts are in the order of the generated images
 
 
 @dataclass(frozen=True, eq=False)
 class TransferRow:
-    """Results of one method, trained in one way, on the test images.
-
-    - `method`: the method's name.
-    - `kind`: how it was trained.
-    - `data`: name of the data set that it was trained on; of cross-validation only where the test set was generated.
-    - `images`: training images: of cross-validation those of the smallest training part; 0 where nothing is learned.
-    - `results`: one a seed, or one where nothing depends on it; rows in the order of the test images.
-    - `way`, `real`: what was done with how many images of the test set's other folds: a number, or "all"; empty where
-      there were none. They are not among `images` but where they were alone.
-    """
+    """Results on the test images of one method with one training."""
 
     method: str
-    kind: Kind
-    data: str
-    images: int
+    kind: Training  # Its training data
+    data: str  # Name of the training data set; for cross-validation only if the test set was generated
+    images: int  # Number of training images; for cross-validation, of the smallest training part; 0 without learning
+    # One for each seed, or one if the seed has no influence; in the order of the test images
     results: tuple[Result, ...]
-    way: Way = ""
+    # Use and number ("all" or a number) of real images of the other folds; empty if none were used. They are counted in
+    # `images` only if they were used alone.
+    real_use: RealUse = ""
     real: str = ""
 
     @property
     def training(self) -> str:
-        """How the method was trained, for a column of tables."""
-        match self.way:
+        """Training of the method, for a column of tables."""
+        match self.real_use:
             case "alone":
                 return f"{self.real} of {self.data} (generated)" if self.data else f"{self.real} real"
             case "adapted":
@@ -94,7 +83,7 @@ class TransferRow:
 
     @property
     def material(self) -> str:
-        """What else than N real images the method was trained on."""
+        """Training data other than N real images."""
         match self.kind:
             case "cross-validation":
                 return f"cross-validated on {self.data} (generated)" if self.data else "real, cross-validated"
@@ -114,7 +103,7 @@ class TransferRow:
                 return "none"
 
     def labels(self, seeds: int) -> tuple[str, ...]:
-        """Return the names of its results in errors.csv: method, training and, of several seeds, the seed.
+        """Return the names of the results in errors.csv: method, training and, with several seeds, the seed.
 
         Examples
         --------
@@ -125,25 +114,25 @@ class TransferRow:
         return (name,) if seeds == 1 else tuple(f"{name}, seed {seed}" for seed in range(seeds))
 
 
-def draw_images(count: int, wanted: int, seed: int) -> Places:
-    """Return which of `count` images to train on, (P,) int64 in ascending order, P = `wanted`, drawn by a seed.
+def draw_images(count: int, drawn_count: int, seed: int) -> Indices:
+    """Return the indices of the training images, (P,) int64, ascending, drawn from `count` images by a seed.
 
-    Data sets of equal counts get the same places, so that a generated set and its naive counterpart, or one under
-    another table, are trained on the same pictures under the same lights.
+    Data sets of equal size get the same indices: a generated set and its naive counterpart, or a set made with another
+    look-up table (LUT), are then trained on the same pictures under the same illuminants.
 
     Examples
     --------
     >>> draw_images(5, 5, seed=3).tolist()
     [0, 1, 2, 3, 4]
     """
-    if not 1 <= wanted <= count:
-        raise InputError(f"{wanted} training images of {count} were asked for; expected 1 to {count}")
-    return np.sort(np.random.default_rng(seed).permutation(count)[:wanted])
+    if not 1 <= drawn_count <= count:
+        raise InputError(f"{drawn_count} training images requested, expected 1 to {count}; request fewer or add images")
+    return np.sort(np.random.default_rng(seed).permutation(count)[:drawn_count])
 
 
 def count_images(test: Sequence[Scene], training: Sequence[TrainingSet], seeds: int, images: int) -> int:
-    """Return how many images `transfer` reads for its learners, all seeds together: each image once."""
-    return len(test) + sum(len(_used(_drawn(some, seeds, images))) for some in training)
+    """Return the number of images that `transfer` reads for its learners; each image is counted once for all seeds."""
+    return len(test) + sum(len(_used_indices(_drawn_indices(train_set, seeds, images))) for train_set in training)
 
 
 def transfer(
@@ -156,131 +145,133 @@ def transfer(
     side: int | None = None,
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
-    generated: str = "",
-    beside: Sequence[int | None] = (),
+    generated_name: str = "",
+    real_counts: Sequence[int | None] = (),
 ) -> tuple[TransferRow, ...]:
-    """Return the rows of every learner: cross-validated on the test set, trained on each training set, and beside N.
+    """Return the rows of every learner: cross-validated on the test set, trained on each set, and with real images.
 
-    Of the learner `ConstantLight` no row is made for naive counterparts, whose lights are those of the generated set,
-    and none beside N real images: it looks at none.
-
-    `folds`: one entry for each seed, (N,) int64: the folds of the test images. Seed k is k, from 0: it is handed to
-    every fit and draws the training images. `side`: longest side that images are made small to first, px; None leaves
-    all as they are. `generated`: name of the test set if it was generated, so that no row calls it real; else empty.
-    `beside`: numbers of real images to train beside; None for all that a fold leaves.
+    `folds`: for each seed the folds of the test images, (N,) int64. Seed k is k, from 0; it is passed to every fit and
+    draws the training images. `side`: longest side to which images are reduced first, px; None keeps their size.
+    `generated_name`: name of the test set if it was generated, so that no row calls it real; else empty.
+    `real_counts`: numbers N of real images; None for all that a fold leaves.
     """
     if not learners or not folds:
-        raise InputError(f"{len(learners)} learned methods and {len(folds)} seeds: expected at least one of each")
-    for each in folds:
-        require_apart(test, each)
-    # All that may be refused is, before the first image is read.
-    drawn = [_drawn(some, len(folds), images) for some in training]
-    trials = gather(test, learners, side, workers, on_scene)
-    bench = _Bench(trials, folds)
-    parts: list[TransferRow] = []
+        raise InputError(f"{len(learners)} learned methods and {len(folds)} seeds, expected one each; add some")
+    for seed_folds in folds:
+        require_groups_together(test, seed_folds)
+    # Everything that can be refused is refused before the first image is read.
+    indices_by_set = [_drawn_indices(train_set, len(folds), images) for train_set in training]
+    tests = collect_material(test, learners, side, workers, on_scene)
+    subsets = _RealSubsets(tests, folds)
+    entries: list[TransferRow] = []
     for number, learner in enumerate(learners):
-        real = tuple(cross_fit(learner, number, trials, each, seed) for seed, each in enumerate(folds))
-        parts.append(TransferRow(learner.name, "cross-validation", generated, bench.least, real))
-        for count in () if isinstance(learner, ConstantLight) else beside:
-            # All that a fold leaves is what cross-validation trains on.
-            results = real if count is None else bench.results(number, learner, count, bench.alone)
-            name = _name_of(count)
-            parts.append(TransferRow(learner.name, "real", generated, count or bench.least, results, "alone", name))
-    for some, wanted in zip(training, drawn, strict=True):
-        # Of a large set only what some seed wants is read.
-        used = _used(wanted)
-        lessons = gather([some.scenes[int(place)] for place in used.tolist()], learners, side, workers, on_scene)
-        places = [np.searchsorted(used, each).astype(np.int64) for each in wanted]
+        crossed = tuple(cross_fit(learner, number, tests, seed_folds, seed) for seed, seed_folds in enumerate(folds))
+        fewest = subsets.min_images
+        entries.append(TransferRow(learner.name, "cross-validation", generated_name, fewest, crossed))
+        # The constant illuminant reads no image, so N images would only repeat cross-validation with less data.
+        for count in () if isinstance(learner, ConstantLight) else real_counts:
+            # All images that a fold leaves are the training images of cross-validation.
+            results = crossed if count is None else subsets.results(number, learner, count, subsets.alone)
+            label = _count_label(count)
+            entries.append(TransferRow(learner.name, "real", generated_name, count or fewest, results, "alone", label))
+    for train_set, seed_indices in zip(training, indices_by_set, strict=True):
+        # Only the images that some seed needs are read.
+        used_indices = _used_indices(seed_indices)
+        scenes = [train_set.scenes[int(index)] for index in used_indices.tolist()]
+        material = collect_material(scenes, learners, side, workers, on_scene)
+        positions = [np.searchsorted(used_indices, indices).astype(np.int64) for indices in seed_indices]
         for number, learner in enumerate(learners):
-            if isinstance(learner, ConstantLight) and some.kind in NAIVE:
+            # Naive counterparts have the illuminants of the generated set: the row would be the same.
+            if isinstance(learner, ConstantLight) and train_set.kind in NAIVE:
                 continue
-            taught = [fit_on(learner, number, lessons, each, seed) for seed, each in enumerate(places)]
+            fitted = [fit_on(learner, number, material, indices, seed) for seed, indices in enumerate(positions)]
             results = tuple(
-                result_of(learner.name, estimate_on(method, number, trials, trials.everything), trials.truths)
-                for method in taught
+                result_of(learner.name, estimate_on(method, number, tests, tests.all_indices), tests.truths)
+                for method in fitted
             )
-            row = TransferRow(learner.name, some.kind, some.data, images, results)
-            parts.append(row)
+            row = TransferRow(learner.name, train_set.kind, train_set.data, images, results)
+            entries.append(row)
             if not isinstance(learner, FeatureLearner) or isinstance(learner, ConstantLight):
                 continue
-            for count in beside:
-                results = bench.results(number, learner, count, partial(bench.adapted, taught))
-                parts.append(replace(row, results=results, way="adapted", real=_name_of(count)))
-    rows = [part for learner in learners for part in parts if part.method == learner.name]
+            for count in real_counts:
+                results = subsets.results(number, learner, count, partial(subsets.adapted, fitted))
+                entries.append(replace(row, results=results, real_use="adapted", real=_count_label(count)))
+    rows = [entry for learner in learners for entry in entries if entry.method == learner.name]
     if methods:
-        found = evaluate(trials.scenes, methods, workers)
-        rows += [TransferRow(result.method, "none", "", 0, (result,)) for result in found]
+        method_results = evaluate(tests.scenes, methods, workers)
+        rows += [TransferRow(result.method, "none", "", 0, (result,)) for result in method_results]
     return tuple(rows)
 
 
-# From learner, its number, places of N real images (N,) int64 and seed to a method.
-_Fit = Callable[[AnyLearner, int, Places, int], Method]
+# Fits a learner: learner, its index, indices of N real images (N,) int64, seed.
+_Fit = Callable[[AnyLearner, int, Indices, int], Method]
 
 
 @dataclass(frozen=True, eq=False)
-class _Bench:
-    """The test images, and how N of them are drawn that others are tested by.
+class _RealSubsets:
+    """Test images, with subsets of N real images for training.
 
-    - `trials`: their material.
-    - `folds`: for each seed the fold of each, (N,) int64.
-    - `known`: what N teach alone, by learner, seed and images: the same for every set.
+    - `trials`: material of the test images.
+    - `folds`: for each seed the fold of each image, (N,) int64.
+    - `known`: models of N images alone, by learner, seed and images; they are shared by all training sets.
     """
 
-    trials: Material
+    tests: Material
     folds: Sequence[npt.NDArray[np.int64]]
-    known: dict[tuple[int, int, bytes], LearnedAlone] = field(default_factory=dict)
+    learned: dict[tuple[int, int, bytes], LearnedAlone] = field(default_factory=dict)
 
     @property
-    def least(self) -> int:
-        """The images of the smallest part that is trained on."""
-        return min(len(each) - int(np.bincount(each).max()) for each in self.folds)
+    def min_images(self) -> int:
+        """Number of images of the smallest training part."""
+        return min(len(seed_folds) - int(np.bincount(seed_folds).max()) for seed_folds in self.folds)
 
     def results(self, number: int, learner: AnyLearner, real: int | None, fit: _Fit) -> tuple[Result, ...]:
-        """Return for each seed the result of a learner, each fold estimated by `real` images of the others."""
-        made: list[Result] = []
+        """Return one result for each seed; each fold is estimated after a fit to `real` images of the other folds."""
+        results: list[Result] = []
         for seed, folds in enumerate(self.folds):
             order = np.random.default_rng(seed).permutation(len(folds))
             answers: dict[int, SceneAnswer] = {}
             for fold in np.unique(folds):
-                held = np.flatnonzero(folds == fold)
-                drawn = np.sort(order[folds[order] != fold][:real])
-                method = fit(learner, number, drawn, seed)
-                answers |= zip(held.tolist(), estimate_on(method, number, self.trials, held), strict=True)
-            listed = [answers[place] for place in range(len(folds))]
-            made.append(result_of(learner.name, listed, self.trials.truths))
-        return tuple(made)
+                test_indices = np.flatnonzero(folds == fold)
+                indices = np.sort(order[folds[order] != fold][:real])
+                method = fit(learner, number, indices, seed)
+                estimates = estimate_on(method, number, self.tests, test_indices)
+                answers |= zip(test_indices.tolist(), estimates, strict=True)
+            ordered = [answers[index] for index in range(len(folds))]
+            results.append(result_of(learner.name, ordered, self.tests.truths))
+        return tuple(results)
 
-    def alone(self, learner: AnyLearner, number: int, drawn: Places, seed: int) -> Method:
-        """Return what a learner learns of real images alone, at `drawn` (N,) int64."""
+    def alone(self, learner: AnyLearner, number: int, indices: Indices, seed: int) -> Method:
+        """Return the method fitted to real images alone, with indices (N,) int64."""
         if isinstance(learner, FeatureLearner):
-            return self._learned(learner, number, drawn, seed).method
-        return fit_on(learner, number, self.trials, drawn, seed)
+            return self._learned(learner, number, indices, seed).method
+        return fit_on(learner, number, self.tests, indices, seed)
 
     def adapted(
-        self, taught: Sequence[Method], learner: AnyLearner, number: int, drawn: Places, seed: int
+        self, fitted: Sequence[Method], learner: AnyLearner, number: int, indices: Indices, seed: int
     ) -> LearnedMethod:
-        """Return what was learned elsewhere, for each seed, adapted to real images at `drawn` (N,) int64."""
-        method = taught[seed]
+        """Return the method fitted to a set with this seed, adapted to real images with indices (N,) int64."""
+        method = fitted[seed]
         if not isinstance(learner, FeatureLearner) or not isinstance(method, LearnedMethod):
-            raise TypeError(f"{learner.name} has no features to adapt by")
-        return adapt(method, self._learned(learner, number, drawn, seed))
+            raise TypeError(f"{learner.name} cannot be adapted, because it has no features")
+        return adapt(method, self._learned(learner, number, indices, seed))
 
-    def _learned(self, learner: FeatureLearner, number: int, drawn: Places, seed: int) -> LearnedAlone:
-        key = number, seed, drawn.tobytes()
-        if key not in self.known:
-            features = self.trials.features[number]
-            given = [] if features is None else [features[int(place)] for place in drawn]
-            self.known[key] = learn_alone(learner, given, self.trials.truths[drawn], seed)
-        return self.known[key]
+    def _learned(self, learner: FeatureLearner, number: int, indices: Indices, seed: int) -> LearnedAlone:
+        key = number, seed, indices.tobytes()
+        if key not in self.learned:
+            features = self.tests.features[number]
+            drawn_features = [] if features is None else [features[int(index)] for index in indices]
+            self.learned[key] = learn_alone(learner, drawn_features, self.tests.truths[indices], seed)
+        return self.learned[key]
 
 
-def _name_of(count: int | None) -> str:
+def _count_label(count: int | None) -> str:
     return "all" if count is None else str(count)
 
 
-def _drawn(some: TrainingSet, seeds: int, images: int) -> list[Places]:
-    return [draw_images(len(some.scenes), images, seed) for seed in range(seeds)]
+def _drawn_indices(train_set: TrainingSet, seeds: int, images: int) -> list[Indices]:
+    return [draw_images(len(train_set.scenes), images, seed) for seed in range(seeds)]
 
 
-def _used(drawn: Sequence[Places]) -> Places:
-    return np.unique(np.concatenate(drawn))
+def _used_indices(seed_indices: Sequence[Indices]) -> Indices:
+    return np.unique(np.concatenate(seed_indices))

@@ -1,4 +1,4 @@
-"""Working folders of commands, each a copy of what a module has made once."""
+"""Working folders of command tests."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 
 
 @pytest.fixture
-def place(made_place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a working folder that is a copy of what the fixture `made_place` of a module has made."""
+def work_folder(made_place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a working folder: a copy of the folder made by the module's fixture `made_place`."""
     shutil.copytree(made_place, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path

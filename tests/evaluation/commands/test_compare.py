@@ -1,4 +1,4 @@
-"""`evaluate compare` as a user meets it."""
+"""`evaluate compare`, run as a command."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HEAD = "image,method,truth_r,truth_g,truth_b,recovery,reproduction,guessed\n"
 
 @pytest.fixture
 def runs(tmp_path: Path) -> tuple[str, str]:
-    """Return two runs of methods A and B on 30 images, the second with A improved and one image missing."""
+    """Return two runs of methods A and B on 30 images; the second has smaller errors of A and one image less."""
     random = np.random.default_rng(1)
     hard = random.gamma(1.5, 2, 30)
     folders = tmp_path / "first", tmp_path / "second"
@@ -37,60 +37,58 @@ def runs(tmp_path: Path) -> tuple[str, str]:
 def test_two_runs(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", *runs]) == 0
     printed = capsys.readouterr().out
-    one, two = runs
-    assert f"A ({two}) lacks 1 image of A ({one}), left out here: im 29" in printed
-    assert f"A ({one}) errs less than A ({two}) on 0 of 29 images, more on 29, equal on 0: A ({two}) errs" in printed
-    assert f"B <i> ({one}) errs less than B <i> ({two}) on 0 of 29 images, more on 0, equal on 29: not" in printed
+    first, second = runs
+    assert f"A ({second}) lacks 1 image of A ({first}), excluded here: im 29" in printed
+    assert f"A ({second}) on 0 of 29 images, larger on 29, equal on 0: A ({second}) is better" in printed
+    assert f"B <i> ({second}) on 0 of 29 images, larger on 0, equal on 29: not" in printed
 
 
-def test_methods_by_their_short_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_accepts_short_method_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = ("Gray-world", "PCA bright and dark", "Shades-of-Gray (p=4)", "Own")
     lines = [
-        f"im {number},{name},1,2,1,1.5,{1 + place + number / 10},0\n"
+        f"im {number},{name},1,2,1,1.5,{1 + index + number / 10},0\n"
         for number in range(9)
-        for place, name in enumerate(names)
+        for index, name in enumerate(names)
     ]
     (tmp_path / "errors.csv").write_text(HEAD + "".join(lines))
     assert main(["compare", str(tmp_path), "--method", "pca", "--method", "shades-of-gray:p=4"]) == 0
-    chosen = capsys.readouterr().out
-    assert "PCA bright and dark errs less than Shades-of-Gray (p=4) on 9 of 9 images" in chosen
+    output = capsys.readouterr().out
+    assert "PCA bright and dark has smaller errors than Shades-of-Gray (p=4) on 9 of 9 images" in output
 
 
-def test_runs_without_a_common_method(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_refuses_runs_without_common_method(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     path = Path(runs[1]) / "errors.csv"
     path.write_text(path.read_text().replace(",A,", ",C,").replace(",B <i>,", ",D,"))
     assert main(["compare", *runs]) == 2
     assert "--method FIRST=SECOND" in capsys.readouterr().err
     path.write_text(path.read_text().replace(",1,2,1,", ",1,1,1,"))
     assert main(["compare", *runs, "--method", "A=C"]) == 2
-    assert f"im 0 in A ({runs[0]}) and C ({runs[1]}) are 19.47 degrees apart" in capsys.readouterr().err
+    assert f"im 0 in A ({runs[0]}) and C ({runs[1]}) differ by 19.47 degrees" in capsys.readouterr().err
 
 
-def test_runs_of_the_command_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compares_results_folders(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "one"
     assert main(["run", str(dataset), "--method", "white-patch,gray-world", "--out", str(out)]) == 0
     shutil.copytree(out, tmp_path / "two")
     capsys.readouterr()
     assert main(["compare", str(out), str(tmp_path / "two")]) == 0
     printed = capsys.readouterr().out
-    assert "on 0 of 8 groups of 16 images, more on 0, equal on 8" in printed
+    assert "on 0 of 8 groups of 16 images, larger on 0, equal on 8" in printed
     assert main(["compare", str(out)]) == 0
     # Random codes: white is in every image, and grey on average only by chance.
-    assert "White-Patch errs less than Gray-world on 8 of 8 groups of 16 images" in capsys.readouterr().out
+    assert "White-Patch has smaller errors than Gray-world on 8 of 8 groups of 16 images" in capsys.readouterr().out
 
 
-def test_what_two_runs_did_otherwise_to_the_images_is_said(
-    runs: tuple[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    for place, black in zip(runs, ("0", "500"), strict=True):
+def test_reports_different_treatments(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    for folder, black in zip(runs, ("0", "500"), strict=True):
         record = {"data_set": {"place": "photos"}, "treatment": {"black level": black, "mask": "none"}}
-        (Path(place) / "run.json").write_text(json.dumps(record))
+        (Path(folder) / "run.json").write_text(json.dumps(record))
     assert main(["compare", *runs]) == 0
-    told = [line for line in capsys.readouterr().out.splitlines() if "the runs differ in" in line]
-    assert told == ["the runs differ in their black level: first 0, second 500"]
+    notes = [line for line in capsys.readouterr().out.splitlines() if "the runs differ in" in line]
+    assert notes == ["the runs differ in black level: first 0, second 500"]
 
 
-def test_the_folder_has_tables_and_a_page(runs: tuple[str, str], tmp_path: Path) -> None:
+def test_writes_tables_and_page(runs: tuple[str, str], tmp_path: Path) -> None:
     out = tmp_path / "comparison"
     assert main(["compare", *runs, "--out", str(out)]) == 0
     assert {path.name for path in out.iterdir()} == {"tests.csv", "statistics.csv", "tables.tex", "report.html"}

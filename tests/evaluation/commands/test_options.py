@@ -1,7 +1,4 @@
-"""What the options of commands name as methods, learners and estimates.
-
-The options that every command has which reads a data set.
-"""
+"""Selection of methods and learners by name, and options for reading data."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ from foundation.errors import InputError
 pytestmark = pytest.mark.slow
 
 
-def test_all_are_all_and_each_is_chosen_once() -> None:
+def test_all_contains_each_method_once() -> None:
     names = [method.name for method in choose_methods(["pca", "all", "evaluation.methods.pca:BrightDark"])]
     assert names[0] == names[-1] == "PCA bright and dark"  # By two names it is two.
     assert sorted(names[:-1]) == sorted(method.name for method in standard_methods().values())
@@ -34,16 +31,14 @@ def test_all_are_all_and_each_is_chosen_once() -> None:
     ]
 
 
-def test_the_standard_ones_are_seven_and_what_a_run_takes_unasked(
-    dataset: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    chosen = choose_methods([" Standard"])
-    assert [method.name for method in chosen] == [standard_methods()[name].name for name in STANDARD]
-    assert len(chosen) == 7
+def test_default_methods_are_the_seven_standard_ones(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    methods = choose_methods([" Standard"])
+    assert [method.name for method in methods] == [standard_methods()[name].name for name in STANDARD]
+    assert len(methods) == 7
     assert len(choose_methods(["standard", "all", "pca"])) == len(standard_methods())
     assert main(["run", str(dataset), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["errors"]
-    assert list(dict.fromkeys(row["method"] for row in rows)) == [method.name for method in chosen]
+    assert list(dict.fromkeys(row["method"] for row in rows)) == [method.name for method in methods]
 
 
 LEARNER = """
@@ -62,7 +57,7 @@ class Estimates:
 """
 
 
-def test_what_learns_is_no_method_and_what_does_not_is_no_learner(tmp_path: Path) -> None:
+def test_separates_methods_and_learners(tmp_path: Path) -> None:
     file = tmp_path / "own.py"
     file.write_text(LEARNER)
     assert choose_learners([f"{file}:Learns"])[0].name == "Learns"
@@ -77,18 +72,16 @@ def test_what_learns_is_no_method_and_what_does_not_is_no_learner(tmp_path: Path
         choose_learners(["magic"])
 
 
-def test_a_class_that_has_to_learn_before_it_estimates_is_sent_to_cv(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_suggests_cv_for_untrained_class(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "own.py"
     file.write_text(
         "class Own:\n    name = 'Own'\n\n    def fit(self, scenes, seed=0):\n        self.light = scenes[0].truth\n"
         "        return self\n\n    def estimate(self, image, saturation=None, mask=None):\n        return self.light\n"
     )
     assert main(["run", str(dataset), "--method", f"{file}:Own"]) == 2
-    said = capsys.readouterr().err
-    assert "AttributeError" in said
-    assert "give it to evaluate cv" in said
+    error = capsys.readouterr().err
+    assert "AttributeError" in error
+    assert "use evaluate cv" in error
 
 
 @pytest.mark.parametrize(
@@ -102,6 +95,6 @@ def test_a_class_that_has_to_learn_before_it_estimates_is_sent_to_cv(
         (["black=128", "saturation=100"], "100"),
     ],
 )
-def test_what_cannot_be_read_so_is_refused(texts: list[str], words: str) -> None:
+def test_refuses_invalid_read_options(texts: list[str], words: str) -> None:
     with pytest.raises(InputError, match=re.escape(words)):
         reading_options(texts)

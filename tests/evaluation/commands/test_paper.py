@@ -1,4 +1,4 @@
-"""`evaluate paper` as a user meets it: each command end to end on small tables and data sets."""
+"""`evaluate paper`: each command from end to end on small look-up tables and data sets."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["make_table"]
 
 @pytest.fixture
 def thumbnails(tmp_path: Path) -> Path:
-    """Return an archive of 9 thumbnails of smooth colours under lights of their own."""
+    """Return an archive of 9 thumbnails of smooth colours under different illuminants."""
     rng = np.random.default_rng(0)
     lights = np.array([0.5, 1.0, 0.6]) * rng.uniform(0.8, 1.25, (9, 3))
     ramps = np.exp(rng.uniform(-2, 2, (9, 3, 3, 3))).repeat(10, axis=1).repeat(10, axis=2)
@@ -49,32 +49,32 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def test_a_matrix_for_photographs_is_refused(
+def test_refuses_matrix_for_photographs(
     make_table: TableMaker, truths: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "pictures").mkdir()
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "pictures" / "black.png")
     lut = str(make_table("Test").folder)
-    given = ("--pictures", str(tmp_path / "pictures"), "--lights-like", str(truths), "--side", "16")
-    assert main(["paper", "table1", lut, *given, "--matrix", "Canon EOS 550D"]) == 2
-    assert "is for a data set of raw images" in capsys.readouterr().err
+    options = ("--pictures", str(tmp_path / "pictures"), "--lights-like", str(truths), "--side", "16")
+    assert main(["paper", "table1", lut, *options, "--matrix", "Canon EOS 550D"]) == 2
+    assert "needs a data set of raw images" in capsys.readouterr().err
 
 
 def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    made, out = tmp_path / "made", tmp_path / "out"
+    generated_set, out = tmp_path / "made", tmp_path / "out"
     scenes = random_scenes(12, 30, 30)
     options = DatasetOptions(previews=False)
-    generate_dataset(make_table("Test"), made, scenes, RandomLights(1, len(LIGHTS), 0), options=options)
-    wish = ("--generated", str(made), "--method", "smart-color-cat", "--out", str(out))
-    assert main(["paper", "table2", str(thumbnails), *wish]) == 0
+    generate_dataset(make_table("Test"), generated_set, scenes, RandomLights(1, len(LIGHTS), 0), options=options)
+    arguments = ("--generated", str(generated_set), "--method", "smart-color-cat", "--out", str(out))
+    assert main(["paper", "table2", str(thumbnails), *arguments]) == 0
     printed = capsys.readouterr().out
-    assert "The paper's table is of Cube+" in printed
+    assert "The paper's table is for Cube+" in printed
     real, generated = (rows_of(out / f"trained_on_{name}.csv") for name in ("real", "generated"))
     (ratio,) = rows_of(out / "ratios.csv")
     assert float(ratio["Ratio"]) == pytest.approx(float(generated[0]["Med."]) / float(real[0]["Med."]))
     assert float(ratio["In the paper, on Cube+"]) == pytest.approx(1.43 / 1.35)
-    assert main(["paper", "table2", str(thumbnails), "--generated", str(made), "--method", "magic"]) == 2
-    assert "'magic' is no method that learns" in capsys.readouterr().err
+    assert main(["paper", "table2", str(thumbnails), "--generated", str(generated_set), "--method", "magic"]) == 2
+    assert "'magic' is not a learned method" in capsys.readouterr().err
     copy = thumbnails.with_name("copy.npz")
     copy.write_bytes(thumbnails.read_bytes())
     assert main(["paper", "table2", str(thumbnails), "--generated", str(copy)]) == 2
@@ -82,16 +82,16 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("unseen", "message"),
     [((), "They were kept, as in the paper"), (("--unseen",), "Generated: made, 4 images")],
 )
-def test_table2_tests_the_pictures_that_it_trained_on_only_where_it_says_so(
+def test_table2_excludes_test_pictures_only_with_unseen(
     make_table: TableMaker,
     thumbnails: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    given: tuple[str, ...],
-    said: str,
+    unseen: tuple[str, ...],
+    message: str,
 ) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
@@ -101,21 +101,21 @@ def test_table2_tests_the_pictures_that_it_trained_on_only_where_it_says_so(
     options = DatasetOptions(previews=False)
     lights = RandomLights(2, len(LIGHTS), 0)
     generate_dataset(make_table("Test"), tmp_path / "made", find_pictures(str(pictures)), lights, options=options)
-    wish = ("--generated", str(tmp_path / "made"), "--method", "constant-light", *given)
-    assert main(["paper", "table2", str(thumbnails), *wish]) == 0
+    arguments = ("--generated", str(tmp_path / "made"), "--method", "constant-light", *unseen)
+    assert main(["paper", "table2", str(thumbnails), *arguments]) == 0
     printed = capsys.readouterr()
-    assert said in printed.out
+    assert message in printed.out
     assert "4 of 8 images of made are also in photos, by name: p0.png" in printed.out + printed.err
 
 
-def test_what_was_computed_is_kept_where_the_reader_of_the_output_left(tmp_path: Path) -> None:
+def test_keeps_results_if_output_is_closed(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((20, 30, 3), dtype=np.uint8)).save(tmp_path / "noise.png")
     reader, writer = os.pipe()
     os.close(reader)
     call = [sys.executable, "-m", "evaluation.cli", "paper", "reduction", "noise.png", "--out", "out"]
-    done = subprocess.run(call, cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    process = subprocess.run(call, cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
-    assert (done.returncode, (tmp_path / "out" / "report.html").is_file()) == (0, True), done.stderr
+    assert (process.returncode, (tmp_path / "out" / "report.html").is_file()) == (0, True), process.stderr
 
 
 @pytest.mark.parametrize(
@@ -125,14 +125,14 @@ def test_what_was_computed_is_kept_where_the_reader_of_the_output_left(tmp_path:
         *(
             (("table1", "nowhere", "--pictures", ".", "--lights-like", "x.csv", option, given), message)
             for option, given, message in (
-                ("--sizes", "12,big", "'big' is no side of an image"),
+                ("--sizes", "12,big", "side 'big' of an image"),
                 ("--sizes", "1,65535", "nowhere is no LUT"),
             )
         ),
         (("bits", "nowhere.npz", "--out", "taken"), "taken already exists"),
     ],
 )
-def test_what_cannot_be_done_is_one_sentence(
+def test_refuses_with_one_sentence(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

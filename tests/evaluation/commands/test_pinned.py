@@ -1,4 +1,4 @@
-"""What every command prints and writes of small data sets, to the last digits: no change may move it unseen."""
+"""Pinned numbers that the commands print and write for small data sets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def made_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a generated set, its pictures and table, two sets of thumbnails, and copies of layouts."""
+    """Return a folder with a generated set, its pictures and LUT, two sets of thumbnails, and copies of layouts."""
     folder = tmp_path_factory.mktemp("place")
     save_pictures(folder / "pictures", [f"{number}.png" for number in range(6)])
     Maker(folder, write_table(folder / "lut")).make()
@@ -86,10 +86,10 @@ SEQUENCES: dict[str, tuple[str, ...]] = {
 
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_commands(
-    name: str, place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    name: str, work_folder: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     figures = recorded_figures(monkeypatch)
-    before = set(place.rglob("*"))
+    before = set(work_folder.rglob("*"))
     told: dict[str, Any] = {}
     for command in SEQUENCES[name]:
         drawn = len(figures)
@@ -99,12 +99,12 @@ def test_commands(
             del figures[drawn:]
         if command.endswith("--json"):
             told[str(len(told) + 1)] = json.loads(out)
-    new = [path for path in sorted(place.rglob("*")) if path not in before and path.is_file()]
+    new = [path for path in sorted(work_folder.rglob("*")) if path not in before and path.is_file()]
     # Tables are printed as well, pages are those of runs, and what is compared shows in what is made of it.
     new = [path for path in new if path.suffix != ".tex"]
     if name in ("cv", "transfer"):
         new = [path for path in new if path.parent.name != "two"]
     if name in ("compare", "transfer"):
         new = [path for path in new if path.parent.name not in ("one", "two") or path.suffix == ".json"]
-    files = {path.relative_to(place).as_posix(): contents(path) for path in new}
+    files = {path.relative_to(work_folder).as_posix(): contents(path) for path in new}
     pinned(f"commands, {name}", {"told": told, "files": files, "figures": figures}, nothing=1e-7)

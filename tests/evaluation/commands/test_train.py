@@ -22,7 +22,7 @@ def data(tmp_path: Path) -> Path:
     return tmp_path / "world.npz"
 
 
-def test_a_model_is_trained_saved_and_used(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_trains_saves_and_uses_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = tmp_path / "models" / "cat.npz"
     assert main(["train", "smart-color-cat", str(data), "--out", str(model), "--seed", "4"]) == 0
     printed = capsys.readouterr().out
@@ -40,25 +40,32 @@ def test_a_model_is_trained_saved_and_used(data: Path, tmp_path: Path, capsys: p
     assert model.read_bytes() == before
 
 
-def test_a_model_is_adapted(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before, after = tmp_path / "before.npz", tmp_path / "after.npz"
+def test_adapts_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    base_file, adapted_file = tmp_path / "before.npz", tmp_path / "after.npz"
     with np.load(data) as content:
         few: dict[str, Any] = {name: content[name][:6] for name in content.files}
     few["names"] = np.array([f"few {number}" for number in range(6)])
     np.savez(tmp_path / "few.npz", **few)
-    assert main(["train", "kernel-ridge", str(data), "--out", str(before)]) == 0
+    assert main(["train", "kernel-ridge", str(data), "--out", str(base_file)]) == 0
     capsys.readouterr()
-    assert main(["train", "kernel-ridge", str(tmp_path / "few.npz"), "--adapt", str(before), "--out", str(after)]) == 0
+    assert (
+        main(
+            ["train", "kernel-ridge", str(tmp_path / "few.npz"), "--adapt", str(base_file), "--out", str(adapted_file)]
+        )
+        == 0
+    )
     printed = " ".join(capsys.readouterr().out.split())
-    assert "before.npz answers with a share of" in printed
-    # What either of both trainings has seen is no test.
-    assert main(["run", str(data), "--method", str(after)]) == 0
-    assert ": 12 of 12 images were trained on" in " ".join(capsys.readouterr().out.split())
-    assert main(["train", "smart-color-cat", str(data), "--adapt", str(before), "--out", str(tmp_path / "no.npz")]) == 2
-    assert "is of kernel-ridge, smart-color-cat was asked for" in " ".join(capsys.readouterr().err.split())
+    assert "weights of the blend: " in printed
+    # Images of either training are reported as training images.
+    assert main(["run", str(data), "--method", str(adapted_file)]) == 0
+    assert ": 12 of 12 images were used for training" in " ".join(capsys.readouterr().out.split())
+    assert (
+        main(["train", "smart-color-cat", str(data), "--adapt", str(base_file), "--out", str(tmp_path / "no.npz")]) == 2
+    )
+    assert "is a model of kernel-ridge, expected smart-color-cat" in " ".join(capsys.readouterr().err.split())
 
 
-def test_a_class_of_the_users_own(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_trains_user_class(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.py").write_text(
         "import numpy as np\n\n\n"
         "class Mean:\n"
@@ -69,14 +76,14 @@ def test_a_class_of_the_users_own(data: Path, tmp_path: Path, capsys: pytest.Cap
         "    def estimate(self, image, saturation=None, mask=None):\n"
         "        return self.light\n"
     )
-    mine = f"{tmp_path / 'mine.py'}:Mean"
-    assert main(["cv", mine, str(data)]) == 0
+    class_file = f"{tmp_path / 'class_file.py'}:Mean"
+    assert main(["cv", class_file, str(data)]) == 0
     assert "My mean" in capsys.readouterr().out
-    assert main(["train", mine, str(data), "--out", str(tmp_path / "model.npz")]) == 2
-    assert "is a class of your own, which a model file cannot hold: evaluate cv" in capsys.readouterr().err
+    assert main(["train", class_file, str(data), "--out", str(tmp_path / "model.npz")]) == 2
+    assert "is your own class" in capsys.readouterr().err
 
 
-def test_all_leaves_out_what_is_not_installed_and_says_why(
+def test_all_omits_learners_that_are_not_installed(
     data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
@@ -84,40 +91,40 @@ def test_all_leaves_out_what_is_not_installed_and_says_why(
     assert main(["cv", "all", str(data), "--folds", "2"]) == 0
     printed = capsys.readouterr().out
     assert "Log-chroma" in printed
-    assert "Convolutional network is left out: training convnet needs torch" in printed
+    assert "Convolutional network is omitted: training convnet needs torch" in printed
     assert "pip install scikit-learn" in printed
     assert main(["cv", "convnet", str(data)]) == 2
     assert "pip install torch" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("arguments", "why"),
+    ("arguments", "message"),
     [
         (["cv", "smart-color-cat", "DATA", "--folds", "none.csv"], "none.csv"),
-        (["train", "all", "DATA", "--out", "x.npz"], "a model file holds one"),
+        (["train", "all", "DATA", "--out", "x.npz"], "expected one for a model file"),
         (["train", "smart-color-cat", "DATA", "--out", "model.txt"], "ends in .npz"),
     ],
 )
-def test_mistakes_are_named(
+def test_refuses_wrong_arguments(
     arguments: list[str],
-    why: str,
+    message: str,
     data: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(data.parent)
     assert main([str(data) if argument == "DATA" else argument for argument in arguments]) == 2
-    assert why in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert [path.name for path in data.parent.iterdir()] == ["world.npz"]
 
 
-def test_copies_in_several_folds_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_reports_copies_in_several_folds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     images = np.random.default_rng(0).random((6, 8, 8, 3), np.float32)
     images[4] = images[1]
     names = [f"{number}.png" for number in range(6)]
     np.savez(tmp_path / "set.npz", images=images, gt=np.ones((6, 3)), names=names)
     (tmp_path / "folds.csv").write_text("image,fold\n" + "".join(f"{n}.png,{n % 2}\n" for n in range(6)))
     assert main(["cv", "constant-light", f"{tmp_path}/set.npz", "--folds", f"{tmp_path}/folds.csv"]) == 0
-    assert "1 image is a copy of images of other folds (4.png of 1.png)" in capsys.readouterr().out
+    assert "1 image is a copy of images in other folds (4.png of 1.png)" in capsys.readouterr().out
     assert main(["cv", "constant-light", f"{tmp_path}/set.npz", "--folds", "2"]) == 0
     assert "copies" not in capsys.readouterr().out

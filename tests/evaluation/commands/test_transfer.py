@@ -1,4 +1,4 @@
-"""`evaluate transfer` as a user meets it: what it prints, writes and refuses."""
+"""`evaluate transfer`: its output, files and refusals."""
 
 from __future__ import annotations
 
@@ -58,21 +58,18 @@ def made_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 BASIC = ("transfer", "real.npz", "made", "--method", "own.py:Map, gray-world")
 
 
-def test_the_same_command_gives_the_same_bytes(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_are_reproducible(work_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with np.load("real.npz") as data:
         content = {name: data[name] for name in data.files}
     np.savez("tiny.npz", **content | {"images": content["images"].repeat(8, axis=1).repeat(8, axis=2)})
-    wish = ["transfer", "tiny.npz", *BASIC[2:]]
-    assert main([*wish, "--out", "one", "--workers", "1"]) == 0
-    assert (
-        "sides of up to 64 px, half of the images of each training set up to 24 px: all were made small"
-        in capsys.readouterr().out
-    )
-    found = json_of(main, [*wish, "--out", "two", "--workers", "3"], capsys)
-    assert (found["command"], found["test"], found["settings"]["side"]) == ("evaluate transfer", "tiny", 24)
-    assert all(table["rows"] for table in found["tables"])
-    for path in (place / "one").iterdir():
-        assert path.read_bytes() == (place / "two" / path.name).read_bytes(), path.name
+    arguments = ["transfer", "tiny.npz", *BASIC[2:]]
+    assert main([*arguments, "--out", "one", "--workers", "1"]) == 0
+    assert "test images 64 px, training sets 24 px" in capsys.readouterr().out
+    output = json_of(main, [*arguments, "--out", "two", "--workers", "3"], capsys)
+    assert (output["command"], output["test"], output["settings"]["side"]) == ("evaluate transfer", "tiny", 24)
+    assert all(table["rows"] for table in output["tables"])
+    for path in (work_folder / "one").iterdir():
+        assert path.read_bytes() == (work_folder / "two" / path.name).read_bytes(), path.name
 
 
 @pytest.mark.parametrize(
@@ -83,20 +80,20 @@ def test_the_same_command_gives_the_same_bytes(place: Path, capsys: pytest.Captu
     ],
     ids=["one image is larger", "the second set is larger"],
 )
-def test_images_are_made_small_by_the_sizes_of_whole_sets(
-    place: Path, capsys: pytest.CaptureFixture[str], sides: tuple[int, int], trained: list[str], side: int | None
+def test_reduces_images_by_sizes_of_whole_sets(
+    work_folder: Path, capsys: pytest.CaptureFixture[str], sides: tuple[int, int], trained: list[str], side: int | None
 ) -> None:
-    save_pictures(place / "sources", ["a.png"], 1, sides[0])
-    save_pictures(place / "sources", ["b.png", "c.png", "d.png"], 2, sides[1])
-    Maker(place, open_lut(place / "lut")).make("odd", pictures=place / "sources")
+    save_pictures(work_folder / "sources", ["a.png"], 1, sides[0])
+    save_pictures(work_folder / "sources", ["b.png", "c.png", "d.png"], 2, sides[1])
+    Maker(work_folder, open_lut(work_folder / "lut")).make("odd", pictures=work_folder / "sources")
     with np.load("real.npz") as data:
         content = {name: data[name] for name in data.files}
     np.savez("real.npz", **content | {"images": content["images"].repeat(3, axis=1).repeat(3, axis=2)})
-    found = json_of(main, ["transfer", "real.npz", *trained, "--method", "gray-world"], capsys)
-    assert found["settings"]["side"] == side
+    output = json_of(main, ["transfer", "real.npz", *trained, "--method", "gray-world"], capsys)
+    assert output["settings"]["side"] == side
 
 
-def test_all_is_understood_in_any_case(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_ignores_case(work_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     methods = [json_of(main, [*BASIC[:3], "--method", word], capsys)["settings"]["methods"] for word in ("ALL", "all")]
     assert methods[0] == methods[1]
 
@@ -107,28 +104,30 @@ def test_all_is_understood_in_any_case(place: Path, capsys: pytest.CaptureFixtur
         (("--method", "magic"), "'magic'"),
         (("--method", "kernel-rdge"), "kernel-rdge"),
         (("--method", "own.py:Map, ./own.py:Map"), "named twice"),
-        (("made/../made",), "two training sets are called made"),
+        (("made/../made",), "two training sets have the name made"),
         (("real.npz",), "real.npz is both training and test"),
         (("--naive", "lut"), "holds no picture"),
         (("--out", "lut"), "lut already exists; name another place for the results"),
-        (("--real", "20,many"), "--real is '20,many', expected numbers of real images between commas, or all"),
+        (("--real", "20,many"), "--real is '20,many', expected numbers of real images"),
     ],
 )
-def test_what_cannot_be_done_is_one_sentence(
-    place: Path,
+def test_refuses_with_one_sentence(
+    work_folder: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     arguments: tuple[str, ...],
     message: str,
 ) -> None:
-    monkeypatch.setattr(transfer_rows, "gather", Mock(side_effect=AssertionError("no method must be trained")))
-    before = sorted(place.rglob("*"))
+    monkeypatch.setattr(
+        transfer_rows, "collect_material", Mock(side_effect=AssertionError("no method must be trained"))
+    )
+    before = sorted(work_folder.rglob("*"))
     assert main([*BASIC, *arguments]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
-    assert [path for path in sorted(place.rglob("*")) if "__pycache__" not in path.parts] == before
+    assert [path for path in sorted(work_folder.rglob("*")) if "__pycache__" not in path.parts] == before
 
 
-def test_test_images_that_were_printed_are_left_out(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_excludes_printed_test_images(work_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with np.load("real.npz") as data:
         content = {name: data[name] for name in data.files}
     names = content["names"].copy()
@@ -136,5 +135,5 @@ def test_test_images_that_were_printed_are_left_out(place: Path, capsys: pytest.
     np.savez("other.npz", **content | {"names": names})
     assert main(["transfer", "other.npz", *BASIC[2:], "--out", "out"]) == 0
     assert "2 of 12 images of made are also in the test set, by name: 3.png" in capsys.readouterr().out
-    assert json.loads((place / "out" / "run.json").read_text())["training"][0]["images"] == 10
+    assert json.loads((work_folder / "out" / "run.json").read_text())["training"][0]["images"] == 10
     assert len(open_generated("made").scenes) == 12

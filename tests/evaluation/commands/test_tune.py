@@ -1,4 +1,4 @@
-"""`evaluate tune` as a user meets it."""
+"""`evaluate tune`, run as a command."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from evaluation.cli import main
 
 
-def test_a_family_that_is_none_is_told_before_anything_is_opened(capsys: pytest.CaptureFixture[str]) -> None:
+def test_refuses_unknown_family_before_opening_data(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tune", "pca", "no/such/data"]) == 2
-    told = capsys.readouterr().err
-    assert "'pca' is no family of methods to tune; the families are shades-of-gray, general-gray-world" in told
+    error = capsys.readouterr().err
+    assert "'pca' is no family of methods to tune; the families are shades-of-gray, general-gray-world" in error

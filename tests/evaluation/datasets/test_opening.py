@@ -50,7 +50,7 @@ def test_every_layout_keeps_the_contract(name: str, place_of: Place) -> None:
     place = place_of(name)
     data = open_scenes(place, options=options_of(COPIES[name]))
     assert data.layout == COPIES[name].layout
-    assert data.place == str(place)
+    assert data.location == str(place)
     contract.check(data)
     # Whether the reader was ever tried on a published copy is said with results.
     stated = data.treatment.get("reader", "")

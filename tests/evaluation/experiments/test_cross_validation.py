@@ -1,7 +1,4 @@
-"""Cross-validation: each image is estimated once, by a model that has not seen it.
-
-Images made small keep the colours of their areas, and nothing of what is clipped or masked.
-"""
+"""Cross-validation, reduction of images, and tuning without ground truths."""
 
 from __future__ import annotations
 
@@ -28,7 +25,7 @@ from tests.evaluation.learning.made_up_world import world
 from tests.evaluation.made_scenes import Made
 
 
-def test_areas_are_averaged_by_hand() -> None:
+def test_shrinking_averages_areas() -> None:
     image = np.arange(48, dtype=np.uint16).reshape(4, 4, 3)
     small, mask = shrink_image(image, side=2)
     assert not mask.any()
@@ -41,7 +38,7 @@ def test_areas_are_averaged_by_hand() -> None:
     np.testing.assert_allclose(small[0, :, 0], [20 / 1.5, 70 / 1.5], rtol=1e-5)
 
 
-def test_what_is_clipped_or_masked_does_not_show() -> None:
+def test_shrinking_excludes_clipped_and_masked_pixels() -> None:
     light = np.array([3.0, 4.0, 2.0])
     image = np.random.default_rng(0).uniform(1, 100, (32, 48, 1)) * light
     image[3:9, 5:20] = 900, 100, 5
@@ -54,8 +51,10 @@ def test_what_is_clipped_or_masked_does_not_show() -> None:
     assert empty[0, 0]
     assert empty[6, 9]
     assert not empty[3:5].any()
-    seen = small[~empty]
-    np.testing.assert_allclose(seen / seen.sum(axis=1, keepdims=True), np.tile(light / 9, (len(seen), 1)), rtol=1e-5)
+    values = small[~empty]
+    np.testing.assert_allclose(
+        values / values.sum(axis=1, keepdims=True), np.tile(light / 9, (len(values), 1)), rtol=1e-5
+    )
     assert not small[empty].any()
 
 
@@ -64,22 +63,22 @@ pytestmark = pytest.mark.slow
 
 @dataclass(frozen=True)
 class Memory:
-    """A class as a user would write it: it knows the lights of the images that it was fitted to, and no others."""
+    """User class that knows the illuminants of its training images, and no others."""
 
     name: str = "Memory"
-    known: dict[bytes, npt.NDArray[np.float64]] = field(default_factory=dict[bytes, Any])
+    lights: dict[bytes, npt.NDArray[np.float64]] = field(default_factory=dict[bytes, Any])
 
     def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Memory:
-        return Memory(known={np.asarray(scene.read()[0]).tobytes(): scene.truth for scene in scenes})
+        return Memory(lights={np.asarray(scene.read()[0]).tobytes(): scene.truth for scene in scenes})
 
     def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> npt.NDArray[np.float64]:
-        known = self.known.get(np.asarray(image).tobytes())
-        return GREY if known is None else unit(known)
+        lights = self.lights.get(np.asarray(image).tobytes())
+        return GREY if lights is None else unit(lights)
 
 
 @dataclass(frozen=True, eq=False)
-class Counted(Made):
-    """A scene that says when it is read."""
+class ReadCounter(Made):
+    """A scene that records when it is read."""
 
     log: list[str] = field(default_factory=list[str])
 
@@ -92,7 +91,7 @@ SCENES = world(24)
 FOLDS = draw_folds(24, 3)
 
 
-def test_no_image_is_estimated_by_a_model_that_knows_it() -> None:
+def test_estimates_only_unseen_images() -> None:
     (result,) = cross_validate(SCENES, [Memory()], FOLDS)
     assert result.guessed.all()
     # The same scenes twice under other names: now the memory helps wherever the folds part the two.
@@ -102,37 +101,37 @@ def test_no_image_is_estimated_by_a_model_that_knows_it() -> None:
     assert leaking.errors["recovery"].max() < 1e-5
 
 
-def test_the_model_of_a_fold_is_that_of_the_other_scenes() -> None:
+def test_trains_on_other_folds() -> None:
     learner = RegressionTrees(windows=2)
     (result,) = cross_validate(SCENES, [learner], FOLDS, seed=5)
     for fold in range(3):
         method = learner.fit([scene for scene, where in zip(SCENES, FOLDS, strict=True) if where != fold], seed=5)
-        for place in np.flatnonzero(fold == FOLDS):
-            np.testing.assert_allclose(result.estimates[place], method.estimate(SCENES[place].image), rtol=1e-14)
+        for index in np.flatnonzero(fold == FOLDS):
+            np.testing.assert_allclose(result.estimates[index], method.estimate(SCENES[index].image), rtol=1e-14)
 
 
-def test_each_image_is_read_once_for_all_folds_and_learners() -> None:
+def test_reads_each_image_once() -> None:
     log: list[str] = []
-    scenes = [Counted(scene.name, scene.truth, scene.image, log=log) for scene in SCENES]
+    scenes = [ReadCounter(scene.name, scene.truth, scene.image, log=log) for scene in SCENES]
     steps: list[int] = []
     learners = [RegressionTrees(windows=1), RegressionTrees(windows=2)]
     results = cross_validate(scenes, learners, FOLDS, on_scene=lambda: steps.append(1))
     assert sorted(log) == sorted(scene.name for scene in SCENES)
     assert len(steps) == len(SCENES)
     parallel = cross_validate(SCENES, learners, FOLDS, workers=3)
-    for one, other in zip(results, parallel, strict=True):
-        np.testing.assert_array_equal(one.estimates, other.estimates)
+    for first, second in zip(results, parallel, strict=True):
+        np.testing.assert_array_equal(first.estimates, second.estimates)
 
 
-def test_an_image_without_a_usable_pixel_counts_and_is_marked() -> None:
+def test_marks_image_without_usable_pixel() -> None:
     black = replace(SCENES[3], image=np.zeros_like(SCENES[3].image))
     (result,) = cross_validate([*SCENES[:3], black, *SCENES[4:]], [RegressionTrees(windows=1)], FOLDS)
-    assert result.guessed.tolist() == [place == 3 for place in range(24)]
+    assert result.guessed.tolist() == [index == 3 for index in range(24)]
     np.testing.assert_allclose(result.estimates[3], 3**-0.5)
     assert result.errors["recovery"][3] > 1
 
 
-def test_what_cannot_be_validated_is_refused() -> None:
+def test_refuses_impossible_validation() -> None:
     with pytest.raises(InputError, match="0 methods in 3 folds"):
         cross_validate(SCENES, [], FOLDS)
     with pytest.raises(InputError, match="1 methods in 1 folds"):
@@ -145,7 +144,7 @@ def test_what_cannot_be_validated_is_refused() -> None:
 
 
 class Hoarder:
-    """A class that keeps everything that it was ever fitted to in itself, and returns itself."""
+    """User class that accumulates its training images and returns itself from `fit`."""
 
     name = "Hoarder"
 
@@ -157,18 +156,18 @@ class Hoarder:
         return self
 
     def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
-        return self.known.get(np.asarray(image).tobytes())
+        return self.lights.get(np.asarray(image).tobytes())
 
 
-def test_a_class_that_returns_itself_begins_each_fold_anew() -> None:
+def test_each_fold_starts_from_fresh_copy() -> None:
     hoarder = Hoarder()
     (result,) = cross_validate(SCENES, [hoarder], FOLDS)
     assert result.guessed.all()
     assert not hoarder.known
 
 
-class Answers:
-    """Learns nothing and answers what it is told to."""
+class FixedAnswer:
+    """User class that always returns the given value."""
 
     name = "Answers"
 
@@ -188,28 +187,28 @@ class Answers:
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (1.0, "Answers fails on .*returned an array of shape"),
-        ("no method", "Answers returns NoneType from fit, expected a method"),
-        (RuntimeError("no data"), "Answers fails to learn from 16 images: RuntimeError: no data"),
-        (SystemExit(0), "Answers fails to learn from 16 images: SystemExit: 0"),
+        (1.0, "Answers failed on .*returned an array of shape"),
+        ("no method", "Answers.fit returned NoneType, expected a method"),
+        (RuntimeError("no data"), "Answers failed in training on 16 images: RuntimeError: no data"),
+        (SystemExit(0), "Answers failed in training on 16 images: SystemExit: 0"),
     ],
 )
-def test_what_a_class_does_wrong_is_told_with_its_name(value: object, message: str) -> None:
+def test_reports_faulty_class_by_name(value: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        cross_validate(SCENES, [Answers(value)], FOLDS)
+        cross_validate(SCENES, [FixedAnswer(value)], FOLDS)
 
 
-def test_no_light_is_grey_and_the_images_stay_as_they_are() -> None:
-    (result,) = cross_validate(SCENES, [Answers((-1, 1, 1))], FOLDS)
+def test_missing_estimate_becomes_grey_and_images_are_unchanged() -> None:
+    (result,) = cross_validate(SCENES, [FixedAnswer((-1, 1, 1))], FOLDS)
     assert result.guessed.all()
     assert SCENES[0].image.any()
 
 
 @dataclass(frozen=True, eq=False)
 class Shop:
-    """Tiles with a greenish cast under a light that differs in red and blue only, beside a grey one that is brightest.
+    """Tiles with a greenish cast next to a brightest grey one, under an illuminant that differs in red and blue only.
 
-    `told` is the ground truth that the data set states, which may be wrong; None where asking for it is an error.
+    `told` is the ground truth of the data set, which may be wrong; None raises an error if it is read.
     """
 
     number: int
@@ -241,30 +240,32 @@ class Shop:
 BLIND = [Shop(number) for number in range(8)]
 
 
-def test_ground_truths_are_not_looked_at() -> None:
+def test_tuning_does_not_read_ground_truths() -> None:
     tuned = tune_family("shades-of-gray", "shops", BLIND)
     assert tuned.settings[0].text == "shades-of-gray:p=15"
-    assert [one.spread for one in tuned.settings] == sorted(one.spread for one in tuned.settings)
-    assert {one.errors for one in tuned.settings} == {None}
+    assert [unread.spread for unread in tuned.settings] == sorted(unread.spread for unread in tuned.settings)
+    assert {unread.errors for unread in tuned.settings} == {None}
     assert (tuned.images, tuned.counted) == (8, 8)
 
 
-def test_wrong_ground_truths_change_the_errors_and_not_the_choice() -> None:
+def test_wrong_ground_truths_do_not_change_choice() -> None:
     right = [Shop(scene.number, tuple(scene.light.tolist())) for scene in BLIND]
-    wrong = [Shop(scene.number, (1, 0.1, 0.1)) for scene in BLIND]
+    wrong_scenes = [Shop(scene.number, (1, 0.1, 0.1)) for scene in BLIND]
     blind = tune_family("shades-of-gray", "shops", BLIND)
-    good, bad = (tune_family("shades-of-gray", "shops", scenes, "recovery") for scenes in (right, wrong))
-    for other in (good, bad):
-        assert [(one.text, one.spread) for one in other.settings] == [(one.text, one.spread) for one in blind.settings]
+    good, bad = (tune_family("shades-of-gray", "shops", scenes, "recovery") for scenes in (right, wrong_scenes))
+    for wrong_tuning in (good, bad):
+        assert [(right_tuning.text, right_tuning.spread) for right_tuning in wrong_tuning.settings] == [
+            (right_tuning.text, right_tuning.spread) for right_tuning in blind.settings
+        ]
     assert good.settings[0].errors is not None
     assert bad.settings[0].errors is not None
     assert good.settings[0].errors.median < bad.settings[0].errors.median - 20
 
 
-def test_images_without_a_light_are_left_out_and_told() -> None:
+def test_tuning_excludes_and_reports_images_without_estimate() -> None:
     scenes = [*BLIND, Shop(8, black=True)]
     tuned = tune_family("shades-of-gray", "shops", scenes)
     assert tuned.settings == tune_family("shades-of-gray", "shops", BLIND).settings
-    assert tuning_table(tuned).notes == ("1 of 9 images give no light with some setting and do not count for any.",)
+    assert tuning_table(tuned).notes[0].startswith("1 of 9 images are excluded")
     with pytest.raises(InputError, match="1 of 2 images"):
         tune_family("shades-of-gray", "shops", scenes[-2:])

@@ -1,4 +1,4 @@
-"""Folds: balanced, drawn by a seed, never parting what belongs together."""
+"""Folds: published, drawn or read from a file; groups stay together."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from evaluation.experiments.folds import (
     folds_to_csv,
     group_of,
     read_folds,
-    require_apart,
+    require_groups_together,
 )
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError, InputError
@@ -24,40 +24,40 @@ from foundation.errors import FormatError, InputError
 NAMES = ["a.png", "b.png", "c.png", "d, e.png"]
 
 
-def test_folds_are_the_authors_unless_others_are_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uses_published_folds_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     scenes: Any = tuple(SimpleNamespace(name=name, truth=np.ones(3), saturation=None) for name in NAMES)
     data = SceneSet("Four", "plain", "four", scenes, folds=(1, 0, 1, 0))
-    assert [part if isinstance(part, str) else part.tolist() for part in choose_folds(data)] == [
+    assert [item if isinstance(item, str) else item.tolist() for item in choose_folds(data)] == [
         [1, 0, 1, 0],
         "the data set's own",
     ]
     drawn, origin = choose_folds(data, "2", seed=3)
     assert (drawn.tolist(), origin) == (draw_scene_folds(scenes, 2, 3).tolist(), "drawn by seed 3")
     assert set(choose_folds(replace(data, folds=None))[0].tolist()) == {0, 1, 2}
-    # Whether a word is a file is asked of the disk only where it has no ending.
+    # A word without extension is a file if it exists.
     Path("folds").write_text(folds_to_csv(NAMES, np.array([0, 1, 1, 1])))
     assert choose_folds(data, "folds")[0].tolist() == [0, 1, 1, 1]
     assert choose_folds(data, "folds")[1] == "from folds"
 
 
 @pytest.mark.parametrize(
-    ("text", "why"),
+    ("text", "message"),
     [
-        ("-2", "2 to 4 folds are possible"),
-        ("+-2", "'[+]-2', expected a number from 2"),
-        ("²", "'²', expected a number from 2"),
+        ("-2", "expected 2 to 4"),
+        ("+-2", "'[+]-2', expected a number"),
+        ("²", "'²', expected a number"),
         ("two.csv", "cannot read folds from two.csv"),
     ],
 )
-def test_what_names_no_folds_is_refused(text: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_invalid_folds_option(text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     scenes: Any = tuple(SimpleNamespace(name=name, truth=np.ones(3), saturation=None) for name in NAMES)
-    with pytest.raises((InputError, FormatError), match=why):
+    with pytest.raises((InputError, FormatError), match=message):
         choose_folds(SceneSet("Four", "plain", "four", scenes), text)
 
 
-def test_a_file_of_folds_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_fold_file_round_trip(tmp_path: Path) -> None:
     path, folds = tmp_path / "folds.csv", np.array([2, 0, 1, 2])
     path.write_text(folds_to_csv(NAMES, folds))
     np.testing.assert_array_equal(read_folds(path, NAMES), folds)
@@ -66,25 +66,25 @@ def test_a_file_of_folds_is_read_as_it_was_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "why"),
+    ("text", "message"),
     [
         ('image,fold\na.png,0\nb.png,1\nc.png\n"d, e.png",1\n', "without a fold: c.png"),
-        ('image,fold\na.png,7\nb.png,7\nc.png,7\n"d, e.png",7\n', "fold 7 only"),
+        ('image,fold\na.png,7\nb.png,7\nc.png,7\n"d, e.png",7\n', "only the fold 7"),
     ],
 )
-def test_a_bad_file_of_folds_is_refused(tmp_path: Path, text: str, why: str) -> None:
+def test_refuses_invalid_fold_file(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "folds.csv"
     path.write_text(text)
-    with pytest.raises(FormatError, match=why):
+    with pytest.raises(FormatError, match=message):
         read_folds(path, NAMES)
 
 
-def test_folds_that_leak_are_refused() -> None:
+def test_refuses_folds_that_separate_groups() -> None:
     scenes: Any = [SimpleNamespace(name=f"{number}.png", group=f"picture {number // 2}") for number in range(4)]
-    require_apart(scenes, np.array([0, 0, 1, 1]))
+    require_groups_together(scenes, np.array([0, 0, 1, 1]))
     with pytest.raises(InputError, match=r"picture 1 .*folds 0 and 1"):
-        require_apart(scenes, np.array([0, 0, 0, 1]))
-    named: Any = [SimpleNamespace(name="same.png"), SimpleNamespace(name="same.png")]
-    assert group_of(named[0]) == "same.png"
+        require_groups_together(scenes, np.array([0, 0, 0, 1]))
+    same_names: Any = [SimpleNamespace(name="same.png"), SimpleNamespace(name="same.png")]
+    assert group_of(same_names[0]) == "same.png"
     with pytest.raises(InputError, match=r"same\.png"):
-        require_apart(named, np.array([0, 1]))
+        require_groups_together(same_names, np.array([0, 1]))

@@ -1,4 +1,4 @@
-"""Numbers of statistics, comparisons, folds, descriptions and figures, to the last digits, with values at limits."""
+"""Pinned numbers of statistics, comparisons, folds, descriptions and figures, with values at limits."""
 
 from __future__ import annotations
 

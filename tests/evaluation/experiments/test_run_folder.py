@@ -1,4 +1,4 @@
-"""Results folders: whole or not at all; and what a run says of a model that was trained on its images."""
+"""Results folders: complete or absent, reproducible, with notes on models tested on training images."""
 
 from __future__ import annotations
 
@@ -36,29 +36,29 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 class Killed(BaseException):
-    """The end of a process, wherever it is."""
+    """End of the process at an arbitrary point."""
 
 
-def test_the_same_run_gives_the_same_bytes_whatever_the_workers(tmp_path: Path) -> None:
+def test_files_do_not_depend_on_workers(tmp_path: Path) -> None:
     counts: list[int] = []
     for workers in (1, 3):
         run = run_methods(mixed_set(), METHODS, workers, lambda: counts.append(1))
         write_run(run, mixed_set().scenes, tmp_path / str(workers), workers=workers)
     assert len(counts) == 2 * 5
-    one, other = content(tmp_path / "1"), content(tmp_path / "3")
-    assert one == other
-    assert set(one) == {
+    first, second = content(tmp_path / "1"), content(tmp_path / "3")
+    assert first == second
+    assert set(first) == {
         *("run.json", "results.csv", "errors.csv", "table.tex", "report.html", "pixels.csv", "regions.csv"),
     }
 
 
-def test_a_folder_whose_writing_ends_early_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_writing_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, write_atomic = tmp_path / "out", run_folder.write_atomic
     run = run_methods(mixed_set(), METHODS)
-    left = iter(range(4))
+    remaining = iter(range(4))
 
     def writes(path: Path, text: str) -> None:
-        if next(left, None) is None:
+        if next(remaining, None) is None:
             raise Killed
         write_atomic(path, text)
 
@@ -71,11 +71,11 @@ def test_a_folder_whose_writing_ends_early_is_not_there(tmp_path: Path, monkeypa
     assert len(content(folder)) == 7
 
 
-def test_a_true_light_without_a_channel_is_judged() -> None:
+def test_ground_truth_with_zero_channel_has_error() -> None:
     run_methods(as_set((Wall("red", np.array([1.0, 0, 0])),)), [METHODS[0]])
 
 
-def test_what_is_there_is_kept(tmp_path: Path) -> None:
+def test_existing_folder_is_kept(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").touch()
     with pytest.raises(InputError):
@@ -84,7 +84,7 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
 
 
 class Flat:
-    """A model that always sees the same light."""
+    """A model that always returns the same illuminant."""
 
     def lights(self, features: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
         return np.ones((len(features), 3))
@@ -93,18 +93,21 @@ class Flat:
         return {"seen": np.ones(3)}
 
 
-def test_a_model_judged_on_what_it_was_trained_on_is_said_to_be() -> None:
-    data, other = as_set(walls(3)), as_set(walls(4))
+def test_reports_model_tested_on_training_data() -> None:
+    data, larger_set = as_set(walls(3)), as_set(walls(4))
     record = provenance_of(data, 0, SystemClock())
     learner = standard_learners()["regression-trees"]
     model = StoredMethod(learner, Flat(), data.name, record)
-    (part,) = run_methods(other, [model]).notes
-    assert ": 3 of 4 images were trained on, by name and light or by source picture" in part
-    # The name of the data set, the order of its images and the endings of their names may be others.
+    (first_note,) = run_methods(larger_set, [model]).notes
+    assert ": 3 of 4 images were used for training, by name and ground truth or by source picture" in first_note
+    # The name of the data set, the order of its images and their file extensions may differ.
     renamed = tuple(Wall(f"copies/{Path(wall.name).stem.upper()}.TIF", wall.truth) for wall in reversed(walls(4)))
-    assert ": 3 of 4 images were trained on" in run_methods(replace(as_set(renamed), name="Others"), [model]).notes[0]
-    others = tuple(Wall(f"other {wall.name}", wall.truth) for wall in walls(4))
-    assert "none of these has the name and light" in run_methods(as_set(others), [model]).notes[0]
-    assert run_methods(replace(as_set(others), name="Others"), [model]).notes == ()
+    assert (
+        ": 3 of 4 images were used for training"
+        in run_methods(replace(as_set(renamed), name="Others"), [model]).notes[0]
+    )
+    renamed_scenes = tuple(Wall(f"other {wall.name}", wall.truth) for wall in walls(4))
+    assert "no image was identified as a training image" in run_methods(as_set(renamed_scenes), [model]).notes[0]
+    assert run_methods(replace(as_set(renamed_scenes), name="Others"), [model]).notes == ()
     (note,) = run_methods(data, [model]).notes
-    assert note.startswith(f"{learner.name} (trained on Walls) was trained on these very images")
+    assert note.startswith(f"{learner.name} (trained on Walls) was trained on these images")

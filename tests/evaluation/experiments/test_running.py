@@ -1,4 +1,4 @@
-"""Methods of strangers in the runner: what they return, raise and change; images under several lights; the order."""
+"""User methods in a run: returned values, errors, changed images; and images under several illuminants."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ GRAY_WORLD = GrayEdge("Gray-world", 0, 1, 0, 0)
 LIGHTS = np.array([[2.0, 1, 1], [1, 1, 1]])
 
 
-class Returns:
-    """A stranger's method that returns what it is told to on images whose first pixel is not too bright."""
+class FixedValues:
+    """User method that returns, or raises, the given values one after another."""
 
     name = "Stranger"
 
@@ -48,9 +48,9 @@ class Returns:
         (GREY, "no usable pixel"),
     ],
 )
-def test_what_is_no_light_is_counted_named_and_taken_as_grey(value: object, cause: str) -> None:
+def test_missing_estimate_is_counted_and_grey(value: object, cause: str) -> None:
     scenes = walls(3)
-    (result,) = evaluate(scenes, [Returns((3, 4, 0), value, [0.1, 0.1, 0.1])])
+    (result,) = evaluate(scenes, [FixedValues((3, 4, 0), value, [0.1, 0.1, 0.1])])
     assert result.guessed.tolist() == [False, True, False]
     assert result.causes == {1: cause}
     np.testing.assert_allclose(result.estimates, [[0.6, 0.8, 0], [3**-0.5] * 3, [3**-0.5] * 3])
@@ -68,37 +68,37 @@ def test_what_is_no_light_is_counted_named_and_taken_as_grey(value: object, caus
         (np.ma.masked_array([1.0, 1, 1], [False, False, True]), "returned MaskedArray, expected three real numbers"),
     ],
 )
-def test_a_mistake_in_a_method_ends_the_run_with_its_name(value: object, message: str) -> None:
-    with pytest.raises(InputError, match=rf"^Stranger fails on wall 1\.png: .*{message}.*; correct it and run"):
-        evaluate(walls(3), [Returns((1, 1, 1), value, (1, 1, 1))])
+def test_faulty_method_is_reported_by_name(value: object, message: str) -> None:
+    with pytest.raises(InputError, match=rf"^Stranger failed on wall 1\.png: .*{message}.*; correct it and run"):
+        evaluate(walls(3), [FixedValues((1, 1, 1), value, (1, 1, 1))])
 
 
-def test_the_line_of_the_user_s_file_is_named(tmp_path: Path) -> None:
+def test_reports_line_of_user_file(tmp_path: Path) -> None:
     file = tmp_path / "own.py"
     file.write_text(
         "import numpy as np\n\nclass Own:\n    name = 'Own'\n\n"
         "    def estimate(self, image, saturation=None, mask=None):\n        return np.linalg.inv(np.zeros((3, 3)))\n"
     )
     method = find_method(f"{file}:Own")
-    with pytest.raises(InputError, match=r"Own fails on wall 0\.png: LinAlgError: .*\(own\.py, line 7\)"):
+    with pytest.raises(InputError, match=r"Own failed on wall 0\.png: LinAlgError: .*\(own\.py, line 7\)"):
         evaluate(walls(1), [method])  # pyrefly: ignore[bad-argument-type]
 
 
-def test_nothing_to_evaluate_is_said() -> None:
+def test_refuses_run_without_methods() -> None:
     with pytest.raises(InputError, match="0 methods on 3 images"):
         evaluate(walls(3), [])
 
 
 @pytest.mark.parametrize("light", [(0, 0, 0), (np.nan, 1, 1), (np.inf, 1, 1), (1, 1, -1)])
-def test_a_scene_without_a_light_is_named_before_the_work(light: tuple[float, ...]) -> None:
+def test_refuses_invalid_ground_truth_before_reading(light: tuple[float, ...]) -> None:
     read: list[str] = []
     with pytest.raises(InputError, match=r"dark\.png.*blue"):
         evaluate([*walls(1, read), Wall("dark.png", np.array(light))], [GRAY_WORLD])
     assert not read
 
 
-class Destroys:
-    """A stranger's method that uses the image it is given as its own."""
+class ChangesImage:
+    """User method that overwrites the image it receives."""
 
     name = "Destroys"
 
@@ -109,7 +109,7 @@ class Destroys:
 
 
 class InMemory(Wall):
-    """A wall that hands out the same array every time, as thumbnails do."""
+    """A wall that returns the same array every time, as thumbnails do."""
 
     def read(self) -> tuple[npt.NDArray[np.float32], None]:
         return IMAGE, None
@@ -118,16 +118,16 @@ class InMemory(Wall):
 IMAGE = (np.random.default_rng(0).random((6, 6, 3)) + 0.1).astype(np.float32)
 
 
-def test_a_method_cannot_change_what_others_see() -> None:
+def test_method_cannot_change_images_of_others() -> None:
     scenes = [InMemory("one", np.ones(3)), InMemory("two", np.ones(3))]
     alone = evaluate(scenes, [GRAY_WORLD])[0].estimates
-    both = evaluate(scenes, [Destroys(), GRAY_WORLD])
-    np.testing.assert_array_equal(both[1].estimates, alone)
-    assert both[0].errors["recovery"][1] == both[0].errors["recovery"][0]
+    results = evaluate(scenes, [ChangesImage(), GRAY_WORLD])
+    np.testing.assert_array_equal(results[1].estimates, alone)
+    assert results[0].errors["recovery"][1] == results[0].errors["recovery"][0]
 
 
-class CountsCallers:
-    """A stranger's method that two threads must not enter at once."""
+class SingleThreaded:
+    """User method that fails if two threads call it at the same time."""
 
     name = "Counts"
 
@@ -141,15 +141,15 @@ class CountsCallers:
         return np.asarray(image.mean(axis=(0, 1)), dtype=np.float64)
 
 
-def test_a_stranger_s_method_has_one_caller_at_a_time() -> None:
+def test_user_method_runs_in_one_thread_at_a_time() -> None:
     scenes = walls(40)
-    (one,) = evaluate(scenes, [CountsCallers()], workers=1)
-    (four,) = evaluate(scenes, [CountsCallers()], workers=4)
-    np.testing.assert_array_equal(one.estimates, four.estimates)
+    (single,) = evaluate(scenes, [SingleThreaded()], workers=1)
+    (threaded,) = evaluate(scenes, [SingleThreaded()], workers=4)
+    np.testing.assert_array_equal(single.estimates, threaded.estimates)
 
 
 class HalfRight:
-    """A stranger's local method: right on the left part, grey elsewhere; globally it says white."""
+    """User method with a map: correct on the left part, grey elsewhere; its single estimate is white."""
 
     name = "Half right"
 
@@ -157,38 +157,38 @@ class HalfRight:
         return np.ones(3)
 
     def estimate_map(self, image: Any, saturation: float | None = None, mask: Any = None) -> npt.NDArray[np.float32]:
-        found = np.full(image.shape, 1 / 3, np.float32)
-        found[:, :4] = (0.5, 0.25, 0.25)
-        return found
+        lights = np.full(image.shape, 1 / 3, np.float32)
+        lights[:, :4] = (0.5, 0.25, 0.25)
+        return lights
 
 
-def test_several_lights_are_judged_by_pixel_and_region() -> None:
+def test_errors_by_pixel_and_region() -> None:
     scenes: list[Scene] = [*walls(1), MixedWall("mixed", LIGHTS)]
-    whole, local = evaluate(scenes, [Returns((1, 1, 1), (1, 1, 1)), HalfRight()], workers=1)
-    off = float(recovery_error(LIGHTS[0], LIGHTS[1]))
-    ((place, error),) = (whole.maps or {}).items()
-    assert place == 1
-    assert error.recovery == pytest.approx(off / 4, abs=1e-4)
-    assert [region.recovery for region in error.regions] == pytest.approx([off, 0], abs=1e-4)
+    global_result, local = evaluate(scenes, [FixedValues((1, 1, 1), (1, 1, 1)), HalfRight()], workers=1)
+    angle = float(recovery_error(LIGHTS[0], LIGHTS[1]))
+    ((index, error),) = (global_result.maps or {}).items()
+    assert index == 1
+    assert error.recovery == pytest.approx(angle / 4, abs=1e-4)
+    assert [region.recovery for region in error.regions] == pytest.approx([angle, 0], abs=1e-4)
     assert [region.share for region in error.regions] == pytest.approx([0.25, 0.75])
     error = (local.maps or {})[1]
     assert (error.recovery, error.rgb) == pytest.approx((0, 0), abs=1e-4)
-    # Both are held to the mean light by their one estimate.
-    assert local.errors["recovery"][1] == whole.errors["recovery"][1] > 1
+    # The single estimates of both are compared with the mean illuminant.
+    assert local.errors["recovery"][1] == global_result.errors["recovery"][1] > 1
 
 
-def _two_pixels(found: Any) -> Any:
-    found[0, 0] = np.nan
-    found[0, 1] = 0
-    return found
+def _two_pixels(lights: Any) -> Any:
+    lights[0, 0] = np.nan
+    lights[0, 1] = 0
+    return lights
 
 
-def _half(found: Any) -> Any:
-    return found[:6]
+def _half(lights: Any) -> Any:
+    return lights[:6]
 
 
-def _integers(found: Any) -> Any:
-    return (found * 100).astype(np.uint8)
+def _integers(lights: Any) -> Any:
+    return (lights * 100).astype(np.uint8)
 
 
 def altered(monkeypatch: pytest.MonkeyPatch, change: Callable[[Any], Any]) -> HalfRight:
@@ -206,17 +206,15 @@ def altered(monkeypatch: pytest.MonkeyPatch, change: Callable[[Any], Any]) -> Ha
     ("change", "message"),
     [(_half, r"float32 of shape \(6, 16, 3\), expected floats \(12, 16, 3\)"), (_integers, "uint8 of shape")],
 )
-def test_a_map_that_is_none_ends_the_run(
-    monkeypatch: pytest.MonkeyPatch, change: Callable[[Any], Any], message: str
-) -> None:
+def test_refuses_invalid_map(monkeypatch: pytest.MonkeyPatch, change: Callable[[Any], Any], message: str) -> None:
     method = altered(monkeypatch, change)
-    with pytest.raises(InputError, match=f"fails on mixed: .*{message}"):
+    with pytest.raises(InputError, match=f"failed on mixed: .*{message}"):
         evaluate([MixedWall("mixed", LIGHTS)], [method])
 
 
-def test_pixels_without_a_light_are_counted_and_grey(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pixels_without_estimate_are_counted_and_grey(monkeypatch: pytest.MonkeyPatch) -> None:
     (result,) = evaluate([MixedWall("mixed", LIGHTS)], [altered(monkeypatch, _two_pixels)])
-    assert result.causes == {0: "no light in 2 of 192 pixels of its map"}
+    assert result.causes == {0: "no estimate in 2 of 192 pixels of its map"}
     assert not result.guessed.any()
-    # Two of 192 pixels are grey now, where the light is red.
+    # Two of 192 pixels under the red illuminant are grey.
     assert (result.maps or {})[0].recovery == pytest.approx(float(recovery_error(*LIGHTS)) * 2 / 192, rel=1e-3)

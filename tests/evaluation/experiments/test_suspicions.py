@@ -1,4 +1,4 @@
-"""Notes on lights that are written otherwise than they are read: made where they are, and not where all is right."""
+"""Notes on illuminants written in another convention: given for wrong conventions, absent for correct data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RANDOM = np.random.default_rng(3)
 TRUTHS = RANDOM.uniform([0.3, 0.9, 0.2], [0.6, 1.1, 0.5], (40, 3))
 
 
-def test_methods_of_the_suite_on_images() -> None:
+def test_reports_only_wrong_conventions() -> None:
     truths = TRUTHS * [2, 1, 1]
     scenes = [Wall(name, truth) for name, truth in zip(NAMES, truths, strict=True)]
     results = evaluate(scenes, [GrayEdge("Gray-world", 0, 1, 0), GrayEdge("White-Patch", 0, np.inf, 0)])

@@ -1,7 +1,4 @@
-"""Tables on terminals of every width.
-
-LaTeX tables: every row has as many cells as the preamble has columns, and no character is a command by accident.
-"""
+"""Tables on terminals of different widths, and as LaTeX."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ TABLE = Table(
 )
 
 
-def test_square_brackets_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+def test_prints_square_brackets_literally(capsys: pytest.CaptureFixture[str]) -> None:
     print_table(TABLE)
     title, *rest, note = capsys.readouterr().out.splitlines()
     assert title == TABLE.title
@@ -28,9 +25,7 @@ def test_square_brackets_are_no_markup(capsys: pytest.CaptureFixture[str]) -> No
     assert "Shades-of-Gray [p=2] of many words" in "\n".join(rest)
 
 
-def test_a_narrow_terminal_folds_names_and_cuts_no_number(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_narrow_terminal_folds_only_names(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")  # By which rich takes any output for a terminal.
     monkeypatch.setenv("COLUMNS", "45")
     print_table(TABLE)
@@ -40,9 +35,7 @@ def test_a_narrow_terminal_folds_names_and_cuts_no_number(
         assert word in text
 
 
-def test_a_file_gets_the_whole_table_however_narrow_the_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_file_gets_full_width(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("COLUMNS", "30")
     print_table(TABLE)
     lines = capsys.readouterr().out.splitlines()[1:-1]
@@ -54,18 +47,18 @@ def test_a_file_gets_the_whole_table_however_narrow_the_terminal(
 HEADS = ("Algorithm", "Mean", "Best 25%")
 
 
-def test_a_stack_has_one_preamble_and_every_title() -> None:
+def test_joined_tables_have_one_preamble_and_all_titles() -> None:
     tables = [Table(f"Set {number}", HEADS, (("Gray-world", 1.0, 2.0),)) for number in range(3)]
     text = tables_to_latex("All of them", tables)
     assert text.count("\\begin{tabular}") == 1
     assert [f"\\multicolumn{{3}}{{|c|}}{{Set {number}}}\\\\" in text for number in range(3)] == [True] * 3
     with pytest.raises(ValueError, match="expected at least one"):
         tables_to_latex("None", [])
-    with pytest.raises(ValueError, match="same columns"):
+    with pytest.raises(ValueError, match="same number of columns"):
         tables_to_latex("Two kinds", [tables[0], Table("Narrow", ("a",), ())])
 
 
 @pytest.mark.parametrize("mark", list("\\&%$#_{}~^<>|"))
-def test_special_characters_are_escaped(mark: str) -> None:
+def test_escapes_special_characters(mark: str) -> None:
     # Not alone after the escape as a character that TeX acts on: preceded by a backslash, within $…$, or by its name.
     assert escape_latex(mark) in (f"\\{mark}", f"${mark}$") or escape_latex(mark).startswith("\\text")

@@ -1,4 +1,4 @@
-"""Records of methods: the same for the same method in any process, another for any other."""
+"""Records of methods: equal only for the same method."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evaluation.results.method_records import describe_method
 pytestmark = pytest.mark.slow
 
 
-def test_a_changed_file_is_another_method(tmp_path: Path) -> None:
+def test_record_depends_on_source_file(tmp_path: Path) -> None:
     text = "class Own:\n    name = 'Own'\n\n    def estimate(self, *given):\n        return 1, 1, 1\n"
     records: list[dict[str, Any]] = []
     for number, content in enumerate((text, text, text + "# changed\n")):
@@ -24,7 +24,7 @@ def test_a_changed_file_is_another_method(tmp_path: Path) -> None:
     assert records[0]["class"] == "own.py:Own"
 
 
-def test_another_setting_is_another_method() -> None:
+def test_record_depends_on_settings() -> None:
     class Own:
         name = "Own"
 

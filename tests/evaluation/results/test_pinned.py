@@ -1,4 +1,4 @@
-"""What readers of results, estimates, folds, statistics and models make of files at their limits and beyond."""
+"""Pinned results of readers for damaged files and values at limits."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ REFUSED = {"refused": 1}
 
 
 def attempt(read: Callable[[], Any]) -> Any:
-    """Return what is read, or that it was refused."""
+    """Return the value that `read` returns, or that it was refused."""
     try:
         return read()
     except (CropError, KeyError, TypeError, ValueError):
@@ -50,7 +50,7 @@ TRUTHS = "File,GT_R,GT_G,GT_B\nA_1,0.2,0.5,0.3\nA_2,0.3,0.5,0.2\nB_1,1,2,1\n"
 
 
 def damages(text: str) -> Iterator[tuple[str, str]]:
-    """Yield a text, damaged in several ways, each with its name."""
+    """Yield damaged versions of a text with their names."""
     lines = text.splitlines(keepends=True)
     last = lines[-1]
     yield "empty", ""
@@ -92,7 +92,7 @@ def test_damaged_tables(tmp_path: Path, pinned: Pinned) -> None:
 
 
 def changed(array: Any) -> dict[str, Any]:
-    """Return an array changed in several ways."""
+    """Return changed versions of an array."""
     return {
         "shorter": array[:-1] if array.ndim else np.zeros(2),
         "of floats": np.real(array).astype(np.float32),

@@ -1,7 +1,4 @@
-"""Tables as values and as CSV, which is read back by Python's own reader.
-
-Tables of results: one light and several are never mixed silently, and images without a light are named.
-"""
+"""Tables as values and as CSV, and tables of results under one and several illuminants."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ LIGHTS = np.array([[2.0, 1, 1], [1, 1, 1]])
 
 
 class White:
-    """Says white, and nothing at all on images that are named."""
+    """Estimates white, and nothing on images with given names."""
 
     name = "White"
 
@@ -38,28 +35,25 @@ def subject_of(scenes: tuple[Scene, ...]) -> Subject:
     return Subject("Walls", tuple(scene.name for scene in scenes), mixed)
 
 
-def test_several_lights_are_said_and_told_apart() -> None:
+def test_separates_images_under_several_illuminants() -> None:
     scenes: tuple[Scene, ...] = (*walls(3), MixedWall("mixed", LIGHTS), MixedWall("other", LIGHTS))
     results = evaluate(scenes, [White()])
     subject = subject_of(scenes)
     title = summary_table(subject, results, "recovery").title
-    assert title.startswith("Walls: recovery angular error of 5 images (2 of them under several lights, held to")
-    several, one = lights_tables(subject, results, "recovery")
-    off = float(recovery_error(*LIGHTS))
+    assert "2 under several illuminants" in title
+    several, single = lights_tables(subject, results, "recovery")
+    angle = float(recovery_error(*LIGHTS))
     row = dict(zip(several.columns[1::2], several.rows[0][1::2], strict=True))
-    assert row["MAE_illum"] == pytest.approx(off / 4, abs=1e-4)
-    assert row["By region"] == pytest.approx(off / 2, abs=1e-4)
+    assert row["MAE_illum"] == pytest.approx(angle / 4, abs=1e-4)
+    assert row["By region"] == pytest.approx(angle / 2, abs=1e-4)
     assert row["Mean light"] == pytest.approx(float(recovery_error((1, 1, 1), scenes[3].truth)), abs=1e-4)
     alone = recovery_error((1, 1, 1), np.stack([scene.truth for scene in scenes[:3]]))
-    assert one.rows[0][1:] == pytest.approx(summarise(alone).as_tuple())
-    everything = summary_table(subject_of(scenes[3:]), evaluate(scenes[3:], [White()]), "recovery").title
-    assert (
-        everything
-        == "Walls: recovery angular error of 2 images under several lights, held to the mean of these, degrees"
-    )
+    assert single.rows[0][1:] == pytest.approx(summarise(alone).as_tuple())
+    title = summary_table(subject_of(scenes[3:]), evaluate(scenes[3:], [White()]), "recovery").title
+    assert "2 images under several illuminants" in title
 
 
-def test_an_image_of_which_nothing_is_judged_is_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_excludes_image_without_judged_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     scenes = (MixedWall("seen", LIGHTS), MixedWall("unseen", LIGHTS))
     read = MixedWall.read
 
@@ -71,7 +65,7 @@ def test_an_image_of_which_nothing_is_judged_is_left_out_and_counted(monkeypatch
     results = evaluate(scenes, [White()])
     (several,) = lights_tables(subject_of(scenes), results, "recovery")
     assert several.rows[0][1] == pytest.approx(float(recovery_error(*LIGHTS)) / 4, abs=1e-4)
-    assert any(note.startswith("1 images have no pixel whose light is known") for note in several.notes)
+    assert any(note.startswith("1 images are excluded") for note in several.notes)
     row = next(row for row in statistics_rows(subject_of(scenes), results).rows if row[1] == "pixel_rgb")
     assert row[3] == 1
 
@@ -84,7 +78,7 @@ TABLE = Table(
 )
 
 
-def test_text_is_rounded_and_csv_is_not() -> None:
+def test_rounds_text_but_not_csv() -> None:
     assert TABLE.texts()[0][1:] == ("0.67", "1707", "1.2 to 3.4")
     assert TABLE.texts()[1][1] == "–"
     head, *rows = csv.reader(table_to_csv(TABLE).splitlines(keepends=True))

@@ -1,4 +1,4 @@
-"""Small made-up tables of the paper's two cameras."""
+"""Small simulated look-up tables of the paper's two cameras."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ TableMaker = Callable[..., Lut]
 
 @pytest.fixture
 def make_table(tmp_path: Path) -> TableMaker:
-    """Return a maker of tables whose colours reflect as their code, with noise of that share of the value."""
+    """Return a function that makes LUTs whose colours reflect as their codes, with relative noise."""
 
     def make(camera: str, noise: float = 0.0, samples: int = 25) -> Lut:
         random = np.random.default_rng(5)
         bright = [(CODES / 7 * light)[:, None].repeat(samples, axis=1) for light in LIGHTS]
-        noisy = [np.maximum(one * (1 + noise * random.standard_normal(one.shape)), 0) for one in bright]
+        noisy = [np.maximum(sample * (1 + noise * random.standard_normal(sample.shape)), 0) for sample in bright]
         return write_lut(tmp_path / camera.replace(" ", "-"), noisy, LIGHTS, camera)
 
     return make

@@ -1,4 +1,4 @@
-"""The paper's numbers are kept as it prints them."""
+"""Published numbers, compared with the source of the paper."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ALL = [(f"{key}, {method}", row) for key, rows in [*TABLE1.items(), *TABLE2.item
 
 
 def printed(text: str) -> list[tuple[str, dict[str, PublishedRow]]]:
-    """Return the heads of the blocks of both tables and their rows."""
+    """Return the heading and the rows of each block of both tables."""
     _, *blocks = BLOCK.split(text)
     # The last block of the first table is followed by the text, where no row stands.
     return [
@@ -34,31 +34,31 @@ def printed(text: str) -> list[tuple[str, dict[str, PublishedRow]]]:
 
 # Where the paper's source is not at hand the table's inner consistency below is what holds.
 @pytest.mark.parametrize("path", PAPERS[:1])
-def test_they_are_those_of_the_paper(path: Path) -> None:
+def test_numbers_match_paper_source(path: Path) -> None:
     blocks = printed(path.read_text())
     assert len(blocks) == len(TABLE1) + len(TABLE2) == 10
     for (head, rows), (cell, ours) in zip(blocks, TABLE1.items(), strict=False):
-        words = [part.strip("~ ") for part in head.split(",")]
+        words = [value.strip("~ ") for value in head.split(",")]
         assert [word.split()[0] for word in words] == list(cell)
         assert [word.split()[1] for word in words] == ["scenes", "sensor", "illuminations"]
         assert rows == ours
-    (head, rows), (other, moved) = blocks[8:]
+    (head, rows), (theirs, moved) = blocks[8:]
     assert "cross-validation" in head
-    assert "generated" in other
+    assert "generated" in theirs
     assert rows == TABLE2["real"]
     assert moved == TABLE2["generated"]
 
 
 @pytest.mark.parametrize(("name", "row"), ALL, ids=[name for name, _ in ALL])
-def test_the_last_number_is_the_geometric_mean_of_the_others(name: str, row: PublishedRow) -> None:
-    *parts, average = row.as_tuple()
-    low = math.prod(part - 0.005 for part in parts) ** 0.2
-    high = math.prod(part + 0.005 for part in parts) ** 0.2
+def test_average_is_geometric_mean(name: str, row: PublishedRow) -> None:
+    *values, average = row.as_tuple()
+    low = math.prod(value - 0.005 for value in values) ** 0.2
+    high = math.prod(value + 0.005 for value in values) ** 0.2
     assert low - 0.005 <= average <= high + 0.005
     assert row.best25 < row.median < row.worst25
 
 
-def test_a_row_is_no_reproduction_error() -> None:
+def test_published_row_exceeds_reproduction_error() -> None:
     # White corrected to a single channel is as far from white as the error can be.
     largest = math.degrees(math.acos(1 / math.sqrt(3)))
     beyond = [(cell, method) for cell, rows in TABLE1.items() for method, row in rows.items() if row.worst25 > largest]

@@ -1,7 +1,4 @@
-"""Plain methods on generated data sets: the eight of them, and worlds in which White-Patch is right or wrong.
-
-What a table holds: its noise, and how grey its print is.
-"""
+"""Data sets of table 1, errors of methods in cases with a known answer, and figures of the print."""
 
 from __future__ import annotations
 
@@ -28,7 +25,7 @@ TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
 
 
 @pytest.mark.slow
-def test_noise_of_the_print_s_white(make_table: TableMaker) -> None:
+def test_noise_of_print_white(make_table: TableMaker) -> None:
     ((*head, level, r, g, b, high_r, high_g, high_b),) = noise_table([make_table("Test", noise=0.05, samples=400)]).rows
     assert head == ["Test", len(LIGHTS)]
     assert level == pytest.approx(100 * float(np.median(LIGHTS.max(axis=1))) / 9000, rel=0.02)
@@ -37,7 +34,7 @@ def test_noise_of_the_print_s_white(make_table: TableMaker) -> None:
     assert (high_r, high_g, high_b) == pytest.approx([15] * 3, rel=0.4)
 
 
-def test_a_print_that_reflects_as_its_code_is_grey(make_table: TableMaker) -> None:
+def test_print_of_codes_is_grey(make_table: TableMaker) -> None:
     mean, rms = print_table([make_table("Test")]).rows
     # Of the black bodies of 3002 and 3003 K the second is nearer to daylight. The codes are 0, 1/7 … 1.
     assert mean[:3] == ("Test", 3, "mean")
@@ -55,20 +52,20 @@ def small(make_table: TableMaker, noise: tuple[float, float] = (0.0, 0.0)) -> tu
     return settings(luts, PICTURES, TRUTHS, side=48, seed=3, names=("C1", "C1"))
 
 
-def test_the_eight_data_sets_are_the_paper_s_in_its_order(make_table: TableMaker) -> None:
-    chosen = small(make_table)
-    assert [part.cell for part in chosen] == list(TABLE1)
-    assert all(len(part.scenes) == 5 for part in chosen)
-    images = [part.scenes[0].read()[0] for part in chosen]
+def test_data_sets_are_in_paper_order(make_table: TableMaker) -> None:
+    blocks = small(make_table)
+    assert [block.cell for block in blocks] == list(TABLE1)
+    assert all(len(block.scenes) == 5 for block in blocks)
+    images = [block.scenes[0].read()[0] for block in blocks]
     assert [image.shape for image in images] == [(32, 48, 3)] * 4 + [(48, 48, 3)] * 4
     # Nearest to the ground truths in turn, and drawn: not the same lights.
-    assert [scene.light for scene in chosen[0].scenes] == [0, 3, 0, 3, 0]
-    assert [scene.light for scene in chosen[1].scenes] != [scene.light for scene in chosen[0].scenes]
+    assert [scene.light for scene in blocks[0].scenes] == [0, 3, 0, 3, 0]
+    assert [scene.light for scene in blocks[1].scenes] != [scene.light for scene in blocks[0].scenes]
     # Both tables show the same scenes: what differs is the sensor.
-    np.testing.assert_array_equal(chosen[4].scenes[1].source.read().picture, chosen[6].scenes[1].source.read().picture)
+    np.testing.assert_array_equal(blocks[4].scenes[1].source.read().picture, blocks[6].scenes[1].source.read().picture)
 
 
-def test_without_noise_a_white_pixel_is_the_light(make_table: TableMaker) -> None:
+def test_white_pixel_is_illuminant_without_noise(make_table: TableMaker) -> None:
     random = [block for block in table1(small(make_table)) if block.cell[0] == "Random"]
     assert len(random) == 4
     for block in random:
@@ -78,7 +75,7 @@ def test_without_noise_a_white_pixel_is_the_light(make_table: TableMaker) -> Non
         assert block.results[1].errors["recovery"].max() < 2
 
 
-def test_the_noisier_table_is_worse_for_the_maximum_and_not_for_means(make_table: TableMaker) -> None:
+def test_noise_increases_error_of_white_patch_only(make_table: TableMaker) -> None:
     blocks = {block.cell: block for block in table1(small(make_table, (0.02, 0.2)))}
     for scenes, lights in (("Random", "C1"), ("Random", "Random")):
         quiet, noisy = blocks[scenes, "6D", lights], blocks[scenes, "550D", lights]
@@ -93,9 +90,9 @@ MADE = [Made("m", np.array([2.0, 1, 1]), np.ones((4, 4, 3)))]
 FOLDS = np.array([0, 0, 1, 1, 2, 2])
 
 
-def test_who_was_trained_on_what() -> None:
+def test_table2_separates_training_data() -> None:
     (trained,) = table2(REAL, MADE, {"regression-trees": MeanLearner()}, FOLDS)
-    for place, light in enumerate(REAL_LIGHTS):
-        others = np.mean([unit(one) for one in REAL_LIGHTS[place // 2 != FOLDS]], axis=0)
-        assert trained.real.errors["recovery"][place] == pytest.approx(float(recovery_error(others, light)))
-        assert trained.generated.errors["recovery"][place] == pytest.approx(float(recovery_error([2, 1, 1], light)))
+    for index, light in enumerate(REAL_LIGHTS):
+        generated = np.mean([unit(result) for result in REAL_LIGHTS[index // 2 != FOLDS]], axis=0)
+        assert trained.real.errors["recovery"][index] == pytest.approx(float(recovery_error(generated, light)))
+        assert trained.generated.errors["recovery"][index] == pytest.approx(float(recovery_error([2, 1, 1], light)))

@@ -1,4 +1,4 @@
-"""Generated sets of a table that is itself naive: what a code reflects is its linear sRGB, nothing is printed."""
+"""Generated sets of a naive look-up table: colours reflect the linear sRGB of their codes, without print and noise."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BOTH = ListedLights((0, 1))
 
 @dataclass(frozen=True)
 class Maker:
-    """Makes generated sets in a folder, of its pictures and its table."""
+    """Makes generated sets in a folder from its pictures and its LUT."""
 
     folder: Path
     lut: Lut
@@ -68,7 +68,7 @@ class Maker:
 
 
 def save_pictures(folder: Path, names: Sequence[str], seed: int = 0, side: int = 24) -> None:
-    """Save pictures of flat patches, of codes that the table keeps whole."""
+    """Save pictures of flat patches, with codes that the LUT contains exactly."""
     random = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
@@ -77,7 +77,7 @@ def save_pictures(folder: Path, names: Sequence[str], seed: int = 0, side: int =
 
 
 def write_table(folder: Path, matrix: npt.NDArray[np.float64] | None = None, camera: str = "Canon EOS 550D") -> Lut:
-    """Write a table whose samples are linear sRGB, through a matrix if there is one, times the light."""
+    """Write a LUT with samples of linear sRGB, optionally through a matrix, times the illuminant."""
     linear = decode_srgb(CODES * 32 / 255)
     if matrix is not None:
         linear = np.maximum(linear @ matrix.T, 0)
@@ -86,6 +86,6 @@ def write_table(folder: Path, matrix: npt.NDArray[np.float64] | None = None, cam
 
 @pytest.fixture
 def maker(tmp_path: Path) -> Maker:
-    """Return a maker of generated sets of three pictures."""
+    """Return a `Maker` with three pictures."""
     save_pictures(tmp_path / "pictures", ("a.png", "b.png", "c.png"))
     return Maker(tmp_path, write_table(tmp_path / "lut"))

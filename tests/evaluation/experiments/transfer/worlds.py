@@ -1,4 +1,4 @@
-"""Made-up worlds: scenes of random surfaces under lights of a given spread, and a learner that takes no time."""
+"""Simulated worlds: scenes of random surfaces under illuminants with a given spread, and a fast learner."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COOL = (0.22, 0.42, 0.36)
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """A scene of 16 × 16 surfaces whose mean is not quite grey."""
+    """A scene of 16 × 16 surfaces whose mean is not exactly grey."""
 
     name: str
     truth: npt.NDArray[np.float64]
@@ -38,7 +38,7 @@ def world(
     centre: tuple[float, float, float] = WARM,
     cast: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> tuple[Patches, ...]:
-    """Return scenes under lights around a centre, their surfaces with a cast of their own."""
+    """Return scenes under illuminants around a centre, with a colour cast of their surfaces."""
     random = np.random.default_rng([seed, 99])
     lights = np.array(centre) * np.exp(random.normal(0, 0.12, (count, 3)))
     return tuple(
@@ -49,7 +49,7 @@ def world(
 
 @dataclass(frozen=True)
 class MeanColour(FeatureLearner):
-    """A straight map from the chromaticities of the mean colour to those of the light, by least squares."""
+    """Linear map from the chromaticities of the mean colour to those of the illuminant, by least squares."""
 
     key = "mean-colour"
     title = "Mean colour"
@@ -73,8 +73,8 @@ class StraightMap:
     map: npt.NDArray[np.float64]
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
-        found = np.maximum(np.asarray(features, dtype=np.float64) @ self.map, 1e-6)
-        return found / found.sum(axis=1, keepdims=True)
+        estimates = np.maximum(np.asarray(features, dtype=np.float64) @ self.map, 1e-6)
+        return estimates / estimates.sum(axis=1, keepdims=True)
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
         return {"map": self.map}
@@ -95,7 +95,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class MeanLearner:
-    """A user's class: no features, only `fit`."""
+    """User class without features, with `fit` only."""
 
     name: str = "Mean light"
 
