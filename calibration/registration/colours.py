@@ -139,7 +139,7 @@ class ColourModel:
     light: _Array  # (6, 3) polynomial of second order in page coordinates −1 … 1, mean about 1
     page_mm: tuple[float, float]
 
-    def flat(self, rgb: npt.ArrayLike) -> _Array:
+    def predict_flat(self, rgb: npt.ArrayLike) -> _Array:
         """Return camera RGB (N, 3) float64, counts, of printed codes (N, 3), 0 … 255, under uniform illumination."""
         return _code_terms(rgb, self.degree) @ self.coefficients
 
@@ -147,9 +147,9 @@ class ColourModel:
         """Return the relative illumination (N, 3) float64 at points (N, 2) mm of the page, mean about 1."""
         return _page_terms(points_mm, self.page_mm) @ self.light
 
-    def seen(self, rgb: npt.ArrayLike, points_mm: _Array) -> _Array:
+    def predict(self, rgb: npt.ArrayLike, points_mm: _Array) -> _Array:
         """Return camera RGB (N, 3) float64, counts, of printed codes (N, 3) at points (N, 2) mm of the page."""
-        return self.flat(rgb) * self.light_at(points_mm)
+        return self.predict_flat(rgb) * self.light_at(points_mm)
 
 
 def _code_terms(rgb: npt.ArrayLike, degree: int) -> _Array:

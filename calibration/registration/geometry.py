@@ -31,8 +31,8 @@ from foundation.errors import RegistrationError
 # (four tags). With fewer pairs the coefficients would fit noise.
 _PAIRS_FOR_ALL, _PAIRS_FOR_ONE = 48, 16
 
-# Assumed focal length in half diagonals of the frame. For a tilt of 2° the foot of the camera's perpendicular is then
-# 3 to 5 % of the diagonal off. Real lenses of 1.5 to 0.8 diagonals give 5 to 3 %.
+# Assumed focal length in half diagonals of the frame. With real lenses of 1.5 to 0.8 diagonals, a tilt of 2° moves the
+# foot of the camera's perpendicular by 5 to 3 % of the diagonal; this assumption gives 3 to 5 %.
 _FOCAL_RADII = 2.2
 
 # Height of the finite difference in `parallax`, relative to the camera distance.
@@ -372,7 +372,7 @@ class LateralColour:
         offset = (positions_px - self.centre_px) / self.radius_px
         return offset * (linear + cubic * (offset**2).sum(axis=-1, keepdims=True))
 
-    def seen_px(self, positions_px: _Array) -> _Array:
+    def channels_px(self, positions_px: _Array) -> _Array:
         """Return positions (3, N, 2) float64 px of red, green and blue for positions (N, 2) px of green."""
         return np.stack([positions_px + self.shift_px(positions_px, channel) for channel in CHANNELS])
 

@@ -339,7 +339,7 @@ class Matcher:
 
     def in_channels(self, points_mm: npt.ArrayLike) -> _Array:
         """Map points (N, 2) mm to half-size px (3, N, 2) float64 of red, green and blue."""
-        return self.lateral.seen_px(self.to_pixels(points_mm))
+        return self.lateral.channels_px(self.to_pixels(points_mm))
 
     def _measured_rgb(self) -> _Array:
         positions_px = self.to_pixels(self._centres)
@@ -356,10 +356,10 @@ class Matcher:
         Patches and references: (N, 3) float64, references last; measured is NaN outside the frame. Paper: (3,) float64.
         """
         self.colours = self._fit_colours()
-        return self._measured_rgb(), self.colours.seen(self._rgb, self._centres), self._paper_rgb()
+        return self._measured_rgb(), self.colours.predict(self._rgb, self._centres), self._paper_rgb()
 
     def _paper_rgb(self) -> _Array:
-        return self.colours.flat(np.array([PAPER_WHITE]))[0]
+        return self.colours.predict_flat(np.array([PAPER_WHITE]))[0]
 
     def _fit_colours(self) -> ColourModel:
         rgb = self._measured_rgb()
@@ -369,7 +369,7 @@ class Matcher:
 
     def _template(self, raster: Raster, cover: sparse.csr_array, sigma: _Array) -> _Float:
         """Predict the print (H, W, 3) float32 as seen by the camera; `sigma` (2,) is the blur in elements."""
-        flat = self.colours.flat(self._rgb)
+        flat = self.colours.predict_flat(self._rgb)
         paper = self._paper_rgb()
         image = np.asarray(cover @ (flat - paper)) + paper
         image = image.reshape(*raster.shape, 3).astype(np.float32)
@@ -528,9 +528,9 @@ class Matcher:
             compared = compared.weakened(_COLOURS_REPEAT)
         points = compared.points_mm
         previous, positions_px = self.displacement, self.to_pixels(points)
-        shifted = self.lateral.seen_px(positions_px)
+        shifted = self.lateral.channels_px(positions_px)
         self.lateral = self.lateral.remeasured(*self._with_anchors(*self._in_blocks(compared, positions_px)))
-        compared = compared.after(self.lateral.seen_px(positions_px) - shifted)
+        compared = compared.after(self.lateral.channels_px(positions_px) - shifted)
         moved = self._move(compared)
         self._remainder = compared.after(self.displacement.at(points) - previous.at(points))
         return moved

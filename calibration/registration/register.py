@@ -258,8 +258,8 @@ def _clear_edges(
     information_across = np.einsum("ni,nj->nij", normals, normals) / _OUTLINE_SIGMA_PX**2
     marks = Anchors(field.outline_mm[is_clear], edges_px, weight[..., None, None] * information_across)
     initial_px = field.outline_px[is_clear]
-    lateral = lateral.remeasured(initial_px, marks.information, marks.pull(lateral.seen_px(initial_px)))
-    green = initial_px + marks.residual_px(lateral.seen_px(initial_px))
+    lateral = lateral.remeasured(initial_px, marks.information, marks.pull(lateral.channels_px(initial_px)))
+    green = initial_px + marks.residual_px(lateral.channels_px(initial_px))
     return replace(field, outline_mm=marks.points_mm, outline_px=green, normals=normals), marks, lateral
 
 

@@ -258,7 +258,7 @@ def test_colours_of_a_print(pinned: Pinned) -> None:
         seen_there = 6000 * ink * light * random.normal(1, 0.004, ink.shape)
         seen_there[::37] *= 0.6
         model = colours.fit_colours(chart.rgb.astype(np.float64), points, seen_there, chart.page_mm, finely)
-        expected = model.seen(chart.rgb, points)
+        expected = model.predict(chart.rgb, points)
         paper = np.full_like(expected, 6000.0)
         mismatched = colours.mismatched(seen_there, expected, paper, chart)
         result.append(

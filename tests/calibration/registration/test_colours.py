@@ -96,7 +96,7 @@ def test_fits_polynomial_and_illumination(patches: int, is_fine: bool, degree: i
     measured[::25] *= 0.3
     model = fit_colours(rgb, points, measured, page, is_fine)
     assert model.degree == degree
-    np.testing.assert_allclose(model.seen(rgb, points), clean, rtol=0.02)
+    np.testing.assert_allclose(model.predict(rgb, points), clean, rtol=0.02)
     # The mean illumination at the patches is 1.
     np.testing.assert_allclose(model.light_at(points).mean(axis=0), 1, rtol=1e-9)
-    np.testing.assert_allclose(model.flat(rgb) * model.light_at(points), model.seen(rgb, points))
+    np.testing.assert_allclose(model.predict_flat(rgb) * model.light_at(points), model.predict(rgb, points))
