@@ -399,7 +399,7 @@ def _brightness_text(table: TableMeasurements, accepted: float) -> str:
         return ""
     order = sorted(range(len(codes.off_brightness)), key=lambda light: -codes.off_brightness[light])
     beyond = [k for k in order if codes.off_brightness[k] > accepted]
-    return first_of([f"illuminant {k} by {100 * codes.brightness[k]:+.0f} %" for k in beyond])
+    return first_few([f"illuminant {k} by {100 * codes.brightness[k]:+.0f} %" for k in beyond])
 
 
 def _frames_off_brightness(table: TableMeasurements, limit: float) -> list[FrameRecord] | None:

@@ -83,7 +83,7 @@ _FEW_SLIPPED, _SLIPPED_SHARE = 2, 0.015
 class Registration:
     """Position of the chart in one frame."""
 
-    framing: Framing  # chart pose from tags or outline
+    framing: ChartPose  # chart pose from tags or outline
     lens: Lens  # homography and lens distortion of the green channel
     displacement: Displacement  # smooth correction of `lens` for a sheet that is not flat
     lateral: LateralColour  # shifts of red and blue against green
