@@ -1,7 +1,8 @@
 """Write the generated parts of the documentation.
 
 `docs/reference/figures.md` and `causes.md` come from the code. The result tables of `docs/measured.md`,
-`docs/transfer.md` and `docs/reference/judge.md` come from the recorded results in `docs/results`. A test compares the files with the output of this module.
+`docs/transfer.md` and `docs/reference/judge.md` come from the recorded results in `docs/results`. A test compares the
+files with the output of this module.
 """
 
 from __future__ import annotations

@@ -194,7 +194,7 @@ def indistinct_methods(results: Sequence[Result], uncertainty_deg: float | None)
         if abs(median_a - median_b) < uncertainty_deg
     ]
     note = (
-        f"medians of {first_few(pairs, 3)} differ by less than {uncertainty_deg:.2g} degrees, the uncertainty of ground "
-        "truths (k = 2); this data set cannot rank these methods"
+        f"medians of {first_few(pairs, 3)} differ by less than {uncertainty_deg:.2g} degrees, the uncertainty of "
+        "ground truths (k = 2); this data set cannot rank these methods"
     )
     return (note,) if pairs else ()
