@@ -51,7 +51,7 @@ class Check:
 
     @property
     def is_beyond(self) -> bool:
-        """Whether the value is outside its limits. The frame may pass all the same if another check has the cause."""
+        """Whether the value is outside its limits. Another check may report the cause, or the change is followed."""
         if self.value is None:
             return False
         return (self.low is not None and self.value < self.low) or (self.high is not None and self.value > self.high)
