@@ -115,7 +115,7 @@ NAMED = {
     "half-changed picture": "only a part of the picture had changed|did only a part of the picture change|"
     "did only a part of it change|did the picture change during",
     "late picture": "light of the frame before|is the picture late|did the picture change during",
-    "repeated file": "a frame that it had given before",
+    "repeated file": "delivered an earlier frame again",
     "zeroed strip": r"rows, from row \d+,? do not reach",
     "scrambled rows": "the file was damaged",
     "dead primary": "no (red|blue) comes through|does the lamp fail|is the projector on",

@@ -103,7 +103,7 @@ def test_trial_frames_show_what_a_table_of_them_shows(
         without.mkdir()
         again = measure_trial(session, Saturation(13584, True, 15831), None, without)
     assert not trial.series_trouble
-    assert "holds 0 files" in again.series_trouble
+    assert "contains 0 files" in again.series_trouble
     assert again.verdict == trial.verdict
     shown = {row.figure.name: row.value for row in trial.verdict.rows}
     assert shown.keys() == {figure.name for figure in FIGURES if figure.before_session} & built.keys()
