@@ -384,7 +384,7 @@ def page(
         sentence={
             "accept": "Accepted: every figure is within its limit.",
             "accept with remarks": f"Accepted with remarks on {len(verdict.remarks)} of {len(verdict.rows)} figures.",
-            "refuse": f"Refused: {len(verdict.refused)} of {len(verdict.rows)} figures are beyond their limits of refusal.",
+            "refuse": f"Refused for {len(verdict.refused)} of {len(verdict.rows)} figures.",
         }[verdict.outcome],
         usable=not verdict.refused,
         todo=rows[:beyond_count],
