@@ -114,7 +114,7 @@ NAMED = {
     "hand": "somebody or something stands in front",
     "half-changed picture": "only part of the picture ha[ds] changed|the picture changed during",
     "late picture": "previous illuminant|the picture is late|the picture changed during",
-    "repeated file": "a frame that it had given before",
+    "repeated file": "delivered an earlier frame again",
     "zeroed strip": r"rows, from row \d+,? do not reach",
     "scrambled rows": "the file was damaged",
     "dead primary": "(red|blue) is missing|check the lamp|that the projector is on",

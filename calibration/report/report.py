@@ -377,14 +377,14 @@ def page(
     return render(
         "calibration.report",
         "report.html",
-        title=f"LUT of {table.session.lights} illuminants, {table.session.camera}",
+        title=f"Look-up table (LUT) of {table.session.lights} illuminants, {table.session.camera}",
         taken=f"Session {table.session.folder.name}{simulated}",
         words=_OUTCOME_WORDS,
         outcome=verdict.outcome,
         sentence={
             "accept": "Accepted: every figure is within its limit.",
             "accept with remarks": f"Accepted with remarks on {len(verdict.remarks)} of {len(verdict.rows)} figures.",
-            "refuse": f"Refused: {len(verdict.refused)} of {len(verdict.rows)} figures exceed their refusing limits.",
+            "refuse": f"Refused for {len(verdict.refused)} of {len(verdict.rows)} figures.",
         }[verdict.outcome],
         usable=not verdict.refused,
         todo=rows[:beyond_count],

@@ -101,7 +101,7 @@ def test_trial_figures_agree_with_lut(room: Room, tmp_path: Path, monkeypatch: p
         empty_folder.mkdir()
         repeated = measure_trial(session, Saturation(13584, True, 15831), None, empty_folder)
     assert not trial.series_trouble
-    assert "holds 0 files" in repeated.series_trouble
+    assert "contains 0 files" in repeated.series_trouble
     assert repeated.verdict == trial.verdict
     measured = {row.figure.name: row.value for row in trial.verdict.rows}
     assert measured.keys() == {figure.name for figure in FIGURES if figure.before_session} & built.keys()
