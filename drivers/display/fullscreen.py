@@ -221,7 +221,7 @@ _DIGITS: Final = (
     "111100111001111", "111100111101111", "111001001001001", "111101111101111", "111101111001111",
 )  # fmt: skip
 
-_COVER_REMEDY: Final = "check for a window or notification in front, desktop scaling, and colour filters"
+_COVER_REMEDY: Final = "look for a window or notification in front, desktop scaling, or a colour filter"
 
 
 class FullScreen:
@@ -483,7 +483,7 @@ class FullScreen:
             own: int = self._glfw.get_x11_window(self._window)
             cover = self._screen.cover(self.display.x + column, self.display.y + row, own)
         if cover is not None:
-            return f"covered by {cover}: close it, and disable such windows and notifications"
+            return f"in front of it lies {cover}: close it, and switch such windows and notifications off"
         return _COVER_REMEDY
 
     def _require_usable(self) -> None:

@@ -424,7 +424,7 @@ def check_frames(data: bytes | memoryview, frames: Sequence[StoredFrame]) -> Seq
         extents = sorted(frame.extents)
         for offset, size in extents:
             if size <= 0 or offset + size > len(data):
-                raise RawDamaged(f"its pixels extend to byte {offset + size}, the file has {len(data)} bytes")
+                raise RawDamaged(f"its pixels are at bytes {offset} to {offset + size}, the file has {len(data)}")
         for (first, size), (following, _) in pairwise(extents):
             if first + size > following:
                 raise RawDamaged(f"parts of its pixels overlap at byte {following}")

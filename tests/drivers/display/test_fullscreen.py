@@ -96,7 +96,7 @@ def test_reports_a_pop_up_by_name(screen: FullScreen, virtual: VirtualScreen) ->
         picture = virtual.picture()
         assert np.count_nonzero(picture != 0xFF8800) > 100
     # What it covered stays wrong, with nobody in front, until it is painted again.
-    until(lambda: "covered by" not in covered(screen, colour))
+    until(lambda: "in front of it" not in covered(screen, colour))
     screen.show(colour)
     screen.verify(colour)
 
@@ -144,7 +144,7 @@ def test_detects_a_changed_corner(screen: FullScreen, virtual: VirtualScreen) ->
     with messaging(virtual, "speck", "+639+359"):
         message = covered(screen, colour)
     assert "in 1 of 230400 pixels" in message
-    assert "within 1×1 px at +639+359; covered by “speck” (Xmessage), " in message
+    assert "within 1×1 px at +639+359; in front of it lies “speck” (Xmessage), " in message
 
 
 def test_detects_another_colour_without_a_covering_window(screen: FullScreen) -> None:
