@@ -4,8 +4,8 @@ python-gphoto2 is optional and imported only when a camera is opened. After a fa
 next call opens a new one; a frame in transfer is lost and may be repeated.
 
 libgphoto2 has several names for one setting; the first name that a body has is used. Labels are from libgphoto2's
-tables, untranslated, and every setting is read back. A body is refused if it offers no raw format, if its focus is not
-manual, or if another setting would spoil a series. Settings that a body does not show are ignored.
+tables, untranslated, and every setting is read back. A body is refused if it offers no raw format, focuses
+automatically, or has another setting that would spoil a series. Settings that a body does not show are ignored.
 
 Source: libgphoto2 2.5.34, camlibs/ptp2/config.c (names and labels), camlibs/ptp2/cameras (settings of bodies).
 """

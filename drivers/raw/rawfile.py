@@ -246,9 +246,9 @@ class Mosaic:
         Returns
         -------
         (2, 2) float64, counts, or None
-            Mean for each position of the top left visible block, over photosites within six robust standard deviations
-            of the median, without the first four columns of each area. None without a masked area of sufficient size.
-            Not truncated: an integer would lose up to one count (LibRaw's 2047 for 2047.98).
+            Mean for each position of the top left visible block. Photosites beyond six robust standard deviations of
+            the median and the first four columns of each area are left out. None without a masked area of sufficient
+            size. Not truncated: an integer would lose up to one count (LibRaw's 2047 for 2047.98).
         """
         means = np.empty((2, 2))
         for row in range(2):
