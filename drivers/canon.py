@@ -1171,7 +1171,7 @@ class EosBody:
     def _truncated_error(self, pending: PendingObject, received: int) -> DeviceError:
         return DeviceError(
             f"{self.label} announced {pending.size} bytes for {pending.name!r}, sent only {received}; "
-            "the frame is invalid and may be repeated"
+            "the frame is invalid; repeat it"
         )
 
     def _send_frames_to_host(self) -> None:

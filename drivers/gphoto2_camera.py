@@ -4,8 +4,8 @@ python-gphoto2 is optional and imported only when a camera is opened. After a fa
 next call opens a new one; a frame in transfer is lost and may be repeated.
 
 libgphoto2 has several names for one setting; the first name that a body has is used. Labels are from libgphoto2's
-tables, untranslated, and every setting is read back. A body is refused if it offers no raw format, if its focus is not
-manual, or if another setting would spoil a series. Settings that a body does not show are ignored.
+tables, untranslated, and every setting is read back. A body is refused if it offers no raw format, focuses
+automatically, or has another setting that would spoil a series. Settings that a body does not show are ignored.
 
 Source: libgphoto2 2.5.34, camlibs/ptp2/config.c (names and labels), camlibs/ptp2/cameras (settings of bodies).
 """
@@ -104,8 +104,8 @@ Body = Callable[[str], BodySetting | None]  # Returns the setting of a name; Non
 
 def first_setting(body: Body, names: Iterable[str]) -> BodySetting | None:
     """Return the first setting of `names` that a body has; one with choices or bounds is preferred."""
-    shown = [setting for name in names if (setting := body(name)) is not None]
-    return next((setting for setting in shown if setting.choices or setting.bounds), shown[0] if shown else None)
+    present = [setting for name in names if (setting := body(name)) is not None]
+    return next((setting for setting in present if setting.choices or setting.bounds), present[0] if present else None)
 
 
 def plan_settings(body: Body, settings: ExposureSettings) -> dict[str, str]:
@@ -125,14 +125,14 @@ def plan_settings(body: Body, settings: ExposureSettings) -> dict[str, str]:
             faults.append(f"{name} is {setting.value}; {effect}: set it to {labels[0]} on the camera")
         else:
             values[name] = label
-    _plan(first_setting(body, TARGET), HOST_TARGETS, values, faults)
+    _select(first_setting(body, TARGET), HOST_TARGETS, values, faults)
     raw = first_setting(body, RAW_FORMAT)
     if raw is None:
         faults.append(
             f"a raw format cannot be set: the body shows neither {' nor '.join(RAW_FORMAT)}; set it to raw alone "
             "by hand and take the frames with another program, then use `acquire import`"
         )
-    _plan(raw, _RAW_LABELS, values, faults)
+    _select(raw, _RAW_LABELS, values, faults)
     for names, value in (
         (ISO, float(settings.iso)),
         (APERTURE, settings.aperture),
@@ -204,7 +204,7 @@ def battery_level(text: str) -> float | None:
     return None
 
 
-def _plan(setting: BodySetting | None, labels: tuple[str, ...], values: dict[str, str], faults: list[str]) -> None:
+def _select(setting: BodySetting | None, labels: tuple[str, ...], values: dict[str, str], faults: list[str]) -> None:
     """Set a setting to the first offered label in `labels`; a body that already has one need not offer it."""
     if setting is None:
         return

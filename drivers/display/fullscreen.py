@@ -221,7 +221,7 @@ _DIGITS: Final = (
     "111100111001111", "111100111101111", "111001001001001", "111101111101111", "111101111001111",
 )  # fmt: skip
 
-_COVER_REMEDY: Final = "check for a window or notification in front, desktop scaling, and colour filters"
+_COVER_REMEDY: Final = "look for a window or notification in front, desktop scaling, or a colour filter"
 
 
 class FullScreen:
@@ -274,7 +274,7 @@ class FullScreen:
         self._require_full()
         self._require_awake()
         self._glfw.make_context_current(self._window)
-        self._require(self._read_screen(), colour, "the screen shows")
+        self._require_colour(self._read_screen(), colour, "the screen shows")
 
     def identify(self) -> None:
         """Show the display's number in large white blocks on black."""
@@ -424,13 +424,13 @@ class FullScreen:
     def _present(self, colour: Colour) -> None:
         self._glfw.make_context_current(self._window)
         self._fill(colour)
-        self._require(self._read_buffer(BACK), colour, "OpenGL drew", on_screen=False)
+        self._require_colour(self._read_buffer(BACK), colour, "OpenGL drew", on_screen=False)
         self._glfw.swap_buffers(self._window)
         self._gl.finish()
         deadline = self._clock.monotonic() + CONFIRMING_S
         while True:
             try:
-                self._require(self._read_screen(), colour, "the screen shows")
+                self._require_colour(self._read_screen(), colour, "the screen shows")
             except DeviceError:
                 if self._clock.monotonic() > deadline:
                     raise
@@ -461,7 +461,9 @@ class FullScreen:
         np.bitwise_and(self._pixels, np.uint32(0xFFFFFF), out=self._pixels)
         return self._pixels
 
-    def _require(self, pixels: npt.NDArray[np.uint32], colour: Colour, subject: str, *, on_screen: bool = True) -> None:
+    def _require_colour(
+        self, pixels: npt.NDArray[np.uint32], colour: Colour, subject: str, *, on_screen: bool = True
+    ) -> None:
         expected = colour.red << 16 | colour.green << 8 | colour.blue
         is_wrong = pixels != expected
         if is_wrong.any():
@@ -483,7 +485,7 @@ class FullScreen:
             own: int = self._glfw.get_x11_window(self._window)
             cover = self._screen.cover(self.display.x + column, self.display.y + row, own)
         if cover is not None:
-            return f"covered by {cover}: close it, and disable such windows and notifications"
+            return f"in front of it lies {cover}: close it, and switch such windows and notifications off"
         return _COVER_REMEDY
 
     def _require_usable(self) -> None:

@@ -109,7 +109,8 @@ MessageParser = Callable[[bytes], tuple[_T, int] | None]
 class Exchange:
     """Requests and replies over connections that `connect` opens.
 
-    - `greet` exchanges the opening messages of a new connection; returns an unlogged prefix for the first request.
+    - `greet` exchanges the opening messages of a new connection. It returns a prefix of the first request, which is not
+      logged.
     - `silence_remedy`, `endless_remedy`: remedies in the messages for a missing reply and for a reply without an end.
     """
 

@@ -93,8 +93,8 @@ class UsbPipes(Protocol):
 # File in `drivers/data` that allows users of a Linux machine to open cameras.
 UDEV_RULE = "70-crop-cameras.rules"
 _PERMISSION_REMEDY = (
-    f"cannot be opened by this user; on Linux install the rule {UDEV_RULE} (docs/devices.md, USB permission), and plug "
-    "the camera in again"
+    f"may not be opened by this user; on Linux install the rule {UDEV_RULE} (docs/devices.md, USB permission), and "
+    "plug the camera in again"
 )
 _BUSY_REMEDY = (
     ", e.g. the photo monitor of the desktop; close photo programs, and on Linux run: "
@@ -298,7 +298,7 @@ class OpenUsbDevice:
                 case errno.EPIPE:
                     fault = PipeStalled(f"{label} halted the pipe; clear the halt")
                 case errno.EBUSY:
-                    fault = DeviceRefused(f"{label} is in use by another program{_BUSY_REMEDY}")
+                    fault = DeviceRefused(f"{label} is held by another program{_BUSY_REMEDY}")
                 case errno.EACCES | errno.EPERM:
                     fault = DeviceRefused(f"{label} {_PERMISSION_REMEDY}")
                 case errno.EOVERFLOW:

@@ -508,7 +508,7 @@ def _encode_parameters(parameters: tuple[int, ...]) -> bytes:
 
 @dataclass(frozen=True)
 class _Coded(PtpDataset):
-    """Base of request, response and event: a number of `codes` and parameters; text ``NAME(0x1, 0x2)``."""
+    """Base of request, response and event: a code of `codes`, and parameters; as text ``NAME(0x1, 0x2)``."""
 
     codes: ClassVar[type[IntEnum]]
     code: U16

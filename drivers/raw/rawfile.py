@@ -246,9 +246,9 @@ class Mosaic:
         Returns
         -------
         (2, 2) float64, counts, or None
-            Mean for each position of the top left visible block, over photosites within six robust standard deviations
-            of the median, without the first four columns of each area. None without a masked area of sufficient size.
-            Not truncated: an integer would lose up to one count (LibRaw's 2047 for 2047.98).
+            Mean for each position of the top left visible block. Photosites beyond six robust standard deviations of
+            the median and the first four columns of each area are left out. None without a masked area of sufficient
+            size. Not truncated: an integer would lose up to one count (LibRaw's 2047 for 2047.98).
         """
         means = np.empty((2, 2))
         for row in range(2):
@@ -424,7 +424,7 @@ def check_frames(data: bytes | memoryview, frames: Sequence[StoredFrame]) -> Seq
         extents = sorted(frame.extents)
         for offset, size in extents:
             if size <= 0 or offset + size > len(data):
-                raise RawDamaged(f"its pixels extend to byte {offset + size}, the file has {len(data)} bytes")
+                raise RawDamaged(f"its pixels are at bytes {offset} to {offset + size}, the file has {len(data)}")
         for (first, size), (following, _) in pairwise(extents):
             if first + size > following:
                 raise RawDamaged(f"parts of its pixels overlap at byte {following}")

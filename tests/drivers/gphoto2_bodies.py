@@ -188,7 +188,7 @@ class FakeBody:
     number: int = 0
     openings: int = 0
 
-    # What gphoto2.Camera does.
+    # Methods of gphoto2.Camera.
 
     def init(self) -> None:
         self.openings += 1

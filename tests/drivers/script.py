@@ -18,18 +18,18 @@ class Script:
 
     def write(self, data: bytes, timeout: float) -> None:
         if self._lines and self._lines[0] is None:
-            raise LinkClosed("the script hangs up")
-        assert self._lines, f"nothing more was to be said, but {data!r} was"
+            raise LinkClosed("the script disconnects")
+        assert self._lines, f"the script has ended, but {data!r} was sent"
         assert data == self._lines.pop(0)
 
     def read(self, limit: int, timeout: float) -> bytes:
         if not timeout:
             return b""
         if not self._lines:
-            raise LinkTimeout("the script has nothing to say")
+            raise LinkTimeout("the script has no reply")
         line = self._lines.pop(0)
         if line is None:
-            raise LinkClosed("the script hangs up")
+            raise LinkClosed("the script disconnects")
         return line
 
     def close(self) -> None:

@@ -291,7 +291,7 @@ def test_fetches_whole_frames_without_partial_reads(lists: bool) -> None:
     for _ in range(3):
         lab.take(attempts=1)
     assert lab.openings == 1
-    assert [len(recorder.parameters(code)) for code in PIECES] == [lists, lists], "it is not asked again"
+    assert [len(recorder.parameters(code)) for code in PIECES] == [lists, lists], "it is not requested again"
     assert lab.waiting() == 0
 
 
@@ -307,7 +307,7 @@ def test_keeps_the_body_awake_in_a_long_wait() -> None:
     assert lab.openings == 1
 
 
-# Trouble.
+# Faults.
 
 EVERY_OPERATION = (
     Operation.GET_DEVICE_INFO,
@@ -573,7 +573,7 @@ def test_reports_a_wrong_size(lab: Lab, size: str) -> None:
     for _ in range(2):
         with pytest.raises(DeviceError):
             lab.take(attempts=1)
-        assert lab.waiting() == 1, "of every exposure it holds the last"
+        assert lab.waiting() == 1, "it holds only the last exposure"
     assert lab.openings == 1
     lab.camera.close()
     assert lab.waiting() == 0
@@ -594,7 +594,7 @@ def test_frees_a_jpeg_next_to_the_raw(lab: Lab) -> None:
 def test_discards_frames_of_a_killed_run(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.take()
-    # The host dies with the release pressed and the frame under way.
+    # The host is killed while the release is pressed and a frame is exposed.
     lab.device.answer(PtpRequest(Operation.EOS_REMOTE_RELEASE_ON, 1000, (3, 1)), None)
     assert len(lab.film.frames) == 2
     lab.camera = CanonEos(lab.open, lab.clock)
@@ -635,7 +635,7 @@ def test_calls_end_within_their_time_limits(fault: str) -> None:
     }[fault]
     with pytest.raises(DeviceError, match=rf"^(Canon Digital Camera .* at USB port 1-1 )?{cause}"):
         lab.camera.expose()
-    # A bare answer may take 20 s, what declines it 10 s, and the connection is renewed for 30 s after that at most.
+    # A reply may take 20 s, a declined operation 10 s, and the connection is then renewed for at most 30 s.
     assert lab.clock.monotonic() - start <= {"busy": 45, "silent": 75, "gone": 30, "never announced": 45}[fault]
 
 
@@ -738,11 +738,11 @@ def test_continues_without_a_missing_optional_operation(code: Operation, answer:
     assert lab.openings == 1
     assert lab.waiting() == 0
     if code not in (Operation.EOS_KEEP_DEVICE_ON, Operation.EOS_REMOTE_RELEASE_OFF):
-        assert len(recorder.parameters(code)) <= 1, "it is not asked again"
+        assert len(recorder.parameters(code)) <= 1, "it is not requested again"
     lab.camera.close()
 
 
-# What is left of battery and card.
+# Battery and card capacity.
 
 
 def test_reads_battery_and_card_capacity(lab: Lab) -> None:
@@ -788,7 +788,7 @@ def test_refuses_another_maker(lab: Lab) -> None:
         Lab(body).camera.identity()
 
 
-# As vcam 47260ba plays an EOS 1300D (src/canon/canon.c): every property's value, and no list of what it can be set to.
+# As vcam 47260ba plays an EOS 1300D (src/canon/canon.c): values of all properties, without lists.
 
 
 def without_lists(records: tuple[Record, ...]) -> tuple[Record, ...]:
@@ -865,7 +865,7 @@ def test_waits_for_a_busy_body_on_the_same_connection(lab: Lab) -> None:
     assert lab.openings == 1
 
 
-# Names from libgphoto2's table of cameras (camlibs/ptp2/library.c); which of them want 0x15 or 0x11 as remote mode,
+# Names from libgphoto2's table of cameras (camlibs/ptp2/library.c); those with 0x15 or 0x11 as remote mode
 # from `is_canon_eos_m` in its ptp-private.h and camera_prepare_canon_eos_capture in its config.c (2.5.34).
 
 
@@ -894,7 +894,7 @@ def test_exposes_with_a_lens_without_contacts() -> None:
     assert lab.film.settings == [bare]
 
 
-# What a body tells, as values.
+# Records and state.
 
 
 def test_reads_mirror_lockup_in_recorded_custom_functions(body: str, recording: list[Recorded]) -> None:
@@ -935,7 +935,7 @@ def test_claims_of_a_body_use_little_memory() -> None:
 
 @pytest.mark.parametrize("length", [1 << 32, (1 << 32) - 1, 5 << 20, 1 << 40])
 def test_refuses_an_answer_of_gigabytes(length: int) -> None:
-    # 32 bits of a container say at most 4 GiB, or that the end is not known; PTP/IP has 64.
+    # A container has 32 bits for the length, at most 4 GiB or unknown; PTP/IP has 64.
     reception = Reception(PtpRequest(Operation.EOS_GET_EVENT, 7), None, "the camera")
     with pytest.raises(ProtocolError, match="4194304"):
         reception.start(7, length)
@@ -1119,8 +1119,8 @@ def test_refuses_inconsistent_records(octets: str, reason: str) -> None:
 @pytest.mark.parametrize(
     "body",
     [
-        "01d10000 01000000 02000000 01000000 02000000",  # a list of a kind without items that has some
-        "01d10000 03000000 01000000 01000000 02000000",  # items of a structure that is not known
+        "01d10000 01000000 02000000 01000000 02000000",  # a list with items, of a kind without items
+        "01d10000 03000000 01000000 01000000 02000000",  # items of an unknown structure
         "20d10000 03000000 00000000 02000000",
     ],
 )
@@ -1146,14 +1146,14 @@ def test_settings_match_canons_bytes() -> None:
     setting = PropertySetting(Property.EOS_CAPTURE_DESTINATION, canon.number_value(CaptureDestination.HOST))
     assert setting.encode() == examples.SETTING
     assert PropertySetting.decode(examples.SETTING) == setting
-    # RAW only: 20 bytes of value, 28 with the header, as facts from the wire have it.
+    # RAW only: 20 bytes of value, 28 with the header, as recorded.
     setting = PropertySetting(Property.EOS_IMAGE_FORMAT, canon.RAW_ONLY.encode())
     assert setting.encode() == examples.IMAGE_SETTING
     assert ImageFormat.decode(PropertySetting.decode(examples.IMAGE_SETTING).value) == canon.RAW_ONLY
 
 
 SCALES = pytest.mark.parametrize("scale", [SHUTTER, APERTURE, ISO], ids=lambda scale: scale.name)
-# The list of apertures that the recorded 60D offered: third stops, f/3.5 to f/22.
+# Apertures offered by the recorded 60D: third stops, f/3.5 to f/22.
 APERTURES_60D = (0x25, 0x28, 0x2B, 0x2D, 0x30, 0x33, 0x35, 0x38, 0x3B, 0x3D, 0x40, 0x43, 0x45, 0x48, 0x4B, 0x4D, 0x50)
 
 
@@ -1173,8 +1173,8 @@ LAWS: dict[str, Callable[[int], float]] = {
 
 @SCALES
 def test_labels_are_rounded_stops(scale: Scale) -> None:
-    # A nominal value lies within a quarter of a stop of the exact one (0.3 s and f/1.8 as half stops are the
-    # coarsest), so that no code can be off by a third.
+    # A nominal value is within a quarter of a stop of the exact value (0.3 s and f/1.8 as half stops deviate
+    # most), so no code can be wrong by a third.
     for step in scale.steps:
         stops = abs(math.log2(step.value / LAWS[scale.name](step.code))) * (2 if scale is APERTURE else 1)
         assert stops < 0.25, (step, stops)

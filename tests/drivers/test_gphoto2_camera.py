@@ -80,7 +80,7 @@ class Bodies:
 def bodies() -> Generator[Bodies]:
     command = [sys.executable, "-m", "tests.drivers.gphoto2_server"]
     folder = Path(__file__).parents[2]
-    # Lines are looked for with nothing kept back: a film reads the same pipe.
+    # Unbuffered, because a film reads the same pipe.
     pipe = subprocess.PIPE
     with subprocess.Popen(command, cwd=folder, stdin=pipe, stdout=pipe, bufsize=0) as process:
         assert process.stdin is not None
@@ -195,7 +195,7 @@ def test_plans_nikon_settings() -> None:
         "shutterspeed2": "1/60",
     }
     assert plan_settings(NIKON_D7100.get, replace(SETTINGS, shutter_s=0.5))["shutterspeed2"] == "1/2"
-    # Its other list rounds short times away: 1/6400 s is "0.0001s" there, as 1/8000 s is.
+    # The other list truncates short times: 1/6400 s and 1/8000 s are both "0.0001s".
     assert plan_settings(NIKON_D7100.get, replace(SETTINGS, shutter_s=1 / 6400))["shutterspeed2"] == "1/6400"
 
 
@@ -268,8 +268,8 @@ def test_reports_all_faults_at_once() -> None:
 
 
 def test_accepts_a_lens_without_contacts() -> None:
-    # As libgphoto2 shows a Canon's aperture of code 0: "implicit auto", and that as the only choice (printed by gphoto2
-    # 2.5.28 of the simulated body).
+    # As libgphoto2 shows a Canon's aperture of code 0: "implicit auto" as the only choice (printed by gphoto2
+    # 2.5.28 for the simulated body).
     for value, choices in (("implicit auto", ("implicit auto",)), ("f/0", ()), ("", ())):
         bare = (NIKON_Z7 | {"f-number": BodySetting("f-number", value, choices)}).get
         assert "f-number" not in plan_settings(bare, replace(SETTINGS, aperture=None))
@@ -377,7 +377,7 @@ try:
     camera.configure(settings)
 except DeviceError as error:
     said["refused"] = str(error)
-# As if it had been taken for good: what it makes is a JPEG.
+# Skip the refusal: the virtual camera writes a JPEG.
 camera._settings = settings
 camera._apply = lambda *_: None
 try:
@@ -397,7 +397,7 @@ print(json.dumps(said))
 def test_reads_the_virtual_camera_of_libgphoto2(tmp_path: Path) -> None:
     pytest.importorskip("gphoto2", reason="the extra `gphoto2` is not installed")
     (tmp_path / "IMG_0001.JPG").write_bytes(b"\xff\xd8\xff\xd9")
-    # python-gphoto2 takes its virtual USB for the real one where this is set.
+    # With this variable python-gphoto2 uses its virtual USB.
     done = subprocess.run(
         [sys.executable, "-c", VIRTUAL],
         cwd=Path(__file__).parents[2],
@@ -417,6 +417,6 @@ def test_reads_the_virtual_camera_of_libgphoto2(tmp_path: Path) -> None:
         "imagequality"
     )
     assert "iso 100 cannot be set" in said["refused"]
-    assert "f-number" not in said["refused"], "that it can"
+    assert "f-number" not in said["refused"], "the f-number can be set"
     assert "a raw file was expected" in said["made"]
     assert (said["f-number"], said["shutterspeed"]) == ("f/8", "1.0000s")

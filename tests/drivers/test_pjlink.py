@@ -148,7 +148,7 @@ def test_error_codes_have_messages(code: bytes, error: type[Exception], reason: 
     projector = driver(script)
     with pytest.raises(error, match=rf"{code.decode()} to AVMT 31: .*{reason}"):
         projector.set_muted(True)
-    # A refusal is no fault of the cable: the same connection goes on.
+    # A refusal is not a fault of the cable, so the connection stays open.
     assert projector.power() is Power.WARMING
 
 
@@ -227,7 +227,7 @@ def test_unsupported_class_2_queries_return_no_value(code: bytes) -> None:
         b"%1POWR ?\r", b"%1POWR=1\r",
     )  # fmt: skip
     projector = driver(script)
-    # What it does not know it is asked once.
+    # Unsupported queries are sent once.
     for _ in range(2):
         assert projector.picture_fault() is None
     assert projector.frozen() is None
@@ -235,7 +235,7 @@ def test_unsupported_class_2_queries_return_no_value(code: bytes) -> None:
     assert projector.muted() is None
     assert projector.lamps() == ()
     assert projector.faults() == ()
-    # Health is not taken from silence: the second time it is asked for its power instead.
+    # The second call queries the power, so that a missing reply does not look healthy.
     assert projector.faults() == ()
     assert script.ended()
 
@@ -301,7 +301,7 @@ def test_class_1_gets_no_class_2_queries(answer: bytes) -> None:
 
 
 def test_startup_notice_does_not_answer_a_query() -> None:
-    # Some class 2 projectors send it there, and fill their packets up with NUL (seen by users of other controllers).
+    # Some class 2 projectors send it over TCP, and pad their packets with NUL (reports of other controllers' users).
     script = Script(
         b"PJLINK 0\r" + bytes(200),
         b"%1POWR ?\r", b"%2LKUP=D0:D9:4F:00:00:01\r\0\0\0", b"\0\0%1POWR=1\r" + bytes(120),
@@ -405,7 +405,7 @@ def test_recovers_from_a_lost_answer() -> None:
     projector = PjLinkProjector(connect)
     with pytest.raises(LinkTimeout):
         projector.switch_on()
-    # The command itself went through; the driver does not hide that it cannot know.
+    # The command was executed, but the driver cannot detect that and reports the timeout.
     assert projector.power() is Power.WARMING
 
 
@@ -448,7 +448,7 @@ def test_refuses_invalid_greetings(line: bytes) -> None:
 
 
 def test_reports_an_http_server_that_sends_first() -> None:
-    # RFC 9110, 15.5.9: what a server may send that has waited too long for a request.
+    # RFC 9110, 15.5.9: reply of a server that has waited too long for a request.
     with pytest.raises(ProtocolError, match=r"HTTP server.*'HTTP/1\.1 408"):
         wire.parse_greeting(b"HTTP/1.1 408 Request Timeout")
 
@@ -688,7 +688,7 @@ def test_search_collects_for_thirty_seconds_without_duplicates() -> None:
     clock = SimulatedClock()
     network = ScriptedNetwork(
         clock,
-        (0.0, b"%2SRCH\r", "192.168.1.2"),  # our own question, come back
+        (0.0, b"%2SRCH\r", "192.168.1.2"),  # our own search, received by ourselves
         (0.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"),
         (1.7, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"),
         (2.0, b"%2POWR=1\r", "192.168.1.22"),

@@ -56,7 +56,7 @@ def test_zero_denominator_is_damage_except_in_exposure_tags() -> None:
 
 
 def test_refuses_huge_directories() -> None:
-    # Five entries that each claim as many values as may be, and more entries than any directory has.
+    # Five entries with the largest number of values, and a directory with too many entries.
     entry = struct.pack("<HHII", TiffTag.LINEARIZATION_TABLE, 1, 1 << 17, 0)
     with pytest.raises(TiffDamaged):
         read_directories((b"II*\0" + struct.pack("<IH", 8, 5) + 5 * entry).ljust(1 << 18, b"\0"))

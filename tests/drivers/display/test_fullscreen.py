@@ -95,8 +95,8 @@ def test_reports_a_pop_up_by_name(screen: FullScreen, virtual: VirtualScreen) ->
                 use(colour)
         picture = virtual.picture()
         assert np.count_nonzero(picture != 0xFF8800) > 100
-    # What it covered stays wrong, with nobody in front, until it is painted again.
-    until(lambda: "covered by" not in covered(screen, colour))
+    # The covered area stays wrong until it is painted again.
+    until(lambda: "in front of it" not in covered(screen, colour))
     screen.show(colour)
     screen.verify(colour)
 
@@ -119,7 +119,7 @@ def test_reports_a_framed_pop_up_by_name(tmp_path: Path, monkeypatch: pytest.Mon
             presenter.show(colour)
             presenter.verify(colour)
             with messaging(server, "Updates are ready"):
-                # It may be seen before it has its frame, and covered by ours again until it is raised.
+                # It may be visible before it has its frame, and covered by our window until it is raised.
                 until(lambda: "“Updates are ready” (Xmessage)" in covered(presenter, colour))
             until(lambda: shows(presenter, colour))
             presenter.verify(colour)
@@ -144,7 +144,7 @@ def test_detects_a_changed_corner(screen: FullScreen, virtual: VirtualScreen) ->
     with messaging(virtual, "speck", "+639+359"):
         message = covered(screen, colour)
     assert "in 1 of 230400 pixels" in message
-    assert "within 1×1 px at +639+359; covered by “speck” (Xmessage), " in message
+    assert "within 1×1 px at +639+359; in front of it lies “speck” (Xmessage), " in message
 
 
 def test_detects_another_colour_without_a_covering_window(screen: FullScreen) -> None:
@@ -177,7 +177,7 @@ def messaging(server: VirtualScreen, title: str, place: str = "+100+80") -> Gene
 def until(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
-        assert time.monotonic() < deadline, "it never came"
+        assert time.monotonic() < deadline, "the condition was not met in time"
         time.sleep(0.005)
 
 
@@ -254,7 +254,7 @@ def test_restores_a_moved_window(screen: FullScreen, virtual: VirtualScreen) -> 
 
 
 def test_detects_a_display_in_power_saving(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
-    # No server without a monitor has power saving: only that its absence is no darkness is seen on a real one.
+    # Servers without a monitor have no power saving, so only its absence can be tested.
     asked: list[bool] = []
     monkeypatch.setattr(fullscreen, "is_dark", lambda display: asked.append(is_dark(display)))  # pyrefly: ignore[implicit-any-lambda]
     screen.show(WHITE)
@@ -294,7 +294,7 @@ def test_window_disappears_with_a_killed_process(virtual: VirtualScreen) -> None
         assert plain(virtual.picture()) == Colour(250, 240, 230)
         process.kill()
     deadline = time.monotonic() + PATIENCE_S
-    # The server may be seen while it paints, when the picture is of two colours.
+    # During painting the image may have two colours.
     while np.any(virtual.picture()):
         assert time.monotonic() < deadline, "the window is still there"
     assert plain(virtual.picture()) == BLACK
@@ -387,7 +387,7 @@ def test_identifies_displays(outputs: str) -> None:
     clock = Onlooker()
     assert [display.number for display in identify_displays(5.0, clock)] == [1, 2]
     assert clock.picture is not None
-    # A two in 3×5 blocks; 38 px is a seventh of the projector's 270 px, rounded down.
+    # The digit 2 in 3×5 blocks of 38 px, a seventh of the projector's 270 px, rounded down.
     block, left, top = 38, 640 + (480 - 5 * 38) // 2 + 38, (270 - 7 * 38) // 2 + 38
     middles = clock.picture[top + block // 2 : top + 5 * block : block, left + block // 2 : left + 3 * block : block]
     rows = ["".join("#" if pixel == 0xFFFFFF else "." for pixel in row) for row in middles]
@@ -415,8 +415,8 @@ def test_ignores_an_uninitialised_gamma_ramp(screen: FullScreen, monkeypatch: py
 
     straight = np.linspace(0, 1, 256)
     bend = np.sin(np.pi * straight) / 255
-    # Some X servers give out whatever their memory held before. Drivers end a ramp at 255/256 or at 1; a bend of two
-    # codes is one, and inverted colours are somebody's wish.
+    # Some X servers return uninitialised memory. Drivers end a ramp at 255/256 or at 1; a deviation of two codes is
+    # reported, and so are inverted colours.
     noise = np.random.default_rng(1).random(256)
     good, bad = (noise, straight * 255 / 256, straight - bend), (straight - 2 * bend, straight[::-1])
     for ramp in (*good, *bad):
@@ -437,7 +437,7 @@ def test_reports_a_colour_profile(outputs: str) -> None:
 
         assert told() == []
         set_profile("_ICC_PROFILE")
-        assert told() == [], "that is the other display's"
+        assert told() == [], "it belongs to the other display"
         set_profile("_ICC_PROFILE_1")
         (warning,) = told()
         assert "colour profile is set for DUMMY1" in warning

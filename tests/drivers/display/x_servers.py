@@ -88,7 +88,7 @@ class VirtualScreen:
 def virtual_screen(folder: Path, size: str, *, cursor: bool = False) -> Generator[VirtualScreen]:
     """Run Xvfb with one screen of `size`, such as ``800x600``; black, or grey with a cursor; skip without Xvfb."""
     arguments = ["-screen", "0", f"{size}x24", "-fbdir", str(folder), "-nolisten", "tcp", "-noreset"]
-    # Without -retro, a cursor appears only once some program has chosen one.
+    # Without -retro, a cursor appears only after a program has set one.
     arguments += ["-retro"] if cursor else ["-br", "-nocursor"]
     with _running("Xvfb", arguments, folder) as (display, process):
         yield VirtualScreen(display, folder / "Xvfb_screen0", process)
@@ -130,7 +130,7 @@ def notification(display: str, place: tuple[int, int, int, int], code: int) -> G
         while (kind := _exactly(server, 32)[0]) != 1:
             assert kind != 0, "the X server refuses the window"
         yield
-    # With its connection goes the window.
+    # The window closes with its connection.
 
 
 def _greeted(server: socket.socket, display: str) -> tuple[int, int]:
@@ -149,7 +149,7 @@ def _exactly(server: socket.socket, size: int) -> bytes:
     data = bytearray()
     while len(data) < size:
         piece = server.recv(size - len(data))
-        assert piece, "the X server hung up"
+        assert piece, "the X server disconnected"
         data += piece
     return bytes(data)
 
@@ -173,7 +173,7 @@ def _running(server: str, arguments: list[str], folder: Path) -> Generator[tuple
         )
     try:
         assert process.stdout is not None
-        # The number comes when the server is ready; a server that cannot start ends, and says nothing.
+        # The number is printed when the server is ready; a server that cannot start ends without output.
         number = process.stdout.readline().decode().strip()
         if not number:
             pytest.skip(f"{server} does not start here: {(folder / f'{server}.err').read_text()[-300:]}")

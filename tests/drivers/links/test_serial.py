@@ -60,7 +60,7 @@ class TestSerialLink(LinkContract):
         near.close()
 
     def test_what_was_sent_before_hanging_up_is_still_read(self, ends: Ends) -> None:
-        # A cable that is pulled out takes along what the system had not handed over: only the end is certain.
+        # An unplugged cable loses data that the system has not delivered, so only the end is certain.
         near, far = ends
         far.write(b"last words", PATIENCE_S)
         assert read_exactly(near, 10) == b"last words"

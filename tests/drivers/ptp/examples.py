@@ -33,13 +33,13 @@ OBJECT_INFO = bytes.fromhex(
     "01000200 03b1 0000 40d28c01 0838 00100000 a0000000 78000000 40140000 800d0000 0e000000 00009131 0000 00000000"
     "00000000 0d49004d0047005f0030003000340032002e00430052003200000000 00 00"
 )
-# EOS 60D, answer to 0x9102: a card of 31.9 GB named SD, with two bytes behind the dataset.
+# EOS 60D, answer to 0x9102: a card of 31.9 GB named SD, with two bytes after the dataset.
 STORAGE_INFO = bytes.fromhex("0400 0300 0000 0000886d07000000 0080bf6c07000000 ffffffff 03530044000000 00 0000")
 # EOS 60D, property 0x5001: the battery at 50 %, values of one byte sent as two.
 BATTERY_DESC = bytes.fromhex("0150 0200 00 32 32 02 0500 6400 4b00 3200 1900 0000")
 # ISO 15740, 13.3.3: property 0x5003 as a string of two choices.
 STRING_DESC = bytes.fromhex("0350 ffff 01 0231000000 0232000000 02 0200 0231000000 0232000000")
-# EOS 400D, answer to 0x9116 after a shot, as gphoto2 logged it with its container's header of 12 bytes.
+# EOS 400D, reply to 0x9116 after a release, logged by gphoto2 with its container header of 12 bytes.
 EOS_400D_SHOT = bytes.fromhex(
     "50000000020016910b070000 3c000000"
     "81c1000052639431 0100010001380000"
@@ -47,11 +47,11 @@ EOS_400D_SHOT = bytes.fromhex(
     "50639431494d475f 313538392e4a5047"
     "00000000f8d2ed49 0800000000000000"
 )
-# A transfer request of the layout found on the wire: handle, format, 0, size, 0, name.
+# A transfer request in the recorded layout: handle, format, 0, size, 0, name.
 TRANSFER_REQUEST = bytes.fromhex(
     "29000000 86c10000 21009191 03b10000 00000000 40d28c01 00000000 494d475f303034322e435232 00 08000000 00000000"
 )
-# A state dump in miniature: two properties, a list, a list of image formats, a status, a type not known.
+# A small state dump: two properties, a list, a list of image formats, a status, an unknown type.
 STATE = bytes.fromhex(
     "10000000 89c10000 03d10000 68000000"
     "17000000 89c10000 afd10000 3132383630323730383600"

@@ -93,7 +93,7 @@ def test_storage_info_keeps_appended_bytes() -> None:
 def test_properties_match_the_standards_bytes() -> None:
     text = DevicePropDesc(0x5003, DataType.STRING, True, "1", "2", ("1", "2"))
     assert text.encode() == examples.STRING_DESC
-    # The 60D sends bytes as words and means bytes.
+    # The 60D sends bytes as words.
     battery = DevicePropDesc(0x5001, DataType.UINT8, False, 50, 50, (100, 75, 50, 25, 0), widened=True)
     assert battery.encode() == examples.BATTERY_DESC
     assert replace(battery, widened=False).encode() == bytes.fromhex("0150 0200 00 32 32 02 0500 64 4b 32 19 00")
@@ -141,7 +141,7 @@ DATASETS = st.one_of(
 
 @given(st.sampled_from([kind for kind in DataType if kind != DataType.STRING]), st.data())
 def test_values_survive_encoding_and_decoding(kind: DataType, data: st.DataObject) -> None:
-    # By the standard signed types are the odd ones, and a type of twice the number has half again as many bytes.
+    # In the standard, signed types have odd numbers; pairs of types double in size.
     bits, signed = 8 << (kind - 1) // 2, kind % 2 == 1
     least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     values = data.draw(st.lists(st.integers(least, most), min_size=1, max_size=5).map(tuple))

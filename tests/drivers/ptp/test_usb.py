@@ -296,7 +296,7 @@ def test_refuses_protocol_violations(reads: tuple[bytes, ...], reason: str) -> N
 
 
 def test_refuses_success_with_half_the_data() -> None:
-    # A short packet cannot end a container whose length is known: what follows is taken for its payload.
+    # A short packet cannot end a container of known length; the next bytes are its payload.
     with pytest.raises((ProtocolError, LinkTimeout)):
         get(Script(data(2000, bytes(100)), OK))
 
@@ -388,7 +388,7 @@ def test_refuses_a_response_with_a_changed_byte(at: int, value: int) -> None:
         done = transport.transact(PtpRequest(ECHO, 0x01020304), timeout=PATIENCE_S)
     except (ProtocolError, LinkTimeout):
         return
-    # Only the code may differ, for any is allowed.
+    # Only the code may differ, because any code is permitted.
     assert done.response.transaction == 0x01020304
     assert done.response.parameters == ()
     assert at in (6, 7) or done.response.ok

@@ -45,7 +45,7 @@ def cr2_bytes(
         {},
         {259: shorts(6), 273: longs(0), 279: longs(len(strip)), 50752: shorts(number, each, last)},
     ]
-    # Header: TIFF, then "CR", version 2.0, and where the raw directory is.
+    # Header: TIFF, then "CR", version 2.0, and the position of the raw directory.
     starts: list[int] = []
     place = 16
     for tags in (*directories, exif):
@@ -143,7 +143,7 @@ def lossless_jpeg(counts: NDArray[np.uint16]) -> bytes:
     # Sixteen codes of five bits, 0 … 15, so that each category is its own code.
     codes = (size.astype(np.int64) << size) | np.where(one < 0, one + (1 << size) - 1, one)
     bits = _bits(codes, size + 5)
-    # Eight of them are whole bytes.
+    # Eight rows are whole bytes.
     many = height // 8 if alike else 0
     rest = np.tile(bits, height % 8) if alike else bits
     packed = np.packbits(np.tile(bits, 8)).tobytes() * many if many else b""

@@ -38,7 +38,7 @@ def by_imagecodecs(counts: Counts) -> bytes:
 def test_accepts_complete_streams(counts: Counts, encode: Callable[[Counts], bytes]) -> None:
     stream = encode(counts)
     assert lossless_fault(stream) is None
-    # Whole words, or a sector, behind the last sample.
+    # Whole words, or a sector, after the last sample.
     for padding in (bytes(3), b"\xff\xd9" + bytes(500)):
         assert lossless_fault(stream[:-2] + padding) is None
 
@@ -106,7 +106,7 @@ def test_predictors_match_the_standard(predictor: int) -> None:
         7: left + up >> 1,
     }[predictor].copy()  # fmt: skip
     predicted[0, 1:], predicted[1:, 0], predicted[0, 0] = left[0, 1:], up[1:, 0], 1 << 13
-    # The differences of that predictor, written as if they were those of counts by the first.
+    # Differences of this predictor, encoded like those of predictor 1.
     stream = _stream_of((counts - predicted).ravel(), predictor)
     assert lossless_fault(stream) is None
 

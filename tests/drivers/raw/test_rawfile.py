@@ -78,8 +78,8 @@ def test_counts_equal_dcraw() -> None:
 
 @pytest.mark.slow
 def test_reads_a_real_550d_file() -> None:
-    # Tags as exiftool and tifffile show them; the sensor's left border is black on a real sensor, near the 2048 counts
-    # that Canon's bodies of this generation are set to.
+    # Tags as shown by exiftool and tifffile; the left border of a real sensor is black, near the 2048 counts set in
+    # Canon's bodies of this generation.
     mosaic = read_raw(EOS_550D)
     assert mosaic.camera == "Canon EOS Kiss X4"
     assert mosaic.pattern == "RGGB"
@@ -112,7 +112,7 @@ def test_reads_a_real_g2_file() -> None:
 
 @pytest.mark.slow
 def test_visible_area_of_a_550d_equals_dcraw(tmp_path: Path) -> None:
-    # dcraw 9.28 shows raw[51:3516, 142:5344] as RGGB; LibRaw's own frame begins one row lower.
+    # dcraw 9.28 shows raw[51:3516, 142:5344] as RGGB; LibRaw's visible area starts one row lower.
     columns = np.random.default_rng(2).integers(0, 2, 5344)
     columns[:2] = 1
     counts = np.add.outer(8192 + np.arange(3516), columns).astype(np.uint16)
@@ -130,7 +130,7 @@ def test_visible_area_of_a_550d_equals_dcraw(tmp_path: Path) -> None:
 @pytest.mark.parametrize("maker", ["Canon", "Nikon"])
 @pytest.mark.parametrize(("top", "left"), [(0, 0), (1, 0), (0, 1), (13, 17), (12, 40)])
 def test_visible_area_of_a_dng_is_its_active_area(tmp_path: Path, maker: str, top: int, left: int) -> None:
-    # DNG 1.4: CFAPattern counts from the active area's corner, however odd that is.
+    # DNG 1.4: CFAPattern starts at the corner of the active area, also if it is odd.
     counts = noise((61, 90))
     more = {271: text(maker), 272: text("Test"), 50829: longs(top, left, 60, 88), 33422: (1, 4, b"\2\1\1\0")}
     write_dng(tmp_path / "odd.dng", counts, more)
@@ -192,7 +192,7 @@ def test_plain_dng_equals_libraw(
     if table:
         more[50712] = shorts(*range(0, 8192, 2))
     write_dng(tmp_path / "a.dng", noise(size), more)
-    # A table of tones is LibRaw's to apply, a visible area that is not stated its to know.
+    # LibRaw applies linearisation tables, and has the visible area if it is not stated.
     assert uses_libraw(tmp_path / "a.dng") == (table or corner is None)
     read = read_raw(tmp_path / "a.dng")
     with pytest.MonkeyPatch.context() as patch:
@@ -209,7 +209,7 @@ def test_plain_dng_equals_libraw(
 
 @pytest.mark.slow
 def test_black_keeps_fraction_and_position(tmp_path: Path) -> None:
-    # DNG 1.4: BlackLevel counts from the active area's corner; the deltas of columns and rows add to it.
+    # DNG 1.4: BlackLevel starts at the corner of the active area; deltas of columns and rows are added.
     levels = ratios((20483, 10), (20495, 10), (2050, 1), (2051, 1))
     more = {50713: shorts(2, 2), 50714: levels, 50829: longs(3, 5, 40, 60)}
     write_dng(tmp_path / "a.dng", noise((40, 60)), more)
@@ -225,10 +225,10 @@ def test_masked_black_is_the_mean_of_each_position(tmp_path: Path) -> None:
     truth = np.array([[2047.25, 2048.0], [2049.5, 2046.75]])
     for row in range(2):
         for column in range(2):
-            # The visible corner (13, 41) has phase (0, 0): sensor rows and columns of even number have the other.
+            # The visible corner (13, 41) has position (0, 0); even sensor rows and columns have the other position.
             border = counts[(row + 1) % 2 :: 2, (column + 1) % 2 : 41 : 2]
             border[...] = np.round(rng.normal(truth[row, column], 6.0, border.shape))
-    counts[:, :4] = 2066  # the disturbed first columns, too near to be told by their value
+    counts[:, :4] = 2066  # disturbed first columns, too similar to be excluded by their value
     counts[50, 20:24] = 16000  # hot photosites
     write_dng(tmp_path / "a.dng", counts, {50829: longs(13, 41, 201, 300), 50830: longs(0, 0, 201, 40)})
     mosaic = read_raw(tmp_path / "a.dng")
@@ -238,7 +238,7 @@ def test_masked_black_is_the_mean_of_each_position(tmp_path: Path) -> None:
     np.testing.assert_allclose(black, truth, atol=0.6)
 
 
-# What is no raw file
+# Other files
 
 
 @pytest.mark.slow
@@ -283,7 +283,7 @@ def test_refuses_other_sensors(tmp_path: Path) -> None:
 @pytest.mark.parametrize("real", REAL, ids=lambda real: real.name)
 def test_refuses_truncated_files(tmp_path: Path, real: Path, capfd: pytest.CaptureFixture[str]) -> None:
     data = real.read_bytes()
-    # The last 58 bytes of blackmagic.dng pad the file; no tag points at them.
+    # The last 58 bytes of blackmagic.dng are padding; no tag points to them.
     whole = len(data) - (58 if real.name == "blackmagic.dng" else 0)
     lengths = [0, 7, 8, 100, 999, 1500, 5000, 20_000, *np.linspace(30_000, whole - 1, 9).astype(int).tolist()]
     cut = tmp_path / real.name
@@ -356,7 +356,7 @@ def test_reads_complete_files_and_refuses_truncated_ones(name: str) -> None:
     data, counts = FILES[name]
     np.testing.assert_array_equal(decode_raw(data, WHERE).sensor, counts)
     for length in (0, 7, 12, 40, 200, len(data) // 2, len(data) - 40, len(data) - 1):
-        # The last byte of a lossless JPEG is its end's mark.
+        # The last byte of a lossless JPEG belongs to its end marker.
         if length < len(data) - 1 or name not in ("cr2", "dng lossless"):
             with pytest.raises(FormatError, match=r"frame\.raw cannot be read"):
                 decode_raw(data[:length], WHERE)
@@ -420,7 +420,7 @@ STATED: dict[str, tuple[str, Directory]] = {
 @pytest.mark.parametrize("model", STATED)
 def test_accepts_layouts_of_real_cameras(model: str) -> None:
     maker, pixels = STATED[model]
-    # Where tiles begin stands a lossless JPEG's header.
+    # Each tile starts with the header of a lossless JPEG.
     sof = bytes.fromhex("ffd8ffc3000e0e02000200010111000000")
     data = memoryview(bytearray(b"II*\0".ljust(45_000_000, b"\0")))
     for place in pixels.integers(T.TILE_OFFSETS):
@@ -564,9 +564,11 @@ def test_accepts_dark_and_saturated_frames() -> None:
     dark = np.random.default_rng(2).normal(64, 8, (SIDE, 2 * SIDE)).clip(0).astype(np.uint16)
     dark[:, 7] = 0  # a dead column
     assert filled_fault(dark, np.full((2, 2), 64.0), 4095) is None
-    assert filled_fault(np.full_like(dark, 32), np.full((2, 2), 64.0), 4095) is None, "half of black is not below it"
+    assert filled_fault(np.full_like(dark, 32), np.full((2, 2), 64.0), 4095) is None, (
+        "half of the black level is accepted"
+    )
     assert filled_fault(np.full_like(dark, 31), np.full((2, 2), 64.0), 4095) is not None
-    # Black is subtracted in some bodies, and half of the noise with it.
+    # Some bodies subtract black, and half of the noise.
     assert filled_fault(np.maximum(dark, 64) - 64, np.zeros((2, 2)), 4095) is None
     assert filled_fault(np.full_like(dark, 65535), np.zeros((2, 2)), 65535) is None
     assert filled_fault(np.full_like(dark, 16383), np.full((2, 2), 1024.0), 15_000) is None

@@ -86,19 +86,19 @@ def masked(model: str, left: int, stated: Cr3 | None, rows: int = 4056) -> tuple
 
 def test_masked_columns_of_a_cr3() -> None:
     assert masked("Canon EOS M50", 264, Cr3()) == (Area(36, 0, 4020, 260),)
-    # What the file states narrows that down, and adds nothing.
+    # Stated areas can only reduce the known area.
     assert masked("Canon EOS M50", 264, Cr3(black=(Area(0, 0, 4056, 256), Area(0, 264, 28, 6024)))) == (
         Area(36, 0, 4020, 256),
     )
     assert masked("Canon EOS M50", 264, Cr3(black=(Area(40, 40, 4000, 100),))) == (Area(40, 40, 4000, 100),)
     assert masked("Canon EOS M50", 264, Cr3(black=(Area(0, 40, 4000, 400),))) == (Area(36, 0, 4020, 260),), (
-        "it is not black there"
+        "the stated area is not black"
     )
     assert masked("Canon EOS M50", 264, Cr3(black=(Area(0, 0, 4056, 3),))) == ()
 
 
 def test_leaves_out_columns_that_are_not_black() -> None:
-    # LibRaw's table: EOS R10 168 columns, of which the first 16 and the last 48 are none; R5 Mark II 258, 128.
+    # LibRaw's table: EOS R10 168 columns, without the first 16 and the last 48; R5 Mark II 258, 128.
     for camera in ("Canon EOS R10", "Canon EOS R6m2", "Canon EOS R6 Mark II"):
         assert masked(camera, 168, Cr3()) == (Area(36, 16, 4020, 104),)
     for camera in ("Canon EOS R5m2", "Canon EOS R5 Mark II"):
@@ -111,7 +111,7 @@ SMALL = box(b"stsz", struct.pack(">III", 0, 400, 1)), box(b"co64", struct.pack("
 def test_refuses_files_that_libraw_cannot_decode(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for name, data, reason in (
         ("whole.CR3", cr3("R", track(areas(), b"CRAW", (64, 48), *SMALL)), "LibRaw reports"),
-        ("stub.CR3", cr3(), "its pixels extend to byte 5000900"),
+        ("stub.CR3", cr3(), "its pixels are at bytes 900 to 5000900"),
         ("cut.CR3", cr3()[:-10], "its box 'mdat' extends to byte"),
         ("head.CR3", cr3()[:40], "cannot be read as a raw file"),
         ("brand.CR3", b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", "no description of its images"),

@@ -19,7 +19,7 @@ class Script:
         self._replies: list[bytes] = []
 
     def write(self, data: bytes, timeout: float) -> None:
-        assert self._turns, f"nothing more was to be said, but {data!r} was"
+        assert self._turns, f"the script has ended, but {data!r} was sent"
         expected, reply = self._turns.pop(0)
         assert data == expected
         self._replies += (reply,) if isinstance(reply, bytes) else reply
@@ -28,7 +28,7 @@ class Script:
         if not self._replies:
             if not timeout:
                 return b""
-            raise LinkTimeout("the script has nothing more to say")
+            raise LinkTimeout("the script has no reply")
         return self._replies.pop(0)
 
     def close(self) -> None:

@@ -88,7 +88,7 @@ def bench_of(
     def repair() -> None:
         device.repair()
         if language.faults is None and language.reports_unasked:
-            # That it is well again, it cannot say: only that its lamp is struck again.
+            # It does not announce the repair, only that its lamp is struck again.
             device.switch_on()
         catch_up()
 
@@ -178,7 +178,7 @@ def test_epson_reports_power_but_no_faults_while_switching() -> None:
     projector.switch_on()
     assert projector.faults() == ()
     script.more(b":")
-    assert projector.faults() == (), "of a projector that is on, ERR means that it does not know the question"
+    assert projector.faults() == (), "if the projector is on, ERR means an unsupported query"
     assert script.ended()
 
 
@@ -252,7 +252,7 @@ def test_epson_mute_lamp_and_error_codes() -> None:
 
 
 def test_epson_ignores_events() -> None:
-    # Not confirmed: what newer projectors send unasked.
+    # Not confirmed: unasked messages of newer projectors.
     event = b"IMEVENT=0001 02 00000002 00000000 T1 F1\r:"
     projector, script = scripted("epson", (b"PWR?\r", (event, b"PWR=02\r:")))
     assert projector.power() is Power.WARMING
@@ -394,13 +394,13 @@ def test_benq_unsupported_mute_query_returns_none(answer: bytes) -> None:
 
 
 def test_benq_unknown_mute_state_is_set_again() -> None:
-    # A remote control may have shown the picture meanwhile.
+    # A remote control may have shown the image in between.
     ask = (b"\r*blank=?#\r", b"*Unsupported item#\r\n")
     hide = (b"\r*blank=on#\r", b"*BLANK=ON#\r\n")
     projector, script = scripted("benq", ask, hide, ask, hide, ask)
     projector.set_muted(True)
     projector.set_muted(True)
-    assert projector.muted(), "what was set last is known where the projector does not tell"
+    assert projector.muted(), "the last command counts if the state is not reported"
     assert script.ended()
 
 
@@ -445,14 +445,14 @@ def test_optoma_mute_lamp_model_and_refusal() -> None:
     projector, script = scripted(
         "optoma",
         (OPTOMA_MUTE, b"P"),
-        (b"~00355 1\r", b"F\r"),  # not confirmed; older models do not know it
+        (b"~00355 1\r", b"F\r"),  # not confirmed; missing in older models
         (b"~00108 1\r", b"OK0123\r"),
         (OPTOMA_STATE, b"OK1\r"),
         (b"~00151 1\r", b"OK2\r"),
         (b"~0002 0\r", b"F\r"),
     )
     projector.set_muted(True)
-    assert projector.muted(), "what was set last is known where the projector does not tell"
+    assert projector.muted(), "the last command counts if the state is not reported"
     assert projector.lamps() == (Lamp(123, lit=True),)
     assert projector.identity() == ProjectorIdentity("Optoma", "model 2", "")
     with pytest.raises(DeviceRefused):
@@ -551,7 +551,7 @@ def test_any_bytes_are_understood_or_refused(name: str, data: bytes) -> None:
 @pytest.mark.parametrize("name", NAMES)
 @given(key=st.binary(min_size=4, max_size=4).filter(any))
 def test_wrong_speed_is_a_device_error(name: str, key: bytes) -> None:
-    # At the wrong speed bytes come with some bits set wrongly and the highest one mostly set.
+    # At the wrong speed some bits are wrong, and the highest bit is mostly set.
     def garble(data: bytes) -> bytes:
         return bytes(byte ^ key[place % 4] | 0x80 for place, byte in enumerate(data))
 
