@@ -57,7 +57,7 @@ def _require_own_packages() -> None:
         raise ImportError(str(error)) from error
 
 
-def _run_command(command: str) -> int:
+def _run(command: str) -> int:
     try:
         _require_own_packages()
     except ImportError as error:
@@ -68,24 +68,24 @@ def _run_command(command: str) -> int:
 
 def acquire() -> int:
     """Run the command `acquire`."""
-    return _run_command("acquire")
+    return _run("acquire")
 
 
 def build_lut() -> int:
     """Run the command `build-lut`."""
-    return _run_command("build-lut")
+    return _run("build-lut")
 
 
 def generate() -> int:
     """Run the command `generate`."""
-    return _run_command("generate")
+    return _run("generate")
 
 
 def evaluate() -> int:
     """Run the command `evaluate`."""
-    return _run_command("evaluate")
+    return _run("evaluate")
 
 
 def sim() -> int:
     """Run the command `sim`."""
-    return _run_command("sim")
+    return _run("sim")

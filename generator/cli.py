@@ -243,7 +243,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
         choice = choice["lights"]
     output.add(
         dataset=masked(out),
-        record=not was_there,
+        made=not was_there,
         images=record.images,
         planned=record.planned,
         pictures=record.sources,

@@ -328,7 +328,7 @@ def _require_inside(location: str, name: str) -> None:
         )
 
 
-Store = LocalStore | RemoteStore  # Files below one place
+Store = LocalStore | RemoteStore  # Files below one location
 
 
 def read_bounded(store: Store, name: str, most_bytes: int) -> bytes:

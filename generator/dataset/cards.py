@@ -56,10 +56,9 @@ def summary_of(description: Description) -> str:
     """Return sentences on the content of the images."""
     table = description.table
     return (
-        f"{counted(description.images, 'image')} of linear camera RGB as the raw sensor of the "
-        f"{one_line(table.camera)} would "
-        "give them, each with the exact colour of its light. Black is 0, saturation "
-        f"{table.white_level}; nothing is white balanced. {kind_of(description)}"
+        f"{counted(description.images, 'image')} in linear camera RGB, as the raw sensor of the "
+        f"{one_line(table.camera)} would record them, each with the exact colour of its illuminant. Black is 0, the "
+        f"saturation level is {table.white_level}; images are not white balanced. {kind_of(description)}"
     )
 
 

@@ -324,9 +324,9 @@ def generate_dataset(
     >>> from generator import DatasetOptions, find_pictures, generate_dataset, open_lut
     >>> lut, options = open_lut("lut"), DatasetOptions(form="tiff", previews=False)
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     place = f"{folder}/dataset"
-    ...     made = generate_dataset(lut, place, find_pictures("cat.png"), [0, 3], options=options, workers=2)
-    ...     [(entry.image, entry.source, entry.illumination) for entry in made.entries]
+    ...     out = f"{folder}/dataset"
+    ...     dataset = generate_dataset(lut, out, find_pictures("cat.png"), [0, 3], options=options, workers=2)
+    ...     [(entry.image, entry.source, entry.illumination) for entry in dataset.entries]
     [('000000.tiff', 'cat.png', '0'), ('000001.tiff', 'cat.png', '3')]
     """
     choice: LightChoice = lights if isinstance(lights, LightChoice) else listed_lights(lights, lut)

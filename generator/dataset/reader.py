@@ -87,7 +87,7 @@ def read_entries(store: Store, description: Description) -> Iterator[Entry]:
         if extra_lines:
             raise FormatError(
                 f"{store.location}/{TRUTHS} has {count + extra_lines} lines, expected one for each of the {count} "
-                f"images of {GROUND_TRUTH}; make the dataset again"
+                f"images of {GROUND_TRUTH}; make the data set again"
             )
 
 
@@ -408,7 +408,7 @@ def open_dataset(location: Path | str) -> Dataset:
     >>> import tempfile
     >>> from generator import find_pictures, generate_dataset, open_dataset, open_lut
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     made = generate_dataset(open_lut("lut"), f"{folder}/dataset", find_pictures("cat.png"), [2])
+    ...     _ = generate_dataset(open_lut("lut"), f"{folder}/dataset", find_pictures("cat.png"), [2])
     ...     dataset = open_dataset(f"{folder}/dataset")
     ...     image = dataset.read_image(dataset.entries[0])
     >>> image.shape, image.dtype, dataset.entries[0].truth

@@ -166,8 +166,8 @@ class RawImage:
 
     def details(self) -> Details:
         """Return the columns of `images.csv`."""
-        columns_colours: Details = {} if self.print_colours is None else dict(vars(self.print_colours))
-        return columns_colours if self.black_taken is None else columns_colours | {"black_taken": self.black_taken}
+        columns: Details = {} if self.print_colours is None else dict(vars(self.print_colours))
+        return columns if self.black_taken is None else columns | {"black_taken": self.black_taken}
 
 
 def photograph(

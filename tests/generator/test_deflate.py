@@ -46,8 +46,8 @@ def rows_of(image: Image16, filters: npt.NDArray[np.uint8]) -> bytes:
     """Return the rows of a PNG with filters 0 (None) or 1 (Sub) (ISO/IEC 15948, 9.2)."""
     height, width, _ = image.shape
     plain = image.astype(">u2").view(np.uint8).reshape(height, 6 * width).astype(np.int64)
-    left = np.pad(plain, ((0, 0), (6, 0)))[:, :-6]
-    filtered = (plain - np.where(filters[:, None] == 1, left, 0)) % 256
+    previous = np.pad(plain, ((0, 0), (6, 0)))[:, :-6]
+    filtered = (plain - np.where(filters[:, None] == 1, previous, 0)) % 256
     return np.hstack([filters[:, None], filtered]).astype(np.uint8).tobytes()
 
 

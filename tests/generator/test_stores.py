@@ -43,7 +43,7 @@ class FolderedStore(MemoryFileSystem):
     protocol = "ftp"
     store: dict[str, object] = {}  # noqa: RUF012  as fsspec has it
     pseudo_dirs = [""]  # noqa: RUF012  as fsspec has it
-    made: set[str] = set()  # noqa: RUF012  of this test
+    folders: set[str] = set()  # noqa: RUF012  of this test
 
     @classmethod
     def _strip_protocol(cls, path: str) -> str:
@@ -51,10 +51,10 @@ class FolderedStore(MemoryFileSystem):
 
     def makedirs(self, path: str, exist_ok: bool = False) -> None:
         del exist_ok
-        self.made.add(path.rstrip("/"))
+        self.folders.add(path.rstrip("/"))
 
     def _require(self, path: str) -> None:
-        if path.rpartition("/")[0] not in self.made:
+        if path.rpartition("/")[0] not in self.folders:
             raise EOFError("550 No such file or directory")
 
     def pipe_file(self, path: str, value: bytes, mode: str = "overwrite", **kwargs: Any) -> None:
@@ -70,7 +70,7 @@ class FolderedStore(MemoryFileSystem):
 def ftp_store() -> Generator[FolderedStore]:
     original = import_module("fsspec").get_filesystem_class("ftp")
     register_implementation("ftp", FolderedStore, clobber=True)
-    FolderedStore.made.clear()
+    FolderedStore.folders.clear()
     yield FolderedStore()
     register_implementation("ftp", original, clobber=True)
 
@@ -78,7 +78,7 @@ def ftp_store() -> Generator[FolderedStore]:
 def test_creates_parent_folders(table_and_picture: Path, ftp_store: FolderedStore) -> None:
     arguments = ["lut", "ftp://host/deep/out", "--sources", "cat.png", "--light", "0", "--workers", "1"]
     assert import_module("generator.cli").main(arguments) == 0
-    assert "/host/deep/out/images" in ftp_store.made
+    assert "/host/deep/out/images" in ftp_store.folders
     assert import_module("generator.cli").main(["--verify", "ftp://host/deep/out"]) == 0
 
 
@@ -170,9 +170,9 @@ def empty_stores() -> Iterator[None]:
     FailingFileSystem.store.clear()
 
 
-def contents(place: str | Path) -> dict[str, str]:
+def file_hashes(location: str | Path) -> dict[str, str]:
     """Return the hash of every file of a store."""
-    store = open_store(place)
+    store = open_store(location)
     return {name: hashlib.sha256(store.get(name)).hexdigest() for name in store.names()}
 
 
@@ -186,7 +186,7 @@ def test_store_and_disk_have_equal_data_sets(make_lut: MakeLut, tmp_path: Path, 
     lut = make_lut()
     make(lut, tmp_path / "out", layout=layout)
     make(lut, "memory://bucket/out", layout=layout, workers=3)
-    assert contents("memory://bucket/out") == contents(tmp_path / "out")
+    assert file_hashes("memory://bucket/out") == file_hashes(tmp_path / "out")
     remote, local = open_dataset("memory://bucket/out"), open_dataset(tmp_path / "out")
     assert remote.entries == local.entries
     assert remote.sources == local.sources
@@ -204,7 +204,7 @@ STRIDE = 3  # The store fails at every third write
 def test_resumes_after_failure_of_any_write(make_lut: MakeLut, tmp_path: Path, layout: str) -> None:
     lut = make_lut()
     make(lut, tmp_path / "out", layout=layout, previews=False)
-    expected = contents(tmp_path / "out")
+    expected = file_hashes(tmp_path / "out")
     write = 1 - STRIDE
     failed = True
     while failed:
@@ -222,7 +222,7 @@ def test_resumes_after_failure_of_any_write(make_lut: MakeLut, tmp_path: Path, l
         FailingFileSystem.fails_at = None
         if failed:
             make(lut, "failing://bucket/out", layout=layout, previews=False)
-        assert contents("failing://bucket/out") == expected, f"failed at write {write}"
+        assert file_hashes("failing://bucket/out") == expected, f"failed at write {write}"
     assert write > 8
 
 
@@ -237,7 +237,7 @@ def test_shares_in_a_store(make_lut: MakeLut, tmp_path: Path) -> None:
         make(lut, "memory://out", seed=4)
     assert make_share(plan, "memory://out", (0, 2)) == (3, 3)
     make_dataset(plan, "memory://out")
-    assert contents("memory://out") == contents(tmp_path / "out")
+    assert file_hashes("memory://out") == file_hashes(tmp_path / "out")
 
 
 def test_sources_in_a_store(make_lut: MakeLut, tmp_path: Path) -> None:
@@ -250,9 +250,9 @@ def test_sources_in_a_store(make_lut: MakeLut, tmp_path: Path) -> None:
         RemoteStore("memory://bucket/pictures").put(name, data)
     RemoteStore("memory://bucket/pictures").put("c.png", b"no picture")
     (tmp_path / "pictures" / "c.png").write_bytes(b"no picture")
-    for place, out in (("memory://bucket/pictures", "there"), (str(tmp_path / "pictures"), "here")):
-        generate_dataset(lut, tmp_path / out, find_pictures([place]), [0, 1])
-    assert contents(tmp_path / "there") == contents(tmp_path / "here")
+    for location, out in (("memory://bucket/pictures", "there"), (str(tmp_path / "pictures"), "here")):
+        generate_dataset(lut, tmp_path / out, find_pictures([location]), [0, 1])
+    assert file_hashes(tmp_path / "there") == file_hashes(tmp_path / "here")
     assert len(open_dataset(tmp_path / "here").description.skipped) == 1
 
 
@@ -272,7 +272,7 @@ def test_ignores_late_worker_of_removed_plan(make_lut: MakeLut, tmp_path: Path, 
         make_shard_on_worker(old.job(0), late_workplace)
     make_dataset(new, out)
     make_dataset(new, tmp_path / "undisturbed")
-    assert contents(out) == contents(tmp_path / "undisturbed")
+    assert file_hashes(out) == file_hashes(tmp_path / "undisturbed")
 
 
 def test_unreachable_source_stops_the_work(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,8 +300,8 @@ def test_distinguishes_unmounted_disk_from_missing_picture(make_lut: MakeLut, tm
         (folder / name).write_bytes(cv2.imencode(".png", np.zeros((9, 8, 3), np.uint8))[1].tobytes())
     pictures = find_pictures([folder])
     (folder / "a.png").unlink()
-    made = generate_dataset(make_lut(), tmp_path / "one", pictures, [0])
-    assert (made.description.sources, [skipped.name for skipped in made.description.skipped]) == (1, ["a.png"])
+    dataset = generate_dataset(make_lut(), tmp_path / "one", pictures, [0])
+    assert (dataset.description.sources, [skipped.name for skipped in dataset.description.skipped]) == (1, ["a.png"])
     shutil.rmtree(folder)
     if unmounted == "empty":
         folder.mkdir()

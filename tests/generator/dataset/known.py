@@ -75,7 +75,7 @@ def rows_of(text: str) -> list[list[Any]]:
     return [[plain_text(cell) for cell in row] for row in csv.reader(io.StringIO(text))]
 
 
-def held_by(out: Path) -> dict[str, Any]:
+def data_set_content(out: Path) -> dict[str, Any]:
     """Return the numbers of every list of a data set, and shape and bytes of each image and map."""
     dataset = open_dataset(out)
     described = json.loads((out / "dataset.json").read_text(encoding="utf-8"))
@@ -85,7 +85,7 @@ def held_by(out: Path) -> dict[str, Any]:
     return {
         "pixels": [described["pixels"], described["replaced_pixels"]],
         "lists": lists,
-        "truths": [[float(part) for part in line.split()] for line in (out / "gt.txt").read_text().splitlines()],
+        "truths": [[float(number) for number in line.split()] for line in (out / "gt.txt").read_text().splitlines()],
         "parts": {name: len(images) for name, images in splits.items()},
         "files": len(sums),
         "faults": len(list(file_faults(out))),

@@ -73,16 +73,16 @@ def test_rows_of_sources(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.
     assert len(displayed) == images_on(sheet) == 20
     assert len(sheet.axes) == 20 + 4, "a dot for each light above its column"
     displayed.clear()
-    part = contact_sheet(data_set, max_rows=3, max_columns=2)
+    small_sheet = contact_sheet(data_set, max_rows=3, max_columns=2)
     assert displayed == ["000000.png", "000003.png", "000008.png", "000011.png", "000016.png", "000019.png"]
-    assert part.dtype == np.uint8
+    assert small_sheet.dtype == np.uint8
     width, height = np.round(sheet.get_size_inches() * sheet.dpi)
-    assert part.shape[0] < height
-    assert part.shape[1] < width
+    assert small_sheet.shape[0] < height
+    assert small_sheet.shape[1] < width
 
 
 def test_limits_number_of_lights(make_lut: MakeLut, tmp_path: Path) -> None:
-    lights = ListedLights(tuple(mixture_of({0: part, 1: 10 - part}) for part in range(1, 10)))
+    lights = ListedLights(tuple(mixture_of({0: weight, 1: 10 - weight}) for weight in range(1, 10)))
     data_set = make_data_set(make_lut(), tmp_path / "out", 1, lights)
     assert data_set.description.images == 9
     sheet = draw(data_set, MAX_ROWS, MAX_COLUMNS)
@@ -90,8 +90,8 @@ def test_limits_number_of_lights(make_lut: MakeLut, tmp_path: Path) -> None:
     # The label of a mixture is its chromaticity, and its colour is the mixture of codes in linear light.
     assert data_set.entries[0].lights == ("0:0.1+1:0.9",)
     truth = data_set.entries[0].truths[0]
-    words = [text.get_text() for text in sheet.texts]
-    assert f"r {truth[0]:.2f} b {truth[2]:.2f}" in words
+    texts = [text.get_text() for text in sheet.texts]
+    assert f"r {truth[0]:.2f} b {truth[2]:.2f}" in texts
     dot: Any = next(axes.patches[0] for axes in sheet.axes if axes.patches)
     # The codes are 9, 8, 0 and 9, 8, 1; the display has a gamma of 2.2.
     assert np.multiply(dot.get_facecolor()[:3], 255) == pytest.approx([9, 8, 0.9 ** (1 / 2.2)])
@@ -100,17 +100,17 @@ def test_limits_number_of_lights(make_lut: MakeLut, tmp_path: Path) -> None:
 def test_single_images_fill_a_grid(make_lut: MakeLut, tmp_path: Path) -> None:
     data_set = make_data_set(make_lut(), tmp_path / "out", 30, RandomLights(1, 4, 0))
     sheet = draw(data_set, MAX_ROWS, MAX_COLUMNS)
-    words = [text.get_text() for text in sheet.texts]
+    texts = [text.get_text() for text in sheet.texts]
     width, height = sheet.get_size_inches()
     assert images_on(sheet) == 24
     assert 0.6 < height / width < 1.1
-    assert any("24 of 30 pictures shown" in word for word in words)
+    assert any("24 of 30 pictures shown" in text for text in texts)
     names = [entry.source for entry in data_set.entries]
-    assert [word for word in words if word in names] == [
+    assert [text for text in texts if text in names] == [
         names[index] for index in np.linspace(0, 29, 24).round().astype(int)
     ]
     small_sheet = draw(data_set, 2, 3)
-    words = [text.get_text() for text in small_sheet.texts]
+    texts = [text.get_text() for text in small_sheet.texts]
     assert small_sheet.get_size_inches()[1] < height
-    assert any("4 of 30 pictures shown" in word for word in words)
-    assert any("image by image" in word for word in words)
+    assert any("4 of 30 pictures shown" in text for text in texts)
+    assert any("image by image" in text for text in texts)

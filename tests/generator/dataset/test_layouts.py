@@ -93,18 +93,18 @@ def test_adds_file_layout_by_one_entry(make: Make, monkeypatch: pytest.MonkeyPat
         (default.read_image(image_entry), default.read_weights(image_entry), default.read_preview(image_entry))
         for image_entry in default.entries
     ]
-    entry = FileLayout(file_name=lambda kind, part, name: f"{part}/{kind}/{name}")
+    entry = FileLayout(file_name=lambda kind, split_name, name: f"{split_name}/{kind}/{name}")
     monkeypatch.setitem(cast("dict[str, Any]", layouts.LAYOUTS), "folder", entry)
     variant = make("folder", lights, split=split)
-    parts = {"train", "test"} if split else {"data"}
-    assert {path.parts[-3] for path in folder_of(variant).rglob("*.png")} == parts
+    splits = {"train", "test"} if split else {"data"}
+    assert {path.parts[-3] for path in folder_of(variant).rglob("*.png")} == splits
     assert list(file_faults(folder_of(variant))) == []
     for image_entry, (image, weights, preview) in zip(variant.entries, images, strict=True):
         np.testing.assert_array_equal(variant.read_image(image_entry), image)
         np.testing.assert_array_equal(variant.read_weights(image_entry), weights)
         assert variant.read_preview(image_entry) == preview
     card = (folder_of(variant) / "README.md").read_text()
-    assert all(f"`{part}/images/NNNNNN.png`" in card for part in parts)
+    assert all(f"`{split_name}/images/NNNNNN.png`" in card for split_name in splits)
     assert (entry.folder("masks", ["train", "test"]), entry.folder("masks", ["test"])) == (None, "test/masks")
 
 
@@ -162,18 +162,18 @@ def hugging_face(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempP
 
 def test_hugging_face_reads_shards(make: Make, hugging_face: Any, tmp_path: Path) -> None:
     data_set = make("parquet", split=(0.6, 0.0, 0.4), rendering="colorimetric")
-    files = {part: str(folder_of(data_set) / part / "*.parquet") for part in ("train", "test")}
+    files = {split: str(folder_of(data_set) / split / "*.parquet") for split in ("train", "test")}
     loaded = hugging_face.load_dataset("parquet", data_files=files, cache_dir=str(tmp_path / "cache"))
     assert set(loaded) == {"train", "test"}
     entries = {entry.image: entry for entry in data_set.entries}
-    for part, rows in loaded.items():
+    for split, rows in loaded.items():
         assert type(rows.features["image"]).__name__ == "Image"
         for row in rows:
             entry = entries.pop(row["image"]["path"])
             np.testing.assert_array_equal(decoded(row["image"]["bytes"]), data_set.read_image(entry))
             assert row["preview"].size == (28, 24), "previews are decoded, as pictures"
             assert row["number"] == int(entry.image[:6])
-            assert (row["source"], row["split"]) == (entry.source, part) == (entry.source, entry.split)
+            assert (row["source"], row["split"]) == (entry.source, split) == (entry.source, entry.split)
             assert row["truth"] == pytest.approx(entry.truth, abs=1e-9)
             assert [light["illumination"] for light in row["lights"]] == list(entry.lights)
             details = json.loads(row["details"])
@@ -213,25 +213,25 @@ def test_closes_incomplete_shard_without_warnings(
 def test_hugging_face_reads_splits_by_card(make: Make, hugging_face: Any, tmp_path: Path, layout: Layout) -> None:
     data_set = make(layout, split=(0.6, 0.0, 0.4), previews=False)
     loaded = hugging_face.load_dataset(str(folder_of(data_set)), cache_dir=str(tmp_path / "cache"))
-    assert {part: rows.num_rows for part, rows in loaded.items()} == {
-        part: images for part, images in data_set.description.splits.items() if images
+    assert {split: rows.num_rows for split, rows in loaded.items()} == {
+        split: images for split, images in data_set.description.splits.items() if images
     }
     assert not {"preview", "details", "masks", "ground_truth"} & set(loaded["train"].column_names)
 
 
-def maps_in_folder(place: Path) -> list[bytes]:
+def maps_in_folder(folder: Path) -> list[bytes]:
     names = ("masks/000003_0.png", "masks/000003_1.png", "ground_truth/000003.png")
-    return [(place / name).read_bytes() for name in names]
+    return [(folder / name).read_bytes() for name in names]
 
 
-def maps_in_tar(place: Path) -> list[bytes]:
-    with tarfile.open(place / "data" / "000000.tar") as tar:
+def maps_in_tar(folder: Path) -> list[bytes]:
+    with tarfile.open(folder / "data" / "000000.tar") as tar:
         streams = [tar.extractfile(f"000003.{name}.png") for name in ("masks_0", "masks_1", "ground_truth")]
         return [stream.read() for stream in streams if stream is not None]
 
 
-def maps_in_parquet(place: Path) -> list[bytes]:
-    row = import_module("pyarrow.parquet").read_table(place / "data" / "000000.parquet").to_pylist()[3]
+def maps_in_parquet(folder: Path) -> list[bytes]:
+    row = import_module("pyarrow.parquet").read_table(folder / "data" / "000000.parquet").to_pylist()[3]
     return [file["bytes"] for file in (*row["masks"], row["ground_truth"])]
 
 
@@ -281,10 +281,10 @@ def grey(data: bytes) -> npt.NDArray[np.uint16]:
 def test_verify_reports_changed_files(make: Make, layout: Layout) -> None:
     folder = folder_of(make(layout, split=(0.5, 0.2, 0.3)))
     verified: list[tuple[int, int]] = []
-    assert list(file_faults(folder, lambda done, total: verified.append((done, total)), workers=3)) == []
+    assert list(file_faults(folder, lambda count, total: verified.append((count, total)), workers=3)) == []
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     files = len(names - {"SHA256SUMS", *COMPLETED_BY_HAND})
-    assert verified == [(done + 1, files) for done in range(files)]
+    assert verified == [(count + 1, files) for count in range(files)]
     victim = sorted(path for path in folder.rglob("00000*") if path.suffix != ".jpg")[0]
     data = bytearray(victim.read_bytes())
     data[len(data) // 2] ^= 1

@@ -134,8 +134,8 @@ def test_bytes_do_not_depend_on_workers(make_lut: MakeLut, pictures: Path, tmp_p
         generate_dataset(lut, tmp_path / f"out{workers}", sources, choice, seed=5, workers=workers)
     assert contents(tmp_path / "out1") == contents(tmp_path / "out7")
     generate_dataset(lut, tmp_path / "other", sources, RandomLights(3, 4, 5), seed=6)
-    one, other_lut = contents(tmp_path / "out1"), contents(tmp_path / "other")
-    assert all(one[name] != other_lut[name] for name in one if name.startswith("images/"))
+    first, second = contents(tmp_path / "out1"), contents(tmp_path / "other")
+    assert all(first[name] != second[name] for name in first if name.startswith("images/"))
 
 
 @pytest.mark.slow
@@ -194,7 +194,7 @@ def test_skips_pictures_too_small_for_format(make_lut: MakeLut, tmp_path: Path) 
 def test_failed_data_set_leaves_no_files(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     sources = find_pictures([pictures])
-    before, threads = contents(tmp_path), threading.active_count()
+    original, threads = contents(tmp_path), threading.active_count()
     with pytest.raises(InputError, match="9"):
         generate_dataset(lut, tmp_path / "out", sources, [0, 9], workers=2)
     with pytest.raises(FormatError, match="0 of 1 pictures"):
@@ -204,7 +204,7 @@ def test_failed_data_set_leaves_no_files(make_lut: MakeLut, pictures: Path, tmp_
         generate_dataset(lut, tmp_path / "out", sources, [0], options=DatasetOptions(split=invalid_split))
     with pytest.raises(InputError, match="'bmp'"):
         DatasetOptions(form=cast("Any", "bmp"))
-    assert contents(tmp_path) == before
+    assert contents(tmp_path) == original
     assert not list(tmp_path.glob(".out*"))
     assert threading.active_count() == threads
 
@@ -240,14 +240,14 @@ class TestRepeatedCommand:
     def test_changes_nothing(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
         options = (*self.OPTIONS, "--contact-sheet", "sheet.png")
         assert main(("lut", "out", *options)) == 0
-        before = {path: path.stat().st_mtime_ns for path in Path("out").rglob("*")}
+        original_times = {path: path.stat().st_mtime_ns for path in Path("out").rglob("*")}
         capsys.readouterr()
         assert main(("lut", "out", *options)) == 0
         printed = capsys.readouterr().out
         assert "out: 6 images of 6 pictures under" in printed
         assert "it was already complete" in printed
         assert "sheet.png: the contact sheet already exists" in printed
-        assert {path: path.stat().st_mtime_ns for path in Path("out").rglob("*")} == before
+        assert {path: path.stat().st_mtime_ns for path in Path("out").rglob("*")} == original_times
 
     @pytest.mark.slow
     def test_reports_changed_pictures(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:

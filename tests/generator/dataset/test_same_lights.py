@@ -35,10 +35,11 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def spectrum(table: str, label: str) -> npt.NDArray[np.float64]:
     """Return the spectrum in three bands of a label."""
-    shown = open_lut(Path(table)).illuminations
-    terms = [part.partition(":") for part in label.split("+")]
+    illuminations = open_lut(Path(table)).illuminations
+    terms = [term.partition(":") for term in label.split("+")]
     return np.sum(
-        [float(weight or 1) * np.array(SPECTRA[shown[int(light)].colour.blue]) for light, _, weight in terms], axis=0
+        [float(weight or 1) * np.array(SPECTRA[illuminations[int(light)].colour.blue]) for light, _, weight in terms],
+        axis=0,
     )
 
 
@@ -138,12 +139,12 @@ def test_repeats_crops_and_tints(lab: Path) -> None:
     crops = ("--crop", "16x16", "--crops", "2")
     assert main(("one", "first", *options, *crops, "--random", "1", "--seed", "2")) == 0
     assert main(("one", "again", *options, "--lights-of", "first", "--seed", "2")) == 0
-    first, again = open_dataset("first"), open_dataset("again")
-    assert [entry.image for entry in first.entries] == [entry.image for entry in again.entries]
+    first, repeated = open_dataset("first"), open_dataset("again")
+    assert [entry.image for entry in first.entries] == [entry.image for entry in repeated.entries]
     assert len(first.entries) == 6
-    for first_entry, second_entry in zip(first.entries, again.entries, strict=True):
+    for first_entry, second_entry in zip(first.entries, repeated.entries, strict=True):
         assert (first_entry.lights, first_entry.truth) == (second_entry.lights, second_entry.truth)
-        assert first.read_image(first_entry).tolist() == again.read_image(second_entry).tolist()
+        assert first.read_image(first_entry).tolist() == repeated.read_image(second_entry).tolist()
 
 
 def test_distinguishes_spectra_by_name(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:

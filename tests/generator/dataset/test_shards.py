@@ -250,14 +250,14 @@ def test_repeats_images_of_changed_picture(make_lut: MakeLut, tmp_path: Path, mo
     def draw(name: str, code: int) -> None:
         assert cv2.imwrite(str(folder / f"{name}.png"), np.full((16, 24, 3), code, np.uint8))
 
-    for place, name in enumerate("abcd"):
-        draw(name, 50 * place)
+    for index, name in enumerate("abcd"):
+        draw(name, 50 * index)
     sources = find_pictures(folder)
     killed_after(7, lambda: make_one_shard(lut, out, sources=sources))
     draw("a", 9)
     draw("d", 10)
-    done = counts_of_run(monkeypatch, lambda callbacks: make_one_shard(lut, out, callbacks, sources=sources))
-    assert done == (4, 4, [0, 1, 6, 7]), "one image of d was finished"
+    counts = counts_of_run(monkeypatch, lambda callbacks: make_one_shard(lut, out, callbacks, sources=sources))
+    assert counts == (4, 4, [0, 1, 6, 7]), "one image of d was finished"
     make_one_shard(lut, tmp_path / "whole", sources=sources)
     assert contents(out) == contents(tmp_path / "whole")
 
@@ -270,8 +270,8 @@ def test_skips_images_of_removed_picture(make_lut: MakeLut, tmp_path: Path, monk
     sources = find_pictures(folder)
     killed_after(5, lambda: make_one_shard(lut, out, sources=sources))
     (folder / "a.png").unlink()
-    done = counts_of_run(monkeypatch, lambda callbacks: make_one_shard(lut, out, callbacks, sources=sources))
-    assert done == (3, 3, [5, 6, 7])
+    counts = counts_of_run(monkeypatch, lambda callbacks: make_one_shard(lut, out, callbacks, sources=sources))
+    assert counts == (3, 3, [5, 6, 7])
     assert len(open_dataset(out).entries) == 6
 
 
@@ -335,12 +335,12 @@ def test_writes_record_after_syncing_files(
         fsync(handle)
         synced.add(os.fstat(handle).st_ino)
 
-    def checking(place: Workplace, record: ShardRecord) -> None:
+    def checking(workplace: Workplace, record: ShardRecord) -> None:
         for file in record.files:
-            path = Path(place.files.location) / file.name
+            path = Path(workplace.files.location) / file.name
             assert {path.stat().st_ino, path.parent.stat().st_ino} <= synced, f"{file.name} is only in memory"
             checked.append(file.name)
-        commit(place, record)
+        commit(workplace, record)
 
     monkeypatch.setattr(plain_files, "_SYNCED_IMAGES", 2)
     monkeypatch.setattr(os, "fsync", recorded)
@@ -359,9 +359,9 @@ def test_refuses_other_plan(make_lut: MakeLut, tmp_path: Path) -> None:
         make(lut, out, previews=True)
     with pytest.raises(InputError, match=r"8.*6.*4.*3.*4.*3.*sha256"):
         make(lut, out, 3)
-    other = make_lut(bits=3, name="other")
+    other_lut = make_lut(bits=3, name="other")
     with pytest.raises(InputError, match=r"sha256.*2.*3"):
-        make(other, out)
+        make(other_lut, out)
     make(lut, out)
 
 
@@ -418,17 +418,17 @@ def test_shard_made_twice_is_equal(make_lut: MakeLut, tmp_path: Path, monkeypatc
     lut, out = make_lut(), tmp_path / "out"
     plan = plan_of(lut)
     make_dataset(plan, tmp_path / "whole")
-    done = Workplace.done
+    original = Workplace.done
 
-    def done_with_concurrent_share(place: Workplace, shard_numbers: range) -> set[int]:
-        reused = done(place, shard_numbers)
-        with monkeypatch.context() as other:
-            other.setattr(Workplace, "done", done)
+    def done_with_concurrent_share(workplace: Workplace, shard_numbers: range) -> set[int]:
+        reused = original(workplace, shard_numbers)
+        with monkeypatch.context() as patched:
+            patched.setattr(Workplace, "done", original)
             make_share(plan, out, (0, 2))
         return reused
 
-    with open_workplace(out, plan.identity(), alone=False) as place, ThreadPoolExecutor(1) as pool:
-        assert make_shard(plan.job(1), lut, place, pool, 1) == make_shard(plan.job(1), lut, place, pool, 1)
+    with open_workplace(out, plan.identity(), alone=False) as workplace, ThreadPoolExecutor(1) as pool:
+        assert make_shard(plan.job(1), lut, workplace, pool, 1) == make_shard(plan.job(1), lut, workplace, pool, 1)
         monkeypatch.setattr(Workplace, "done", done_with_concurrent_share)
         assert make_share(plan, out, (0, 2)) == (4, 6)
         monkeypatch.undo()
@@ -443,9 +443,9 @@ def test_share_reads_only_its_records(make_lut: MakeLut, tmp_path: Path, monkeyp
     killed_after(1, lambda: make_share(plan_of(lut), out, (3, 6)))
     pieces = Workplace.pieces
 
-    def recorded(place: Workplace, shard: int) -> dict[str, Any]:
+    def recorded(workplace: Workplace, shard: int) -> dict[str, Any]:
         read.add(shard)
-        return pieces(place, shard)
+        return pieces(workplace, shard)
 
     monkeypatch.setattr(Workplace, "pieces", recorded)
     assert make_share(plan_of(lut), out, (1, 6)) == (4, 6), "shard 3 has finished images, but is not complete"
@@ -475,8 +475,8 @@ def test_repeats_shard_with_damaged_record(
     make_share(plan_of(lut), out, (0, 1))
     (record,) = (tmp_path / ".out.partial" / "plan" / "shards").glob("000001.*")
     record.write_text(record.read_text().replace(old, new))
-    done = counts_of_run(monkeypatch, lambda callbacks: make_dataset(plan_of(lut), out, callbacks=callbacks))
-    assert done == (10, 2, [2, 3])
+    counts = counts_of_run(monkeypatch, lambda callbacks: make_dataset(plan_of(lut), out, callbacks=callbacks))
+    assert counts == (10, 2, [2, 3])
     make_dataset(plan_of(lut), tmp_path / "whole")
     assert contents(out) == contents(tmp_path / "whole")
 
@@ -565,16 +565,16 @@ def test_existing_data_set_keeps_rendering(make_lut: MakeLut, pictures: Path, tm
 
 def test_bytes_do_not_depend_on_workers_or_shares(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
-    one = make_and_hash(lut, pictures, tmp_path / "one", BY_COLOUR, workers=1)
-    assert make_and_hash(lut, pictures, tmp_path / "three", BY_COLOUR, workers=3) == one
+    expected = make_and_hash(lut, pictures, tmp_path / "one", BY_COLOUR, workers=1)
+    assert make_and_hash(lut, pictures, tmp_path / "three", BY_COLOUR, workers=3) == expected
     plan = Plan(lut, find_pictures(pictures), ListedLights((1, 2)), 5, BY_COLOUR)
     job = pickle.loads(pickle.dumps(plan.job(0)))
     out = tmp_path / "shares"
-    with open_workplace(out, plan.identity(), alone=False) as place, ThreadPoolExecutor(1) as pool:
-        make_shard(job, lut, place, pool, 1)
+    with open_workplace(out, plan.identity(), alone=False) as workplace, ThreadPoolExecutor(1) as pool:
+        make_shard(job, lut, workplace, pool, 1)
     make_share(plan, out, (0, 1))
     make_dataset(plan, out)
-    assert {name: one[name] for name in ("images.csv", "dataset.json", "images/000003.png")} == {
+    assert {name: expected[name] for name in ("images.csv", "dataset.json", "images/000003.png")} == {
         name: hashlib.sha256((out / name).read_bytes()).hexdigest()
         for name in ("images.csv", "dataset.json", "images/000003.png")
     }
@@ -691,9 +691,11 @@ def test_variation_keeps_ground_truths(lut: Lut, make_varied: Make) -> None:
         assert 0.25 <= row["exposure"] <= 4
         assert row["iso"] == pytest.approx(400)
         # A fall-off is equal in all channels, so it scales the mean of an image.
-        one, other = (set_.read_image(entry).astype(np.float64).mean(axis=(0, 1)) for set_ in (unvaried, varied))
+        first_mean, second_mean = (
+            set_.read_image(entry).astype(np.float64).mean(axis=(0, 1)) for set_ in (unvaried, varied)
+        )
         if row["clipped"] < 0.001:
-            ratio = other / one / row["exposure"]
+            ratio = second_mean / first_mean / row["exposure"]
             assert row["end_g"] - 0.05 < ratio.min()
             assert ratio.max() < 1.05
     assert list(file_faults(varied.store.location)) == []
@@ -704,12 +706,12 @@ def test_variation_does_not_depend_on_workers_or_layout(lut: Lut, make_varied: M
     make_varied("one", **options)
     make_varied("three", workers=3, **options)
     assert contents(tmp_path / "one") == contents(tmp_path / "three")
-    one = open_dataset(tmp_path / "one")
+    first = open_dataset(tmp_path / "one")
     for layout in ("webdataset", "parquet"):
-        other = make_varied(layout, layout=layout, **options)
-        assert other.details == one.details
-        for entry, counterpart in zip(one.entries, other.entries, strict=True):
-            np.testing.assert_array_equal(one.read_image(entry), other.read_image(counterpart))
+        second = make_varied(layout, layout=layout, **options)
+        assert second.details == first.details
+        for entry, counterpart in zip(first.entries, second.entries, strict=True):
+            np.testing.assert_array_equal(first.read_image(entry), second.read_image(counterpart))
 
 
 def test_clips_requested_share(lut: Lut, make_varied: Make) -> None:
@@ -744,14 +746,17 @@ def test_crops_are_numbered_and_share_a_split(make_varied: Make, smooth_pictures
         expected = render(lut, np.ascontiguousarray(cut), int(entry.illumination), seed=5, image=number)
         np.testing.assert_array_equal(dataset.read_image(entry), expected)
     # All crops of a picture are in one split and one group of folds.
-    parts = {
-        entry.source: {other.split for other in dataset.entries if other.source == entry.source}
+    splits = {
+        entry.source: {other_entry.split for other_entry in dataset.entries if other_entry.source == entry.source}
         for entry in dataset.entries
     }
-    assert all(len(counterpart) == 1 for counterpart in parts.values())
-    assert {getattr(scene, "group", "") for scene in open_generated(dataset.store.location).scenes} == set(parts)
+    assert all(len(counterpart) == 1 for counterpart in splits.values())
+    assert {getattr(scene, "group", "") for scene in open_generated(dataset.store.location).scenes} == set(splits)
     # Crops have different illuminants.
-    assert len({tuple(entry.illumination for entry in dataset.entries[at : at + 2]) for at in range(0, 24, 2)}) > 4
+    assert (
+        len({tuple(entry.illumination for entry in dataset.entries[start : start + 2]) for start in range(0, 24, 2)})
+        > 4
+    )
     assert dataset.description.pixels == 4 * 3 * 32 * 24
 
 
@@ -821,7 +826,7 @@ def test_raw_files_have_equal_counts(lut: Lut, make_varied: Make, smooth_picture
     )
     unvaried = make_varied("tiff", variation)
     assert raw.details == {name.replace("tiff", "dng"): row for name, row in unvaried.details.items()}
-    for one, other in zip(raw.entries, unvaried.entries, strict=True):
-        halved, image = raw.read_image(one), unvaried.read_image(other)
+    for raw_entry, tiff_entry in zip(raw.entries, unvaried.entries, strict=True):
+        halved, image = raw.read_image(raw_entry), unvaried.read_image(tiff_entry)
         np.testing.assert_array_equal(halved[..., 0], image[0::2, 0::2, 0])
         np.testing.assert_array_equal(halved[..., 2], image[1::2, 1::2, 2])

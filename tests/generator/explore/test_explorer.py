@@ -66,17 +66,17 @@ def explorer(make_table: MakeTable, tmp_path: Path) -> Explorer:
     [("1:.3+2:.7", "colorimetric"), ("r=.25,b=.3", "codes")],
 )
 def test_command_makes_displayed_image(explorer: Explorer, light: str, rendering: Rendering) -> None:
-    shown = explorer.show(1, light)
+    record = explorer.show(1, light)
     image = explorer.counts(1, light, rendering).copy()
     assert image.shape == (round(SIDE * 5 / 9), SIDE, 3)
-    arguments = shlex.split(shown["commands"][rendering])
+    arguments = shlex.split(record["commands"][rendering])
     assert arguments[0] == "generate"
     assert arguments[arguments.index("--sources") + 1] == "my pictures/it's 1.png", "relative to the working folder"
     assert main(arguments[1:]) == 0
     data_set = open_dataset("dataset")
     assert (data_set.read_image(data_set.entries[0]) == image).all()
-    assert data_set.entries[0].truth == pytest.approx(shown["truth"], abs=1e-9)
-    assert [data_set.entries[0].lights[0], len(data_set.entries)] == [shown["light"], 1]
+    assert data_set.entries[0].truth == pytest.approx(record["truth"], abs=1e-9)
+    assert [data_set.entries[0].lights[0], len(data_set.entries)] == [record["light"], 1]
 
 
 @pytest.mark.slow
@@ -122,8 +122,8 @@ def test_gamut_of_one_light_is_a_point(make_lut: MakeLut) -> None:
 
 
 def test_replaces_light_outside_gamut_by_nearest(explorer: Explorer) -> None:
-    shown = explorer.show(0, "r=.9,b=.05")
-    assert shown["light"] == "0"
+    record = explorer.show(0, "r=.9,b=.05")
+    assert record["light"] == "0"
     with pytest.raises(InputError):
         explorer.show(0, "sunny")
 
@@ -157,10 +157,10 @@ def test_refuses_picture_with_too_many_pixels(explorer: Explorer, monkeypatch: p
 @pytest.mark.slow
 def test_sample_pictures(tmp_path: Path, pinned: Pinned) -> None:
     samples = sample_folder(tmp_path)
-    before = {path.name: path.stat().st_mtime_ns for path in samples.iterdir()}
-    assert len(before) == 3
+    original_times = {path.name: path.stat().st_mtime_ns for path in samples.iterdir()}
+    assert len(original_times) == 3
     assert sample_folder(tmp_path) == samples
-    assert before == {path.name: path.stat().st_mtime_ns for path in samples.iterdir()}
+    assert original_times == {path.name: path.stat().st_mtime_ns for path in samples.iterdir()}
     codes = read_picture(samples / "balls.png").astype(np.int64)
     assert codes.shape == (600, 900, 3)
     squares = codes.reshape(20, 30, 30, 30, 3).sum(axis=(1, 3))
@@ -168,7 +168,7 @@ def test_sample_pictures(tmp_path: Path, pinned: Pinned) -> None:
     pinned("sample pictures", [codes, *squares.transpose(2, 0, 1)], same=2e-5)
     # The red ball: its surface in the middle, brighter towards the lamp on the upper left than away from it.
     x, y, radius = 160, 395, 130
-    middle, near, far = (codes[y + part * radius // 2, x + part * radius // 2] for part in (0, -1, 1))
+    middle, near, far = (codes[y + direction * radius // 2, x + direction * radius // 2] for direction in (0, -1, 1))
     assert middle.argmax() == 0
     assert near.sum() > middle.sum() > far.sum()
     # The highlight is half way between the lamp and the viewer and has the colour of the lamp.
@@ -396,7 +396,7 @@ def test_page_shows_lut_and_first_picture(tab: Tab, page: Explorer) -> None:
         assert text_of(tab, "command-codes").endswith("--max-side 100 --light 0 --rendering codes")
         assert text_of(tab, "command-colorimetric").endswith("--max-side 100 --light 0")
         truth = page.lut.white[0] / page.lut.white[0].sum()
-        assert all(f"{part:.3f}" in text_of(tab, "light-facts") for part in truth)
+        assert all(f"{number:.3f}" in text_of(tab, "light-facts") for number in truth)
         for panel, rendering in enumerate(("codes", "colorimetric")):
             image = page.counts(0, "0", rendering)
             assert tab.value(f"[...panels[{panel}].counts.slice(0, 600)]") == image.ravel()[:600].tolist()
@@ -483,9 +483,9 @@ def test_measures_pixel(tab: Tab, page: Explorer) -> None:
         tab.value("document.querySelector('.screen').focus()")
         for key in ("ArrowLeft", "ArrowDown", "ArrowDown"):
             tab.press(key)
-        at = tab.value("state.at")
+        pixel = tab.value("state.at")
         image = page.counts(0, "0", "codes")
-        assert at == [image.shape[1] // 2 - 1, image.shape[0] // 2 + 2]
+        assert pixel == [image.shape[1] // 2 - 1, image.shape[0] // 2 + 2]
         rows = (
             "[...panels[{}].rows.querySelectorAll('tr')].map((row) => [...row.cells].map((cell) => cell.textContent))"
         )
@@ -493,18 +493,18 @@ def test_measures_pixel(tab: Tab, page: Explorer) -> None:
             tab.wait_for(f"panels[{panel}].rows.textContent.includes('±')")
             image = page.counts(0, "0", rendering)
             for channel, (_, count, spread) in enumerate(tab.value(rows.format(panel))):
-                mean, deviation = (float(part) for part in spread.split("±"))
-                assert int(count) == image[at[1], at[0], channel]
+                mean, deviation = (float(number) for number in spread.split("±"))
+                assert int(count) == image[pixel[1], pixel[0], channel]
                 assert abs(int(count) - mean) < 5 * deviation
         middle = "[...panels[0].loupe.getContext('2d').getImageData(66, 66, 1, 1).data]"
         assert tab.value(middle) == tab.value(
-            f"[...panels[0].canvas.getContext('2d').getImageData({at[0]}, {at[1]}, 1, 1).data]"
+            f"[...panels[0].canvas.getContext('2d').getImageData({pixel[0]}, {pixel[1]}, 1, 1).data]"
         )
         tab.value("pick(2)")
         tab.wait_for("panels[0].drawn === '0 2' && panels[0].rows.textContent.includes('±')")
         count, spread = tab.value(rows.format(0))[1][1:]
-        assert int(count) == page.counts(0, "2", "codes")[at[1], at[0], 1]
-        assert float(spread.split("±")[0]) == pytest.approx(page.pixel(0, "2", "codes", *at)["mean"][1], abs=0.06)
+        assert int(count) == page.counts(0, "2", "codes")[pixel[1], pixel[0], 1]
+        assert float(spread.split("±")[0]) == pytest.approx(page.pixel(0, "2", "codes", *pixel)["mean"][1], abs=0.06)
 
 
 def shades(tab: Tab, view: str) -> np.ndarray[Any, Any]:
@@ -575,10 +575,10 @@ def test_phone_with_token(tab: Tab, page: Explorer) -> None:
 def test_failed_rendering_is_reported_in_its_panel(tab: Tab, page: Explorer, monkeypatch: pytest.MonkeyPatch) -> None:
     counts = page.counts
 
-    def refused(number: int, chosen: str, rendering: Any) -> Any:
+    def refused(number: int, light: str, rendering: Any) -> Any:
         if rendering == "colorimetric":
             raise QualityError("the print has no contrast; render by codes")
-        return counts(number, chosen, rendering)
+        return counts(number, light, rendering)
 
     monkeypatch.setattr(page, "counts", refused)
     with ExploreServer(page, "127.0.0.1", 0) as server:
@@ -603,8 +603,8 @@ def test_balances_light_without_blue(tab: Tab, page: Explorer) -> None:
         # Blue of the ground truth is reduced to 1/1000, so balanced values exceed all counts.
         truth = page.lut.white[0] * [1, 1, 1e-3]
         tab.value(f"shown.truth = {json.dumps((truth / truth.sum()).tolist())}")
-        wanted = flash(image / page.lut.provenance.white_level * truth[1] / truth)
-        assert np.abs(shades(tab, "balanced").astype(int) - wanted).max() <= 2
+        expected = flash(image / page.lut.provenance.white_level * truth[1] / truth)
+        assert np.abs(shades(tab, "balanced").astype(int) - expected).max() <= 2
 
 
 @pytest.mark.slow

@@ -31,19 +31,21 @@ def light_numbers(lightings: tuple[Lighting, ...]) -> tuple[int, ...]:
 
 def test_nearest_light_has_smallest_angle(make_lut: MakeLut) -> None:
     lut = make_lut(lights=4)
-    wanted = lut.white[[2, 0, 3]] * np.array([[1e-4], [7.0], [1.0]]) + [[0, 0, 1e-3]] * 3
-    choice = nearest_lights(lut, wanted, "truths.csv")
+    targets = lut.white[[2, 0, 3]] * np.array([[1e-4], [7.0], [1.0]]) + [[0, 0, 1e-3]] * 3
+    choice = nearest_lights(lut, targets, "truths.csv")
     assert max(match.angle for match in choice.matches) < 0.2
     assert [light_numbers(choice.lightings_of(position)) for position in range(5)] == [(2,), (0,), (3,), (2,), (0,)]
     assert choice.describe() == {"choice": "nearest", "file": "truths.csv", "each": 1, "lights": ["2", "0", "3"]}
-    both = nearest_lights(lut, wanted, lights_each=2)
-    assert [light_numbers(both.lightings_of(position)) for position in range(3)] == [(2, 0), (3, 2), (0, 3)]
+    pairs = nearest_lights(lut, targets, lights_each=2)
+    assert [light_numbers(pairs.lightings_of(position)) for position in range(3)] == [(2, 0), (3, 2), (0, 3)]
 
 
 def test_parses_light_names(make_lut: MakeLut) -> None:
     lut = make_lut(lights=3)
-    named = [replace(light, name=name) for light, name in zip(lut.illuminations, ("A", "FL2", "D65"), strict=True)]
-    lut = replace(lut, illuminations=tuple(named))
+    illuminations = [
+        replace(light, name=name) for light, name in zip(lut.illuminations, ("A", "FL2", "D65"), strict=True)
+    ]
+    lut = replace(lut, illuminations=tuple(illuminations))
     assert parse_light(" FL2 ", lut) == single_mixture(1)
     assert parse_light("2", lut) == single_mixture(2)
     with pytest.raises(InputError, match=r"'fl2'.*'FL2'\?"):

@@ -85,7 +85,7 @@ def draws(distribution: Distribution, count: int) -> npt.NDArray[np.float64]:
 
 
 def drawn_chromaticities(choice: DrawnLights, pictures: int) -> npt.NDArray[np.float64]:
-    mixtures = [lighting.mixtures[0] for at in range(pictures) for lighting in choice.lightings_of(at)]
+    mixtures = [lighting.mixtures[0] for position in range(pictures) for lighting in choice.lightings_of(position)]
     return rb_of(np.array([np.asarray(mixture.weights) @ GAMUT.white[list(mixture.lights)] for mixture in mixtures]))
 
 
@@ -164,8 +164,8 @@ def test_drawn_lights_are_uniform_inside_gamut() -> None:
 def test_drawn_lights_depend_on_seed_and_position() -> None:
     choice = DrawnLights(GAMUT, Uniform(), 2, seed=4)
     unpickled = pickle.loads(pickle.dumps(DrawnLights(GAMUT, Uniform(), 2, seed=4)))
-    forwards = [choice.lightings_of(at) for at in range(20)]
-    assert [unpickled.lightings_of(at) for at in reversed(range(20))] == forwards[::-1]
+    forwards = [choice.lightings_of(position) for position in range(20)]
+    assert [unpickled.lightings_of(position) for position in reversed(range(20))] == forwards[::-1]
     labels = {lighting.mixtures[0].label for lightings in forwards for lighting in lightings}
     assert len(labels) == 40
     assert DrawnLights(GAMUT, Uniform(), 2, seed=5).lightings_of(0) != forwards[0]

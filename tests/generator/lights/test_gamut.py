@@ -93,8 +93,8 @@ def test_refuses_light_outside_gamut_with_nearest() -> None:
     # Brute force over all mixtures of two illuminants.
     share = np.linspace(0, 1, 401)[:, None, None, None]
     pairs = share * GRID.directions[:, None] + (1 - share) * GRID.directions[None]
-    least = angles_deg(pairs.reshape(-1, 3), target).min()
-    assert nearest.angle == pytest.approx(least, rel=1e-4)
+    smallest = angles_deg(pairs.reshape(-1, 3), target).min()
+    assert nearest.angle == pytest.approx(smallest, rel=1e-4)
     assert f"{nearest.angle:.2f}°" in str(info.value)
 
 

@@ -14,7 +14,7 @@ from generator.masks.making import FULL, GivenMasks
 from generator.masks.maps import quantised_chromaticities
 from tests.generator.conftest import MakeLut
 
-_parts = st.dictionaries(
+_shares = st.dictionaries(
     st.integers(0, 999_999), st.floats(1e-6, 1e6, allow_nan=False, allow_infinity=False), min_size=1, max_size=5
 )
 
@@ -28,13 +28,13 @@ class Halves(GivenMasks):
         return np.broadcast_to(np.stack([left, 1 - left], axis=-1), (height, width, 2)).copy()
 
 
-@given(_parts)
-def test_label_round_trip(parts: dict[int, float]) -> None:
-    mixture = mixture_of(parts)
+@given(_shares)
+def test_label_round_trip(shares: dict[int, float]) -> None:
+    mixture = mixture_of(shares)
     assert parse_mixture(mixture.label) == mixture
     assert sum(round(weight * 10**9) for weight in mixture.weights) == 10**9
-    total = sum(parts.values())
-    for light, share in parts.items():
+    total = sum(shares.values())
+    for light, share in shares.items():
         weight = dict(zip(mixture.lights, mixture.weights, strict=True)).get(light, 0)
         assert weight == pytest.approx(share / total, abs=5e-9)
 
