@@ -149,9 +149,9 @@ def explore(
 
     Reads the look-up table LUT and pictures; writes only to the cache. The page shows the illuminants in the
     chromaticity plane with the black-body curve and the gamut of all mixtures: select an illuminant, drag it, or mix
-    two. It shows the image of each picture for both renderings, with ground truth, histogram, single pixels and their
-    noise, and the command that makes a data set from the picture. A picture dropped onto the page is kept in memory
-    only. With --host the address contains a token, which is new at each start.
+    two. It shows the image of each picture for both renderings, with ground truth, histogram and the noise of single
+    pixels. It also shows the command that makes a data set from the picture. A picture dropped onto the page is kept
+    in memory only. With --host the address contains a token, which is new at each start.
     """
     from calibration.table.lut import open_lut
     from generator.explore.explorer import MAX_SIDE, Explorer, ExploreServer, sample_folder

@@ -338,8 +338,8 @@ def find_repeats(image: Any, history: Any, distances: Any) -> None:
 
     The distance is 0 if the window has no equal pixel. `history` (32768,) uint64 is working memory.
     """
-    # An entry of `history` has the byte position of the last pixel with this hash, above those bits of the mixed
-    # pixel that are not in the hash. Mixing is one to one, so pixels that agree in both are equal.
+    # An entry of `history` is the byte position of the last pixel with this hash. Its low bits are those bits of the
+    # mixed pixel that are not in the hash. Mixing is one to one, so pixels that agree in both are equal.
     shift, rotation = uint64(48) - uint64(15), uint64(64 - 48 + 15)
     open_bits = (uint64(1) << shift) - uint64(1)
     for slot in range(_HASHES):

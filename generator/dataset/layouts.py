@@ -82,8 +82,8 @@ ShardWriter = FileWriter | JoinedWriter
 class FileLayout:
     """A layout with one file for each image."""
 
-    # Name in the data set, from the file kind (`images`, `previews`, `masks`, `ground_truth`), the split (`data` if the
-    # data set is not divided), and the name of the file such as ``000123.png``.
+    # Name in the data set. Arguments: file kind (`images`, `previews`, `masks`, `ground_truth`); split, or `data` if
+    # the data set is not divided; name of the file, such as ``000123.png``.
     file_name: Callable[[str, str, str], str]
     library: ClassVar[str] = ""
     is_of_the_hub: ClassVar[bool] = False

@@ -2,9 +2,9 @@
 
 A data set is a function of its LUT, sources, choice of illuminants, seed and options. Image number
 `(position · crops + c) · lights_each + k` shows crop c of the source at `position` under illuminant k of scene
-`position · crops + c`. The number does not depend on whether other sources can be read. Shard i has the numbers from
-i · n to (i + 1) · n − 1, where n is the number of images in a shard. Any worker can therefore make any shard at any
-time, and a shard that is made twice has the same bytes.
+`position · crops + c`. The number does not depend on whether other sources can be read. A shard has n images; shard i
+has the numbers from i · n to (i + 1) · n − 1. Any worker can therefore make any shard at any time, and a shard that is
+made twice has the same bytes.
 """
 
 from __future__ import annotations

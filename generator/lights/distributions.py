@@ -43,7 +43,7 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
 def ground_truths_by_line(path: Path) -> dict[int, list[float]]:
     """Return the ground truths of a file, linear camera RGB ≥ 0, by line number.
 
-    The file is a CSV file with columns `GT_R,GT_G,GT_B` or `r,g,b` (others are ignored), or has lines of three numbers
+    A CSV file has the columns `GT_R,GT_G,GT_B` or `r,g,b`; others are ignored. Otherwise each line has three numbers,
     separated by blanks or commas, as in `gt.txt` and Cube+. Raises FormatError.
     """
     lines = read_text(path, "name a text file", "ground truths").splitlines()

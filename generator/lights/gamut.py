@@ -1,7 +1,7 @@
 """Gamut of a LUT: the mixtures of its illuminants, and the mixture for a given chromaticity.
 
-An illuminant is a direction in linear camera RGB. Mixtures of several illuminants form a cone. In the rb-chromaticity
-plane (r = R / (R + G + B), b = B / (R + G + B)) the cone is their convex hull, and three illuminants suffice for any
+An illuminant is a direction in linear camera RGB. Mixtures of several illuminants form a cone. In the chromaticity
+plane of r = R / (R + G + B) and b = B / (R + G + B), the cone is their convex hull. Three illuminants suffice for any
 point (Carathéodory). `Gamut.match` selects, in this order:
 
 1. one illuminant, if it is within `TOLERANCE_DEG` of the target;
