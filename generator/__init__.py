@@ -1,4 +1,4 @@
-"""Generate raw linear images and data sets with exact ground truth, from a look-up table (LUT) and any picture.
+"""Generate raw linear images and data sets from a look-up table (LUT) and any picture.
 
 Three lines give the raw image that the camera would have taken of a print of the picture::
 
