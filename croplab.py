@@ -1,8 +1,8 @@
-"""CroP under one name of its own: `import croplab`, then `croplab.open_lut`, `croplab.render` and the rest.
+"""The public API under one name: `import croplab`, then `croplab.open_lut`, `croplab.render` and the others.
 
-The names are those of `generator` and `evaluation` that docs/library.md is about, loaded when they are first used. The
-packages have short names, so a file `generator.py` in a user's folder would hide one: here, and at the start of each
-command, that is told by the name of the file.
+It exports the public names of `generator`, `generator.training` and `evaluation.metrics`, which docs/library.md
+describes. Each is loaded at its first use. A user's file `generator.py` would hide our package of that name; this
+module and each command check that, and the error names the file.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
+# Module of each command.
 COMMANDS = {
     "acquire": "acquisition.cli",
     "build-lut": "calibration.cli",
@@ -19,23 +20,22 @@ COMMANDS = {
     "evaluate": "evaluation.cli",
     "sim": "synthesis.cli",
 }
-"""The commands, and the module of each."""
 
-_HOMES = "generator", "generator.training", "evaluation.metrics"
-"""Where the names are; each says in `__all__` which are public."""
+# Modules with public names; `__all__` of each lists them.
+_API_MODULES = "generator", "generator.training", "evaluation.metrics"
 
 
 def __getattr__(name: str) -> object:
-    homes: list[ModuleType] = []
-    # Python asks modules for names of its own, such as __path__.
+    modules: list[ModuleType] = []
+    # Python itself looks up names such as __path__, which must not load the packages.
     if name == "__all__" or not name.startswith("__"):
         _require_own_packages()
-        homes = [import_module(home) for home in _HOMES]
+        modules = [import_module(module_name) for module_name in _API_MODULES]
     if name == "__all__":
-        return [public for home in homes for public in home.__all__]
-    for home in homes:
-        if name in home.__all__:
-            return getattr(home, name)
+        return [public_name for module in modules for public_name in module.__all__]
+    for module in modules:
+        if name in module.__all__:
+            return getattr(module, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
@@ -44,11 +44,10 @@ def __dir__() -> list[str]:
 
 
 def _require_own_packages() -> None:
-    """Raise an ImportError that names the file by which one of the packages is hidden."""
-    # The lowest package, which has the check, may be the hidden one.
-    lowest = import_module("foundation")
-    if Path(lowest.__file__ or "").resolve().parent != Path(__file__).resolve().parent / "foundation":
-        raise ImportError(f"{lowest.__file__} hides the package foundation of CroP; rename it")
+    # The check itself is in the package foundation, so whether a file hides that one is checked first.
+    foundation = import_module("foundation")
+    if Path(foundation.__file__ or "").resolve().parent != Path(__file__).resolve().parent / "foundation":
+        raise ImportError(f"{foundation.__file__} hides the package foundation of CroP; rename this file")
     from foundation.errors import InputError
     from foundation.version import require_own_packages
 

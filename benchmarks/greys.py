@@ -21,7 +21,7 @@ from calibration.table.demo_table import table_folder
 from calibration.table.lut import Lut, open_lut
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError
-from generator.lights.lighting import plain
+from generator.lights.lighting import single_mixture
 from generator.rendering.colorimetric import rendering_with
 from generator.rendering.matrices import matrix_for
 
@@ -45,7 +45,7 @@ def measure(lut: Lut, name: str, black_taken: float) -> None:
     ratios: list[npt.NDArray[np.float64]] = []
     least, bends = np.inf, 0.0
     for light in range(len(lut.samples)):
-        mixture = plain(light)
+        mixture = single_mixture(light)
         image = rendering.draw(ramp, [mixture], black_taken).astype(np.float64)
         means, spreads = image.mean(axis=1), image.std(axis=1)
         # Black that is taken out wholly has no colour.

@@ -23,7 +23,7 @@ from benchmarks.generator import SAMPLES, WHITE, in_turns, mask_weights, noisy_t
 from calibration.table.lut import Lut
 from generator.files import encode_pieces
 from generator.kernels.mixing import mix_samples
-from generator.lights.lighting import Lighting, plain
+from generator.lights.lighting import Lighting, single_mixture
 from generator.masks.making import parse_masks
 from generator.masks.maps import encode_maps
 
@@ -58,7 +58,7 @@ def measure(name: str, lut: Lut, picture: npt.NDArray[np.uint8], repeats: int) -
     image = mix_samples(lut.samples, picture, mask_weights("soft-edge", height, width), white_level=WHITE)
     calls: dict[str, Callable[[], object]] = {"usual": lambda: usual(lut, picture)}
     for kind in KINDS:
-        lighting = Lighting((plain(0), plain(1)), parse_masks(kind, 2, 1).maker(0))
+        lighting = Lighting((single_mixture(0), single_mixture(1)), parse_masks(kind, 2, 1).maker(0))
         its = lighting.weights_of(height, width)
         calls[f"{kind}, masks"] = lambda lighting=lighting: lighting.weights_of(height, width)
         calls[f"{kind}, mixing"] = lambda its=its: mix_samples(lut.samples, picture, its, white_level=WHITE)

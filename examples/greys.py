@@ -22,7 +22,7 @@ from calibration.table.lut import open_lut
 from foundation.colorimetry import angles_deg
 from generator.kernels.printing import NODES, SIDE, nearest_nodes
 from generator.lights.choices import light_numbers
-from generator.lights.lighting import plain
+from generator.lights.lighting import single_mixture
 from generator.pictures.sources import open_picture
 from generator.rendering.colorimetric import ColorimetricRendering, source_colours
 from generator.rendering.matrices import matrix_for
@@ -46,7 +46,7 @@ def kept(seen: Array, wanted: Array, shares: Array) -> str:
 def row(rendering: ColorimetricRendering, light: int, shares: Array) -> list[str]:
     """Return the figures of one light."""
     lut, white = rendering.lut, rendering.lut.white[light]
-    wanted, seen = source_colours(rendering.matrix), rendering.seen(plain(light)) / white
+    wanted, seen = source_colours(rendering.matrix), rendering.seen(single_mixture(light)) / white
     black = seen[0]
     bare = (seen - black) / (seen[-1] - black)
     side = 1 << lut.provenance.bits

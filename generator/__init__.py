@@ -1,13 +1,13 @@
-"""From a look-up table and any picture to raw linear images and whole datasets.
+"""Generate raw linear images and data sets from a look-up table (LUT) and any picture.
 
-Three lines from a table and a picture to the raw image a camera would have taken of the picture's print::
+Three lines give the raw image that the camera would have taken of a print of the picture::
 
     from generator import open_lut, read_picture, render
     lut = open_lut("LUT")
     raw = render(lut, read_picture("cat.jpg"), light=12, seed=0)     # (H, W, 3) uint16, linear camera RGB
     truth = lut.ground_truth[12]                                     # (3,) float64, r + g + b = 1
 
-What is imported from here is loaded when it is first used, because compiled and imaging libraries take their time.
+Each name is loaded at its first use, because compiled and imaging libraries take long to load.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ __all__ = [
     "render",
 ]
 
-_HOMES = {
+# Module of each public name.
+_MODULE_OF_NAME = {
     "Callbacks": "generator.dataset.shards",
     "DatasetOptions": "generator.dataset.plan",
     "Workers": "generator.dataset.making",
@@ -64,7 +65,22 @@ _HOMES = {
 
 
 def open_lut(folder: Path | str) -> Lut:
-    """Return the table in a folder, or the small computed one of ``demo:``; see `calibration.table.lut.open_lut`.
+    """Open a look-up table (LUT).
+
+    Parameters
+    ----------
+    folder
+        Folder of the LUT, or ``demo:`` for a small computed LUT.
+
+    Returns
+    -------
+    Lut
+        The LUT; samples are read when they are used.
+
+    Raises
+    ------
+    FormatError
+        The folder contains no LUT, or the LUT is damaged.
 
     Examples
     --------
@@ -79,6 +95,6 @@ def open_lut(folder: Path | str) -> Lut:
 
 
 def __getattr__(name: str) -> object:
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+    if name in _MODULE_OF_NAME:
+        return getattr(import_module(_MODULE_OF_NAME[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,35 +1,8 @@
-"""A 16-bit linear image as the bytes of a file, losslessly, and back; masks and previews beside it.
+"""Image files: encode 16-bit linear images, masks and previews, and decode them.
 
-docs/formats.md says what each format is, and `docs/decisions/0011-image-files.md` what else was weighed. Every encoder
-releases the interpreter's lock while it computes (not while it copies uncompressed pixels into the file). Beside image
-and file a PNG takes some megabytes, however large.
-
-**PNG** (ISO/IEC 15948). Chunks are written here around `generator.deflate`; one of data holds a band of rows. Values
-are the image's own: no gAMA, cICP or iCCP chunk, since camera RGB is no display's and some readers would convert, and
-no sBIT, since values lie at the lower end of the 16 bits. Maps are smooth: of differences to the row above ISA-L makes
-as few bytes as OpenCV's writer does, in a fifth of its time; its bytes depend on its version and may on the processor,
-but on nothing else if it is used as `docs/decisions/0051-first-bytes-apart.md` says.
-
-**TIFF** 6.0 as every reader can read it: one uncompressed strip. The zstd codec is missing from widespread readers,
-and deflate, at the speed of their TIFF writers, costs more time than it saves room.
-
-**OpenEXR**, scan lines under zip, saturation at the white level. Written here, since the libraries at hand write to
-named files only. Source: "OpenEXR File Layout" and "Technical Introduction to OpenEXR", version 2 of the file, one
-part; the reordering and prediction before zip are those of the reference implementation (ImfZip).
-
-**JPEG XL** (ISO/IEC 18181) at its lowest effort; it has no place for the image's metadata.
-
-**DNG** 1.7.1, chapters 2 and 4. Each photosite of the RGGB pattern takes its own channel of its pixel. Black is 0,
-white the table's saturation, AsShotNeutral the ground truth, so that a raw program shows neutral things as neutral.
-The colour matrix is the one that LibRaw holds for the table's camera or, for a camera unknown to it, that of linear
-sRGB: neutral things stay neutral with both, other colours are right with the first only. The file names CroP as its
-maker, so that no program applies facts of the camera's own files to it, such as their black level.
-
-**Previews** are the image in camera colours, made small and tone mapped by Flash, as JPEG. An image of 16 bits has few
-values, so every logarithm and power is taken once for each value and not once for each pixel. Nothing here starts
-threads of its own: the images of a dataset are made by as many threads as there are processors. Flash is N. Banić,
-S. Lončarić, "Flash and Storm: fast and highly practical tone mapping based on Naka-Rushton equation", VISAPP 2018; used
-for the previews as the paper uses it in its figure of the generation process, and in its section 4.2.
+docs/formats.md describes the formats; docs/decisions/0011-image-files.md compares them with others. Encoders are
+lossless, except for previews. They release the interpreter lock while they compute and start no threads, because a data
+set is made by one thread for each processor. Camera RGB is no display colour space, so files have no colour profile.
 """
 
 from __future__ import annotations
@@ -61,55 +34,53 @@ Image = npt.NDArray[np.uint16]
 Format = Literal["png", "tiff", "exr", "jxl", "dng"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
 
-_threads = threading.local()  # Each thread's packer of PNG, with its working memory
+_threads = threading.local()  # The PNG packer of each thread, with its working memory
 
 
 @dataclass(frozen=True)
 class ImageMetadata:
-    """Light and camera of one image.
+    """Ground truth and camera of one image."""
 
-    - `white_level`: value of saturation, 1 … 65535, in the units of the image.
-    - `white`: linear camera RGB of an achromatic surface under the image's light, of any length: the ground truth.
-    - `camera`: maker and model, as the table has it.
-    """
-
-    white_level: int
-    white: tuple[float, float, float]
-    camera: str
+    white_level: int  # saturation level in counts, 1 … 65535
+    white: tuple[float, float, float]  # ground truth: linear camera RGB of an achromatic surface, of any length
+    camera: str  # maker and model, from the LUT
 
     def to_json(self) -> str:
-        """Return one line of JSON in ASCII, for formats with a place for a text."""
+        """Return one line of JSON in ASCII, for formats with a text field."""
         values = {"white_level": self.white_level, "white": self.white, "camera": self.camera}
         return json.dumps({"format": "crop.image", "values": "linear camera RGB, black 0", **values})
 
 
-FULL: Final = 65535  # Largest number of 16 bits, which saturation becomes
+FULL: Final = 65535  # Largest value of 16 bits
 
-
+# PNG (ISO/IEC 15948), with the deflate packer of `generator.deflate`; each IDAT chunk has one band of rows. There is no
+# sBIT chunk, because values use the lower end of the 16 bits.
 SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"  # The first bytes of every PNG file (clause 5.2)
-TALLEST: Final = (1 << 31) - 1  # Largest size in the format (clause 11.2.2)
-# Most pixels of a band, unless a row has more: 1.5 MiB, so that an image of any size needs little memory.
+TALLEST: Final = (1 << 31) - 1  # Largest height, px (clause 11.2.2)
+# Largest number of pixels in a band of several rows: 1.5 MiB, so that large images need little memory.
 BAND: Final = 1 << 18
-_ZLIB: Final = bytes([0x78, 0x01])  # Deflate, a window of 32 KiB, packed fast (RFC 1950, 2.2)
-# Level of ISA-L's compression, of 0 to 3, for maps and for what OpenEXR's prediction leaves: both are smooth.
+_ZLIB: Final = bytes([0x78, 0x01])  # zlib header: deflate, window of 32 KiB, fastest level (RFC 1950, 2.2)
+# Compression level of ISA-L (0 to 3) for maps and for OpenEXR after prediction. Both are smooth: with the filter Up,
+# ISA-L makes maps as small as OpenCV does in a fifth of the time.
 _LEVEL: Final = 1
-# Bytes that are packed before all others; of more than 16 ISA-L would use the loop that is wrong at its start.
+# Bytes packed separately at the start. With more than 16, ISA-L would use its fast loop, whose first hash is undefined
+# (docs/decisions/0051-first-bytes-apart.md).
 _APART: Final = 8
-_UP: Final = 2  # The filter type Up (clause 9.2)
+_UP: Final = 2  # Filter type Up (clause 9.2)
 # Colour types (clause 11.2.2).
 _GREY: Final = 0
 _RGB: Final = 2
 
 
 def png_pieces(image: Image, metadata: ImageMetadata) -> Iterator[bytes | memoryview]:
-    """Yield the file of `image` (H, W, 3) uint16 piece by piece; the memory of each is used again for the next."""
+    """Yield the PNG file of `image` (H, W, 3) uint16 in pieces, each valid until the next."""
     height, width, _ = image.shape
     if width > WIDEST or height > TALLEST:
         raise InputError(
-            f"an image of {width}x{height} px is too large for PNG: {WIDEST} columns and {TALLEST} rows at most; "
-            "make it smaller"
+            f"an image of {width}x{height} px is too large for PNG, which allows {WIDEST}x{TALLEST} px; reduce the "
+            "image"
         )
-    yield _head(width, height, _RGB)
+    yield _png_head(width, height, _RGB)
     yield from _chunk(b"tEXt", b"Description\0" + metadata.to_json().encode("ascii"))
     rows = max(1, BAND // width)
     checksum = 1
@@ -128,70 +99,73 @@ def _packer() -> Packer:
 
 
 def encode_map(values: Image) -> bytes:
-    """Return smooth `values` (H, W) or (H, W, 3) uint16, such as a mask of weights, as the bytes of a PNG."""
+    """Return the PNG file of smooth `values` (H, W) or (H, W, 3) uint16, such as a mask."""
     height, width = values.shape[:2]
     plain = values.astype(">u2").view(np.uint8).reshape(height, -1)
     rows = np.empty((height, 1 + plain.shape[1]), np.uint8)
     rows[:, 0] = _UP
     rows[0, 1:] = plain[0]
     np.subtract(plain[1:], plain[:-1], out=rows[1:, 1:])
-    head = _head(width, height, _GREY if values.ndim == 2 else _RGB)
+    head = _png_head(width, height, _GREY if values.ndim == 2 else _RGB)
     return b"".join([head, *_chunk(b"IDAT", _packed(rows)), *_chunk(b"IEND")])
 
 
 def _packed(data: npt.NDArray[np.uint8]) -> bytes:
-    """Return contiguous `data` as zlib data, RFC 1950, the same bytes in every process."""
     packer, plain = isal_zlib.compressobj(_LEVEL), data.reshape(-1).data
-    # Given all at once, ISA-L takes what lies in a register for its hash of the third to the sixth byte.
+    # In a single call ISA-L hashes bytes 3 to 6 with an undefined register, so that files differ between processes.
     first = packer.compress(plain[:_APART]) + packer.flush(isal_zlib.Z_SYNC_FLUSH)
     return b"".join([first, packer.compress(plain[_APART:]), packer.flush()])
 
 
-def _head(width: int, height: int, colour: int) -> bytes:
+def _png_head(width: int, height: int, colour: int) -> bytes:
     size = struct.pack(">IIBBBBB", width, height, 16, colour, 0, 0, 0)
     return SIGNATURE + b"".join(_chunk(b"IHDR", size))
 
 
-def _chunk(kind: bytes, *parts: bytes | memoryview) -> Iterator[bytes | memoryview]:
-    """Yield the pieces of a chunk (clause 5.3)."""
-    checksum = isal_zlib.crc32(kind)
-    for part in parts:
-        checksum = isal_zlib.crc32(part, checksum)
-    yield struct.pack(">I", sum(len(part) for part in parts)) + kind
-    yield from filter(None, parts)
+def _chunk(chunk_type: bytes, *pieces: bytes | memoryview) -> Iterator[bytes | memoryview]:
+    checksum = isal_zlib.crc32(chunk_type)
+    for piece in pieces:
+        checksum = isal_zlib.crc32(piece, checksum)
+    # Length, type, data and CRC (clause 5.3).
+    yield struct.pack(">I", sum(len(piece) for piece in pieces)) + chunk_type
+    yield from filter(None, pieces)
     yield struct.pack(">I", checksum)
 
 
 def decode_png(data: bytes) -> npt.NDArray[np.generic]:
-    """Return what a PNG holds, (H, W) or (H, W, channels), RGB, uint8 or uint16, as it stands there."""
+    """Return the values of a PNG: (H, W) or (H, W, channels) in RGB order, uint8 or uint16."""
     import cv2
 
-    # OpenCV would read other formats, too.
-    found = None
+    # OpenCV would also read other formats.
+    decoded = None
     if data.startswith(SIGNATURE):
-        found = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    if found is None:
-        raise ValueError("no whole PNG file")
-    if found.ndim == 2:
-        return found
-    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+        decoded = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if decoded is None:
+        raise ValueError("not a complete PNG file")
+    if decoded.ndim == 2:
+        return decoded
+    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB if decoded.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
 
-# Largest number of a signed 32-bit integer, which counts the columns of a window and the bytes of a chunk.
+# OpenEXR, scan lines with ZIP compression. Our own encoder, because the libraries write only to named files. Sources:
+# "OpenEXR File Layout", "Technical Introduction to OpenEXR"; prediction as in ImfZip of the reference implementation.
+
+# Largest signed 32-bit integer, the type of window columns and of chunk sizes in bytes.
 LARGEST_SIDE: Final = (1 << 31) - 1
 
-# First bytes of every OpenEXR file of version 2 with scan lines in one part.
+# First bytes of an OpenEXR file of version 2 with scan lines in one part.
 _MAGIC_AND_VERSION: Final = struct.pack("<ii", 20000630, 2)
-_ZIP: Final = 3  # Number of the compression ZIP_COMPRESSION
-_LINES: Final = 16  # Scan lines that ZIP_COMPRESSION packs together
-_FLOAT: Final = 2  # Number of the pixel type FLOAT
+_ZIP: Final = 3  # Code of ZIP_COMPRESSION
+_LINES: Final = 16  # Scan lines in a block of ZIP_COMPRESSION
+_FLOAT: Final = 2  # Code of the pixel type FLOAT
 
 
 def encode_exr(image: Image, metadata: ImageMetadata) -> bytes:
-    """Return the file of `image` (H, W, 3) uint16."""
+    """Return the OpenEXR file of `image` (H, W, 3) uint16."""
     height, width, _ = image.shape
     if 12 * width * _LINES > LARGEST_SIDE:
-        raise InputError(f"an image of {width}x{height} px is too wide for EXR; choose png or tiff, or make it smaller")
+        largest = LARGEST_SIDE // 12 // _LINES
+        raise InputError(f"an image is {width} px wide, EXR allows {largest}; choose png or tiff, or reduce the image")
     start = _header(width, height, metadata)
     chunks = [_scan_lines(image, y) for y in range(0, height, _LINES)]
     sizes = np.array([len(chunk) for chunk in chunks], dtype=np.uint64)
@@ -201,7 +175,7 @@ def encode_exr(image: Image, metadata: ImageMetadata) -> bytes:
 
 
 def decode_exr(data: bytes) -> Image:
-    """Return the image (H, W, 3) uint16 of a file's bytes."""
+    """Return the image (H, W, 3) uint16 of an OpenEXR file."""
     import OpenImageIO as oiio  # noqa: N813
 
     # OpenImageIO reads named files only.
@@ -217,7 +191,7 @@ def decode_exr(data: bytes) -> Image:
     values = np.asarray(values)
     image = values.astype(np.uint16) if values.size and values.min() >= 0 and values.max() <= 65535 else None
     if image is None or not np.array_equal(image, values):
-        raise ValueError("its values are not whole numbers 0 to 65535")
+        raise ValueError("its values are not integers from 0 to 65535")
     return image
 
 
@@ -240,25 +214,25 @@ def _header(width: int, height: int, metadata: ImageMetadata) -> bytes:
     return _MAGIC_AND_VERSION + b"".join(attributes) + b"\0"
 
 
-def _attribute(name: str, kind: str, value: bytes) -> bytes:
-    return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+def _attribute(name: str, type_name: str, value: bytes) -> bytes:
+    return name.encode() + b"\0" + type_name.encode() + b"\0" + struct.pack("<i", len(value)) + value
 
 
 def _scan_lines(image: Image, y: int) -> bytes:
-    """Return the chunk of the scan lines from `y` on: channels B, G, R of a line, then the next line."""
+    # The order in a chunk is: channels B, G, R of a line, then the next line.
     lines = image[y : y + _LINES, :, ::-1].transpose(0, 2, 1).astype("<f4", order="C")
     raw = lines.reshape(-1).view(np.uint8)
-    # Bytes of even and of odd places are parted, then differences taken: so noise and exponents stand apart.
-    apart = np.concatenate([raw[0::2], raw[1::2]])
-    apart[1:] = apart[1:] - apart[:-1] + np.uint8(128)
-    data = _packed(apart)
-    # Data that do not become smaller are stored without reordering.
+    # Even and odd bytes are separated before differences are taken, so that exponents are not mixed with noise.
+    separated = np.concatenate([raw[0::2], raw[1::2]])
+    separated[1:] = separated[1:] - separated[:-1] + np.uint8(128)
+    data = _packed(separated)
+    # Data that compression does not reduce are stored unchanged.
     body = data if len(data) < raw.nbytes else raw.tobytes()
     return struct.pack("<ii", y, len(body)) + body
 
 
 def encode_jxl(image: Image) -> bytes:
-    """Return the file of `image` (H, W, 3) uint16, all 16 bits kept."""
+    """Return the lossless JPEG XL file (ISO/IEC 18181) of `image` (H, W, 3) uint16; the format has no metadata."""
     codecs = imagecodecs()
     try:
         return bytes(codecs.jpegxl_encode(np.ascontiguousarray(image), effort=1, lossless=True, numthreads=1))
@@ -269,24 +243,25 @@ def encode_jxl(image: Image) -> bytes:
 
 
 def decode_jxl(data: bytes) -> npt.NDArray[np.generic]:
-    """Return what a JPEG XL file holds, (H, W, channels) or (H, W), uint8, uint16 or float32 as it is stored."""
+    """Return the values of a JPEG XL file: (H, W) or (H, W, channels), uint8, uint16 or float32 as stored."""
     return np.asarray(imagecodecs().jpegxl_decode(data, numthreads=1))
 
 
 def imagecodecs() -> Any:
-    """Return the module that has libjxl; a plain installation does without its 90 MB."""
+    """Return the module imagecodecs with libjxl, an optional dependency of 90 MB."""
     try:
         import imagecodecs as module
     except ImportError as error:
-        raise InputError("JPEG XL needs imagecodecs: pip install imagecodecs; or choose png") from error
+        raise InputError("JPEG XL needs the library imagecodecs; run pip install imagecodecs, or choose png") from error
     return module
 
 
 def encode_tiff(image: Image, metadata: ImageMetadata) -> bytes:
-    """Return the file of `image` (H, W, 3) uint16."""
+    """Return the TIFF 6.0 file of `image` (H, W, 3) uint16: one uncompressed strip."""
+    # Many readers lack the zstd codec, and deflate costs more time than the smaller file saves.
     height, width, channels = image.shape
     tags: Tags = {
-        TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # the picture itself
+        TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # full-size image
         TiffTag.IMAGE_WIDTH: (ValueType.LONG, [width]),
         TiffTag.IMAGE_LENGTH: (ValueType.LONG, [height]),
         TiffTag.BITS_PER_SAMPLE: (ValueType.SHORT, [16] * channels),
@@ -295,60 +270,61 @@ def encode_tiff(image: Image, metadata: ImageMetadata) -> bytes:
         TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
         TiffTag.SAMPLES_PER_PIXEL: (ValueType.SHORT, [channels]),
         TiffTag.ROWS_PER_STRIP: (ValueType.LONG, [height]),
-        TiffTag.PLANAR_CONFIGURATION: (ValueType.SHORT, [1]),  # pixel by pixel
+        TiffTag.PLANAR_CONFIGURATION: (ValueType.SHORT, [1]),  # interleaved
         TiffTag.SAMPLE_FORMAT: (ValueType.SHORT, [1] * channels),  # unsigned integers
     }
     try:
         start = head(tags, image.nbytes)
     except ValueError as error:
         raise InputError(
-            f"an image of {width}x{height} px is too large for TIFF: {error}; choose png or exr, or make it smaller"
+            f"an image of {width}x{height} px is too large for TIFF: {error}; choose png or exr, or reduce the image"
         ) from error
     return b"".join([start, np.ascontiguousarray(image, dtype="<u2").data])
 
 
 def decode_tiff(data: bytes) -> npt.NDArray[np.generic]:
-    """Return the first picture of a TIFF, (H, W) or (H, W, channels), uint8, uint16, float32 or whatever is stored.
-
-    OpenCV's reader is not used: of pictures stored plane by plane, and of files that are cut off, it makes others.
-    """
+    """Return the first page of a TIFF: (H, W) or (H, W, channels), of the stored type."""
+    # OpenCV misreads images stored plane by plane and truncated files, so it is not used.
     import tifffile
 
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         page = file.pages.first
-        found = np.asarray(page.asarray())
-        # Planes that are stored one after another come as the first axis.
-        return np.moveaxis(found, 0, -1) if page.axes.startswith("S") and found.ndim == 3 else found
+        values = np.asarray(page.asarray())
+        # If planes are stored one after another, they are the first axis.
+        return np.moveaxis(values, 0, -1) if page.axes.startswith("S") and values.ndim == 3 else values
 
 
-SMALLEST_SIDE = 22  # Photosites along a side below which LibRaw takes a file for no raw file
+# DNG 1.7.1, chapters 2 and 4.
+SMALLEST_SIDE = 22  # Smallest side in photosites; LibRaw does not open smaller raw files
 
 # From XYZ to linear sRGB, IEC 61966-2-1.
 _SRGB: Matrix = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))
 
 
 def encode_dng(image: Image, metadata: ImageMetadata) -> bytes:
-    """Return the file of `image` (H, W, 3) uint16, uncompressed."""
+    """Return the uncompressed DNG file of `image` (H, W, 3) uint16 with an RGGB pattern."""
     height, width, _ = image.shape
     if min(height, width) < SMALLEST_SIDE:
         raise InputError(
-            f"an image of {width}x{height} px is too small for DNG: raw programs open none below "
-            f"{SMALLEST_SIDE}x{SMALLEST_SIDE}; choose png or tiff"
+            f"an image of {width}x{height} px is too small for DNG, raw developers need "
+            f"{SMALLEST_SIDE}x{SMALLEST_SIDE} px or more; choose png or tiff"
         )
     neutral = _neutral(metadata)
+    # Neutral colours are correct with either matrix, other colours only with that of the camera.
     matrix = camera_matrix(metadata.camera) or _SRGB
     model = f"{metadata.camera} generated".strip()
     tags: Tags = {
-        TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # the picture itself
+        TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # full-size image
         TiffTag.IMAGE_WIDTH: (ValueType.LONG, [width]),
         TiffTag.IMAGE_LENGTH: (ValueType.LONG, [height]),
         TiffTag.BITS_PER_SAMPLE: (ValueType.SHORT, [16]),
         TiffTag.COMPRESSION: (ValueType.SHORT, [1]),  # none
         TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [CFA]),
         TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
+        # Not the maker of the camera, so that raw developers do not apply its black level or other facts.
         TiffTag.MAKE: text("CroP"),
         TiffTag.MODEL: text(model),
-        TiffTag.ORIENTATION: (ValueType.SHORT, [1]),  # as it lies
+        TiffTag.ORIENTATION: (ValueType.SHORT, [1]),  # not rotated
         TiffTag.SAMPLES_PER_PIXEL: (ValueType.SHORT, [1]),
         TiffTag.ROWS_PER_STRIP: (ValueType.LONG, [height]),
         TiffTag.PLANAR_CONFIGURATION: (ValueType.SHORT, [1]),
@@ -363,16 +339,16 @@ def encode_dng(image: Image, metadata: ImageMetadata) -> bytes:
         TiffTag.WHITE_LEVEL: (ValueType.SHORT, [metadata.white_level]),
         TiffTag.COLOR_MATRIX_1: (
             ValueType.SRATIONAL,
-            [part for row in matrix for entry in row for part in (round(10000 * entry), 10000)],
+            [integer for row in matrix for entry in row for integer in (round(10000 * entry), 10000)],
         ),
-        TiffTag.AS_SHOT_NEUTRAL: rationals(*neutral),
+        TiffTag.AS_SHOT_NEUTRAL: rationals(*neutral),  # the ground truth
         TiffTag.CALIBRATION_ILLUMINANT_1: (ValueType.SHORT, [D65]),
     }
     try:
         start = head(tags, 2 * height * width)
     except ValueError as error:
         raise InputError(
-            f"an image of {width}x{height} px is too large for DNG: {error}; choose png, or make it smaller"
+            f"an image of {width}x{height} px is too large for DNG: {error}; choose png, or reduce the image"
         ) from error
     return b"".join([start, mosaic_of(image).data])
 
@@ -390,7 +366,7 @@ def mosaic_of(image: Image) -> Image:
 def half_size(counts: Image) -> Image:
     """Return linear RGB (H // 2, W // 2, 3) uint16 of an RGGB mosaic (H, W) uint16.
 
-    Each 2×2 block becomes a pixel: red, the mean of both greens rounded up, blue.
+    Each pixel is made from a 2×2 block: red, the mean of both greens rounded up, and blue.
     """
     height, width = (size // 2 * 2 for size in counts.shape)
     image = np.empty((height // 2, width // 2, 3), np.uint16)
@@ -401,60 +377,52 @@ def half_size(counts: Image) -> Image:
     return image
 
 
-def _whole(encode: Callable[[Image, ImageMetadata], bytes]) -> Callable[[Image, ImageMetadata], tuple[bytes]]:
+def _single_piece(encode: Callable[[Image, ImageMetadata], bytes]) -> Callable[[Image, ImageMetadata], tuple[bytes]]:
     return lambda image, metadata: (encode(image, metadata),)
 
 
 def _neutral(metadata: ImageMetadata) -> tuple[float, float, float]:
     if not 1 <= metadata.white_level <= 65535:
-        raise InputError(f"the white level is {metadata.white_level}; DNG expects 1 to 65535")
+        raise InputError(f"the saturation level is {metadata.white_level}, DNG expects 1 to 65535; choose png or exr")
     largest = max(metadata.white)
-    if not all(math.isfinite(part) and part > largest * 1e-5 for part in metadata.white):
-        raise InputError(
-            f"the light's white is {metadata.white}, DNG expects every channel above 0; choose png, tiff, exr or jxl"
-        )
-    red, green, blue = (part / largest for part in metadata.white)
+    if not all(math.isfinite(channel) and channel > largest * 1e-5 for channel in metadata.white):
+        raise InputError(f"the ground truth is {metadata.white}, DNG expects channels above 0; choose another format")
+    red, green, blue = (channel / largest for channel in metadata.white)
     return red, green, blue
 
 
-_JPEG_QUALITY: Final = 92  # Of previews, on libjpeg's scale to 100: no blocks are visible
+_JPEG_QUALITY: Final = 92  # Quality of previews on the scale of libjpeg (1 to 100): no visible blocks
 
+_LONGEST_JPEG: Final = 65500  # Longest side of a JPEG file, px (JPEG_MAX_DIMENSION of libjpeg)
 
-_LONGEST_JPEG: Final = 65500  # Longest side that libjpeg writes, px (its JPEG_MAX_DIMENSION)
-
-_DEFLATE_RATIO: Final = 1032  # Bytes that deflate makes of one at most (RFC 1951: 258 of two bits)
+_DEFLATE_RATIO: Final = 1032  # Largest ratio of unpacked to packed bytes (RFC 1951: 258 bytes from two bits)
 
 
 @dataclass(frozen=True)
 class FileFormat:
-    """A format of images' files.
+    """A file format of images."""
 
-    - `pieces`: the file of an image (H, W, 3) uint16 and its light in pieces, whose memory may be used again for the
-      next one.
-    - `decode`: the array in the bytes of a file of that name, (H, W) or (H, W, channels), as it stands there.
-    - `libraries`: distributions that encode it, or for a raw file name its colour matrix: their versions may change the
-      bytes of a file. None if CroP encodes it.
-    - `smallest_side`: least width and height, px.
-    """
-
+    # Encodes an image (H, W, 3) uint16; each piece is valid until the next.
     pieces: Callable[[Image, ImageMetadata], Iterable[bytes | memoryview]]
+    # Decodes the bytes of the named file to an array (H, W) or (H, W, channels).
     decode: Callable[[bytes, str], npt.NDArray[np.generic]]
+    # Distributions whose version may change the bytes: encoders, or the source of the colour matrix of a raw file.
     libraries: tuple[str, ...] = ()
-    smallest_side: int = 1
+    smallest_side: int = 1  # px
 
 
 # All formats by name.
 FILE_FORMATS: Final[Mapping[Format, FileFormat]] = {
     "png": FileFormat(png_pieces, lambda data, _: decode_png(data)),
-    "tiff": FileFormat(_whole(encode_tiff), lambda data, _: decode_tiff(data)),
-    "exr": FileFormat(_whole(encode_exr), lambda data, _: decode_exr(data), libraries=("isal",)),
+    "tiff": FileFormat(_single_piece(encode_tiff), lambda data, _: decode_tiff(data)),
+    "exr": FileFormat(_single_piece(encode_exr), lambda data, _: decode_exr(data), libraries=("isal",)),
     "jxl": FileFormat(
         lambda image, _: (encode_jxl(image),),
         lambda data, _: decode_jxl(data),
         libraries=("imagecodecs",),
     ),
     "dng": FileFormat(
-        _whole(encode_dng),
+        _single_piece(encode_dng),
         lambda data, name: half_size(decode_raw(data, Path(name)).counts),
         libraries=("rawpy",),
         smallest_side=SMALLEST_SIDE,
@@ -463,148 +431,149 @@ FILE_FORMATS: Final[Mapping[Format, FileFormat]] = {
 
 
 def suffix_of(form: Format) -> str:
-    """Return the suffix of file names of that format, such as ``.png``."""
+    """Return the file name suffix of a format, such as ``.png``."""
     return f".{form}"
 
 
 def libraries_of(form: Format) -> tuple[str, ...]:
-    """Return the distributions whose version may change the bytes of a file of that format; none if CroP encodes it."""
+    """Return `FileFormat.libraries` of a format; raises InputError if one is not installed."""
     if form == "jxl":
         imagecodecs()
     return FILE_FORMATS[form].libraries
 
 
 def encode_image(image: Image, form: Format, metadata: ImageMetadata) -> bytes:
-    """Return `image` as the bytes of a file.
-
-    `image`: (H, W, 3) uint16, linear camera RGB.
-    """
+    """Return the file of `image` (H, W, 3) uint16, linear camera RGB."""
     return b"".join(map(bytes, encode_pieces(image, form, metadata)))
 
 
 def encode_pieces(image: Image, form: Format, metadata: ImageMetadata) -> Iterable[bytes | memoryview]:
-    """Return the file of `image` (H, W, 3) uint16 in pieces, whose memory may be used again for the next one.
+    """Return the file of `image` (H, W, 3) uint16 in pieces, each valid until the next.
 
-    Pieces of a PNG are encoded one after the other, so that a file of any size needs little memory.
+    A PNG is encoded piece by piece, so that large files need little memory.
     """
-    _check(image)
+    _require_rgb16(image)
     return FILE_FORMATS[form].pieces(image, metadata)
 
 
-def _check(image: Image) -> None:
+def _require_rgb16(image: Image) -> None:
     if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"the image is {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
 
 
-def decode_image(data: bytes, form: Format, what: str) -> Image:
-    """Return the image that `encode_image` made a file of.
+def decode_image(data: bytes, form: Format, name: str) -> Image:
+    """Return the image (H, W, 3) uint16 of a file; of ``dng`` the half-size image (H // 2, W // 2, 3).
 
-    `data`: the file's bytes. Returns (H, W, 3) uint16, as it was encoded; of `dng` (H // 2, W // 2, 3), the half-size
-    linear RGB of its mosaic: red, the mean of both greens, rounded up, and blue of each 2×2 block.
+    `name` is the file name in messages. Raises FormatError.
     """
-    require_plausible(data, what)
+    require_plausible(data, name)
     try:
-        image = FILE_FORMATS[form].decode(data, what)
+        image = FILE_FORMATS[form].decode(data, name)
     except CropError:
         raise
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise FormatError(f"{what} cannot be read as {form}: {reason}; make it again") from error
+        raise FormatError(f"{name} cannot be read as {form}: {reason}; make it again") from error
     if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3:
-        raise FormatError(f"{what} holds {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
+        raise FormatError(f"{name} is {image.dtype} {image.shape}, expected uint16 (height, width, 3); make it again")
     return image.astype(np.uint16, copy=False)
 
 
-def require_plausible(data: bytes, what: str) -> None:
-    """Refuse a PNG file that claims more pixels or bytes than it can hold; says nothing of other formats.
-
-    Deflate makes at most 1032 bytes of one (zlib's "Maximum Compression Factor"): a decoder that believed the head
-    would fill memory before it found that there is nothing (ISO/IEC 15948, 5.3 and 11.2.2).
-
-    `data`: the file's bytes.
-    """
+def require_plausible(data: bytes, name: str) -> None:
+    """Raise FormatError if a PNG file declares more pixels or bytes than it can contain; accept other formats."""
+    # A decoder allocates the declared size (ISO/IEC 15948, 5.3 and 11.2.2), which a small file could set to fill the
+    # memory. Deflate unpacks one byte to at most 1032 (the "Maximum Compression Factor" of zlib).
     if len(data) < 26 or not data.startswith(SIGNATURE):
         return
     width, height, depth, colour = struct.unpack(">IIBB", data[16:26])
     channels = {2: 3, 4: 2, 6: 4}.get(colour, 1)
     claimed = height * (1 + width * channels * depth // 8)
     if claimed > _DEFLATE_RATIO * len(data):
-        raise FormatError(f"{what} claims {width}x{height} px, which its {len(data)} bytes cannot hold; make it again")
-    place = 8
-    while place + 12 <= len(data):
-        (size,) = struct.unpack(">I", data[place : place + 4])
-        if size > len(data) - place - 12:
-            left = len(data) - place - 12
-            raise FormatError(f"{what}: a part of the PNG claims {size} bytes where {left} are left; make it again")
-        place += size + 12
+        raise FormatError(f"{name} declares {width}x{height} px, but has only {len(data)} bytes; make it again")
+    offset = 8
+    while offset + 12 <= len(data):
+        (size,) = struct.unpack(">I", data[offset : offset + 4])
+        if size > len(data) - offset - 12:
+            remaining = len(data) - offset - 12
+            raise FormatError(f"{name}: a chunk declares {size} bytes, but {remaining} follow; make it again")
+        offset += size + 12
 
 
-# Replaces brightness 0, which has no logarithm; linear values are 0 … 1, so it is far below any signal.
+# Previews: the image in camera RGB, reduced, tone mapped with Flash and stored as JPEG. Flash is N. Banić, S. Lončarić,
+# "Flash and Storm: fast and highly practical tone mapping based on Naka-Rushton equation", VISAPP 2018. The paper on
+# CroP uses it in section 4.2 and in the figure of the generation process.
+
+# Replaces brightness 0, which has no logarithm. Linear values are 0 … 1, so this is far below any signal.
 DARK: Final = 1e-9
 
-_BLACK: Final = np.float32(1e-30)  # Replaces 0 before a logarithm of float32, and is code 0 afterwards
+_BLACK: Final = np.float32(1e-30)  # Replaces 0 before the logarithm in float32; its code is 0
 
 
 @dataclass(frozen=True)
 class Flash:
-    """The operator with the parameters of one image, so that it can be undone.
+    """The tone mapping operator Flash with the parameters of one image."""
 
-    - `k`: semi-saturation: a · exp(mean ln V) of the image it was fitted to.
-    - `scale`: code that the brightest value became, divided by that value: undone before anything else.
-    - `gamma`: display exponent g of y ** (1 / g); 1 for none.
-    """
-
-    k: float
-    scale: float
-    gamma: float
+    k: float  # semi-saturation: a · exp(mean ln V), where V is the brightness of the fitted image
+    scale: float  # code of the brightest pixel (255) over its value before scaling
+    gamma: float  # display exponent g of y ** (1 / g); 1 for none
 
     def apply(self, linear: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-        """Return codes (..., 3) float64 of linear RGB (..., 3) ≥ 0; the fitted image's brightest value becomes 255."""
+        """Return codes (..., 3) float64 of linear RGB (..., 3) ≥ 0; the brightest fitted value becomes 255."""
         linear = np.asarray(linear, dtype=np.float64)
         brightness = np.maximum(linear.max(axis=-1, keepdims=True), DARK)
         return self.scale * (linear / (brightness + self.k)) ** (1 / self.gamma)
 
     def invert(self, codes: npt.NDArray[np.floating] | npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
-        """Return linear RGB (..., 3) float64 of codes (..., 3) of any type, 0 … 255, rounded or not.
-
-        With y = x / (V + k) the largest channel W = V / (V + k), hence x = y k / (1 − W).
-        """
+        """Return linear RGB (..., 3) float64 of codes (..., 3), 0 … 255."""
+        # From y = x / (V + k), the largest channel is W = V / (V + k), hence x = y k / (1 − W).
         mapped = (np.asarray(codes, dtype=np.float64) / self.scale) ** self.gamma
         largest = mapped.max(axis=-1, keepdims=True)
-        # A rounded-up brightest code may reach W = 1, which no finite brightness has.
+        # A code that was rounded up may give W = 1, which corresponds to infinite brightness.
         return mapped * self.k / np.maximum(1 - largest, DARK)
 
 
 def fit_flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2.2) -> Flash:
-    """Return the operator fitted to an image.
+    """Return the operator fitted to an image (..., 3) float ≥ 0, linear RGB, 1 = saturation.
 
-    `linear`: (..., 3) float ≥ 0, linear RGB, 1 = saturation.
+    `a` is the strength and `gamma` the display exponent, both above 0.
     """
     if not linear.size or a <= 0 or gamma <= 0:
         raise InputError(
-            f"tone mapping got an image {linear.shape}, a={a} and gamma={gamma}, expected pixels and numbers above 0"
+            f"the image has shape {linear.shape}, a is {a}, gamma is {gamma}; expected pixels, and numbers above 0"
         )
     brightness = _brightness(np.asarray(linear))
     return flash_from_brightness(float(np.log(brightness).mean(dtype=np.float64)), float(brightness.max()), a, gamma)
 
 
 def flash_from_brightness(mean_log: float, peak: float, a: float = 5.0, gamma: float = 2.2) -> Flash:
-    """Return the operator for an image with that mean of the logarithms of brightness, and that largest brightness."""
+    """Return the operator for the mean logarithm of brightness and the largest brightness of an image."""
     k = a * math.exp(mean_log)
     return Flash(k, 255.0 / (peak / (peak + k)) ** (1 / gamma), gamma)
 
 
 def flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2.2) -> npt.NDArray[np.uint8]:
-    """Return the picture (..., 3) uint8 of a linear image (..., 3) float, 1 = saturation; see `fit_flash`.
+    """Tone map a linear image with the operator Flash.
 
-    Computed in single precision: a code may differ by one from the rounded result of `Flash.apply`.
+    It is computed in single precision, so a code may differ by one from the rounded result of `Flash.apply`.
 
     Parameters
     ----------
     linear
         (..., 3) float ≥ 0, linear RGB, 1 = saturation.
-    a, gamma
-        Strength and display exponent, as for `fit_flash`.
+    a
+        Strength, above 0; larger values give a darker image.
+    gamma
+        Display exponent, above 0; 1 for none.
+
+    Returns
+    -------
+    ndarray
+        (..., 3) uint8, codes for a display.
+
+    Raises
+    ------
+    InputError
+        The image has no pixels, or a parameter is not above 0.
 
     Examples
     --------
@@ -616,7 +585,7 @@ def flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2.2) 
     operator = fit_flash(linear, a, gamma)
     mapped = linear / (_brightness(linear) + np.float32(operator.k))[..., None]
     if gamma != 1:
-        # Through logarithms, which numpy computes several at once; a power takes ten times as long.
+        # exp and log are vectorised in numpy; a power takes ten times as long.
         np.maximum(mapped, _BLACK, out=mapped)
         np.log(mapped, out=mapped)
         mapped *= np.float32(1 / gamma)
@@ -627,31 +596,27 @@ def flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2.2) 
 
 
 def _brightness(linear: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Return brightness (...), the largest channel of `linear` (..., 3), at least `DARK`."""
     largest = np.maximum(np.maximum(linear[..., 0], linear[..., 1]), linear[..., 2])
     return np.maximum(largest, linear.dtype.type(DARK))
 
 
-# Longest side of a preview, px: enough to judge content and colours by eye, in some tens of kB, and less than that of
-# the images of most datasets, of which a preview of the same size would be a copy.
+# Longest side of a preview, px: enough to judge content and colours by eye, and a file of some tens of kB.
 PREVIEW_SIDE: Final = 400
 
-_GAMMA: Final = 2.2  # Exponent of a usual display, as in the paper's figure of the generation process
-_HALF: Final = np.float32(0.5)  # Added before a number is cut to a whole one, which rounds it
+_GAMMA: Final = 2.2  # Exponent of a usual display, as in the figure of the paper
+_HALF: Final = np.float32(0.5)  # Added before truncation, to round
 
 
 @compiled
 def _shrink(image: Any, factor: int, out: Any) -> None:
-    """Fill `out` with the rounded means of the blocks of `image`, `factor` pixels wide and high, or what is left there.
-
-    `image` is (H, W, 3) uint16, `out` (⌈H / factor⌉, ⌈W / factor⌉, 3) uint16.
-    """
+    # Fill `out` (⌈H / factor⌉, ⌈W / factor⌉, 3) uint16 with the rounded means of blocks of `image` (H, W, 3) uint16,
+    # `factor` pixels wide and high; blocks at the right and lower edge may be smaller.
     height, width = image.shape[0], image.shape[1]
     sums = np.empty(3 * width, np.int64)
-    one, two = uint64(1), uint64(2)
+    u1, u2 = uint64(1), uint64(2)
     for y in range(out.shape[0]):
         top, end = factor * y, min(factor * (y + 1), height)
-        # Rows are added first, so that the compiler can vectorise what touches every sample.
+        # Rows are added first, because the compiler can vectorise this loop over all samples.
         first, small = image[top].reshape(-1), out[y].reshape(-1)
         for i in range(3 * width):
             sums[i] = first[i]
@@ -659,31 +624,31 @@ def _shrink(image: Any, factor: int, out: Any) -> None:
             samples = image[row].reshape(-1)
             for i in range(3 * width):
                 sums[i] += samples[i]
-        left, at = uint64(0), uint64(0)
+        sum_index, out_index = uint64(0), uint64(0)
         columns = min(factor, width)
         share = 1.0 / ((end - top) * columns)
         for x in range(out.shape[1]):
             if factor * (x + 1) > width:
                 columns = width - factor * x
                 share = 1.0 / ((end - top) * columns)
-            red, green, blue = sums[left], sums[left + one], sums[left + two]
+            red, green, blue = sums[sum_index], sums[sum_index + u1], sums[sum_index + u2]
             for _ in range(columns - 1):
-                left += uint64(3)
-                red += sums[left]
-                green += sums[left + one]
-                blue += sums[left + two]
-            left += uint64(3)
-            small[at] = uint16(red * share + 0.5)
-            small[at + one] = uint16(green * share + 0.5)
-            small[at + two] = uint16(blue * share + 0.5)
-            at += uint64(3)
+                sum_index += uint64(3)
+                red += sums[sum_index]
+                green += sums[sum_index + u1]
+                blue += sums[sum_index + u2]
+            sum_index += uint64(3)
+            small[out_index] = uint16(red * share + 0.5)
+            small[out_index + u1] = uint16(green * share + 0.5)
+            small[out_index + u2] = uint16(blue * share + 0.5)
+            out_index += uint64(3)
 
 
-def _smaller(image: npt.NDArray[np.uint16], factor: int) -> npt.NDArray[np.uint16]:
-    """Return the rounded means (⌈H / factor⌉, ⌈W / factor⌉, 3) uint16 of the blocks of `image` (H, W, 3)."""
+def _shrunk(image: npt.NDArray[np.uint16], factor: int) -> npt.NDArray[np.uint16]:
     height, width = image.shape[:2]
     if factor == 2 and height % 2 == width % 2 == 0:
-        # OpenCV's means of two by two are the same, halves rounded up, in a third of the time; of others they are not.
+        # OpenCV gives the same 2×2 means (halves rounded up) in a third of the time; other factors it rounds
+        # differently.
         import cv2
 
         return cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.uint16, copy=False)
@@ -694,11 +659,9 @@ def _smaller(image: npt.NDArray[np.uint16], factor: int) -> npt.NDArray[np.uint1
 
 @compiled
 def _brightest(samples: Any, logs: Any) -> Any:
-    """Return the largest channel of all pixels, and the sum over pixels of the logarithm of the largest channel.
-
-    `samples` is (3 N,) uint16, `logs` (65536,) float64 the logarithm of each value.
-    """
-    # Two counters, so that equal values do not wait for each other.
+    # Return the largest value of `samples` (3 N,) uint16, and the sum over pixels of the logarithm of the largest
+    # channel, from `logs` (65536,) float64. Pixels are counted by value, so that each logarithm is taken once. Two
+    # counters avoid that an increment waits for the previous one of the same value.
     counts = np.zeros((2, 1 << 16), np.uint32)
     top = uint16(0)
     i = uint64(0)
@@ -714,13 +677,13 @@ def _brightest(samples: Any, logs: Any) -> Any:
 
 
 @compiled
-def _map(samples: Any, roots: Any, shades: Any, out: Any) -> None:
-    """Fill `out` with the rounded product of each sample's gamma root and the shade of its pixel's largest channel."""
+def _tone_map(samples: Any, roots: Any, shades: Any, out: Any) -> None:
+    # Fill `out` with the rounded product of the gamma root of each sample and the shade of the largest channel.
     i = uint64(0)
     for _ in range(len(samples) // 3):
         red, green, blue = samples[i], samples[i + uint64(1)], samples[i + uint64(2)]
         shade = shades[max(red, green, blue)]
-        # None is above 255 by more than an error of rounding.
+        # Products exceed 255 only by rounding errors, so no clipping is needed.
         out[i] = uint8(roots[red] * shade + _HALF)
         out[i + uint64(1)] = uint8(roots[green] * shade + _HALF)
         out[i + uint64(2)] = uint8(roots[blue] * shade + _HALF)
@@ -729,44 +692,40 @@ def _map(samples: Any, roots: Any, shades: Any, out: Any) -> None:
 
 @lru_cache(maxsize=4)
 def _tables(white_level: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.float32]]:
-    """Return lookup tables (65536,) over the values of 16 bits: brightness, its logarithm, its gamma root.
-
-    Brightness is the value over the white level, at least `DARK`.
-    """
+    # Of each 16-bit value: brightness (value over saturation level, at least `DARK`), its logarithm, its gamma root.
     linear = np.arange(1 << 16) / white_level
     brightness = np.maximum(linear, DARK)
     return brightness.astype(np.float32), np.log(brightness), (linear ** (1 / _GAMMA)).astype(np.float32)
 
 
 def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREVIEW_SIDE) -> npt.NDArray[np.uint8]:
-    """Return the preview of a raw linear image: made small, then tone mapped, colours as the camera saw them.
+    """Return the preview of a raw linear image (H, W, 3) uint16, reduced and tone mapped in camera RGB.
 
-    `image`: (H, W, 3) uint16, linear camera RGB. `side`: longest side allowed, px. A pixel of the preview is the mean
-    of k × k pixels, k the least whole number that makes it fit. Returns (h, w, 3) uint8, codes for a display; h and w
-    are H / k and W / k, rounded up.
+    Each pixel is the mean of k × k pixels, with the smallest k that reduces the longest side to `side` px. Returns
+    (⌈H / k⌉, ⌈W / k⌉, 3) uint8, codes for a display.
     """
     height, width = image.shape[:2]
     factor = -(-max(height, width) // side)
     if factor > 1:
-        image = _smaller(np.ascontiguousarray(image), factor)
+        image = _shrunk(np.ascontiguousarray(image), factor)
     brightness, logs, roots = _tables(white_level)
     samples = np.ascontiguousarray(image).reshape(-1)
     top, total = _brightest(samples, logs)
-    seen = brightness[: int(top) + 1]
-    operator = flash_from_brightness(float(total) / (samples.size // 3), float(seen[-1]), gamma=_GAMMA)
-    shades = float32(operator.scale) * (seen + float32(operator.k)) ** float32(-1 / _GAMMA)
+    levels = brightness[: int(top) + 1]
+    operator = flash_from_brightness(float(total) / (samples.size // 3), float(levels[-1]), gamma=_GAMMA)
+    shades = float32(operator.scale) * (levels + float32(operator.k)) ** float32(-1 / _GAMMA)
     picture = np.empty(image.shape, np.uint8)
-    _map(samples, roots, shades, picture.reshape(-1))
+    _tone_map(samples, roots, shades, picture.reshape(-1))
     return picture
 
 
 def encode_preview(picture: npt.NDArray[np.uint8]) -> bytes:
-    """Return `picture` (H, W, 3) uint8, RGB, as the bytes of a JPEG file."""
+    """Return the JPEG file of `picture` (H, W, 3) uint8, RGB."""
     import simplejpeg
 
     if max(picture.shape) > _LONGEST_JPEG:
         raise InputError(
-            f"a preview of {picture.shape[1]}x{picture.shape[0]} px cannot be written as JPEG; make it smaller"
+            f"a preview has {picture.shape[1]}x{picture.shape[0]} px, JPEG allows {_LONGEST_JPEG} px; reduce it"
         )
     pixels = np.ascontiguousarray(picture)
     return simplejpeg.encode_jpeg(pixels, _JPEG_QUALITY, colorspace="RGB", colorsubsampling="420")

@@ -1,6 +1,6 @@
-"""The options of the command `generate`: a frozen dataclass for each panel of its help, and the values they give.
+"""The options of the command `generate`: one frozen dataclass for each panel of the help.
 
-Libraries that take long to load are imported when a group makes something of its options.
+Methods of the classes turn options into objects of the library. They import slow libraries only when they are called.
 """
 
 from __future__ import annotations
@@ -37,105 +37,104 @@ _work_option = partial(option, panel="Work")
 
 
 @dataclass(frozen=True)
-class Places:
-    """The arguments: the table, and the place of the dataset; None where an option needs neither."""
+class PathArguments:
+    """The arguments; None if they are not given, as with --verify."""
 
     lut: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="LUT", help="Folder of the table; demo: for a small one to begin with.", show_default=False
-        ),
+        typer.Argument(metavar="LUT", help="Folder of the LUT; demo: for a small computed LUT.", show_default=False),
     ] = None
     out: Annotated[
-        str | None, typer.Argument(metavar="OUT", help="Folder or URL to make; must not exist.", show_default=False)
+        str | None,
+        typer.Argument(metavar="OUT", help="Folder or URL of the new data set; must not exist.", show_default=False),
     ] = None
 
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """Which pictures are sources, and how they are prepared."""
+    """Selection and preparation of the source pictures."""
 
     sources: Annotated[
         list[str] | None,
         _source_option(
             "PLACE",
-            "A picture, or a folder that is searched with those below it, or a URL of either on a store that fsspec "
-            "knows; may be repeated.",
+            "A picture, a folder that is searched with its subfolders, or the URL of either on a store supported by "
+            "fsspec; may be repeated.",
         ),
     ] = None
     random_scenes: Annotated[
         str | None,
-        _source_option("N", "Add N pictures of uniformly random colours, 512x512 px; of another size as N:WxH."),
+        _source_option("N", "Add N pictures of uniformly random colours, 512x512 px; N:WxH selects another size."),
     ] = None
-    max_side: Annotated[int | None, _source_option("PX", "Make larger pictures this small first.", min=1)] = None
+    max_side: Annotated[int | None, _source_option("PX", "Reduce larger pictures to this longest side.", min=1)] = None
     crop: Annotated[
         str | None,
         _source_option(
             "WxH",
-            "Cut pictures to this size; smaller ones are left out. WxH,cover first makes pictures as small as still "
-            "covers the crop. One crop is cut from the centre, or with WxH,random from a place that the seed chooses.",
+            "Crop pictures to this size; smaller pictures are skipped. WxH,cover first reduces each picture until it "
+            "just covers the crop. The crop is taken from the centre, or with WxH,random from a random position.",
         ),
     ] = None
     crops: Annotated[
         int,
-        _source_option("N", "Cut N different crops of each picture, at random places far from each other.", min=1),
+        _source_option("N", "Take N different crops of each picture, at random positions far from each other.", min=1),
     ] = 1
 
     def preparation(self, seed: int) -> Preparation:
-        """Return what is done to each picture; an InputError names the option that cannot be used."""
+        """Return the preparation that the options select."""
         from generator.pictures.sources import Preparation
 
         if self.crop is None:
             return Preparation(self.max_side, seed=seed, crops=self.crops)
-        size, *words = self.crop.split(",")
-        unknown = [word for word in words if word not in ("cover", "random")]
+        size, *flags = self.crop.split(",")
+        unknown = [flag for flag in flags if flag not in ("cover", "random")]
         if unknown:
-            raise InputError(f"--crop {self.crop} has {unknown[0]!r}, expected cover or random behind the size")
+            raise InputError(f"--crop {self.crop} contains {unknown[0]!r}, expected cover or random after the size")
         return Preparation(
             self.max_side,
             _size(size, "--crop"),
-            cover="cover" in words,
-            crop_at="random" if "random" in words else None,
+            cover="cover" in flags,
+            crop_at="random" if "random" in flags else None,
             seed=seed,
             crops=self.crops,
         )
 
     def find(self, preparation: Preparation) -> tuple[Source, ...]:
-        """Return the sources: pictures that are found, then random ones."""
+        """Return the pictures of --sources, followed by random pictures."""
         from generator.pictures.random_scenes import random_scenes
         from generator.pictures.sources import find_pictures
 
-        places = self.sources or []
-        if not places and (preparation.crop or preparation.max_side):
+        locations = self.sources or []
+        if not locations and (preparation.crop or preparation.max_side):
             raise InputError(
-                "--crop, --crops and --max-side are for pictures, and --sources names none; random ones have a size, "
-                "as in --random-scenes 8:256x256"
+                "--crop, --crops and --max-side need pictures, but --sources is missing; add it, or give the size of "
+                "random pictures as in --random-scenes 8:256x256"
             )
-        found: tuple[Source, ...] = find_pictures(places, preparation)
+        sources: tuple[Source, ...] = find_pictures(locations, preparation)
         if self.random_scenes is not None:
             if preparation.crops > 1:
-                raise InputError("--crops is for pictures; leave --random-scenes out, or make a dataset of them alone")
+                raise InputError("--crops does not apply to random pictures; omit --crops or --random-scenes")
             number, _, size = self.random_scenes.partition(":")
             if not re.fullmatch(r"[1-9]\d{0,8}", number, re.ASCII):
                 raise InputError(
                     f"--random-scenes is {self.random_scenes!r}, expected a number such as 8, or 8:256x256"
                 )
-            found += random_scenes(int(number), *_size(size or "512x512", "--random-scenes"), preparation.seed)
-        if not found:
-            raise InputError("there is no source picture; name some with --sources or ask for --random-scenes")
-        return found
+            sources += random_scenes(int(number), *_size(size or "512x512", "--random-scenes"), preparation.seed)
+        if not sources:
+            raise InputError("there are no source pictures, expected one or more; use --sources or --random-scenes")
+        return sources
 
 
 @dataclass(frozen=True)
 class LightOptions:
-    """Which lights fall on which picture, and where."""
+    """Illuminants of each image, and their masks."""
 
     light: Annotated[
         list[str] | None,
         _light_option(
             "LIGHT",
-            "A light for every picture: numbers of the table's, 0,5,12-20 or all; a mixture of them, 12:0.25+40:0.75; "
-            "5600K; a name such as D65 where the table's lights have names; or a chromaticity r=.3,b=.25. May be "
+            "Illuminants for every picture: numbers of the LUT, 0,5,12-20 or all; a mixture 12:0.25+40:0.75; a colour "
+            "temperature 5600K; a name such as D65 if the LUT has names; or a chromaticity r=0.3,b=0.25. May be "
             "repeated.",
         ),
     ] = None
@@ -143,67 +142,68 @@ class LightOptions:
         int | None,
         _light_option(
             "K",
-            "K images of each picture, under distinct random lights of the table, or under lights drawn from "
-            "--distribution. \\[default: 1]",
+            "Make K images of each picture, under different random illuminants of the LUT, or under illuminants drawn "
+            "from --distribution. \\[default: 1]",
         ),
     ] = None
     distribution: Annotated[
         str | None,
         _light_option(
             "NAME",
-            "Draw chromaticities from uniform, gaussian:r=.3,b=.25,sd=.02 (or sd_r, sd_b and corr for sd), or a "
-            "file of ground truths as of --nearest: the kernel density of its lights.",
+            "Draw chromaticities from uniform, from gaussian:r=0.3,b=0.25,sd=0.02 (or sd_r, sd_b and corr instead of "
+            "sd), or from the kernel density of a file of ground truths as for --nearest.",
         ),
     ] = None
     nearest: Annotated[
         Path | None,
         _light_option(
             "GT.csv",
-            "For scene i, in the order of the pictures, the light nearest in angle to ground truth i of this file, "
-            "which starts over when it ends (columns GT_R,GT_G,GT_B or r,g,b, or lines of three numbers).",
+            "Use for scene i the illuminant of the LUT nearest in angle to ground truth i of this file (columns "
+            "GT_R,GT_G,GT_B or r,g,b, or lines of three numbers). Scenes are in the order of the pictures; the file "
+            "is repeated if it is shorter.",
         ),
     ] = None
     match: Annotated[
         Path | None,
         _light_option(
             "GT.csv",
-            "The same with a mixture of lights that matches the ground truth; where the table cannot make it, with the "
-            "nearest that it can, unless that is too far off.",
+            "Like --nearest, with a mixture of illuminants that matches the ground truth. If it is outside the gamut "
+            "of the LUT, the nearest mixture is used; a large distance is refused.",
         ),
     ] = None
     lights_per_image: Annotated[
-        int | None, _light_option("K", "Let K lights fall on each image. \\[default: 1; 2 with --masks]")
+        int | None, _light_option("K", "Use K illuminants in each image. \\[default: 1; 2 with --masks]")
     ] = None
     lights_of: Annotated[
         str | None,
         _light_option(
             "DATASET",
-            "Make the scenes of this dataset under the same lights for another camera, whose table LUT has the same "
-            "lights; --sources names the same pictures, which are prepared in the same way.",
+            "Repeat the scenes and illuminants of this data set for another camera. LUT must contain the same "
+            "illuminants, and --sources the same pictures; they are prepared in the same way.",
         ),
     ] = None
     masks: Annotated[
         str | None,
         _light_option(
             "KIND",
-            "Where each of several lights falls: half-plane or soft-edge (angle, width), spots (count, radius, "
-            "softness), smooth (scale, contrast), window (columns, rows, softness), with numbers where wanted, as in "
-            "spots:count=3,radius=.1; or a folder of masks. \\[default: smooth]",
+            "Distribute several illuminants over the image: half-plane or soft-edge (angle, width), spots (count, "
+            "radius, softness), smooth (scale, contrast), window (columns, rows, softness), with optional numbers as "
+            "in spots:count=3,radius=0.1; or a folder of masks. \\[default: smooth]",
         ),
     ] = None
 
     def choose(self, lut: Lut, seed: int) -> LightChoice:
-        """Return the choice of lights; an InputError names the option that cannot be used."""
+        """Return the illuminants that the options select."""
         from generator.lights.choices import SimultaneousLights
         from generator.masks.making import parse_masks
 
         together = self.lights_per_image or (1 if self.masks is None else 2)
         if self.lights_per_image is not None and self.lights_per_image < 1:
-            raise InputError(f"{self.lights_per_image} lights an image were asked for, expected 1 or more")
+            raise InputError(f"--lights-per-image is {self.lights_per_image}, expected 1 or more")
         if self.masks is not None and together == 1:
             raise InputError(
-                f"--masks {self.masks} says where several lights fall, but each image has one; ask for more with "
-                "--lights-per-image"
+                f"--masks {self.masks} needs several illuminants in an image, but there is 1; use --lights-per-image 2 "
+                "or more"
             )
         choice = self._lights(lut, seed, together)
         if together == 1:
@@ -211,23 +211,23 @@ class LightOptions:
         return SimultaneousLights(choice, together, parse_masks(self.masks or "smooth", together, seed))
 
     def _lights(self, lut: Lut, seed: int, together: int) -> LightChoice:
-        """Return the choice of lights with as many for each picture as its images have together."""
         from generator.lights import choices
         from generator.lights.distributions import ground_truths_by_line, load_ground_truths, parse_distribution
         from generator.lights.gamut import Gamut
         from generator.lights.lighting import RandomLights
 
-        ways = {
+        is_given_by_option = {
             "--light": bool(self.light),
             "--nearest": self.nearest is not None,
             "--match": self.match is not None,
             "--distribution": self.distribution is not None,
             "--random": self.random is not None and self.distribution is None,
         }
-        given = [name for name, is_given in ways.items() if is_given]
-        if len(given) > 1:
+        given_options = [name for name, is_given in is_given_by_option.items() if is_given]
+        if len(given_options) > 1:
             raise InputError(
-                f"{' and '.join(given)} were both given; give one of them (only --random may go with --distribution)"
+                f"{' and '.join(given_options)} exclude each other; give only one (--random may be used with "
+                "--distribution)"
             )
         count = together * (1 if self.random is None else self.random)
         if self.light:
@@ -243,31 +243,30 @@ class LightOptions:
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """What is written, and the seed of everything random."""
+    """Format of the output, and the seed."""
 
-    seed: Annotated[int, _image_option(None, "Seed of everything random.")] = 0
+    seed: Annotated[int, _image_option(None, "Seed of all random choices.")] = 0
     format: Annotated[
         Literal["png", "tiff", "exr", "jxl", "dng"],
         _image_option(
             None,
-            "PNG of 16 bits, of which Pillow and imageio keep 8 (read with cv2.IMREAD_UNCHANGED or open_dataset); "
-            "uncompressed TIFF, fast and large; OpenEXR; JPEG XL, small; or raw files, Bayer DNG.",
+            "16-bit PNG (read with cv2.IMREAD_UNCHANGED or open_dataset; Pillow and imageio keep 8 bits); TIFF, "
+            "uncompressed, fast and large; OpenEXR; JPEG XL, small; or Bayer DNG raw files.",
         ),
     ] = "png"
     layout: Annotated[
         Literal["folder", "webdataset", "parquet"],
         _image_option(
             None,
-            "Each image in a file of its own, or those of a shard in a tar file (WebDataset) or in a Parquet file "
-            "(Hugging Face datasets).",
+            "One file for each image, or one file for each shard: tar (WebDataset) or Parquet (Hugging Face datasets).",
         ),
     ] = "folder"
     split: Annotated[
         str | None,
         _image_option(
             "SHARES",
-            "Divide by source into train, validation and test, such as 0.8,0.1,0.1; two shares are train and test. By "
-            "a hash of each picture, so that parts have these sizes on average.",
+            "Divide by source picture into train, validation and test, such as 0.8,0.1,0.1; two shares mean train and "
+            "test. A hash of each picture decides, so shares are exact only on average.",
         ),
     ] = None
     preview: Annotated[bool, _image_option(None, "Write tone-mapped previews.")] = True
@@ -275,19 +274,18 @@ class ImageOptions:
         bool,
         _image_option(
             None,
-            "Add to ground_truth.csv what each light's direction may be off by, in degrees (k = 2), as the table "
-            "states it.",
+            "Add the uncertainty of each ground truth, reported by the LUT, to ground_truth.csv (degrees, k = 2).",
         ),
     ] = False
     contact_sheet: Annotated[
         Path | None,
-        _image_option("PATH", "Write a page of previews to this PNG file; with --verify of a dataset that is there."),
+        _image_option("PATH", "Write a page of previews to this PNG file; with --verify, of an existing data set."),
     ] = None
 
     def dataset_options(
         self, shard_images: int, reading: Mapping[str, Any], variation: Variation | None, crops: int
     ) -> DatasetOptions:
-        """Return the options of the dataset; an InputError names the option that cannot be used."""
+        """Return the options of the data set."""
         from generator.dataset.plan import DatasetOptions, parse_split
 
         return DatasetOptions(
@@ -305,22 +303,22 @@ class ImageOptions:
 
 @dataclass(frozen=True)
 class RenderingOptions:
-    """How the codes of a picture become what the camera sees of its print."""
+    """Rendering of pictures to raw images."""
 
     rendering: Annotated[
         Literal["codes", "colorimetric"] | None,
         _image_option(
             None,
-            "Print a picture so that it looks to the camera as its colours should; or take its codes as those of the "
-            "print, as the paper did. \\[default: colorimetric; a dataset that was begun goes on as it was]",
+            "Render the colours of a picture as accurately as the print allows (colorimetric), or use its codes as "
+            "codes of the print, as in the paper. \\[default: colorimetric; an existing data set keeps its rendering]",
         ),
     ] = None
     matrix: Annotated[
         str | None,
         _image_option(
             "NAME",
-            "For colorimetric rendering: linear sRGB to the camera's RGB, of a camera by its name, of a file of 3 x 3 "
-            "numbers, table for the one fitted from the table, or none. \\[default: that of the table's camera, else "
+            "Matrix from linear sRGB to camera RGB, for colorimetric rendering: name of a camera, file with 3 x 3 "
+            "numbers, table for a matrix fitted to the LUT, or none. \\[default: matrix of the camera of the LUT, else "
             "table]",
         ),
     ] = None
@@ -328,60 +326,57 @@ class RenderingOptions:
         str,
         _image_option(
             "WHAT",
-            "The print's own black: keep it, compensate for it (take it out), or take out a random share of it of each "
-            "image, random or random:MAX. The ground truth stays.",
+            "Black of the print: keep it, compensate (subtract it), or subtract a random share in each image, random "
+            "or random:MAX. The ground truth does not change.",
         ),
     ] = "keep"
 
-    def of(self, options: DatasetOptions, table: Lut, begun: Rendering | None) -> DatasetOptions:
-        """Return the options of a dataset with these; an InputError says which cannot be used.
-
-        `begun`: how the dataset is rendered that is there, or was begun; None for a new one.
-        """
+    def apply_to(self, options: DatasetOptions, table: Lut, existing: Rendering | None) -> DatasetOptions:
+        """Return `options` with this rendering."""
+        # `existing` is the rendering of a data set that is complete or in progress; None for a new one.
         from generator.rendering.black_points import parse_black_point
         from generator.rendering.matrices import matrix_for
 
-        rendering = self.rendering or begun or options.rendering
+        rendering = self.rendering or existing or options.rendering
         if rendering == "codes" and self.matrix is not None:
-            raise InputError("--matrix is for --rendering colorimetric; add that, or leave --matrix out")
+            raise InputError("--matrix needs --rendering colorimetric, but the rendering is codes; omit --matrix")
         matrix = matrix_for(table, self.matrix) if rendering == "colorimetric" else None
         return replace(options, rendering=rendering, matrix=matrix, black_point=parse_black_point(self.black_point))
 
 
 @dataclass(frozen=True)
 class VariationOptions:
-    """What differs from image to image beside scene and light."""
+    """Random changes of each image in addition to scene and illuminant."""
 
     exposure: Annotated[
         str | None,
         _variation_option(
             "KIND",
-            "Expose images anew: a factor such as .5; stops:low=-2,high=1 or normal:mean=-1,sd=.5, drawn for each; "
-            "clip:share=.01 clips that share of the pixels, level:share=.01,low=.3,high=.9 lets it reach a level over "
-            "saturation (most=8 limits the factor). Noise is that of the light, counts are cut at saturation.",
+            "Change the exposure: a factor such as 0.5; stops:low=-2,high=1 or normal:mean=-1,sd=0.5, drawn for each "
+            "image; clip:share=0.01 saturates that share of the pixels; level:share=0.01,low=0.3,high=0.9 brings it to "
+            "a level relative to saturation (most=8 limits the factor). Noise follows the light; counts are clipped.",
         ),
     ] = None
     gradient: Annotated[
         str | None,
         _variation_option(
             "KIND",
-            "Let the light fall off over the image by up to some stops: smooth, soft-edge, spots or window with the "
-            "numbers of --masks and stops=1,least=0,colour=0; with a colour, ln(R/G) and ln(B/G) of the far end differ "
-            "by up to that, and images have masks and maps of the ground truth.",
+            "Add a fall-off of brightness: smooth, soft-edge, spots or window with the numbers of --masks, and stops=1 "
+            "(largest fall-off), least=0 (smallest), colour=0 (largest change of ln(R/G) and ln(B/G) at the dark end; "
+            "images then get masks and ground truth maps).",
         ),
     ] = None
     iso: Annotated[
         str | None,
         _variation_option(
             "N/BASE",
-            "Add the noise of ISO speed N to that of the table, which was photographed with speed BASE: 1600/100, or "
-            "1600/100:read=2.5, electrons of read noise before the amplifier. Tables that say their ISO speed need no "
-            "BASE.",
+            "Increase the noise from ISO speed BASE of the LUT to ISO speed N: 1600/100, or 1600/100:read=2.5 with the "
+            "read noise before the amplifier in electrons. BASE may be omitted if the LUT records it.",
         ),
     ] = None
 
     def variation(self, lut: Lut) -> Variation | None:
-        """Return the variation of images of a table, or None."""
+        """Return the variation of the images, or None."""
         from generator.variation.iso_speed import known_of_table, parse_iso
         from generator.variation.variation import parse_exposure, parse_gradient, varied_by
 
@@ -395,40 +390,42 @@ class VariationOptions:
 
 @dataclass(frozen=True)
 class WorkOptions:
-    """Who does the work and which part of it."""
+    """Workers, shards and verification."""
 
     workers: Annotated[
-        int | None, _work_option("N", "Threads, or processes of the engine dask. \\[default: one a processor]")
+        int | None,
+        _work_option("N", "Number of threads, or of processes of the engine dask. \\[default: number of processors]"),
     ] = None
     engine: Annotated[
         str,
         _work_option(
             "NAME",
-            "local, dask (a cluster on this machine), or dask://HOST:PORT of a scheduler; docs/clusters.md.",
+            "local, dask (a cluster on this machine), or dask://HOST:PORT of a scheduler; see docs/clusters.md.",
         ),
     ] = "local"
     shard_images: Annotated[
         int,
-        _work_option("N", "Images of a shard: what a kill may cost of tar and Parquet files, and on a store.", min=1),
+        _work_option(
+            "N", "Images in one shard: all that a kill can lose of tar and Parquet files, or in a store.", min=1
+        ),
     ] = 256
     shard: Annotated[
         str | None,
         _work_option(
             "I/N",
-            "Make share I of N only, I from 0, beside other programs that make theirs; then run the command without "
-            "it.",
+            "Make only share I of N, with I from 0, in parallel to other programs. Then run the command without it.",
         ),
     ] = None
     verify: Annotated[
         str | None,
         _work_option(
             "OUT",
-            "Hash every file of the dataset OUT again and name those that have changed; no other argument is needed.",
+            "Check the hash of every file of the data set OUT and list changed files; needs no other argument.",
         ),
     ] = None
 
-    def makers(self) -> Workers:
-        """Return who makes the images: as many as there are processors unless a number is given."""
+    def to_workers(self) -> Workers:
+        """Return the workers; their default number is that of the processors."""
         from generator.dataset.making import Workers
 
         return Workers(self.engine, processor_count() if self.workers is None else self.workers)
@@ -442,67 +439,55 @@ def _size(text: str, name: str) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """Sources and lights of a dataset.
-
-    - `sources`, `choice`: the sources and the lights.
-    - `reading`: how sources were read, as plain values.
-    - `lines`: lines to print about the choice.
-    - `crops`: crops of each picture.
-    """
+class DatasetInputs:
+    """Sources and illuminants of a data set."""
 
     sources: tuple[Source, ...]
     choice: LightChoice
-    reading: Mapping[str, Any]
-    lines: tuple[str, ...]
-    crops: int
+    reading: Mapping[str, Any]  # preparation of the pictures, as plain values
+    lines: tuple[str, ...]  # printed for the user
+    crops: int  # of each picture
 
 
-def choose(lut: Lut, pictures: PictureOptions, light: LightOptions, seed: int) -> Chosen:
-    """Return the sources and lights that the options ask for."""
+def dataset_inputs(lut: Lut, pictures: PictureOptions, light: LightOptions, seed: int) -> DatasetInputs:
+    """Return the sources and illuminants that the options select."""
     from generator.lights.choices import light_notes
 
     if light.lights_of is not None:
-        return _same_scenes(lut, light.lights_of, pictures, light)
+        return _inputs_of_dataset(lut, light.lights_of, pictures, light)
     preparation = pictures.preparation(seed)
     sources = pictures.find(preparation)
     choice = light.choose(lut, seed)
-    return Chosen(sources, choice, preparation.describe(), light_notes(choice), preparation.crops)
+    return DatasetInputs(sources, choice, preparation.describe(), light_notes(choice), preparation.crops)
 
 
-def _same_scenes(lut: Lut, place: str, pictures: PictureOptions, light: LightOptions) -> Chosen:
+def _inputs_of_dataset(lut: Lut, location: str, pictures: PictureOptions, light: LightOptions) -> DatasetInputs:
     from generator.dataset.reader import open_dataset
     from generator.dataset.same_lights import lights_of, scenes_of
 
     if replace(light, lights_of=None) != LightOptions():
-        raise InputError(f"--lights-of {place} gives the lights, and so does another option; leave one out")
-    dataset = open_dataset(place)
-    preparation = _prepared_as(pictures, dataset.description, place)
-    found = pictures.find(preparation) if pictures.sources else ()
-    sources = scenes_of(dataset, found)
+        raise InputError(f"--lights-of {location} and another option both select illuminants; omit one")
+    dataset = open_dataset(location)
+    preparation = _preparation_as_in(pictures, dataset.description, location)
+    candidates = pictures.find(preparation) if pictures.sources else ()
+    sources = scenes_of(dataset, candidates)
     reading = {**preparation.describe(), "lights_of": {"pictures_seed": preparation.seed}}
     lines = tuple(
-        f"{place} was made with {name.replace('_', ' ')}; here the options decide"
+        f"{location} was made with {name.replace('_', ' ')}, which is not copied; set the option if you need it"
         for name in ("variation", "rendering", "black_point")
         if name in dataset.description.options
     )
-    return Chosen(sources, lights_of(dataset, lut), reading, lines, preparation.crops)
+    return DatasetInputs(sources, lights_of(dataset, lut), reading, lines, preparation.crops)
 
 
-def _prepared_as(pictures: PictureOptions, made: Description, place: str) -> Preparation:
-    """Return the preparation of a dataset's pictures; an InputError if the options give another one."""
+def _preparation_as_in(pictures: PictureOptions, description: Description, location: str) -> Preparation:
     from generator.dataset.same_lights import preparation_of
     from generator.pictures.sources import UNPREPARED
 
     if pictures.random_scenes:
-        raise InputError(
-            f"--lights-of {place} gives the pictures; leave --random-scenes out, those of it are made again"
-        )
-    prepared = preparation_of(made)
-    given = pictures.preparation(prepared.seed)
-    if given.describe() not in (prepared.describe(), UNPREPARED.describe()):
-        raise InputError(
-            f"--max-side, --crop and --crops prepare pictures in another way than those of {place}; leave them out, "
-            "pictures are prepared as there"
-        )
+        raise InputError(f"--lights-of {location} already selects the random pictures; omit --random-scenes")
+    prepared = preparation_of(description)
+    requested = pictures.preparation(prepared.seed)
+    if requested.describe() not in (prepared.describe(), UNPREPARED.describe()):
+        raise InputError(f"--max-side, --crop and --crops must be as for {location}; omit them")
     return prepared

@@ -1,4 +1,4 @@
-"""How far `generate` has come, on a terminal and in a log."""
+"""Progress of `generate`, as a bar on a terminal or as lines in a log."""
 
 from __future__ import annotations
 
@@ -18,89 +18,90 @@ if TYPE_CHECKING:
     from generator.dataset.shards import Callbacks
 
 
-# Work that is done within so many seconds gets no bar but its last line: what draws bars takes a tenth to load.
+# Seconds before a bar is shown. Loading the library for bars takes 0.1 s, so short work prints its last line only.
 SOON_S: Final = 0.5
 
 
 @contextmanager
-def shown_progress(images: int) -> Generator[Callbacks]:
-    """Show how many images are made, how fast, and the time left while the block runs.
+def show_progress(images: int) -> Generator[Callbacks]:
+    """Show the number of images, the rate and the remaining time while the block runs.
 
-    On a terminal that is a bar; elsewhere, and where the work is done at once, one line at the end.
+    A terminal shows a bar. Logs, and work shorter than `SOON_S`, get one line at the end.
     """
     from generator.dataset.shards import SILENT, Callbacks
 
     if not shows_progress():
         yield SILENT
         return
-    with ExitStack() as shown:
-        count = _Images(images, shown)
+    with ExitStack() as stack:
+        count = _ImageCounter(images, stack)
         try:
             yield Callbacks(on_done=count.leave_out, on_image=count.advance, on_skip=count.skip, on_wait=count.warn)
         finally:
             count.end()
 
 
-class _Images:
-    """How many images are made."""
+class _ImageCounter:
+    """Counts of images, and their display."""
 
-    def __init__(self, total: int, shown: ExitStack) -> None:
+    def __init__(self, total: int, stack: ExitStack) -> None:
         self._total = total
-        self._shown = shown
-        self._made = self._found = self._told = 0
-        self._began = time.monotonic()
+        self._shown = stack
+        self._made = self._reused = self._reported = 0
+        self._start = time.monotonic()
         self._bar: Progress | None = None
 
     def leave_out(self, images: int) -> None:
-        """Count more images that are found finished; less than 0 takes some back."""
+        """Count images of an earlier run; a negative number subtracts images that must be made again."""
         self._total -= images
-        self._found += images
+        self._reused += images
 
     def advance(self) -> None:
-        """Show that one more image is made, and the mean rate: a cluster reports the images of a shard at once."""
+        """Count one new image."""
         self._made += 1
-        if not self._told:
-            self._tell_found()
-        if self._bar is None and sys.stderr.isatty() and time.monotonic() - self._began > SOON_S:
+        if not self._reported:
+            self._report_reused()
+        if self._bar is None and sys.stderr.isatty() and time.monotonic() - self._start > SOON_S:
             self._bar = self._shown.enter_context(_bar())
             self._bar.add_task("images", total=self._total, rate="", left="")
         self._update()
 
     def skip(self, name: str, reason: str, images: int) -> None:
-        """Show that a picture cannot be read, and why."""
+        """Report a picture that cannot be read."""
         self._total -= images
-        self.warn(f"left out {name}: {reason}")
+        self.warn(f"skipped {name}: {reason}")
         self._update()
 
     def warn(self, sentence: str) -> None:
-        """Show what the user should know meanwhile."""
+        """Print a warning."""
         self._print(sentence, style="yellow")
 
     def end(self) -> None:
-        """Show what was found of shards that were taken up later, and what was made, where no bar does."""
-        self._tell_found()
+        """Print the final counts."""
+        self._report_reused()
         if self._bar is None:
             print(f"images {self._made}/{self._total} {self._rate():.1f}/s", file=sys.stderr)
 
-    def _tell_found(self) -> None:
-        """Show how many images were found finished in all; shards that were begun are found one after another."""
-        if self._found > self._told:
-            self._print(f"{self._found} images were found finished" + (" in all" if self._told else ""))
-            self._told = self._found
+    def _report_reused(self) -> None:
+        # Unfinished shards are resumed one after another, so that the number may rise during the run.
+        if self._reused > self._reported:
+            self._print(f"{self._reused} images exist from an earlier run" + (" in total" if self._reported else ""))
+            self._reported = self._reused
 
     def _rate(self) -> float:
-        return self._made / max(time.monotonic() - self._began, 0.1)
+        # The mean over the whole run, because a cluster reports all images of a shard at once.
+        return self._made / max(time.monotonic() - self._start, 0.1)
 
     def _update(self) -> None:
         if self._bar is None or not self._made:
             return
         rate = self._rate()
-        left = timedelta(seconds=round(max(self._total - self._made, 0) / rate))
+        remaining = timedelta(seconds=round(max(self._total - self._made, 0) / rate))
         task = self._bar.task_ids[0]
-        self._bar.update(task, completed=self._made, total=self._total, rate=f"{rate:.1f}/s", left=f"{left} left")
+        self._bar.update(task, completed=self._made, total=self._total, rate=f"{rate:.1f}/s", left=f"{remaining} left")
 
     def _print(self, sentence: str, style: str | None = None) -> None:
-        """Print a line above the bar; names in it are others', and are not obeyed."""
+        # Names of foreign files may contain control characters.
         sentence = printable(sentence)
         if self._bar is not None:
             self._bar.console.print(sentence, style=style, markup=False, highlight=False)

@@ -1,13 +1,10 @@
-"""Files below one place: a folder of this machine, or any object store that fsspec reaches.
+"""Files below one location: a folder of this machine, or an object store that fsspec supports.
 
-Rules that hold inside:
+A location is a path or a URL as the user writes it. A name is a path below it, with forward slashes. Contract:
 
-- A file is there whole or not at all. Two programs may write one name at once: the later file replaces the earlier.
-- Only files that were synchronised (`Store.sync`) are sure to survive a loss of power. To synchronise many at once
-  costs one wait, not many.
-- An object store has no rename and needs none: an object appears when its last byte has arrived.
-
-A place is a path or a URL as a user writes it; a name is a path below it, with forward slashes.
+- Writing is atomic: a file exists with all its bytes or not at all. If two programs write one name, the later wins.
+- A file survives a loss of power only after `Store.sync`. Synchronise many files at once: they share one wait.
+- An object store has no rename. An object appears when its last byte has arrived.
 """
 
 from __future__ import annotations
@@ -41,77 +38,77 @@ if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
 
 
-DESCRIPTION: Final = "dataset.json"  # Name of the file that marks a place as a complete dataset; it is written last
+DESCRIPTION: Final = "dataset.json"  # Marks a complete data set, so it is written last
 
 
-def is_remote(place: str) -> bool:
-    """Return whether `place` is a URL of a store and not a path of this machine (file:// is a path)."""
-    scheme, found, _ = place.partition("://")
-    return bool(found) and scheme not in ("file", "local")
+def is_remote(location: str) -> bool:
+    """Return whether `location` is the URL of a store; file:// is a path of this machine."""
+    scheme, separator, _ = location.partition("://")
+    return bool(separator) and scheme not in ("file", "local")
 
 
-def local_path(place: str | Path) -> Path:
-    """Return the path of a place of this machine, of which file:// may be the first part; it ends in a name."""
-    text = str(place)
+def local_path(location: str | Path) -> Path:
+    """Return the path of a location of this machine, without file:// and with a last component."""
+    text = str(location)
     for scheme in ("file://", "local://"):
         text = text.removeprefix(scheme)
     path = Path(text)
     if text and path.name in ("", ".."):
         path = path.resolve()
     if not path.name:
-        raise InputError(f"{str(place)!r} names no place; name a folder, such as dataset")
+        raise InputError(f"{str(location)!r} is not a folder name, expected a name such as dataset; give one")
     return path
 
 
 def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
-    """Return the store of a URL, by fsspec, and the path in it."""
+    """Return the fsspec file system of a URL, and the path in it."""
     from fsspec.core import url_to_fs
 
     try:
         return url_to_fs(url)
     except Exception as error:
-        # A store may connect here, and has errors of its own (ftplib's are no OSError).
+        # A store may connect here and raise its own errors; those of ftplib are not OSError.
         reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
-            f"cannot reach {url}: {reason}; name a store that fsspec knows, and install its library (s3://: s3fs, "
-            "gs://: gcsfs, az://: adlfs)"
+            f"cannot open the store {url}: {reason}; use a store that fsspec supports, and install its library (s3://: "
+            "s3fs, gs://: gcsfs, az://: adlfs)"
         ) from error
 
 
-Pieces = Iterable[bytes | memoryview]  # A file's bytes in order; a piece is valid until the next is asked for
+Pieces = Iterable[bytes | memoryview]  # The bytes of a file in order; each piece is valid until the next one
 
-# Files synchronised at a time: a file system commits its journal once for all that wait, so that sixteen waits cost
-# little more than one.
+# Files that are synchronised in parallel. A file system commits its journal once for all waiting files, so 16 waits
+# take little longer than one.
 _SYNC_THREADS: Final = 16
 
-# Bytes that are gathered before they are written; larger pieces are written as they are. Python asks the system twice
-# for a size where none is given, and each question hands the interpreter's lock to another thread.
+# Buffer size in bytes; larger pieces are written directly. Without a size Python makes two system calls to get one,
+# and each call may pass the interpreter lock to another thread.
 _BUFFER: Final = 1 << 16
 
-# Stores by fsspec's names in which a file lies in a folder that has to be there; an object store might make a bucket
-# of it.
+# Protocols of fsspec with real folders, which must exist before a file is written. Other stores are not asked for
+# folders, because some would create a bucket.
 _WITH_FOLDERS: Final = frozenset({"ftp", "sftp", "ssh", "smb", "webdav", "webdavs", "hdfs", "arrow_hdfs"})
 
 
 @dataclass(frozen=True)
 class LocalStore:
-    """A folder of this machine. The folder itself is never made here: a dataset that was finished stays finished."""
+    """A folder of this machine. It is not created here, so that late writes cannot change a completed data set."""
 
     root: Path
 
     @property
-    def place(self) -> str:
-        """The folder, for messages and records."""
+    def location(self) -> str:
+        """The folder, for messages."""
         return str(self.root)
 
     def put(self, name: str, data: bytes | Pieces) -> None:
-        """Write a file; a StorageError says why it cannot be."""
+        """Write a file; raises StorageError."""
         with self.create(name) as stream:
             for piece in (data,) if isinstance(data, bytes) else data:
                 stream.write(piece)
 
     def append(self, name: str, data: bytes) -> None:
-        """Add to the end of a file, made where it is missing; a kill or a full disk may cut what is added."""
+        """Append to a file, or create it; not atomic, so a kill or a full disk may truncate the addition."""
         path = self.root / name
         try:
             if not path.parent.is_dir():
@@ -123,9 +120,9 @@ class LocalStore:
 
     @contextmanager
     def create(self, name: str) -> Generator[BinaryIO]:
-        """Open a file to be written; it appears when the block ends well, and is on the disk once synchronised."""
+        """Open a new file for writing; it appears at the end of the block, unless the block raises."""
         path = self.root / name
-        # Named by chance, because two programs may be at the same shard; see `foundation.files.is_partial`.
+        # A random name, because two programs may write the same shard; see `foundation.files.is_partial`.
         hidden = partial_path(path.with_name(f"{path.name}.{secrets.token_hex(8)}"))
         try:
             try:
@@ -145,50 +142,50 @@ class LocalStore:
 
     def _make_folder(self, folder: Path) -> None:
         if not self.root.is_dir():
-            raise StorageError(f"{self.root} is gone: the dataset was finished or removed meanwhile")
+            raise StorageError(f"{self.root} was completed or removed by another program; run the same command again")
         folder.mkdir(parents=True, exist_ok=True)
 
     def sync(self, names: Iterable[str]) -> None:
-        """Wait until these files and their names are on the disk."""
+        """Wait until these files and their folder entries are on the disk."""
         paths = [self.root / name for name in names]
-        list(_syncing().map(_sync_file, paths))
+        list(_sync_pool().map(_sync_file, paths))
         for folder in {path.parent for path in paths}:
             sync_folder(folder)
 
     def get(self, name: str) -> bytes:
-        """Return a file's bytes; a FormatError says why they cannot be read."""
+        """Return the bytes of a file; raises FormatError."""
         with self.open(name) as stream:
             return stream.read()
 
     @contextmanager
     def open(self, name: str) -> Generator[BinaryIO]:
-        """Open a file to be read in order; a FormatError says why it cannot be."""
+        """Open a file for sequential reading; raises FormatError."""
         try:
-            # A dataset may be a stranger's, and its lists may name anything.
+            # Lists of a foreign data set may contain any name, so names that leave the folder are refused.
             with open_inside(self.root, name) as stream:
                 yield stream
         except OSError as error:
-            raise reading_error(self.root / name, error, "make the dataset again") from error
+            raise reading_error(self.root / name, error, "make the data set again") from error
 
     def has(self, name: str) -> bool:
-        """Return whether there is such a file."""
+        """Return whether the file exists."""
         try:
             return is_inside_name(name) and (self.root / name).is_file()
         except OSError as error:
-            raise reading_error(self.root / name, error, "see that it may be read") from error
+            raise reading_error(self.root / name, error, "check its permissions") from error
 
     def names(self, folder: str = "") -> Iterator[str]:
-        """Return the names of all files below `folder`, in no order; writes that never finished are left out."""
+        """Yield the names of all complete files below `folder`, in no order."""
         for path, _, files in os.walk(self.root / folder):
             below = Path(path).relative_to(self.root)
             yield from ((below / file).as_posix() for file in files if not is_partial(file))
 
     def remove(self, folder: str) -> None:
-        """Remove a folder with all that is below it, if it is there."""
+        """Remove a folder and its content, if it exists."""
         shutil.rmtree(self.root / folder, ignore_errors=True)
 
     def sweep(self) -> None:
-        """Remove writes that never finished; nobody else may be writing."""
+        """Remove incomplete files; no other program may be writing."""
         for path, _, files in os.walk(self.root):
             for file in files:
                 if is_partial(file):
@@ -196,14 +193,14 @@ class LocalStore:
 
 
 @lru_cache(maxsize=1)
-def _syncing() -> ThreadPoolExecutor:
-    """Return the threads that synchronise files: to start them for a few files takes as long as the files do."""
+def _sync_pool() -> ThreadPoolExecutor:
+    # Kept, because starting the threads takes as long as synchronising a few files.
     return ThreadPoolExecutor(_SYNC_THREADS, "sync")
 
 
 if hasattr(os, "register_at_fork"):
-    # A program that is forked has none of them.
-    os.register_at_fork(after_in_child=_syncing.cache_clear)
+    # A forked process does not inherit the threads.
+    os.register_at_fork(after_in_child=_sync_pool.cache_clear)
 
 
 def _sync_file(path: Path) -> None:
@@ -219,7 +216,7 @@ def _sync_file(path: Path) -> None:
 
 @dataclass(frozen=True)
 class RemoteStore:
-    """A place of an object store."""
+    """A location in an object store."""
 
     url: str
 
@@ -227,13 +224,13 @@ class RemoteStore:
         _ = self._root
 
     @property
-    def place(self) -> str:
-        """The URL, for people: user, password and other secrets in it are masked."""
+    def location(self) -> str:
+        """The URL for messages; passwords and other secrets are masked."""
         return masked(self.url.rstrip("/"))
 
     @property
     def _files(self) -> AbstractFileSystem:
-        # Asked for each time: fsspec keeps one for each URL, and what is sent to a worker must not hold one.
+        # Not stored, because this object is sent to workers and a file system is not; fsspec caches one for each URL.
         return filesystem(self.url)[0]
 
     @property
@@ -242,14 +239,14 @@ class RemoteStore:
 
     def put(self, name: str, data: bytes | Pieces) -> None:
         """Write an object."""
-        whole = data if isinstance(data, bytes) else joined(data)
+        content = data if isinstance(data, bytes) else join_pieces(data)
         with self._translated_errors(name):
-            self._write(name, lambda files, path: files.pipe_file(path, whole))
+            self._write(name, lambda files, path: files.pipe_file(path, content))
 
     @contextmanager
     def create(self, name: str) -> Generator[BinaryIO]:
-        """Open a temporary file to be written; it becomes the object when the block ends well."""
-        # Objects are sent from a file of this machine, so that a block that fails sends nothing.
+        """Open a new object for writing; it is sent at the end of the block, unless the block raises."""
+        # A temporary file of this machine holds the bytes, so that a failed block sends nothing.
         with tempfile.NamedTemporaryFile(prefix="crop-") as stream:
             yield cast("BinaryIO", stream)
             stream.flush()
@@ -257,34 +254,34 @@ class RemoteStore:
                 self._write(name, lambda files, path: files.put_file(stream.name, path))
 
     def sync(self, names: Iterable[str]) -> None:
-        """Return at once: a store that accepted an object keeps it."""
+        """Do nothing: a store keeps every object that it has accepted."""
         del names
 
     def get(self, name: str) -> bytes:
-        """Return an object's bytes."""
-        _require_inside(self.place, name)
+        """Return the bytes of an object; raises FormatError."""
+        _require_inside(self.location, name)
         with self._translated_errors(name, reading=True):
             return self._files.cat_file(self._path(name))
 
     @contextmanager
     def open(self, name: str) -> Generator[BinaryIO]:
-        """Open an object to be read."""
-        _require_inside(self.place, name)
+        """Open an object for reading; raises FormatError."""
+        _require_inside(self.location, name)
         with self._translated_errors(name, reading=True):
             stream = self._files.open(self._path(name), "rb")
         with stream:
             yield stream
 
     def has(self, name: str) -> bool:
-        """Return whether there is such an object."""
+        """Return whether the object exists."""
         with self._translated_errors(name, reading=True):
             return self._files.exists(self._path(name))
 
     def names(self, folder: str = "") -> Iterator[str]:
         """Return the names of all objects below `folder`."""
         with self._translated_errors(folder, reading=True):
-            found = self._files.find(self._path(folder))
-        return (path[len(self._root) :].lstrip("/") for path in found)
+            paths = self._files.find(self._path(folder))
+        return (path[len(self._root) :].lstrip("/") for path in paths)
 
     def remove(self, folder: str) -> None:
         """Remove all objects below `folder`."""
@@ -293,7 +290,6 @@ class RemoteStore:
                 self._files.rm(self._path(folder), recursive=True)
 
     def _write(self, name: str, write: Callable[[AbstractFileSystem, str], object]) -> None:
-        """Write an object; where a store has folders, those above it are made when they are missing."""
         files, path = self._files, self._path(name)
         try:
             write(files, path)
@@ -317,42 +313,40 @@ class RemoteStore:
             reason = masked(" ".join(f"{type(error).__name__}: {error}".split()))
             if reading:
                 raise FormatError(
-                    f"cannot read {self.place}/{name}: {reason}; check the address and that you may read there"
+                    f"cannot read {self.location}/{name}: {reason}; check the address and your permission to read"
                 ) from error
             raise StorageError(
-                f"cannot write {self.place}/{name}: {reason}; check the address and that you may write there, then run "
-                "the same command again"
+                f"cannot write {self.location}/{name}: {reason}; check the address and your permission to write, then "
+                "run the same command again"
             ) from error
 
 
-def _require_inside(place: str, name: str) -> None:
+def _require_inside(location: str, name: str) -> None:
     if not is_inside_name(name):
         raise FormatError(
-            f"{place}: {name!r} is no name of a file inside the dataset; it is damaged, or not to be trusted"
+            f"{location}: {name!r} is not a file name inside the data set; get it again from a trusted source"
         )
 
 
-Store = LocalStore | RemoteStore  # Files below one place
+Store = LocalStore | RemoteStore  # Files below one location
 
 
 def read_bounded(store: Store, name: str, most_bytes: int) -> bytes:
-    """Return the bytes of a file; a FormatError says why they cannot be read, or that there are more than expected."""
+    """Return the bytes of a file; raises FormatError if it cannot be read or is larger than `most_bytes`."""
     with store.open(name) as stream:
         data = stream.read(most_bytes + 1)
     if len(data) > most_bytes:
-        raise FormatError(
-            f"{store.place}/{name} has more than {most_bytes} bytes, which no dataset's has; it is damaged"
-        )
+        raise FormatError(f"{store.location}/{name} is damaged: it has more than {most_bytes} bytes; copy it again")
     return data
 
 
-def joined(pieces: Pieces) -> bytes:
-    """Return pieces of a file as one."""
+def join_pieces(pieces: Pieces) -> bytes:
+    """Return the pieces of a file as one object."""
     return b"".join([bytes(piece) for piece in pieces])
 
 
-def open_store(place: str | Path) -> Store:
-    """Return the store at a path or URL; nothing is looked at yet."""
-    if isinstance(place, str) and is_remote(place):
-        return RemoteStore(place)
-    return LocalStore(local_path(place))
+def open_store(location: str | Path) -> Store:
+    """Return the store of a path or URL without accessing it."""
+    if isinstance(location, str) and is_remote(location):
+        return RemoteStore(location)
+    return LocalStore(local_path(location))

@@ -1,1 +1,1 @@
-"""Datasets: read, made, stored."""
+"""Data sets: planning, generating, storing and reading."""

@@ -1,8 +1,7 @@
-"""The texts beside a dataset: its card and its datasheet.
+"""The card and the datasheet of a data set.
 
-`README.md` is a dataset card as the Hugging Face Hub reads it, `DATASHEET.md` answers the questions of Gebru et al.,
-"Datasheets for Datasets", Communications of the ACM 64 (2021). What only the makers of a dataset know is marked as
-open.
+`README.md` is a card for the Hugging Face Hub. `DATASHEET.md` answers the questions of Gebru et al., "Datasheets for
+Datasets", Communications of the ACM 64 (2021). Questions that only the authors of a data set can answer are marked.
 """
 
 from __future__ import annotations
@@ -20,111 +19,110 @@ from generator.dataset.layouts import LAYOUTS
 from generator.dataset.records import DATASHEET, Description, one_line, table_cell
 from generator.files import FULL, suffix_of
 
-OPEN: Final = "**TO BE ANSWERED BY THE LAB.**"  # What stands where only the makers of a dataset know the answer
+OPEN: Final = "**TO BE ANSWERED BY THE LAB.**"  # Marks questions that only the authors can answer
 
 
 def uncertainty_of(description: Description) -> str:
-    """Return in a sentence how well the lights are known."""
-    known = [light.uncertainty_deg for light in description.lights if light.uncertainty_deg is not None]
-    if not known:
-        return "The table does not state what its lights may be off by."
+    """Return sentences on the uncertainty of the ground truths."""
+    uncertainties = [light.uncertainty_deg for light in description.lights if light.uncertainty_deg is not None]
+    if not uncertainties:
+        return "The LUT does not report the uncertainty of its ground truths."
     return (
-        f"By the table's uncertainty budget the directions of its lights are known to {median(known):.2g}° in the "
-        f"median and {max(known):.2g}° at worst (expanded uncertainty, k = 2, about 95 % of lights; `uncertainty_deg` "
-        "in `dataset.json`). Differences between methods below that are none."
+        "The LUT reports the expanded uncertainty (k = 2, about 95 %) of its ground truths: "
+        f"{median(uncertainties):.2g}° in the median and {max(uncertainties):.2g}° at most (`uncertainty_deg` in "
+        "`dataset.json`). Smaller differences between methods are not significant."
     )
 
 
 def name_of(description: Description) -> str:
-    """Return what the dataset is called until its makers name it."""
+    """Return the default name of the data set."""
     return f"CroP images of the {one_line(description.table.camera)}, {counted(description.images, 'image')}"
 
 
 def kind_of(description: Description) -> str:
-    """Return in words whether colours were photographed, simulated or computed: no reader may take one for another."""
+    """Return a sentence on the origin of the colours: photographed, simulated or computed."""
     table = description.table
     if table.computed is not None:
-        return "The table behind them was computed from spectra and a model of the sensor; nothing was photographed."
+        return "Their LUT was computed from spectra and a model of the sensor; nothing was photographed."
     rig = None if table.origin is None else table.origin.rig
     if rig == "simulated":
-        return "The table behind them was taken in a simulated laboratory; nothing was photographed."
+        return "Their LUT was made in a simulated laboratory; nothing was photographed."
     if rig is None:
-        return "The table behind them does not record whether its frames were photographed or simulated."
-    return "The table behind them was made from raw frames of a printed chart under a projector's lights."
+        return "Their LUT does not record whether its frames were photographed or simulated."
+    return "Their LUT was made from raw frames of a printed chart under illuminants from a projector."
 
 
 def summary_of(description: Description) -> str:
-    """Return what the images are, in two sentences."""
+    """Return sentences on the content of the images."""
     table = description.table
     return (
-        f"{counted(description.images, 'image')} of linear camera RGB as the raw sensor of the "
-        f"{one_line(table.camera)} would "
-        "give them, each with the exact colour of its light. Black is 0, saturation "
-        f"{table.white_level}; nothing is white balanced. {kind_of(description)}"
+        f"{counted(description.images, 'image')} in linear camera RGB, as the raw sensor of the "
+        f"{one_line(table.camera)} would record them, each with the exact colour of its illuminant. Black is 0, the "
+        f"saturation level is {table.white_level}; images are not white balanced. {kind_of(description)}"
     )
 
 
 def brightness_note(description: Description) -> str:
-    """Return why a reader that knows nothing of raw images shows them as it does, and what to do about it."""
+    """Return a note on the brightness of the images in programs that assume full-range images."""
     white = description.table.white_level
     if option(description, "format") == "dng":
-        return "Images are raw files: open them with a raw developer."
+        return "Images are raw files; open them with a raw developer."
     return (
-        f"A reader that takes {FULL} for white, as WebDataset's decoders, imageio and image viewers do, shows them "
-        f"nearly black: {white} is white here. Divide by {white} after decoding all 16 bits. Previews show "
-        "what they look like."
+        f"The saturation level is {white}. Programs that assume {FULL}, such as decoders of WebDataset, imageio and "
+        f"image viewers, show images nearly black. Divide by {white} after decoding all 16 bits. Previews show the "
+        "content."
     )
 
 
 def origin_table(description: Description) -> list[tuple[str, str]]:
-    """Return what the table says of its origin, names and values; what it does not say is "not recorded"."""
+    """Return names and values of the origin of the LUT; missing values are "not recorded"."""
     return [(name, one_line(value)) for name, value in origin_lines(description.table.origin)]
 
 
 def citation_of(description: Description) -> str:
-    """Return a BibTeX entry of the table."""
+    """Return a BibTeX entry of the LUT."""
     table = description.table
     computed = table.computed is not None
     return bibtex(table.camera, table.lights, table.software, table.sha256, table.origin, computed)
 
 
 def truth_of(description: Description) -> str:
-    """Return in words where the ground truth comes from."""
+    """Return a sentence on the source of the ground truth."""
     if description.table.computed is not None:
-        return "it is what the model of the sensor answers to bare paper under the light's spectrum."
-    return "it is the mean of the white references that lie among the colours, under the same light."
+        return "it is the response of the sensor model to bare paper under the spectrum of the illuminant."
+    return "it is the mean of the white references among the patches, under the same illuminant."
 
 
 def pixels_of(description: Description) -> str:
-    """Return in words how a pixel comes from the table's samples, by the rendering of the dataset."""
+    """Return sentences on the rendering of a pixel from the samples of the LUT."""
     samples = description.table.samples
     if option(description, "rendering") is None:
         return (
-            f"Each pixel is one of the {samples} samples that the table has of its colour, drawn by the seed; where "
-            "lights mix, one of each."
+            f"Each pixel is one of the {samples} samples of its colour in the LUT, drawn with the seed; for mixed "
+            "illuminants one sample of each is combined."
         )
     return (
-        "Each pixel is the mean of its colour, interpolated between cells of the table, plus the deviation of one of "
-        f"the {samples} samples of the nearest cell from their mean, drawn by the seed and scaled to the noise at that "
-        "level; where lights mix, of each."
+        "Each pixel is the mean of its colour, interpolated between patches of the LUT, plus noise. The noise is the "
+        f"deviation of one of the {samples} samples of the nearest patch from their mean, drawn with the seed and "
+        "scaled to the noise at that level; for mixed illuminants the deviations of each are combined."
     )
 
 
 def noise_of(description: Description) -> str:
-    """Return in words how many electrons a count is and what noise a sample has, as far as the table says it."""
-    green = "Green is the mean of two photosites, so that its noise has half the variance of one."
+    """Return sentences on gain and noise, as far as the LUT records them."""
+    green = "Green is the mean of two photosites, so its noise has half the variance of one photosite."
     table = description.table
     if table.computed is None:
-        return f"Gain and read noise are in `report.html` of the table, as measured. {green}"
+        return f"Measured gain and read noise are in `report.html` of the LUT. {green}"
     try:
         body, iso = table.computed["body"], float(table.computed["exposure"]["iso"])
         gain, read, early = (float(body[name]) for name in ("electrons_per_dn", "read_noise_dn", "sensor_noise_e"))
     except (KeyError, TypeError, ValueError):
-        return f"The table does not state gain and read noise. {green}"
+        return f"The LUT does not record gain and read noise. {green}"
     return (
-        f"In the model of the sensor a count is {gain * 100 / iso:.4g} electrons at its ISO {iso:g}; "
-        f"at ISO 100 it is {gain:.4g}, and the read noise of a photosite {read:.4g} counts, of which {early:.4g} "
-        f"electrons arise before the amplifier. {green}"
+        f"In the model of the sensor, one count is {gain * 100 / iso:.4g} electrons at its ISO {iso:g}. "
+        f"At ISO 100 one count is {gain:.4g} electrons, and the read noise of a photosite is {read:.4g} counts, of "
+        f"which {early:.4g} electrons arise before the amplifier. {green}"
     )
 
 
@@ -133,17 +131,17 @@ def _procedure(description: Description) -> str:
     name = one_line(table_title(table.camera, table.lights, table.origin, table.computed is not None))
     if table.computed is not None:
         return (
-            f"{name}: samples of all colours of a chart were computed under known lights. No frame was taken, and "
-            "there is no report; `computed` under `table` in `dataset.json` has the model and its settings."
+            f"{name}: samples of all colours of a chart were computed under known illuminants. No frame was taken, and "
+            "there is no report. The model and its settings are in `dataset.json`, as `computed` of `table`."
         )
     return (
-        f"A chart of all colours under known lights: {name}. The table's report has the verdict on it and every figure "
-        "with its limit."
+        f"A chart of all colours was photographed under known illuminants: {name}. The report of the LUT has the "
+        "verdict and every figure with its limit."
     )
 
 
 def option(description: Description, name: str) -> Any:
-    """Return an option as `dataset.json` has it; None where it was off."""
+    """Return an option as in `dataset.json`; None if it was not used."""
     return description.options.get(name)
 
 
@@ -152,16 +150,16 @@ def datasheet(description: Description) -> str:
     template = Template((Path(__file__).parent / "datasheet.md").read_text("utf-8"))
     table, origin = description.table, dict(origin_table(description))
     authors = "" if table.origin is None else "; ".join(table.origin.authors)
-    splits = "; ".join(f"{part}: {images} images" for part, images in description.splits.items())
+    splits = "; ".join(f"{split}: {images} images" for split, images in description.splits.items())
     by_colour = option(description, "rendering") is not None
-    rendering = "by codes: a picture's 8-bit sRGB value is the code of a printed cell"
+    rendering = "by codes: the 8-bit sRGB value of a picture is the code of a printed patch"
     answers: dict[str, object] = {
-        "authors": f"The table: {authors}. The dataset: {OPEN}" if authors else OPEN,
+        "authors": f"The LUT: {authors}. The data set: {OPEN}" if authors else OPEN,
         "camera": table.camera,
         "citation": citation_of(description),
-        "dates": "No frame was taken for the table."
+        "dates": "No frame was taken for the LUT."
         if table.computed is not None
-        else f"The table's frames: {origin['Dates']}.",
+        else f"The frames of the LUT: {origin['Dates']}.",
         "format": option(description, "format"),
         "images": counted(description.images, "image"),
         "kind": kind_of(description),
@@ -175,18 +173,18 @@ def datasheet(description: Description) -> str:
         "pixels": description.pixels,
         "pixels_are": pixels_of(description),
         "procedure": _procedure(description),
-        "rendering": "colorimetrically, interpolated between the cells of the chart" if by_colour else rendering,
+        "rendering": "colorimetrically, interpolated between the patches of the chart" if by_colour else rendering,
         "replaced": description.replaced_pixels,
-        "repeats": "Each picture is in one image."
+        "repeats": "Each picture is used in one image."
         if description.images <= description.sources
-        else "Images of one picture repeat it, or parts of it, under another light or with other noise.",
+        else "Images of one picture show it, or parts of it, under different illuminants or with different noise.",
         "seed": description.seed,
         "skipped": len(description.skipped),
         "software": description.software,
         "sources": description.sources,
-        "splits": f"{splits}. All images of a picture are in one part."
+        "splits": f"{splits}. All images of a picture are in one split."
         if splits
-        else "None; keep all images of a picture in one part.",
+        else "None; keep all images of a picture in one split.",
         "summary": summary_of(description),
         "table": table.sha256,
         "table_software": table.software,
@@ -194,11 +192,11 @@ def datasheet(description: Description) -> str:
         "uncertainty": uncertainty_of(description),
         "white_level": table.white_level,
     }
-    # The makers of the dataset are asked for whether or not those of the table are known.
+    # One more than in the template, because `authors` always has an open question on the data set.
     return template.substitute(answers, count=template.template.count("${open}") + 1)
 
 
-# Numbers of images below which a data set is of a size category of the Hub.
+# Size categories of the Hugging Face Hub, with their upper limit in images.
 _SIZES = (
     (1_000, "n<1K"),
     (10_000, "1K<n<10K"),
@@ -213,31 +211,31 @@ _TAGS = ("color-constancy", "white-balance", "illumination-estimation", "raw-ima
 
 
 def size_category(images: int) -> str:
-    """Return the Hub's size category of a number of images."""
+    """Return the size category of the Hugging Face Hub."""
     return next((name for limit, name in _SIZES if images < limit), "1B<n<10B")
 
 
 def card(description: Description) -> str:
-    """Return the text of README.md; the licence is left open, for pictures have one of their own."""
+    """Return the text of README.md; the licence is open, because it depends on the licences of the pictures."""
     lights = "".join(f"| {light.illumination} | {light.cell} |\n" for light in description.lights[:20])
-    more = f"\nand {len(description.lights) - 20} more in `dataset.json`.\n" if len(description.lights) > 20 else ""
+    rest = f"\nand {len(description.lights) - 20} more in `dataset.json`.\n" if len(description.lights) > 20 else ""
     origin = "".join(f"| {name} | {table_cell(value)} |\n" for name, value in origin_table(description))
-    splits = ", ".join(f"{part} {images}" for part, images in description.splits.items()) or "not divided"
+    splits = ", ".join(f"{split} {images}" for split, images in description.splits.items()) or "not divided"
     return (
         f"---\n{_front_matter(description)}---\n\n# {name_of(description)}\n\n{summary_of(description)}\n\n"
-        f"- **Images**: {description.images}, of {description.sources} pictures; parts: {splits}\n"
-        f"- **Ground truth**: `ground_truth.csv`, r + g + b = 1, a row a light; `gt.txt`, a line an image\n"
-        f"- **Made by** {description.software}, seed {description.seed}; `dataset.json` has enough to make every byte "
-        f"again, `SHA256SUMS` the hash of every file but this one and `{DATASHEET}`\n"
+        f"- **Images**: {description.images}, of {description.sources} pictures; splits: {splits}\n"
+        "- **Ground truth**: `ground_truth.csv`, r + g + b = 1, one row for each illuminant; `gt.txt`, one line for "
+        f"each image\n- **Made by** {description.software}, seed {description.seed}; `dataset.json` has the settings "
+        f"to reproduce every byte, `SHA256SUMS` the hash of every file except this one and `{DATASHEET}`\n"
         f"- **More**: [{DATASHEET}]({DATASHEET}) (Datasheets for Datasets)\n\n"
         f"## Reading\n\n{_reading(description)}\n\n{brightness_note(description)}\n\n"
         f"## Noise\n\n{pixels_of(description)} {noise_of(description)}\n\n"
-        f"## Licence\n\n**To be stated by whoever publishes**: images are made of pictures, which have licences of "
-        f"their own (`sources.csv` names them), and of the table, whose licence is in the list below. Put the result "
-        f"into the front matter, in place of `unknown`.\n\n"
-        f"## The table\n\n{kind_of(description)} Its hash is `{description.table.sha256}`.\n\n"
+        "## Licence\n\n**The publisher must state it**: images are made from pictures with their own licences (listed "
+        "in `sources.csv`) and from the LUT, whose licence is listed below. Replace `unknown` in the front matter by "
+        f"the result.\n\n"
+        f"## The LUT\n\n{kind_of(description)} Its hash is `{description.table.sha256}`.\n\n"
         f"| | |\n|---|---|\n{origin}\n"
-        f"## Lights\n\n| number | light |\n|---|---|\n{lights}{more}\n"
+        f"## Illuminants\n\n| number | illuminant |\n|---|---|\n{lights}{rest}\n"
         f"## Citation\n\n```bibtex\n{citation_of(description)}```\n"
     )
 
@@ -255,15 +253,15 @@ def _front_matter(description: Description) -> str:
 
 
 def _configs(description: Description) -> str:
-    """Return where the files of each part lie; of plain files the table of ground truths is what rows are read from."""
     layout = LAYOUTS[option(description, "layout")]
+    # With single files, the Hub reads the rows of the table of ground truths.
     if not layout.is_of_the_hub:
         files = "  - split: train\n    path: ground_truth.csv\n"
     else:
         files = "".join(
-            f"  - split: {'train' if part == 'data' else part}\n    path: {pattern}\n"
-            for part in description.parts
-            for pattern in layout.patterns([part], "")
+            f"  - split: {'train' if split == 'data' else split}\n    path: {pattern}\n"
+            for split in description.parts
+            for pattern in layout.patterns([split], "")
         )
     return f"configs:\n- config_name: default\n  data_files:\n{files}"
 
@@ -275,7 +273,7 @@ def _reading(description: Description) -> str:
     names = layout.patterns(description.parts, suffix_of(option(description, "format")))
     files = " and ".join(f"`{name.replace('*', 'NNNNNN')}`" for name in names)
     return (
-        f"{files} are linear, 16 bits where the format has them; `load_dataset` gives the rows of "
-        "`ground_truth.csv`, whose column `image` names the file. Pillow, and imageio by it, keep 8 of 16 bits of a "
-        "PNG: use `cv2.imread(path, cv2.IMREAD_UNCHANGED)` (then BGR) or `generator.open_dataset`."
+        f"{files} are linear, with 16 bits if the format supports them. `load_dataset` returns the rows of "
+        "`ground_truth.csv`; the column `image` has the file name. Pillow and imageio keep only 8 of the 16 bits of a "
+        "PNG; use `cv2.imread(path, cv2.IMREAD_UNCHANGED)` (in BGR order) or `generator.open_dataset`."
     )

@@ -1,9 +1,7 @@
-"""Layouts in which the images of a shard lie in one file, tar and Parquet.
+"""Layouts with one file for each shard: tar and Parquet; docs/formats.md describes them.
 
-docs/formats.md says what lies in a shard: POSIX.1-1988 ustar files whose members are named after the WebDataset
-specification, all with one owner, time and mode, so that equal images make equal files; or Parquet files that Hugging
-Face `datasets` reads, a row an image, which need pyarrow, the extra `parquet`. There only previews are decoded by
-themselves: Pillow, with which `datasets` would decode, keeps 8 of a 16-bit image's bits.
+Tar files (POSIX.1-1988 ustar) follow the WebDataset specification. Parquet files have one row for each image, for
+Hugging Face `datasets`, and need pyarrow (the extra `parquet`). Equal images give equal files.
 """
 
 from __future__ import annotations
@@ -19,20 +17,20 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple, Protocol, Se
 
 from foundation.errors import CropError, FormatError
 from foundation.files import HashingWriter
-from generator.dataset.records import FileSum, Sample, part_of, shard_key
-from generator.stores import Store, joined
+from generator.dataset.records import FileSum, Sample, shard_key, split_name
+from generator.stores import Store, join_pieces
 
 if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
 
-# Arguments of `__exit__`: the type, value and traceback of what ended the block, or None.
+# Type of the arguments of `__exit__`: type, value and traceback of an exception, or None.
 ExitReason = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
 
 
 def metadata_of(sample: Sample) -> dict[str, Any]:
-    """Return what a shard records of an image beside its pixels, as plain values for JSON."""
+    """Return the metadata of an image in a shard, as plain values for JSON."""
     record = sample.record
     plain: dict[str, Any] = {
         "image": record.number,
@@ -43,15 +41,15 @@ def metadata_of(sample: Sample) -> dict[str, Any]:
         "truth": list(record.truth),
         "lights": [{"illumination": light.illumination, "truth": list(light.truth)} for light in record.lights],
     }
-    # What no option asked for is no key: such datasets keep their bytes.
+    # Unused options add no key, so that such data sets keep their bytes between versions.
     return plain | {"details": record.details} if record.details else plain
 
 
 class _Container(Protocol):
-    """A file of a shard in which the files of several images lie, while it is written."""
+    """An open file of a shard that takes several images."""
 
     def append(self, sample: Sample) -> None:
-        """Write an image and what belongs to it."""
+        """Write the files of an image."""
         ...
 
     def close(self) -> None:
@@ -59,36 +57,36 @@ class _Container(Protocol):
         ...
 
     def give_up(self) -> None:
-        """Write no end of a file that will not be."""
+        """Close without completing the file, after an error."""
         ...
 
 
 class JoinedWriter:
-    """The images of a shard in one file, `data/000003.tar` or `.parquet`, or in one for each part of the dataset.
+    """Writes the images of a shard to one file for each split, such as `data/000003.tar`.
 
-    `begin` makes such a file of the stream that it is written to.
+    `start` opens a container on the stream of such a file.
     """
 
-    def __init__(self, store: Store, shard: int, ending: str, begin: Callable[[HashingWriter], _Container]) -> None:
-        self._store, self._begin = store, begin
+    def __init__(self, store: Store, shard: int, ending: str, start: Callable[[HashingWriter], _Container]) -> None:
+        self._store, self._start = store, start
         self._name = f"{shard_key(shard)}.{ending}"
         self._stack = ExitStack()
         self._open: dict[str, tuple[_Container, HashingWriter]] = {}
 
     def store(self, sample: Sample) -> Sample:
-        """Return the sample with its bytes computed: such a file takes its images one after the other."""
-        return replace(sample, files=tuple((kind, ending, (joined(data),)) for kind, ending, data in sample.files))
+        """Return the sample with computed bytes; `append` writes them, because the file is sequential."""
+        return replace(sample, files=tuple((role, ending, (join_pieces(data),)) for role, ending, data in sample.files))
 
     def append(self, sample: Sample) -> None:
-        """Write an image and what belongs to it."""
-        name = f"{part_of(sample.split)}/{self._name}"
+        """Write the files of an image."""
+        name = f"{split_name(sample.split)}/{self._name}"
         if name not in self._open:
             hashed = HashingWriter(self._stack.enter_context(self._store.create(name)))
-            self._open[name] = (self._begin(hashed), hashed)
+            self._open[name] = (self._start(hashed), hashed)
         self._open[name][0].append(sample)
 
     def close(self) -> list[FileSum]:
-        """Finish the files, bring them to the disk and return them."""
+        """Complete the files, synchronise them with the disk; return their names and hashes."""
         for container, _ in self._open.values():
             container.close()
         self._stack.close()
@@ -99,7 +97,7 @@ class JoinedWriter:
         return self
 
     def __exit__(self, *error: *ExitReason) -> None:
-        """Leave no half file behind."""
+        """Remove incomplete files."""
         for container, _ in self._open.values():
             container.give_up()
         self._stack.__exit__(*error)
@@ -108,22 +106,22 @@ class JoinedWriter:
 _INFIXES: Final = {"images": "", "previews": ".preview", "masks": ".masks", "ground_truth": ".ground_truth"}
 
 
-def _member_name(kind: str, key: str, ending: str) -> str:
-    """Return the name of a file of an image where the files of a shard lie in one: ``000123.masks_0.png``."""
-    return f"{key}{_INFIXES[kind]}{ending}"
+def _member_name(file_kind: str, key: str, ending: str) -> str:
+    return f"{key}{_INFIXES[file_kind]}{ending}"
 
 
 class _Tar:
-    """A tar file of images and what belongs to each."""
+    """A tar file of images."""
 
     def __init__(self, stream: HashingWriter) -> None:
         self._tar = tarfile.open(fileobj=cast("Any", stream), mode="w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
 
     def append(self, sample: Sample) -> None:
         text = json.dumps(metadata_of(sample), ensure_ascii=False) + "\n"
-        for kind, ending, pieces in (*sample.files, ("images", ".json", (text.encode(),))):
-            data = joined(pieces)
-            header = tarfile.TarInfo(_member_name(kind, sample.key, ending))
+        for file_kind, ending, pieces in (*sample.files, ("images", ".json", (text.encode(),))):
+            data = join_pieces(pieces)
+            # Owner, time and mode are constant, so that equal images give equal files.
+            header = tarfile.TarInfo(_member_name(file_kind, sample.key, ending))
             header.size = len(data)
             header.mode = 0o644
             self._tar.addfile(header, io.BytesIO(data))
@@ -136,11 +134,7 @@ class _Tar:
 
 
 def _read_tar(stream: BinaryIO, file: str) -> bytes | None:
-    """Return the bytes of a file in a tar file.
-
-    Only members that are plain files are looked at: a tar file may also hold links and sparse files, and claim sizes
-    that it does not have.
-    """
+    # Only plain files are read, because a foreign tar file may contain links, sparse files and false sizes.
     for name, offset, size in _members(stream):
         if name == file:
             stream.seek(offset)
@@ -149,7 +143,7 @@ def _read_tar(stream: BinaryIO, file: str) -> bytes | None:
 
 
 def _members(stream: BinaryIO) -> Iterator[tuple[str, int, int]]:
-    """Yield name, offset and size of the plain files of a tar file (POSIX.1-1988, ustar), as they follow each other."""
+    """Yield name, offset and size of the plain files of a tar file (POSIX.1-1988, ustar)."""
     end = stream.seek(0, io.SEEK_END)
     offset = 0
     while offset < end:
@@ -160,23 +154,23 @@ def _members(stream: BinaryIO) -> Iterator[tuple[str, int, int]]:
         header = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
         offset += tarfile.BLOCKSIZE
         if not 0 <= header.size <= end - offset:
-            raise tarfile.ReadError(f"{header.name!r} claims {header.size} bytes, {end - offset} are left")
+            raise tarfile.ReadError(f"{header.name!r} declares {header.size} bytes, but only {end - offset} follow")
         if header.type in (tarfile.REGTYPE, tarfile.AREGTYPE):
             yield header.name, offset, header.size
         offset += -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
 
 
-# Bytes from which a group of rows is written: what a reader has to read to get at one image.
+# Bytes after which a group of rows is written: a reader must read a whole group to get one image.
 _GROUP_BYTES: Final = 4 << 20
 
-_GROUP_ROWS: Final = 64  # Rows of a group at most: small images stay quick to reach too
+_GROUP_ROWS: Final = 64  # Largest number of rows in a group, for the same reason if images are small
 
-# Longest text in the description of a shard, of which the longest of ours are a few kilobytes.
-_MOST_THRIFT_BYTES: Final = 64 << 20
+# Limits for reading foreign files, to bound the memory. Longest text in the metadata in bytes; ours have some kB.
+_MOST_TEXT_BYTES: Final = 64 << 20
 
-_MOST_THRIFT_ITEMS: Final = 1 << 20  # Things that a list in it may hold: ours hold columns and groups, some hundred
+_MOST_LIST_ITEMS: Final = 1 << 20  # Longest list in the metadata; ours have some hundred columns and groups
 
-_MOST_ROWS: Final = 1 << 16  # Rows of a group that is read: a thousand times those that are written
+_MOST_ROWS: Final = 1 << 16  # Largest number of rows in a group; a thousand times `_GROUP_ROWS`
 
 _COLUMNS: Final = {"images": "image", "previews": "preview", "ground_truth": "ground_truth"}
 
@@ -190,7 +184,8 @@ _TRUTH = {"feature": {"dtype": "float64", "_type": "Value"}, "length": 3, "_type
 
 
 def _schema(previews: bool, maps: bool, details: bool) -> pa.Schema:
-    """Return the columns, and in their metadata the features as `datasets` reads them."""
+    # The metadata have the features for `datasets`. Only previews are decoded: `datasets` decodes with Pillow, which
+    # keeps 8 of 16 bits.
     import pyarrow as pa
 
     file = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
@@ -214,20 +209,20 @@ def _schema(previews: bool, maps: bool, details: bool) -> pa.Schema:
         ("ground_truth", file, _FILE),
     ]
     left_out = {"preview": not previews, "details": not details, "masks": not maps, "ground_truth": not maps}
-    kept = [column for column in columns if not left_out.get(column[0])]
-    features = {name: feature for name, _, feature in kept}
+    used_columns = [column for column in columns if not left_out.get(column[0])]
+    features = {name: feature for name, _, feature in used_columns}
     info = json.dumps({"info": {"features": features}})
-    return pa.schema([(name, kind) for name, kind, _ in kept]).with_metadata({"huggingface": info})
+    return pa.schema([(name, data_type) for name, data_type, _ in used_columns]).with_metadata({"huggingface": info})
 
 
 class _Parquet:
-    """A Parquet file with one row an image."""
+    """A Parquet file with one row for each image."""
 
     def __init__(self, stream: HashingWriter, columns: pa.Schema) -> None:
         import pyarrow.parquet as pq
 
         self._schema = columns
-        # Images are compressed already, and the few numbers beside them are not worth a reader's trouble.
+        # Images are already compressed, and compressing the few other values would save little.
         self._writer: pq.ParquetWriter = pq.ParquetWriter(
             stream, self._schema, compression="none", use_dictionary=False, write_statistics=["number"]
         )
@@ -239,14 +234,14 @@ class _Parquet:
         row: dict[str, Any] = {"number": metadata.pop("image"), **metadata, "masks": []}
         if "details" in row:
             row["details"] = json.dumps(row["details"], ensure_ascii=False)
-        for kind, ending, pieces in sample.files:
-            data = joined(pieces)
+        for file_kind, ending, pieces in sample.files:
+            data = join_pieces(pieces)
             self._size += len(data)
             file = {"bytes": data, "path": f"{sample.key}{ending}"}
-            if kind == "masks":
+            if file_kind == "masks":
                 row["masks"].append(file)
             else:
-                row[_COLUMNS[kind]] = file
+                row[_COLUMNS[file_kind]] = file
         self._rows.append(row)
         if self._size >= _GROUP_BYTES or len(self._rows) >= _GROUP_ROWS:
             self._flush()
@@ -267,41 +262,41 @@ class _Parquet:
 
 
 def _cell_of(file: str) -> tuple[str, int | None]:
-    """Return the column that has a file, named as in a tar file, and its place where it is one of several."""
-    kind = file.split(".")[1:-1]
-    if not kind:
+    # The column of a file that is named as in a tar file, and its index if the column has a list.
+    infix = file.split(".")[1:-1]
+    if not infix:
         return "image", None
-    name, several, place = kind[0].partition("masks_")
-    return ("masks", int(place)) if several else (name, None)
+    name, several, index = infix[0].partition("masks_")
+    return ("masks", int(index)) if several else (name, None)
 
 
 def _read_parquet(stream: BinaryIO, file: str) -> bytes | None:
     import pyarrow.parquet as pq
 
     number = int(file.partition(".")[0])
-    column, place = _cell_of(file)
+    column, index = _cell_of(file)
     size = stream.seek(0, 2)
     table = pq.ParquetFile(
-        stream, thrift_string_size_limit=_MOST_THRIFT_BYTES, thrift_container_size_limit=_MOST_THRIFT_ITEMS
+        stream, thrift_string_size_limit=_MOST_TEXT_BYTES, thrift_container_size_limit=_MOST_LIST_ITEMS
     )
     for group in range(table.num_row_groups):
-        # Our writer compresses nothing: a group that claims more than the file has is none of ours.
-        known = table.metadata.row_group(group)
-        if not (0 <= known.num_rows <= _MOST_ROWS and 0 <= known.total_byte_size <= 2 * size + 65536):
-            raise ValueError(f"it claims {known.num_rows} rows of {known.total_byte_size} bytes in a group")
+        # Our files are not compressed, so a group that declares more bytes than the file is damaged or foreign.
+        row_group = table.metadata.row_group(group)
+        if not (0 <= row_group.num_rows <= _MOST_ROWS and 0 <= row_group.total_byte_size <= 2 * size + 65536):
+            raise ValueError(f"a group declares {row_group.num_rows} rows of {row_group.total_byte_size} bytes")
         numbers = table.read_row_group(group, ["number"]).column("number").to_pylist()
         if number in numbers:
             cells = table.read_row_group(group, [column]).column(column).to_pylist()
             cell = cells[numbers.index(number)]
-            data = (cell if place is None else cell[place])["bytes"]
+            data = (cell if index is None else cell[index])["bytes"]
             if not isinstance(data, bytes):
-                raise ValueError(f"{file} is no file")
+                raise ValueError(f"{file} has no bytes")
             return data
     return None
 
 
-class Beside(NamedTuple):
-    """What a dataset has beside images and their lights: previews, maps of several lights, what options did."""
+class Extras(NamedTuple):
+    """Optional content of a data set: previews, maps of several illuminants, details of each image."""
 
     previews: bool
     maps: bool
@@ -310,31 +305,23 @@ class Beside(NamedTuple):
 
 @dataclass(frozen=True)
 class JoinedLayout:
-    """A layout in which the images of a shard lie in one file.
+    """A layout with one file for each shard."""
 
-    - `ending`: of the name of such a file.
-    - `begin`: begins one on a stream.
-    - `read`: returns the bytes of an image's file that lies in one, named as in a tar file (``000123.masks_0.png``);
-      None where it has no such. Whatever else it raises says that the file is damaged.
-    - `library`: by which it is written and read; "" where Python suffices.
-    - `is_of_the_hub`: whether Hugging Face's `load_dataset` finds the images in it; else it finds the table of lights.
-    - `reading`: for the dataset's card, how images are read without losing bits.
-    """
-
-    ending: str
-    begin: Callable[[HashingWriter, Beside], _Container]
+    ending: str  # of the file name
+    start: Callable[[HashingWriter, Extras], _Container]  # opens a container on a stream
+    # Returns the bytes of a file named as in a tar file (``000123.masks_0.png``), or None; raises if damaged.
     read: Callable[[BinaryIO, str], bytes | None]
-    library: str
-    is_of_the_hub: bool
-    reading: str
+    library: str  # required Python library, or ""
+    is_of_the_hub: bool  # `load_dataset` of Hugging Face reads the images; else it reads the table of ground truths
+    reading: str  # text of the card: how to read images with all bits
 
-    def open_writer(self, store: Store, shard: int, beside: Beside) -> JoinedWriter:
+    def open_writer(self, store: Store, shard: int, extras: Extras) -> JoinedWriter:
         """Return the writer of a shard."""
-        return JoinedWriter(store, shard, self.ending, lambda stream: self.begin(stream, beside))
+        return JoinedWriter(store, shard, self.ending, lambda stream: self.start(stream, extras))
 
-    def name_of(self, kind: str, part: str, shard: int, key: str, ending: str) -> str:
-        """Return the name of an image's file: that of its shard in the dataset, and its own in there."""
-        return f"{part}/{shard_key(shard)}.{self.ending}/{_member_name(kind, key, ending)}"
+    def name_of(self, file_kind: str, split_name: str, shard: int, key: str, ending: str) -> str:
+        """Return the name of a file of an image: the file of its shard, and the name inside."""
+        return f"{split_name}/{shard_key(shard)}.{self.ending}/{_member_name(file_kind, key, ending)}"
 
     def get(self, store: Store, name: str) -> bytes:
         """Return the bytes of a file by its name."""
@@ -345,23 +332,23 @@ class JoinedLayout:
             except CropError:
                 raise
             except Exception as error:
-                # Whatever a foreign file makes of the library: its own errors, and those of values that are missing.
+                # A damaged file may raise any error of the library, or one about missing values.
                 reason = " ".join(f"{type(error).__name__}: {error}".split())
-                raise FormatError(f"{store.place}/{container} is damaged: {reason}; make the dataset again") from error
+                raise FormatError(f"{store.location}/{container} is damaged: {reason}; copy it again") from error
         if data is None:
-            raise FormatError(f"{store.place}/{container} holds no {file}; make the dataset again")
+            raise FormatError(f"{store.location}/{container} lacks the listed file {file}; make the data set again")
         return data
 
-    def patterns(self, parts: Sequence[str], ending: str) -> list[str]:
-        """Return the patterns of the files that images lie in."""
+    def patterns(self, split_names: Sequence[str], ending: str) -> list[str]:
+        """Return the glob patterns of the files with images."""
         del ending
-        return [f"{part}/*.{self.ending}" for part in parts]
+        return [f"{split_name}/*.{self.ending}" for split_name in split_names]
 
 
 _HUB_READING: Final = (
-    "`load_dataset` finds the parts. Its decoder, Pillow, keeps 8 of 16 bits: decode the bytes with "
-    "`cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)` (then BGR), with "
-    '`.cast_column("png", Image(decode=False))` before it in WebDataset shards; or read with '
+    "`load_dataset` reads the splits. Its decoder, Pillow, keeps only 8 of 16 bits. Decode the bytes with "
+    "`cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)` (in BGR order), after "
+    '`.cast_column("png", Image(decode=False))` for WebDataset shards, or read images with '
     "`generator.open_dataset`."
 )
 
@@ -370,7 +357,7 @@ _HUB_READING: Final = (
 JOINED: Final[Mapping[str, JoinedLayout]] = {
     "webdataset": JoinedLayout(
         ending="tar",
-        begin=lambda stream, _: _Tar(stream),
+        start=lambda stream, _: _Tar(stream),
         read=_read_tar,
         library="",
         is_of_the_hub=True,
@@ -378,7 +365,7 @@ JOINED: Final[Mapping[str, JoinedLayout]] = {
     ),
     "parquet": JoinedLayout(
         ending="parquet",
-        begin=lambda stream, beside: _Parquet(stream, _schema(*beside)),
+        start=lambda stream, beside: _Parquet(stream, _schema(*beside)),
         read=_read_parquet,
         library="pyarrow",
         is_of_the_hub=True,

@@ -1,4 +1,4 @@
-"""How the images of a dataset lie on disk: each in a file of its own, or those of a shard in one; and all layouts."""
+"""Layouts of data sets: one file for each image, or one file for each shard (`generator.dataset.joined`)."""
 
 from __future__ import annotations
 
@@ -10,24 +10,23 @@ from typing import ClassVar, Final, Self
 
 from foundation.errors import InputError
 from foundation.files import HashingWriter
-from generator.dataset.joined import JOINED, Beside, ExitReason, JoinedLayout, JoinedWriter
-from generator.dataset.records import FileSum, Sample, part_of
+from generator.dataset.joined import JOINED, ExitReason, Extras, JoinedLayout, JoinedWriter
+from generator.dataset.records import FileSum, Sample, split_name
 from generator.stores import Store
 
-# Images from which files are synchronised while others are made: enough that one wait for the disk serves many.
+# Number of images whose files are synchronised together, so that one wait for the disk serves many files.
 _SYNCED_IMAGES: Final = 32
-_SYNCED_PIXELS: Final = 1 << 23  # Pixels of such images, for the same reason where images are large
+_SYNCED_PIXELS: Final = 1 << 23  # Number of pixels of such images; it limits the wait if images are large
 
 
 class FileWriter:
-    """Each image in a file of its own, named by `FileLayout.place`.
+    """Writes each image to its own file.
 
-    A thread of its own synchronises the files with the disk, a few at a time, while others are made; only the last few
-    are waited for.
+    A separate thread synchronises files with the disk while other images are made; `close` waits for the last ones.
     """
 
-    def __init__(self, store: Store, place: Callable[[str, str, str], str]) -> None:
-        self._store, self._place = store, place
+    def __init__(self, store: Store, file_name: Callable[[str, str, str], str]) -> None:
+        self._store, self._file_name = store, file_name
         self._files: list[FileSum] = []
         self._thread = ThreadPoolExecutor(1)
         self._syncing: list[Future[None]] = []
@@ -35,10 +34,10 @@ class FileWriter:
         self._images = self._pixels = 0
 
     def store(self, sample: Sample) -> Sample:
-        """Write the files of a sample; return it without their bytes."""
+        """Write the files of a sample; return the sample without their bytes."""
         sums: list[FileSum] = []
-        for kind, ending, data in sample.files:
-            name = self._place(kind, part_of(sample.split), f"{sample.key}{ending}")
+        for file_kind, ending, data in sample.files:
+            name = self._file_name(file_kind, split_name(sample.split), f"{sample.key}{ending}")
             with self._store.create(name) as stream:
                 hashed = HashingWriter(stream)
                 for piece in data:
@@ -60,7 +59,7 @@ class FileWriter:
         self._written, self._images, self._pixels = [], 0, 0
 
     def close(self) -> list[FileSum]:
-        """Wait until all files are on the disk and return them."""
+        """Wait until all files are on the disk; return their names and hashes."""
         self._sync()
         for synced in self._syncing:
             synced.result()
@@ -70,60 +69,58 @@ class FileWriter:
         return self
 
     def __exit__(self, *error: *ExitReason) -> None:
-        """Leave the files where they are: whoever makes the shard again writes the same."""
+        """Keep the files, because making the shard again writes the same files."""
         self._thread.shutdown(cancel_futures=True)
 
 
-# Writes the samples of one shard, in a block; files that are still open appear only if the block ends well. `store`
-# is called from the thread that made a sample, `append` in the order of their numbers.
+# Context manager that writes the samples of one shard; open files appear only if the block does not raise. `store` is
+# called by the thread that made a sample, `append` in the order of the image numbers.
 ShardWriter = FileWriter | JoinedWriter
 
 
 @dataclass(frozen=True)
 class FileLayout:
-    """A layout in which each image is a file of its own.
+    """A layout with one file for each image."""
 
-    - `place`: name in the dataset of a file of some kind (`images`, `previews`, `masks`, `ground_truth`), of a part of
-      the dataset (`data` where it is not divided), and of its own name, such as ``000123.png``.
-    """
-
-    place: Callable[[str, str, str], str]
+    # Name in the data set. Arguments: file kind (`images`, `previews`, `masks`, `ground_truth`); split, or `data` if
+    # the data set is not divided; name of the file, such as ``000123.png``.
+    file_name: Callable[[str, str, str], str]
     library: ClassVar[str] = ""
     is_of_the_hub: ClassVar[bool] = False
 
-    def open_writer(self, store: Store, shard: int, beside: Beside) -> FileWriter:
+    def open_writer(self, store: Store, shard: int, extras: Extras) -> FileWriter:
         """Return the writer of a shard."""
-        del shard, beside
-        return FileWriter(store, self.place)
+        del shard, extras
+        return FileWriter(store, self.file_name)
 
-    def name_of(self, kind: str, part: str, shard: int, key: str, ending: str) -> str:
-        """Return the name of an image's file in the dataset."""
+    def name_of(self, file_kind: str, split_name: str, shard: int, key: str, ending: str) -> str:
+        """Return the name of a file of an image in the data set."""
         del shard
-        return self.place(kind, part, f"{key}{ending}")
+        return self.file_name(file_kind, split_name, f"{key}{ending}")
 
     def get(self, store: Store, name: str) -> bytes:
         """Return the bytes of a file by its name."""
         return store.get(name)
 
-    def folder(self, kind: str, parts: Sequence[str]) -> str | None:
-        """Return the folder of all files of a kind; None where they lie in several."""
-        folders = {self.place(kind, part, "").removesuffix("/") for part in parts}
+    def folder(self, file_kind: str, split_names: Sequence[str]) -> str | None:
+        """Return the folder of all files of a kind; None if there are several."""
+        folders = {self.file_name(file_kind, split_name, "").removesuffix("/") for split_name in split_names}
         return folders.pop() if len(folders) == 1 else None
 
-    def patterns(self, parts: Sequence[str], ending: str) -> list[str]:
-        """Return the patterns of the images' files, which end in `ending`."""
-        return list(dict.fromkeys(self.place("images", part, f"*{ending}") for part in parts))
+    def patterns(self, split_names: Sequence[str], ending: str) -> list[str]:
+        """Return the glob patterns of image files that end in `ending`."""
+        return list(dict.fromkeys(self.file_name("images", split_name, f"*{ending}") for split_name in split_names))
 
 
 # All layouts by name.
 LAYOUTS: Final[Mapping[str, FileLayout | JoinedLayout]] = {
-    "folder": FileLayout(place=lambda kind, part, name: f"{kind}/{name}"),
+    "folder": FileLayout(file_name=lambda file_kind, split_name, name: f"{file_kind}/{name}"),
     **JOINED,
 }
 
 
 def require_library(layout: str) -> None:
-    """Refuse a layout whose library is not installed."""
+    """Raise InputError if the library of a layout is not installed."""
     library = LAYOUTS[layout].library
     if library and find_spec(library) is None:
-        raise InputError(f"the layout {layout} needs {library}; install it with: pip install {library}")
+        raise InputError(f"the layout {layout} needs {library}, which is not installed; run pip install {library}")

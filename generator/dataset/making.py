@@ -1,15 +1,13 @@
-"""Making a dataset: whole, in shares beside other programs, out of the shards of all shares; and who may work at it.
+"""Generate data sets: complete, or in shares by several programs.
 
-Shards (`generator.dataset.shards`) are made by threads of this program, or by the workers of a Dask cluster. Either
-takes the shards that are not done and returns when they are, whatever died meanwhile.
+Threads of this program or workers of a Dask cluster make the shards (`generator.dataset.shards`). Contract of the
+workplace, the folder or store location in which a data set is made (`shards.Workplace`):
 
-Rules that hold inside, of the place where a dataset is made (`shards.Workplace`):
-
-- A place belongs to one plan. Another plan is refused with a message that says how the two differ. A worker of a plan
-  that was removed may still be alive: its records bear the identifier of its plan, so they are never taken for ours.
-- A program that makes the whole dataset locks the folder alone; programs that make shares of it share the lock.
-- A place without a finished image is of no use later and is removed when the work fails; so is one without a finished
-  shard where the command is at fault, which has to be another then.
+- A workplace belongs to one plan. Another plan is refused, and the message lists the differences. Records have the
+  identifier of their plan, because a worker of a removed plan may still be running.
+- A program that makes the complete data set locks the folder exclusively; programs that make shares share the lock.
+- When the work fails, a workplace without a finished image is removed. If the command is at fault and must change, a
+  workplace without a finished shard is removed too.
 """
 
 from __future__ import annotations
@@ -47,8 +45,8 @@ from generator.dataset.shards import (
     ShardDone,
     Workplace,
     assemble,
-    make_elsewhere,
     make_shard,
+    make_shard_on_worker,
     remove_notes,
 )
 from generator.lights.choices import listed_lights
@@ -65,20 +63,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Workers:
-    """Who makes the shards; no byte of the dataset depends on it.
+    """Workers that make the shards; the bytes of the data set do not depend on them.
 
     Attributes
     ----------
     engine
-        ``local``, ``dask`` or ``dask://HOST:PORT``; see `parse_engine`.
+        ``"local"`` for threads, ``"dask"`` for a cluster on this machine, or ``"dask://HOST:PORT"`` of a scheduler.
     count
-        Threads, or processes of a cluster on this machine, 1 or more; each has at most about three pictures in memory.
-        A cluster that is named has its own.
+        Number of threads, or of processes of a cluster on this machine, 1 or more. Each keeps about three pictures in
+        memory. An existing cluster has its own number.
 
     Raises
     ------
     InputError
-        There is no such engine, or no worker.
+        The engine or the number is invalid.
 
     Examples
     --------
@@ -93,19 +91,19 @@ class Workers:
 
     def __post_init__(self) -> None:
         if self.count < 1:
-            raise InputError(f"{self.count} workers were asked for, expected 1 or more")
+            raise InputError(f"the number of workers is {self.count}, expected 1 or more")
         parse_engine(self.engine)
 
     @property
     def address(self) -> str | None:
-        """The scheduler's address, as `parse_engine` returns it."""
+        """Address of the scheduler; see `parse_engine`."""
         return parse_engine(self.engine)
 
 
 def parse_engine(text: str) -> str | None:
-    """Return the address of the Dask scheduler that an engine's name asks for.
+    """Return the address of the Dask scheduler of an engine.
 
-    Returns `tcp://HOST:PORT`; empty for a cluster on this machine; None for threads of this program.
+    It is ``tcp://HOST:PORT``, empty for a cluster on this machine, or None for threads of this program.
     """
     if text == "local":
         return None
@@ -113,30 +111,30 @@ def parse_engine(text: str) -> str | None:
         return ""
     match = re.fullmatch(r"dask://([^/\s]+:\d+)/?", text)
     if not match:
-        raise InputError(f"{text!r} is no engine; use local, dask, or dask://HOST:PORT of a Dask scheduler")
+        raise InputError(f"the engine is {text!r}, expected local, dask, or dask://HOST:PORT of a Dask scheduler")
     return f"tcp://{match[1]}"
 
 
 def parse_share(text: str) -> tuple[int, int]:
-    """Return (i, n) of a text such as `3/16`: share i of n, i from 0."""
+    """Return (i, n) of a text such as `3/16`, which means share i of n, with i from 0."""
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip(), re.ASCII)
     if not match or not int(match[1]) < int(match[2]):
-        raise InputError(f"{text!r} is no share; write I/N with I from 0 to N - 1, such as 0/16")
+        raise InputError(f"the share is {text!r}, expected I/N with I from 0 to N - 1, such as 0/16")
     return int(match[1]), int(match[2])
 
 
-# How often a shard is submitted at most. Dask gives a task up once it was on four workers that died; after five times
-# four it is the shard, and no accident, that kills them.
+# Largest number of submissions of a shard. Dask gives up a task after four workers have died with it. After 5 × 4 dead
+# workers, the shard itself is the probable cause.
 ATTEMPTS: Final = 5
 
-# How long a scheduler may take to answer, s: one that runs answers in milliseconds, also on a busy network.
+# Timeout for the scheduler in s; a running scheduler answers in milliseconds, even on a busy network.
 CONNECT_S: Final = 10.0
 
 _Event = Callable[[], None]
 
 
-def _by_threads(plan: Plan, shards: Sequence[int], place: Workplace, workers: int, callbacks: Callbacks) -> None:
-    """Make two shards at a time, so that the threads have work while one of the two is being finished."""
+def _by_threads(plan: Plan, shards: Sequence[int], workplace: Workplace, workers: int, callbacks: Callbacks) -> None:
+    # Two shards are made at once, so that all threads have work while one of the shards is being completed.
     events: SimpleQueue[_Event | None] = SimpleQueue()
     cancelled = threading.Event()
     waiting = iter(shards)
@@ -160,7 +158,7 @@ def _by_threads(plan: Plan, shards: Sequence[int], place: Workplace, workers: in
                     if shard is None:
                         return
                     job = plan.job(shard)
-                make_shard(job, plan.lut, place, pool, depth, queued, cancelled)
+                make_shard(job, plan.lut, workplace, pool, depth, queued, cancelled)
         except ShardCancelled:
             pass
         except BaseException as error:
@@ -179,12 +177,12 @@ def _by_threads(plan: Plan, shards: Sequence[int], place: Workplace, workers: in
 
 
 def _by_dask(
-    address: str, plan: Plan, shards: Sequence[int], place: Workplace, workers: int, callbacks: Callbacks
+    address: str, plan: Plan, shards: Sequence[int], workplace: Workplace, workers: int, callbacks: Callbacks
 ) -> None:
     try:
         from distributed import KilledWorker, as_completed
     except ImportError as error:
-        raise InputError("the engine dask needs Dask; install it with: pip install dask distributed") from error
+        raise InputError("the engine dask needs Dask, not installed here; run pip install dask distributed") from error
 
     attempts = dict.fromkeys(shards, 0)
     waiting: Iterator[int] = iter(shards)
@@ -193,43 +191,43 @@ def _by_dask(
         def submit(shard: int) -> distributed.Future[ShardDone]:
             attempts[shard] += 1
             key = f"crop-shard-{shard}-{attempts[shard]}-{plan.seed}-{id(plan)}"
-            return client.submit(make_elsewhere, plan.job(shard), place, key=key, pure=False)
+            return client.submit(make_shard_on_worker, plan.job(shard), workplace, key=key, pure=False)
 
         threads = client.nthreads()
         if not threads:
-            callbacks.on_wait(f"the Dask scheduler has no worker yet; start some with: dask worker {address}")
-        # A few tasks a thread are handed out at a time: a plan may have more of them than memory has room for.
+            callbacks.on_wait(f"the Dask scheduler has 0 workers, expected 1 or more; run dask worker {address}")
+        # Only a few tasks for each thread are submitted at once, because all tasks of a plan may exceed the memory.
         at_once = max(4, 3 * sum(threads.values()))
         running = {submit(shard): shard for shard in islice(waiting, at_once)}
         futures = as_completed(list(running), loop=client.loop)
         for future in futures:
             shard = running.pop(future)
             try:
-                done = future.result()
+                result = future.result()
             except KilledWorker as error:
                 if attempts[shard] >= ATTEMPTS:
                     raise DeviceError(
-                        f"shard {shard} was on {4 * ATTEMPTS} workers when they died; give the workers more memory or "
-                        "make shards smaller, then run the same command again to go on"
+                        f"{4 * ATTEMPTS} workers died while they made shard {shard}; give the workers more memory or "
+                        "make shards smaller, then run the same command again to resume"
                     ) from error
-                again = submit(shard)
-                running[again] = shard
-                futures.add(again)
+                retry = submit(shard)
+                running[retry] = shard
+                futures.add(retry)
                 continue
             except CropError:
                 raise
             except Exception as error:
                 if future.status in ("cancelled", "lost"):
                     raise DeviceError(
-                        f"the Dask cluster {address or 'of this machine'} was lost; start it again, then run the same "
-                        "command again to go on"
+                        f"the connection to the Dask cluster {address or 'of this machine'} was lost; start it again, "
+                        "then run the same command again to resume"
                     ) from error
                 raise
-            for skipped in done.skipped:
+            for skipped in result.skipped:
                 callbacks.on_skip(*skipped)
-            if done.found:
-                callbacks.on_done(done.found)
-            for _ in range(done.images - done.found):
+            if result.reused:
+                callbacks.on_done(result.reused)
+            for _ in range(result.images - result.reused):
                 callbacks.on_image()
             following = next(waiting, None)
             if following is not None:
@@ -247,8 +245,8 @@ def _client(address: str, workers: int) -> Generator[distributed.Client]:
             client = Client(address, timeout=CONNECT_S, set_as_default=False)
         except OSError as error:
             raise InputError(
-                f"no Dask scheduler answers at {address.removeprefix('tcp://')}: {error}; start one with "
-                "dask scheduler, or give its address"
+                f"no answer from a Dask scheduler at {address.removeprefix('tcp://')}: {error}; start one with "
+                "dask scheduler, or correct the address"
             ) from error
         with client:
             yield client
@@ -265,8 +263,8 @@ def _client(address: str, workers: int) -> Generator[distributed.Client]:
         )
     except RuntimeError as error:
         raise DeviceError(
-            f"the Dask cluster of this machine cannot be started ({error}): a worker died at once; run the same "
-            "command again to go on, or with fewer --workers"
+            f"the Dask cluster of this machine cannot be started ({error}), because a worker died; run the same "
+            "command again to resume, or use fewer --workers"
         ) from error
     with cluster, Client(cluster, set_as_default=False) as client:
         yield client
@@ -283,43 +281,42 @@ def generate_dataset(
     workers: Workers | int = 1,
     callbacks: Callbacks = SILENT,
 ) -> Dataset:
-    """Make a dataset: every source picture under its lights.
+    """Generate a data set: images of every source picture under its illuminants.
 
     Parameters
     ----------
     lut
-        The table.
+        The look-up table (LUT); see `open_lut`.
     out
-        Where the dataset is to be, a folder or a URL of a store that fsspec knows; must be free. It appears when it is
-        complete. The work of an earlier call with the same plan that was interrupted is continued.
+        New folder, or URL of a store that fsspec supports. It appears when the data set is complete. An interrupted
+        call is resumed by a call with equal arguments.
     sources
-        The pictures; see `generator.pictures.sources`.
+        The source pictures; see `find_pictures`.
     lights
-        The same lights for every picture, each a number in the table, a text as the command's ``--light`` takes it
-        (``"5600K"``, ``"D65"``, ``"12:0.25+40:0.75"``), or a mixture; or a choice of `generator.lights.choices`, which
-        says which lights fall on which picture.
+        The same illuminants for every picture, or a choice of `generator.lights.choices`. Each illuminant is a number
+        in the LUT, a mixture, or a text as for ``--light`` (``"5600K"``, ``"D65"``, ``"12:0.25+40:0.75"``).
     seed
-        0 … 2⁶⁴ − 1; chooses the samples of every pixel.
+        Seed of all random choices, 0 … 2⁶⁴ − 1.
     options
-        File format, layout, previews, split and shards; the defaults of `DatasetOptions` if None.
+        File format, layout, split and others; defaults of `DatasetOptions` if None.
     workers
-        Who does the work; a number is that of threads. No byte depends on it.
+        The workers, or the number of threads. The bytes of the data set do not depend on them.
     callbacks
-        What is called after each image, for each source that cannot be read, and where the work waits.
+        Functions called after each image, for each picture that cannot be read, and when the work waits.
 
     Returns
     -------
     Dataset
-        The dataset, opened.
+        The data set, opened.
 
     Raises
     ------
     InputError
-        A light is not in the table, the place is taken or belongs to another plan, or there is no source.
+        An illuminant is not in the LUT, `out` exists or belongs to another plan, or there are no sources.
     FormatError
         None of the sources can be read.
     StorageError
-        The disk is full, read-only or gone; the images that are finished are kept for the next call.
+        The disk is full, read-only or missing; finished images are kept for the next call.
 
     Examples
     --------
@@ -327,9 +324,9 @@ def generate_dataset(
     >>> from generator import DatasetOptions, find_pictures, generate_dataset, open_lut
     >>> lut, options = open_lut("lut"), DatasetOptions(form="tiff", previews=False)
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     place = f"{folder}/dataset"
-    ...     made = generate_dataset(lut, place, find_pictures("cat.png"), [0, 3], options=options, workers=2)
-    ...     [(entry.image, entry.source, entry.illumination) for entry in made.entries]
+    ...     out = f"{folder}/dataset"
+    ...     dataset = generate_dataset(lut, out, find_pictures("cat.png"), [0, 3], options=options, workers=2)
+    ...     [(entry.image, entry.source, entry.illumination) for entry in dataset.entries]
     [('000000.tiff', 'cat.png', '0'), ('000001.tiff', 'cat.png', '3')]
     """
     choice: LightChoice = lights if isinstance(lights, LightChoice) else listed_lights(lights, lut)
@@ -338,70 +335,66 @@ def generate_dataset(
 
 
 def make_dataset(plan: Plan, out: Path | str, workers: Workers | None = None, callbacks: Callbacks = SILENT) -> Dataset:
-    """Make the dataset of a plan, or continue it; parameters and errors as of `generate_dataset`.
-
-    One thread makes it if `workers` is None.
-    """
+    """Make or resume the data set of a plan, with one thread if `workers` is None; see `generate_dataset`."""
     identity = plan.identity()
-    if finished(out, identity):
+    if is_complete(out, identity):
         return open_dataset(out)
-    with workplace(out, identity) as place:
-        _make(plan, place, range(plan.shards), workers or Workers(), callbacks)
+    with open_workplace(out, identity) as workplace:
+        _make_missing(plan, workplace, range(plan.shards), workers or Workers(), callbacks)
         try:
-            return assemble(place, identity)
+            return assemble(workplace, identity)
         except NothingMadeError:
-            place.discard()
+            workplace.discard()
             raise
 
 
-def begun_rendering(out: Path | str) -> Rendering | None:
-    """Return how the dataset is rendered that is at `out`, or was begun there; None where there is none."""
+def existing_rendering(out: Path | str) -> Rendering | None:
+    """Return the rendering of the data set at `out`, complete or in progress; None if there is none."""
     if holds_dataset(out):
         options: Mapping[str, Any] = load_description(open_store(out)).options
-    elif is_begun(out):
+    elif is_started(out):
         options = stored_identity(out)["options"]
     else:
         return None
     return "codes" if options.get("rendering") is None else "colorimetric"
 
 
-def made_before(plan: Plan, out: Path | str) -> Dataset | None:
-    """Return the dataset at `out` if it is complete and of this very plan; None where there is no complete one.
+def completed_dataset(plan: Plan, out: Path | str) -> Dataset | None:
+    """Return the complete data set at `out`, or None if there is none; raises InputError if its plan differs.
 
-    Pictures on this machine that were written to since are hashed again and compared; those on a store are compared by
-    their names.
+    Pictures on this machine that were modified since are hashed again; those in a store are compared by name.
     """
     if not holds_dataset(out):
         return None
     dataset = open_dataset(out)
-    made, identity = dataset.description, plan.identity()
+    description, identity = dataset.description, plan.identity()
     stored = {
-        "software": made.software,
-        "libraries": made.libraries,
-        "table": made.table.model_dump(mode="json"),
-        "seed": made.seed,
-        "options": made.options,
-        "images": made.planned,
+        "software": description.software,
+        "libraries": description.libraries,
+        "table": description.table.model_dump(mode="json"),
+        "seed": description.seed,
+        "options": description.options,
+        "images": description.planned,
     }
-    differing = differences(stored, {key: identity[key] for key in stored}) or _other_pictures(dataset, plan, out)
+    differing = differences(stored, {key: identity[key] for key in stored}) or _differing_pictures(dataset, plan, out)
     if differing:
         raise InputError(
-            f"{out} holds a dataset that this command would make otherwise ({'; '.join(differing)}); name another "
-            "place, or remove what is there"
+            f"{out} already has a different data set ({'; '.join(differing)}); choose another location, or remove the "
+            "data set"
         )
     return dataset
 
 
-def _other_pictures(dataset: Dataset, plan: Plan, out: Path | str) -> list[str]:
-    known = {source.position: (source.name, source.sha256) for source in dataset.sources}
-    known |= {skipped.position: (skipped.name, None) for skipped in dataset.description.skipped}
-    if len(known) != len(plan.sources):
-        return [f"sources {len(known)}, now {len(plan.sources)}"]
+def _differing_pictures(dataset: Dataset, plan: Plan, out: Path | str) -> list[str]:
+    recorded = {source.position: (source.name, source.sha256) for source in dataset.sources}
+    recorded |= {skipped.position: (skipped.name, None) for skipped in dataset.description.skipped}
+    if len(recorded) != len(plan.sources):
+        return [f"sources {len(recorded)}, now {len(plan.sources)}"]
     since = None if is_remote(str(out)) else (local_path(out) / DESCRIPTION).stat().st_mtime
-    for place, source in enumerate(plan.sources):
-        name, sha256 = known.get(place, ("", None))
+    for position, source in enumerate(plan.sources):
+        name, sha256 = recorded.get(position, ("", None))
         if source.name != name:
-            return [f"source {place} {name}, now {source.name}"]
+            return [f"source {position} {name}, now {source.name}"]
         if sha256 is not None and since is not None and hash_since(source, since) not in (None, sha256):
             return [f"the content of {name}"]
     return []
@@ -414,110 +407,110 @@ def make_share(
     workers: Workers | None = None,
     callbacks: Callbacks = SILENT,
 ) -> tuple[int, int]:
-    """Make one of several shares of a dataset, beside other programs that make theirs; then call `make_dataset`.
+    """Make share (i, n) of a data set: all shards with number mod n = i. Call `make_dataset` after the last share.
 
-    `share`: (i, n): the shards whose number leaves i when divided by n, i from 0.
+    Returns the number of complete shards and of all shards.
     """
     index, count = share
     if not 0 <= index < count:
-        raise InputError(f"share {index} of {count} was asked for, expected 0 to {count - 1}")
-    with workplace(out, plan.identity(), alone=False) as place:
-        _make(plan, place, range(index, plan.shards, count), workers or Workers(), callbacks)
-        return place.count_done(), plan.shards
+        raise InputError(f"the share is {index} of {count}, expected 0 to {count - 1}")
+    with open_workplace(out, plan.identity(), alone=False) as workplace:
+        _make_missing(plan, workplace, range(index, plan.shards, count), workers or Workers(), callbacks)
+        return workplace.count_done(), plan.shards
 
 
-def _make(plan: Plan, place: Workplace, wanted: range, workers: Workers, callbacks: Callbacks) -> None:
-    done = place.done(wanted)
-    missing = [shard for shard in wanted if shard not in done]
-    callbacks.on_done(sum(map(plan.images_of, done)))
+def _make_missing(plan: Plan, workplace: Workplace, shards: range, workers: Workers, callbacks: Callbacks) -> None:
+    done_shards = workplace.done(shards)
+    missing = [shard for shard in shards if shard not in done_shards]
+    callbacks.on_done(sum(map(plan.images_of, done_shards)))
     if not missing:
         return
     if workers.address is None:
-        _by_threads(plan, missing, place, workers.count, callbacks)
+        _by_threads(plan, missing, workplace, workers.count, callbacks)
     else:
-        _by_dask(workers.address, plan, missing, place, workers.count, callbacks)
+        _by_dask(workers.address, plan, missing, workplace, workers.count, callbacks)
 
 
-def finished(out: str | Path, identity: PlanIdentity) -> bool:
-    """Return whether the dataset of this plan is complete; notes that a killed program left are removed then."""
+def is_complete(out: str | Path, identity: PlanIdentity) -> bool:
+    """Return whether the data set of this plan is complete; if so, remove notes left by a killed program."""
     notes = _notes(out)
     if not open_store(out).has(DESCRIPTION):
         return False
-    planned = notes.has(PLAN)
-    if planned and differences(_load(notes), identity):
+    has_plan = notes.has(PLAN)
+    if has_plan and differences(_load_plan(notes), identity):
         return False
     remove_notes(notes)
-    return planned
+    return has_plan
 
 
 def require_free_place(out: str | Path) -> None:
-    """Raise an InputError if `out` is taken, so that a command can say so before it does any work."""
-    if is_begun(out):
+    """Raise InputError if `out` exists, so that a command fails before it starts to work."""
+    if is_started(out):
         return
     if isinstance(out, str) and is_remote(out):
         if RemoteStore(out).has(DESCRIPTION):
-            raise InputError(f"{out} already holds a dataset; name another place, or remove what is there")
+            raise InputError(f"{out} already has a data set; choose another location, or remove the data set")
     else:
-        require_free(local_path(out), "the dataset")
+        require_free(local_path(out), "the data set")
 
 
 def holds_dataset(out: str | Path) -> bool:
-    """Return whether a dataset is complete at `out`, and no plan lies there that its making was ended by."""
-    return open_store(out).has(DESCRIPTION) and not is_begun(out)
+    """Return whether there is a complete data set at `out`."""
+    return open_store(out).has(DESCRIPTION) and not is_started(out)
 
 
-def is_begun(out: str | Path) -> bool:
-    """Return whether a plan lies at `out` of a dataset that is being made, or was before its program ended."""
+def is_started(out: str | Path) -> bool:
+    """Return whether a data set at `out` is in progress or was interrupted."""
     return _notes(out).has(PLAN)
 
 
-def differences(stored: Any, wanted: Any) -> list[str]:
-    """Return each difference of two plans, or of parts of them, in words."""
-    return list(_differences(stored, json.loads(json.dumps(wanted))))
+def differences(stored: Any, planned: Any) -> list[str]:
+    """Return a text for each difference of two plans."""
+    return list(_differences(stored, json.loads(json.dumps(planned))))
 
 
 @contextmanager
-def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Generator[Workplace]:
-    """Open the place where the dataset `out` is being made, or begin one."""
+def open_workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Generator[Workplace]:
+    """Open or create the workplace of the data set `out`."""
     if isinstance(out, str) and is_remote(out):
-        yield from _remote(out, identity)
+        yield from _open_remote_workplace(out, identity)
         return
     path = local_path(out)
-    require_free(path, "the dataset")
-    # Whole, since a worker may have been started in another folder.
+    require_free(path, "the data set")
+    # Absolute, because a worker may run in another folder.
     folder = partial_path(path).absolute()
-    busy = f"{path} is being made by another program; wait for it, or name another place"
-    planned = None if alone else (folder / "plan" / PLAN).is_file
-    with locked_folder(folder, busy, share_if=planned, target=path) as lock:
+    busy = f"{path} is being made by another program; wait until it ends, or choose another location"
+    has_plan = None if alone else (folder / "plan" / PLAN).is_file
+    with locked_folder(folder, busy, share_if=has_plan, target=path) as lock:
         notes = LocalStore(folder / "plan")
         plan_id = _plan_id(identity)
-        place = Workplace(LocalStore(folder / f"dataset-{plan_id}"), notes, str(path), plan_id)
-        is_begun = notes.has(PLAN)
-        if is_begun:
-            # What another plan has made stays, so that the command that began it can finish it.
+        workplace = Workplace(LocalStore(folder / f"dataset-{plan_id}"), notes, str(path), plan_id)
+        is_started = notes.has(PLAN)
+        if is_started:
+            # Files of another plan are kept, so that its own command can resume it.
             _require_same(notes, identity, path, f"remove {folder}")
         try:
-            if not is_begun:
+            if not is_started:
                 _require_still_free(path, folder)
-                _begin(folder, plan_id)
-                notes.put(PLAN, _text(identity))
+                _create_folders(folder, plan_id)
+                notes.put(PLAN, _plan_bytes(identity))
                 notes.sync([PLAN])
             if not alone:
                 lock.share()
-            yield place
+            yield workplace
         except BaseException as error:
-            # An InputError asks for another command, which could not go on with images of this one.
-            if alone and folder.is_dir() and not place.has_finished(isinstance(error, InputError)):
+            # After an InputError the command must change, and another plan cannot use these images.
+            if alone and folder.is_dir() and not workplace.has_finished(isinstance(error, InputError)):
                 shutil.rmtree(folder, ignore_errors=True)
             raise
 
 
 def stored_identity(out: str | Path) -> PlanIdentity:
-    """Return the identity of the plan of a dataset that is being made."""
+    """Return the identity of the plan of a data set in progress."""
     notes = _notes(out)
     if not notes.has(PLAN):
-        raise InputError(f"no dataset is being made at {out}; begin one with generate")
-    return _load(notes)
+        raise InputError(f"there is no data set in progress at {out}, expected one; start it with generate")
+    return _load_plan(notes)
 
 
 def _notes(out: str | Path) -> Store:
@@ -526,37 +519,37 @@ def _notes(out: str | Path) -> Store:
     return LocalStore(partial_path(local_path(out)) / "plan")
 
 
-def _remote(out: str, identity: PlanIdentity) -> Generator[Workplace]:
+def _open_remote_workplace(out: str, identity: PlanIdentity) -> Generator[Workplace]:
     files, notes = RemoteStore(out), RemoteStore(f"{out.rstrip('/')}/{NOTES}")
-    place = Workplace(files, notes, out, _plan_id(identity))
+    workplace = Workplace(files, notes, out, _plan_id(identity))
     if files.has(DESCRIPTION):
-        raise InputError(f"{out} already holds a dataset; name another place, or remove what is there")
-    begun = notes.has(PLAN)
-    if not begun:
+        raise InputError(f"{out} already has a data set; choose another location, or remove the data set")
+    is_started = notes.has(PLAN)
+    if not is_started:
         if next(files.names(), None) is not None:
-            raise InputError(f"{out} already holds something else; name another place, or remove what is there")
-        notes.put(PLAN, _text(identity))
+            raise InputError(f"{out} already has other files; choose another location, or remove them")
+        notes.put(PLAN, _plan_bytes(identity))
     _require_same(notes, identity, out, f"remove what is below {out}")
     try:
-        yield place
+        yield workplace
     except BaseException:
         with contextlib.suppress(Exception):
-            if not begun and not place.has_finished():
+            if not is_started and not workplace.has_finished():
                 files.remove("")
         raise
 
 
 def _require_still_free(path: Path, folder: Path) -> None:
-    """Refuse when another program finished the dataset while its hold was waited for; `folder` is then new."""
+    # Another program may have completed the data set while this one waited for the lock; `folder` is then new.
     try:
-        require_free(path, "the dataset")
+        require_free(path, "the data set")
     except InputError:
         shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
-def _begin(folder: Path, plan_id: str) -> None:
-    """Make the folders inside; files that are there without a plan are left from before the plan was written."""
+def _create_folders(folder: Path, plan_id: str) -> None:
+    # Files without a plan are from a program that was killed before it wrote the plan.
     try:
         clear_folder(folder)
         for inner in ("plan", f"dataset-{plan_id}"):
@@ -565,43 +558,42 @@ def _begin(folder: Path, plan_id: str) -> None:
         raise storage_error(folder, error) from error
 
 
-def _text(identity: PlanIdentity) -> bytes:
+def _plan_bytes(identity: PlanIdentity) -> bytes:
     return (json.dumps(identity, indent=1) + "\n").encode()
 
 
 def _plan_id(identity: PlanIdentity) -> str:
-    """Return the first 16 hexadecimal digits of the SHA-256 of the plan's identity."""
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _load(notes: Store) -> dict[str, Any]:
+def _load_plan(notes: Store) -> dict[str, Any]:
     try:
         loaded = json.loads(notes.get(PLAN))
     except ValueError as error:
-        raise FormatError(f"{notes.place}/{PLAN} is damaged; remove it and all beside it, then begin anew") from error
+        raise FormatError(f"{notes.location}/{PLAN} is damaged; remove it and its folder, then start again") from error
     return dict(loaded)
 
 
 def _require_same(notes: Store, identity: PlanIdentity, out: str | Path, remedy: str) -> None:
-    differing = differences(_load(notes), identity)
+    differing = differences(_load_plan(notes), identity)
     if differing:
         raise InputError(
-            f"{out} was begun with another plan ({'; '.join(differing)}); finish it as it was begun, {remedy}, or name "
-            "another place"
+            f"{out} was started with another plan ({'; '.join(differing)}); complete it with the first command, "
+            f"{remedy}, or choose another location"
         )
 
 
-def _differences(stored: Any, wanted: Any, name: str = "") -> Generator[str]:
-    if isinstance(stored, dict) and isinstance(wanted, dict):
-        one, other = cast("dict[str, Any]", stored), cast("dict[str, Any]", wanted)
-        for key in dict.fromkeys([*one, *other]):
+def _differences(stored: Any, planned: Any, name: str = "") -> Generator[str]:
+    if isinstance(stored, dict) and isinstance(planned, dict):
+        stored_values, planned_values = cast("dict[str, Any]", stored), cast("dict[str, Any]", planned)
+        for key in dict.fromkeys([*stored_values, *planned_values]):
             # "lights", not "options lights lights".
             inner = name if key in ("options", name.rpartition(" ")[2]) else f"{name} {key}".strip()
-            yield from _differences(one.get(key), other.get(key), inner)
-    elif stored != wanted:
-        yield f"{name} {_short(stored)}, now {_short(wanted)}"
+            yield from _differences(stored_values.get(key), planned_values.get(key), inner)
+    elif stored != planned:
+        yield f"{name} {_shortened(stored)}, now {_shortened(planned)}"
 
 
-def _short(value: Any, most: int = 40) -> str:
+def _shortened(value: Any, limit: int = 40) -> str:
     text = json.dumps(value)
-    return text if len(text) <= most else f"{text[:most]}…"
+    return text if len(text) <= limit else f"{text[:limit]}…"

@@ -1,12 +1,10 @@
-"""What a dataset is to be, before a pixel is touched: every image has its number, every number its shard.
+"""Plan of a data set: it assigns a number to every image and a shard to every number.
 
-A dataset is a function of its table, its list of sources, the choice of lights, the seed and the options. Image number
-`(position · crops + c) · lights_each + k` shows crop c of the source at `position` (the one, or the whole, unless
-several are asked for) under the k-th light of scene `position · crops + c`, whether or not the sources before it can be
-read. Shard i holds the numbers from i · n up to (i + 1) · n, n the images of a shard. So any worker can make any shard
-at any time, and a shard made twice is the same twice.
-
-Each source falls into a part of the split by its own hash.
+A data set is a function of its LUT, sources, choice of illuminants, seed and options. Image number
+`(position · crops + c) · lights_each + k` shows crop c of the source at `position` under illuminant k of scene
+`position · crops + c`. The number does not depend on whether other sources can be read. A shard has n images; shard i
+has the numbers from i · n to (i + 1) · n − 1. Any worker can therefore make any shard at any time, and a shard that is
+made twice has the same bytes.
 """
 
 from __future__ import annotations
@@ -38,52 +36,51 @@ if TYPE_CHECKING:
     from generator.pictures.sources import Source
 
 
-# Images of a shard unless said otherwise: all that a kill can cost, for each shard that was being made.
+# Default number of images in a shard. A kill loses at most this number for each shard in progress.
 SHARD_IMAGES: Final = 256
 
-# Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options. 1 took the
-# grey in the print's black cell out where 2 takes the grey that black was mapped to; 3 tries more cells for greys
-# that 2 left off by .2 degrees and more; 4 prints through one map of the chart, interpolated between cells, where
-# those before it mixed cells for each light.
+# Version of colorimetric rendering, raised when its rules change the pixels for equal options. 1 subtracted the grey of
+# the black patch of the print, 2 the grey to which black is mapped. 3 tries more patches for greys with errors of 0.2
+# degrees or more in 2. 4 uses one map of the chart, interpolated between patches, instead of one for each illuminant.
 RENDERING_VERSION: Final = 4
 
 
 @dataclass(frozen=True)
 class DatasetOptions:
-    """What a dataset is to be, beside its table, sources, lights and seed.
+    """Options of a data set in addition to its LUT, sources, illuminants and seed.
 
     Attributes
     ----------
     form
-        File format of the images; see `generator.files`.
+        File format of the images: ``"png"``, ``"tiff"``, ``"exr"``, ``"jxl"`` or ``"dng"``.
     layout
-        How images lie: each in its file, or those of a shard in a tar or Parquet file.
+        ``"folder"``: one file for each image; ``"webdataset"`` or ``"parquet"``: one file for each shard.
     previews
-        Whether tone-mapped pictures go with them.
+        Whether tone-mapped previews are written.
     split
-        Shares of train, validation and test, 0 … 1, sum 1; None leaves the dataset undivided.
+        Shares of train, validation and test, 0 … 1, sum 1; None for an undivided data set.
     shard_images
-        Images of one shard, 1 or more.
+        Number of images in a shard, 1 or more.
     variation
-        What differs from image to image beside scene and light; see `generator.variation`.
+        Random exposure, fall-off and noise of each image (`generator.variation`), or None.
     crops
-        Crops of each picture, 1 or more; of more than one the sources must have as many.
+        Number of crops of each picture, 1 or more; the sources must be prepared with the same number.
     reading
-        How sources were read, as plain values; recorded only.
+        Preparation of the sources as plain values; it is only recorded.
     rendering
-        ``"colorimetric"``: the print shows the camera the picture's colours; ``"codes"``: codes of a picture are those
-        of the print, the paper's way.
+        ``"colorimetric"``: the print reproduces the colours of the picture; ``"codes"``: the codes of the picture are
+        the codes of the print, as in the paper.
     matrix
-        Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
+        Matrix from linear sRGB to camera RGB for colorimetric rendering; None for that of the camera of the LUT.
     black_point
-        What becomes of the print's black.
+        Treatment of the black of the print.
     uncertainty
-        Whether `ground_truth.csv` has what each light's direction may be off by, as the table states it.
+        Whether `ground_truth.csv` has the uncertainty of each ground truth (degrees, k = 2).
 
     Raises
     ------
     InputError
-        An option is none of these.
+        An option is invalid.
 
     Examples
     --------
@@ -91,7 +88,7 @@ class DatasetOptions:
     256
     >>> DatasetOptions(split=(0.8, 0.1, 0.2))
     Traceback (most recent call last):
-    foundation.errors.InputError: the split 0.8,0.1,0.2 is to be three shares from 0 that sum to 1, such as 0.8,0.1,0.1
+    foundation.errors.InputError: the split is 0.8,0.1,0.2, expected three shares ≥ 0 with the sum 1 as in 0.8,0.1,0.1
     """
 
     form: Format = "png"
@@ -109,25 +106,25 @@ class DatasetOptions:
 
     @property
     def has_details(self) -> bool:
-        """Whether options do something to each image that is recorded of it: `images.csv` lists it then."""
+        """Whether `images.csv` records details of each image."""
         return self.variation is not None or self.crops > 1 or self.is_rendered
 
     @cached_property
     def tints(self) -> bool:
-        """Whether the light of an image changes its colour over it, so that images have maps of it."""
+        """Whether the illuminant changes its colour over an image, so that images have maps of it."""
         return self.variation is not None and self.variation.tints
 
     @property
     def is_rendered(self) -> bool:
-        """Whether images are not rendered by codes with the print's black kept."""
+        """Whether rendering changes pixels: it is not by codes with the black of the print kept."""
         return self.rendering != "codes" or self.black_point.kind != "keep"
 
     def describe_rendering(self, lut: Lut) -> dict[str, Any]:
-        """Return how images are rendered as plain values; nothing for codes with the print's black kept."""
+        """Return the rendering as plain values; empty for codes with the black of the print kept."""
         described: dict[str, Any] = {}
         if self.rendering == "colorimetric":
             used = self.matrix or matrix_for(lut)
-            rows = [[float(part) for part in row] for row in used.rows]
+            rows = [[float(number) for number in row] for row in used.rows]
             matrix = {"name": used.name, "source": used.source, "rows": rows}
             described["rendering"] = {"name": self.rendering, "version": RENDERING_VERSION, "matrix": matrix}
         if self.black_point.kind != "keep":
@@ -135,79 +132,71 @@ class DatasetOptions:
         return described
 
     def __post_init__(self) -> None:
-        for what, value, known in (
+        for option_name, value, choices in (
             ("format", self.form, FORMATS),
             ("layout", self.layout, get_args(Layout)),
             ("rendering", self.rendering, get_args(Rendering)),
         ):
-            if value not in known:
-                raise InputError(f"{value!r} is no {what} of a dataset; use one of {', '.join(known)}")
+            if value not in choices:
+                raise InputError(f"the {option_name} of a data set is {value!r}, expected one of {', '.join(choices)}")
         if self.rendering == "codes" and self.matrix is not None:
-            raise InputError("a colour matrix is for colorimetric rendering; choose that, or leave the matrix out")
+            raise InputError("a colour matrix needs colorimetric rendering, but rendering is codes; omit the matrix")
         if self.shard_images < 1:
-            raise InputError(f"shards of {self.shard_images} images were asked for, expected 1 or more")
+            raise InputError(f"shard_images is {self.shard_images}, expected 1 or more")
         if self.crops < 1:
-            raise InputError(f"{self.crops} crops of each picture were asked for, expected 1 or more")
+            raise InputError(f"crops is {self.crops}, expected 1 or more")
         split = self.split
         if split is not None and not (len(split) == 3 and min(split) >= 0 and abs(sum(split) - 1) < _ROUNDED):
             shares = ",".join(f"{share:g}" for share in split)
-            raise InputError(f"the split {shares} is to be three shares from 0 that sum to 1, such as 0.8,0.1,0.1")
+            raise InputError(f"the split is {shares}, expected three shares ≥ 0 with the sum 1 as in 0.8,0.1,0.1")
 
 
-_ROUNDED: Final = 1e-6  # By which a sum of shares may differ from 1
+_ROUNDED: Final = 1e-6  # Allowed difference of a sum of shares from 1
 
 
 def parse_split(text: str) -> tuple[float, float, float]:
-    """Return the shares of train, validation and test of a text such as `0.8,0.1,0.1` or `80,10,10`.
+    """Return the shares of train, validation and test in a text such as `0.8,0.1,0.1` or `80,10,10`.
 
-    Two numbers are train and test. Whole numbers and percentages are scaled to the sum 1; other shares must have it.
+    Two numbers mean train and test. Integers and percentages are scaled to the sum 1; other shares must have this sum.
     """
     try:
-        parts = [float(part) for part in text.split(",")]
+        shares = [float(share) for share in text.split(",")]
     except ValueError:
-        parts = []
-    if len(parts) == 2:
-        parts.insert(1, 0.0)
-    if len(parts) != 3 or not min(parts) >= 0 or not 0 < sum(parts) < float("inf"):
-        raise InputError(f"the split {text!r} is to be shares of train, validation and test, such as 0.8,0.1,0.1")
-    total = sum(parts)
-    whole = total >= 1 and all(part == int(part) for part in parts)
-    if not (whole or abs(total - 1) < _ROUNDED or abs(total - 100) < 100 * _ROUNDED):
+        shares = []
+    if len(shares) == 2:
+        shares.insert(1, 0.0)
+    if len(shares) != 3 or not min(shares) >= 0 or not 0 < sum(shares) < float("inf"):
+        raise InputError(f"the split is {text!r}, expected shares of train, validation and test such as 0.8,0.1,0.1")
+    total = sum(shares)
+    is_whole = total >= 1 and all(share == int(share) for share in shares)
+    if not (is_whole or abs(total - 1) < _ROUNDED or abs(total - 100) < 100 * _ROUNDED):
         raise InputError(
-            f"the split {text} sums to {total:.10g}, and every picture is put into a part; expected shares that sum to "
-            "1, such as 0.8,0.1,0.1, or whole numbers such as 8,1,1"
+            f"the split {text} has the sum {total:.10g}, expected 1 as in 0.8,0.1,0.1; use a sum of 1, or integers as "
+            "in 8,1,1"
         )
-    return parts[0] / total, parts[1] / total, parts[2] / total
+    return shares[0] / total, shares[1] / total, shares[2] / total
 
 
 @dataclass(frozen=True)
 class ShardJob:
-    """Everything that a worker on any machine needs to make one shard.
+    """All data that a worker on any machine needs to make one shard."""
 
-    - `table`, `table_sha256`: the table's folder, and its hash to compare with what is found there.
-    - `shard`, `first`, `stop`: its number, its first image number and the one after its last.
-    - `position`: place of the first of `sources` in the whole list.
-    - `sources`: the sources that its images show.
-    - `choice`, `seed`, `options`: those of the plan.
-    - `versions`: versions of the libraries that the bytes depend on; a worker must have the same.
-    """
-
-    table: Path
-    table_sha256: str
+    table: Path  # folder of the LUT
+    table_sha256: str  # the worker compares the LUT with this hash
     shard: int
-    first: int
-    stop: int
-    position: int
-    sources: tuple[Source, ...]
+    first: int  # first image number
+    stop: int  # last image number + 1
+    position: int  # of the first of `sources` in the list of the plan
+    sources: tuple[Source, ...]  # of the images in this shard
     choice: LightChoice
     seed: int
     options: DatasetOptions
-    versions: dict[str, str]
+    versions: dict[str, str]  # of the libraries that change bytes; a worker must have the same
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A dataset to be made."""
+    """Plan of a data set."""
 
     lut: Lut
     sources: Sequence[Source]
@@ -219,50 +208,50 @@ class Plan:
         key_of(self.seed)
         if not self.sources or not self.choice.lights_each:
             raise InputError(
-                f"{len(self.sources)} pictures under {self.choice.lights_each} lights make no image; name some of both"
+                f"the plan has {len(self.sources)} pictures and {self.choice.lights_each} illuminants; add some of both"
             )
         if self.total > 1 << 32:
-            raise InputError(f"{self.total} images are more than a dataset holds, 2^32; make several, each with a seed")
+            raise InputError(f"the plan has {self.total} images, expected at most 2^32; make several data sets")
         if self.options.tints and any(lighting.masks for lighting in self.choice.lightings_of(0)):
             raise InputError(
-                "a gradient with a colour and several lights an image were both asked for, but masks tell either; "
-                "leave out colour, or ask for one light"
+                "a gradient with colour and several illuminants in an image both need masks, expected one of them; "
+                "omit colour, or use one illuminant"
             )
         require_library(self.options.layout)
 
     @property
     def total(self) -> int:
-        """Images planned."""
+        """Number of planned images."""
         return len(self.sources) * self.images_each
 
     @property
     def images_each(self) -> int:
-        """Images of each source."""
+        """Number of images of each source."""
         return self.options.crops * self.choice.lights_each
 
     @property
     def shards(self) -> int:
-        """Shards they are cut into."""
+        """Number of shards."""
         return -(-self.total // self.options.shard_images)
 
     def images_of(self, shard: int) -> int:
-        """Return how many images are planned for a shard."""
+        """Return the number of planned images of a shard."""
         return min(self.options.shard_images, self.total - shard * self.options.shard_images)
 
     def job(self, shard: int) -> ShardJob:
-        """Return the task of shard number `shard`."""
+        """Return the job of a shard."""
         first = shard * self.options.shard_images
         stop = first + self.images_of(shard)
-        each = self.images_each
-        places = range(first // each, (stop - 1) // each + 1)
+        images_each = self.images_each
+        positions = range(first // images_each, (stop - 1) // images_each + 1)
         return ShardJob(
             table=self.lut.folder.resolve(),
             table_sha256=self.lut.sha256,
             shard=shard,
             first=first,
             stop=stop,
-            position=places[0],
-            sources=tuple(self.sources[place] for place in places),
+            position=positions[0],
+            sources=tuple(self.sources[position] for position in positions),
             choice=self.choice,
             seed=self.seed,
             options=self.options,
@@ -270,7 +259,7 @@ class Plan:
         )
 
     def identity(self) -> dict[str, Any]:
-        """Return plain values that two plans share exactly if they make the same bytes."""
+        """Return plain values that are equal for two plans exactly if they make the same bytes."""
         return {
             "format": "crop.plan",
             "version": 1,
@@ -286,7 +275,7 @@ class Plan:
         }
 
     def recorded_options(self) -> dict[str, Any]:
-        """Return the options as `dataset.json` has them; through JSON, so that they compare with what is read back."""
+        """Return the options as in `dataset.json`, converted to JSON types so that they compare with a read file."""
         options = self.options
         recorded = {
             "format": options.form,
@@ -298,23 +287,21 @@ class Plan:
             "split": dict(zip(SPLITS, options.split, strict=True)) if options.split else None,
             "shard_images": options.shard_images,
         }
-        # What is off is no key: such datasets keep their bytes.
+        # Unused options add no key, so that such data sets keep their bytes between versions.
         if options.variation is not None:
             recorded["variation"] = options.variation.describe()
         if options.crops > 1:
             recorded["crops"] = options.crops
         if options.uncertainty:
             recorded["uncertainty"] = True
-        # A data set is published: addresses in it have no secrets.
+        # Data sets are published, so secrets in addresses are masked.
         return json.loads(json.dumps(masked_values(recorded)))
 
 
 def sources_sha256(sources: Sequence[Source]) -> str:
-    """Return a hash over the list of sources: the name of each, and how it is made or read.
-
-    Where a file lies and what is in it are left out: a list is the same on every machine, and its files are hashed when
-    they are read.
-    """
+    """Return a hash over name and preparation of all sources."""
+    # Folders and contents are not included: the hash is equal on every machine, and files are hashed when they are
+    # read.
     digest = hashlib.sha256()
     for source in sources:
         digest.update(json.dumps(source.to_json(), sort_keys=True).encode() + b"\n")
@@ -323,17 +310,14 @@ def sources_sha256(sources: Sequence[Source]) -> str:
 
 @lru_cache
 def versions(form: Format, layout: Layout) -> dict[str, str]:
-    """Return the versions of the libraries that decode sources, find lights and encode images, by their names.
-
-    Other versions may give other bytes.
-    """
+    """Return the versions of the libraries that may change bytes, by name."""
     names = {"isal", "numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "scipy", "simplejpeg"}
     needed = {*libraries_of(form), LAYOUTS[layout].library} - {""}
     return {name: importlib.metadata.version(name) for name in sorted(names | needed)}
 
 
 def table_of(lut: Lut) -> TableRecord:
-    """Return the record of the table."""
+    """Return the record of the LUT."""
     provenance = lut.provenance
     return TableRecord(
         sha256=lut.sha256,

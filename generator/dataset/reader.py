@@ -1,7 +1,7 @@
-"""A dataset: how its files are read, and whether they are those that were made; docs/formats.md says what they hold.
+"""Read and verify data sets; docs/formats.md describes their files.
 
-No byte of them depends on the workers, the clock or the machine's paths; the versions of the libraries that encode and
-decode are recorded.
+Readers raise FormatError if files are missing, damaged or inconsistent. Data sets may come from foreign sources, so
+names, numbers and sizes in their lists are checked.
 """
 
 from __future__ import annotations
@@ -43,54 +43,51 @@ from generator.dataset.records import (
     SourceRecord,
     Split,
     Triple,
-    part_of,
+    split_name,
 )
 from generator.files import decode_image
 from generator.lights.lighting import parse_mixture
 from generator.masks.maps import decode_ground_truth, decode_weights
 from generator.stores import DESCRIPTION, Store, open_store, read_bounded
 
-# A number, of which ten digits count all images that a dataset holds, and an ending.
+# File name of an image: a number, for which ten digits suffice, and a suffix.
 _NAME: Final = re.compile(r"([0-9]{1,10})(\.[A-Za-z0-9.]*)?")
-_VALID: Final = "with r + g + b = 1 and none below 0"
-# What sums and means of chromaticities may be off by: more than six written digits are, and less than a thousandth of
-# a degree.
+_VALID: Final = "with r + g + b = 1 and no negative number"
+# Tolerance for sums and means of chromaticities: above the rounding of six digits, below 0.001 degrees.
 _ROUNDING: Final = 2e-6
-_KEPT: Final = 4096  # Lights of images that are kept, since many images share one: several times a table's lights
+_KEPT: Final = 4096  # Cached illuminants, because many images share one; several times the number in a LUT
 
 
 def read_entries(store: Store, description: Description) -> Iterator[Entry]:
-    """Yield the images of a dataset in the order of their numbers; reads no image.
-
-    Both lists are in this order, and the rows of one image follow each other, so that a line of each is in memory.
-    """
-    name = f"{store.place}/{GROUND_TRUTH}"
-    part_of: dict[int, Split] = {}
-    for part in SPLITS:
-        if part in description.splits:
-            with _text(store, f"splits/{part}.txt") as images:
-                part_of.update((_number(image.rstrip("\r\n")), part) for image in images)
-    with _text(store, TRUTHS) as truths, _text(store, GROUND_TRUTH) as table:
+    """Yield the entries of a data set in the order of their numbers, without reading images."""
+    # Both lists are in this order, and rows of an image are consecutive, so one line of each list is in memory.
+    name = f"{store.location}/{GROUND_TRUTH}"
+    split_of_image: dict[int, Split] = {}
+    for split in SPLITS:
+        if split in description.splits:
+            with _open_text(store, f"splits/{split}.txt") as images:
+                split_of_image.update((_number(image.rstrip("\r\n")), split) for image in images)
+    with _open_text(store, TRUTHS) as truths, _open_text(store, GROUND_TRUTH) as table:
         last, count = -1, 0
         for image, group in groupby(_numbered_rows(name, table), key=lambda numbered: numbered[1].get("image")):
             count += 1
             source, labels, whites = _read_rows(name, group)
             number = _number(image or "")
             if image is None or number <= last:
-                raise FormatError(f"{name}: {image!r} is not in the order of the images; make the dataset again")
+                raise FormatError(f"{name}: the image {image!r} is not in order; make the data set again")
             last = number
             truth = _truth(store, next(truths, ""), count, image, whites)
-            yield Entry(image, source, labels, whites, truth, part_of.get(number))
+            yield Entry(image, source, labels, whites, truth, split_of_image.get(number))
         if count != description.images:
             raise FormatError(
-                f"{name} has rows of {count} images, expected the {description.images} of {DESCRIPTION}; make the "
-                "dataset again"
+                f"{name} has rows of {count} images, expected {description.images} as in {DESCRIPTION}; generate the "
+                "data set again"
             )
-        more = sum(1 for line in truths if line.strip())
-        if more:
+        extra_lines = sum(1 for line in truths if line.strip())
+        if extra_lines:
             raise FormatError(
-                f"{store.place}/{TRUTHS} has {count + more} lines, expected one for each of the {count} images of "
-                f"{GROUND_TRUTH}; make the dataset again"
+                f"{store.location}/{TRUTHS} has {count + extra_lines} lines, expected one for each of the {count} "
+                f"images of {GROUND_TRUTH}; make the data set again"
             )
 
 
@@ -100,7 +97,7 @@ def _numbered_rows(name: str, table: Iterable[str]) -> Iterator[tuple[int, dict[
         for row in rows:
             yield rows.line_num, row
     except csv.Error as error:
-        raise FormatError(f"{name}, line {rows.line_num + 1} is no CSV: {error}; make the dataset again") from error
+        raise FormatError(f"{name}, line {rows.line_num + 1} is not CSV: {error}; make the data set again") from error
 
 
 def _read_rows(
@@ -114,56 +111,53 @@ def _read_rows(
             source = sys.intern(row["source"])
         except (KeyError, TypeError, ValueError, InputError) as error:
             raise FormatError(
-                f"{name}, line {line}: expected {','.join(GROUND_TRUTH_COLUMNS)} {_VALID}, found "
-                f"{_shown(','.join(map(str, row.values())))}; make the dataset again"
+                f"{name}, line {line} is {_excerpt(','.join(map(str, row.values())))}, expected "
+                f"{','.join(GROUND_TRUTH_COLUMNS)} {_VALID}; make the data set again"
             ) from error
     return source, *_unzipped(tuple(lights))
 
 
 def _truth(store: Store, text: str, line: int, image: str, lights: tuple[Triple, ...]) -> Triple:
-    """Return the mean of an image's lights by its line of `gt.txt`; a FormatError if it cannot be their mean."""
-    name = f"{store.place}/{TRUTHS}, line {line}"
+    name = f"{store.location}/{TRUTHS}, line {line}"
     try:
         truth = _triple(*text.split())
     except (TypeError, ValueError) as error:
         raise FormatError(
-            f"{name}: expected the light of {image}, r g b {_VALID}, found {_shown(text.strip())}; make the dataset "
-            "again"
+            f"{name}: {image} has {_excerpt(text.strip())}, expected r g b {_VALID}; make the data set again"
         ) from error
     if not _may_be_mean(truth, lights):
-        listed = " and ".join("{:g} {:g} {:g}".format(*light) for light in lights)
+        expected = " and ".join("{:g} {:g} {:g}".format(*light) for light in lights)
         raise FormatError(
-            f"{name}: {text.strip()} is not the light of {image}, which is {listed} in {GROUND_TRUTH}; see with "
-            f"generate --verify {store.place} which of the two files has changed, and restore it"
+            f"{name}: the ground truth of {image} is {text.strip()}, expected {expected} as in {GROUND_TRUTH}; run "
+            f"generate --verify {store.location} to see which of the two files has changed, and restore it"
         )
     return truth
 
 
 @lru_cache(maxsize=_KEPT)
 def _may_be_mean(mean: Triple, lights: tuple[Triple, ...]) -> bool:
-    """Return whether lights may have this mean; one light is its own."""
+    # The weights are not in the lists, so only the range of each channel is checked.
     return all(
-        min(parts) - _ROUNDING <= part <= max(parts) + _ROUNDING for part, *parts in zip(mean, *lights, strict=True)
+        min(light_components) - _ROUNDING <= component <= max(light_components) + _ROUNDING
+        for component, *light_components in zip(mean, *lights, strict=True)
     )
 
 
-def _shown(text: str) -> str:
-    """Return the text of a line for a message, cut where it is long."""
-    return repr(text if len(text) <= 80 else f"{text[:80]}…") if text else "nothing"
+def _excerpt(text: str) -> str:
+    return repr(text if len(text) <= 80 else f"{text[:80]}…") if text else "empty"
 
 
 @contextmanager
-def _text(store: Store, name: str) -> Generator[Iterator[str]]:
-    """Open a file of text to be read line by line; a FormatError tells of a line that does not end."""
+def _open_text(store: Store, name: str) -> Generator[Iterator[str]]:
     with store.open(name) as stream:
-        lines = bounded_lines(stream, f"{store.place}/{name}")
+        lines = bounded_lines(stream, f"{store.location}/{name}")
         yield (line.decode("utf-8-sig" if number == 0 else "utf-8", "replace") for number, line in enumerate(lines))
 
 
 def _number(image: str) -> int:
-    """Return the number of an image by its name; -1 if it has none, or is no name of a file."""
-    found = _NAME.fullmatch(image)
-    return int(found[1]) if found else -1
+    # -1 if the name is invalid.
+    match = _NAME.fullmatch(image)
+    return int(match[1]) if match else -1
 
 
 @lru_cache(maxsize=_KEPT)
@@ -180,55 +174,55 @@ def _unzipped(lights: tuple[tuple[str, Triple], ...]) -> tuple[tuple[str, ...], 
 def _triple(red: str, green: str, blue: str) -> Triple:
     triple = float(red), float(green), float(blue)
     if not (min(triple) >= 0 and abs(sum(triple) - 1) <= _ROUNDING):
-        raise ValueError(f"{triple} is no chromaticity")
+        raise ValueError(f"{triple} is not a chromaticity")
     return triple
 
 
-_LINE: Final = re.compile("[0-9a-f]{64}")  # A hash as `sha256sum` writes it
+_LINE: Final = re.compile("[0-9a-f]{64}")  # A hash in the format of `sha256sum`
 
 
 def file_faults(
-    place: str | Path, progress: Callable[[int, int], None] | None = None, *, workers: int = 1
+    location: str | Path, progress: Callable[[int, int], None] | None = None, *, workers: int = 1
 ) -> Iterator[str]:
-    """Yield each file of a dataset that is missing, changed or unknown, in words; reads every byte of it.
+    """Yield a text for each file that is missing, changed or not listed; reads every byte of the data set.
 
-    Card and datasheet are completed by hand and not looked at.
+    The card and the datasheet are not checked, because they are completed by hand.
     """
-    store = open_store(place)
-    sums = f"{store.place}/{SUMS}"
+    store = open_store(location)
+    sums = f"{store.location}/{SUMS}"
     if not store.has(DESCRIPTION):
-        raise FormatError(f"{place} is no dataset: it has no {DESCRIPTION}; make one with generate")
-    with store.open(SUMS) as listed:
-        total = sum(1 for _ in bounded_lines(listed, sums))
-    known: set[str] = {SUMS}
+        raise FormatError(f"{location} is not a data set, because {DESCRIPTION} is missing; make one with generate")
+    with store.open(SUMS) as stream:
+        total = sum(1 for _ in bounded_lines(stream, sums))
+    listed_names: set[str] = {SUMS}
     verified = 0
-    with store.open(SUMS) as listed:
-        lines = _named(bounded_lines(listed, sums), known)
-        for fault in ordered_map(partial(_verify_named, store), lines, workers):
+    with store.open(SUMS) as stream:
+        lines = _listed_files(bounded_lines(stream, sums), listed_names)
+        for fault in ordered_map(partial(_verify_listed, store), lines, workers):
             if fault is not None:
                 yield fault
             verified += 1
             if progress is not None:
                 progress(verified, total)
-    for name in sorted(set(store.names()) - known - set(COMPLETED_BY_HAND)):
-        yield f"{name} is no part of the dataset"
+    for name in sorted(set(store.names()) - listed_names - set(COMPLETED_BY_HAND)):
+        yield f"{name} is not listed in {SUMS}; remove it if you do not need it"
 
 
-def _named(lines: Iterator[bytes], known: set[str]) -> Iterator[tuple[str, str, str | None]]:
-    """Yield name and hash of each line, and what is wrong with it; names are added to `known`, once each."""
+def _listed_files(lines: Iterator[bytes], listed_names: set[str]) -> Iterator[tuple[str, str, str | None]]:
+    # Yields name, hash and fault of each line, and adds the names to `listed_names`.
     for number, line in enumerate(lines, start=1):
         digest, _, name = line.decode("utf-8", "replace").rstrip("\n").partition("  ")
         if not _LINE.fullmatch(digest) or not is_inside_name(name):
-            yield "", "", f"{SUMS}, line {number}: expected a hash, two blanks and a name inside the dataset"
-        elif name in known:
-            # Whoever lists one file a million times would have it read a million times.
+            yield "", "", f"{SUMS}, line {number}: expected a hash, two spaces and a name inside the data set"
+        elif name in listed_names:
+            # Each file is read once only, even if a malicious list repeats it a million times.
             yield "", "", f"{SUMS}, line {number}: {name} is listed twice"
         else:
-            known.add(name)
+            listed_names.add(name)
             yield name, digest, None
 
 
-def _verify_named(store: Store, line: tuple[str, str, str | None]) -> str | None:
+def _verify_listed(store: Store, line: tuple[str, str, str | None]) -> str | None:
     name, digest, fault = line
     return _fault_of(store, name, digest) if fault is None else fault
 
@@ -236,24 +230,29 @@ def _verify_named(store: Store, line: tuple[str, str, str | None]) -> str | None
 def _fault_of(store: Store, name: str, digest: str) -> str | None:
     try:
         with store.open(name) as stream:
-            found = stream_sha256(stream)
+            actual_digest = stream_sha256(stream)
     except FormatError as error:
         missing = isinstance(error.__cause__, FileNotFoundError)
         return f"{name} is missing" if missing else f"{name} is missing or cannot be read: {error}"
-    return None if found == digest else f"{name} has changed"
+    return None if actual_digest == digest else f"{name} has changed"
 
 
-# Lists that are read whole have a line an image or source, some hundred bytes: this is forty million of them.
+# Largest list that is read at once, in bytes: forty million lines (one for each image or source) of 100 bytes.
 MOST_LIST_BYTES: Final = 4 << 30
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """A dataset on disk or in a store; lists and images are read where they are used.
+    """A data set on disk or in a store; lists and images are read when they are used.
 
-    - `store`: where its files are.
-    - `description`: the content of `dataset.json`.
-    - `made_under`: `light_labels`, where the dataset was made just now; None to find them in its lists.
+    Attributes
+    ----------
+    store
+        Location of the files.
+    description
+        Content of `dataset.json`; `description.table.white_level` is the saturation level.
+    made_under
+        `light_labels` of a data set that was just generated; None to read them from its lists.
     """
 
     store: Store
@@ -261,47 +260,79 @@ class Dataset:
     made_under: frozenset[str] | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
-        """Return one line: a dataset has an entry for each of its images."""
-        return f"Dataset({self.store.place!r}, {counted(self.description.images, 'image')}, layout {self.layout})"
+        """Return one line, because the list of entries may be very long."""
+        return f"Dataset({self.store.location!r}, {counted(self.description.images, 'image')}, layout {self.layout})"
 
     def read_image(self, entry: Entry) -> npt.NDArray[np.uint16]:
-        """Return the image (H, W, 3) uint16, linear camera RGB, `description.table.white_level` = saturation."""
+        """Return an image.
+
+        Parameters
+        ----------
+        entry
+            An element of `entries`.
+
+        Returns
+        -------
+        ndarray
+            (H, W, 3) uint16, linear camera RGB, black 0, saturation `description.table.white_level`; of the format
+            ``dng`` the half-size image.
+
+        Raises
+        ------
+        FormatError
+            The file is missing or damaged.
+        """
         name = self._name(entry, "images", PurePosixPath(entry.image).suffix)
-        return decode_image(self._bytes(name), self._options.format, f"{self.store.place}/{name}")
+        return decode_image(self._bytes(name), self._options.format, f"{self.store.location}/{name}")
 
     def read_preview(self, entry: Entry) -> bytes | None:
-        """Return the JPEG file of an image's preview, or None if the dataset has none."""
+        """Return the JPEG file of the preview of an image, or None if the data set has no previews."""
         if not self._options.previews:
             return None
         return self._bytes(self._name(entry, "previews", ".jpg"))
 
     def read_weights(self, entry: Entry) -> npt.NDArray[np.float32]:
-        """Return how the lights of an image share its pixels: (H, W, K) float32.
+        """Return the masks of an image with several illuminants.
 
-        In the order of `entry.lights`, sum 1.
+        Parameters
+        ----------
+        entry
+            An element of `entries`.
+
+        Returns
+        -------
+        ndarray
+            (H, W, K) float32, weights of the illuminants in the order of `entry.lights`, sum 1 in each pixel.
+
+        Raises
+        ------
+        InputError
+            The image has one illuminant and therefore no masks.
+        FormatError
+            A file is missing or damaged.
         """
         masks = [self._map(entry, "masks", f"_{light}.png") for light in range(len(entry.lights))]
-        return decode_weights(masks, self._of(entry, "masks"))
+        return decode_weights(masks, self._described(entry, "masks"))
 
     def read_ground_truth_map(self, entry: Entry) -> npt.NDArray[np.float32]:
-        """Return the ground truth of every pixel of an image: (H, W, 3) float32, r + g + b = 1."""
-        return decode_ground_truth(self._map(entry, "ground_truth", ".png"), self._of(entry, "ground truth"))
+        """Return the ground truth of every pixel, (H, W, 3) float32, r + g + b = 1; errors as for `read_weights`."""
+        return decode_ground_truth(self._map(entry, "ground_truth", ".png"), self._described(entry, "ground truth"))
 
     @cached_property
     def entries(self) -> tuple[Entry, ...]:
-        """Its images in the order of their numbers."""
+        """One entry for each image, in the order of their numbers."""
         return tuple(read_entries(self.store, self.description))
 
     @cached_property
     def light_labels(self) -> frozenset[str]:
-        """Every light on its images once: number in the table, or name of the mixture; see `Entry.lights`."""
+        """All illuminants of the images without repetitions; see `Entry.lights`."""
         if self.made_under is not None:
             return self.made_under
         return frozenset(label for entry in self.entries for label in entry.lights)
 
     @property
     def layout(self) -> str:
-        """Its layout, a name of `generator.dataset.layouts.LAYOUTS`."""
+        """The layout: ``"folder"``, ``"webdataset"`` or ``"parquet"``."""
         return self._options.layout
 
     @cached_property
@@ -318,78 +349,83 @@ class Dataset:
                 for row in rows
             )
         except (ValidationError, csv.Error, KeyError, TypeError, AttributeError) as error:
-            raise FormatError(f"{self.store.place}/{SOURCES} is damaged; make the dataset again") from error
+            raise FormatError(f"{self.store.location}/{SOURCES} is damaged; make the data set again") from error
 
     @cached_property
     def details(self) -> dict[str, dict[str, str]]:
-        """What options did to each image, as `images.csv` has it, by the image's name; empty if none did anything."""
+        """Details of each image from `images.csv`, by image name; empty if the options need none."""
         if not self.store.has(IMAGES):
             return {}
         rows = csv.DictReader(io.StringIO(self._list(IMAGES)))
         try:
             return {row.pop("image"): row for row in rows}
         except csv.Error as error:
-            raise FormatError(f"{self.store.place}/{IMAGES} is no CSV: {error}; make the dataset again") from error
+            raise FormatError(f"{self.store.location}/{IMAGES} is not CSV: {error}; make the data set again") from error
         except KeyError as error:
-            raise FormatError(f"{self.store.place}/{IMAGES} has no column image; make the dataset again") from error
+            raise FormatError(f"{self.store.location}/{IMAGES} has no column image; make the data set again") from error
 
     def _list(self, name: str) -> str:
         return read_bounded(self.store, name, MOST_LIST_BYTES).decode("utf-8", "replace")
 
-    def _map(self, entry: Entry, kind: str, ending: str) -> bytes:
+    def _map(self, entry: Entry, file_kind: str, ending: str) -> bytes:
         if len(entry.lights) == 1:
-            raise InputError(f"one light falls on {entry.image}, so that it has no masks; see its truth")
-        return self._bytes(self._name(entry, kind, ending))
+            raise InputError(f"{entry.image} has 1 illuminant and no masks, expected 2 or more; use entry.truth")
+        return self._bytes(self._name(entry, file_kind, ending))
 
-    def _name(self, entry: Entry, kind: str, ending: str) -> str:
+    def _name(self, entry: Entry, file_kind: str, ending: str) -> str:
         key = PurePosixPath(entry.image).stem
         shard = _number(entry.image) // self._options.shard_images
-        return LAYOUTS[self.layout].name_of(kind, part_of(entry.split), shard, key, ending)
+        return LAYOUTS[self.layout].name_of(file_kind, split_name(entry.split), shard, key, ending)
 
     def _bytes(self, name: str) -> bytes:
         require_library(self.layout)
         return LAYOUTS[self.layout].get(self.store, name)
 
-    def _of(self, entry: Entry, what: str) -> str:
-        return f"{self.store.place}, the {what} of {entry.image},"
+    def _described(self, entry: Entry, content: str) -> str:
+        return f"{self.store.location}, the {content} of {entry.image},"
 
 
-def open_dataset(place: Path | str) -> Dataset:
-    """Open a dataset; reads no image.
+def open_dataset(location: Path | str) -> Dataset:
+    """Open a data set without reading images.
 
     Parameters
     ----------
-    place
-        Its folder, or its URL in a store that fsspec knows.
+    location
+        Folder of the data set, or its URL in a store that fsspec supports.
+
+    Returns
+    -------
+    Dataset
+        The data set; its lists are read and checked.
 
     Raises
     ------
     FormatError
-        There is no dataset, it is of a version that this software does not read, or its files disagree.
+        There is no data set, its version is not supported, or its files are inconsistent.
 
     Examples
     --------
     >>> import tempfile
     >>> from generator import find_pictures, generate_dataset, open_dataset, open_lut
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     made = generate_dataset(open_lut("lut"), f"{folder}/dataset", find_pictures("cat.png"), [2])
+    ...     _ = generate_dataset(open_lut("lut"), f"{folder}/dataset", find_pictures("cat.png"), [2])
     ...     dataset = open_dataset(f"{folder}/dataset")
     ...     image = dataset.read_image(dataset.entries[0])
     >>> image.shape, image.dtype, dataset.entries[0].truth
     ((40, 50, 3), dtype('uint16'), (0.407407407, 0.296296296, 0.296296296))
     """
-    store = open_store(place)
+    store = open_store(location)
     if not store.has(DESCRIPTION):
-        raise FormatError(f"{place} is no dataset: it has no {DESCRIPTION}; make one with generate")
+        raise FormatError(f"{location} is not a data set, because {DESCRIPTION} is missing; make one with generate")
     dataset = Dataset(store, load_description(store))
-    # Lists that disagree are told now, not in the middle of what is done with the images.
+    # Reads the lists, so that inconsistent lists are reported before images are used.
     _ = dataset.entries
     return dataset
 
 
 def load_description(store: Store) -> Description:
-    """Return the content of a dataset's `dataset.json`; a FormatError says why it cannot be used."""
-    name = f"{store.place}/{DESCRIPTION}"
+    """Return the content of `dataset.json`; raises FormatError."""
+    name = f"{store.location}/{DESCRIPTION}"
     try:
         content = parse_json_object(read_bounded(store, DESCRIPTION, MAX_JSON_BYTES), name)
         description = Description.model_validate(content)
@@ -397,9 +433,9 @@ def load_description(store: Store) -> Description:
     except ValidationError as error:
         first = error.errors()[0]
         raise FormatError(
-            f"{name} is no dataset's description: {'.'.join(map(str, first['loc']))}: {first['msg']}; this software "
-            f"reads {FORMAT} of version {VERSION}"
+            f"{name} is invalid: {'.'.join(map(str, first['loc']))}: {first['msg']}; expected {FORMAT} of version "
+            f"{VERSION}, make the data set again"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"{name} is damaged ({type(error).__name__}: {error}); make the dataset again") from error
+        raise FormatError(f"{name} is damaged ({type(error).__name__}: {error}); make the data set again") from error
     return description

@@ -1,8 +1,7 @@
-"""What a dataset is on disk: its description, lights and sources, the record of each shard, and the names of its files.
+"""Records of a data set on disk: description, illuminants, sources, images and shards, and the names of the files.
 
-A shard is a range of planned image numbers that is made by one task. Its record is written when everything else of it
-is on the disk: a shard with a record is done, one without is not. How its images lie there is another matter
-(`generator.dataset.layouts`).
+A shard is a range of planned image numbers, made by one task. Its record is written after all its files are on the
+disk, so that a shard is complete exactly if it has a record. `generator.dataset.layouts` defines the image files.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from generator.stores import Pieces
 
 
 class SparseRecord(Record):
-    """A record of which keys that are None by default are left out while they are, so that files stay as they were."""
+    """A record that omits keys with default None while they are None, so that older files keep their bytes."""
 
     @model_serializer(mode="wrap")
     def _without_none(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -28,12 +27,11 @@ class SparseRecord(Record):
 
 
 FORMAT: Final = "crop.dataset"
-VERSION: Final = 2  # Of `dataset.json`; raised when a reader of the version before would misread a dataset
-
+VERSION: Final = 2  # Version of `dataset.json`; raised when an older reader would misread a data set
 
 GROUND_TRUTH: Final = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")
-# Column of `ground_truth.csv` on request: what the light's direction may be off by, expanded (k = 2), degrees.
+# Optional column of `ground_truth.csv`: expanded uncertainty (k = 2) of the ground truth, degrees.
 UNCERTAINTY_COLUMN: Final = "uncertainty_deg"
 
 IMAGES: Final = "images.csv"
@@ -44,11 +42,11 @@ SUMS: Final = "SHA256SUMS"
 DATASHEET: Final = "DATASHEET.md"
 CARD: Final = "README.md"
 
-# Files that a lab completes, so that no hash of them is recorded; nothing of this software reads them.
+# Files that the authors complete by hand, so their hashes are not recorded; this software does not read them.
 COMPLETED_BY_HAND: Final = (CARD, DATASHEET)
 
 Triple = tuple[float, float, float]
-# What options did to one image, by column of `images.csv`; all images of a dataset have the same columns.
+# Details of one image, by column of `images.csv`; all images of a data set have the same columns.
 Details = dict[str, int | float | str]
 
 Layout = Literal["folder", "webdataset", "parquet"]
@@ -57,7 +55,7 @@ SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
 
 
 class ReadingOptions(Record):
-    """What of the options of a dataset its readers need; they refuse values that no dataset is made with."""
+    """The options of a data set that are needed for reading; invalid values are refused."""
 
     format: Format
     layout: Layout
@@ -66,102 +64,83 @@ class ReadingOptions(Record):
 
 
 class TableRecord(SparseRecord):
-    """The table a dataset was made from; `sha256` as `calibration.table.lut.Lut.sha256`.
+    """The LUT of a data set."""
 
-    `computed` is what the table says of itself where nothing was photographed for it
-    (`calibration.table.lut.Provenance.computed`), `lights` how many
-    it has, `origin` with what, when and by whom its frames were taken; None where that was not kept.
-    """
-
-    sha256: str
+    sha256: str  # `calibration.table.lut.Lut.sha256`
     camera: str
-    bits: int = Field(ge=1, le=8)
-    samples: int = Field(ge=1)
-    white_level: int = Field(ge=1, le=65535)
+    bits: int = Field(ge=1, le=8)  # of each colour channel of the chart
+    samples: int = Field(ge=1)  # of each patch under each illuminant
+    white_level: int = Field(ge=1, le=65535)  # saturation level in counts
     software: str
-    computed: dict[str, Any] | None = None
-    lights: int | None = Field(default=None, ge=1)
-    origin: OriginRecord | None = None
+    computed: dict[str, Any] | None = None  # settings of a computed LUT (`Provenance.computed`)
+    lights: int | None = Field(default=None, ge=1)  # number of illuminants
+    origin: OriginRecord | None = None  # equipment, date and authors of the frames
 
 
 class Light(SparseRecord):
-    """A light of the table that was used; `codes` as projected, `white` the ground truth in linear camera RGB.
+    """An illuminant of the LUT that was used."""
 
-    Lights of a table that was computed under spectra of its own have a `name`, and codes that would show their colour.
-    `uncertainty_deg` is the expanded uncertainty (k = 2) of its direction, where the table states it.
-    """
-
-    illumination: int
+    illumination: int  # number in the LUT
     kind: str
     cct_k: float | None
-    codes: tuple[int, int, int]
-    white: Triple
-    name: str | None = None
-    uncertainty_deg: float | None = None
+    codes: tuple[int, int, int]  # of the projector; for a computed spectrum codes of a similar colour
+    white: Triple  # ground truth in linear camera RGB, not normalised
+    name: str | None = None  # of a computed spectrum
+    uncertainty_deg: float | None = None  # expanded uncertainty (k = 2), if the LUT reports it
 
     @property
     def label(self) -> str:
-        """Return what to call it for a reader: its name, its temperature if a black body, else its codes."""
+        """Return a label for users: the name, the temperature of a black body, or the codes."""
         if self.name is not None:
             return self.name
         return f"{self.cct_k:.0f} K" if self.cct_k is not None else "{} {} {}".format(*self.codes)
 
     @property
     def cell(self) -> str:
-        """Return the label for a cell of a table in Markdown, and that it is codes where it is."""
+        """Return the label for a Markdown table, with the word `codes` if it has codes."""
         return table_cell(self.label if self.name or self.cct_k is not None else f"codes {self.label}")
 
 
 def table_cell(text: str) -> str:
-    """Return a text that stays in its cell of a table in Markdown and is no markup of HTML."""
+    """Return a text with Markdown and HTML markup escaped for a Markdown table."""
     return one_line(text).replace("|", "\\|").replace("<", "&lt;")
 
 
 def one_line(text: str) -> str:
-    """Return a text that no other line of a file follows from: foreign tables name cameras as they like."""
+    """Return a text as one line, because names in foreign files may contain line breaks."""
     return " ".join(text.split())
 
 
 class SourceRecord(Record):
-    """A source picture that was used.
+    """A source picture that was used."""
 
-    - `position`: place in the list of sources, from 0; the choice of its lights depends on it.
-    - `name`, `sha256`: its name, and the hash of its file; no hash where it was made and not read.
-    - `profile`: how its colour profile was used, in words; None where it was made and not read.
-    - `width`, `height`: size of its images, px.
-    - `replaced_pixels`: pixels of colours that the table lists as unfit, which took the nearest fit colour.
-    - `split`: the part of the dataset that its images belong to; None where it was not divided.
-    - `note`: what is to be known of it, between semicolons: what it took to read it, or that it is black or tiny; None
-      for nothing.
-    """
-
-    position: int
+    position: int  # in the list of sources, from 0; the choice of illuminants depends on it
     name: str
-    sha256: str | None
-    profile: str | None = None
-    width: int
-    height: int
-    replaced_pixels: int
-    split: Split | None = None
-    note: str | None = None
+    sha256: str | None  # of its file; None for a computed picture
+    profile: str | None = None  # treatment of its colour profile; None for a computed picture
+    width: int  # of its images, px
+    height: int  # of its images, px
+    replaced_pixels: int  # pixels with colours that the LUT lists as unfit, replaced by the nearest fit colour
+    split: Split | None = None  # None if the data set is not divided
+    note: str | None = None  # problems in reading, black or tiny pictures; separated by semicolons
 
 
 class Skipped(Record):
-    """A source picture that could not be read; its numbers are left free."""
+    """A source picture that could not be read; its image numbers are not used."""
 
     position: int
     name: str
 
 
 class LightRow(Record):
-    """A light in an image: its number in the table, or what a mixture is called, and its ground truth of sum 1."""
+    """An illuminant in an image: number in the LUT or label of a mixture, and ground truth with the sum 1."""
 
     illumination: str
     truth: Triple
 
 
 class ImageRecord(Record):
-    """An image that was made; `truth` is the mean of its lights over its pixels, of sum 1; `details` as `Details`."""
+    """A generated image; `truth` is the mean of its illuminants over all pixels, with the sum 1."""
 
     number: int
     position: int
@@ -171,14 +150,14 @@ class ImageRecord(Record):
 
 
 class FileSum(Record):
-    """A file of the dataset and its SHA-256."""
+    """A file of the data set and its SHA-256."""
 
     name: str
     sha256: str
 
 
 class FinishedImage(Record):
-    """An image of a shard that is not done; its `files` are those of its piece."""
+    """A finished image of an incomplete shard; `files` are stored in its piece (`foundation.pieces`)."""
 
     image: ImageRecord
     source: SourceRecord
@@ -186,44 +165,26 @@ class FinishedImage(Record):
 
 
 class RenderingSummary(Record):
-    """How the images of a dataset were rendered, where that is not by codes with the print's black kept.
+    """Results of the rendering of a data set."""
 
-    - `outside`, `distance`: means over all pixels of the columns of `images.csv`: the share of colours that the print
-      cannot show, and by how many degrees they are missed. None where images were rendered by codes.
-    - `black_taken`: mean over all images of the share of the print's black that was taken out.
-    """
-
-    outside: float | None = None
-    distance: float | None = None
-    black_taken: float = 0.0
+    outside: float | None = None  # mean share of pixels with colours that the print cannot show; None for codes
+    distance: float | None = None  # mean colour error over all pixels, degrees; None for codes
+    black_taken: float = 0.0  # mean subtracted share of the black of the print
 
 
 class ShardRecord(Record):
-    """What a shard made; images and files in the order of their numbers, sources in that of their positions.
-
-    `lights` are those of the table that were used, alone or mixed; `files` are those of the shard's piece.
-    """
+    """A complete shard."""
 
     shard: int
-    sources: list[SourceRecord]
+    sources: list[SourceRecord]  # in the order of their positions
     skipped: list[Skipped]
-    images: list[ImageRecord]
-    files: list[FileSum] = Field(default_factory=list[FileSum], exclude=True)
-    lights: list[Light]
+    images: list[ImageRecord]  # in the order of their numbers
+    files: list[FileSum] = Field(default_factory=list[FileSum], exclude=True)  # stored in its piece
+    lights: list[Light]  # used illuminants of the LUT, alone or mixed
 
 
 class Description(SparseRecord):
-    """The content of `dataset.json`.
-
-    - `seed`, `options`: what the dataset is; with the table and the sources, enough to make every byte again.
-    - `planned`, `images`: images planned and made; the numbers of the rest are free.
-    - `sources`, `pixels`, `replaced_pixels`: sources used, their pixels together, and those of them whose colour was
-      replaced.
-    - `splits`: images in each part, where the dataset was divided.
-    - `lights`: the lights of the table that were used, alone or mixed.
-    - `skipped`: sources that could not be read.
-    - `rendering`: how images were rendered; None by codes with the print's black kept.
-    """
+    """The content of `dataset.json`; seed, options, LUT and sources determine every byte."""
 
     format: Literal["crop.dataset"] = FORMAT
     version: Literal[2] = VERSION
@@ -232,32 +193,40 @@ class Description(SparseRecord):
     table: TableRecord
     seed: int
     options: dict[str, Any]
-    planned: int = Field(ge=0, le=1 << 32)
-    images: int = Field(ge=0, le=1 << 32)
-    sources: int = Field(ge=0, le=1 << 32)
-    pixels: int = Field(ge=0)
-    replaced_pixels: int = Field(ge=0)
-    splits: dict[str, int] = Field(default_factory=dict[str, int])
-    lights: list[Light]
+    planned: int = Field(ge=0, le=1 << 32)  # number of planned images; numbers of missing ones are not used
+    images: int = Field(ge=0, le=1 << 32)  # number of generated images
+    sources: int = Field(ge=0, le=1 << 32)  # number of sources that were used
+    pixels: int = Field(ge=0)  # of all sources
+    replaced_pixels: int = Field(ge=0)  # of all sources; see `SourceRecord`
+    splits: dict[str, int] = Field(default_factory=dict[str, int])  # images of each split
+    lights: list[Light]  # used illuminants of the LUT, alone or mixed
     skipped: list[Skipped]
-    rendering: RenderingSummary | None = None
+    rendering: RenderingSummary | None = None  # None for codes with the black of the print kept
 
     @property
     def parts(self) -> list[str]:
-        """Names of the parts that have images; one, `data`, of a dataset that was not divided."""
-        return [part for part, images in self.splits.items() if images] or [part_of(None)]
+        """Names of the splits with images; `data` if the data set is not divided."""
+        return [split for split, images in self.splits.items() if images] or [split_name(None)]
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One image.
+    """One image of a data set.
 
-    - `image`: its file name; in shards the name it would have as a file.
-    - `source`: its source's name.
-    - `lights`: number in the table, or name of the mixture, of each light in it.
-    - `truths`: ground truth (r, g, b) of sum 1 of each light.
-    - `truth`: mean of its lights over its pixels, of sum 1: the ground truth where there is one light.
-    - `split`: the part of the dataset it belongs to.
+    Attributes
+    ----------
+    image
+        File name, also in layouts with one file for each shard.
+    source
+        Name of the source picture.
+    lights
+        Number in the LUT, or label of the mixture, of each illuminant.
+    truths
+        Ground truth (r, g, b) of each illuminant, sum 1.
+    truth
+        Mean of the illuminants over all pixels, sum 1; the ground truth if there is one illuminant.
+    split
+        Split of the image; None if the data set is not divided.
     """
 
     image: str
@@ -269,46 +238,40 @@ class Entry:
 
     @property
     def illumination(self) -> str:
-        """The light's number in the table or its name; of several the first."""
+        """Number in the LUT, or label of the mixture, of the first illuminant."""
         return self.lights[0]
 
 
-def part_of(split: str | None) -> str:
-    """Return the name of the part of a dataset that an image belongs to, as file names have it."""
+def split_name(split: str | None) -> str:
+    """Return the name of a split in file names; `data` if the data set is not divided."""
     return split or "data"
 
 
 def image_key(number: int) -> str:
-    """Return the number of an image as file names have it: six digits, more where they are needed."""
+    """Return the number of an image in file names, with at least six digits."""
     return f"{number:06d}"
 
 
 def shard_key(shard: int) -> str:
-    """Return the number of a shard as file names have it."""
+    """Return the number of a shard in file names."""
     return f"{shard:06d}"
 
 
 @dataclass(frozen=True)
 class Sample:
-    """An image with all that goes with it, ready to be written.
-
-    - `record`: its number, source and ground truth.
-    - `source`, `split`: its source's name, and the part of the dataset it belongs to.
-    - `width`, `height`: px.
-    - `files`: kind (`images`, `previews`, `masks`, `ground_truth`), what follows the number in the file's name, and the
-      bytes, which can be iterated over once; the image first.
-    - `stored`: files of it that are written already.
-    """
+    """An image with its maps and preview, ready to be written."""
 
     record: ImageRecord
-    source: str
+    source: str  # name of the source picture
     split: Split | None
-    width: int
-    height: int
+    width: int  # px
+    height: int  # px
+    # File kind (`images`, `previews`, `masks`, `ground_truth`), end of the file name, and bytes that can be iterated
+    # once; the image is first.
     files: tuple[tuple[str, str, Pieces], ...]
-    stored: tuple[FileSum, ...] = ()
+    stored: tuple[FileSum, ...] = ()  # files that are already written
 
     @property
     def key(self) -> str:
-        """The number as file names have it."""
+        """Number of the image in file names."""
         return image_key(self.record.number)

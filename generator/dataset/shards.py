@@ -1,24 +1,21 @@
-"""A shard of a dataset: from its pictures to the record that says it is done; then what is made of all shards together.
+"""Make the shards of a data set, and assemble the data set from them.
 
-Pictures are read, photographed and written. Where that happens (`Workplace`), work that was interrupted is continued,
-and the dataset appears whole. On a disk everything happens in the hidden folder `.OUT.partial`: `dataset-ID/`, with the
-plan's identifier, fills with files, and `plan/` has the plan and a record file of finished pieces for each shard
-(`foundation.pieces`). At the end `dataset-ID/` gets its name by one rename, then the rest is removed. An object store
-has no rename: the files are written where they stay, plan and records below `OUT/.plan/`, and `dataset.json`, written
-last, makes a dataset of them.
+A `Workplace` is the location where a data set is made; interrupted work is resumed there. On a disk it is the hidden
+folder `.OUT.partial`. Its subfolder `dataset-ID/` has the files, where ID is the identifier of the plan. `plan/` has
+the plan and a file of finished pieces for each shard (`foundation.pieces`). At the end `dataset-ID/` is renamed to
+OUT. An object store has no rename: files are written to their final location, plan and records below `OUT/.plan/`, and
+`dataset.json` is written last. Contract:
 
-Rules that hold inside:
+- The bytes of a shard depend only on its job: not on workers, other shards, or repeated work.
+- A shard is complete exactly if its piece exists, because the piece is written after all files are on the disk. The
+  program may be killed at any time, and several programs may make the same shard at once.
+- Each image of an incomplete shard is a piece too. When the shard is resumed, an image is reused if its files and its
+  source still have the recorded hashes. Object stores cannot append to files and have no such pieces.
+- Each worker keeps about three pictures in memory.
 
-- A shard's bytes depend on its job alone: not on the workers, on other shards, or on how often it is made.
-- A shard is one piece, written when all else has been synchronised with the disk: a shard with its piece is whole. The
-  program may be killed at any instruction, and any number of programs may make the same shard at once.
-- Until then each image is a piece, and counts if its files are there with their hashes and its source is as it was. The
-  bytes of the others do not depend on it. An object store cannot add to a file, so that it has no such pieces.
-- At most about three pictures are in memory for each worker.
-
-An image under one light has that light's ground truth, however its intensity falls off. Where it falls off with a tint
-(`generator.variation.variation`) the light stands in the records twice, as it is at the near and at the far end, and
-masks and maps say how much of either reaches a pixel.
+An image with one illuminant has the ground truth of this illuminant, also with a fall-off of brightness. With a
+coloured fall-off (`generator.variation.variation`), the illuminant is listed twice, for the near and the far end.
+Masks and ground truth maps then have the weights of both in each pixel.
 """
 
 from __future__ import annotations
@@ -48,7 +45,7 @@ from foundation.pieces import Piece, read_pieces
 from foundation.records import from_json
 from foundation.version import software
 from generator.dataset.cards import card, datasheet
-from generator.dataset.joined import Beside
+from generator.dataset.joined import Extras
 from generator.dataset.layouts import LAYOUTS, ShardWriter
 from generator.dataset.plan import DatasetOptions, ShardJob, versions
 from generator.dataset.reader import Dataset, load_description
@@ -102,91 +99,75 @@ if TYPE_CHECKING:
 
 
 PLAN: Final = "plan.json"
-RECORDS: Final = "shards"
-# Names among a place's notes: of the plan, of the folder of shards' records, and in a store of the notes' folder.
-NOTES: Final = ".plan"
-_WHOLE: Final = "shard"  # Name of the piece that is a shard; those of images are their numbers
-_HEAD_BYTES: Final = 80  # Of a record: a line end, a SHA-256 and the name of its first piece
-_READERS: Final = 16  # Record files that are read at a time: a store is waited for most of the time
+RECORDS: Final = "shards"  # Folder of the records of shards
+NOTES: Final = ".plan"  # Folder of plan and records in an object store
+_SHARD_PIECE: Final = "shard"  # Name of the piece of a complete shard; pieces of images have their numbers as names
+_HEAD_BYTES: Final = 80  # Bytes of a record file that contain the name of its first piece, after a SHA-256
+_READERS: Final = 16  # Record files that are read in parallel, because most of the time is waiting for the store
 
 PlanIdentity = Mapping[str, Any]
 
 _threads: Final = threading.local()
 
-# A shorter side below which a picture is noted: icons and failed downloads are so small, photographs never are.
+# Shorter side in px below which a picture gets a note: probably an icon or a failed download, not a photograph.
 TINY_PX: Final = 16
 
-_WORD: Final = 1 << 64  # Values of the eight bytes of a hash that place a source among the parts
+_WORD: Final = 1 << 64  # Number of values of the eight bytes of a hash that select the split of a source
 
 
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
-    """Return the part of the dataset that a source belongs to.
-
-    Decided by the seed and the source's content, or its name where it has no file, and by no other source, so that two
-    copies of one file, whatever their names, are in the same part. The shares hold on average.
-
-    `shares`: of train, validation and test; sum 1. None leaves it undivided.
-    """
+    """Return the split of a source; `shares` of train, validation and test have the sum 1."""
+    # It depends on the seed and the content (the name, if there is no file), but on no other source. Copies of one file
+    # are therefore in the same split, and the shares are exact only on average.
     if shares is None:
         return None
-    word = hashlib.sha256(f"split {seed} {sha256 or name}".encode()).digest()[:8]
-    place = int.from_bytes(word, "big") / _WORD
+    digest = hashlib.sha256(f"split {seed} {sha256 or name}".encode()).digest()[:8]
+    position = int.from_bytes(digest, "big") / _WORD
     bound = 0.0
-    for part, share in zip(SPLITS, shares, strict=True):
+    for split, share in zip(SPLITS, shares, strict=True):
         bound += share
-        if place < bound and share:
-            return part
+        if position < bound and share:
+            return split
     return max(zip(shares, SPLITS, strict=True))[1]
 
 
 def light_of(lut: Lut, light: int) -> Light:
-    """Return the record of light number `light` of the table."""
-    shown, expanded = lut.illuminations[light], lut.truth_uncertainty_deg
-    red, green, blue = (float(part) for part in lut.white[light])
+    """Return the record of an illuminant of the LUT."""
+    illumination, expanded = lut.illuminations[light], lut.truth_uncertainty_deg
+    red, green, blue = (float(channel) for channel in lut.white[light])
     return Light(
         illumination=light,
-        kind=shown.kind,
-        cct_k=shown.cct_k,
-        codes=shown.colour,
+        kind=illumination.kind,
+        cct_k=illumination.cct_k,
+        codes=illumination.colour,
         white=(red, green, blue),
-        name=shown.name,
+        name=illumination.name,
         uncertainty_deg=None if expanded is None else float(f"{expanded[light]:.4g}"),
     )
 
 
 @dataclass(frozen=True)
-class ShownColours:
-    """How well a print shows the colours of a picture; columns of `images.csv`.
+class PrintColours:
+    """Colour reproduction of the print of a picture; columns of `images.csv`."""
 
-    - `cells`: first 16 digits of the SHA-256 of the map of the print.
-    - `outside`: share of the pixels that the print cannot show, 0 … 1.
-    - `distance`: mean angle by which colours are missed, degrees.
-    """
-
-    cells: str
-    outside: float
-    distance: float
+    cells: str  # first 16 digits of the SHA-256 of the map of the print
+    outside: float  # share of the pixels with colours that the print cannot show, 0 … 1
+    distance: float  # mean colour error, degrees
 
 
 @dataclass(frozen=True, eq=False)
 class RawImage:
-    """The raw image of a print.
+    """The raw image of a print."""
 
-    - `counts`: (H, W, 3) uint16, linear camera RGB. One light: memory that the thread's next call overwrites.
-    - `weights`: (H, W, K) float32, the share of each of several lights in each pixel; None with one light.
-    - `black_taken`: share of the print's black that was taken out, 0 … 1; None if the black is kept.
-    - `shown`: how the print shows the colours; None if it was rendered by codes.
-    """
-
-    counts: npt.NDArray[np.uint16]
-    weights: npt.NDArray[np.float32] | None
-    black_taken: float | None = None
-    shown: ShownColours | None = None
+    counts: npt.NDArray[np.uint16]  # (H, W, 3), linear camera RGB; may be overwritten by the next call in this thread
+    weights: npt.NDArray[np.float32] | None  # (H, W, K), masks of several illuminants; None for one
+    black_taken: float | None = None  # subtracted share of the black of the print, 0 … 1; None if it is kept
+    print_colours: PrintColours | None = None
 
     def details(self) -> Details:
         """Return the columns of `images.csv`."""
-        shown: Details = {} if self.shown is None else dict(vars(self.shown))
-        return shown if self.black_taken is None else shown | {"black_taken": self.black_taken}
+        columns: Details = {} if self.print_colours is None else dict(vars(self.print_colours))
+        return columns if self.black_taken is None else columns | {"black_taken": self.black_taken}
 
 
 def photograph(
@@ -198,11 +179,11 @@ def photograph(
     number: int,
     white_level: int,
 ) -> RawImage:
-    """Return the raw image of a picture's print.
+    """Return the raw image of a print of `picture` (H, W, 3) uint8, sRGB codes.
 
-    `picture`: (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
+    For rendering by codes, all colours must have samples in the LUT. `number` is the number of the image.
     """
-    # The hash of the table stands for its samples in the dataset's description.
+    # The data set records only the hash of the LUT, so samples must match their hashes.
     for mixture in lighting.mixtures:
         for light in mixture.lights:
             lut.require_unchanged(light)
@@ -221,8 +202,8 @@ def photograph(
             image=number,
             out=_reused(picture.shape),
         )
-        shown = ShownColours(rendering.map.sha256[:16], round(outside, 6), round(distance, 6))
-        return RawImage(counts, weights, share, shown)
+        print_colours = PrintColours(rendering.map.sha256[:16], round(outside, 6), round(distance, 6))
+        return RawImage(counts, weights, share, print_colours)
     tables = [_samples(lut, mixture, picture, share or 0.0, seed) for mixture in lighting.mixtures]
     if weights is None:
         counts = draw_samples(tables[0], picture, seed=seed, image=number, out=_reused(picture.shape))
@@ -232,7 +213,7 @@ def photograph(
 
 
 def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int) -> npt.NDArray[np.uint16]:
-    """Return the samples of a light without a share of the print's black, at least those of a picture's colours."""
+    # Samples with a share of the black of the print subtracted, at least for the colours of the picture.
     samples = mixture.samples(lut, seed, picture)
     if not share:
         return samples
@@ -242,10 +223,8 @@ def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: i
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
-    """Return an array uint16 of any content in memory of the calling thread, which its next call overwrites.
-
-    Fresh pages take as long to map as the drawing into them.
-    """
+    # Uninitialised memory of the calling thread, overwritten by its next call. Mapping new pages would take as long as
+    # rendering into them.
     size = math.prod(shape)
     memory: npt.NDArray[np.uint16] | None = getattr(_threads, "memory", None)
     if memory is None or memory.size < size:
@@ -255,24 +234,16 @@ def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
 
 @dataclass(frozen=True, eq=False)
 class _ImageLight:
-    """The light of one image.
+    """Ground truth and maps of one image."""
 
-    - `truth`: chromaticity, sum 1, of the light averaged over the pixels.
-    - `maps`: kind, what follows the image's number in the file's name, and the bytes of each map beside the image.
-    """
-
-    truth: Triple
+    truth: Triple  # mean over all pixels, sum 1
     rows: list[LightRow]
-    maps: list[tuple[str, str, bytes]]
+    maps: list[tuple[str, str, bytes]]  # file kind, end of the file name, bytes
 
 
 def _image_light(
     lut: Lut, lighting: Lighting, weights: npt.NDArray[np.float32] | None, varied: Varied, tints: bool
 ) -> _ImageLight:
-    """Return the light of an image.
-
-    `weights`: (H, W, K) float32, of each of K lights in each pixel; None of one light.
-    """
     labels = [mixture.label for mixture in lighting.mixtures]
     whites = lighting.whites(lut)
     intensity = None
@@ -292,8 +263,8 @@ def _image_light(
 
 
 def chromaticity(white: npt.NDArray[np.float64]) -> Triple:
-    """Return (r, g, b) of sum 1 of linear RGB (3,) float64."""
-    red, green, blue = (float(part) for part in white / white.sum())
+    """Return (r, g, b) with the sum 1 of linear RGB (3,) float64."""
+    red, green, blue = (float(channel) for channel in white / white.sum())
     return red, green, blue
 
 
@@ -303,27 +274,26 @@ def _ignore(*arguments: object) -> None:
 
 @dataclass(frozen=True)
 class Callbacks:
-    """What is called while images are made, always from the calling thread.
+    """Functions that are called while images are generated, always from the calling thread.
 
     Attributes
     ----------
     on_done
-        Takes how many more of the planned images are found finished: of the shards that are done before the first image
-        is made, and of a shard that was begun when it is taken up; less than 0 for images whose source proves to have
-        changed since, which are made again.
+        Called with a number of images that are reused from an earlier run. It is negative if the source of reused
+        images has changed, so that they are made again.
     on_image
         Called after each image.
     on_skip
-        Takes the name of a source that cannot be read, the reason, and the number of images that are left out.
+        Called with the name of a source that cannot be read, the reason, and the number of its images.
     on_wait
-        Takes a sentence for the user where the work waits for somebody to do something.
+        Called with a message when the work waits for an action of the user.
 
     Examples
     --------
-    >>> left_out = []
-    >>> callbacks = Callbacks(on_skip=lambda name, reason, images: left_out.append(name))
-    >>> callbacks.on_skip("bad.png", "bad.png is no picture", 2)
-    >>> left_out
+    >>> skipped = []
+    >>> callbacks = Callbacks(on_skip=lambda name, reason, images: skipped.append(name))
+    >>> callbacks.on_skip("bad.png", "bad.png is not a picture", 2)
+    >>> skipped
     ['bad.png']
     """
 
@@ -338,23 +308,20 @@ SILENT: Final = Callbacks()  # Callbacks that do nothing
 
 @dataclass(frozen=True)
 class _ReadSource:
-    """The crops of a source, or all of it, and what is recorded of it; no crops where all its images are finished.
+    """A source picture that was read."""
 
-    Where sRGB codes are those of the print, they are codes that the table has samples of.
-    """
-
-    cuts: tuple[Cut, ...]
+    cuts: tuple[Cut, ...]  # its crops, or one of the full picture; empty if all its images are finished
     record: SourceRecord
 
 
 class ShardCancelled(Exception):
-    """A shard was given up because something else failed; whoever caused it handles it."""
+    """A shard was cancelled because of an error elsewhere, which is handled there."""
 
 
 def make_shard(
     job: ShardJob,
     lut: Lut,
-    place: Workplace,
+    workplace: Workplace,
     pool: ThreadPoolExecutor,
     workers: int,
     callbacks: Callbacks = SILENT,
@@ -367,7 +334,7 @@ def make_shard(
     used: set[int] = set()
     pending: deque[Future[Sample]] = deque()
     reading: deque[Future[_ReadSource]] = deque()
-    finished = _finished_images(job, place, pool)
+    finished = _finished_images(job, workplace, pool)
     if finished:
         callbacks.on_done(len(finished))
 
@@ -378,37 +345,37 @@ def make_shard(
         if sample.record.number not in finished:
             callbacks.on_image()
 
-    def forget_changed(wanted: list[tuple[int, int, Lighting]], source: SourceRecord | None) -> None:
-        changed = [number for number, _, _ in wanted if number in finished and finished[number].source != source]
+    def forget_changed(shard_images: list[tuple[int, int, Lighting]], source: SourceRecord | None) -> None:
+        changed = [number for number, _, _ in shard_images if number in finished and finished[number].source != source]
         for number in changed:
             del finished[number]
         if changed:
             callbacks.on_done(-len(changed))
 
-    with _writer_of(job, place) as writer, _cancelling(pending, reading):
+    with _writer_of(job, workplace) as writer, _cancelling(pending, reading):
         for row, source in enumerate(job.sources):
             while len(reading) <= workers and row + len(reading) < len(job.sources):
                 reading.append(pool.submit(_read, job, lut, row + len(reading), finished))
-            wanted = _wanted(job, job.position + row)
+            shard_images = _images_of_source(job, job.position + row)
             try:
                 read = reading.popleft().result()
             except FormatError as error:
-                forget_changed(wanted, None)
+                forget_changed(shard_images, None)
                 skipped.append(Skipped(position=job.position + row, name=source.name))
-                callbacks.on_skip(source.name, str(error), len(wanted))
+                callbacks.on_skip(source.name, str(error), len(shard_images))
                 continue
-            forget_changed(wanted, read.record)
+            forget_changed(shard_images, read.record)
             sources.append(read.record)
-            for number, crop, lighting in wanted:
+            for number, crop, lighting in shard_images:
                 while len(pending) >= 2 * workers:
                     finish_one(writer)
                 if cancelled is not None and cancelled.is_set():
                     raise ShardCancelled
                 used.update(light for mixture in lighting.mixtures for light in mixture.lights)
                 if number in finished:
-                    pending.append(pool.submit(_taken_up, finished[number]))
+                    pending.append(pool.submit(_reused_sample, finished[number]))
                 else:
-                    pending.append(pool.submit(_photographed, job, lut, place, writer, number, read, crop, lighting))
+                    pending.append(pool.submit(_rendered, job, lut, workplace, writer, number, read, crop, lighting))
         while pending:
             finish_one(writer)
         files = writer.close()
@@ -420,28 +387,27 @@ def make_shard(
         files=files,
         lights=[light_of(lut, light) for light in sorted(used)],
     )
-    place.commit(record)
+    workplace.commit(record)
     return record
 
 
-def _finished_images(job: ShardJob, place: Workplace, pool: ThreadPoolExecutor) -> dict[int, FinishedImage]:
-    # Another program may have committed the whole shard meanwhile.
-    pieces = [piece for name, piece in place.pieces(job.shard).items() if name != _WHOLE]
-    return {image.image.number: image for image in pool.map(place.image_of, pieces) if image is not None}
+def _finished_images(job: ShardJob, workplace: Workplace, pool: ThreadPoolExecutor) -> dict[int, FinishedImage]:
+    # Another program may have committed the complete shard in the meantime.
+    pieces = [piece for name, piece in workplace.pieces(job.shard).items() if name != _SHARD_PIECE]
+    return {image.image.number: image for image in pool.map(workplace.image_of, pieces) if image is not None}
 
 
-def _taken_up(image: FinishedImage) -> Sample:
-    """Return a finished image for the writer's `append`."""
+def _reused_sample(image: FinishedImage) -> Sample:
     source = image.source
     return Sample(image.image, source.name, source.split, source.width, source.height, (), tuple(image.files))
 
 
-def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
+def _writer_of(job: ShardJob, workplace: Workplace) -> ShardWriter:
     options = job.options
     lightings = job.choice.lightings_of(job.position * options.crops)
     maps = options.tints or any(lighting.masks is not None for lighting in lightings)
-    beside = Beside(options.previews, maps, options.has_details)
-    return LAYOUTS[options.layout].open_writer(place.files, job.shard, beside)
+    extras = Extras(options.previews, maps, options.has_details)
+    return LAYOUTS[options.layout].open_writer(workplace.files, job.shard, extras)
 
 
 @contextmanager
@@ -457,41 +423,35 @@ def _cancelling(*queues: deque[Future[Any]]) -> Generator[None]:
 
 @dataclass(frozen=True)
 class ShardDone:
-    """Result of a task: how many images its shard has, and of each source that cannot be read name, reason, images.
+    """Result of a task of a worker."""
 
-    `found`: how many of the images whoever was at the shard before had finished.
-    """
-
-    images: int
-    skipped: tuple[tuple[str, str, int], ...]
-    found: int = 0
+    images: int  # of the shard
+    skipped: tuple[tuple[str, str, int], ...]  # sources that cannot be read: name, reason, number of images
+    reused: int = 0  # images that an earlier run had finished
 
 
-def make_elsewhere(job: ShardJob, place: Workplace) -> ShardDone:
-    """Make a shard in a program of its own, which opens the table itself: the task of an engine's worker.
-
-    A shard that is done already is not made again.
-    """
-    if place.has(job.shard):
-        return ShardDone(len(place.load(job.shard).images), ())
-    found = versions(job.options.form, job.options.layout)
-    if found != job.versions:
-        differing = [name for name in job.versions if found.get(name) != job.versions[name]]
+def make_shard_on_worker(job: ShardJob, workplace: Workplace) -> ShardDone:
+    """Make a shard in a worker process, which opens the LUT itself, unless the shard is complete."""
+    if workplace.has(job.shard):
+        return ShardDone(len(workplace.load(job.shard).images), ())
+    installed = versions(job.options.form, job.options.layout)
+    if installed != job.versions:
+        differing = [name for name in job.versions if installed.get(name) != job.versions[name]]
         raise InputError(
-            "a worker has other libraries than the plan was made with: "
-            + ", ".join(f"{name} {found.get(name)} for {job.versions[name]}" for name in differing)
-            + "; install the same on every machine"
+            "a worker has different versions of libraries than the plan: "
+            + ", ".join(f"{name} {installed.get(name)}, expected {job.versions[name]}" for name in differing)
+            + "; install equal versions on all machines"
         )
     skipped: list[tuple[str, str, int]] = []
-    taken_up: list[int] = []
+    reused_counts: list[int] = []
 
     def skip(name: str, reason: str, images: int) -> None:
         skipped.append((name, reason, images))
 
     lut = _table_of(job.table, job.table_sha256)
     with ThreadPoolExecutor(1) as pool:
-        record = make_shard(job, lut, place, pool, 1, Callbacks(on_done=taken_up.append, on_skip=skip))
-    return ShardDone(len(record.images), tuple(skipped), sum(taken_up))
+        record = make_shard(job, lut, workplace, pool, 1, Callbacks(on_done=reused_counts.append, on_skip=skip))
+    return ShardDone(len(record.images), tuple(skipped), sum(reused_counts))
 
 
 @lru_cache(maxsize=2)
@@ -499,53 +459,53 @@ def _table_of(folder: Path, sha256: str) -> Lut:
     lut = open_lut(folder)
     if lut.sha256 != sha256:
         raise InputError(
-            f"the table {folder} of a worker is not that of the plan; give every machine the same table at that path"
+            f"the LUT {folder} of a worker has hash {lut.sha256}, expected {sha256}; copy the LUT to all machines"
         )
     return lut
 
 
-def _wanted(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
-    """Return number, crop and lighting of each image of the source at `position` that is in the shard."""
-    crops, each = job.options.crops, job.choice.lights_each
-    numbered = (
-        ((position * crops + crop) * each + place, crop, lighting)
+def _images_of_source(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
+    # Number, crop and lighting of each image of the source that is in the shard.
+    crops, lights_each = job.options.crops, job.choice.lights_each
+    numbered_images = (
+        ((position * crops + crop) * lights_each + light_index, crop, lighting)
         for crop in range(crops)
-        for place, lighting in enumerate(job.choice.lightings_of(position * crops + crop))
+        for light_index, lighting in enumerate(job.choice.lightings_of(position * crops + crop))
     )
-    return [wanted for wanted in numbered if job.first <= wanted[0] < job.stop]
+    return [numbered_image for numbered_image in numbered_images if job.first <= numbered_image[0] < job.stop]
 
 
-def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedImage]) -> _ReadSource:
-    known = _known_source(job, job.position + place, finished) if finished else None
-    if known is not None:
-        return _ReadSource((), known)
-    source: Source = job.sources[place]
+def _read(job: ShardJob, lut: Lut, row: int, finished: Mapping[int, FinishedImage]) -> _ReadSource:
+    recorded = _unchanged_source(job, job.position + row, finished) if finished else None
+    if recorded is not None:
+        return _ReadSource((), recorded)
+    source: Source = job.sources[row]
     scene = source.read()
-    whole = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
-    if len(whole) != job.options.crops:
+    source_cuts = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
+    if len(source_cuts) != job.options.crops:
         raise InputError(
-            f"{source.name} has {max(1, len(whole))} crops, expected {job.options.crops}; give the preparation of "
-            "pictures and the options of the dataset the same number, and leave random scenes out"
+            f"{source.name} has {max(1, len(source_cuts))} crops, expected {job.options.crops}; use one number of "
+            "crops for the preparation and the data set, and omit random scenes"
         )
     if job.options.rendering == "codes":
-        fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in whole]
+        fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in source_cuts]
     else:
-        # Mixtures of cells hold fit ones alone.
-        fit = [(cut.picture, 0) for cut in whole]
+        # Colorimetric rendering uses only fit patches.
+        fit = [(cut.picture, 0) for cut in source_cuts]
     height, width = scene.picture.shape[:2]
-    least = FILE_FORMATS[job.options.form].smallest_side
-    if min(height, width) < least:
+    smallest_side = FILE_FORMATS[job.options.form].smallest_side
+    if min(height, width) < smallest_side:
         raise FormatError(
-            f"{source.name} is {width}x{height} px, too small for {job.options.form}, which takes {least}x{least} and "
-            "more; choose another format, or leave it out"
+            f"{source.name} is {width}x{height} px, expected {smallest_side}x{smallest_side} or more for "
+            f"{job.options.form}; choose another format, or omit the picture"
         )
     notes = [*scene.notes]
     if min(height, width) < TINY_PX:
         notes.append(f"tiny, {width}x{height} px")
-    if not all(cut.picture.any() for cut in whole):
+    if not all(cut.picture.any() for cut in source_cuts):
         notes.append("all black")
     record = SourceRecord(
-        position=job.position + place,
+        position=job.position + row,
         name=source.name,
         sha256=scene.sha256,
         profile=scene.profile or None,
@@ -555,24 +515,25 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
         split=split_of(job.options.split, job.seed, scene.sha256, source.name),
         note="; ".join(notes) or None,
     )
-    cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
+    cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(source_cuts, fit, strict=True))
     return _ReadSource(cuts, record)
 
 
-def _known_source(job: ShardJob, position: int, finished: Mapping[int, FinishedImage]) -> SourceRecord | None:
-    """Return the record of a source that is as it was when every image of it was finished; else None."""
-    known = [finished[number].source if number in finished else None for number, _, _ in _wanted(job, position)]
-    first = known[0] if known else None
-    if first is None or any(source != first for source in known):
+def _unchanged_source(job: ShardJob, position: int, finished: Mapping[int, FinishedImage]) -> SourceRecord | None:
+    # The record of a source with all images finished that has not changed since; else None.
+    images = _images_of_source(job, position)
+    records = [finished[number].source if number in finished else None for number, _, _ in images]
+    first = records[0] if records else None
+    if first is None or any(source != first for source in records):
         return None
-    # Of a file on a store no hash is known before it is read.
+    # For a file in a store the hash is unknown before reading it.
     return first if hash_since(job.sources[position - job.position], -math.inf) == first.sha256 else None
 
 
-def _photographed(
+def _rendered(
     job: ShardJob,
     lut: Lut,
-    place: Workplace,
+    workplace: Workplace,
     writer: ShardWriter,
     number: int,
     source: _ReadSource,
@@ -582,9 +543,9 @@ def _photographed(
     options, cut = job.options, source.cuts[crop]
     height, width = cut.picture.shape[:2]
     white_level = lut.provenance.white_level
-    # What exceeds saturation may be below it once it is exposed anew, and is cut then.
-    most = white_level if options.variation is None else FULL
-    raw = photograph(lut, cut.picture, lighting, options, job.seed, number, most)
+    # A variation may reduce the exposure, so values above saturation are kept and clipped afterwards.
+    limit = white_level if options.variation is None else FULL
+    raw = photograph(lut, cut.picture, lighting, options, job.seed, number, limit)
     varied = Varied()
     if options.variation is not None:
         varied = options.variation.apply(raw.counts, white_level, job.seed, number)
@@ -592,7 +553,7 @@ def _photographed(
     metadata = ImageMetadata(white_level, light.truth, lut.provenance.camera)
     files: list[tuple[str, str, Pieces]] = [
         ("images", suffix_of(options.form), encode_pieces(raw.counts, options.form, metadata)),
-        *((kind, ending, (data,)) for kind, ending, data in light.maps),
+        *((file_kind, ending, (data,)) for file_kind, ending, data in light.maps),
     ]
     if options.previews:
         files.append(("previews", ".jpg", (encode_preview(preview_of(raw.counts, white_level)),)))
@@ -606,22 +567,22 @@ def _photographed(
     )
     sample = writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
     if sample.stored:
-        place.note(job.shard, FinishedImage(image=record, source=source.record, files=list(sample.stored)))
+        workplace.note(job.shard, FinishedImage(image=record, source=source.record, files=list(sample.stored)))
     return sample
 
 
 class NothingMadeError(FormatError):
-    """None of the sources can be read, so there is no dataset."""
+    """None of the sources can be read, so there is no data set."""
 
 
 class _RenderingSums:
-    """Adds up how images were rendered."""
+    """Sums over images for the rendering summary."""
 
     def __init__(self) -> None:
         self._sums = dict.fromkeys(("images", "pixels", "black_taken", "outside", "distance"), 0.0)
 
     def add(self, details: Details, pixels: int) -> None:
-        """Add what is recorded of an image of so many pixels."""
+        """Add the details of an image."""
         self._sums["images"] += 1
         self._sums["black_taken"] += float(details.get("black_taken", 0))
         if "cells" in details:
@@ -630,7 +591,7 @@ class _RenderingSums:
                 self._sums[name] += pixels * float(details[name])
 
     def summary(self) -> RenderingSummary:
-        """Return means over pixels and images."""
+        """Return the means over pixels and images."""
         by_colour = {
             name: round(self._sums[name] / self._sums["pixels"], 6)
             for name in ("outside", "distance")
@@ -641,29 +602,29 @@ class _RenderingSums:
 
 
 class _ListedFile:
-    """A text file of the dataset that is written in order and hashed while it is written."""
+    """A text file of the data set that is hashed while it is written."""
 
     def __init__(self, stack: ExitStack, store: Store, name: str) -> None:
         self.name = name
         self._writer = HashingWriter(stack.enter_context(store.create(name)))
 
     def write(self, text: str) -> None:
-        """Append a text, as UTF-8."""
+        """Append a text in UTF-8."""
         self._writer.write(text.encode())
 
     @property
     def sha256(self) -> str:
-        """Of what was written so far."""
+        """SHA-256 of the text written so far."""
         return self._writer.sha256
 
     @property
     def sum(self) -> str:
-        """The file's line in SHA256SUMS."""
+        """Line of the file in SHA256SUMS."""
         return f"{self.sha256}  {self.name}\n"
 
 
-def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
-    """Write what a dataset has beside its images, give the dataset its name, and return it; its lists are not read."""
+def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
+    """Write lists and description of a data set, publish it, and return it."""
     options = identity["options"]
     suffix = suffix_of(options["format"])
     counts: Counter[str] = Counter()
@@ -674,22 +635,22 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
     details: _ListedFile | None = None
     rendered = _RenderingSums()
     with ExitStack() as stack:
-        truths = _ListedFile(stack, place.files, TRUTHS)
-        table = _ListedFile(stack, place.files, GROUND_TRUTH)
-        listed = _ListedFile(stack, place.files, SOURCES)
-        parts = {
-            part: _ListedFile(stack, place.files, f"splits/{part}.txt")
-            for part in SPLITS
+        truths = _ListedFile(stack, workplace.files, TRUTHS)
+        table = _ListedFile(stack, workplace.files, GROUND_TRUTH)
+        sources_file = _ListedFile(stack, workplace.files, SOURCES)
+        split_files = {
+            split: _ListedFile(stack, workplace.files, f"splits/{split}.txt")
+            for split in SPLITS
             if options["split"] is not None
         }
-        sums = stack.enter_context(place.files.create(SUMS))
-        stated = bool(options.get("uncertainty"))
-        table.write(csv_text([[*GROUND_TRUTH_COLUMNS, *([UNCERTAINTY_COLUMN] if stated else [])]]))
-        listed.write(csv_text([SOURCE_COLUMNS]))
-        for record, fresh, left_out in _records(place, int(identity["shards"])):
+        sums = stack.enter_context(workplace.files.create(SUMS))
+        has_uncertainty = bool(options.get("uncertainty"))
+        table.write(csv_text([[*GROUND_TRUTH_COLUMNS, *([UNCERTAINTY_COLUMN] if has_uncertainty else [])]]))
+        sources_file.write(csv_text([SOURCE_COLUMNS]))
+        for record, fresh, left_out in _records(workplace, int(identity["shards"])):
             names = {source.position: source for source in record.sources}
             for source in fresh:
-                listed.write(_source_row(source))
+                sources_file.write(_source_row(source))
                 counts["sources"] += 1
                 counts["pixels"] += source.width * source.height * int(options.get("crops", 1))
                 counts["replaced"] += source.replaced_pixels
@@ -698,25 +659,25 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
             for image in record.images:
                 source = names[image.position]
                 name = f"{image_key(image.number)}{suffix}"
-                table.write(_image_rows(name, source.name, image, used if stated else None))
+                table.write(_image_rows(name, source.name, image, used if has_uncertainty else None))
                 truths.write("{:.9f} {:.9f} {:.9f}\n".format(*image.truth))
                 labels.update(light.illumination for light in image.lights)
                 if image.details:
                     rendered.add(image.details, source.width * source.height)
                     if details is None:
-                        details = _ListedFile(stack, place.files, IMAGES)
+                        details = _ListedFile(stack, workplace.files, IMAGES)
                         details.write(csv_text([["image", *image.details]]))
                     details.write(csv_text([[name, *map(_plain, image.details.values())]]))
                 if source.split is not None:
-                    parts[source.split].write(f"{name}\n")
+                    split_files[source.split].write(f"{name}\n")
                     splits[source.split] += 1
                 counts["images"] += 1
             for file in record.files:
                 sums.write(f"{file.sha256}  {file.name}\n".encode())
         if not counts["images"]:
             raise NothingMadeError(
-                f"none of the {identity['sources']['count']} pictures can be used: all were "
-                "left out, each with its reason; name others, or ask for a smaller crop if they are too small"
+                f"0 of {identity['sources']['count']} pictures can be used, expected 1 or more; the reasons are listed "
+                "above. Give other pictures, or a smaller crop if they are too small"
             )
         description = Description(
             software=software(),
@@ -729,42 +690,42 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
             sources=counts["sources"],
             pixels=counts["pixels"],
             replaced_pixels=counts["replaced"],
-            splits={part: splits[part] for part in parts},
+            splits={split: splits[split] for split in split_files},
             lights=[used[light] for light in sorted(used)],
             skipped=skipped,
             rendering=rendered.summary() if {"rendering", "black_point"} & options.keys() else None,
         )
         text = (description.model_dump_json(indent=2) + "\n").encode()
-        written = [table, truths, listed, *parts.values()]
+        written = [table, truths, sources_file, *split_files.values()]
         if details is not None:
             written.append(details)
         for file in written:
             sums.write(file.sum.encode())
         sums.write(f"{hashlib.sha256(text).hexdigest()}  {DESCRIPTION}\n".encode())
-        # Its makers complete them, so that no hash of them is recorded.
+        # The authors complete these files by hand, so their hashes are not recorded.
         texts = {CARD: card(description), DATASHEET: datasheet(description)}
         for name, card_text in texts.items():
-            place.files.put(name, card_text.encode())
+            workplace.files.put(name, card_text.encode())
     names = [file.name for file in written]
-    place.files.sync([*names, SUMS, *COMPLETED_BY_HAND])
-    # In an object store this makes it a dataset, so everything else is there.
-    place.files.put(DESCRIPTION, text)
-    place.files.sync([DESCRIPTION])
-    place.publish()
-    store = open_store(place.out)
+    workplace.files.sync([*names, SUMS, *COMPLETED_BY_HAND])
+    # In an object store this file completes the data set, so it is written last.
+    workplace.files.put(DESCRIPTION, text)
+    workplace.files.sync([DESCRIPTION])
+    workplace.publish()
+    store = open_store(workplace.out)
     return Dataset(store, load_description(store), frozenset(labels))
 
 
-def _records(place: Workplace, shards: int) -> Iterator[tuple[ShardRecord, list[SourceRecord], list[Skipped]]]:
+def _records(workplace: Workplace, shards: int) -> Iterator[tuple[ShardRecord, list[SourceRecord], list[Skipped]]]:
     last: SourceRecord | Skipped | None = None
     for shard in range(shards):
-        record = place.load(shard)
+        record = workplace.load(shard)
         ordered = sorted((*record.sources, *record.skipped), key=lambda source: source.position)
         if last is not None and ordered and ordered[0].position == last.position:
             if ordered[0] != last:
                 raise FormatError(
-                    f"the picture {last.name} changed, or could be read only once, while the dataset was made; remove "
-                    f"{place.notes.place} with all beside it and begin again"
+                    f"the picture {last.name} differs between two shards, expected no change while the data set is "
+                    f"made; remove {workplace.notes.location} and the files next to it, then start again"
                 )
             fresh = ordered[1:]
         else:
@@ -779,147 +740,138 @@ def _records(place: Workplace, shards: int) -> Iterator[tuple[ShardRecord, list[
 
 
 def _plain(value: float | str) -> str:
-    """Return a value of `images.csv`; nine digits give back every float32."""
+    # Nine digits represent every float32 exactly.
     return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
 def _source_row(source: SourceRecord) -> str:
-    known = (source.position, source.name, source.sha256 or "", source.width, source.height, source.replaced_pixels)
-    return csv_text([[*known, source.split or "", source.profile or "", source.note or ""]])
+    cells = (source.position, source.name, source.sha256 or "", source.width, source.height, source.replaced_pixels)
+    return csv_text([[*cells, source.split or "", source.profile or "", source.note or ""]])
 
 
-def _image_rows(name: str, source: str, image: ImageRecord, stated: Mapping[int, Light] | None) -> str:
-    """Return the rows of an image's lights, with what each may be off by where the table's lights are given."""
+def _image_rows(name: str, source: str, image: ImageRecord, used_lights: Mapping[int, Light] | None) -> str:
+    # One row for each illuminant, with its uncertainty if `used_lights` are given.
     return csv_text(
         [
             name,
             source,
             light.illumination,
-            *(f"{part:.9f}" for part in light.truth),
-            *([] if stated is None else [_uncertainty(light.illumination, stated)]),
+            *(f"{channel:.9f}" for channel in light.truth),
+            *([] if used_lights is None else [_uncertainty(light.illumination, used_lights)]),
         ]
         for light in image.lights
     )
 
 
 def _uncertainty(label: str, lights: Mapping[int, Light]) -> str:
-    """Return the expanded uncertainty of a light by its label, degrees: of a mixture the largest of its parts'.
-
-    Errors of a table's lights have causes in common, so that they do not cancel in a mixture, and a mixture lies
-    between its parts. Nothing where the table does not state one.
-    """
-    parts = [lights[int(part.partition(":")[0])].uncertainty_deg for part in label.split("+")]
-    known = [part for part in parts if part is not None]
-    return f"{max(known):.4g}" if len(known) == len(parts) else ""
+    # Expanded uncertainty in degrees; empty if the LUT does not report it. A mixture gets the largest value of its
+    # illuminants, because their errors have common causes and do not cancel.
+    uncertainties = [lights[int(term.partition(":")[0])].uncertainty_deg for term in label.split("+")]
+    reported = [uncertainty for uncertainty in uncertainties if uncertainty is not None]
+    return f"{max(reported):.4g}" if len(reported) == len(uncertainties) else ""
 
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where a dataset is being made.
+    """The location where a data set is made."""
 
-    - `files`: what will be the dataset.
-    - `notes`: the plan and the shards' records, which are removed at the end.
-    - `out`: the dataset's place.
-    - `plan_id`: identifier of the plan; see `generator.dataset.making`.
-    """
+    files: Store  # files of the data set
+    notes: Store  # plan and records of shards, removed at the end
+    out: str  # location of the complete data set
+    plan_id: str  # first 16 hexadecimal digits of the SHA-256 of the plan
 
-    files: Store
-    notes: Store
-    out: str
-    plan_id: str
-
-    def done(self, wanted: Container[int]) -> set[int]:
-        """Return which of the wanted shards are done; records of others are not read."""
-        shards = [shard for shard in self._recorded() if shard in wanted]
-        whole = ordered_map(self.has, shards, _READERS)
-        return {shard for shard, is_done in zip(shards, whole, strict=True) if is_done}
+    def done(self, shards: Container[int]) -> set[int]:
+        """Return the complete shards among `shards`; other records are not read."""
+        recorded_shards = [shard for shard in self._recorded() if shard in shards]
+        are_done = ordered_map(self.has, recorded_shards, _READERS)
+        return {shard for shard, is_done in zip(recorded_shards, are_done, strict=True) if is_done}
 
     def count_done(self) -> int:
-        """Return how many shards are done by the heads of their records; the rest of a record is not read."""
+        """Return the number of complete shards, from the heads of their records."""
         return sum(ordered_map(self._is_headed_whole, self._recorded(), _READERS))
 
     def _recorded(self) -> list[int]:
-        """Return the shards that have a record, of the whole or of images."""
+        # Complete and incomplete shards with a record.
         ending = f".{self.plan_id}"
-        found = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
-        return [int(name.removesuffix(ending)) for name in found if name.endswith(ending)]
+        names = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
+        return [int(name.removesuffix(ending)) for name in names if name.endswith(ending)]
 
     def _is_headed_whole(self, shard: int) -> bool:
-        # In a store there are no records of images; elsewhere `commit` replaces them, so that the whole comes first.
+        # A store has records of complete shards only. On a disk, `commit` replaces the pieces of images by the shard.
         if not isinstance(self.notes, LocalStore):
             return True
         with self.notes.open(self._record_name(shard)) as stream:
-            return f"\t{_WHOLE}\t".encode() in stream.read(_HEAD_BYTES)
+            return f"\t{_SHARD_PIECE}\t".encode() in stream.read(_HEAD_BYTES)
 
     def has(self, shard: int) -> bool:
-        """Return whether a shard is done."""
-        return _WHOLE in self.pieces(shard)
+        """Return whether a shard is complete."""
+        return _SHARD_PIECE in self.pieces(shard)
 
     def load(self, shard: int) -> ShardRecord:
-        """Return the record of a shard that is done."""
-        whole = self.pieces(shard).get(_WHOLE)
-        if whole is None:
-            raise FormatError(f"{self.notes.place}/{self._record_name(shard)} is damaged; run the same command again")
-        return _record_in(whole, ShardRecord)
+        """Return the record of a complete shard."""
+        piece = self.pieces(shard).get(_SHARD_PIECE)
+        if piece is None:
+            raise FormatError(f"{self.notes.location}/{self._record_name(shard)} is damaged; run the command again")
+        return _record_in(piece, ShardRecord)
 
     def commit(self, record: ShardRecord) -> None:
-        """Bring the record of a shard to the disk whose files are there: from here on it is done."""
+        """Write the record of a shard after its files; from now on the shard is complete."""
         name = self._record_name(record.shard)
-        self.notes.put(name, self._piece(_WHOLE, record).to_line())
+        self.notes.put(name, self._piece(_SHARD_PIECE, record).to_line())
         self.notes.sync([name])
 
     def note(self, shard: int, image: FinishedImage) -> None:
-        """Note that all files of an image of a shard are written; any thread may do so."""
+        """Record that all files of an image are written; may be called from any thread."""
         if isinstance(self.notes, LocalStore):
             self.notes.append(self._record_name(shard), self._piece(str(image.image.number), image).to_line())
 
     def pieces(self, shard: int) -> dict[str, Piece]:
-        """Return the finished pieces of a shard by their names."""
+        """Return the finished pieces of a shard by name."""
         name = self._record_name(shard)
         return read_pieces(self.notes.get(name), self.plan_id) if self.notes.has(name) else {}
 
     def image_of(self, piece: Piece) -> FinishedImage | None:
-        """Return the image that a piece is; None if a file of it is not as it was written."""
+        """Return the image of a piece; None if one of its files has changed."""
         return _record_in(piece, FinishedImage) if piece.is_complete(self.files.open) else None
 
     def has_finished(self, shard: bool = False) -> bool:
-        """Return whether an image is finished, or a `shard`, of this plan or of another one."""
+        """Return whether an image (or a complete shard, if `shard`) of any plan is finished."""
         names = self.notes.names(RECORDS)
-        return any(not shard or _WHOLE in read_pieces(self.notes.get(name)) for name in names)
+        return any(not shard or _SHARD_PIECE in read_pieces(self.notes.get(name)) for name in names)
 
     def discard(self) -> None:
-        """Remove the records of the shards that are done, since to continue would end the same."""
+        """Remove the records of complete shards, because resuming them would fail again."""
         self.notes.remove(RECORDS)
 
     def publish(self) -> None:
-        """Make a dataset of the files; all of them, the description last, are there."""
+        """Make the files a complete data set; all of them must be written."""
         if isinstance(self.files, LocalStore):
             out = Path(self.out)
-            require_free(out, "the dataset")
+            require_free(out, "the data set")
             self.files.sweep()
-            publish_folder(self.files.root, out, "the dataset")
+            publish_folder(self.files.root, out, "the data set")
         remove_notes(self.notes)
 
     def _piece(self, name: str, record: ShardRecord | FinishedImage) -> Piece:
         return Piece(name, self.plan_id, {file.name: file.sha256 for file in record.files}, record.model_dump_json())
 
     def _record_name(self, shard: int) -> str:
-        # A worker of a plan that was removed may still be alive: it writes under another name.
+        # A worker of a removed plan may still be running; it uses another name.
         return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}"
 
 
 _Finished = TypeVar("_Finished", ShardRecord, FinishedImage)
 
 
-def _record_in(piece: Piece, kind: type[_Finished]) -> _Finished:
+def _record_in(piece: Piece, record_type: type[_Finished]) -> _Finished:
     files = [FileSum(name=name, sha256=sha256) for name, sha256 in piece.files.items()]
-    return from_json(kind, piece.values, f"the piece {piece.name}", "make the dataset again").model_copy(
+    return from_json(record_type, piece.values, f"the piece {piece.name}", "make the data set again").model_copy(
         update={"files": files}
     )
 
 
 def remove_notes(notes: Store) -> None:
-    """Remove the notes, the plan last: until then a program that is run again finds that the dataset is its own."""
+    """Remove the notes; the plan is removed last, so that a killed program can be run again."""
     notes.remove(RECORDS)
     if isinstance(notes, LocalStore):
         shutil.rmtree(notes.root.parent, ignore_errors=True)

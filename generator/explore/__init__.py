@@ -1,1 +1,1 @@
-"""A table in the browser: its lights as points, a picture under any of them, and the command that makes the same."""
+"""The LUT explorer: illuminants and rendered pictures in the browser, with the command for each."""

@@ -1,11 +1,8 @@
-"""`generate explore`: the server of a page on a table, what the page may ask, and pictures for those who name none.
+"""`generate explore`: the server of the page on a LUT, its requests, and computed sample pictures.
 
-Images are made as `generate` makes them (`generator.dataset.shards.photograph`): the first image of a dataset of this
-picture alone, under this light alone, with seed 0. So the command that is shown makes the bytes that are shown. The
-server (see `foundation.local_server`) writes no file that stays.
-
-Pictures to begin with are shaded balls, patches with greys, and random colours. They are computed, so that nobody's
-photographs have to go with the package, and kept as files, so that a command can name them.
+Images are rendered by `generator.dataset.shards.photograph`, as the first image of a data set of one picture and one
+illuminant with seed 0. The command on the page therefore makes the same bytes as the page shows. The server
+(`foundation.local_server`) keeps uploaded pictures in memory only.
 """
 
 from __future__ import annotations
@@ -49,39 +46,39 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
-MAX_SIDE: Final = 1000  # Longest side of a picture on the page, px: what a window shows, and made in milliseconds
+MAX_SIDE: Final = 1000  # Longest side of a picture on the page, px: fits a window and renders in milliseconds
 
-MOST_DROPPED: Final = 8  # Pictures sent by pages that are kept, the newest; and decoded pictures that are at hand
+MOST_DROPPED: Final = 8  # Number of uploaded pictures that are kept, and of decoded pictures in the cache
 
-# Pixels of a picture that a page sends: those of the largest cameras, 200 MB while it is decoded.
+# Largest number of pixels of an uploaded picture: that of the largest cameras, 200 MB while it is decoded.
 MOST_DROPPED_PIXELS: Final = 1 << 26
 
-# Side of the field of equal pixels whose spread is a pixel's noise: 256 draws tell a deviation to a twentieth.
+# Side of the area of equal pixels that measures noise: 256 samples give a standard deviation to 5 %.
 _DRAWS: Final = 16
 
-_STEPS: Final = 33  # Points of the curve of the black bodies
+_STEPS: Final = 33  # Points of the black-body curve
 
-_PLACE: Final = "dataset"  # Where the command that is shown makes its dataset
+_OUTPUT: Final = "dataset"  # Output folder in the command on the page
 
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """A picture: its name, how its profile was treated, and its codes (H, W, 3) uint8."""
+    """A picture on the page."""
 
     name: str
-    profile: str
-    picture: Picture
+    profile: str  # treatment of its colour profile
+    picture: Picture  # (H, W, 3) uint8
 
 
 class Explorer:
-    """A table, and pictures to hold under its lights; may be asked from several threads.
+    """A LUT and pictures to render with it; it can be used from several threads.
 
-    `given`: the table as the user named it, for the command. `max_side`: longest side of a picture, px.
+    `lut_argument` is the LUT as the user wrote it, for the command; `max_side` is the longest side of a picture, px.
     """
 
-    def __init__(self, given: str, lut: Lut, sources: Sequence[PictureFile], max_side: int = MAX_SIDE) -> None:
+    def __init__(self, lut_argument: str, lut: Lut, sources: Sequence[PictureFile], max_side: int = MAX_SIDE) -> None:
         self.lut = lut
-        self._given = given
+        self._lut_argument = lut_argument
         self._sources = sources
         self._preparation = Preparation(max_side=max_side)
         self._gamut = Gamut.of(lut)
@@ -91,15 +88,15 @@ class Explorer:
         self._read = lru_cache(maxsize=MOST_DROPPED)(self._read_source)
 
     def describe(self) -> dict[str, Any]:
-        """Return the table as plain values: lights with their chromaticities, gamut, black bodies; and the pictures."""
+        """Return illuminants, gamut and black bodies of the LUT, and the number of pictures, as plain values."""
         from scipy.spatial import ConvexHull
 
         lut, gamut = self.lut, self._gamut
         lights = [light_of(lut, number) for number in range(len(lut.white))]
-        # Lights on a line have two ends, and neighbours between them; one light has no neighbour.
+        # Illuminants on a line have no triangles; their edges give the hull. A single illuminant has no edge either.
         around = ConvexHull(gamut.rb).vertices.tolist() if len(gamut.triangles) else {0, *gamut.edges.ravel().tolist()}
         return {
-            "name": self._given,
+            "name": self._lut_argument,
             "camera": lut.provenance.camera,
             "computed": lut.provenance.computed is not None,
             "colours": 8**lut.provenance.bits,
@@ -116,9 +113,9 @@ class Explorer:
         }
 
     def add(self, name: str, data: bytes) -> int:
-        """Keep a picture that a page sent and return its number; a FormatError says why it cannot be read.
+        """Store an uploaded picture and return its number; raises FormatError.
 
-        `name`: of its file. The oldest of more than `MOST_DROPPED` is forgotten.
+        If there are more than `MOST_DROPPED`, the oldest is removed.
         """
         plain = "".join(character for character in PurePosixPath(name).name if character.isprintable()) or "picture"
         suffix = PurePosixPath(plain).suffix.lower()
@@ -137,9 +134,9 @@ class Explorer:
         return number
 
     def show(self, number: int, light: str) -> dict[str, Any]:
-        """Return what is known of a picture under a light, as `generate --light` takes it, without its pixels.
+        """Return ground truth, mixture and commands of a picture under an illuminant (text as for ``--light``).
 
-        A chromaticity that the table cannot make becomes the nearest that it can.
+        A chromaticity outside the gamut is replaced by the nearest one in the gamut.
         """
         scene, mixture = self._scene(number), self._mixture(light)
         white = mixture.white(self.lut)
@@ -147,7 +144,7 @@ class Explorer:
         return {
             "number": number,
             "light": mixture.label,
-            "parts": [list(part) for part in zip(mixture.lights, mixture.weights, strict=True)],
+            "parts": [list(pair) for pair in zip(mixture.lights, mixture.weights, strict=True)],
             "rb": rb_of(white).tolist(),
             "truth": chromaticity(white),
             "picture": {"name": scene.name, "width": width, "height": height, "profile": scene.profile},
@@ -159,14 +156,14 @@ class Explorer:
         }
 
     def counts(self, number: int, light: str, rendering: Rendering) -> npt.NDArray[np.uint16]:
-        """Return the raw image (H, W, 3) uint16, linear camera RGB, of a picture under a light."""
+        """Return the raw image (H, W, 3) uint16, linear camera RGB, of a picture under an illuminant."""
         return self._photograph(self._scene(number).picture, self._mixture(light), rendering, 0)
 
     def pixel(self, number: int, light: str, rendering: Rendering, x: int, y: int) -> dict[str, Any]:
-        """Return the codes of one pixel of a picture, and mean and standard deviation of what is drawn for them."""
+        """Return the codes of one pixel, and mean and standard deviation of its counts over many samples."""
         picture = self._scene(number).picture
         if not (0 <= y < picture.shape[0] and 0 <= x < picture.shape[1]):
-            raise InputError(f"there is no pixel {x}, {y} in a picture of {picture.shape[1]}x{picture.shape[0]} px")
+            raise InputError(f"the pixel {x}, {y} is outside the picture, {picture.shape[1]}x{picture.shape[0]} px")
         field = np.broadcast_to(picture[y, x], (_DRAWS, _DRAWS, 3)).copy()
         drawn = self._photograph(field, self._mixture(light), rendering, 1).reshape(-1, 3).astype(np.float64)
         mean, deviation = drawn.mean(axis=0), drawn.std(axis=0, ddof=1)
@@ -178,27 +175,25 @@ class Explorer:
         }
 
     def command(self, number: int, mixture: Mixture, rendering: Rendering) -> str:
-        """Return the command that makes a dataset of the image, to be run where this program was started.
-
-        For a picture that a page sent it names the file alone: a browser does not tell where it lies.
-        """
+        """Return the command that makes a data set of the image, for the folder in which this program was started."""
+        # For an uploaded picture only the file name is known, because browsers do not send its folder.
         if number < len(self._sources):
             location = self._sources[number].location
-            place = masked(location) if is_remote(location) else _seen_from_here(location)
+            location = masked(location) if is_remote(location) else _relative_path(location)
         else:
-            place = self._scene(number).name
-        words = ["generate", _as_place(self._given), _PLACE, "--sources", _as_place(place)]
-        words += ["--max-side", str(self._preparation.max_side), "--light", mixture.label]
+            location = self._scene(number).name
+        arguments = ["generate", _as_argument(self._lut_argument), _OUTPUT, "--sources", _as_argument(location)]
+        arguments += ["--max-side", str(self._preparation.max_side), "--light", mixture.label]
         if rendering != DEFAULT:
-            words += ["--rendering", rendering]
-        return shlex.join(words)
+            arguments += ["--rendering", rendering]
+        return shlex.join(arguments)
 
     @cached_property
     def _matrix(self) -> ColourMatrix:
         return matrix_for(self.lut)
 
     def _black_bodies(self) -> list[list[float]]:
-        """Return the curve of the black bodies between those of the table: kelvin, r and b; none of fewer than two."""
+        # Temperature (K), r and b of points on the black-body curve between those of the LUT; empty for fewer than two.
         bodies = {light.cct_k for light in self.lut.illuminations if light.cct_k is not None}
         if len(bodies) < 2:
             return []
@@ -212,7 +207,7 @@ class Explorer:
         with self._adding:
             scene = self._dropped.get(number)
         if scene is None:
-            raise InputError(f"there is no picture {number}; the last {MOST_DROPPED} that pages sent are kept: send it")
+            raise InputError(f"there is no picture {number}, the last {MOST_DROPPED} uploads are kept; upload it again")
         return scene
 
     def _read_source(self, number: int) -> _Scene:
@@ -226,7 +221,7 @@ class Explorer:
     def _photograph(
         self, picture: Picture, mixture: Mixture, rendering: Rendering, image: int
     ) -> npt.NDArray[np.uint16]:
-        """Return the image (H, W, 3) uint16, in memory that the calling thread's next call overwrites."""
+        # The image is in memory that the next call in this thread overwrites.
         lut = self.lut
         if rendering == "codes":
             picture = replace_unfit_colours(picture, lut.provenance)[0]
@@ -235,28 +230,28 @@ class Explorer:
         return photograph(lut, picture, Lighting((mixture,)), options, 0, image, lut.provenance.white_level).counts
 
 
-def _as_place(name: str) -> str:
-    """Return a path that is taken for no option, nor for the command that shows the page."""
+def _as_argument(name: str) -> str:
+    # Prevents that a path is parsed as an option or as the subcommand.
     return f"./{name}" if name.startswith("-") or name == "explore" else name
 
 
-def _seen_from_here(location: str) -> str:
+def _relative_path(location: str) -> str:
     path = Path(location)
     return os.fspath(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else location
 
 
-MOST_BYTES: Final = 64 << 20  # Bytes of a file that a page sends: photographs of 16 bits, and not a film
+MOST_BYTES: Final = 64 << 20  # Largest upload in bytes: enough for a 16-bit photograph, too small for a film
 
 
 class ExploreServer(LocalServer):
-    """Serves a table and its pictures.
+    """Serves a LUT and its pictures.
 
-    - ``table.json``: the table, lights, gamut.
-    - ``shown.json?picture=N&light=TEXT``: a picture under a light without its pixels, and the commands.
-    - ``counts?picture=N&light=TEXT&rendering=NAME``: its image; height and width as two uint32, then the counts as
-      uint16, R, G, B, row by row, all little-endian.
-    - ``pixel.json?…&x=X&y=Y``: the noise of a pixel.
-    - ``picture?name=NAME`` by PUT: a picture's file; answered with its number.
+    - ``table.json``: illuminants and gamut (`Explorer.describe`).
+    - ``shown.json?picture=N&light=TEXT``: ground truth and commands (`Explorer.show`).
+    - ``counts?picture=N&light=TEXT&rendering=NAME``: the raw image; height and width as two uint32, then the counts as
+      uint16 in the order R, G, B, row by row, all little-endian.
+    - ``pixel.json?…&x=X&y=Y``: noise of a pixel (`Explorer.pixel`).
+    - ``picture?name=NAME`` by PUT: upload of a picture; the answer is its number.
     """
 
     command = "generate explore"
@@ -272,18 +267,18 @@ class ExploreServer(LocalServer):
         super().__init__(host, port)
 
     def answer(self, request: Request) -> Response | Refusal:
-        """Return the answer; of what cannot be used, the sentence that a command would end with."""
+        """Return the answer, or status 422 with the error message of an invalid request."""
         try:
             return self._answer(request)
         except CropError as error:
             return Refusal(422, str(error))
 
     def _answer(self, request: Request) -> Response | Refusal:
-        asked, explorer = request.query, self._explorer
+        query, explorer = request.query, self._explorer
         if request.body is not None:
             if request.path != "picture":
-                return Refusal(404, "pictures are taken at /picture")
-            return _json({"picture": explorer.add(asked.get("name", "picture"), request.body)})
+                return Refusal(404, f"/{request.path} accepts no upload; send pictures to /picture")
+            return _json({"picture": explorer.add(query.get("name", "picture"), request.body)})
         match request.path:
             case "":
                 policy = f"{self._page.policy}; frame-ancestors 'none'"
@@ -293,42 +288,45 @@ class ExploreServer(LocalServer):
             case "table.json":
                 return _json(explorer.describe())
             case "shown.json":
-                return _json(explorer.show(_number(asked, "picture"), asked.get("light", "")))
+                return _json(explorer.show(_number(query, "picture"), query.get("light", "")))
             case "counts":
-                image = explorer.counts(_number(asked, "picture"), asked.get("light", ""), _rendering(asked))
+                image = explorer.counts(_number(query, "picture"), query.get("light", ""), _rendering(query))
                 size = np.array(image.shape[:2], "<u4").tobytes()
                 return Response("application/octet-stream", size + image.astype("<u2", copy=False).tobytes())
             case "pixel.json":
-                x, y = _number(asked, "x"), _number(asked, "y")
-                return _json(explorer.pixel(_number(asked, "picture"), asked.get("light", ""), _rendering(asked), x, y))
+                x, y = _number(query, "x"), _number(query, "y")
+                return _json(explorer.pixel(_number(query, "picture"), query.get("light", ""), _rendering(query), x, y))
             case _:
-                return Refusal(404, "here are /, /table.json, /shown.json, /counts and /pixel.json")
+                return Refusal(404, "this path does not exist; use /, /table.json, /shown.json, /counts or /pixel.json")
 
 
 def _json(value: Any) -> Response:
     return Response("application/json", json.dumps(value, allow_nan=False).encode())
 
 
-def _number(asked: Mapping[str, str], name: str) -> int:
-    text = asked.get(name, "")
+def _number(query: Mapping[str, str], name: str) -> int:
+    text = query.get(name, "")
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise InputError(f"{name}={text[:40]!r} is no number from 0")
+        raise InputError(f"{name} is {text[:40]!r}, expected an integer ≥ 0")
     return int(text)
 
 
-def _rendering(asked: Mapping[str, str]) -> Rendering:
-    text = asked.get("rendering", "codes")
-    for known in get_args(Rendering):
-        if text == known:
-            return known
-    raise InputError(f"{text[:40]!r} is no rendering; expected one of {', '.join(get_args(Rendering))}")
+def _rendering(query: Mapping[str, str]) -> Rendering:
+    text = query.get("rendering", "codes")
+    for name in get_args(Rendering):
+        if text == name:
+            return name
+    raise InputError(f"the rendering is {text[:40]!r}, expected one of {', '.join(get_args(Rendering))}")
 
 
-_WIDTH: Final = 900  # Width of the pictures, px: as much as a page shows without making them smaller
+# Sample pictures: shaded balls, patches with greys, and random colours. They are computed, so that the package needs no
+# photographs, and stored in the cache, so that a command can use them.
 
-_HEIGHT: Final = 600  # Height, px
+_WIDTH: Final = 900  # Width of the sample pictures, px; the page shows this size without reduction
 
-# Balls: centre and radius, px, and linear sRGB of the surface, back to front.
+_HEIGHT: Final = 600  # Height of the sample pictures, px
+
+# Balls from back to front: centre x, y and radius in px, and linear sRGB of the surface.
 _BALLS: Final = (
     ((160, 395, 130), (0.78, 0.05, 0.04)),
     ((395, 330, 175), (0.85, 0.55, 0.06)),
@@ -339,22 +337,19 @@ _BALLS: Final = (
     ((765, 535, 45), (0.90, 0.90, 0.88)),
 )
 
-_FROM: Final = np.array([-0.5, -0.65, 0.57])  # Direction to the lamp: right, down, towards the viewer
+_TO_LAMP: Final = np.array([-0.5, -0.65, 0.57])  # Direction to the lamp: right, down, towards the viewer
 
-_PATCHES: Final = 6  # Patches in a row: hues, and below them greys
+_PATCHES: Final = 6  # Patches in each row; the last row has greys
 
 
 def sample_folder(cache: Path | None = None) -> Path:
-    """Return the folder of the sample pictures, made if it is not there.
-
-    `cache`: where it is kept; None for `foundation.folders.cache_folder`.
-    """
+    """Return the folder of the sample pictures in `cache` (default: `cache_folder`); create it if needed."""
     import cv2
 
     cache = cache or cache_folder()
     if cache is None:
         raise InputError(
-            "the sample pictures need a place to be kept, and there is no home folder; set XDG_CACHE_HOME, or name "
+            "the sample pictures need a cache folder, but there is no home folder; set XDG_CACHE_HOME, or give "
             "pictures with --sources"
         )
     pictures = {"balls": _balls(), "patches": _patches(), "random": _random()}
@@ -369,7 +364,7 @@ def sample_folder(cache: Path | None = None) -> Path:
 
 def _balls() -> Picture:
     y, x = np.mgrid[:_HEIGHT, :_WIDTH].astype(np.float64)
-    lamp = _FROM / np.linalg.norm(_FROM)
+    lamp = _TO_LAMP / np.linalg.norm(_TO_LAMP)
     floor = y > 0.55 * _HEIGHT
     fall = 1.0 - 0.45 * np.hypot((x - 250) / _WIDTH, (y - 150) / _HEIGHT)
     linear = (np.where(floor, 0.30, 0.42) * fall)[..., None] * np.ones(3)
@@ -390,7 +385,7 @@ def _balls() -> Picture:
 def _patches() -> Picture:
     hues = np.arange(_PATCHES) / _PATCHES
     wheel = 0.5 + 0.5 * np.cos(2 * np.pi * (hues[:, None] - np.array([0.0, 1 / 3, 2 / 3])))
-    rows = [0.25 + part * (wheel - 0.5) for part in (0.4, 0.25, 0.1)]
+    rows = [0.25 + contrast * (wheel - 0.5) for contrast in (0.4, 0.25, 0.1)]
     greys = np.repeat(np.linspace(0, 1, _PATCHES)[:, None] ** 2.2, 3, axis=1)
     patches = srgb_codes(np.clip(np.stack([*rows, greys]), 0, 1))
     side = _WIDTH // _PATCHES

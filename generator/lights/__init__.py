@@ -1,1 +1,1 @@
-"""Which light an image is under: the table's own, mixtures of them, and how lights are drawn."""
+"""Illuminants of images: those of the LUT, mixtures of them, and how they are chosen."""

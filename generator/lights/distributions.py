@@ -1,7 +1,7 @@
-"""Distributions of lights in the rb-chromaticity plane, from which a table's gamut is filled.
+"""Distributions of illuminants in the rb-chromaticity plane, and files of ground truths.
 
-A distribution turns random words into chromaticities; the caller draws again what falls outside the gamut, so
-that every distribution is cut to the gamut and keeps its shape within.
+A distribution turns random words into chromaticities. The caller repeats draws outside the gamut of the LUT, so that
+every distribution is cut to the gamut and keeps its shape inside.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from generator.philox import Words, standard_normal
 _Array = npt.NDArray[np.float64]
 
 
-# Columns of a ground truth, as data sets and tables name them.
+# Names of the columns of a ground truth in data sets and tables.
 TRIPLES: Final = (
     ("gt_r", "gt_g", "gt_b"),
     ("r", "g", "b"),
@@ -36,68 +36,65 @@ TRIPLES: Final = (
 
 
 def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
-    """Return the ground truths of a file as `ground_truths_by_line` reads it.
-
-    Returns (N, 3) float64 ≥ 0, linear camera RGB, not normalised.
-    """
+    """Return the ground truths of a file, (N, 3) float64 ≥ 0, linear camera RGB, not normalised."""
     return np.array(list(ground_truths_by_line(path).values()))
 
 
 def ground_truths_by_line(path: Path) -> dict[int, list[float]]:
-    """Return the ground truths of a file, linear camera RGB ≥ 0, by the numbers of their lines.
+    """Return the ground truths of a file, linear camera RGB ≥ 0, by line number.
 
-    Either a CSV file whose head names the columns `GT_R,GT_G,GT_B` or `r,g,b` (others are ignored), or lines of three
-    numbers between blanks or commas, as in `gt.txt` and Cube+.
+    A CSV file has the columns `GT_R,GT_G,GT_B` or `r,g,b`; others are ignored. Otherwise each line has three numbers,
+    separated by blanks or commas, as in `gt.txt` and Cube+. Raises FormatError.
     """
     lines = read_text(path, "name a text file", "ground truths").splitlines()
     numbered = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
     if not numbered:
-        raise FormatError(f"{path} is empty; expected three numbers a line")
+        raise FormatError(f"{path} is empty, expected three numbers in each line; choose another file")
     columns: Sequence[int] = (0, 1, 2)
     head = [field.strip().lower() for field in next(csv.reader([numbered[0][1]]))]
-    named = not any(is_number(token) for token in re.split(r"[\s,;]+", numbered[0][1]))
-    if named:
+    has_header = not any(is_number(token) for token in re.split(r"[\s,;]+", numbered[0][1]))
+    if has_header:
         triple = next((names for names in TRIPLES if all(name in head for name in names)), None)
         if triple is None:
-            raise FormatError(f"{path}, line 1: no columns GT_R,GT_G,GT_B or r,g,b; found {','.join(head)}")
+            raise FormatError(f"{path}, line 1 is {','.join(head)}, expected GT_R,GT_G,GT_B or r,g,b; correct it")
         columns = [head.index(name) for name in triple]
     truths: dict[int, list[float]] = {}
-    for number, line in numbered[named:]:
-        fields = next(csv.reader([line])) if named else re.split(r"[\s,;]+", line.strip(",; "))
+    for number, line in numbered[has_header:]:
+        fields = next(csv.reader([line])) if has_header else re.split(r"[\s,;]+", line.strip(",; "))
         try:
-            if not named and len(fields) != 3:
-                raise ValueError(f"expected 3 numbers, found {len(fields)}")
+            if not has_header and len(fields) != 3:
+                raise ValueError(f"{len(fields)} numbers, expected 3")
             if len(fields) <= max(columns):
-                raise ValueError(f"expected at least {max(columns) + 1} fields, found {len(fields)}")
+                raise ValueError(f"{len(fields)} fields, expected at least {max(columns) + 1}")
             truth = [float(fields[column]) for column in columns]
         except ValueError as error:
-            raise FormatError(f"{path}, line {number}: {line!r} is no ground truth: {error}") from error
+            raise FormatError(f"{path}, line {number}: {line!r} is not a ground truth ({error}); correct it") from error
         if not is_ground_truth(truth):
             raise FormatError(
-                f"{path}, line {number}: {line!r} is no ground truth: expected numbers from 0, sum above 0"
+                f"{path}, line {number}: {line!r} is not a ground truth, expected numbers ≥ 0, sum above 0; correct it"
             )
         truths[number] = truth
     if not truths:
-        raise FormatError(f"{path} holds no ground truth below its head line")
+        raise FormatError(f"{path} has only a header, expected a ground truth in each line below; choose another file")
     return truths
 
 
 def is_ground_truth(numbers: Sequence[float]) -> bool:
-    """Return whether numbers are a light's linear RGB: three that are finite and from 0, with a sum above 0."""
+    """Return whether numbers can be linear RGB of an illuminant: three, finite, ≥ 0, sum above 0."""
     return len(numbers) == 3 and bool(np.isfinite(numbers).all()) and min(numbers) >= 0 and sum(numbers) > 0
 
 
-_WORD: Final = float(1 << 32)  # Values of a random word
+_WORD: Final = float(1 << 32)  # Number of values of a random word
 
 
 @dataclass(frozen=True)
 class Uniform:
-    """Every chromaticity of the gamut equally likely: uniform over the triangle of all r, b ≥ 0 with r + b ≤ 1."""
+    """Uniform over the triangle of all r, b ≥ 0 with r + b ≤ 1."""
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
         """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
         r, b = ((word + 0.5) / _WORD for word in words[:2])
-        # The upper half of the square is the lower half turned about its centre.
+        # Points in the upper half of the square are rotated about its centre into the lower half.
         over = r + b > 1
         return np.stack([np.where(over, 1 - r, r), np.where(over, 1 - b, b)], axis=1)
 
@@ -108,7 +105,7 @@ class Uniform:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """A normal distribution of r and b: means, standard deviations above 0, correlation within −1 … 1."""
+    """Normal distribution of r and b: means, standard deviations above 0, correlation between −1 and 1."""
 
     r: float
     b: float
@@ -134,24 +131,20 @@ class Gaussian:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The lights of a data set: a kernel density estimate over the chromaticities of its ground truths.
+    """Kernel density estimate over the chromaticities of the ground truths of a data set.
 
-    Kernels are Gaussians with the data's covariance, made small by Scott's factor n^(−1/6) (D. W. Scott, Multivariate
+    Kernels are Gaussians with the covariance of the data, scaled by Scott's factor n^(−1/6) (D. W. Scott, Multivariate
     Density Estimation, 1992; `scipy.stats.gaussian_kde`).
-
-    - `rb`: (N, 2) float64, the data's chromaticities.
-    - `root`: (2, 2) float64, lower triangular, times its transpose the kernel's covariance.
-    - `file`, `sha256`: name of the file of the data, and the hash of the ground truths read from it.
     """
 
-    rb: _Array
-    root: _Array
-    file: str
-    sha256: str
+    rb: _Array  # (N, 2) float64, chromaticities of the data
+    root: _Array  # (2, 2) float64, Cholesky factor of the covariance of the kernel
+    file: str  # name of the data file
+    sha256: str  # hash of the ground truths
 
     @classmethod
     def of(cls, truths: _Array, file: str = "") -> Fitted:
-        """Return the distribution of ground truths (N, 3) float64, linear RGB of the table's camera, of any length."""
+        """Return the distribution of ground truths (N, 3) float64, linear RGB of the camera of the LUT."""
         from scipy.stats import gaussian_kde
 
         rb = rb_of(truths)
@@ -160,17 +153,17 @@ class Fitted:
             root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
         except ValueError as error:
             raise FormatError(
-                f"no distribution fits the {len(rb)} ground truths of {file or 'the list'}: expected three or more "
-                "that do not lie on a line"
+                f"no distribution can be fitted to the {len(rb)} ground truths of {file or 'the list'}, expected three "
+                "or more that are not on a line; choose another file"
             ) from error
         return cls(rb, root, file, hashlib.sha256(np.ascontiguousarray(truths, dtype="<f8").tobytes()).hexdigest())
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
-        """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words; the third chooses kernels."""
-        chosen = (words[2].astype(np.uint64) * np.uint64(len(self.rb))) >> np.uint64(32)
+        """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words; the third selects kernels."""
+        kernels = (words[2].astype(np.uint64) * np.uint64(len(self.rb))) >> np.uint64(32)
         normal, root = standard_normal(words), self.root
-        aside = np.stack([root[0, 0] * normal[:, 0], root[1, 0] * normal[:, 0] + root[1, 1] * normal[:, 1]], axis=1)
-        return self.rb[chosen.astype(np.intp)] + aside
+        offsets = np.stack([root[0, 0] * normal[:, 0], root[1, 0] * normal[:, 0] + root[1, 1] * normal[:, 1]], axis=1)
+        return self.rb[kernels.astype(np.intp)] + offsets
 
     def describe(self) -> dict[str, Any]:
         """Return the distribution as plain values."""
@@ -183,10 +176,10 @@ class Fitted:
         }
 
 
-# Chromaticities r and b as a function of random words; some may be no chromaticities at all.
+# Maps random words to r and b; some results may be outside the triangle of chromaticities.
 Distribution = Uniform | Gaussian | Fitted
 
-# Ranges of the numbers of a Gaussian; without breadth, or with a correlation of 1, it would have no density.
+# Ranges of the numbers of a Gaussian. With a standard deviation of 0 or a correlation of 1 it would have no density.
 _GAUSSIAN: Final = {
     "r": (0.0, 1.0),
     "b": (0.0, 1.0),
@@ -198,23 +191,21 @@ _GAUSSIAN: Final = {
 
 
 def parse_distribution(text: str) -> Distribution:
-    """Return the distribution that a text names.
+    """Return the distribution that a text specifies.
 
-    ``uniform``; ``gaussian:r=.3,b=.25,sd=.02`` or ``gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8``; or a file as
-    `load_ground_truths` reads it, whose lights are fitted.
+    It is ``uniform``, ``gaussian:r=0.3,b=0.25,sd=0.02``, ``gaussian:r=0.3,b=0.25,sd_r=0.03,sd_b=0.02,corr=-0.8``, or
+    the name of a file for `load_ground_truths`.
     """
-    kind, _, rest = text.strip().partition(":")
-    if kind == "uniform" and not rest:
+    name, _, rest = text.strip().partition(":")
+    if name == "uniform" and not rest:
         return Uniform()
     path = Path(text)
     if path.is_file():
         return Fitted.of(load_ground_truths(path), path.name)
-    if kind == "gaussian":
+    if name == "gaussian":
         numbers = parse_numbers(rest, _GAUSSIAN, "the distribution gaussian")
         spread = [numbers.get(name, numbers.get("sd")) for name in ("sd_r", "sd_b")]
         if "r" in numbers and "b" in numbers and spread[0] is not None and spread[1] is not None:
             return Gaussian(numbers["r"], numbers["b"], spread[0], spread[1], numbers.get("corr", 0.0))
-        raise InputError(f"{text!r} lacks a number; write gaussian:r=.3,b=.25,sd=.02, or sd_r, sd_b and corr for sd")
-    raise InputError(
-        f"{text!r} is no distribution of lights; write uniform, gaussian:r=.3,b=.25,sd=.02, or name a file of lights"
-    )
+        raise InputError(f"{text!r} is incomplete; write gaussian:r=0.3,b=0.25,sd=0.02, or sd_r, sd_b, corr for sd")
+    raise InputError(f"{text!r} is not a distribution; write uniform, gaussian:r=0.3,b=0.25,sd=0.02, or a file")

@@ -1,15 +1,13 @@
-"""The light on a picture: a mixture of the table's lights, or several mixtures, each in its part of the picture.
+"""Illuminant of an image: a mixture of illuminants of the LUT, or several mixtures with masks.
 
-And which falls on which picture (`LightChoice`): lights that are listed, or drawn from the table's, stand here, others
-in `generator.lights.choices`.
+It also defines `LightChoice`, the choice of illuminants for pictures, and two simple choices. Others are in
+`generator.lights.choices`. Contract:
 
-Light adds, so a mixture with weights from 0 is a real light, its ground truth the same mixture of the ground truths.
-Rules that hold inside:
-
-- The weights of a mixture sum to 1. So it is as bright as its lights are and never brighter than the brightest, the
-  stray light of an exposure is in the mixture once, and the noise is that of one exposure (`kernels.mixed_table`).
-- Weights are whole billionths, so that a label gives back the mixture to the last bit.
-- What masks give for a pixel sums to 1 in whole 65535ths, so that a 16-bit file holds it without loss.
+- The ground truth of a mixture is the same mixture of ground truths, because light adds.
+- Weights of a mixture sum to 1, so stray light counts once and the noise is that of one exposure
+  (`kernels.mixing.mixed_table`).
+- Weights are multiples of 10⁻⁹, so that a label specifies the mixture exactly.
+- Masks of a pixel sum to 1 in multiples of 1/65535, so that a 16-bit file stores them without loss.
 """
 
 from __future__ import annotations
@@ -33,15 +31,24 @@ from generator.masks.making import MaskMaker
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-_BILLION: Final = 10**9  # Parts of a weight: as many decimals as a label has
+_BILLION: Final = 10**9  # Units of a weight; a label has nine decimals
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Lights of a table shining together; one light of weight 1 is that light as it was photographed.
+    """A mixture of illuminants of a LUT; with one illuminant of weight 1, that illuminant.
 
-    - `lights`: numbers in the table, ascending.
-    - `weights`: above 0, sum 1; rounded to billionths when made.
+    Attributes
+    ----------
+    lights
+        Numbers in the LUT, ascending.
+    weights
+        Above 0, sum 1; rounded to billionths.
+
+    Raises
+    ------
+    InputError
+        Numbers or weights are invalid.
 
     Examples
     --------
@@ -56,14 +63,14 @@ class Mixture:
         ascending = all(low < high for low, high in zip(self.lights, self.lights[1:], strict=False))
         if not self.lights or len(self.lights) != len(self.weights) or not ascending or self.lights[0] < 0:
             raise InputError(
-                f"lights {self.lights} with weights {self.weights} are no mixture: expected ascending numbers, a "
-                "weight each"
+                f"illuminants {self.lights} with weights {self.weights} are not a mixture; expected ascending numbers "
+                "and one weight for each"
             )
         if not all(0 < weight < np.inf for weight in self.weights) or abs(sum(self.weights) - 1) > 1e-6:
-            raise InputError(f"the weights {self.weights} of a mixture are to be above 0 and sum to 1")
-        parts = [max(1, round(weight * _BILLION)) for weight in self.weights]
-        parts[parts.index(max(parts))] += _BILLION - sum(parts)
-        object.__setattr__(self, "weights", tuple(part / _BILLION for part in parts))
+            raise InputError(f"the weights of a mixture are {self.weights}, expected numbers above 0 with the sum 1")
+        billionths = [max(1, round(weight * _BILLION)) for weight in self.weights]
+        billionths[billionths.index(max(billionths))] += _BILLION - sum(billionths)
+        object.__setattr__(self, "weights", tuple(count / _BILLION for count in billionths))
 
     @property
     def label(self) -> str:
@@ -79,10 +86,9 @@ class Mixture:
         return np.asarray(self.weights) @ lut.white[list(self.lights)]
 
     def samples(self, lut: Lut, seed: int = 0, picture: npt.NDArray[np.uint8] | None = None) -> npt.NDArray[np.uint16]:
-        """Return the samples (8**bits, S, 3) uint16 of this light, as `kernels.rendering.draw_samples` takes them.
+        """Return the samples (8**bits, S, 3) uint16 of this illuminant, for `kernels.rendering.draw_samples`.
 
-        `picture`: (H, W, 3) uint8, the picture they are for: of a small one, samples of other colours may be 0, and a
-        light alone is not read whole. None: any pictures, of any size.
+        If `picture` (H, W, 3) uint8 is given and small, samples of colours that it lacks may be 0.
         """
         self._require(lut)
         pixels = WHOLE_LIGHT_PIXELS if picture is None else picture.shape[0] * picture.shape[1]
@@ -90,7 +96,7 @@ class Mixture:
             return read_light(lut, self.lights[0], pixels)
         colours = None
         if picture is not None and pixels < WHOLE_LIGHT_PIXELS:
-            # To find the colours of a large picture takes as long as to mix all.
+            # For a large picture, finding its colours takes as long as mixing all of them.
             colours = colours_in(picture, lut.provenance.bits)
         tables = [lut.light_samples(light) for light in self.lights]
         return mixed_table(tables, self.weights, white_level=lut.provenance.white_level, seed=seed, colours=colours)
@@ -98,72 +104,68 @@ class Mixture:
     def _require(self, lut: Lut) -> None:
         if self.lights[-1] >= len(lut.white):
             raise InputError(
-                f"there is no light {self.lights[-1]}; the table {lut.folder} has lights 0 to {len(lut.white) - 1}"
+                f"the LUT {lut.folder} has no illuminant {self.lights[-1]}; choose one of 0 to {len(lut.white) - 1}"
             )
 
 
 @lru_cache(maxsize=1024)
-def plain(light: int) -> Mixture:
-    """Return light number `light` alone: a mixture of one."""
+def single_mixture(light: int) -> Mixture:
+    """Return the mixture of one illuminant."""
     return Mixture((light,), (1.0,))
 
 
-def mixture_of(parts: Mapping[int, float]) -> Mixture:
-    """Return the mixture of lights in the proportion of `parts` ≥ 0 (light to share); shares of 0 are left out."""
-    total = sum(parts.values())
-    kept = {light: parts[light] / total for light in sorted(parts) if parts[light] / total * _BILLION >= 0.5}
-    total = sum(kept.values())
-    return Mixture(tuple(kept), tuple(weight / total for weight in kept.values()))
+def mixture_of(shares: Mapping[int, float]) -> Mixture:
+    """Return the mixture of illuminants with shares ≥ 0 by number; shares of 0 are omitted."""
+    total = sum(shares.values())
+    used = {light: shares[light] / total for light in sorted(shares) if shares[light] / total * _BILLION >= 0.5}
+    total = sum(used.values())
+    return Mixture(tuple(used), tuple(weight / total for weight in used.values()))
 
 
 def parse_mixture(label: str) -> Mixture:
-    """Return the mixture that a `Mixture.label` names: ``12``, or ``12:0.25+40:0.75``."""
+    """Return the mixture of a label: ``12``, or ``12:0.25+40:0.75``."""
     if re.fullmatch(r"\d{1,9}", label, re.ASCII):
-        return plain(int(label))
-    matches = [re.fullmatch(r"(\d{1,9}):(\d*\.?\d+)", part.strip(), re.ASCII) for part in label.split("+")]
-    parts = {int(match[1]): float(match[2]) for match in matches if match}
-    if len(parts) != len(matches) or not all(parts.values()):
-        raise InputError(f"{label!r} is no mixture of lights; write a light such as 12, or 12:0.25+40:0.75")
-    ordered = sorted(parts)
-    return Mixture(tuple(ordered), tuple(parts[light] for light in ordered))
+        return single_mixture(int(label))
+    matches = [re.fullmatch(r"(\d{1,9}):(\d*\.?\d+)", term.strip(), re.ASCII) for term in label.split("+")]
+    weights = {int(match[1]): float(match[2]) for match in matches if match}
+    if len(weights) != len(matches) or not all(weights.values()):
+        raise InputError(f"{label!r} is not a mixture of illuminants; write 12, or 12:0.25+40:0.75")
+    ordered = sorted(weights)
+    return Mixture(tuple(ordered), tuple(weights[light] for light in ordered))
 
 
 @dataclass(frozen=True)
 class Lighting:
-    """The light of one image.
-
-    - `mixtures`: the lights in it.
-    - `masks`: where each falls; None where one light falls on everything.
-    """
+    """The illuminants of one image."""
 
     mixtures: tuple[Mixture, ...]
-    masks: MaskMaker | None = None
+    masks: MaskMaker | None = None  # None for one illuminant
 
     def __post_init__(self) -> None:
         if not self.mixtures or (self.masks is None) != (len(self.mixtures) == 1):
             raise InputError(
-                f"{len(self.mixtures)} lights with{'out' if self.masks is None else ''} masks make no lighting; "
-                "expected one light, or several and masks that say where each falls"
+                f"{len(self.mixtures)} illuminants with{'out' if self.masks is None else ''} masks; expected one "
+                "without, or several with masks"
             )
 
     def weights_of(self, height: int, width: int) -> npt.NDArray[np.float32]:
-        """Return the share of each light in each pixel: (height, width, lights) float32, sum 1 in whole 65535ths."""
+        """Return the weight of each illuminant in each pixel, (height, width, illuminants) float32, sum 1."""
         if self.masks is None:
             return np.ones((height, width, 1), np.float32)
         return self.masks.weights(height, width, len(self.mixtures))
 
     def whites(self, lut: Lut) -> npt.NDArray[np.float64]:
-        """Return the ground truth of each light, (lights, 3) float64, linear camera RGB, not normalised."""
+        """Return the ground truth of each illuminant, (illuminants, 3) float64, linear camera RGB, not normalised."""
         return np.array([mixture.white(lut) for mixture in self.mixtures])
 
 
 @runtime_checkable
 class LightChoice(Protocol):
-    """Which light falls on each source picture: a function of its position in the list of sources, and of a seed."""
+    """Choice of illuminants: a function of the position in the list of sources and of a seed."""
 
     @property
     def lights_each(self) -> int:
-        """Images for each picture."""
+        """Images of each picture."""
         ...
 
     def lightings_of(self, position: int) -> tuple[Lighting, ...]:
@@ -171,25 +173,25 @@ class LightChoice(Protocol):
         ...
 
     def describe(self) -> dict[str, Any]:
-        """Return the choice as plain values for `dataset.json`: enough to make every byte again."""
+        """Return the choice as plain values for `dataset.json`; with the sources they determine every byte."""
         ...
 
 
 @dataclass(frozen=True)
 class ListedLights:
-    """The same lights for every picture: numbers of the table's lights, or mixtures of them."""
+    """The same illuminants for every picture: numbers in the LUT, or mixtures."""
 
     lights: tuple[int | Mixture, ...]
 
     @property
     def lights_each(self) -> int:
-        """Images for each picture."""
+        """Images of each picture."""
         return len(self.lights)
 
     def lightings_of(self, position: int) -> tuple[Lighting, ...]:
-        """Return the lighting of each image; `position` does not matter."""
+        """Return the lighting of each image; it does not depend on `position`."""
         del position
-        mixtures = (light if isinstance(light, Mixture) else plain(light) for light in self.lights)
+        mixtures = (light if isinstance(light, Mixture) else single_mixture(light) for light in self.lights)
         return tuple(Lighting((mixture,)) for mixture in mixtures)
 
     def describe(self) -> dict[str, Any]:
@@ -200,7 +202,7 @@ class ListedLights:
 
 @dataclass(frozen=True)
 class RandomLights:
-    """`lights_each` distinct lights of `total` for each picture, every set equally likely; purpose 1 of `philox`."""
+    """`lights_each` different illuminants of `total` for each picture, equally likely; purpose 1 of `philox`."""
 
     lights_each: int
     total: int
@@ -209,14 +211,14 @@ class RandomLights:
     def __post_init__(self) -> None:
         if not 1 <= self.lights_each <= self.total:
             raise InputError(
-                f"{self.lights_each} random lights a picture were asked for; the table has {self.total}, expected 1 to "
-                "that"
+                f"the number of random illuminants of each picture is {self.lights_each}, expected 1 to {self.total}, "
+                "the number in the LUT"
             )
 
     def lightings_of(self, position: int) -> tuple[Lighting, ...]:
         """Return the lighting of each image of the picture at `position`."""
         lights = philox.distinct(self.seed, self.lights_each, self.total, position, philox.LIGHTS)
-        return tuple(Lighting((plain(light),)) for light in lights)
+        return tuple(Lighting((single_mixture(light),)) for light in lights)
 
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values."""

@@ -1,1 +1,1 @@
-"""How several lights share an image."""
+"""Masks: weights of several illuminants in an image."""

@@ -1,20 +1,17 @@
-"""Where each of several lights falls on an image: masks that are computed, or that a user gives as files.
+"""Masks: the weight of each of several illuminants in each pixel, computed or read from files.
 
-A plan makes the masks of image after image; a maker makes those of one image at any size. The weights of a pixel are
-whole 65535ths that sum to 1, so that a 16-bit file holds them without loss. Rules that hold for what is computed:
+A mask plan returns a mask maker for each image, and a maker returns the masks at any size. Weights of a pixel sum to 1
+in multiples of 1/65535, so that a 16-bit file stores them without loss. Contract of computed masks:
 
-- Lengths are shares of the picture's longer side, and noise has its place in the picture and not in a pixel. So the
-  masks of one seed and number look the same at every size; an edge is never sharper than one pixel.
-- What is made depends on the seed and the image's number alone; purpose 5 of `philox`.
-- Every pixel is computed with +, −, ×, ÷ and √ alone, which IEEE 754 rounds alike everywhere. So the same masks are
-  the same bytes on every processor, up to the last bit of the few sines that place the shapes.
+- They depend only on the seed and the number of the image; purpose 5 of `philox`.
+- Lengths are relative to the longer side of the image. Masks with one seed and number look the same at every size, and
+  an edge is never sharper than one pixel.
+- Pixels are computed only with +, −, ×, ÷ and √, which IEEE 754 rounds equally everywhere. Masks therefore have the
+  same bytes on every processor, except for the last bit of a few sines that place the shapes.
+- The first illuminant is outside all shapes.
 
-A shape draws its places from an image's streams, and gives a function from places in the picture to the lights'
-shares. The first light is the one that falls where no shape is.
-
-docs/formats.md says which files are masks in a folder. Full scale is weight 1; 8 or 16 bits, or float from 0 to 1;
-transparency does not count. A set of any size is made to fit the image. Weights are divided by their sum. Where K masks
-leave a pixel dark, the first light falls.
+docs/formats.md describes mask files. Full scale is weight 1, transparency is ignored, and masks are resized to the
+image. Weights are divided by their sum. A pixel that is 0 in all K masks gets the first illuminant.
 """
 
 from __future__ import annotations
@@ -36,23 +33,23 @@ from generator import philox
 from generator.files import require_plausible
 from generator.named_numbers import Range, parse_numbers
 
-# float32: what is computed from float32 arrays and Python's own numbers stays float32.
+# float32 in practice: numpy keeps float32 if arrays are combined with Python numbers.
 Array = npt.NDArray[np.floating[Any]]
 _ZERO: Final = np.float32(0)
 _HALF: Final = np.float32(0.5)
 _ONE: Final = np.float32(1)
 _THREE: Final = np.float32(3)
-_STEP: Final = 64  # Numbers of one stream: as many as the largest shape draws, 1 + 3 · 20 of the spots, and some
-# Breadth of the bars between a window's panes, as a share of the window: 6 cm of a metre, as glazing bars are.
+_STEP: Final = 64  # Numbers of one stream: more than the largest shape needs, 1 + 3 · 20 for spots
+# Width of the bars between the panes of a window, relative to the window: 6 cm of 1 m, as glazing bars.
 _BAR: Final = 0.06
 
-# From v (h, 1), rows' distances from the picture's centre, shares of its longer side, to lights' shares (K, h, W).
+# Maps v (h, 1), the distance of rows from the image centre relative to the longer side, to the shares (K, h, W).
 Shares = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
 class RandomStreams:
-    """Uniform random numbers of one image; each `stream` of them is independent of the others, and each purpose."""
+    """Uniform random numbers of one image, in independent streams."""
 
     seed: int
     number: int
@@ -66,27 +63,23 @@ class RandomStreams:
 
 @inlined
 def stepped(x: Any) -> Any:
-    """Return for float32 x 0 below 0, 1 above 1, and 3x² − 2x³ between (the cubic Hermite step)."""
+    """Return the cubic Hermite step of float32 x: 3x² − 2x³, 0 below 0 and 1 above 1."""
     x = min(max(x, _ZERO), _ONE)
     return x * x * (_THREE - x - x)
 
 
 @dataclass(frozen=True)
 class HalfPlanes:
-    """Parallel strips, one for each light: for two lights a half plane each.
+    """Parallel strips, one for each illuminant; half planes for two."""
 
-    - `angle`: direction in degrees from the first light to the last, clockwise from the right; None: any.
-    - `width`: breadth of the soft edge; 0 is as sharp as pixels allow. None: any from 0.1 to 0.6.
-    """
-
-    angle: float | None = None
-    width: float | None = 0.0
+    angle: float | None = None  # from the first illuminant to the last, degrees, clockwise from the right; None: random
+    width: float | None = 0.0  # of the soft edge, 0 for one pixel; None: random from 0.1 to 0.6
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function from rows v (h, 1) to the lights' shares (K, h, W) float32 of their pixels.
+        """Return the function from rows v (h, 1) to the shares (K, h, W) float32 of the illuminants.
 
-        `pixel`: size of a pixel, a share of the longer side. `u`: (1, W) float32, the columns' distances from the
-        picture's centre, shares of the longer side.
+        All lengths are relative to the longer side: `half` has half the width and height of the image, `pixel` is the
+        size of a pixel, and `u` (1, W) float32 are the distances of columns from the image centre.
         """
         drawn: list[float] = streams.uniform(0).tolist()
         angle = math.radians(360 * drawn[0] if self.angle is None else self.angle)
@@ -105,22 +98,17 @@ class HalfPlanes:
         return fill
 
     def describe(self) -> dict[str, Any]:
-        """Return the kind and its numbers."""
+        """Return the shape as plain values."""
         return {"masks": "half-plane" if self.width == 0 else "soft-edge", "angle": self.angle, "width": self.width}
 
 
 @dataclass(frozen=True)
 class Spots:
-    """Soft discs of every light but the first.
+    """Soft discs of every illuminant except the first."""
 
-    - `count`: discs of each light; None: any from 1 to 4.
-    - `radius`: where a disc's light has fallen to a half; None: any from 0.08 to 0.3.
-    - `softness`: breadth of the edge over the radius, up to 2.
-    """
-
-    count: int | None = None
-    radius: float | None = None
-    softness: float = 0.8
+    count: int | None = None  # discs of each illuminant; None: random from 1 to 4
+    radius: float | None = None  # at which the share is 0.5; None: random from 0.08 to 0.3
+    softness: float = 0.8  # width of the edge relative to the radius, at most 2
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `HalfPlanes.shares`."""
@@ -131,35 +119,31 @@ class Spots:
             discs.append([])
             for x, y, size in drawn[1 : 1 + 3 * count].reshape(-1, 3).tolist():
                 radius = 0.08 + 0.22 * size if self.radius is None else self.radius
-                place = (half[0] * (2 * x - 1), half[1] * (2 * y - 1))
+                centre = (half[0] * (2 * x - 1), half[1] * (2 * y - 1))
                 edge = max(self.softness * radius, pixel)
-                discs[-1].append((*place, radius, edge))
+                discs[-1].append((*centre, radius, edge))
 
-        places = [np.array(light, np.float32).reshape(-1, 4) for light in discs]
+        disc_arrays = [np.array(light, np.float32).reshape(-1, 4) for light in discs]
 
         def fill(v: Array) -> Array:
             shares = np.ones((lights, len(v), u.shape[1]), np.float32)
-            for light, its in enumerate(places, start=1):
-                _fill_discs(u[0], v[:, 0], its, shares[light])
-            return _over_the_first(shares)
+            for light, light_discs in enumerate(disc_arrays, start=1):
+                _fill_discs(u[0], v[:, 0], light_discs, shares[light])
+            return _with_first_light(shares)
 
         return fill
 
     def describe(self) -> dict[str, Any]:
-        """Return the kind and its numbers."""
+        """Return the shape as plain values."""
         return {"masks": "spots", "count": self.count, "radius": self.radius, "softness": self.softness}
 
 
 @dataclass(frozen=True)
 class SmoothFields:
-    """Lights that pass into one another: a random field for each, smoothed by cubic B-splines (I. Schoenberg, 1946).
+    """Smooth transitions: a random field for each illuminant from cubic B-splines (I. Schoenberg, 1946)."""
 
-    - `scale`: distance over which a field changes, a share of the longer side.
-    - `contrast`: how much one light prevails where its field is largest.
-    """
-
-    scale: float = 0.5
-    contrast: float = 2.0
+    scale: float = 0.5  # distance over which a field changes, relative to the longer side
+    contrast: float = 2.0  # dominance of one illuminant at the maximum of its field
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `HalfPlanes.shares`."""
@@ -168,7 +152,7 @@ class SmoothFields:
         fields: list[Array] = []
         for light in range(lights):
             drawn = streams.uniform(light, knots * knots).reshape(knots, knots)
-            # The spline leaves 0.479 of the knots' variance in each direction, on the average.
+            # The spline reduces the variance of the knots to 0.479 on average in each direction.
             field = (self.contrast / 0.479 * math.sqrt(12) * (drawn - 0.5)).astype(np.float32)
             fields.append(np.ascontiguousarray(self._splined(np.ascontiguousarray(field.T), u[0]).T))
 
@@ -180,15 +164,15 @@ class SmoothFields:
         return fill
 
     def describe(self) -> dict[str, Any]:
-        """Return the kind and its numbers."""
+        """Return the shape as plain values."""
         return {"masks": "smooth", "scale": self.scale, "contrast": self.contrast}
 
-    def _splined(self, knots: Array, at: Array) -> Array:
-        """Return (n, m) float32 for `knots` (K, m), whose first index runs over places `at` (n,) from −0.5 to 0.5."""
-        place = (at + 0.5) * (2 / self.scale)
-        first = np.floor(place)
+    def _splined(self, knots: Array, positions: Array) -> Array:
+        # Interpolates `knots` (K, m) along the first axis at `positions` (n,) from −0.5 to 0.5; returns (n, m) float32.
+        knot_positions = (positions + 0.5) * (2 / self.scale)
+        first = np.floor(knot_positions)
         index = first.astype(np.intp)
-        t = place - first
+        t = knot_positions - first
         s = 1 - t
         weights = (
             s * s * s / 6,
@@ -196,22 +180,18 @@ class SmoothFields:
             (4 - 6 * s * s + 3 * s * s * s) / 6,
             t * t * t / 6,
         )
-        total = np.zeros((len(at), knots.shape[1]), np.float32)
+        total = np.zeros((len(positions), knots.shape[1]), np.float32)
         _add_splines(knots, index, np.stack(weights), total)
         return total
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Daylight through a window on wall or floor: panes in perspective, a window for each light but the first.
+    """Daylight through windows: panes in perspective, one window for each illuminant except the first."""
 
-    - `columns`, `rows`: panes across and down; None: 2 or 3.
-    - `softness`: breadth of the half shadow, a share of the window; None: any from 0.02 to 0.1.
-    """
-
-    columns: int | None = None
-    rows: int | None = None
-    softness: float | None = None
+    columns: int | None = None  # of panes; None: 2 or 3
+    rows: int | None = None  # of panes; None: 2 or 3
+    softness: float | None = None  # width of the half shadow relative to the window; None: random from 0.02 to 0.1
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `HalfPlanes.shares`."""
@@ -221,25 +201,23 @@ class Windows:
             shares = np.ones((lights, len(v), u.shape[1]), np.float32)
             for light, (matrix, columns, rows, soft) in enumerate(windows, start=1):
                 x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
-                # Behind the vanishing line there is no window.
-                seen = w > 1e-3
-                w = np.where(seen, w, 1)
-                shares[light] = _panes(x / w, columns, soft) * _panes(y / w, rows, soft) * seen
-            return _over_the_first(shares)
+                # Behind the vanishing line the window is not visible.
+                is_in_front = w > 1e-3
+                w = np.where(is_in_front, w, 1)
+                shares[light] = _panes(x / w, columns, soft) * _panes(y / w, rows, soft) * is_in_front
+            return _with_first_light(shares)
 
         return fill
 
     def describe(self) -> dict[str, Any]:
-        """Return the kind and its numbers."""
+        """Return the shape as plain values."""
         return {"masks": "window", "columns": self.columns, "rows": self.rows, "softness": self.softness}
 
     def _window(
         self, drawn: npt.NDArray[np.float64], half: tuple[float, float], pixel: float
     ) -> tuple[list[list[float]], int, int, float]:
-        """Return the homography (3, 3) from the picture to the window's unit square, its panes, and its softness.
-
-        `drawn` (64,) float64 are random numbers between 0 and 1.
-        """
+        # Returns the homography from the image to the unit square of the window, the numbers of panes, and the
+        # softness. `drawn` (64,) are uniform random numbers.
         size = 0.45 + 0.35 * drawn[0]
         shape = 0.7 + 0.7 * drawn[1]
         width, height = size * math.sqrt(shape), size / math.sqrt(shape)
@@ -247,7 +225,7 @@ class Windows:
         slant = 0.8 * (drawn[4] - 0.5)
         turn = math.radians(40 * (drawn[5] - 0.5))
         corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-        # One side of the window is farther away, hence shorter.
+        # One side of the window is farther away and therefore shorter.
         far = 1 - 0.4 * drawn[6:8] * np.sign(corners[:, ::-1] * (drawn[8:10] - 0.5)).clip(0)
         corners = corners * far * [width, height]
         corners[:, 0] += slant * corners[:, 1]
@@ -259,13 +237,13 @@ class Windows:
         return matrix.tolist(), columns, rows, max(soft, pixel / float(min(width, height)))
 
 
-# A kind of masks: from the streams of an image to where its lights fall.
+# Shapes of computed masks.
 Shape = HalfPlanes | Spots | SmoothFields | Windows
 
 
 @compiled
 def _fill_strips(u: Any, v: Any, right: Any, down: Any, edges: Any, width: Any, shares: Any) -> None:
-    """Fill the lights' shares (K, n, m), all 1, with strips between K − 1 soft edges."""
+    # Fills `shares` (K, n, m), all 1 before, with strips between K − 1 soft edges.
     for y in range(len(v)):
         for edge in range(len(edges)):
             for x in range(len(u)):
@@ -276,7 +254,7 @@ def _fill_strips(u: Any, v: Any, right: Any, down: Any, edges: Any, width: Any, 
 
 @compiled
 def _fill_discs(u: Any, v: Any, discs: Any, light: Any) -> None:
-    """Fill a light's shares (n, m), all 1, with discs."""
+    # Fills the shares of one illuminant (n, m), all 1 before, with discs.
     for y in range(len(v)):
         for disc in range(len(discs)):
             x0, y0, radius, edge = discs[disc, 0], discs[disc, 1], discs[disc, 2], discs[disc, 3]
@@ -289,7 +267,7 @@ def _fill_discs(u: Any, v: Any, discs: Any, light: Any) -> None:
 
 @compiled
 def _add_splines(knots: Any, index: Any, weights: Any, total: Any) -> None:
-    """Add to each row of `total` (n, m) four rows of `knots`, from that of `index` (n,) on, times `weights` (4, n)."""
+    # Adds to each row of `total` (n, m) four rows of `knots`, starting at `index` (n,), times `weights` (4, n).
     for y in range(total.shape[0]):
         for step in range(4):
             weight, row = weights[step, y], index[y] + step
@@ -299,7 +277,7 @@ def _add_splines(knots: Any, index: Any, weights: Any, total: Any) -> None:
 
 @compiled
 def _grow(levels: Any) -> None:
-    """Replace float32 x in `levels` (n, m) by (x + √(1 + x²))²: it grows from 0 to ∞ as an exponential, of √ alone."""
+    # Replaces x by (x + √(1 + x²))², which grows from 0 to ∞ like an exponential but needs only √.
     for y in range(levels.shape[0]):
         for x in range(levels.shape[1]):
             level = levels[y, x]
@@ -309,7 +287,7 @@ def _grow(levels: Any) -> None:
 
 
 def _homography(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the homography (3, 3) float64 from four places (4, 2), clockwise, to the corners of the unit square."""
+    # From four points (4, 2), clockwise, to the corners of the unit square.
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     rows: list[list[float]] = []
     for (u, v), (x, y) in zip(corners.tolist(), square.tolist(), strict=True):
@@ -318,19 +296,19 @@ def _homography(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 @compiled
-def _add_panes(at: Any, sides: Any, soft: Any, light: Any) -> None:
-    """Add to `light` (n, m) float32 the panes between `sides` (P, 2) at places `at` (n, m), and clip it to 0 … 1."""
-    for y in range(at.shape[0]):
+def _add_panes(positions: Any, sides: Any, soft: Any, light: Any) -> None:
+    for y in range(positions.shape[0]):
         for pane in range(sides.shape[0]):
-            left, right = sides[pane, 0], sides[pane, 1]
-            for x in range(at.shape[1]):
-                light[y, x] += stepped((at[y, x] - left) / soft + _HALF) - stepped((at[y, x] - right) / soft + _HALF)
-        for x in range(at.shape[1]):
+            start, end = sides[pane, 0], sides[pane, 1]
+            for x in range(positions.shape[1]):
+                position = positions[y, x]
+                light[y, x] += stepped((position - start) / soft + _HALF) - stepped((position - end) / soft + _HALF)
+        for x in range(positions.shape[1]):
             light[y, x] = min(max(light[y, x], _ZERO), _ONE)
 
 
-def _panes(at: Array, count: int, soft: float) -> Array:
-    """Return the light (n, m) float32 through `count` panes at places `at` (n, m) float32, 0 … 1 across the window."""
+def _panes(positions: Array, count: int, soft: float) -> Array:
+    # Transmission (n, m) of `count` panes at `positions` (n, m) from 0 to 1 across the window.
     sides = [
         (
             pane / count + (_BAR / 2 if pane else 0.0),
@@ -338,42 +316,41 @@ def _panes(at: Array, count: int, soft: float) -> Array:
         )
         for pane in range(count)
     ]
-    light = np.zeros_like(at)
-    _add_panes(at, np.array(sides, np.float32), np.float32(soft), light)
+    light = np.zeros_like(positions)
+    _add_panes(positions, np.array(sides, np.float32), np.float32(soft), light)
     return light
 
 
-def _over_the_first(shares: Array) -> Array:
-    """Return the lights' shares (K, h, W) float32, in place: the first light's, all 1, times what the others leave."""
+def _with_first_light(shares: Array) -> Array:
+    # In place: the first illuminant, all 1 before, gets the product of 1 − share over the others.
     for light in shares[1:]:
         shares[0] *= 1 - light
     return shares
 
 
-FULL: Final = 65535  # Weight 1 as a 16-bit file holds it: the largest value of 16 bits
+FULL: Final = 65535  # Weight 1 in a 16-bit file
 
-Weights = npt.NDArray[np.float32]  # (H, W, K) float32, 0 … 1: the weight of each of K lights in each pixel; sum 1
+Weights = npt.NDArray[np.float32]  # (H, W, K) float32, 0 … 1: weight of each of K illuminants in each pixel, sum 1
 
 _FULL: Final = np.float32(FULL)
-_WHOLE: Final = np.int32(FULL)
+_FULL_COUNT: Final = np.int32(FULL)
 
 
 @compiled
 def _quantise_shares_of_two(first: Any, second: Any, out: Any) -> None:
-    """Do as `_quantise_shares` for two lights and `out` (H, 2 W) float32, in a loop that the compiler vectorises."""
+    # `_quantise_shares` for two illuminants and `out` (H, 2 W), in a loop that the compiler vectorises.
     for y in range(first.shape[0]):
         for x in range(first.shape[1]):
             total = first[y, x] + second[y, x]
-            one = np.int32(first[y, x] / total * _FULL + _HALF)
-            other = np.int32(second[y, x] / total * _FULL + _HALF)
-            left, is_less = np.int32(_WHOLE - one - other), np.int32(second[y, x] > first[y, x])
-            out[y, 2 * x] = np.float32(np.int32(one + left * np.int32(1 - is_less))) / _FULL
-            out[y, 2 * x + 1] = np.float32(np.int32(other + left * is_less)) / _FULL
+            first_part = np.int32(first[y, x] / total * _FULL + _HALF)
+            second_part = np.int32(second[y, x] / total * _FULL + _HALF)
+            remainder, is_less = np.int32(_FULL_COUNT - first_part - second_part), np.int32(second[y, x] > first[y, x])
+            out[y, 2 * x] = np.float32(np.int32(first_part + remainder * np.int32(1 - is_less))) / _FULL
+            out[y, 2 * x + 1] = np.float32(np.int32(second_part + remainder * is_less)) / _FULL
 
 
 @compiled
 def _quantise_shares(shares: Any, out: Any) -> None:
-    """Fill `out` (H, W, K) float32 with `shares` (K, H, W) float32 as `quantise_shares` does."""
     lights, rows, columns = shares.shape
     for y in range(rows):
         for x in range(columns):
@@ -383,19 +360,19 @@ def _quantise_shares(shares: Any, out: Any) -> None:
                 total += shares[light, y, x]
                 if shares[light, y, x] > shares[largest, y, x]:
                     largest = light
-            left = FULL
+            remainder = FULL
             for light in range(lights):
-                part = np.int32(shares[light, y, x] / total * _FULL + _HALF)
-                left -= part
-                out[y, x, light] = np.float32(part) / _FULL
-            part = np.int32(shares[largest, y, x] / total * _FULL + _HALF)
-            out[y, x, largest] = np.float32(part + left) / _FULL
+                quantised = np.int32(shares[light, y, x] / total * _FULL + _HALF)
+                remainder -= quantised
+                out[y, x, light] = np.float32(quantised) / _FULL
+            quantised = np.int32(shares[largest, y, x] / total * _FULL + _HALF)
+            out[y, x, largest] = np.float32(quantised + remainder) / _FULL
 
 
 def quantise_shares(shares: npt.NDArray[np.floating[Any]], out: Weights) -> None:
-    """Fill `out` with shares in whole 65535ths that sum to 1; the largest takes up the rounding error.
+    """Fill `out` (H, W, K) float32, contiguous, with normalised shares in multiples of 1/65535.
 
-    `shares`: (K, H, W) float32 ≥ 0, not all 0 in a pixel. `out`: (H, W, K) float32, 0 to 1, contiguous.
+    `shares` is (K, H, W) float32 ≥ 0, not all 0 in a pixel. The largest share absorbs the rounding error.
     """
     if len(shares) == 2:
         _quantise_shares_of_two(shares[0], shares[1], out.reshape(len(out), -1))
@@ -403,21 +380,21 @@ def quantise_shares(shares: npt.NDArray[np.floating[Any]], out: Weights) -> None
         _quantise_shares(shares, out)
 
 
-def decode_values(file: bytes, what: Path | str) -> npt.NDArray[Any]:
-    """Return the values (H, W) or (H, W, 3), RGB, of the file's dtype (uint8, uint16, float32), no transparency."""
+def decode_values(file: bytes, name: Path | str) -> npt.NDArray[Any]:
+    """Return the values (H, W) or (H, W, 3), RGB without transparency, uint8, uint16 or float32 as stored."""
     import cv2
 
-    require_plausible(file, str(what))
+    require_plausible(file, str(name))
     data = np.frombuffer(file, np.uint8)
     image = cast("npt.NDArray[Any] | None", cv2.imdecode(data, cv2.IMREAD_UNCHANGED)) if data.size else None
     if image is None or image.ndim not in (2, 3):
-        raise FormatError(f"{what} is no picture that can be read, or damaged; give masks as PNG or TIFF")
+        raise FormatError(f"{name} cannot be read as an image, expected PNG or TIFF; replace it")
     if image.ndim == 2:
         return image
     return image[..., 0] if image.shape[2] < 3 else image[..., 2::-1]
 
 
-# Endings of what is taken for a mask.
+# File name suffixes of masks.
 SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".webp", ".pgm", ".ppm")
 
 _Array = npt.NDArray[np.float32]
@@ -430,13 +407,13 @@ class GivenMasks:
     files: tuple[Path, ...]
 
     def weights(self, height: int, width: int, lights: int) -> Weights:
-        """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel."""
-        masks = [_fitted(mask, height, width) for file in self.files for mask in _read(file)]
+        """Return the weights (height, width, lights) float32, in multiples of 1/65535, sum 1 in every pixel."""
+        masks = [_resized(mask, height, width) for file in self.files for mask in _read(file)]
         names = ", ".join(file.name for file in self.files)
         if len(masks) not in (lights, lights - 1):
             raise FormatError(
-                f"{names} in {self.files[0].parent}: {lights} lights need {lights} masks, or {lights - 1} for those "
-                f"after the first; found {len(masks)}"
+                f"{names} in {self.files[0].parent} have {len(masks)} masks; {lights} illuminants need {lights}, or "
+                f"{lights - 1} without the first; add or remove masks"
             )
         total = np.sum(masks, axis=0, dtype=np.float32)
         if len(masks) == lights:
@@ -452,22 +429,17 @@ class GivenMasks:
 
 @dataclass(frozen=True)
 class GivenMaskPlan:
-    """Sets of mask files for one image after another, starting over when they end.
+    """Sets of mask files, used for one image after another and repeated if there are too few."""
 
-    - `folder`: name of the folder.
-    - `sets`: in the order of their names.
-    - `sha256`: over the names and bytes of all files in their order.
-    - `places`: which set belongs to the image of a number; empty where all are taken in turn.
-    """
-
-    folder: str
-    sets: tuple[GivenMasks, ...]
-    sha256: str
-    places: Mapping[int, int] = field(default_factory=dict[int, int])
+    folder: str  # name of the folder
+    sets: tuple[GivenMasks, ...]  # in the order of their names
+    sha256: str  # hash of the names and bytes of all files in this order
+    # Index of the set by image number, if the file names have image numbers; else empty, and sets are used in turn.
+    set_of_image: Mapping[int, int] = field(default_factory=dict[int, int])
 
     def maker(self, number: int) -> GivenMasks:
         """Return the masks of image `number`."""
-        return self.sets[self.places.get(number, number % len(self.sets))]
+        return self.sets[self.set_of_image.get(number, number % len(self.sets))]
 
     def describe(self) -> dict[str, Any]:
         """Return the plan as plain values."""
@@ -475,19 +447,19 @@ class GivenMaskPlan:
 
 
 def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
-    """Return the sets of masks in a folder; docs/formats.md has the rules."""
+    """Return the sets of masks in a folder; docs/formats.md describes their names."""
     try:
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     except OSError as error:
-        raise FormatError(f"cannot list the masks of {folder}: {error.strerror}; name a folder of masks") from error
+        raise FormatError(f"cannot list the masks of {folder}: {error.strerror}; give a folder of masks") from error
     groups: dict[str, list[tuple[int, Path]]] = {}
     for path in files:
-        # Cameras count their files with four digits or more.
+        # Up to three digits are the number of a mask; cameras number files with four or more.
         match = re.fullmatch(r"(.+)_(\d{1,3})", path.stem)
         name, number = (f"{match[1]}_", int(match[2])) if match else (path.stem, 0)
         groups.setdefault(name, []).append((number, path))
     if not groups:
-        raise FormatError(f"there is no mask in {folder}; expected images such as NAME_1.png, NAME_2.png, a light each")
+        raise FormatError(f"{folder} has no masks, expected images such as NAME_1.png, NAME_2.png; give another folder")
     digest = hashlib.sha256()
     sets: list[GivenMasks] = []
     for name in sorted(groups):
@@ -495,38 +467,38 @@ def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
         for path in members:
             digest.update(f"{path.name}\n".encode())
             digest.update(_bytes_of(path))
-        given = GivenMasks(members)
-        given.weights(2, 2, lights)
-        sets.append(given)
+        masks = GivenMasks(members)
+        masks.weights(2, 2, lights)
+        sets.append(masks)
     keys = [re.fullmatch(r"(\d{6,})_", name) for name in sorted(groups)]
-    places = {int(key[1]): place for place, key in enumerate(keys) if key}
-    return GivenMaskPlan(folder.name, tuple(sets), digest.hexdigest(), places if len(places) == len(sets) else {})
+    numbered = {int(key[1]): index for index, key in enumerate(keys) if key}
+    return GivenMaskPlan(folder.name, tuple(sets), digest.hexdigest(), numbered if len(numbered) == len(sets) else {})
 
 
 def _bytes_of(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror}") from error
+        raise FormatError(f"cannot read the mask {path}: {error.strerror}; replace it") from error
 
 
 def _read(path: Path) -> list[_Array]:
-    """Return the masks of a file, (H, W) float32, 0 … 1: one if it is grey or its channels are equal, else three."""
+    # A grey file, or one with equal channels, has one mask (H, W) float32, 0 … 1; another file has three.
     image = decode_values(_bytes_of(path), path)
     if image.dtype.kind == "u" and image.dtype.itemsize <= 2:
         scaled = np.asarray(image / np.float32(np.iinfo(image.dtype).max), dtype=np.float32)
     elif image.dtype.kind == "f" and np.isfinite(image).all():
         scaled = np.clip(image, 0, 1).astype(np.float32)
     else:
-        raise FormatError(f"{path} holds {image.dtype} values, or some that are no numbers; give masks of 8 or 16 bits")
+        raise FormatError(f"{path} has {image.dtype} or non-finite values, expected 8 or 16 bits; convert it")
     if scaled.ndim == 2:
         return [scaled]
     grey = bool((scaled == scaled[..., :1]).all())
     return [np.ascontiguousarray(scaled[..., channel]) for channel in range(1 if grey else 3)]
 
 
-def _fitted(mask: _Array, height: int, width: int) -> _Array:
-    """Return a mask (H, W) float32 at the size of the image: averaged over areas to shrink it, else interpolated."""
+def _resized(mask: _Array, height: int, width: int) -> _Array:
+    # Reduced by averaging over areas, enlarged by linear interpolation.
     import cv2
 
     if mask.shape == (height, width):
@@ -536,19 +508,19 @@ def _fitted(mask: _Array, height: int, width: int) -> _Array:
     return np.asarray(cv2.resize(mask, (width, height), interpolation=interpolation), dtype=np.float32)
 
 
-# Pixels computed at a time: intermediate arrays of so many float32 stay in the processor's cache.
+# Pixels computed at once; intermediate float32 arrays of this size stay in the cache of the processor.
 _PIXELS: Final = 1 << 15
 
 
 @dataclass(frozen=True)
 class MadeMasks:
-    """The masks of one image, computed."""
+    """The computed masks of one image."""
 
     shape: Shape
     streams: RandomStreams
 
     def weights(self, height: int, width: int, lights: int) -> Weights:
-        """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel."""
+        """Return the weights (height, width, lights) float32, in multiples of 1/65535, sum 1 in every pixel."""
         longer = max(height, width)
         u = ((np.arange(width) - (width - 1) / 2) / longer).astype(np.float32)[None, :]
         v = ((np.arange(height) - (height - 1) / 2) / longer).astype(np.float32)[:, None]
@@ -562,7 +534,7 @@ class MadeMasks:
 
 @dataclass(frozen=True)
 class MadeMaskPlan:
-    """Masks of one shape, anew for each image."""
+    """Computed masks of one shape, different in each image."""
 
     shape: Shape
     seed: int
@@ -576,11 +548,12 @@ class MadeMaskPlan:
         return self.shape.describe()
 
 
-MaskMaker = GivenMasks | MadeMasks  # Where in one picture each of its lights falls
+MaskMaker = GivenMasks | MadeMasks  # Masks of one image
 
-MaskPlan = GivenMaskPlan | MadeMaskPlan  # Masks for every image of a dataset
+MaskPlan = GivenMaskPlan | MadeMaskPlan  # Masks of all images of a data set
 
-_SHARE: Range = (0.0, 1.0)  # Least and most of a share
+# Smallest and largest value of each number of a shape.
+_SHARE: Range = (0.0, 1.0)
 _OPTIONS: Final[dict[str, dict[str, Range]]] = {
     "half-plane": {"angle": (-360.0, 360.0), "width": _SHARE},
     "soft-edge": {"angle": (-360.0, 360.0), "width": _SHARE},
@@ -591,41 +564,41 @@ _OPTIONS: Final[dict[str, dict[str, Range]]] = {
 
 
 def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
-    """Return the masks that a text names.
+    """Return the masks that a text specifies.
 
-    ``half-plane``, ``soft-edge``, ``spots``, ``smooth`` or ``window``, with numbers where wanted, as in
-    ``soft-edge:angle=30,width=.2``, ``spots:count=3,radius=.1,softness=.5``, ``smooth:scale=.3,contrast=8`` and
-    ``window:columns=2,rows=3,softness=.05``; anything else is a folder of masks as `find_masks` reads it.
+    It is a shape with optional numbers, such as ``half-plane``, ``soft-edge:angle=30,width=0.2``,
+    ``spots:count=3,radius=0.1,softness=0.5``, ``smooth:scale=0.3,contrast=8`` or
+    ``window:columns=2,rows=3,softness=0.05``, or else a folder for `find_masks`.
     """
     if text.strip().partition(":")[0] not in _OPTIONS:
         if not text.strip() or not Path(text).is_dir():
-            raise InputError(f"{text!r} is neither a folder of masks nor a kind of them: {', '.join(_OPTIONS)}")
+            raise InputError(f"{text!r} is not a folder of masks; give one, or a shape: {', '.join(_OPTIONS)}")
         return find_masks(Path(text).absolute(), lights)
     return MadeMaskPlan(parse_shape(text), seed)
 
 
 def parse_shape(text: str) -> Shape:
-    """Return the shape of made masks that a text names, as of `parse_masks`."""
-    kind, _, rest = text.strip().partition(":")
-    if kind not in _OPTIONS:
-        raise InputError(f"{kind!r} is no kind of masks; name one of {', '.join(_OPTIONS)}")
-    numbers = parse_numbers(rest, _OPTIONS[kind], f"the masks {kind}")
-    whole = {name: _whole(numbers[name], name, kind) for name in ("count", "columns", "rows") if name in numbers}
-    match kind:
+    """Return the shape of computed masks that a text specifies; see `parse_masks`."""
+    name, _, rest = text.strip().partition(":")
+    if name not in _OPTIONS:
+        raise InputError(f"{name!r} is not a shape of masks, expected one of {', '.join(_OPTIONS)}")
+    numbers = parse_numbers(rest, _OPTIONS[name], f"the masks {name}")
+    counts = {key: _integer(numbers[key], key, name) for key in ("count", "columns", "rows") if key in numbers}
+    match name:
         case "half-plane" | "soft-edge":
-            width = numbers.get("width", 0.0 if kind == "half-plane" else None)
+            width = numbers.get("width", 0.0 if name == "half-plane" else None)
             return HalfPlanes(numbers.get("angle"), width)
         case "spots":
-            return Spots(whole.get("count"), numbers.get("radius"), numbers.get("softness", Spots.softness))
+            return Spots(counts.get("count"), numbers.get("radius"), numbers.get("softness", Spots.softness))
         case "smooth":
             return SmoothFields(
                 numbers.get("scale", SmoothFields.scale), numbers.get("contrast", SmoothFields.contrast)
             )
         case _:
-            return Windows(whole.get("columns"), whole.get("rows"), numbers.get("softness"))
+            return Windows(counts.get("columns"), counts.get("rows"), numbers.get("softness"))
 
 
-def _whole(number: float, name: str, kind: str) -> int:
+def _integer(number: float, name: str, shape_name: str) -> int:
     if number != int(number):
-        raise InputError(f"{name}={number:g} of the masks {kind}: expected a whole number")
+        raise InputError(f"{name}={number:g} of the masks {shape_name} is invalid, expected an integer")
     return int(number)

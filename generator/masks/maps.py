@@ -1,8 +1,8 @@
-"""Maps beside the images of a dataset: the weight of each light, and the ground truth, of every pixel.
+"""Maps of images with several illuminants: the weights and the ground truth of every pixel, as 16-bit PNG files.
 
-`masks/NNNNNN_k.png` holds the weight of light k = 0 … K − 1 in 16-bit grey, 65535 = 1, sum 65535, and
-`ground_truth/NNNNNN.png` r, g, b in 16 bits with r + g + b = 65535.
-A pixel's ground truth is the chromaticity of the sum of the lights' whites, each times its weight.
+`masks/NNNNNN_k.png` has the weight of illuminant k = 0 … K − 1 in grey; 65535 is weight 1, the sum of all K.
+`ground_truth/NNNNNN.png` has r, g, b with r + g + b = 65535. The ground truth of a pixel is the chromaticity of the
+weighted sum of the ground truths of its illuminants.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def _light_at(weights: Any, whites: Any, y: int, x: int) -> Any:
 
 @inlined
 def _quantised(red: Any, green: Any, blue: Any, full: Any) -> Any:
-    """Return r, g and b as whole parts of `full` that sum to it; green takes the errors of rounding."""
+    # Integers with the sum `full`; green absorbs the rounding errors.
     total = red + green + blue
     first, last = np.int32(np.rint(red / total * full)), np.int32(np.rint(blue / total * full))
     return first, np.int32(np.int32(full) - first - last), last
@@ -50,14 +50,14 @@ def _quantise_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> 
 
 @compiled
 def _quantise_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: Any) -> None:
-    """Do the same for weights (H, 2 W) and `out` (H, 3 W), in a loop that the compiler vectorises."""
+    # `_quantise_chromaticities` for weights (H, 2 W) and `out` (H, 3 W), in a loop that the compiler vectorises.
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1] // 2):
-            one, other = weights[y, 2 * x], weights[y, 2 * x + 1]
-            # Added to 0 first, as for any number of lights, so that the bits are the same.
-            red = _ZERO + one * whites[0, 0] + other * whites[1, 0]
-            green = _ZERO + one * whites[0, 1] + other * whites[1, 1]
-            blue = _ZERO + one * whites[0, 2] + other * whites[1, 2]
+            first, second = weights[y, 2 * x], weights[y, 2 * x + 1]
+            # The sum starts from 0 as for any number of illuminants, so that the result has the same bits.
+            red = _ZERO + first * whites[0, 0] + second * whites[1, 0]
+            green = _ZERO + first * whites[0, 1] + second * whites[1, 1]
+            blue = _ZERO + first * whites[0, 2] + second * whites[1, 2]
             out[y, 3 * x], out[y, 3 * x + 1], out[y, 3 * x + 2] = _quantised(red, green, blue, full)
 
 
@@ -82,11 +82,10 @@ def _sums(weights: Any, out: Any) -> None:
 def quantised_chromaticities(
     weights: npt.NDArray[np.float32], whites: npt.NDArray[np.float64], full: int
 ) -> npt.NDArray[np.uint16]:
-    """Return the chromaticity of the sum of the lights' whites, each times its weight, in each pixel.
+    """Return the chromaticity (H, W, 3) uint16 of the weighted sum of illuminants, with the sum `full` in each pixel.
 
-    `weights`: (H, W, K) float32 ≥ 0, not all 0 in a pixel. `whites`: (K, 3) float64, linear camera RGB above 0. Returns
-    whole parts of `full` ≤ 65535: (H, W, 3) uint16, of which each pixel sums to `full`, computed in float32, lights
-    added up in their order. Red and blue are rounded, green is the rest.
+    `weights` is (H, W, K) float32 ≥ 0, not all 0 in a pixel; `whites` is (K, 3) float64, linear camera RGB above 0;
+    `full` is at most 65535. Red and blue are rounded, green is the rest.
     """
     height, width, lights = weights.shape
     out = np.empty((height, width, 3), np.uint16)
@@ -99,7 +98,7 @@ def quantised_chromaticities(
 
 
 def quantised_weights(weights: npt.NDArray[np.float32], full: int) -> npt.NDArray[np.uint16]:
-    """Return weights (H, W, K) float32 from 0 to 1 as whole parts of `full` ≤ 65535, rounded: (K, H, W) uint16."""
+    """Return weights (H, W, K) float32 from 0 to 1 as (K, H, W) uint16, rounded, with `full` for weight 1."""
     height, width, lights = weights.shape
     out = np.empty((lights, height, width), np.uint16)
     _quantise_weights(weights, np.float32(full), out)
@@ -114,10 +113,10 @@ def mean_weights(weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
 
 
 def encode_maps(weights: Weights, whites: npt.NDArray[np.float64]) -> list[tuple[str, str, bytes]]:
-    """Return what goes beside an image of several lights: folder, what follows the image's number, PNG file.
+    """Return the maps of an image: folder, end of the file name, and PNG file of each.
 
-    `weights`: (H, W, K) float32 in whole 65535ths, what the image was made with. `whites`: (K, 3) float64, the ground
-    truth of each light, linear camera RGB, not normalised.
+    `weights` is (H, W, K) float32 in multiples of 1/65535; `whites` is (K, 3) float64, the ground truth of each
+    illuminant, linear camera RGB, not normalised.
     """
     shares = quantised_weights(weights, FULL)
     maps = [("masks", f"_{light}.png", encode_map(share)) for light, share in enumerate(shares)]
@@ -125,22 +124,21 @@ def encode_maps(weights: Weights, whites: npt.NDArray[np.float64]) -> list[tuple
     return [*maps, ("ground_truth", ".png", encode_map(truth))]
 
 
-def decode_weights(files: Sequence[bytes], what: str) -> Weights:
-    """Return the weights (H, W, K) float32, sum 1, of the K mask files of an image of a dataset."""
-    masks = [_from_16_bits(data, 2, what) for data in files]
+def decode_weights(files: Sequence[bytes], name: str) -> Weights:
+    """Return the weights (H, W, K) float32, sum 1, of the K mask files of an image; raises FormatError."""
+    masks = [_from_16_bits(data, 2, name) for data in files]
     if len({mask.shape for mask in masks}) != 1:
-        raise FormatError(f"the masks of {what} differ in size; make the dataset again")
+        raise FormatError(f"the masks of {name} differ in size, expected equal sizes; make the data set again")
     return np.stack(masks, axis=-1)
 
 
-def decode_ground_truth(data: bytes, what: str) -> npt.NDArray[np.float32]:
-    """Return the ground truth (H, W, 3) float32, r + g + b = 1, of every pixel of an image of a dataset."""
-    return _from_16_bits(data, 3, what)
+def decode_ground_truth(data: bytes, name: str) -> npt.NDArray[np.float32]:
+    """Return the ground truth map (H, W, 3) float32, r + g + b = 1, of an image; raises FormatError."""
+    return _from_16_bits(data, 3, name)
 
 
-def _from_16_bits(data: bytes, dimensions: int, what: str) -> npt.NDArray[np.float32]:
-    """Return the values (H, W) or (H, W, 3) float32, 0 … 1, of a file of 16 bits."""
-    image = decode_values(data, what)
+def _from_16_bits(data: bytes, dimensions: int, name: str) -> npt.NDArray[np.float32]:
+    image = decode_values(data, name)
     if image.dtype != np.uint16 or image.ndim != dimensions:
-        raise FormatError(f"{what} is no map of 16 bits; make the dataset again")
+        raise FormatError(f"{name} is {image.dtype} {image.shape}, expected a 16-bit map; make the data set again")
     return np.asarray(image / np.float32(FULL), dtype=np.float32)

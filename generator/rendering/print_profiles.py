@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from foundation.errors import QualityError
 from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
-from generator.lights.lighting import plain
+from generator.lights.lighting import single_mixture
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -89,7 +89,7 @@ class PrintProfile:
 
 def profile_of(lut: Lut, light: int) -> PrintProfile:
     """Return what the camera of a table sees of each cell under one of its lights."""
-    white = plain(light).white(lut)
+    white = single_mixture(light).white(lut)
     samples = lut.light_samples(light)
     means = samples.mean(axis=1, dtype=np.float64)
     usable = (samples.max(axis=(1, 2)) < lut.provenance.white_level) & ~odd_cells(samples, means)

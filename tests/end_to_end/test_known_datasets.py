@@ -15,7 +15,7 @@ import pytest
 from foundation.errors import CropError
 from generator.cli import main
 from generator.dataset.reader import file_faults, open_dataset
-from tests.generator.dataset.known import held_by, table_in
+from tests.generator.dataset.known import data_set_content, table_in
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -96,7 +96,7 @@ def test_a_dataset(name: str, place: Path, pinned: Pinned) -> None:
         words += ["--sources", "cat.png", "--random-scenes", "1:21x16"]
     out = place / name.replace(" ", "-")
     assert main(["lut", out.name, *words, "--seed", "5", "--workers", "1"]) in (0, 1)
-    pinned(f"dataset, {name}", held_by(out))
+    pinned(f"dataset, {name}", data_set_content(out))
 
 
 def test_scenes_under_the_lights_of_another_table(
@@ -116,7 +116,7 @@ def test_scenes_under_the_lights_of_another_table(
             words = f"{table} again-{name}-{table} --lights-of first-{name} --sources small --rendering codes"
             code = main(words.split())
             again = place / f"again-{name}-{table}"
-            found[f"{name} {table}"] = {"failed": code} if code else held_by(again)
+            found[f"{name} {table}"] = {"failed": code} if code else data_set_content(again)
     pinned("datasets under the lights of others", found)
 
 
@@ -130,7 +130,7 @@ def test_a_dataset_in_shares(place: Path, pinned: Pinned, capsys: pytest.Capture
     for words in (f"{plan} --shard 0/2", f"{plan} --shard 2/2", f"{plan} --shard 1/2", plan, plan):
         run(words)
     run("--verify shares")
-    found.append(held_by(place / "shares"))
+    found.append(data_set_content(place / "shares"))
     (place / "shares/images/000003.png").write_bytes(b"1")
     (place / "shares/images/000004.png").unlink()
     (place / "shares/new.txt").touch()

@@ -1,4 +1,4 @@
-"""A small table with known statistics, and pictures to go with it."""
+"""A small LUT with known statistics, and pictures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MakeLut = Callable[..., Lut]
 
 
 def expected_means(bits: int, light: int) -> npt.NDArray[np.float64]:
-    """Return the (8**bits, 3) means that the samples of `make_lut` are drawn around."""
+    """Return the means (8**bits, 3) of the samples of `make_lut`."""
     index: npt.NDArray[np.int64] = np.arange(8**bits, dtype=np.int64)
     mask = (1 << bits) - 1
     code = np.stack([index >> 2 * bits & mask, index >> bits & mask, index & mask], axis=-1) / mask
@@ -29,7 +29,7 @@ def expected_means(bits: int, light: int) -> npt.NDArray[np.float64]:
 
 
 def lut_in(folder: Path, bits: int = 2, lights: int = 4, unfit: tuple[int, ...] = ()) -> Lut:
-    """Make a table with Poisson samples."""
+    """Make a LUT with Poisson samples."""
     folder.mkdir()
     rng = np.random.default_rng(20190601)
     writer = LutWriter(folder, lights, 8**bits, SAMPLES)
@@ -66,7 +66,7 @@ def lut_in(folder: Path, bits: int = 2, lights: int = 4, unfit: tuple[int, ...] 
 
 @pytest.fixture
 def make_lut(tmp_path: Path) -> MakeLut:
-    """Return a maker of tables with Poisson samples, in folders of their own."""
+    """Return a function that makes LUTs with Poisson samples."""
 
     def make(bits: int = 2, lights: int = 4, unfit: tuple[int, ...] = (), name: str = "lut") -> Lut:
         return lut_in(tmp_path / name, bits, lights, unfit)
@@ -76,7 +76,7 @@ def make_lut(tmp_path: Path) -> MakeLut:
 
 @pytest.fixture
 def table_and_picture(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Go to a folder that holds a table of four lights, `lut`, and a picture of 50 x 40 px, `cat.png`."""
+    """Change to a folder with a LUT of four illuminants, `lut`, and a picture of 50×40 px, `cat.png`."""
     make_lut()
     codes = np.random.default_rng(3).integers(0, 256, (40, 50, 3)).astype(np.uint8)
     (tmp_path / "cat.png").write_bytes(cv2.imencode(".png", codes)[1].tobytes())
@@ -86,7 +86,7 @@ def table_and_picture(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.fixture
 def picture() -> npt.NDArray[np.uint8]:
-    """Return a picture of random codes, of a size that is no multiple of anything."""
+    """Return a picture of random codes with an irregular size."""
     return np.random.default_rng(5).integers(0, 256, (37, 1053, 3)).astype(np.uint8)
 
 
@@ -96,7 +96,7 @@ Rule = Callable[..., npt.NDArray[np.int64]]
 def sample_numbers(
     seed: int, image: int, height: int, width: int, *, first_row: int = 0, place: int = 0, count: int = SAMPLES
 ) -> npt.NDArray[np.int64]:
-    """Return the sample numbers (H, W) by the rule at the head of `generator/kernels/choice.py`, in numpy."""
+    """Return the sample numbers (H, W) by the rule in `generator/kernels/choice.py`, with numpy."""
     y, x = np.arange(first_row, first_row + height), np.arange(width)
     keys = [key.astype(np.uint64)[:, None] for key in philox.words(seed, y, place, image, philox.SAMPLES)[:3]]
     word, low = np.uint64(0xFFFFFFFF), np.uint64(32)

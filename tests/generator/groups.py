@@ -1,4 +1,4 @@
-"""The option groups of `generate_dataset` from plain keywords."""
+"""Keywords of `generate_dataset` from fields of its option groups."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from generator.dataset.plan import DatasetOptions
 from generator.dataset.shards import Callbacks
 
 
-def grouped(**wishes: Any) -> dict[str, Any]:
-    """Return the keywords of `generate_dataset` for `wishes`: fields of its groups, or its own."""
+def grouped(**fields: Any) -> dict[str, Any]:
+    """Return the keywords of `generate_dataset` for fields of its groups and for its own parameters."""
     groups: dict[str, Any] = {}
-    if "workers" in wishes:
-        wishes["count"] = wishes.pop("workers")
+    if "workers" in fields:
+        fields["count"] = fields.pop("workers")
     for name, group in (("options", DatasetOptions), ("workers", Workers), ("callbacks", Callbacks)):
-        names = {field.name for field in dataclasses.fields(group)} & wishes.keys()
-        groups[name] = group(**{field: wishes.pop(field) for field in names})
-    return groups | wishes
+        names = {field.name for field in dataclasses.fields(group)} & fields.keys()
+        groups[name] = group(**{field: fields.pop(field) for field in names})
+    return groups | fields

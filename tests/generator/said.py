@@ -1,4 +1,4 @@
-"""The result of a call or its refusal, to be pinned."""
+"""Results of calls that may be refused, for pinned tests."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 from foundation.errors import CropError
 
 
-def said(call: Callable[..., Any], *given: Any, **named: Any) -> Any:
-    """Return the result of a call, or that it was refused."""
+def said(call: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
+    """Return the result of a call, or a record of its refusal."""
     try:
-        return call(*given, **named)
+        return call(*arguments, **keywords)
     except CropError:
         return {"refused": 1}

@@ -1,4 +1,4 @@
-"""The command `generate` as a user meets it: what it prints, writes and returns."""
+"""The command `generate`: output, files and exit codes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Generate = Callable[..., int]
 
 
-def call(*arguments: str) -> int:
+def run_generate(*arguments: str) -> int:
     return main(arguments)
 
 
@@ -41,22 +41,21 @@ def prepare(folder: Path) -> None:
 
 @pytest.fixture
 def generate(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Generate:
-    """Return a caller of the command in a folder that holds `lut` and `pictures`."""
+    """Return a function that runs the command in a folder with `lut` and `pictures`."""
     prepare(tmp_path)
     monkeypatch.chdir(tmp_path)
-    return call
+    return run_generate
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return such a folder, for tests that leave it as it is."""
+def prepared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with `lut` and `pictures`, for tests that do not change it."""
     folder = tmp_path_factory.mktemp("kept")
     prepare(folder)
     return folder
 
 
-def test_what_is_odd_of_a_picture_is_noted(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every picture can be used, and each looks unlike what its owner sees on a screen, or like a mistake."""
+def test_notes_unusual_pictures(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
     Path("pictures/two.png").unlink()
     cv2.imwrite("pictures/alpha.png", np.full((20, 20, 4), 90, np.uint8))
     cv2.imwrite("pictures/black.png", np.zeros((20, 20, 3), np.uint8))
@@ -68,30 +67,32 @@ def test_what_is_odd_of_a_picture_is_noted(generate: Generate, capsys: pytest.Ca
     with Path("out/sources.csv").open(newline="") as stream:
         notes = {row["name"]: row["note"].split("; ") for row in csv.DictReader(stream)}
     assert notes.pop("one.png") == [""]
-    assert {name: [note.split(",")[0] for note in listed] for name, listed in notes.items()} == {
+    assert {name: [note.split(",")[0] for note in texts] for name, texts in notes.items()} == {
         "alpha.png": ["transparent"],
         "black.png": ["all black"],
         "float.tif": ["floating-point values"],
         "tiny.png": ["tiny", "all black"],
     }
     assert generate("lut", "out", "--sources", "pictures", "--light", "0") == 0
-    assert capsys.readouterr().out.count("4 pictures have notes in sources.csv, such as alpha.png: transparent") == 1
+    assert (
+        capsys.readouterr().out.count("4 pictures have notes in sources.csv, for example alpha.png: transparent") == 1
+    )
 
 
-def test_lights_of_a_file_fit_the_table_or_are_refused(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
+def test_matches_ground_truths_of_file_or_refuses_them(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
     white = open_lut(Path("lut")).white
     near = white[0] / white[0].sum() + [0.0, 0.02, 0.0]
-    wish = ("lut", "out", "--sources", "pictures", "--match", "gt.csv", "--json")
+    options = ("lut", "out", "--sources", "pictures", "--match", "gt.csv", "--json")
     rows = [white[1], white[0], white[2], white[3], near]
     Path("gt.csv").write_text("r,g,b\n\n" + "".join("{:.9f},{:.9f},{:.9f}\n".format(*row) for row in rows))
     with Path("gt.csv").open("a") as stream:
         stream.write("0,0,1\n")
-    assert generate(*wish) == 2
-    assert "of gt.csv lie more than 3 degrees" in (said := capsys.readouterr().err)
-    assert "the first in line 8;" in said
+    assert generate(*options) == 2
+    assert "of gt.csv are more than 3 degrees" in (error_text := capsys.readouterr().err)
+    assert "the first in line 8;" in error_text
     assert not Path("out").exists()
     Path("gt.csv").write_text(Path("gt.csv").read_text().removesuffix("0,0,1\n"))
-    assert generate(*wish, "--lights-per-image", "2") == 0
+    assert generate(*options, "--lights-per-image", "2") == 0
     outside = json.loads(capsys.readouterr().out)["outside"]
     assert outside["count"] == 1
     assert 0.1 < outside["largest_deg"] < 3
@@ -99,19 +100,19 @@ def test_lights_of_a_file_fit_the_table_or_are_refused(generate: Generate, capsy
     assert described["outside"] == outside
 
 
-def test_a_dataset_with_its_contact_sheet(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
+def test_makes_data_set_with_contact_sheet(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
     Path("pictures/bad.png").write_bytes(b"?")
-    wish = ("--sources", "pictures", "--light", "0,2-3", "--seed", "4", "--rendering", "codes")
-    wish += ("--contact-sheet", "sheet.png")
-    assert generate("lut", "out", *wish, "--max-side", "30") == 0
+    options = ("--sources", "pictures", "--light", "0,2-3", "--seed", "4", "--rendering", "codes")
+    options += ("--contact-sheet", "sheet.png")
+    assert generate("lut", "out", *options, "--max-side", "30") == 0
     printed = capsys.readouterr()
-    assert "out: 6 images of 2 pictures under 3 lights" in printed.out
-    assert "1 of 3 pictures was left out" in printed.out
-    assert "lists as unfit; they took the nearest fit colour" in printed.out
-    assert "left out bad.png" in printed.err
+    assert "out: 6 images of 2 pictures under 3 illuminants" in printed.out
+    assert "1 of 3 pictures was skipped" in printed.out
+    assert "lists as unfit; they were replaced by the nearest fit colour" in printed.out
+    assert "skipped bad.png" in printed.err
     assert "6/6" in printed.err
     assert cv2.imread("sheet.png") is not None
-    # The three lines of the package's docstring make the same image.
+    # The example in the docstring of the package gives the same image.
     lut = open_lut("lut")
     raw = render(lut, read_picture("pictures/one.png", 30), light=2, rendering="codes", seed=4, image=4)
     stored = cv2.imread("out/images/000004.png", cv2.IMREAD_UNCHANGED)
@@ -119,111 +120,111 @@ def test_a_dataset_with_its_contact_sheet(generate: Generate, capsys: pytest.Cap
     np.testing.assert_array_equal(stored[..., ::-1], raw)
 
 
-def test_a_sheet_that_could_not_be_written_is_made_alone(
+def test_contact_sheet_is_made_after_failure(
     generate: Generate, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Names are no mathematics, whatever dollar signs are in them."""
+    # Matplotlib must not parse dollar signs in names as formulas.
     Path("pictures/two.png").rename("pictures/A$%$ US$_\\frac{$.png")
-    wish = ("--sources", "pictures", "--light", "0:0.5+2:0.5", "--contact-sheet", "sheet.png")
+    options = ("--sources", "pictures", "--light", "0:0.5+2:0.5", "--contact-sheet", "sheet.png")
 
-    def full(path: Path, data: bytes) -> None:
+    def raise_disk_full(path: Path, data: bytes) -> None:
         raise StorageError(f"cannot write {path}") from OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr(contact, "write_atomic", full)
-        assert generate("lut", "out", *wish) == 5
+        patched.setattr(contact, "write_atomic", raise_disk_full)
+        assert generate("lut", "out", *options) == 5
     assert (
         "error: out is complete, but its contact sheet sheet.png cannot be written: No space left on device; free "
-        "space or choose another place, then make the sheet with generate --verify out --contact-sheet PATH"
+        "space or choose another path, then make the sheet with generate --verify out --contact-sheet PATH"
     ) in capsys.readouterr().err
     assert generate("--verify", "out", "--contact-sheet", "sheet.png") == 0
     assert cv2.imread("sheet.png") is not None
 
 
-def test_shares_are_finished_and_verified(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
-    wish = ("--sources", "pictures", "--light", "all", "--shard-images", "3", "--rendering", "codes")
-    assert generate("lut", "out", *wish, "--shard", "1/2") == 0
-    assert "1 of 3 shards of out are done; others are still to be made" in capsys.readouterr().out
-    assert generate("lut", "out", *wish, "--shard", "0/2") == 0
+def test_completes_and_verifies_shares(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("--sources", "pictures", "--light", "all", "--shard-images", "3", "--rendering", "codes")
+    assert generate("lut", "out", *options, "--shard", "1/2") == 0
+    assert "1 of 3 shards of out are done; run the command for the other shares" in capsys.readouterr().out
+    assert generate("lut", "out", *options, "--shard", "0/2") == 0
     assert "3 of 3 shards of out are done; run the same command without --shard" in capsys.readouterr().out
-    assert generate("lut", "out", *wish) == 0
-    assert "out: 8 images of 2 pictures under 4 lights" in capsys.readouterr().out
+    assert generate("lut", "out", *options) == 0
+    assert "out: 8 images of 2 pictures under 4 illuminants" in capsys.readouterr().out
     assert generate("--verify", "out") == 0
-    assert "out: 8 images, every file as it was made" in capsys.readouterr().out
+    assert "out: 8 images, all files are unchanged" in capsys.readouterr().out
     Path("out/images/000005.png").write_bytes(b"")
     assert generate("--verify", "out") == 4
     printed = capsys.readouterr()
     assert printed.out == "images/000005.png has changed\n"
-    assert "out is not as it was made: 1 fault, listed above" in printed.err
+    assert "out has 1 fault, listed above" in printed.err
 
 
-def test_who_asks_for_the_end_is_told_and_goes_on_later(
+def test_resumes_after_interruption(
     generate: Generate, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def ended(*_: object) -> None:
+    def terminate(*_: object) -> None:
         signal.raise_signal(signal.SIGTERM)
 
-    wish = ("--sources", "pictures", "--light", "all", "--rendering", "codes")
+    options = ("--sources", "pictures", "--light", "all", "--rendering", "codes")
     with monkeypatch.context() as patched:
-        patched.setattr("generator.progress._Images.advance", ended)
-        assert generate("lut", "out", *wish) == 130
+        patched.setattr("generator.progress._ImageCounter.advance", terminate)
+        assert generate("lut", "out", *options) == 130
     assert "interrupted" in capsys.readouterr().err
-    assert generate("lut", "out", *wish) == 0
-    assert capsys.readouterr().err.count("were found finished") <= 1
+    assert generate("lut", "out", *options) == 0
+    assert capsys.readouterr().err.count("exist from an earlier run") <= 1
 
 
-def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
-    wish = ("--sources", "pictures", "--light", "all", "--shard-images", "3", "--rendering", "codes")
-    assert generate("lut", "out", *wish, "--shard", "0/2") == 0
-    assert generate("lut", "out", *wish, "--seed", "1") == 2
-    assert "out was begun with another plan (seed 0, now 1)" in " ".join(capsys.readouterr().err.split())
-    assert generate("lut", "out", *wish) == 0
-    assert "5 images were found finished" in capsys.readouterr().err
+def test_complete_run_reuses_shares(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("--sources", "pictures", "--light", "all", "--shard-images", "3", "--rendering", "codes")
+    assert generate("lut", "out", *options, "--shard", "0/2") == 0
+    assert generate("lut", "out", *options, "--seed", "1") == 2
+    assert "out was started with another plan (seed 0, now 1)" in " ".join(capsys.readouterr().err.split())
+    assert generate("lut", "out", *options) == 0
+    assert "5 images exist from an earlier run" in capsys.readouterr().err
     assert [path.name for path in Path().iterdir() if path.name.startswith(".")] == []
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("lut", "out"), "there is no source picture"),
+        (("lut", "out"), "there are no source pictures"),
         (("lut", "out", "--sources", "nowhere"), "there is no nowhere"),
         (("lut", "pictures", "--sources", "pictures"), "pictures already exists"),
-        (("pictures", "out", "--sources", "pictures"), "pictures is no table"),
+        (("pictures", "out", "--sources", "pictures"), "lut.json"),
         (("lut", "out", "--sources", "pictures", "--nearest", "none.csv"), "cannot read ground truths none.csv"),
         (("lut", "out", "--sources", "pictures", "--seed", "-1"), "the seed is -1"),
         (("lut", "out", "--random-scenes", "1:big"), "--random-scenes is 'big'"),
-        (("lut", "nowhere://out", "--sources", "pictures"), "cannot reach nowhere://out"),
-        ((), "the table and the place of the dataset are missing"),
-        (("lut",), "lut is the table, and the place of the dataset is missing; write generate lut OUT"),
-        (("pictures",), "pictures is no table"),
-        (("pictures", "lut"), "the table comes first, then the place of the dataset: generate lut pictures"),
+        (("lut", "nowhere://out", "--sources", "pictures"), "cannot open the store nowhere://out"),
+        ((), "the arguments LUT and OUT are missing"),
+        (("lut",), "lut is the LUT; the argument OUT is missing; run generate lut OUT"),
+        (("pictures",), "pictures is not a LUT"),
+        (("pictures", "lut"), "give the LUT first: generate lut pictures"),
         (("pictures", "demo:"), "generate demo: pictures"),
-        (("--verify", "lut"), "lut is no dataset"),
-        (("--verify", "out", "extra"), "--verify does not expect extra; leave it out"),
+        (("--verify", "lut"), "lut is not a data set"),
+        (("--verify", "out", "extra"), "--verify takes no LUT, but extra is given; omit it"),
         (("lut", "out", "--random-scenes", "x"), "expected a number such as 8"),
         (("lut", "out", "--sources", "pictures", "--crop", "9x9,left"), "expected cover or random"),
-        (("lut", "out", "--sources", "pictures", "--contact-sheet", "sheet.jpg"), "end in .png"),
+        (("lut", "out", "--sources", "pictures", "--contact-sheet", "sheet.jpg"), "ends in .png"),
         (("lut", "out", "--sources", "pictures", "--contact-sheet", "pictures/one.png"), "already exists"),
         (
             ("lut", "out", "--sources", "pictures", "--contact-sheet", "out/sheet.png"),
-            "would be no part of the dataset",
+            "is inside the data set",
         ),
-        (("lut", "out", "--shard", "0/2", "--contact-sheet", "sheet.png"), "when all shares are done"),
-        (("lut", "", "--sources", "pictures"), "'' names no place"),
-        (("lut", "/", "--sources", "pictures"), "'/' names no place"),
-        (("lut", "out", "--sources", ""), "'' names no place"),
+        (("lut", "out", "--shard", "0/2", "--contact-sheet", "sheet.png"), "in the last run"),
+        (("lut", "", "--sources", "pictures"), "'' is not a folder name"),
+        (("lut", "/", "--sources", "pictures"), "'/' is not a folder name"),
+        (("lut", "out", "--sources", ""), "'' is not a folder name"),
         (("lut", "out", "--sources", "/dev/null"), "/dev/null is a device or a pipe"),
     ],
 )
-def test_what_cannot_be_done_is_one_sentence(
-    kept: Path,
+def test_reports_error_in_one_line(
+    prepared_folder: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     arguments: tuple[str, ...],
     message: str,
 ) -> None:
-    monkeypatch.chdir(kept)
-    assert call(*arguments) == 2
+    monkeypatch.chdir(prepared_folder)
+    assert run_generate(*arguments) == 2
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1
     assert message in errors[0]

@@ -1,4 +1,4 @@
-"""Packed rows are deflate that zlib, libdeflate and ISA-L unpack, in good codes; files are no larger than usual."""
+"""The deflate packer: other libraries unpack its data, codes are optimal, and files are small."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Image16 = npt.NDArray[np.uint16]
 
 
 def drawn(height: int, width: int, colours: int, seed: int = 0) -> Image16:
-    """Return an image drawn from a table of 25 samples of each colour; few colours make it smooth."""
+    """Return an image of 25 samples of each colour; few colours make it smooth."""
     rng = np.random.default_rng(seed)
     table = rng.poisson(rng.uniform(30, 9000, (colours, 1, 3)), (colours, 25, 3)).astype(np.uint16)
     picture = np.sort(rng.integers(0, colours, (height, width)), axis=1)
@@ -36,18 +36,18 @@ def drawn(height: int, width: int, colours: int, seed: int = 0) -> Image16:
 
 
 def smooth(height: int, width: int) -> Image16:
-    """Return a gradient with noise, in which hardly any pixel comes twice."""
+    """Return a gradient with noise, in which hardly any pixel repeats."""
     rng = np.random.default_rng(1)
     means = 3000 + 1000 * np.sin(np.arange(height)[:, None, None] / 50 + np.arange(width)[None, :, None] / 70)
     return rng.poisson(means * [0.6, 1.0, 0.8]).astype(np.uint16)
 
 
 def rows_of(image: Image16, filters: npt.NDArray[np.uint8]) -> bytes:
-    """Return the rows of a PNG with filters 0 (None) or 1 (Sub), as ISO/IEC 15948, clause 9.2 has them."""
+    """Return the rows of a PNG with filters 0 (None) or 1 (Sub) (ISO/IEC 15948, 9.2)."""
     height, width, _ = image.shape
     plain = image.astype(">u2").view(np.uint8).reshape(height, 6 * width).astype(np.int64)
-    left = np.pad(plain, ((0, 0), (6, 0)))[:, :-6]
-    filtered = (plain - np.where(filters[:, None] == 1, left, 0)) % 256
+    previous = np.pad(plain, ((0, 0), (6, 0)))[:, :-6]
+    filtered = (plain - np.where(filters[:, None] == 1, previous, 0)) % 256
     return np.hstack([filters[:, None], filtered]).astype(np.uint8).tobytes()
 
 
@@ -62,7 +62,7 @@ def rows_of(image: Image16, filters: npt.NDArray[np.uint8]) -> bytes:
     ),
     last=st.booleans(),
 )
-def test_bands_unpack_to_their_rows(image: Image16, last: bool) -> None:
+def test_band_unpacks_to_its_rows(image: Image16, last: bool) -> None:
     data, rows = Packer().pack(image, last=last)
     assert rows.tobytes() == rows_of(image, rows[:, 0])
     stream = zlib.decompressobj(wbits=-15)
@@ -71,49 +71,49 @@ def test_bands_unpack_to_their_rows(image: Image16, last: bool) -> None:
     assert not stream.unused_data
 
 
-KINDS: dict[str, Callable[[int, int], Image16]] = {
+IMAGES: dict[str, Callable[[int, int], Image16]] = {
     "drawn": lambda height, width: drawn(height, width, 500),
     "smooth": smooth,
     "even": lambda height, width: np.full((height, width, 3), 300, np.uint16),
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_other_libraries_unpack_the_same(kind: str) -> None:
-    data, rows = Packer().pack(KINDS[kind](150, 400), last=True)
+@pytest.mark.parametrize("image_name", IMAGES)
+def test_other_libraries_unpack_bands(image_name: str) -> None:
+    data, rows = Packer().pack(IMAGES[image_name](150, 400), last=True)
     assert isal_zlib.decompress(data.data, wbits=-15) == rows.tobytes()
     assert imagecodecs.deflate_decode(data.tobytes(), raw=True, out=rows.nbytes) == rows.tobytes()
 
 
-def test_the_way_of_packing_is_the_smaller_one() -> None:
+def test_selects_smaller_method() -> None:
     _, rows = Packer().pack(drawn(200, 300, 100), last=True)
     assert set(rows[:, 0]) == {0}
     _, rows = Packer().pack(smooth(200, 300), last=True)
     assert set(rows[:, 0]) == {1}
 
 
-def test_a_packer_remembers_nothing_of_the_band_before() -> None:
+def test_bands_are_independent() -> None:
     packer = Packer()
     first = packer.pack(drawn(90, 200, 50), last=False)[0].tobytes()
     packer.pack(smooth(200, 300), last=True)
     assert packer.pack(drawn(90, 200, 50), last=False)[0].tobytes() == first
 
 
-def test_a_packer_takes_bands_of_any_shape() -> None:
+def test_packs_bands_of_any_shape() -> None:
     packer = Packer()
     for height, width in ((700, 1), (8, 100), (1, 900), (30, 29)):
         data, rows = packer.pack(drawn(height, width, 50), last=True)
         assert zlib.decompress(data.data, wbits=-15) == rows.tobytes()
 
 
-def test_rows_that_are_not_counted_may_hold_anything() -> None:
-    """Codes come from every eighth row: here those hold few values, and others all values, runs and distances."""
+def test_uncounted_rows_may_have_any_values() -> None:
+    """Codes are made from every eighth row. Here these have few values, and the others all values and runs."""
     image = drawn(400, 500, 300)
-    odd = np.random.default_rng(5).integers(0, 65536, (100, 500, 3)).astype(np.uint16)
+    other_rows = np.random.default_rng(5).integers(0, 65536, (100, 500, 3)).astype(np.uint16)
     for run in range(1, 50):
-        odd[run, 100 : 100 + run] = odd[run, 99]
-        odd[run + 50, 9 * run :] = odd[run + 50, : 500 - 9 * run]
-    image[:100][np.arange(100) % 8 != 4] = odd[np.arange(100) % 8 != 4]
+        other_rows[run, 100 : 100 + run] = other_rows[run, 99]
+        other_rows[run + 50, 9 * run :] = other_rows[run + 50, : 500 - 9 * run]
+    image[:100][np.arange(100) % 8 != 4] = other_rows[np.arange(100) % 8 != 4]
     data, rows = Packer().pack(image, last=True)
     assert not rows[:, 0].any()
     assert zlib.decompress(data.data, wbits=-15) == rows.tobytes() == rows_of(image, rows[:, 0])
@@ -125,19 +125,19 @@ def distances_of(image: Image16) -> npt.NDArray[np.uint16]:
     return distances
 
 
-def test_repeats_are_found_as_far_as_deflate_looks_back() -> None:
-    """Pixel 5461 of a row lies 32766 bytes after the first, within the 32768 allowed; the next one does not."""
-    # Every pixel another, but the two compared.
+def test_finds_repeats_within_window() -> None:
+    """Pixel 5461 is 32766 bytes after the first, within the window of 32768; the next one is outside."""
+    # All pixels differ, except for the two that are compared.
     row = np.arange(1, 5464).astype(np.uint16)[None, :, None] * np.array([1, 3, 7], np.uint16)
-    for place, distance in ((5461, 32766), (5462, 0)):
+    for index, distance in ((5461, 32766), (5462, 0)):
         image = row.copy()
-        image[0, place] = image[0, 0]
+        image[0, index] = image[0, 0]
         expected = np.zeros((1, 5463))
-        expected[0, place] = distance
+        expected[0, index] = distance
         np.testing.assert_array_equal(distances_of(image), expected)
 
 
-def test_distances_count_the_filters_between_rows() -> None:
+def test_distances_include_filter_bytes() -> None:
     image = np.arange(60).astype(np.uint16).reshape(4, 5, 3)
     image[3, 4] = image[1, 0]
     image[2, 2] = image[2, 1]
@@ -150,17 +150,17 @@ def test_distances_count_the_filters_between_rows() -> None:
 @pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 1 << 32), st.integers(1, 40), st.integers(1, 40), st.integers(2, 40))
-def test_what_is_found_is_equal(seed: int, height: int, width: int, colours: int) -> None:
+def test_repeated_pixels_are_equal(seed: int, height: int, width: int, colours: int) -> None:
     image = drawn(height, width, colours, seed)
     data = rows_of(image, np.zeros(height, np.uint8))
     for (y, x), distance in np.ndenumerate(distances_of(image)):
-        at = y * (1 + 6 * width) + 1 + 6 * x
+        offset = y * (1 + 6 * width) + 1 + 6 * x
         if distance:
-            assert data[at - distance : at - distance + 6] == data[at : at + 6]
+            assert data[offset - distance : offset - distance + 6] == data[offset : offset + 6]
 
 
 @pytest.mark.parametrize("band", [1, 400, 5000])
-def test_bands_make_one_stream(monkeypatch: pytest.MonkeyPatch, band: int) -> None:
+def test_bands_form_one_stream(monkeypatch: pytest.MonkeyPatch, band: int) -> None:
     monkeypatch.setattr(files, "BAND", band)
     image = drawn(37, 400, 60)
     data = encode_image(image, "png", METADATA)
@@ -169,14 +169,14 @@ def test_bands_make_one_stream(monkeypatch: pytest.MonkeyPatch, band: int) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_files_are_no_larger_than_those_of_opencv(kind: str) -> None:
-    image = KINDS[kind](512, 512)
-    usual = cv2.imencode(".png", image[..., ::-1])[1]
-    assert len(encode_image(image, "png", METADATA)) <= len(usual)
+@pytest.mark.parametrize("image_name", IMAGES)
+def test_files_are_not_larger_than_opencv(image_name: str) -> None:
+    image = IMAGES[image_name](512, 512)
+    opencv_file = cv2.imencode(".png", image[..., ::-1])[1]
+    assert len(encode_image(image, "png", METADATA)) <= len(opencv_file)
 
 
-def test_images_that_no_png_holds_are_refused() -> None:
+def test_refuses_images_too_large_for_png() -> None:
     wide = np.broadcast_to(np.zeros(1, np.uint16), (1, (1 << 28) + 1, 3))
     with pytest.raises(InputError, match=r"268435457x1 px.*PNG"):
         encode_image(wide, "png", METADATA)
@@ -191,23 +191,23 @@ frequencies = st.lists(st.integers(0, 1 << 40) | st.just(0), min_size=1, max_siz
 @pytest.mark.slow
 @settings(max_examples=80)
 @given(frequencies)
-def test_codes_are_complete_and_begin_no_other(counts: list[int]) -> None:
+def test_codes_are_complete_and_prefix_free(counts: list[int]) -> None:
     lengths = code_lengths(np.array(counts), LONGEST)
-    used = lengths[lengths > 0]
+    used_lengths = lengths[lengths > 0]
     assert ((lengths > 0) == (np.array(counts) > 0)).all()
-    if len(used) > 1:
-        assert used.max() <= LONGEST
-        assert (1 << (LONGEST - used)).sum() == 1 << LONGEST
+    if len(used_lengths) > 1:
+        assert used_lengths.max() <= LONGEST
+        assert (1 << (LONGEST - used_lengths)).sum() == 1 << LONGEST
     codes = [format(code & 0xFFFF, f"0{code >> 16}b")[::-1] for code in codes_of(lengths).tolist() if code >> 16]
     ordered = sorted(codes)
-    assert not any(after.startswith(before) for before, after in pairwise(ordered))
+    assert not any(following.startswith(code) for code, following in pairwise(ordered))
 
 
 @pytest.mark.slow
 @settings(max_examples=60)
 @given(st.lists(st.integers(1, 60), min_size=2, max_size=40))
-def test_codes_are_the_shortest(counts: list[int]) -> None:
-    """Against Huffman's own construction by a heap, where no code reaches the limit."""
+def test_codes_are_optimal(counts: list[int]) -> None:
+    """Compare with Huffman's construction by a heap, where no code reaches the limit."""
     heap = list(counts)
     heapq.heapify(heap)
     best = 0
@@ -219,7 +219,7 @@ def test_codes_are_the_shortest(counts: list[int]) -> None:
     assert (lengths * counts).sum() == best
 
 
-def test_codes_too_long_are_cut() -> None:
+def test_limits_code_length() -> None:
     fibonacci = [1, 1]
     while len(fibonacci) < 40:
         fibonacci.append(fibonacci[-1] + fibonacci[-2])

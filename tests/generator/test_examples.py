@@ -1,4 +1,4 @@
-"""The examples in the docstrings do what they say."""
+"""Run the examples in docstrings."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ MODULES = sorted(
 @pytest.mark.usefixtures("table_and_picture")
 @pytest.mark.parametrize("name", MODULES)
 def test_examples(name: str) -> None:
-    """They run in a folder that holds a table of four lights, `lut`, and a picture of 50 x 40 px, `cat.png`."""
-    # colour-science, which other tests import, makes numpy print arrays as its version 1.13 did.
+    # colour-science, which other tests import, sets the print format of arrays to that of numpy 1.13.
     with np.printoptions(legacy=False):
         assert doctest.testmod(import_module(name), optionflags=doctest.ELLIPSIS).failed == 0
 
 
-def test_the_examples_leave_nothing_behind(table_and_picture: Path) -> None:
+def test_examples_leave_no_files(table_and_picture: Path) -> None:
     test_examples("generator.dataset.making")
     assert sorted(path.name for path in table_and_picture.iterdir()) == ["cat.png", "lut"]

@@ -1,4 +1,4 @@
-"""Files of images: every format gives back what was written, other programs read it, previews look right."""
+"""Image files: round trips, other programs as readers, and previews."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ from tests.pinned import Pinned
 
 METADATA = ImageMetadata(white_level=11536, white=(2046.0, 1579.5, 4520.0), camera="Canon EOS 550D")
 
-WHOLE: tuple[Format, ...] = ("png", "tiff", "exr", "jxl")
-"""The formats that keep all three channels."""
+# Formats with all three channels of each pixel.
+FULL_COLOUR: tuple[Format, ...] = ("png", "tiff", "exr", "jxl")
 
 Image16 = npt.NDArray[np.uint16]
 
@@ -70,7 +70,7 @@ images = hnp.arrays(
 
 
 def noisy(height: int, width: int) -> Image16:
-    """Return an image with shot noise on a gradient, and the extreme numbers."""
+    """Return an image with shot noise on a gradient, and extreme values."""
     rng = np.random.default_rng(0)
     means = np.linspace(20, 12000, height * width * 3).reshape(height, width, 3)
     image = rng.poisson(means).astype(np.uint16)
@@ -85,8 +85,8 @@ def by_openimageio(path: Path) -> Image16:
     return values.astype(np.uint16)
 
 
-@pytest.mark.parametrize("form", WHOLE)
-def test_every_bit_comes_back_in_place(tmp_path: Path, form: Format) -> None:
+@pytest.mark.parametrize("form", FULL_COLOUR)
+def test_round_trip_of_every_format(tmp_path: Path, form: Format) -> None:
     image = noisy(31, 45)
     path = tmp_path / f"image{suffix_of(form)}"
     path.write_bytes(encode_image(image, form, METADATA))
@@ -98,7 +98,7 @@ def test_every_bit_comes_back_in_place(tmp_path: Path, form: Format) -> None:
 
 
 @pytest.mark.parametrize("form", ["png", "tiff"])
-def test_opencv_reads_the_same(form: Format) -> None:
+def test_opencv_reads_files(form: Format) -> None:
     image = noisy(31, 45)
     data = np.frombuffer(encode_image(image, form, METADATA), np.uint8)
     read = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
@@ -107,36 +107,36 @@ def test_opencv_reads_the_same(form: Format) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", WHOLE)
+@pytest.mark.parametrize("form", FULL_COLOUR)
 @settings(max_examples=25)
 @given(image=images)
-def test_any_image_comes_back(form: Format, image: Image16) -> None:
+def test_round_trip_of_any_image(form: Format, image: Image16) -> None:
     np.testing.assert_array_equal(decode_image(encode_image(image, form, METADATA), form, "image"), image)
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_an_image_need_not_be_contiguous(form: Format) -> None:
+def test_accepts_noncontiguous_image(form: Format) -> None:
     image = noisy(48, 60)
     turned = image[::-1, ::-1]
     assert encode_image(turned, form, METADATA) == encode_image(turned.copy(), form, METADATA)
 
 
 def chunks_of(data: bytes) -> list[tuple[bytes, bytes]]:
-    """Return name and content of a PNG's chunks (ISO/IEC 15948, 5.3), each with its sum checked by zlib."""
+    """Return name and content of the chunks of a PNG (ISO/IEC 15948, 5.3), and check their CRC."""
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     chunks: list[tuple[bytes, bytes]] = []
-    at = 8
-    while at < len(data):
-        (size,) = struct.unpack_from(">I", data, at)
-        body = data[at + 4 : at + 8 + size]
-        assert struct.unpack_from(">I", data, at + 8 + size) == (zlib.crc32(body),)
+    offset = 8
+    while offset < len(data):
+        (size,) = struct.unpack_from(">I", data, offset)
+        body = data[offset + 4 : offset + 8 + size]
+        assert struct.unpack_from(">I", data, offset + 8 + size) == (zlib.crc32(body),)
         chunks.append((body[:4], body[4:]))
-        at += 12 + size
+        offset += 12 + size
     return chunks
 
 
 def repeating_maps(count: int) -> list[Image16]:
-    """Return maps whose rows are the same bytes once the row above is subtracted, other bytes in each map."""
+    """Return maps with constant differences between rows, different in each map."""
     first = np.random.default_rng(0).integers(0, 256, (count, 1, 8), np.uint8)
     rows = np.arange(1, 13, dtype=np.uint8)[:, None] * first
     return list(rows.view(">u2").astype(np.uint16))
@@ -147,18 +147,18 @@ def exr_of(values: Image16) -> bytes:
 
 
 @pytest.mark.parametrize("encoded", [encode_map, exr_of])
-def test_what_isal_packs_is_the_same_bytes_in_every_thread(encoded: Callable[[Image16], bytes]) -> None:
-    """What a thread leaves in a register chose matches: one map of 400, and another in every process."""
+def test_isal_gives_equal_bytes_in_every_thread(encoded: Callable[[Image16], bytes]) -> None:
+    # A value left in a register by the thread changed the matches of one map in 400.
     maps = repeating_maps(4000)
 
-    def packed() -> list[bytes]:
+    def encode_all() -> list[bytes]:
         return [encoded(values) for values in maps]
 
-    with ThreadPoolExecutor(1) as other:
-        assert other.submit(packed).result() == packed()
+    with ThreadPoolExecutor(1) as thread:
+        assert thread.submit(encode_all).result() == encode_all()
 
 
-def test_png_is_sixteen_bit_rgb_and_tells_its_shot() -> None:
+def test_png_is_16_bit_rgb_with_metadata() -> None:
     chunks = chunks_of(encode_image(noisy(20, 30), "png", METADATA))
     assert [name for name, _ in chunks] == [b"IHDR", b"tEXt", b"IDAT", b"IEND"]
     # 11.2.2: width, height, bit depth, colour type, compression, filter and interlace methods.
@@ -174,8 +174,8 @@ def test_png_is_sixteen_bit_rgb_and_tells_its_shot() -> None:
     assert len(zlib.decompress(chunks[2][1])) == 20 * (1 + 6 * 30)
 
 
-def test_pillow_shows_the_upper_bytes() -> None:
-    """Pillow has no 16-bit RGB; what it shows is the image all the same, not one changed by a profile or gamma."""
+def test_pillow_reads_upper_bytes() -> None:
+    """Pillow has no 16-bit RGB; it must not apply a profile or gamma."""
     image = noisy(20, 30)
     with Image.open(io.BytesIO(encode_image(image, "png", METADATA))) as read:
         assert read.size == (30, 20)
@@ -183,7 +183,7 @@ def test_pillow_shows_the_upper_bytes() -> None:
         np.testing.assert_array_equal(np.asarray(read.convert("RGB")), image >> 8)
 
 
-def test_tiff_is_uncompressed_and_plain() -> None:
+def test_tiff_tags() -> None:
     image = noisy(4, 5)
     with tifffile.TiffFile(io.BytesIO(encode_image(image, "tiff", METADATA))) as file:
         tags = {tag.code: tag.value for tag in file.pages.first.tags}
@@ -197,21 +197,21 @@ def test_tiff_is_uncompressed_and_plain() -> None:
     }  # fmt: skip
 
 
-def test_the_head_of_exr_is_that_of_the_standard() -> None:
-    """By "OpenEXR File Layout": magic number, version, attributes that each have a name, a type, a size and a value."""
+def test_exr_header() -> None:
+    """By "OpenEXR File Layout": magic number, version, and attributes with name, type, size and value."""
     data = encode_image(noisy(40, 30), "exr", METADATA)
     assert data[:8] == bytes.fromhex("762f3101 02000000")
-    found: dict[bytes, tuple[bytes, bytes]] = {}
-    at = 8
-    while data[at]:
-        name, kind, _ = data[at : at + 200].split(b"\0", 2)
-        at += len(name) + len(kind) + 2
-        (size,) = struct.unpack_from("<i", data, at)
-        found[name] = kind, data[at + 4 : at + 4 + size]
-        at += 4 + size
+    attributes: dict[bytes, tuple[bytes, bytes]] = {}
+    offset = 8
+    while data[offset]:
+        name, type_name, _ = data[offset : offset + 200].split(b"\0", 2)
+        offset += len(name) + len(type_name) + 2
+        (size,) = struct.unpack_from("<i", data, offset)
+        attributes[name] = type_name, data[offset + 4 : offset + 4 + size]
+        offset += 4 + size
     float_channel = struct.pack("<iB3xii", 2, 0, 1, 1)
     window = struct.pack("<4i", 0, 0, 29, 39)
-    assert found == {
+    assert attributes == {
         b"channels": (b"chlist", b"".join(name + b"\0" + float_channel for name in (b"B", b"G", b"R")) + b"\0"),
         b"compression": (b"compression", bytes([3])),
         b"dataWindow": (b"box2i", window),
@@ -224,26 +224,24 @@ def test_the_head_of_exr_is_that_of_the_standard() -> None:
         b"crop:white": (b"v3f", struct.pack("<3f", 2046, 1579.5, 4520)),
         b"crop:white_level": (b"int", struct.pack("<i", 11536)),
     }
-    # Three chunks of 16, 16 and 8 lines, each where the table of offsets says, the last to the end of the file.
-    offsets = [*struct.unpack_from("<3Q", data, at + 1), len(data)]
-    assert offsets[0] == at + 1 + 3 * 8
+    # Three chunks of 16, 16 and 8 lines at the listed offsets.
+    offsets = [*struct.unpack_from("<3Q", data, offset + 1), len(data)]
+    assert offsets[0] == offset + 1 + 3 * 8
     for start, stop, line in zip(offsets, offsets[1:], (0, 16, 32), strict=False):
         assert struct.unpack_from("<2i", data, start) == (line, stop - start - 8)
 
 
-def test_jpeg_xl_is_one_lossless_codestream() -> None:
+def test_jpeg_xl_is_lossless() -> None:
     image = noisy(20, 30)
     data = encode_image(image, "jxl", METADATA)
-    # ISO/IEC 18181-2, 5: the signature box; 16-bit lossless wants level 10, which only a container can tell.
+    # ISO/IEC 18181-2, 5: the signature box. Lossless 16 bits need level 10, which only a container declares.
     assert data[:12] == bytes.fromhex("0000000c 4a584c20 0d0a870a")
     np.testing.assert_array_equal(imagecodecs.jpegxl_decode(data), image)
 
 
 @pytest.mark.parametrize(("form", "width", "height"), [("tiff", 30000, 24000), ("dng", 60000, 36000)])
-def test_what_a_format_of_32_bit_offsets_cannot_hold_is_refused_unwritten(
-    form: Format, width: int, height: int
-) -> None:
-    # One count seen everywhere: an image of 4 GiB that takes no memory.
+def test_refuses_images_above_4_gib(form: Format, width: int, height: int) -> None:
+    # A broadcast value: an image of 4 GiB without memory.
     image = np.broadcast_to(np.uint16(7), (height, width, 3))
     with pytest.raises(InputError, match=rf"an image of {width}x{height} px is too large for {form.upper()}: .* 4 GiB"):
         encode_image(image, form, METADATA)
@@ -251,33 +249,33 @@ def test_what_a_format_of_32_bit_offsets_cannot_hold_is_refused_unwritten(
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("keep", [0, 10, 1000])
-def test_damaged_files_are_refused_by_name(form: Format, keep: int) -> None:
+def test_refuses_damaged_files(form: Format, keep: int) -> None:
     data = encode_image(noisy(40, 40), form, METADATA)
     with pytest.raises(FormatError, match=r"images/000007"):
         decode_image(data[:keep], form, "images/000007")
 
 
-def test_a_png_may_claim_what_deflate_can_make_of_its_bytes() -> None:
-    """70 bytes of a file make 1032 times as many at most: 10 320 rows of one pixel of 16 bits and a byte of filter."""
+def test_accepts_png_sizes_possible_with_deflate() -> None:
+    """70 bytes unpack to at most 1032 times as many: 10 320 rows of one 16-bit pixel and a filter byte."""
 
-    def claiming(height: int, depth: int = 16) -> bytes:
+    def png_head(height: int, depth: int = 16) -> bytes:
         head = struct.pack(">I4sIIBB", 13, b"IHDR", 1, height, depth, 2)
         return (b"\x89PNG\r\n\x1a\n" + head).ljust(70, b"\0")
 
-    require_plausible(claiming(10_320), "it")
-    require_plausible(claiming(18_060, depth=8), "it")
-    for data in (claiming(10_321), claiming(18_061, depth=8)):
+    require_plausible(png_head(10_320), "it")
+    require_plausible(png_head(18_060, depth=8), "it")
+    for data in (png_head(10_321), png_head(18_061, depth=8)):
         with pytest.raises(FormatError):
             require_plausible(data, "it")
 
 
-def test_a_file_of_eight_bits_is_refused() -> None:
+def test_refuses_8_bit_file() -> None:
     data = cv2.imencode(".png", np.zeros((4, 5, 3), np.uint8))[1].tobytes()
-    with pytest.raises(FormatError, match=r"a\.png holds uint8 \(4, 5, 3\).*uint16"):
+    with pytest.raises(FormatError, match=r"a\.png is uint8 \(4, 5, 3\).*uint16"):
         decode_image(data, "png", "a.png")
 
 
-def test_the_libraries_named_are_installed() -> None:
+def test_listed_libraries_are_installed() -> None:
     from importlib.metadata import version
 
     for form in FORMATS:
@@ -285,7 +283,7 @@ def test_the_libraries_named_are_installed() -> None:
             assert version(library)
 
 
-def test_a_preview_is_a_jpeg_of_the_right_colour(tmp_path: Path) -> None:
+def test_preview_is_jpeg_of_right_colour(tmp_path: Path) -> None:
     path = tmp_path / "preview.jpg"
     path.write_bytes(encode_preview(np.full((16, 16, 3), (200, 100, 50), np.uint8)))
     stream = oiio.ImageInput.open(str(path))
@@ -297,33 +295,31 @@ def test_a_preview_is_a_jpeg_of_the_right_colour(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 @pytest.mark.parametrize("planes", [False, True])
 @pytest.mark.parametrize("compression", [None, "zlib"])
-def test_any_tiff_is_read_as_it_stands_or_not_at_all(
-    dtype: type[np.generic], planes: bool, compression: str | None
-) -> None:
+def test_reads_any_tiff_or_refuses_it(dtype: type[np.generic], planes: bool, compression: str | None) -> None:
     image = noisy(30, 40).astype(dtype)
     stream = io.BytesIO()
     stored, config = (image.transpose(2, 0, 1), "separate") if planes else (image, "contig")
     tifffile.imwrite(stream, stored, photometric="rgb", planarconfig=config, compression=compression)
-    found = decode_tiff(stream.getvalue())
-    assert found.dtype == image.dtype
-    np.testing.assert_array_equal(found, image)
-    with pytest.raises(Exception):  # noqa: B017, PT011  # whatever the reader says
+    decoded = decode_tiff(stream.getvalue())
+    assert decoded.dtype == image.dtype
+    np.testing.assert_array_equal(decoded, image)
+    with pytest.raises(Exception):  # noqa: B017, PT011  # any error of the reader
         decode_tiff(stream.getvalue()[: stream.tell() // 2])
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_any_png_is_read_as_it_stands_or_not_at_all(channels: int, dtype: type[np.unsignedinteger]) -> None:
+def test_reads_any_png_or_refuses_it(channels: int, dtype: type[np.unsignedinteger]) -> None:
     image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (20, 31, channels), dtype=dtype)
     image = image[..., 0] if channels == 1 else image
     data = bytes(imagecodecs.png_encode(image))
     np.testing.assert_array_equal(decode_png(data), image)
     for damaged in (data[: len(data) // 2], data[:-20], data[:60] + b"\x99" + data[61:], b"", b"GIF89a"):
-        with pytest.raises(ValueError, match="no whole PNG"):
+        with pytest.raises(ValueError, match="not a complete PNG"):
             decode_png(damaged)
 
 
-def test_jpeg_xl_names_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jpeg_xl_reports_missing_library(monkeypatch: pytest.MonkeyPatch) -> None:
     data = encode_image(noisy(4, 5), "jxl", METADATA)
     monkeypatch.setitem(sys.modules, "imagecodecs", None)
     for attempt in (
@@ -346,39 +342,39 @@ CAMERAS = ("Canon EOS 550D", "Canon EOS 6D Mark II", "Benchmark", "Ένας")
 
 
 def grey_scene(white: tuple[float, float, float]) -> npt.NDArray[np.uint16]:
-    """Return a grey ramp under a light, with shot noise; its brightest place reflects 90 %."""
+    """Return a grey ramp up to 90 % reflectance under an illuminant, with shot noise."""
     reflectance = np.linspace(0.15, 0.9, 96)[None, :, None]
     return np.random.default_rng(3).poisson(np.full((64, 1, 1), 1.0) * reflectance * white).astype(np.uint16)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("light", WHITES)
-def test_what_libraw_shows_is_neutral_where_the_scene_is(light: str, camera: str) -> None:
+def test_libraw_develops_neutral_greys(light: str, camera: str) -> None:
     white = WHITES[light]
-    # Saturation far enough above the white that no channel clips when LibRaw multiplies it by its balance.
+    # Saturation is so far above the ground truth that LibRaw clips no channel after balancing.
     metadata = ImageMetadata(white_level=12000, white=white, camera=camera)
     with rawpy.imread(io.BytesIO(encode_image(grey_scene(white), "dng", metadata))) as raw:
-        shown = raw.postprocess(
+        developed = raw.postprocess(
             use_camera_wb=True, output_bps=16, no_auto_bright=True, gamma=(1, 1), highlight_mode=rawpy.HighlightMode(1)
         )
-    means = shown[8:-8, 8:-8].reshape(-1, 3).mean(axis=0, dtype=np.float64)
-    # The mean of some 3800 pixels of the dimmest channel (some 55 DN) is known to .3 %; six of that are allowed.
+    means = developed[8:-8, 8:-8].reshape(-1, 3).mean(axis=0, dtype=np.float64)
+    # The mean of 3800 pixels of the darkest channel (55 DN) has an error of 0.3 %; six times this is allowed.
     np.testing.assert_allclose(means / means[1], 1, atol=0.02)
 
 
-def test_without_the_ground_truth_it_is_not_neutral() -> None:
-    """So that the test above can fail: the same scene, the balance of another light."""
+def test_wrong_balance_is_not_neutral() -> None:
+    """Check that the test above can fail, with the balance of another illuminant."""
     metadata = ImageMetadata(white_level=12000, white=WHITES["daylight"], camera="Canon EOS 550D")
     with rawpy.imread(io.BytesIO(encode_image(grey_scene(WHITES["candle"]), "dng", metadata))) as raw:
-        shown = raw.postprocess(use_camera_wb=True, output_bps=16, no_auto_bright=True, gamma=(1, 1))
-    means = shown.reshape(-1, 3).mean(axis=0, dtype=np.float64)
+        developed = raw.postprocess(use_camera_wb=True, output_bps=16, no_auto_bright=True, gamma=(1, 1))
+    means = developed.reshape(-1, 3).mean(axis=0, dtype=np.float64)
     assert abs(means[0] / means[1] - 1) > 0.5
 
 
 @pytest.mark.slow
 @settings(max_examples=40)
 @given(height=st.integers(22, 41), width=st.integers(22, 41), seed=st.integers(0, 99))
-def test_each_photosite_is_its_own_channel_of_its_pixel(height: int, width: int, seed: int) -> None:
+def test_photosites_take_channels_of_their_pixels(height: int, width: int, seed: int) -> None:
     image = np.random.default_rng(seed).integers(0, 65536, (height, width, 3)).astype(np.uint16)
     data = encode_image(image, "dng", ImageMetadata(65535, (1.0, 1.0, 1.0), "Canon EOS 550D"))
     mosaic = decode_raw(data, Path("image.dng"))
@@ -392,7 +388,7 @@ def test_each_photosite_is_its_own_channel_of_its_pixel(height: int, width: int,
     np.testing.assert_array_equal(half[..., 2], blocks[:, 1, :, 1])
 
 
-def test_dcraw_sees_the_same_counts_and_balance(tmp_path: Path) -> None:
+def test_dcraw_reads_counts_and_balance(tmp_path: Path) -> None:
     dcraw = shutil.which("dcraw")
     if dcraw is None:
         pytest.skip("dcraw is not installed")
@@ -408,7 +404,7 @@ def test_dcraw_sees_the_same_counts_and_balance(tmp_path: Path) -> None:
     np.testing.assert_allclose(means / means[1], 1, atol=0.02)
 
 
-def test_the_tags_are_those_of_the_standard() -> None:
+def test_dng_tags() -> None:
     image = np.zeros((30, 40, 3), np.uint16)
     metadata = ImageMetadata(11536, (500.0, 2000.0, 1000.0), "Canon EOS 550D")
     with tifffile.TiffFile(io.BytesIO(encode_image(image, "dng", metadata))) as file:
@@ -420,11 +416,11 @@ def test_the_tags_are_those_of_the_standard() -> None:
     neutral = np.array(tags.pop(50728), dtype=float).reshape(3, 2)
     np.testing.assert_allclose(neutral[:, 0] / neutral[:, 1], [0.25, 1, 0.5])
     matrix = np.array(tags.pop(50721), dtype=float).reshape(3, 3, 2)
-    known = camera_matrix("Canon EOS 550D")
-    assert known is not None
-    np.testing.assert_allclose(matrix[..., 0] / matrix[..., 1], known, atol=5e-5)
-    # TIFF 6.0, sections 8 and 4: one uncompressed picture, pixel by pixel. TIFF/EP: blocks of RGGB. DNG 1.7.1, chapter
-    # 4: a file of 1.4 that readers from 1.1 on can read, planes red, green and blue, sites in rows, daylight.
+    published = camera_matrix("Canon EOS 550D")
+    assert published is not None
+    np.testing.assert_allclose(matrix[..., 0] / matrix[..., 1], published, atol=5e-5)
+    # TIFF 6.0, sections 8 and 4: one uncompressed image, interleaved. TIFF/EP: blocks of RGGB. DNG 1.7.1, chapter 4:
+    # version 1.4, readable from 1.1 on, planes red, green and blue, sites in rows, daylight.
     assert tags == {
         254: 0, 256: 40, 257: 30, 258: 16, 259: 1, 262: 32803, 274: 1, 277: 1, 278: 30, 284: 1,
         271: "CroP", 272: "Canon EOS 550D generated", 50708: "CroP Canon EOS 550D generated",
@@ -433,13 +429,13 @@ def test_the_tags_are_those_of_the_standard() -> None:
     }  # fmt: skip
 
 
-def test_the_matrix_of_srgb_is_the_inverse_of_the_standards() -> None:
-    # Of IEC 61966-2-1, which gives it to four decimals beside its inverse.
+def test_srgb_matrix_is_inverse_of_standard() -> None:
+    # From IEC 61966-2-1, which has both matrices with four decimals.
     inverse = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
     np.testing.assert_allclose(np.array(files._SRGB) @ inverse, np.eye(3), atol=3e-4)
 
 
-def test_two_pixels_by_hand() -> None:
+def test_flash_of_two_pixels() -> None:
     # V = 0.1 and 0.4, geometric mean 0.2, k = 5 * 0.2 = 1; y = x / (V + 1); brightest 0.4 / 1.4 becomes 255.
     image = np.array([[[0.1, 0.05, 0.0], [0.2, 0.4, 0.1]]])
     operator = fit_flash(image, gamma=1)
@@ -456,17 +452,17 @@ def test_two_pixels_by_hand() -> None:
     st.floats(0.5, 20),
     st.sampled_from([1.0, 2.2]),
 )
-def test_the_inverse_gives_back_the_image(image: np.ndarray, a: float, gamma: float) -> None:
+def test_flash_inverse(image: np.ndarray, a: float, gamma: float) -> None:
     operator = fit_flash(image, a, gamma)
     np.testing.assert_allclose(operator.invert(operator.apply(image)), image, rtol=1e-6)
 
 
-def test_the_scale_of_the_values_does_not_matter() -> None:
+def test_flash_does_not_depend_on_scale() -> None:
     image = np.random.default_rng(0).uniform(0.01, 1, (9, 9, 3))
     np.testing.assert_allclose(fit_flash(image).apply(image), fit_flash(image / 50).apply(image / 50))
 
 
-def test_codes_of_eight_bits_lose_little() -> None:
+def test_8_bit_codes_lose_little() -> None:
     image = np.random.default_rng(0).uniform(0.02, 1, (50, 50, 3))
     operator = fit_flash(image)
     back = operator.invert(np.rint(operator.apply(image)))
@@ -474,7 +470,7 @@ def test_codes_of_eight_bits_lose_little() -> None:
 
 
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
-def test_single_precision_moves_no_code_by_more_than_one(gamma: float) -> None:
+def test_single_precision_changes_codes_by_at_most_one(gamma: float) -> None:
     image = np.random.default_rng(4).exponential(0.05, (200, 200, 3))
     image[:3] = 0
     exact = np.clip(fit_flash(image, gamma=gamma).apply(image), 0, 255)
@@ -487,7 +483,7 @@ def test_single_precision_moves_no_code_by_more_than_one(gamma: float) -> None:
     hnp.arrays(np.uint16, (3, 4, 3), elements=st.integers(0, 65535) | st.integers(0, 3)),
     st.sampled_from([255, 12000, 65535]),
 )
-def test_previews_are_the_operator_by_tables(image: npt.NDArray[np.uint16], white_level: int) -> None:
+def test_preview_equals_flash(image: npt.NDArray[np.uint16], white_level: int) -> None:
     linear = image / white_level
     exact = np.clip(fit_flash(linear).apply(linear), 0, 255)
     assert np.abs(preview_of(image, white_level) - exact).max() <= 0.5 + 1e-4
@@ -497,7 +493,7 @@ def test_previews_are_the_operator_by_tables(image: npt.NDArray[np.uint16], whit
     hnp.arrays(np.uint16, st.tuples(st.integers(1, 12), st.integers(1, 12), st.just(3))),
     st.integers(1, 12),
 )
-def test_a_pixel_of_a_preview_is_the_mean_of_what_it_stands_for(image: npt.NDArray[np.uint16], side: int) -> None:
+def test_preview_pixels_are_means(image: npt.NDArray[np.uint16], side: int) -> None:
     factor = -(-max(image.shape[:2]) // side)
     means = np.array(
         [
@@ -513,7 +509,7 @@ def test_a_pixel_of_a_preview_is_the_mean_of_what_it_stands_for(image: npt.NDArr
 
 
 @pytest.mark.parametrize("shape", [(64, 90, 3), (64, 89, 3), (63, 90, 3)])
-def test_means_of_two_by_two_are_rounded_as_all_others(shape: tuple[int, ...]) -> None:
+def test_2x2_means_are_rounded_like_others(shape: tuple[int, ...]) -> None:
     image = np.random.default_rng(5).integers(0, 65536, shape, dtype=np.uint16)
     rows, columns = np.arange(0, shape[0], 2), np.arange(0, shape[1], 2)
     sums, pixels = image.astype(np.int64), np.ones(shape, np.int64)
@@ -523,13 +519,13 @@ def test_means_of_two_by_two_are_rounded_as_all_others(shape: tuple[int, ...]) -
     np.testing.assert_array_equal(preview_of(image, 65535, 45), preview_of(rounded, 65535, 45))
 
 
-KNOWN_METADATA = ImageMetadata(white_level=4600, white=(4000.0, 2520.0, 840.5), camera="Known camera")
+LUT_METADATA = ImageMetadata(white_level=4600, white=(4000.0, 2520.0, 840.5), camera="Known camera")
 
-OF_A_BODY = ImageMetadata(white_level=11536, white=(2046.0, 1579.5, 4520.0), camera="Canon EOS 550D")
+CAMERA_METADATA = ImageMetadata(white_level=11536, white=(2046.0, 1579.5, 4520.0), camera="Canon EOS 550D")
 
 
-def kinds_of_images() -> Iterator[tuple[str, npt.NDArray[Any]]]:
-    """Yield images with runs of every length, repeats at the ends of the window, few and many values, odd sizes."""
+def named_images() -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """Yield images with runs of every length, repeats near the end of the window, and unusual sizes."""
     rng = np.random.default_rng(8)
     few = rng.integers(0, 4000, (9, 3))
     for height, width in ((1, 1), (1, 2), (2, 1), (3, 7), (1, 300), (300, 1)):
@@ -539,9 +535,9 @@ def kinds_of_images() -> Iterator[tuple[str, npt.NDArray[Any]]]:
     yield "one colour", np.full((40, 50, 3), 1234)
     yield "black", np.zeros((30, 30, 3))
     for shift in (-1, 0, 1):
-        # The same noise again, just within, at and just beyond 32768 bytes: 60 rows of 91 pixels and a byte each.
-        once = rng.integers(0, 5000, (60, 91 + shift, 3))
-        yield f"repeats {shift}", np.concatenate([once, once, once])
+        # Noise that repeats just within, at and just beyond 32768 bytes: 60 rows of 91 pixels and one byte.
+        noise = rng.integers(0, 5000, (60, 91 + shift, 3))
+        yield f"repeats {shift}", np.concatenate([noise, noise, noise])
     yield "a few colours", few[rng.integers(0, 9, (64, 64))]
     yield "many rows of few colours", few[rng.geometric(0.4, (200, 60)) % 9]
     yield "25 of each of 64", rng.integers(0, 4000, (1600, 3))[rng.integers(0, 1600, (80, 120))]
@@ -549,49 +545,49 @@ def kinds_of_images() -> Iterator[tuple[str, npt.NDArray[Any]]]:
     ramp = np.arange(90 * 70).reshape(90, 70, 1) * np.array([1, 3, 7])
     yield "a ramp", ramp % 65536
     index = np.arange(640 * 480).reshape(640, 480, 1)
-    # Of so many symbols one row of eight is counted.
+    # Enough symbols that only one row in eight is counted.
     yield "samples of cells", (index * index // 97 % 40) * [31, 97, 55] + (index * 2654435761 >> 7) % 25 * [3, 10, 6]
     yield "a noisy ramp", ramp // 8 + rng.poisson(20, (90, 70, 3))
 
 
 @pytest.mark.slow
-def test_files_of_images(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
-    found: dict[str, Any] = {}
-    for name, numbers in kinds_of_images():
+def test_pinned_files(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
+    results: dict[str, Any] = {}
+    for name, numbers in named_images():
         image = numbers.astype(np.uint16)
-        found[name] = [
-            encode_image(image, "png", KNOWN_METADATA),
-            encode_tiff(image, KNOWN_METADATA),
-            encode_exr(image, KNOWN_METADATA)[:340],
+        results[name] = [
+            encode_image(image, "png", LUT_METADATA),
+            encode_tiff(image, LUT_METADATA),
+            encode_exr(image, LUT_METADATA)[:340],
         ]
-        # Maps are packed by a library, whose versions may differ: that they come to less is known.
-        found[name].append(len(encode_map(image[..., 1])) < 100 + image.nbytes)
+        # Maps are packed by a library with different versions, so only their size is pinned.
+        results[name].append(len(encode_map(image[..., 1])) < 100 + image.nbytes)
         if min(image.shape[:2]) >= 22:
-            found[name] += [encode_dng(image, KNOWN_METADATA), encode_dng(image, OF_A_BODY)]
-        # In bands of some rows, the last of them shorter.
+            results[name] += [encode_dng(image, LUT_METADATA), encode_dng(image, CAMERA_METADATA)]
+        # In bands of several rows, the last one shorter.
         with monkeypatch.context() as changed:
             changed.setattr(files, "BAND", 7 * image.shape[1] + 3)
-            found[name].append(encode_image(image, "png", OF_A_BODY))
-    pinned("bytes of images' files", found)
+            results[name].append(encode_image(image, "png", CAMERA_METADATA))
+    pinned("bytes of images' files", results)
 
 
 @pytest.mark.slow
-def test_codes(pinned: Pinned) -> None:
+def test_pinned_codes(pinned: Pinned) -> None:
     rng = np.random.default_rng(9)
-    found: list[Any] = []
-    given: list[npt.NDArray[np.int64]] = [np.array([0, 0, 5]), np.array([0, 3, 3]), np.zeros(4, np.int64)]
-    given += [rng.geometric(part, 60) * (rng.random(60) < 0.7) for part in (0.01, 0.2, 0.9)]
-    given += [2 ** np.arange(25), np.array([1, 1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144])]
-    for counts in given:
+    results: list[Any] = []
+    frequencies: list[npt.NDArray[np.int64]] = [np.array([0, 0, 5]), np.array([0, 3, 3]), np.zeros(4, np.int64)]
+    frequencies += [rng.geometric(probability, 60) * (rng.random(60) < 0.7) for probability in (0.01, 0.2, 0.9)]
+    frequencies += [2 ** np.arange(25), np.array([1, 1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144])]
+    for counts in frequencies:
         for longest in (7, 12, 15):
             lengths = code_lengths(counts, longest)
-            found.append([lengths, codes_of(lengths)])
-    pinned("codes of frequencies", found)
+            results.append([lengths, codes_of(lengths)])
+    pinned("codes of frequencies", results)
 
 
 @pytest.mark.slow
-def test_what_a_head_may_claim(pinned: Pinned) -> None:
-    """The most rows that a file of 200 bytes may claim, by bits and kind of colour; and how long a part may be."""
+def test_pinned_limits_of_png_sizes(pinned: Pinned) -> None:
+    """Largest number of rows that a file of 200 bytes may declare, by depth and colour type, and chunk sizes."""
 
     def is_plausible(data: bytes) -> bool:
         try:
@@ -603,14 +599,16 @@ def test_what_a_head_may_claim(pinned: Pinned) -> None:
     def head(rows: int, depth: int, colour: int, size: int = 13) -> bytes:
         return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBB", size, b"IHDR", 61, rows, depth, colour) + bytes(7)
 
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for depth in (1, 8, 16):
         for colour in range(8):
             rows = range(1 << 20)
-            found[f"{depth} {colour}"] = bisect_left(
-                rows, True, key=lambda many, d=depth, c=colour: not is_plausible(head(many, d, c) + bytes(167))
+            results[f"{depth} {colour}"] = bisect_left(
+                rows,
+                True,
+                key=lambda row_count, d=depth, c=colour: not is_plausible(head(row_count, d, c) + bytes(167)),
             )
-    parts = [head(1, 8, 2)[:length] + struct.pack(">I", size) + bytes(8) for length in (32, 33) for size in range(4)]
-    parts += [head(1, 8, 2, size) for size in (12, 13, 14)] + [head(1, 8, 2)[:length] for length in (7, 25, 26, 32)]
-    found["parts"] = [is_plausible(part) for part in parts]
-    pinned("what a head may claim", found)
+    heads = [head(1, 8, 2)[:length] + struct.pack(">I", size) + bytes(8) for length in (32, 33) for size in range(4)]
+    heads += [head(1, 8, 2, size) for size in (12, 13, 14)] + [head(1, 8, 2)[:length] for length in (7, 25, 26, 32)]
+    results["parts"] = [is_plausible(probability) for probability in heads]
+    pinned("what a head may claim", results)

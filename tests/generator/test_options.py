@@ -1,6 +1,6 @@
-"""Lights of known distributions, lists and requests, as they were chosen before.
+"""Pinned choices of illuminants by distributions, lists and options.
 
-Who changes what a seed decides changes datasets: who makes one again, with a later version, is to get the same.
+A later version must make the same data set from the same seed, so these results must not change.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ pytestmark = pytest.mark.slow
 SEED = 2**40 + 9
 
 
-def shown(choice: LightChoice, scenes: tuple[int, ...] = (0, 1, 2, 70000)) -> list[Any]:
-    """Return what a choice says of itself, and the lights of some scenes."""
+def choice_record(choice: LightChoice, scenes: tuple[int, ...] = (0, 1, 2, 70000)) -> list[Any]:
+    """Return the description of a choice, and the illuminants of some scenes."""
     lights = [
         [mixture.label for lighting in choice.lightings_of(scene) for mixture in lighting.mixtures] for scene in scenes
     ]
@@ -39,7 +39,7 @@ def shown(choice: LightChoice, scenes: tuple[int, ...] = (0, 1, 2, 70000)) -> li
 
 @pytest.fixture(scope="module", autouse=True)
 def lut(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lut]:
-    """Go to a folder with a table and files of lights."""
+    """Change to a folder with a LUT and files of ground truths."""
     folder = tmp_path_factory.mktemp("lights")
     rng = np.random.default_rng(6)
     with chdir(folder):
@@ -54,21 +54,21 @@ def lut(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lut]:
         yield table_in(Path("lut"))
 
 
-def test_draws_of_distributions(pinned: Pinned) -> None:
+def test_pinned_draws(pinned: Pinned) -> None:
     words = philox.words(3, np.arange(100), 1, 2, philox.CHROMATICITIES)
     texts = ("uniform", "gaussian:r=.3,b=.25,sd=.02", "gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8")
     texts += ("gt.csv", "gt.txt", "gaussian:r=.3,sd=.1", "gaussian:r=.3,b=.2,sd_r=.1", "none")
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for text in texts:
         distribution = said(parse_distribution, text)
-        found[text] = distribution if isinstance(distribution, dict) else [
+        results[text] = distribution if isinstance(distribution, dict) else [
             distribution.describe(),
             distribution.draw(words),
         ]  # fmt: skip
-    pinned("draws of distributions", found)
+    pinned("draws of distributions", results)
 
 
-def test_lights_that_texts_name(lut: Lut, pinned: Pinned) -> None:
+def test_pinned_lights_of_texts(lut: Lut, pinned: Pinned) -> None:
     texts = ("0", "4", "5", "999", "1000", "5500", "C", " C ", "c", "tungsten", "2500K", "9000k", "2499K", "4000 K")
     texts += (
         "cct=7000",
@@ -82,15 +82,15 @@ def test_lights_that_texts_name(lut: Lut, pinned: Pinned) -> None:
         "0:0+4:3",
     )
     texts += ("4:.3+0:.7", "0:.3+0:.7", "", "r=.3,b=.25,cct=5000", "1:.2+9:.8")
-    found = {text: said(parse_light, text, lut) for text in texts}
-    found |= {f"{text} nearest": said(parse_light, text, lut, None, "nearest") for text in texts}
+    results = {text: said(parse_light, text, lut) for text in texts}
+    results |= {f"{text} nearest": said(parse_light, text, lut, None, "nearest") for text in texts}
     lists = ("all", " ALL ", "0,2-4", "4-4,1,4", "3-1", "0-5", "1,,2", "0 - 2 , 4", "-1")
-    found |= {f"list {text}": said(light_numbers, text, 5) for text in lists}
-    parts = ({4: 3, 1: 1, 2: 0.0}, {0: 1, 1: 4e-10}, {0: 1, 1: 6e-10}, {0: 1, 1: 1, 2: 1})
-    found |= {f"parts {number}": mixture_of(one) for number, one in enumerate(parts)}
-    found["parsed"] = [parse_mixture(text) for text in ("7", "3:.2+1:.8", "1:.3333333+2:.3333333+5:.3333334")]
-    found["bodies"] = [black_body(lut, kelvin) for kelvin in (2500, 2501, 3000, 3800, 5000, 5500, 8000, 9000)]
-    pinned("lights that texts name", found)
+    results |= {f"list {text}": said(light_numbers, text, 5) for text in lists}
+    share_sets = ({4: 3, 1: 1, 2: 0.0}, {0: 1, 1: 4e-10}, {0: 1, 1: 6e-10}, {0: 1, 1: 1, 2: 1})
+    results |= {f"parts {number}": mixture_of(shares) for number, shares in enumerate(share_sets)}
+    results["parsed"] = [parse_mixture(text) for text in ("7", "3:.2+1:.8", "1:.3333333+2:.3333333+5:.3333334")]
+    results["bodies"] = [black_body(lut, kelvin) for kelvin in (2500, 2501, 3000, 3800, 5000, 5500, 8000, 9000)]
+    pinned("lights that texts name", results)
 
 
 REQUESTS: dict[str, dict[str, Any]] = {
@@ -112,9 +112,9 @@ REQUESTS: dict[str, dict[str, Any]] = {
 }
 
 
-def test_requests(lut: Lut, pinned: Pinned) -> None:
-    found: dict[str, Any] = {}
-    for name, wishes in REQUESTS.items():
-        choice = said(LightOptions(**wishes).choose, lut, SEED)
-        found[name] = choice if isinstance(choice, dict) else said(shown, choice, (0, 1, 70000))
-    pinned("requests of lights", found)
+def test_pinned_choices(lut: Lut, pinned: Pinned) -> None:
+    results: dict[str, Any] = {}
+    for name, keywords in REQUESTS.items():
+        choice = said(LightOptions(**keywords).choose, lut, SEED)
+        results[name] = choice if isinstance(choice, dict) else said(choice_record, choice, (0, 1, 70000))
+    pinned("requests of lights", results)

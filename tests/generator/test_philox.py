@@ -1,4 +1,4 @@
-"""Philox4x32-10 against its authors' vectors, and the choices made from it."""
+"""Philox4x32-10 against the published test vectors, and random choices made with it."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ KNOWN_ANSWERS = [
 
 
 @pytest.mark.parametrize(("counter", "key", "answer"), KNOWN_ANSWERS)
-def test_the_words_are_the_authors(counter: str, key: str, answer: str) -> None:
+def test_words_match_published_vectors(counter: str, key: str, answer: str) -> None:
     a, b, number, purpose = (int(word, 16) for word in counter.split())
     low, high = (int(word, 16) for word in key.split())
-    got = philox.words(high << 32 | low, a, b, number, purpose)
-    assert [int(word) for word in got] == [int(word, 16) for word in answer.split()]
+    result = philox.words(high << 32 | low, a, b, number, purpose)
+    assert [int(word) for word in result] == [int(word, 16) for word in answer.split()]
 
 
 @pytest.mark.parametrize("seed", [-1, 1 << 64])
-def test_a_seed_out_of_range_is_refused(seed: int) -> None:
+def test_refuses_seed_out_of_range(seed: int) -> None:
     with pytest.raises(InputError):
         philox.key_of(seed)
 
 
 @given(st.integers(1, 60), st.data())
-def test_distinct_numbers_are_distinct_and_in_range(total: int, data: st.DataObject) -> None:
+def test_distinct_numbers(total: int, data: st.DataObject) -> None:
     count = data.draw(st.integers(1, total))
-    chosen = philox.distinct(data.draw(st.integers(0, 2**64 - 1)), count, total, 3, philox.LIGHTS)
-    assert len(set(chosen)) == count
-    assert set(chosen) <= set(range(total))
+    numbers = philox.distinct(data.draw(st.integers(0, 2**64 - 1)), count, total, 3, philox.LIGHTS)
+    assert len(set(numbers)) == count
+    assert set(numbers) <= set(range(total))
 
 
 @pytest.mark.slow
-def test_every_order_is_equally_likely() -> None:
+def test_orders_are_equally_likely() -> None:
     # 12 orders of 2 out of 4, 4800 draws: chi-square with 11 degrees of freedom exceeds 37.4 once in 10 000 seeds.
     draws = Counter(philox.distinct(7, 2, 4, number, philox.LIGHTS) for number in range(4800))
     orders = list(itertools.permutations(range(4), 2))

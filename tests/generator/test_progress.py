@@ -1,4 +1,4 @@
-"""What is shown of the work on images: lines or a bar, the colour matrix, and lights whose cells are found first."""
+"""Progress as lines or a bar, and the message about the colour matrix."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ import pytest
 from generator import progress
 from generator.cli import main, matrix_sentence
 from generator.dataset.shards import SILENT
-from generator.progress import shown_progress
+from generator.progress import show_progress
 from generator.rendering.matrices import SOURCE, camera_matrix
 from tests.generator.conftest import MakeLut
 
 
-def test_what_was_found_before_the_first_image_is_one_sum(capsys: pytest.CaptureFixture[str]) -> None:
-    with shown_progress(9) as callbacks:
-        for found in (3, 2, -1):
-            callbacks.on_done(found)
+def test_sums_reused_images_before_first_image(capsys: pytest.CaptureFixture[str]) -> None:
+    with show_progress(9) as callbacks:
+        for count in (3, 2, -1):
+            callbacks.on_done(count)
         callbacks.on_image()
         callbacks.on_done(2)
         callbacks.on_image()
     lines = capsys.readouterr().err.splitlines()
-    assert lines[:2] == ["4 images were found finished", "6 images were found finished in all"]
+    assert lines[:2] == ["4 images exist from an earlier run", "6 images exist from an earlier run in total"]
 
 
 class _Terminal(io.StringIO):
@@ -35,38 +35,38 @@ class _Terminal(io.StringIO):
         return True
 
 
-def _told() -> None:
-    with shown_progress(4) as callbacks:
+def _report_four_images() -> None:
+    with show_progress(4) as callbacks:
         callbacks.on_done(1)
         callbacks.on_image()
         callbacks.on_skip("bad\x1b[2J.png", "it is no picture", 1)
         callbacks.on_image()
 
 
-def test_a_file_gets_lines(capsys: pytest.CaptureFixture[str]) -> None:
-    _told()
+def test_writes_lines_to_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    _report_four_images()
     lines = capsys.readouterr().err.splitlines()
-    assert lines[:2] == ["1 images were found finished", "left out bad\\x1b[2J.png: it is no picture"]
+    assert lines[:2] == ["1 images exist from an earlier run", "skipped bad\\x1b[2J.png: it is no picture"]
     assert lines[2].startswith("images 2/2 ")
     assert len(lines) == 3
 
 
-def test_a_terminal_gets_a_bar_when_it_takes_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shows_bar_for_long_work_on_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     for soon, bar in ((1e6, False), (-1.0, True)):
         terminal = _Terminal()
         monkeypatch.setattr(sys, "stderr", terminal)
         monkeypatch.setattr(progress, "SOON_S", soon)
-        _told()
+        _report_four_images()
         assert ("━" in terminal.getvalue()) == bar
         assert "2/2" in terminal.getvalue()
         assert "\x1b[2J" not in terminal.getvalue()
 
 
-def test_who_wants_errors_alone_gets_nothing(
+def test_is_silent_if_only_errors_are_logged(
     capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.ERROR)
-    with shown_progress(1) as callbacks:
+    with show_progress(1) as callbacks:
         assert callbacks is SILENT
     assert capsys.readouterr().err == ""
 
@@ -75,7 +75,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def place(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     make_lut()
     monkeypatch.chdir(tmp_path)
     assert cv2.imwrite("grey.png", np.full((8, 8, 3), 128, np.uint8))
@@ -83,24 +83,24 @@ def place(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize(
-    ("more", "told", "not_told"),
+    ("options", "expected", "absent"),
     [
-        ((), "that of Test camera is not known, so this one was fitted; if the print's colours were", "dcraw"),
-        (("--matrix", "table"), "colour matrix: table (least squares", "is not known"),
+        ((), "there is no published matrix for Test camera", "dcraw"),
+        (("--matrix", "table"), "colour matrix: table (least squares", "no published matrix"),
         (("--matrix", "Canon EOS 600D"), f"colour matrix: Canon EOS 600D ({SOURCE})", "faults"),
     ],
 )
-def test_the_matrix_is_told(
-    place: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], told: str, not_told: str
+def test_reports_colour_matrix(
+    folder: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], expected: str, absent: str
 ) -> None:
-    wish = ("--sources", "grey.png", "--light", "1", "--no-preview", "--rendering", "colorimetric")
-    assert main(["lut", "out", *wish, *more]) == 0
+    arguments = ("--sources", "grey.png", "--light", "1", "--no-preview", "--rendering", "colorimetric")
+    assert main(["lut", "out", *arguments, *options]) == 0
     printed = capsys.readouterr().out
-    assert told in printed
-    assert not_told not in printed
+    assert expected in printed
+    assert absent not in printed
 
 
-def test_the_tables_own_camera_needs_no_advice() -> None:
-    known = camera_matrix("Canon EOS 550D")
-    assert known is not None
-    assert matrix_sentence(known, "Canon EOS 550D", chosen=False) == f"colour matrix: Canon EOS 550D ({SOURCE})"
+def test_published_matrix_needs_no_warning() -> None:
+    matrix = camera_matrix("Canon EOS 550D")
+    assert matrix is not None
+    assert matrix_sentence(matrix, "Canon EOS 550D", is_chosen=False) == f"colour matrix: Canon EOS 550D ({SOURCE})"

@@ -1,4 +1,4 @@
-"""Stores past this machine: the same dataset, a shard at a time, whatever breaks on the way, and no secret in it."""
+"""Object stores: equal data sets, resumption after failures, and secrets in addresses."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.registry import register_implementation
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.making import generate_dataset, make_dataset, make_share, workplace
+from generator.dataset.making import generate_dataset, make_dataset, make_share, open_workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import file_faults, open_dataset
 from generator.dataset.records import Layout
-from generator.dataset.shards import make_elsewhere
+from generator.dataset.shards import make_shard_on_worker
 from generator.lights.lighting import ListedLights
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import find_pictures
@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 
 
 class FolderedStore(MemoryFileSystem):
-    """A store that takes a file only where its folder was made, as FTP servers do."""
+    """A store that needs existing folders, as FTP servers do."""
 
     protocol = "ftp"
     store: dict[str, object] = {}  # noqa: RUF012  as fsspec has it
     pseudo_dirs = [""]  # noqa: RUF012  as fsspec has it
-    made: set[str] = set()  # noqa: RUF012  of this test
+    folders: set[str] = set()  # noqa: RUF012  of this test
 
     @classmethod
     def _strip_protocol(cls, path: str) -> str:
@@ -51,10 +51,10 @@ class FolderedStore(MemoryFileSystem):
 
     def makedirs(self, path: str, exist_ok: bool = False) -> None:
         del exist_ok
-        self.made.add(path.rstrip("/"))
+        self.folders.add(path.rstrip("/"))
 
     def _require(self, path: str) -> None:
-        if path.rpartition("/")[0] not in self.made:
+        if path.rpartition("/")[0] not in self.folders:
             raise EOFError("550 No such file or directory")
 
     def pipe_file(self, path: str, value: bytes, mode: str = "overwrite", **kwargs: Any) -> None:
@@ -67,22 +67,22 @@ class FolderedStore(MemoryFileSystem):
 
 
 @pytest.fixture
-def foldered() -> Generator[FolderedStore]:
-    before = import_module("fsspec").get_filesystem_class("ftp")
+def ftp_store() -> Generator[FolderedStore]:
+    original = import_module("fsspec").get_filesystem_class("ftp")
     register_implementation("ftp", FolderedStore, clobber=True)
-    FolderedStore.made.clear()
+    FolderedStore.folders.clear()
     yield FolderedStore()
-    register_implementation("ftp", before, clobber=True)
+    register_implementation("ftp", original, clobber=True)
 
 
-def test_parents_are_made(table_and_picture: Path, foldered: FolderedStore) -> None:
+def test_creates_parent_folders(table_and_picture: Path, ftp_store: FolderedStore) -> None:
     arguments = ["lut", "ftp://host/deep/out", "--sources", "cat.png", "--light", "0", "--workers", "1"]
     assert import_module("generator.cli").main(arguments) == 0
-    assert "/host/deep/out/images" in foldered.made
+    assert "/host/deep/out/images" in ftp_store.folders
     assert import_module("generator.cli").main(["--verify", "ftp://host/deep/out"]) == 0
 
 
-def test_what_a_store_raises_while_it_connects_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_connection_error(monkeypatch: pytest.MonkeyPatch) -> None:
     import ftplib
 
     def refuse(url: str) -> None:
@@ -97,7 +97,7 @@ PASSWORD = "ftp-5ecret-word"
 
 
 class GuardedStore(MemoryFileSystem):
-    """A store whose address holds a user and a password, as ftp's and sftp's do."""
+    """A store with user and password in its address, as for ftp and sftp."""
 
     protocol = "guarded"
     store: dict[str, object] = {}  # noqa: RUF012  as fsspec has it
@@ -112,9 +112,7 @@ def command(module: str, *arguments: object) -> int:
     return int(import_module(module).main([*map(str, arguments)]))
 
 
-def test_no_file_of_a_data_set_holds_the_secret_of_its_address(
-    table_and_picture: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_secrets_of_address_are_not_written(table_and_picture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     register_implementation("guarded", GuardedStore, clobber=True)
     address = f"guarded://lab:{PASSWORD}@store/"
     store = GuardedStore()
@@ -124,9 +122,9 @@ def test_no_file_of_a_data_set_holds_the_secret_of_its_address(
     assert command("generator.cli", "--verify", address + "out") == 0
     assert command("generator.cli", table_and_picture / "lut", address + "out", *arguments) in (0, 2)
     assert command("generator.cli", "--verify", address + "nowhere") == 2
-    told = "".join(capsys.readouterr())
-    assert "guarded://…@store/out" in told
-    assert PASSWORD not in told
+    output = "".join(capsys.readouterr())
+    assert "guarded://…@store/out" in output
+    assert PASSWORD not in output
     names = store.find("/store/out")
     assert len(names) > 6
     for name in names:
@@ -139,7 +137,7 @@ SCENES = random_scenes(4, 24, 16, 8)
 
 
 class FailingFileSystem(MemoryFileSystem):
-    """A store of memory that fails at its writes from number `fails_at` on, or never."""
+    """A store in memory that fails from write number `fails_at` on, or never."""
 
     protocol = "failing"
     store: dict[str, Any] = {}  # noqa: RUF012  as the class above has it
@@ -162,7 +160,7 @@ class FailingFileSystem(MemoryFileSystem):
 
 @pytest.fixture(autouse=True)
 def empty_stores() -> Iterator[None]:
-    """Empty the stores of memory, which last as long as the program."""
+    """Empty the stores in memory, which otherwise persist between tests."""
     fsspec.register_implementation("failing", FailingFileSystem, clobber=True)
     FailingFileSystem.fails_at = None
     MemoryFileSystem.store.clear()
@@ -172,42 +170,41 @@ def empty_stores() -> Iterator[None]:
     FailingFileSystem.store.clear()
 
 
-def contents(place: str | Path) -> dict[str, str]:
+def file_hashes(location: str | Path) -> dict[str, str]:
     """Return the hash of every file of a store."""
-    store = open_store(place)
+    store = open_store(location)
     return {name: hashlib.sha256(store.get(name)).hexdigest() for name in store.names()}
 
 
 def make(lut: Lut, out: str | Path, **options: Any) -> None:
-    wishes: dict[str, Any] = {"seed": 3, "shard_images": 3, "split": (0.5, 0.0, 0.5), "rendering": "codes"} | options
-    generate_dataset(lut, out, SCENES, [2, 0], **grouped(**wishes))
+    keywords: dict[str, Any] = {"seed": 3, "shard_images": 3, "split": (0.5, 0.0, 0.5), "rendering": "codes"} | options
+    generate_dataset(lut, out, SCENES, [2, 0], **grouped(**keywords))
 
 
 @pytest.mark.parametrize("layout", get_args(Layout))
-def test_a_dataset_in_a_store_is_the_one_on_the_disk(make_lut: MakeLut, tmp_path: Path, layout: str) -> None:
+def test_store_and_disk_have_equal_data_sets(make_lut: MakeLut, tmp_path: Path, layout: str) -> None:
     lut = make_lut()
     make(lut, tmp_path / "out", layout=layout)
     make(lut, "memory://bucket/out", layout=layout, workers=3)
-    assert contents("memory://bucket/out") == contents(tmp_path / "out")
-    there, here = open_dataset("memory://bucket/out"), open_dataset(tmp_path / "out")
-    assert there.entries == here.entries
-    assert there.sources == here.sources
-    for entry in here.entries[::3]:
-        np.testing.assert_array_equal(there.read_image(entry), here.read_image(entry))
+    assert file_hashes("memory://bucket/out") == file_hashes(tmp_path / "out")
+    remote, local = open_dataset("memory://bucket/out"), open_dataset(tmp_path / "out")
+    assert remote.entries == local.entries
+    assert remote.sources == local.sources
+    for entry in local.entries[::3]:
+        np.testing.assert_array_equal(remote.read_image(entry), local.read_image(entry))
     assert list(file_faults("memory://bucket/out")) == []
     with pytest.raises(InputError, match="memory://bucket/out"):
         make(lut, "memory://bucket/out", layout=layout)
 
 
-STRIDE = 3
-"""Of the writes to a store every third is one at which it fails."""
+STRIDE = 3  # The store fails at every third write
 
 
 @pytest.mark.parametrize("layout", get_args(Layout))
-def test_a_store_that_fails_at_any_write_is_gone_on_with(make_lut: MakeLut, tmp_path: Path, layout: str) -> None:
+def test_resumes_after_failure_of_any_write(make_lut: MakeLut, tmp_path: Path, layout: str) -> None:
     lut = make_lut()
     make(lut, tmp_path / "out", layout=layout, previews=False)
-    expected = contents(tmp_path / "out")
+    expected = file_hashes(tmp_path / "out")
     write = 1 - STRIDE
     failed = True
     while failed:
@@ -225,7 +222,7 @@ def test_a_store_that_fails_at_any_write_is_gone_on_with(make_lut: MakeLut, tmp_
         FailingFileSystem.fails_at = None
         if failed:
             make(lut, "failing://bucket/out", layout=layout, previews=False)
-        assert contents("failing://bucket/out") == expected, f"failed at write {write}"
+        assert file_hashes("failing://bucket/out") == expected, f"failed at write {write}"
     assert write > 8
 
 
@@ -240,7 +237,7 @@ def test_shares_in_a_store(make_lut: MakeLut, tmp_path: Path) -> None:
         make(lut, "memory://out", seed=4)
     assert make_share(plan, "memory://out", (0, 2)) == (3, 3)
     make_dataset(plan, "memory://out")
-    assert contents("memory://out") == contents(tmp_path / "out")
+    assert file_hashes("memory://out") == file_hashes(tmp_path / "out")
 
 
 def test_sources_in_a_store(make_lut: MakeLut, tmp_path: Path) -> None:
@@ -253,36 +250,32 @@ def test_sources_in_a_store(make_lut: MakeLut, tmp_path: Path) -> None:
         RemoteStore("memory://bucket/pictures").put(name, data)
     RemoteStore("memory://bucket/pictures").put("c.png", b"no picture")
     (tmp_path / "pictures" / "c.png").write_bytes(b"no picture")
-    for place, out in (("memory://bucket/pictures", "there"), (str(tmp_path / "pictures"), "here")):
-        generate_dataset(lut, tmp_path / out, find_pictures([place]), [0, 1])
-    assert contents(tmp_path / "there") == contents(tmp_path / "here")
+    for location, out in (("memory://bucket/pictures", "there"), (str(tmp_path / "pictures"), "here")):
+        generate_dataset(lut, tmp_path / out, find_pictures([location]), [0, 1])
+    assert file_hashes(tmp_path / "there") == file_hashes(tmp_path / "here")
     assert len(open_dataset(tmp_path / "here").description.skipped) == 1
 
 
 @pytest.mark.parametrize("remote", [True, False])
-def test_a_late_worker_of_a_plan_that_was_removed_is_not_believed(
-    make_lut: MakeLut, tmp_path: Path, remote: bool
-) -> None:
+def test_ignores_late_worker_of_removed_plan(make_lut: MakeLut, tmp_path: Path, remote: bool) -> None:
     lut = make_lut()
     out = "memory://bucket/out" if remote else str(tmp_path / "out")
     old, new = (
         Plan(lut, SCENES, ListedLights((0, 2)), seed, DatasetOptions(rendering="codes", shard_images=3))
         for seed in (3, 4)
     )
-    with workplace(out, old.identity()) as late:
+    with open_workplace(out, old.identity()) as late_workplace:
         pass
     RemoteStore(out).remove("") if remote else shutil.rmtree(tmp_path / ".out.partial")
     make_share(new, out, (1, 2))
     with nullcontext() if remote else pytest.raises(StorageError):
-        make_elsewhere(old.job(0), late)
+        make_shard_on_worker(old.job(0), late_workplace)
     make_dataset(new, out)
     make_dataset(new, tmp_path / "undisturbed")
-    assert contents(out) == contents(tmp_path / "undisturbed")
+    assert file_hashes(out) == file_hashes(tmp_path / "undisturbed")
 
 
-def test_a_source_out_of_reach_ends_the_work_and_leaves_no_picture_out(
-    make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unreachable_source_stops_the_work(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lut = make_lut()
     data = cv2.imencode(".png", np.zeros((9, 8, 3), np.uint8))[1].tobytes()
     for name in ("a.png", "b.png"):
@@ -300,17 +293,15 @@ def test_a_source_out_of_reach_ends_the_work_and_leaves_no_picture_out(
 
 
 @pytest.mark.parametrize("unmounted", ["gone", "empty"])
-def test_a_disk_that_is_not_mounted_is_told_from_a_picture_that_is_gone(
-    make_lut: MakeLut, tmp_path: Path, unmounted: str
-) -> None:
+def test_distinguishes_unmounted_disk_from_missing_picture(make_lut: MakeLut, tmp_path: Path, unmounted: str) -> None:
     folder = tmp_path / "pictures"
     folder.mkdir()
     for name in ("a.png", "b.png"):
         (folder / name).write_bytes(cv2.imencode(".png", np.zeros((9, 8, 3), np.uint8))[1].tobytes())
     pictures = find_pictures([folder])
     (folder / "a.png").unlink()
-    made = generate_dataset(make_lut(), tmp_path / "one", pictures, [0])
-    assert (made.description.sources, [left.name for left in made.description.skipped]) == (1, ["a.png"])
+    dataset = generate_dataset(make_lut(), tmp_path / "one", pictures, [0])
+    assert (dataset.description.sources, [skipped.name for skipped in dataset.description.skipped]) == (1, ["a.png"])
     shutil.rmtree(folder)
     if unmounted == "empty":
         folder.mkdir()
@@ -318,19 +309,19 @@ def test_a_disk_that_is_not_mounted_is_told_from_a_picture_that_is_gone(
         generate_dataset(make_lut(name="again"), tmp_path / "none", pictures, [0])
 
 
-def test_a_place_that_holds_something_else_is_left_alone(make_lut: MakeLut) -> None:
+def test_refuses_location_with_other_files(make_lut: MakeLut) -> None:
     RemoteStore("memory://bucket").put("out/mine.txt", b"mine")
     with pytest.raises(InputError, match="memory://bucket/out"):
         make(make_lut(), "memory://bucket/out")
     assert RemoteStore("memory://bucket").get("out/mine.txt") == b"mine"
 
 
-def test_a_file_url_is_a_folder(make_lut: MakeLut, tmp_path: Path) -> None:
+def test_file_url_is_a_folder(make_lut: MakeLut, tmp_path: Path) -> None:
     make(make_lut(), f"file://{tmp_path}/out")
     assert open_dataset(f"file://{tmp_path}/out").store == LocalStore(tmp_path / "out")
 
 
-def test_a_file_of_a_block_that_fails_does_not_appear(tmp_path: Path) -> None:
+def test_failed_block_writes_no_file(tmp_path: Path) -> None:
     def fail(store: LocalStore | RemoteStore) -> None:
         with store.create("a/b") as stream:
             stream.write(b"half")
@@ -344,8 +335,8 @@ def test_a_file_of_a_block_that_fails_does_not_appear(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
-def test_a_program_that_was_forked_synchronises_its_files(tmp_path: Path) -> None:
-    # In a process of its own: to fork this one with its threads is not safe.
+def test_forked_process_synchronises_files(tmp_path: Path) -> None:
+    # In a new process, because forking this one with its threads is not safe.
     program = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
@@ -359,6 +350,8 @@ def test_a_program_that_was_forked_synchronises_its_files(tmp_path: Path) -> Non
         "    os._exit(0)\n"
         "sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
     )
-    ran = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr
+    process = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert process.returncode == 0, process.stderr
     assert (tmp_path / "b").read_bytes() == b"2"

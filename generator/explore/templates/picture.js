@@ -1,37 +1,37 @@
-// A picture's counts: fetched, tone mapped, drawn, counted. The same for each rendering.
+// The panel of one rendering: requests the counts of a picture, and draws image, pixel and histogram.
 
-/** Parameters of the tone mapping Flash, as of the previews of datasets. */
+/** Parameters of the tone mapping operator Flash, as for the previews of data sets. */
 const STRENGTH = 5;
 const GAMMA = 2.2;
 const DARK = 1e-9;
 const BINS = 96;
 const LOUPE = 11;
 
-/** Ask the program for an answer; an Error has its sentence. */
+/** Request an answer of the program; throws an Error with its message. */
 async function ask(address, options) {
   let answer;
   try {
     answer = await fetch(address, options);
   } catch {
-    throw new Error("The program does not answer; see whether generate explore still runs.");
+    throw new Error("The program does not answer; check that generate explore still runs.");
   }
   if (!answer.ok) throw new Error((await answer.text()).trim());
   return answer;
 }
 
-/** Do a job for the newest arguments only: while one is done, those that come are kept, and the last one is next. */
+/** Return a function that runs `job` with the newest arguments; calls during a run are replaced by later ones. */
 function newest(job) {
   let waiting = null;
   let busy = false;
-  return async (...given) => {
-    waiting = given;
+  return async (...args) => {
+    waiting = args;
     if (busy) return;
     busy = true;
     try {
       while (waiting) {
-        const now = waiting;
+        const current = waiting;
         waiting = null;
-        await job(...now);
+        await job(...current);
       }
     } finally {
       busy = false;
@@ -40,16 +40,16 @@ function newest(job) {
 }
 
 /**
- * Fill `out`, four bytes a pixel, with counts (three a pixel) that are tone mapped.
+ * Fill `out` (RGBA bytes) with tone mapped counts (RGB); `most` is the largest count.
  *
- * `gains` are multiplied with red, green and blue; `white` is the count of saturation. N. Banić, S. Lončarić, "Flash
+ * Red, green and blue are multiplied by `gains`; `white` is the saturation level. Source: N. Banić, S. Lončarić, "Flash
  * and Storm: fast and highly practical tone mapping based on Naka-Rushton equation", VISAPP 2018.
  */
 function toneMap(counts, most, white, gains, out) {
   const scaled = gains.map((gain) => Float32Array.from({ length: most + 1 }, (_, count) => count * gain));
   const roots = scaled.map((values) => values.map((value) => (value / white) ** (1 / GAMMA)));
   const [red, green, blue] = scaled;
-  // Brightness is known to a whole count, or to a part of the brightest where a light has hardly any of a colour.
+  // Brightness is rounded to counts, or to 1/65535 of the largest value if a channel has a large gain.
   const brightest = Math.min(65535, Math.ceil(most * Math.max(...gains)));
   const unit = Math.max(1, (most * Math.max(...gains)) / 65535);
   const histogram = new Uint32Array(brightest + 1);
@@ -78,7 +78,7 @@ function toneMap(counts, most, white, gains, out) {
   }
 }
 
-/** Fill `out`, four bytes a pixel, with counts as they are: 0 black, `white` white. */
+/** Fill `out` (RGBA bytes) with linear counts; the count `white` is white. */
 function showCounts(counts, white, out) {
   for (let at = 0, to = 0; at < counts.length; at += 3, to += 4) {
     out[to] = (255 * counts[at]) / white;
@@ -89,10 +89,10 @@ function showCounts(counts, white, out) {
 }
 
 class Panel {
-  /** `onPoint` gets a pixel [x, y] that was clicked or gone to. */
+  /** `onPoint` is called with the selected pixel [x, y]. */
   constructor(rendering, title, white, onPoint) {
     [this.rendering, this.title, this.white] = [rendering, title, white];
-    // What the counts are of, and what is known of the pixel that is looked at: either may come first.
+    // Counts and the noise of the selected pixel; either may arrive first.
     this.counts = null;
     this.drawn = "";
     this.most = 0;
@@ -101,10 +101,10 @@ class Panel {
     this.canvas = element("canvas", { role: "img", "aria-label": title });
     this.mark = element("span", { class: "mark", hidden: "" });
     this.screen = element("div", { class: "screen", tabindex: "0", role: "group", hidden: "" }, this.canvas, this.mark);
-    this.screen.setAttribute("aria-label", `${title}; arrow keys move the pixel that is looked at`);
+    this.screen.setAttribute("aria-label", `${title}; arrow keys move the selected pixel`);
     this.wait = element("p", { class: "wait" }, "…");
     $("panels").append(element("div", {}, element("h3", {}, title), this.screen, this.wait));
-    this.loupe = element("canvas", { width: 132, height: 132, role: "img", "aria-label": `Pixels around, ${title}` });
+    this.loupe = element("canvas", { width: 132, height: 132, role: "img", "aria-label": `Enlarged pixels, ${title}` });
     this.rows = element("tbody");
     const heads = ["", "counts", "mean ± sd"].map((text) => element("th", { scope: "col" }, text));
     const table = element("table", {}, element("thead", {}, element("tr", {}, ...heads)), this.rows);
@@ -113,7 +113,7 @@ class Panel {
     );
     this.histogram = element("div", { class: "histogram" });
     $("histograms").append(element("div", {}, element("h3", {}, title), this.histogram));
-    this.show = newest((picture, light, look) => this.fetchImage(picture, light, look));
+    this.show = newest((picture, light, display) => this.fetchImage(picture, light, display));
     this.measure = newest((picture, light, at) => this.fetchNoise(picture, light, at));
     this.listen(onPoint);
   }
@@ -122,8 +122,8 @@ class Panel {
     const point = (event) => {
       const box = this.canvas.getBoundingClientRect();
       const { width, height } = this.canvas;
-      const place = [((event.clientX - box.left) / box.width) * width, ((event.clientY - box.top) / box.height) * height];
-      onPoint(place.map(Math.floor));
+      const position = [((event.clientX - box.left) / box.width) * width, ((event.clientY - box.top) / box.height) * height];
+      onPoint(position.map(Math.floor));
     };
     let down = false;
     this.screen.addEventListener("pointerdown", (event) => {
@@ -135,15 +135,15 @@ class Panel {
     this.screen.addEventListener("pointermove", (event) => down && point(event));
     for (const end of ["pointerup", "pointercancel"]) this.screen.addEventListener(end, () => (down = false));
     this.screen.addEventListener("keydown", (event) => {
-      const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowDown: [0, 1], ArrowUp: [0, -1] }[event.key];
-      if (!way) return;
+      const direction = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowDown: [0, 1], ArrowUp: [0, -1] }[event.key];
+      if (!direction) return;
       event.preventDefault();
-      onPoint(way.map((step) => step * (event.shiftKey ? 10 : 1)), true);
+      onPoint(direction.map((step) => step * (event.shiftKey ? 10 : 1)), true);
     });
   }
 
-  async fetchImage(picture, light, look) {
-    const waits = setTimeout(() => this.say(this.counts ? "…" : "… (by colour, the first picture takes some seconds)"), 400);
+  async fetchImage(picture, light, display) {
+    const timer = setTimeout(() => this.message(this.counts ? "…" : "… (the first picture by colour takes a few seconds)"), 400);
     try {
       const answer = await ask(`counts?${new URLSearchParams({ picture, light, rendering: this.rendering })}`);
       const data = await answer.arrayBuffer();
@@ -153,46 +153,46 @@ class Panel {
       this.most = 0;
       for (let at = 0; at < this.counts.length; at++) if (this.counts[at] > this.most) this.most = this.counts[at];
       [this.canvas.width, this.canvas.height] = [width, height];
-      this.say("");
-      this.draw(look());
+      this.message("");
+      this.draw(display());
       this.drawHistogram();
     } catch (error) {
       this.counts = null;
-      this.say(error.message, true);
+      this.message(error.message, true);
     } finally {
-      clearTimeout(waits);
+      clearTimeout(timer);
     }
   }
 
-  say(text, bad = false) {
+  message(text, bad = false) {
     this.wait.textContent = text;
     this.wait.classList.toggle("bad", bad);
     this.wait.hidden = !text;
     this.screen.hidden = !this.counts || bad;
   }
 
-  /** Draw the picture as `view` asks; `truth` is the ground truth, `at` the pixel that is looked at or null. */
+  /** Draw the image in a `view`; `truth` is the ground truth, `at` the selected pixel or null. */
   draw({ view, truth, at }) {
     if (!this.counts) return;
     const context = this.canvas.getContext("2d");
-    const shown = context.createImageData(this.canvas.width, this.canvas.height);
-    const gains = view === "balanced" ? truth.map((part) => truth[1] / part) : [1, 1, 1];
-    if (view === "counts") showCounts(this.counts, this.white, shown.data);
-    else toneMap(this.counts, this.most, this.white, gains, shown.data);
-    context.putImageData(shown, 0, 0);
+    const image = context.createImageData(this.canvas.width, this.canvas.height);
+    const gains = view === "balanced" ? truth.map((channel) => truth[1] / channel) : [1, 1, 1];
+    if (view === "counts") showCounts(this.counts, this.white, image.data);
+    else toneMap(this.counts, this.most, this.white, gains, image.data);
+    context.putImageData(image, 0, 0);
     this.point(at);
   }
 
   drawHistogram() {
     const [width, height] = [320, 110];
     const bins = [0, 1, 2].map(() => new Uint32Array(BINS + 1));
-    const [counts, part] = [this.counts, BINS / this.white];
+    const [counts, scale] = [this.counts, BINS / this.white];
     for (let at = 0; at < counts.length; at += 3) {
-      bins[0][(counts[at] * part) | 0]++;
-      bins[1][(counts[at + 1] * part) | 0]++;
-      bins[2][(counts[at + 2] * part) | 0]++;
+      bins[0][(counts[at] * scale) | 0]++;
+      bins[1][(counts[at + 1] * scale) | 0]++;
+      bins[2][(counts[at + 2] * scale) | 0]++;
     }
-    const tallest = Math.log1p(Math.max(...bins.flatMap((one) => [...one])));
+    const tallest = Math.log1p(Math.max(...bins.flatMap((channel) => [...channel])));
     const x = (bin) => 4 + (bin / BINS) * (width - 8);
     const svg = shape("svg", { viewBox: `0 0 ${width} ${height + 18}`, role: "img" });
     svg.setAttribute("aria-label", `Histogram, ${this.title}: counts up to ${this.most} of ${this.white}`);
@@ -212,14 +212,14 @@ class Panel {
     this.histogram.replaceChildren(svg);
   }
 
-  /** Look at a pixel [x, y]; null at none. */
+  /** Select a pixel [x, y], or none with null. */
   point(at) {
     const { width, height } = this.canvas;
-    const there = this.counts && at && at[0] < width && at[1] < height;
-    this.at = there ? at : null;
-    this.mark.hidden = !there;
+    const isInside = this.counts && at && at[0] < width && at[1] < height;
+    this.at = isInside ? at : null;
+    this.mark.hidden = !isInside;
     this.drawRows();
-    if (!there) return;
+    if (!isInside) return;
     this.mark.style.left = `${(100 * (at[0] + 0.5)) / width}%`;
     this.mark.style.top = `${(100 * (at[1] + 0.5)) / height}%`;
     const [side, half] = [this.loupe.width, (LOUPE - 1) / 2];
@@ -236,16 +236,16 @@ class Panel {
   async fetchNoise(picture, light, at) {
     const query = new URLSearchParams({ picture, light, rendering: this.rendering, x: at[0], y: at[1] });
     try {
-      const told = await (await ask(`pixel.json?${query}`)).json();
-      this.noise = { ...told, of: `${picture} ${light} ${at}` };
+      const answer = await (await ask(`pixel.json?${query}`)).json();
+      this.noise = { ...answer, of: `${picture} ${light} ${at}` };
     } catch {
-      // The panel itself says what is wrong with the rendering.
+      // The panel already shows the error of the rendering.
       this.noise = null;
     }
     this.drawRows();
   }
 
-  /** Write the counts of the pixel that is looked at, and its noise where that is known of it under this light. */
+  /** Show the counts of the selected pixel, and its noise if it is for the same picture and illuminant. */
   drawRows() {
     const { at } = this;
     const first = at && 3 * (at[1] * this.canvas.width + at[0]);

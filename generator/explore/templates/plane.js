@@ -1,43 +1,43 @@
-// The plane of chromaticities: lights of a table, what they can make together, and the light that is chosen.
+// The chromaticity plane: illuminants of a LUT, their gamut, and the selected illuminant.
 
 const $ = (id) => document.getElementById(id);
 
-/** Return an element with attributes and children; text among them stays text. */
+/** Return an HTML element with attributes and children; strings become text nodes. */
 function element(name, attributes = {}, ...children) {
-  const made = document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.append(...children);
-  return made;
+  const node = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  node.append(...children);
+  return node;
 }
 
-/** Return an element of a drawing. */
+/** Return an SVG element. */
 function shape(name, attributes = {}, ...children) {
-  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.append(...children);
-  return made;
+  const node = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  node.append(...children);
+  return node;
 }
 
-/** Return a number with three decimals and no zero before them, as chromaticities are written. */
-const short = (number) => number.toFixed(3).replace(/^0\./, ".");
+/** Return a chromaticity or weight as text. */
+const short = (number) => number.toFixed(3);
 
-/** How far a pointer may move between down and up, and be from a light, px: a finger is not steadier. */
+/** Largest movement of a pointer that is a click, and largest distance from an illuminant, px; suits a finger. */
 const STEADY_PX = 5;
 const NEAR = 12;
-/** Lights of which small marks are drawn, since large ones would cover each other. */
+/** Number of illuminants above which small marks are drawn, because large ones would overlap. */
 const MANY = 60;
-/** Steps of the arrow keys: about a tenth of a degree, and with Shift ten of them. */
+/** Step of the arrow keys, about 0.1 degrees; ten steps with Shift. */
 const STEP = 0.001;
 
 class Plane {
-  /** `onPick` gets the number of a light, `onStep` how many lights to go on, `onMove` a chromaticity [r, b]. */
+  /** Callbacks get: `onPick` the number of an illuminant, `onStep` a number of steps, `onMove` a chromaticity [r, b]. */
   constructor(box, table, onPick, onStep, onMove) {
-    const places = table.lights.map((light) => light.rb);
-    const [low, high] = [0, 1].map((axis) => [Math.min, Math.max].map((of) => of(...places.map((rb) => rb[axis]))));
+    const points = table.lights.map((light) => light.rb);
+    const [low, high] = [0, 1].map((axis) => [Math.min, Math.max].map((extreme) => extreme(...points.map((rb) => rb[axis]))));
     this.span = Math.max(low[1] - low[0], high[1] - high[0], 0.02) * 1.3;
-    this.origin = [low, high].map(([from, to]) => (from + to) / 2 - this.span / 2);
-    this.lights = places;
-    this.chosen = places[0];
+    this.origin = [low, high].map(([start, end]) => (start + end) / 2 - this.span / 2);
+    this.lights = points;
+    this.chosen = points[0];
     this.svg = shape("svg", { viewBox: `0 0 ${Plane.SIDE + 44} ${Plane.SIDE + 40}`, "aria-hidden": "true" });
     this.drawGrid();
     const path = (points) => points.map((rb, index) => `${index ? "L" : "M"}${this.place(rb).join(" ")}`).join("");
@@ -51,7 +51,7 @@ class Plane {
     this.svg.classList.toggle("many", many);
     table.lights.forEach(({ label, codes, rb }, number) => {
       const [cx, cy] = this.place(rb);
-      const title = shape("title", {}, `light ${number}: ${label}`);
+      const title = shape("title", {}, `illuminant ${number}: ${label}`);
       this.svg.append(shape("circle", { class: "light", cx, cy, r: radius, fill: `rgb(${codes.join(",")})` }, title));
     });
     const curve = path(table.black_bodies.map(([, r, b]) => [r, b]));
@@ -68,7 +68,7 @@ class Plane {
   }
 
   drawGrid() {
-    const step = [0.01, 0.02, 0.05, 0.1, 0.2].find((one) => this.span / one < 7) ?? 0.5;
+    const step = [0.01, 0.02, 0.05, 0.1, 0.2].find((candidate) => this.span / candidate < 7) ?? 0.5;
     const [left, bottom] = [40, 6 + Plane.SIDE];
     for (const axis of [0, 1]) {
       const first = Math.ceil(this.origin[axis] / step);
@@ -79,7 +79,7 @@ class Plane {
         const line = axis ? { x1: left, x2: left + Plane.SIDE, y1: y, y2: y } : { x1: x, x2: x, y1: 6, y2: bottom };
         const at = axis ? { x: left - 5, y: y + 4, "text-anchor": "end" } : { x, y: bottom + 15, "text-anchor": "middle" };
         this.svg.append(shape("line", { class: "gridline", ...line }));
-        this.svg.append(shape("text", at, (tick * step).toFixed(2).replace(/^0\./, ".")));
+        this.svg.append(shape("text", at, (tick * step).toFixed(2)));
       }
     }
     this.svg.append(
@@ -93,8 +93,8 @@ class Plane {
     const at = (event) => new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
     const move = (event) => {
       const { x, y } = at(event);
-      const place = [x - 40, 6 + Plane.SIDE - y];
-      onMove(this.within(place.map((value, axis) => this.origin[axis] + (value / Plane.SIDE) * this.span)));
+      const offset = [x - 40, 6 + Plane.SIDE - y];
+      onMove(this.within(offset.map((value, axis) => this.origin[axis] + (value / Plane.SIDE) * this.span)));
     };
     box.addEventListener("pointerdown", (event) => {
       if (event.button) return;
@@ -113,17 +113,17 @@ class Plane {
     });
     box.addEventListener("pointercancel", () => (down = null));
     box.addEventListener("keydown", (event) => {
-      const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowDown: [0, -1], ArrowUp: [0, 1] }[event.key];
+      const direction = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowDown: [0, -1], ArrowUp: [0, 1] }[event.key];
       const page = { PageUp: -1, PageDown: 1 }[event.key];
-      if (!way && !page) return;
+      if (!direction && !page) return;
       event.preventDefault();
       const step = STEP * (event.shiftKey ? 10 : 1);
-      if (way) onMove(this.within(this.chosen.map((value, axis) => value + step * way[axis])));
+      if (direction) onMove(this.within(this.chosen.map((value, axis) => value + step * direction[axis])));
       else onStep(page);
     });
   }
 
-  /** Return the chromaticity nearest to one that has no negative part. */
+  /** Return the chromaticity moved into the triangle r, b ≥ 0, r + b ≤ 1. */
   within([r, b]) {
     const [red, blue] = [r, b].map((value) => Math.min(Math.max(value, 0), 1));
     const sum = Math.max(red + blue, 1);
@@ -131,16 +131,16 @@ class Plane {
   }
 
   nearest({ x, y }) {
-    let [found, least] = [null, NEAR];
+    let [nearest, smallest] = [null, NEAR];
     this.lights.forEach((rb, number) => {
       const [px, py] = this.place(rb);
       const distance = Math.hypot(px - x, py - y);
-      if (distance < least) [found, least] = [number, distance];
+      if (distance < smallest) [nearest, smallest] = [number, distance];
     });
-    return found;
+    return nearest;
   }
 
-  /** Show the light that is chosen, and the lights that it is mixed of. */
+  /** Mark the selected illuminant, and lines to the illuminants of its mixture. */
   choose(rb, parts) {
     this.chosen = rb;
     const [cx, cy] = this.place(rb);

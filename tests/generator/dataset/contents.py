@@ -1,4 +1,4 @@
-"""What is in a folder, to be compared."""
+"""Hashes of the files in a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a dataset of known options holds, to be pinned."""
+"""A LUT with known numbers, and the content of data sets for pinned tests."""
 
 from __future__ import annotations
 
@@ -18,18 +18,15 @@ from experiment.lights import Illumination
 from generator.dataset.reader import Dataset, file_faults, open_dataset
 from generator.kernels.choice import channels_of
 
+# Spectra of the illuminants in three bands.
 SPECTRA = ((9, 5, 2), (7, 6, 4), (5, 6, 6), (3, 5, 9), (4, 9, 3))
-"""Lights in three bands."""
 
+# Sensitivities of the camera in these bands.
 CAMERA = np.array([[1.0, 0.2, 0.0], [0.1, 1.0, 0.2], [0.0, 0.1, 0.8]])
-"""Sensitivities of the camera in those bands."""
 
 
 def table_in(folder: Path, bits: int = 2, samples: int = 25, order: tuple[int, ...] = (0, 1, 2, 3, 4)) -> Lut:
-    """Make a table with noise of every kind, unfit cells, an uncertainty of each light, names and an origin.
-
-    `order`: in which the lights stand.
-    """
+    """Make a LUT with noise, unfit patches, uncertainties, names and an origin; illuminants are in `order`."""
     folder.mkdir()
     rng = np.random.default_rng(11)
     codes = channels_of(np.arange(1 << 3 * bits), bits) / (2**bits - 1)
@@ -48,7 +45,7 @@ def table_in(folder: Path, bits: int = 2, samples: int = 25, order: tuple[int, .
     ]
     if order == (0, 1, 2, 3, 4):
         plan[4] = Illumination(4, "spectrum", None, Colour(9, 8, 4), "E")
-    known = Provenance(
+    provenance = Provenance(
         camera="Known camera",
         bits=bits,
         white_level=4600,
@@ -61,12 +58,12 @@ def table_in(folder: Path, bits: int = 2, samples: int = 25, order: tuple[int, .
     uncertainty = "illumination,expanded_deg\n" + "".join(
         f"{n},{0.1 * (n + 1) ** 1.5:.4f}\n" for n in range(len(order))
     )
-    writer.finish(plan, np.array(white), known, files={UNCERTAINTY: uncertainty})
+    writer.finish(plan, np.array(white), provenance, files={UNCERTAINTY: uncertainty})
     return open_lut(folder)
 
 
 def plain_text(text: str) -> Any:
-    """Return a number where a text is one."""
+    """Return the number in a text, or the text."""
     try:
         return float(text) if "." in text or "e" in text else int(text)
     except ValueError:
@@ -74,33 +71,33 @@ def plain_text(text: str) -> Any:
 
 
 def rows_of(text: str) -> list[list[Any]]:
-    """Return the cells of a CSV file, numbers as numbers."""
+    """Return the cells of a CSV file, with numbers parsed."""
     return [[plain_text(cell) for cell in row] for row in csv.reader(io.StringIO(text))]
 
 
-def held_by(out: Path) -> dict[str, Any]:
-    """Return what a dataset holds: the numbers of every list, and each image and map as shape and bytes."""
+def data_set_content(out: Path) -> dict[str, Any]:
+    """Return the numbers of every list of a data set, and shape and bytes of each image and map."""
     dataset = open_dataset(out)
     described = json.loads((out / "dataset.json").read_text(encoding="utf-8"))
     lists = {path.name: rows_of(path.read_text(encoding="utf-8")) for path in sorted(out.glob("*.csv"))}
-    parts = {path.stem: path.read_text().split() for path in sorted(out.glob("splits/*"))}
+    splits = {path.stem: path.read_text().split() for path in sorted(out.glob("splits/*"))}
     sums = [line.split("  ")[1] for line in (out / "SHA256SUMS").read_text().splitlines()]
     return {
         "pixels": [described["pixels"], described["replaced_pixels"]],
         "lists": lists,
-        "truths": [[float(part) for part in line.split()] for line in (out / "gt.txt").read_text().splitlines()],
-        "parts": {name: len(one) for name, one in parts.items()},
+        "truths": [[float(number) for number in line.split()] for line in (out / "gt.txt").read_text().splitlines()],
+        "parts": {name: len(images) for name, images in splits.items()},
         "files": len(sums),
         "faults": len(list(file_faults(out))),
-        "images": [shown_of(dataset, number) for number in range(len(dataset.entries))],
+        "images": [image_content(dataset, number) for number in range(len(dataset.entries))],
     }
 
 
-def shown_of(dataset: Dataset, number: int) -> list[Any]:
-    """Return shape and hash of an image, and of its maps where lights differ over it."""
+def image_content(dataset: Dataset, number: int) -> list[Any]:
+    """Return shape and bytes of an image, and the bytes of its maps."""
     entry = dataset.entries[number]
     image = dataset.read_image(entry)
-    shown: list[Any] = [image.shape, image.tobytes()]
+    values: list[Any] = [image.shape, image.tobytes()]
     if len(entry.lights) > 1:
-        shown += [dataset.read_weights(entry).tobytes(), dataset.read_ground_truth_map(entry).tobytes()]
-    return shown
+        values += [dataset.read_weights(entry).tobytes(), dataset.read_ground_truth_map(entry).tobytes()]
+    return values

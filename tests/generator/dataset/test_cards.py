@@ -1,4 +1,4 @@
-"""Card and datasheet: what the Hub reads, and what is left to the makers."""
+"""The card for the Hugging Face Hub, and the datasheet."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from generator.dataset.reader import Dataset
 
+# Sections of Gebru et al., 2021, in their order.
 SECTIONS = (
     "Motivation",
     "Composition",
@@ -31,7 +32,6 @@ SECTIONS = (
     "Distribution",
     "Maintenance",
 )
-"""The sections of Gebru et al., 2021, in their order."""
 
 ORIGIN = OriginRecord(
     rig="lab",
@@ -56,82 +56,82 @@ def dataset_in(out: Path, lut: Lut, layout: Layout) -> Dataset:
 
 
 @pytest.fixture(scope="module", params=get_args(Layout))
-def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def data_set(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("cards")
     return dataset_in(folder / "out", lut_in(folder / "lut"), request.param)
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def folder_data_set(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("plain")
     return dataset_in(folder / "out", lut_in(folder / "lut"), "folder")
 
 
-def place_of(made: Dataset) -> Path:
-    return Path(made.store.place)
+def folder_of(data_set: Dataset) -> Path:
+    return Path(data_set.store.location)
 
 
-def with_origin(made: Dataset, origin: OriginRecord | None, **table: object) -> Description:
-    known = made.description.table.model_copy(update={"origin": origin, **table})
-    return made.description.model_copy(update={"table": known})
+def with_origin(data_set: Dataset, origin: OriginRecord | None, **table: object) -> Description:
+    record = data_set.description.table.model_copy(update={"origin": origin, **table})
+    return data_set.description.model_copy(update={"table": record})
 
 
 @pytest.mark.slow
-def test_the_card_is_what_the_hub_reads(made: Dataset) -> None:
-    # The Hub's own client reads the front matter and refuses what it cannot use.
+def test_hub_client_reads_card(data_set: Dataset) -> None:
+    # The client of the Hub refuses an invalid front matter.
     hub = import_module("huggingface_hub")
-    read = hub.DatasetCard((place_of(made) / "README.md").read_text())
-    assert read.data.license == "unknown"
-    assert read.data.size_categories == ["n<1K"]
-    assert "color-constancy" in read.data.tags
-    files = [entry for config in read.data.to_dict()["configs"] for entry in config["data_files"]]
-    splits = made.description.splits
-    named: set[Split] = {part for part, images in splits.items() if images}  # pyrefly: ignore[bad-assignment]
-    assert {entry["split"] for entry in files} == (named if LAYOUTS[made.layout].is_of_the_hub else {"train"})
+    card_file = hub.DatasetCard((folder_of(data_set) / "README.md").read_text())
+    assert card_file.data.license == "unknown"
+    assert card_file.data.size_categories == ["n<1K"]
+    assert "color-constancy" in card_file.data.tags
+    files = [entry for config in card_file.data.to_dict()["configs"] for entry in config["data_files"]]
+    splits = data_set.description.splits
+    split_names: set[Split] = {split for split, images in splits.items() if images}  # pyrefly: ignore[bad-assignment]
+    assert {entry["split"] for entry in files} == (split_names if LAYOUTS[data_set.layout].is_of_the_hub else {"train"})
     for entry in files:
-        assert list(place_of(made).glob(entry["path"])), entry
+        assert list(folder_of(data_set).glob(entry["path"])), entry
 
 
 @pytest.mark.slow
-def test_the_data_set_of_a_folder_loads_by_its_card(plain: Dataset, tmp_path: Path) -> None:
+def test_hub_loads_folder_by_card(folder_data_set: Dataset, tmp_path: Path) -> None:
     load = import_module("datasets").load_dataset
-    rows = load(str(place_of(plain)), split="train", cache_dir=str(tmp_path / "cache"))
-    assert [row["image"] for row in rows] == [entry.image for entry in plain.entries]
+    rows = load(str(folder_of(folder_data_set)), split="train", cache_dir=str(tmp_path / "cache"))
+    assert [row["image"] for row in rows] == [entry.image for entry in folder_data_set.entries]
 
 
 @pytest.mark.slow
-def test_the_datasheet_has_its_sections_and_marks_what_is_open(made: Dataset) -> None:
-    text = datasheet(made.description)
+def test_datasheet_sections_and_open_questions(data_set: Dataset) -> None:
+    text = datasheet(data_set.description)
     assert tuple(re.findall(r"^## (.+)$", text, re.MULTILINE)) == SECTIONS
     assert "${" not in text
-    said = re.search(r"(\d+) questions are marked", text)
-    assert said is not None
-    assert int(said[1]) == text.count(OPEN)
+    count = re.search(r"(\d+) questions are marked", text)
+    assert count is not None
+    assert int(count[1]) == text.count(OPEN)
     # Each question has an answer or the mark.
     for question, answer in re.findall(r"^\*\*([^*\n]+\?)\*\*\n\n(.+?)(?=\n\n|\Z)", text, re.MULTILINE | re.DOTALL):
         assert answer.strip(), question
-    assert text == (place_of(made) / "DATASHEET.md").read_text()
+    assert text == (folder_of(data_set) / "DATASHEET.md").read_text()
 
 
-def test_what_a_table_says_is_carried_and_breaks_no_line(plain: Dataset) -> None:
-    described = with_origin(plain, ORIGIN)
-    for text in (card(described), datasheet(described)):
+def test_escapes_origin_of_lut(folder_data_set: Dataset) -> None:
+    description = with_origin(folder_data_set, ORIGIN)
+    for text in (card(description), datasheet(description)):
         assert "| Lens | EF50mm \\| f/1.8 &lt;II> |" in text
         assert "| Note | one line --- and another |" in text
         assert "author = {Family, Given}" in text
-    assert "The table: CC-BY-4.0." in datasheet(described)
-    # The front matter is closed once, whatever the table says.
-    assert card(described).count("\n---\n") == 1
+    assert "The LUT: CC-BY-4.0." in datasheet(description)
+    # Text of the LUT must not end the front matter.
+    assert card(description).count("\n---\n") == 1
 
 
-def test_a_computed_table_has_neither_frames_nor_report_but_a_known_gain(plain: Dataset) -> None:
+def test_texts_of_computed_lut(folder_data_set: Dataset) -> None:
     body = {"electrons_per_dn": 1.8, "read_noise_dn": 6.0, "sensor_noise_e": 2.8}
     computed = {"by": "sim table", "body": body, "exposure": {"iso": 200}}
-    text = datasheet(with_origin(plain, None, computed=computed))
-    assert "The table's report has the verdict" not in text
-    assert "The table's frames" not in text
-    assert "a count is 0.9 electrons at its ISO 200" in text
-    assert "read noise of a photosite 6 counts, of which 2.8" in text
-    assert "The table's report has the verdict" in datasheet(plain.description)
-    # A table that others computed need not say it.
-    assert "does not state gain" in card(with_origin(plain, None, computed={"by": "others"}))
+    text = datasheet(with_origin(folder_data_set, None, computed=computed))
+    assert "The report of the LUT has the verdict" not in text
+    assert "The frames of the LUT" not in text
+    assert "one count is 0.9 electrons at its ISO 200" in text
+    assert "read noise of a photosite is 6 counts, of which 2.8" in text
+    assert "The report of the LUT has the verdict" in datasheet(folder_data_set.description)
+    # A LUT computed by others may lack these values.
+    assert "does not record gain" in card(with_origin(folder_data_set, None, computed={"by": "others"}))

@@ -1,4 +1,4 @@
-"""Members of shards in one file: names, times and values, as they were."""
+"""Pinned content of tar and Parquet shards."""
 
 from __future__ import annotations
 
@@ -29,54 +29,56 @@ def lut(tmp_path_factory: pytest.TempPathFactory) -> Lut:
     return table_in(tmp_path_factory.mktemp("described") / "lut")
 
 
-def made(lut: Lut, out: Path, scenes: Any, lights: LightChoice | list[int], **options: Any) -> Dataset:
-    given: dict[str, Any] = {"previews": False, "rendering": "codes", **options}
-    return generate_dataset(lut, out, scenes, lights, seed=3, options=DatasetOptions(**given))
+def make_data_set(lut: Lut, out: Path, scenes: Any, lights: LightChoice | list[int], **options: Any) -> Dataset:
+    keywords: dict[str, Any] = {"previews": False, "rendering": "codes", **options}
+    return generate_dataset(lut, out, scenes, lights, seed=3, options=DatasetOptions(**keywords))
 
 
 @pytest.mark.parametrize("layout", ["webdataset", "parquet"])
-def test_members_of_joined_files(layout: str, lut: Lut, tmp_path: Path, pinned: Pinned) -> None:
+def test_pinned_members(layout: str, lut: Lut, tmp_path: Path, pinned: Pinned) -> None:
     masks = SimultaneousLights(RandomLights(2, 5, 1), 2, parse_masks("spots", 2, 1))
     options: dict[str, Any] = {"layout": layout, "shard_images": 2, "split": (0.4, 0.3, 0.3)}
     variation = varied_by(lut, parse_exposure("stops:low=-1,high=1"))
-    made(lut, tmp_path / "out", random_scenes(5, 13, 11), masks, variation=variation, uncertainty=True, **options)
-    found: dict[str, Any] = {}
+    make_data_set(
+        lut, tmp_path / "out", random_scenes(5, 13, 11), masks, variation=variation, uncertainty=True, **options
+    )
+    content: dict[str, Any] = {}
     for path in sorted((tmp_path / "out").glob("*/*.*")):
         if path.suffix == ".tar":
             with tarfile.open(path) as tar:
-                members = [(one, tar.extractfile(one)) for one in tar.getmembers()]
-                found[f"{path.parent.name}/{path.name}"] = {
-                    one.name: [one.mode, one.mtime, _content(one.name, data.read() if data else b"")]
-                    for one, data in members
+                members = [(member, tar.extractfile(member)) for member in tar.getmembers()]
+                content[f"{path.parent.name}/{path.name}"] = {
+                    member.name: [member.mode, member.mtime, _content(member.name, data.read() if data else b"")]
+                    for member, data in members
                 }
         elif path.suffix == ".parquet":
             parquet = pytest.importorskip("pyarrow.parquet")
             table = parquet.read_table(path)
-            found[f"{path.parent.name}/{path.name}"] = _plain(table.to_pylist())
+            content[f"{path.parent.name}/{path.name}"] = _plain_values(table.to_pylist())
         else:
-            found[f"{path.parent.name}/{path.name}"] = path.read_text().split()
-    pinned(f"members of {layout}", found)
+            content[f"{path.parent.name}/{path.name}"] = path.read_text().split()
+    pinned(f"members of {layout}", content)
 
 
 def _content(name: str, data: bytes) -> Any:
-    return json.loads(data) if name.endswith(".json") else _of_values(data)
+    return json.loads(data) if name.endswith(".json") else _png_values(data)
 
 
-def _of_values(data: bytes) -> Any:
-    """Return the values of a PNG: maps are packed by a library."""
+def _png_values(data: bytes) -> Any:
+    # Values are pinned instead of bytes, because maps are packed by a library with different versions.
     from generator.files import decode_png
 
     return decode_png(data).tobytes()
 
 
-def _plain(value: Any) -> Any:
+def _plain_values(value: Any) -> Any:
     match value:
         case bytes():
-            return _of_values(value)
+            return _png_values(value)
         case dict():
-            return {key: _plain(one) for key, one in value.items()}
+            return {key: _plain_values(member) for key, member in value.items()}
         case list():
-            return [_plain(one) for one in value]
+            return [_plain_values(member) for member in value]
         case str():
             return plain_text(value)
         case _:

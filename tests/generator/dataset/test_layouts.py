@@ -1,4 +1,4 @@
-"""Layouts: the same images in folders, tar and Parquet files, read back by the programs that they are for."""
+"""Layouts: equal images in folders, tar and Parquet files, read by other programs."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ JOINED: tuple[Layout, ...] = tuple(name for name in LAYOUTS if isinstance(layout
 
 @pytest.fixture
 def make(make_lut: MakeLut, tmp_path: Path) -> Make:
-    """Return a maker of datasets of two images of each scene, in shards of 5."""
+    """Return a function that makes data sets with two images of each scene, in shards of 5."""
     lut = make_lut()
 
     def call(layout: Layout, lights: Any = (2, 0), scenes: int = 9, **options: Any) -> Dataset:
@@ -63,8 +63,8 @@ def decoded(data: bytes) -> npt.NDArray[np.uint16]:
     return np.asarray(image[..., ::-1], dtype=np.uint16)
 
 
-def place_of(made: Dataset) -> Path:
-    return Path(made.store.place)
+def folder_of(data_set: Dataset) -> Path:
+    return Path(data_set.store.location)
 
 
 def test_every_layout_is_offered() -> None:
@@ -73,41 +73,44 @@ def test_every_layout_is_offered() -> None:
 
 
 @pytest.mark.parametrize("form", ["png", "tiff", "exr", "jxl", "dng"])
-def test_every_format_is_the_same_image_in_every_layout(make: Make, form: str) -> None:
-    folder, *others = (make(layout, form=form, scenes=4) for layout in LAYOUTS)
-    assert [other.entries for other in others] == [folder.entries] * len(others)
+def test_formats_are_equal_in_every_layout(make: Make, form: str) -> None:
+    folder, *other_layouts = (make(layout, form=form, scenes=4) for layout in LAYOUTS)
+    assert [variant.entries for variant in other_layouts] == [folder.entries] * len(other_layouts)
     assert [entry.image for entry in folder.entries] == [f"{number:06d}.{form}" for number in range(8)]
     for entry in folder.entries[::3]:
         image = folder.read_image(entry)
         assert image.shape == ((12, 14, 3) if form == "dng" else (24, 28, 3))
-        for other in others:
-            np.testing.assert_array_equal(other.read_image(entry), image)
-            assert other.read_preview(entry) == folder.read_preview(entry) != None  # noqa: E711
+        for variant in other_layouts:
+            np.testing.assert_array_equal(variant.read_image(entry), image)
+            assert variant.read_preview(entry) == folder.read_preview(entry) != None  # noqa: E711
 
 
 @pytest.mark.parametrize("split", [None, (0.6, 0.0, 0.4)])
-def test_another_layout_of_files_is_one_entry(make: Make, monkeypatch: pytest.MonkeyPatch, split: Any) -> None:
+def test_adds_file_layout_by_one_entry(make: Make, monkeypatch: pytest.MonkeyPatch, split: Any) -> None:
     lights = SimultaneousLights(ListedLights((2, 0)), 2, parse_masks("half-plane", 2, 5))
-    usual = make("folder", lights, split=split)
-    images = [(usual.read_image(one), usual.read_weights(one), usual.read_preview(one)) for one in usual.entries]
-    entry = FileLayout(place=lambda kind, part, name: f"{part}/{kind}/{name}")
+    default = make("folder", lights, split=split)
+    images = [
+        (default.read_image(image_entry), default.read_weights(image_entry), default.read_preview(image_entry))
+        for image_entry in default.entries
+    ]
+    entry = FileLayout(file_name=lambda kind, split_name, name: f"{split_name}/{kind}/{name}")
     monkeypatch.setitem(cast("dict[str, Any]", layouts.LAYOUTS), "folder", entry)
-    other = make("folder", lights, split=split)
-    parts = {"train", "test"} if split else {"data"}
-    assert {path.parts[-3] for path in place_of(other).rglob("*.png")} == parts
-    assert list(file_faults(place_of(other))) == []
-    for one, (image, weights, preview) in zip(other.entries, images, strict=True):
-        np.testing.assert_array_equal(other.read_image(one), image)
-        np.testing.assert_array_equal(other.read_weights(one), weights)
-        assert other.read_preview(one) == preview
-    card = (place_of(other) / "README.md").read_text()
-    assert all(f"`{part}/images/NNNNNN.png`" in card for part in parts)
+    variant = make("folder", lights, split=split)
+    splits = {"train", "test"} if split else {"data"}
+    assert {path.parts[-3] for path in folder_of(variant).rglob("*.png")} == splits
+    assert list(file_faults(folder_of(variant))) == []
+    for image_entry, (image, weights, preview) in zip(variant.entries, images, strict=True):
+        np.testing.assert_array_equal(variant.read_image(image_entry), image)
+        np.testing.assert_array_equal(variant.read_weights(image_entry), weights)
+        assert variant.read_preview(image_entry) == preview
+    card = (folder_of(variant) / "README.md").read_text()
+    assert all(f"`{split_name}/images/NNNNNN.png`" in card for split_name in splits)
     assert (entry.folder("masks", ["train", "test"]), entry.folder("masks", ["test"])) == (None, "test/masks")
 
 
 READER = """
 import hashlib, json, sys
-# It does without PyTorch, whose import takes longer than all else.
+# The import of PyTorch is slow and not needed.
 sys.modules["torch"] = None
 import webdataset
 for sample in webdataset.WebDataset(sys.argv[1:], shardshuffle=False):
@@ -116,14 +119,14 @@ for sample in webdataset.WebDataset(sys.argv[1:], shardshuffle=False):
 """
 
 
-def test_the_webdataset_package_reads_the_shards(make: Make) -> None:
-    made = make("webdataset", split=(0.6, 0.0, 0.4))
+def test_webdataset_reads_shards(make: Make) -> None:
+    data_set = make("webdataset", split=(0.6, 0.0, 0.4))
     files = make("folder", split=(0.6, 0.0, 0.4))
-    lines = (place_of(files) / "SHA256SUMS").read_text().splitlines()
+    lines = (folder_of(files) / "SHA256SUMS").read_text().splitlines()
     sums = {name: digest for digest, name in (line.split("  ") for line in lines)}
-    entries = {entry.image: entry for entry in made.entries}
-    urls = sorted(place_of(made).glob("*/*.tar"))
-    # In a program of its own, because the package leaves files open.
+    entries = {entry.image: entry for entry in data_set.entries}
+    urls = sorted(folder_of(data_set).glob("*/*.tar"))
+    # In a separate process, because the package does not close its files.
     read = subprocess.run([sys.executable, "-c", READER, *urls], capture_output=True, text=True, check=True)
     for url, key, metadata, digests in map(json.loads, read.stdout.splitlines()):
         entry = entries.pop(f"{key}.png")
@@ -134,9 +137,9 @@ def test_the_webdataset_package_reads_the_shards(make: Make) -> None:
     assert not entries
 
 
-def test_equal_tar_files_whoever_makes_them(make: Make) -> None:
-    made = make("webdataset")
-    (first, *_) = sorted((place_of(made) / "data").iterdir())
+def test_tar_headers_are_constant(make: Make) -> None:
+    data_set = make("webdataset")
+    (first, *_) = sorted((folder_of(data_set) / "data").iterdir())
     with tarfile.open(first) as tar:
         headers = tar.getmembers()
     assert [header.name for header in headers[:3]] == ["000000.png", "000000.preview.jpg", "000000.json"]
@@ -147,7 +150,7 @@ def test_equal_tar_files_whoever_makes_them(make: Make) -> None:
 
 @pytest.fixture
 def hugging_face(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Return the package `datasets`, without network and with its files in a folder of the test."""
+    """Return the package `datasets`, without network and with a temporary cache."""
     cache = tmp_path_factory.mktemp("hugging-face")
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_HOME", str(cache))
@@ -157,32 +160,32 @@ def hugging_face(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempP
     return datasets
 
 
-def test_hugging_face_reads_the_shards(make: Make, hugging_face: Any, tmp_path: Path) -> None:
-    made = make("parquet", split=(0.6, 0.0, 0.4), rendering="colorimetric")
-    files = {part: str(place_of(made) / part / "*.parquet") for part in ("train", "test")}
+def test_hugging_face_reads_shards(make: Make, hugging_face: Any, tmp_path: Path) -> None:
+    data_set = make("parquet", split=(0.6, 0.0, 0.4), rendering="colorimetric")
+    files = {split: str(folder_of(data_set) / split / "*.parquet") for split in ("train", "test")}
     loaded = hugging_face.load_dataset("parquet", data_files=files, cache_dir=str(tmp_path / "cache"))
     assert set(loaded) == {"train", "test"}
-    entries = {entry.image: entry for entry in made.entries}
-    for part, rows in loaded.items():
+    entries = {entry.image: entry for entry in data_set.entries}
+    for split, rows in loaded.items():
         assert type(rows.features["image"]).__name__ == "Image"
         for row in rows:
             entry = entries.pop(row["image"]["path"])
-            np.testing.assert_array_equal(decoded(row["image"]["bytes"]), made.read_image(entry))
+            np.testing.assert_array_equal(decoded(row["image"]["bytes"]), data_set.read_image(entry))
             assert row["preview"].size == (28, 24), "previews are decoded, as pictures"
             assert row["number"] == int(entry.image[:6])
-            assert (row["source"], row["split"]) == (entry.source, part) == (entry.source, entry.split)
+            assert (row["source"], row["split"]) == (entry.source, split) == (entry.source, entry.split)
             assert row["truth"] == pytest.approx(entry.truth, abs=1e-9)
             assert [light["illumination"] for light in row["lights"]] == list(entry.lights)
             details = json.loads(row["details"])
             assert {name: f"{value:g}" if name != "cells" else value for name, value in details.items()} == (
-                made.details[entry.image]
+                data_set.details[entry.image]
             )
     assert not entries
 
 
 @dataclass(frozen=True)
-class Gone:
-    """A source on a disk that is not there any more."""
+class UnreachableSource:
+    """A source on a disk that was removed."""
 
     name: str = "gone"
 
@@ -194,74 +197,76 @@ class Gone:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_shard_that_cannot_be_ended_is_given_up_quietly(
+def test_closes_incomplete_shard_without_warnings(
     make_lut: MakeLut, tmp_path: Path, layout: Layout, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """A writer that ends its file when it is thrown away finds the file closed; pytest fails for that."""
+    # A writer that completes its file when it is deleted would find the stream closed, and pytest would fail.
     with pytest.raises(StorageError):
-        generate_dataset(make_lut(), tmp_path / "out", (*SCENES, Gone()), [0], options=DatasetOptions(layout=layout))
+        generate_dataset(
+            make_lut(), tmp_path / "out", (*SCENES, UnreachableSource()), [0], options=DatasetOptions(layout=layout)
+        )
     gc.collect()
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("layout", [name for name in LAYOUTS if layouts.LAYOUTS[name].is_of_the_hub])
-def test_hugging_face_finds_the_parts_by_the_card(
-    make: Make, hugging_face: Any, tmp_path: Path, layout: Layout
-) -> None:
-    made = make(layout, split=(0.6, 0.0, 0.4), previews=False)
-    loaded = hugging_face.load_dataset(str(place_of(made)), cache_dir=str(tmp_path / "cache"))
-    assert {part: rows.num_rows for part, rows in loaded.items()} == {
-        part: images for part, images in made.description.splits.items() if images
+def test_hugging_face_reads_splits_by_card(make: Make, hugging_face: Any, tmp_path: Path, layout: Layout) -> None:
+    data_set = make(layout, split=(0.6, 0.0, 0.4), previews=False)
+    loaded = hugging_face.load_dataset(str(folder_of(data_set)), cache_dir=str(tmp_path / "cache"))
+    assert {split: rows.num_rows for split, rows in loaded.items()} == {
+        split: images for split, images in data_set.description.splits.items() if images
     }
     assert not {"preview", "details", "masks", "ground_truth"} & set(loaded["train"].column_names)
 
 
-def maps_in_folder(place: Path) -> list[bytes]:
+def maps_in_folder(folder: Path) -> list[bytes]:
     names = ("masks/000003_0.png", "masks/000003_1.png", "ground_truth/000003.png")
-    return [(place / name).read_bytes() for name in names]
+    return [(folder / name).read_bytes() for name in names]
 
 
-def maps_in_tar(place: Path) -> list[bytes]:
-    with tarfile.open(place / "data" / "000000.tar") as tar:
+def maps_in_tar(folder: Path) -> list[bytes]:
+    with tarfile.open(folder / "data" / "000000.tar") as tar:
         streams = [tar.extractfile(f"000003.{name}.png") for name in ("masks_0", "masks_1", "ground_truth")]
         return [stream.read() for stream in streams if stream is not None]
 
 
-def maps_in_parquet(place: Path) -> list[bytes]:
-    row = import_module("pyarrow.parquet").read_table(place / "data" / "000000.parquet").to_pylist()[3]
+def maps_in_parquet(folder: Path) -> list[bytes]:
+    row = import_module("pyarrow.parquet").read_table(folder / "data" / "000000.parquet").to_pylist()[3]
     return [file["bytes"] for file in (*row["masks"], row["ground_truth"])]
 
 
+# Read both masks and the ground truth map of the fourth image without our reader.
 MAPS_OF = {"folder": maps_in_folder, "webdataset": maps_in_tar, "parquet": maps_in_parquet}
-"""Both masks of the fourth image and its ground truth, by other readers than ours."""
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_several_lights_in_an_image(make: Make, make_lut: MakeLut, layout: Layout) -> None:
+def test_several_lights_in_every_layout(make: Make, make_lut: MakeLut, layout: Layout) -> None:
     choice = SimultaneousLights(ListedLights((2, 0)), 2, parse_masks("half-plane", 2, 5))
-    made = make(layout, choice)
-    entry = made.entries[3]
+    data_set = make(layout, choice)
+    entry = data_set.entries[3]
     assert entry.lights == ("2", "0")
-    assert len(made.entries) == 9
+    assert len(data_set.entries) == 9
     assert np.sum(entry.truth) == pytest.approx(1)
-    text = (place_of(made) / "ground_truth.csv").read_text().splitlines()
+    text = (folder_of(data_set) / "ground_truth.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in text[7:9]] == ["000003.png", "000003.png"]
-    first, second, truth = MAPS_OF[layout](place_of(made))
+    first, second, truth = MAPS_OF[layout](folder_of(data_set))
     weights = np.stack([grey(first), grey(second)], axis=-1) / 65535
     truths = decoded(truth) / 65535
     assert weights.shape == (24, 28, 2)
     np.testing.assert_allclose(weights.sum(axis=2), 1, atol=1e-6)
-    np.testing.assert_allclose(made.read_weights(entry), weights, atol=1e-7)
-    np.testing.assert_allclose(made.read_ground_truth_map(entry), truths, atol=1e-7)
+    np.testing.assert_allclose(data_set.read_weights(entry), weights, atol=1e-7)
+    np.testing.assert_allclose(data_set.read_ground_truth_map(entry), truths, atol=1e-7)
     single = make(layout, scenes=2, split=(0.5, 0.5, 0.0))
     for read in (single.read_weights, single.read_ground_truth_map):
         with pytest.raises(InputError, match=r"000002\.png"):
             read(single.entries[2])
-    # Where one light is alone, the map is that light; and the mean of the lights is that of their parts.
-    alone = weights[..., 0] == 1
-    assert 0 < alone.sum() < alone.size
-    np.testing.assert_allclose(truths[alone], np.broadcast_to(entry.truths[0], (alone.sum(), 3)), atol=2e-5)
-    whites = np.array([light.white for light in sorted(made.description.lights, key=lambda light: -light.illumination)])
+    # Where one illuminant has weight 1, the map has its ground truth. The image has the mean over all pixels.
+    is_single = weights[..., 0] == 1
+    assert 0 < is_single.sum() < is_single.size
+    np.testing.assert_allclose(truths[is_single], np.broadcast_to(entry.truths[0], (is_single.sum(), 3)), atol=2e-5)
+    whites = np.array(
+        [light.white for light in sorted(data_set.description.lights, key=lambda light: -light.illumination)]
+    )
     mean = weights.mean(axis=(0, 1)) @ whites
     np.testing.assert_allclose(mean / mean.sum(), entry.truth, atol=1e-6)
 
@@ -273,26 +278,26 @@ def grey(data: bytes) -> npt.NDArray[np.uint16]:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_verifying_names_what_is_not_as_it_was_made(make: Make, layout: Layout) -> None:
-    folder = place_of(make(layout, split=(0.5, 0.2, 0.3)))
+def test_verify_reports_changed_files(make: Make, layout: Layout) -> None:
+    folder = folder_of(make(layout, split=(0.5, 0.2, 0.3)))
     verified: list[tuple[int, int]] = []
-    assert list(file_faults(folder, lambda done, total: verified.append((done, total)), workers=3)) == []
+    assert list(file_faults(folder, lambda count, total: verified.append((count, total)), workers=3)) == []
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     files = len(names - {"SHA256SUMS", *COMPLETED_BY_HAND})
-    assert verified == [(done + 1, files) for done in range(files)]
+    assert verified == [(count + 1, files) for count in range(files)]
     victim = sorted(path for path in folder.rglob("00000*") if path.suffix != ".jpg")[0]
     data = bytearray(victim.read_bytes())
     data[len(data) // 2] ^= 1
     victim.write_bytes(bytes(data))
     (folder / "gt.txt").unlink()
     (folder / "notes.txt").write_text("mine")
-    # Its makers answer the questions left open.
+    # The authors complete the datasheet.
     (folder / "DATASHEET.md").write_text("answered")
     assert sorted(file_faults(folder)) == sorted(
         [
             f"{victim.relative_to(folder).as_posix()} has changed",
             "gt.txt is missing",
-            "notes.txt is no part of the dataset",
+            "notes.txt is not listed in SHA256SUMS; remove it if you do not need it",
         ]
     )
     with pytest.raises(FormatError, match=r"dataset\.json"):
@@ -300,36 +305,36 @@ def test_verifying_names_what_is_not_as_it_was_made(make: Make, layout: Layout) 
 
 
 @pytest.mark.parametrize("layout", JOINED)
-def test_damaged_shards_are_named(make: Make, layout: Layout) -> None:
-    made = make(layout)
-    (file,) = (place_of(made) / "data").glob("000002.*")
-    entry = made.entries[12]
+def test_reports_damaged_shards(make: Make, layout: Layout) -> None:
+    data_set = make(layout)
+    (file,) = (folder_of(data_set) / "data").glob("000002.*")
+    entry = data_set.entries[12]
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 3])
-    with pytest.raises(FormatError, match=rf"{file.name} (is damaged|holds no 000012)"):
-        made.read_image(entry)
+    with pytest.raises(FormatError, match=rf"{file.name} (is damaged|lacks the listed file 000012)"):
+        data_set.read_image(entry)
     file.unlink()
     with pytest.raises(FormatError, match=rf"{file.name}: No such"):
-        made.read_image(entry)
+        data_set.read_image(entry)
 
 
 @pytest.mark.parametrize("layout", ["webdataset", "parquet"])
-def test_an_image_whose_name_lost_its_ending_is_read_or_refused(make: Make, layout: Layout) -> None:
-    """A tar file has it under its whole name, a Parquet file under its number."""
-    made = make(layout)
-    table = place_of(made) / "ground_truth.csv"
+def test_image_name_without_suffix(make: Make, layout: Layout) -> None:
+    """A tar file stores the name, a Parquet file only the number."""
+    data_set = make(layout)
+    table = folder_of(data_set) / "ground_truth.csv"
     table.write_text(table.read_text().replace("000000.png", "000000"))
-    found = open_dataset(place_of(made))
+    opened = open_dataset(folder_of(data_set))
     if layout == "webdataset":
-        with pytest.raises(FormatError, match="holds no 000000"):
-            found.read_image(found.entries[0])
+        with pytest.raises(FormatError, match="lacks the listed file 000000"):
+            opened.read_image(opened.entries[0])
     else:
-        np.testing.assert_array_equal(found.read_image(found.entries[0]), made.read_image(made.entries[0]))
-    np.testing.assert_array_equal(found.read_image(found.entries[1]), made.read_image(made.entries[1]))
+        np.testing.assert_array_equal(opened.read_image(opened.entries[0]), data_set.read_image(data_set.entries[0]))
+    np.testing.assert_array_equal(opened.read_image(opened.entries[1]), data_set.read_image(data_set.entries[1]))
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_an_image_is_a_number_with_an_ending_and_no_path(make: Make, layout: Layout) -> None:
-    table = place_of(make(layout, scenes=2)) / "ground_truth.csv"
+def test_refuses_invalid_image_names(make: Make, layout: Layout) -> None:
+    table = folder_of(make(layout, scenes=2)) / "ground_truth.csv"
     text = table.read_text()
     for name in ("000000../outside/canary.png", "../000000.png", "٠٠٠٠٠٠.png", "0.0/0.png"):
         table.write_text(text.replace("000000.png", name), encoding="utf-8")
@@ -339,8 +344,8 @@ def test_an_image_is_a_number_with_an_ending_and_no_path(make: Make, layout: Lay
     assert open_dataset(table.parent).entries[0].image == "000000"
 
 
-def test_a_number_comes_once_and_has_few_digits(make: Make) -> None:
-    table = place_of(make("folder", scenes=2)) / "ground_truth.csv"
+def test_refuses_invalid_image_numbers(make: Make) -> None:
+    table = folder_of(make("folder", scenes=2)) / "ground_truth.csv"
     text = table.read_text()
     for name in ("0.png", "000000.tiff", "1" * 11 + ".png", "1" * 5000 + ".png"):
         table.write_text(text.replace("\n000001.png,", f"\n{name},"))
@@ -348,7 +353,7 @@ def test_a_number_comes_once_and_has_few_digits(make: Make) -> None:
             open_dataset(table.parent)
 
 
-def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parquet_reports_missing_library(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     def find_spec(name: str) -> None:
         del name
 

@@ -1,4 +1,4 @@
-"""A dataset as a whole: what is in it, that it is made again or found, and the engines that make it."""
+"""Generating data sets: content, repeated commands, and engines."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
+# Image numbers for `pictures` under two illuminants; the numbers of the third picture are not used.
 NUMBERS = (0, 1, 2, 3, 6, 7, 8, 9)
-"""Of the images of `pictures` under two lights: the third picture leaves its two numbers free."""
 
 
 @pytest.fixture
 def pictures(tmp_path: Path) -> Path:
-    """Return a folder of five pictures, the third of them broken."""
+    """Return a folder of five pictures; the third is damaged."""
     folder = tmp_path / "pictures"
     (folder / "more").mkdir(parents=True)
     rng = np.random.default_rng(2)
@@ -53,11 +53,11 @@ def pictures(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_what_is_in_the_folder(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+def test_content_of_data_set(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     skipped: list[tuple[str, str]] = []
     images: list[int] = []
-    made = generate_dataset(
+    data_set = generate_dataset(
         lut,
         tmp_path / "out",
         find_pictures([pictures]),
@@ -104,20 +104,20 @@ def test_what_is_in_the_folder(make_lut: MakeLut, pictures: Path, tmp_path: Path
     assert (sources[1]["width"], sources[1]["height"]) == ("17", "31")
     assert str(tmp_path) not in (tmp_path / "out" / "dataset.json").read_text()
     lines = (tmp_path / "out" / "SHA256SUMS").read_text().splitlines()
-    listed = {name: digest for digest, name in (line.split("  ") for line in lines)}
+    hashes = {name: digest for digest, name in (line.split("  ") for line in lines)}
     unlisted = {"SHA256SUMS", "README.md", "DATASHEET.md"}
-    assert listed == {name: digest for name, digest in contents(tmp_path / "out").items() if name not in unlisted}
-    # Every image is the one that its number, source and light say, by the reader and by OpenCV alone.
-    again = open_dataset(tmp_path / "out")
-    assert again == made
-    for number, entry in zip(NUMBERS, again.entries, strict=True):
+    assert hashes == {name: digest for name, digest in contents(tmp_path / "out").items() if name not in unlisted}
+    # Every image agrees with its number, source and illuminant, for our reader and for OpenCV.
+    reopened = open_dataset(tmp_path / "out")
+    assert reopened == data_set
+    for number, entry in zip(NUMBERS, reopened.entries, strict=True):
         expected = render(lut, read_picture(pictures / entry.source), int(entry.illumination), seed=77, image=number)
-        np.testing.assert_array_equal(again.read_image(entry), expected)
+        np.testing.assert_array_equal(reopened.read_image(entry), expected)
         path = tmp_path / "out" / "images" / entry.image
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert stored is not None
         np.testing.assert_array_equal(stored[..., ::-1], expected)
-        data = again.read_preview(entry)
+        data = reopened.read_preview(entry)
         assert data is not None
         preview = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert preview is not None
@@ -126,7 +126,7 @@ def test_what_is_in_the_folder(make_lut: MakeLut, pictures: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_workers_change_no_byte(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+def test_bytes_do_not_depend_on_workers(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut(unfit=(3,))
     sources = (*find_pictures([pictures]), *random_scenes(3, 40, 30, 5))
     for workers in (1, 7):
@@ -134,29 +134,29 @@ def test_workers_change_no_byte(make_lut: MakeLut, pictures: Path, tmp_path: Pat
         generate_dataset(lut, tmp_path / f"out{workers}", sources, choice, seed=5, workers=workers)
     assert contents(tmp_path / "out1") == contents(tmp_path / "out7")
     generate_dataset(lut, tmp_path / "other", sources, RandomLights(3, 4, 5), seed=6)
-    one, other = contents(tmp_path / "out1"), contents(tmp_path / "other")
-    assert all(one[name] != other[name] for name in one if name.startswith("images/"))
+    first, second = contents(tmp_path / "out1"), contents(tmp_path / "other")
+    assert all(first[name] != second[name] for name in first if name.startswith("images/"))
 
 
 @pytest.mark.slow
-def test_replaced_pixels_are_counted(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+def test_counts_replaced_pixels(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut(unfit=(0, 21))
     (source,) = find_pictures([pictures / "a.png"])
-    made = generate_dataset(
+    data_set = generate_dataset(
         lut, tmp_path / "out", [source], [0], options=DatasetOptions(previews=False, rendering="codes")
     )
     top = source.read().picture >> 6
     count = int(((top == 0).all(axis=2) | (top == 1).all(axis=2)).sum())  # colour 21 is (1, 1, 1)
     assert count > 0
-    assert made.description.replaced_pixels == count
-    assert made.description.pixels == top.size // 3
-    assert [source.replaced_pixels for source in made.sources] == [count]
-    assert made.read_preview(made.entries[0]) is None
+    assert data_set.description.replaced_pixels == count
+    assert data_set.description.pixels == top.size // 3
+    assert [source.replaced_pixels for source in data_set.sources] == [count]
+    assert data_set.read_preview(data_set.entries[0]) is None
     assert not (tmp_path / "out" / "previews").exists()
 
 
 @pytest.mark.slow
-def test_images_come_of_samples_as_they_were_measured(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+def test_refuses_changed_samples(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     with (lut.folder / "samples.npy").open("r+b") as stream:
         stream.seek(-1, os.SEEK_END)
@@ -168,16 +168,16 @@ def test_images_come_of_samples_as_they_were_measured(make_lut: MakeLut, picture
         generate_dataset(lut, tmp_path / "out", sources, [0, 3], options=by_codes)
     with pytest.raises(FormatError, match="illuminant 3"):
         generate_dataset(lut, tmp_path / "mixed", sources, ListedLights((mixture_of({0: 1, 3: 1}),)), options=by_codes)
-    # By colour the map of the print may rest on any light.
+    # For colorimetric rendering, the map of the print may use any illuminant.
     with pytest.raises(FormatError, match="illuminant 3"):
         generate_dataset(lut, tmp_path / "by-colour", sources, [3])
 
 
 @pytest.mark.slow
-def test_pictures_too_small_for_the_format_are_passed_over(make_lut: MakeLut, tmp_path: Path) -> None:
+def test_skips_pictures_too_small_for_format(make_lut: MakeLut, tmp_path: Path) -> None:
     sources = (*random_scenes(1, 21, 40), *random_scenes(1, 22, 22, 5))
     skipped: list[str] = []
-    made = generate_dataset(
+    data_set = generate_dataset(
         make_lut(),
         tmp_path / "out",
         sources,
@@ -185,36 +185,36 @@ def test_pictures_too_small_for_the_format_are_passed_over(make_lut: MakeLut, tm
         options=DatasetOptions(form="dng"),
         callbacks=Callbacks(on_skip=lambda name, reason, missed: skipped.append(reason)),
     )
-    assert [entry.image for entry in made.entries] == ["000001.dng"]
+    assert [entry.image for entry in data_set.entries] == ["000001.dng"]
     (reason,) = skipped
-    assert reason.startswith("random-000000 is 21x40 px, too small for dng, which takes 22x22 and more; choose another")
+    assert reason.startswith("random-000000 is 21x40 px, expected 22x22 or more for dng; choose another")
 
 
 @pytest.mark.slow
-def test_nothing_is_left_of_a_dataset_that_cannot_be(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+def test_failed_data_set_leaves_no_files(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     sources = find_pictures([pictures])
-    before, threads = contents(tmp_path), threading.active_count()
-    with pytest.raises(InputError, match="there is no light 9"):
+    original, threads = contents(tmp_path), threading.active_count()
+    with pytest.raises(InputError, match="9"):
         generate_dataset(lut, tmp_path / "out", sources, [0, 9], workers=2)
-    with pytest.raises(FormatError, match="none of the 1 pictures"):
+    with pytest.raises(FormatError, match="0 of 1 pictures"):
         generate_dataset(lut, tmp_path / "out", find_pictures([pictures / "broken.jpg"]), [0])
-    unlike: Any = (1, 2)
-    with pytest.raises(InputError, match=r"split 1,2 .*sum to 1"):
-        generate_dataset(lut, tmp_path / "out", sources, [0], options=DatasetOptions(split=unlike))
+    invalid_split: Any = (1, 2)
+    with pytest.raises(InputError, match=r"split is 1,2, .*sum 1"):
+        generate_dataset(lut, tmp_path / "out", sources, [0], options=DatasetOptions(split=invalid_split))
     with pytest.raises(InputError, match="'bmp'"):
         DatasetOptions(form=cast("Any", "bmp"))
-    assert contents(tmp_path) == before
+    assert contents(tmp_path) == original
     assert not list(tmp_path.glob(".out*"))
     assert threading.active_count() == threads
 
 
 @pytest.mark.slow
-def test_a_taken_folder_and_empty_lists_are_refused(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+def test_refuses_existing_folder_and_empty_lists(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     with pytest.raises(InputError):
         generate_dataset(lut, pictures, find_pictures([pictures]), [0])
-    with pytest.raises(InputError, match="0 pictures under 1 lights"):
+    with pytest.raises(InputError, match="0 pictures and 1 illuminants"):
         generate_dataset(lut, tmp_path / "out", [], [0])
     with pytest.raises(InputError):
         generate_dataset(lut, tmp_path / "out", find_pictures([pictures]), [])
@@ -224,7 +224,7 @@ def test_a_taken_folder_and_empty_lists_are_refused(make_lut: MakeLut, pictures:
 
 @pytest.fixture
 def lut(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lut:
-    """Return a table of 512 colours, and go to the folder that holds it and a folder of six pictures."""
+    """Return a LUT of 512 colours, and change to its folder with six pictures."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pictures").mkdir()
     for number in range(6):
@@ -233,47 +233,47 @@ def lut(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> L
     return make_lut(bits=3)
 
 
-class TestAskedForTwice:
-    WISH = ("--sources", "pictures", "--seed", "2", "--rendering", "codes")
+class TestRepeatedCommand:
+    OPTIONS = ("--sources", "pictures", "--seed", "2", "--rendering", "codes")
 
     @pytest.mark.slow
-    def test_it_says_so_and_nothing_is_touched(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
-        wish = (*self.WISH, "--contact-sheet", "sheet.png")
-        assert main(("lut", "out", *wish)) == 0
-        before = {path: path.stat().st_mtime_ns for path in Path("out").rglob("*")}
+    def test_changes_nothing(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
+        options = (*self.OPTIONS, "--contact-sheet", "sheet.png")
+        assert main(("lut", "out", *options)) == 0
+        original_times = {path: path.stat().st_mtime_ns for path in Path("out").rglob("*")}
         capsys.readouterr()
-        assert main(("lut", "out", *wish)) == 0
+        assert main(("lut", "out", *options)) == 0
         printed = capsys.readouterr().out
         assert "out: 6 images of 6 pictures under" in printed
-        assert "complete already; nothing was made" in printed
-        assert "sheet.png: a contact sheet is there already" in printed
-        assert {path: path.stat().st_mtime_ns for path in Path("out").rglob("*")} == before
+        assert "it was already complete" in printed
+        assert "sheet.png: the contact sheet already exists" in printed
+        assert {path: path.stat().st_mtime_ns for path in Path("out").rglob("*")} == original_times
 
     @pytest.mark.slow
-    def test_pictures_that_changed_since_are_found(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
-        """Whatever the time that a copy brings with it."""
-        assert main(("lut", "out", *self.WISH)) == 0
+    def test_reports_changed_pictures(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
+        # The time stamps of copied files must not matter.
+        assert main(("lut", "out", *self.OPTIONS)) == 0
         os.utime("out/dataset.json", (1_000_000_000, 1_000_000_000))
-        assert main(("lut", "out", *self.WISH)) == 0, "written to, and the same"
+        assert main(("lut", "out", *self.OPTIONS)) == 0, "new time stamp, but equal content"
         data = Path("pictures/4.png").read_bytes()
         shutil.copy("pictures/5.png", "pictures/4.png")
         os.utime("pictures/4.png", (900_000_000, 900_000_000))
-        assert main(("lut", "out", *self.WISH)) == 2
-        assert "otherwise (the content of 4.png)" in capsys.readouterr().err
+        assert main(("lut", "out", *self.OPTIONS)) == 2
+        assert "different data set (the content of 4.png)" in capsys.readouterr().err
         Path("pictures/4.png").write_bytes(data)
-        assert main(("lut", "out", *self.WISH)) == 0
+        assert main(("lut", "out", *self.OPTIONS)) == 0
         Path("pictures/4.png").rename("pictures/9.png")
-        assert main(("lut", "out", *self.WISH)) == 2
+        assert main(("lut", "out", *self.OPTIONS)) == 2
         assert "source 4 4.png, now 5.png" in capsys.readouterr().err
 
-    def test_what_is_no_dataset_is_in_the_way_still(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_refuses_other_folder(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(("lut", "pictures", "--sources", "pictures")) == 2
         assert "pictures already exists" in capsys.readouterr().err
 
     @pytest.mark.slow
-    def test_of_another_table_too(self, lut: Lut, make_lut: MakeLut, capsys: pytest.CaptureFixture[str]) -> None:
-        made: Dataset = generate_dataset(lut, "out", find_pictures("pictures"), [0])
-        assert made.description.images == 6
+    def test_refuses_other_lut(self, lut: Lut, make_lut: MakeLut, capsys: pytest.CaptureFixture[str]) -> None:
+        data_set: Dataset = generate_dataset(lut, "out", find_pictures("pictures"), [0])
+        assert data_set.description.images == 6
         make_lut(bits=2, name="other")
         assert open_lut("other").sha256 != lut.sha256
         assert main(("other", "out", "--sources", "pictures", "--light", "0")) == 2
@@ -285,7 +285,7 @@ IMAGES = 48
 SHARD = 8
 
 
-def make(lut: Lut, out: Path, engine: str, workers: int, callbacks: Callbacks = SILENT) -> None:
+def make_data_set(lut: Lut, out: Path, engine: str, workers: int, callbacks: Callbacks = SILENT) -> None:
     scenes = random_scenes(IMAGES // 2, 24, 16, 4)
     lights = RandomLights(2, 4, 4)
     generate_dataset(
@@ -302,23 +302,23 @@ def make(lut: Lut, out: Path, engine: str, workers: int, callbacks: Callbacks = 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Lut, dict[str, str]]:
-    """Return a table, and the hashes of the files of a dataset that one thread made of it."""
+    """Return a LUT, and the hashes of the files of a data set that one thread made."""
     folder = tmp_path_factory.mktemp("undisturbed")
     lut = lut_in(folder / "lut")
-    make(lut, folder / "out", "local", 1)
+    make_data_set(lut, folder / "out", "local", 1)
     return lut, contents(folder / "out")
 
 
 def dask_workers() -> list[psutil.Process]:
-    """Return the processes of this program's Dask workers."""
+    """Return the processes of our Dask workers."""
     below = psutil.Process().children(recursive=True)
-    # Where setproctitle is installed, Dask gives them a title in place of their command.
+    # If setproctitle is installed, Dask replaces the command by a title.
     titles = ("spawn_main", "dask")
     return [process for process in below if any(title in " ".join(process.cmdline()).lower() for title in titles)]
 
 
 @pytest.mark.slow
-def test_a_killed_worker_changes_no_byte(undisturbed: tuple[Lut, dict[str, str]], tmp_path: Path) -> None:
+def test_killed_worker_changes_no_byte(undisturbed: tuple[Lut, dict[str, str]], tmp_path: Path) -> None:
     lut, expected = undisturbed
     killed: list[int] = []
 
@@ -328,15 +328,15 @@ def test_a_killed_worker_changes_no_byte(undisturbed: tuple[Lut, dict[str, str]]
             victim.kill()
             killed.append(victim.pid)
 
-    # The only one: what takes its place makes the rest.
-    make(lut, tmp_path / "out", "dask", 1, Callbacks(on_image=kill_one))
+    # It is the only worker; Dask starts another one for the rest.
+    make_data_set(lut, tmp_path / "out", "dask", 1, Callbacks(on_image=kill_one))
     assert len(killed) == 1
     assert contents(tmp_path / "out") == expected
     assert not list(tmp_path.glob(".out*"))
 
 
 @pytest.mark.slow
-def test_a_cluster_of_somebody_else_s(
+def test_existing_dask_cluster(
     undisturbed: tuple[Lut, dict[str, str]],
     make_lut: MakeLut,
     tmp_path: Path,
@@ -352,7 +352,7 @@ def test_a_cluster_of_somebody_else_s(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        make(lut, tmp_path / "out", "local", 1, Callbacks(on_image=stop))
+        make_data_set(lut, tmp_path / "out", "local", 1, Callbacks(on_image=stop))
     with LocalCluster(
         n_workers=0,
         threads_per_worker=2,
@@ -362,53 +362,53 @@ def test_a_cluster_of_somebody_else_s(
         silence_logs=logging.CRITICAL,
     ) as cluster:
         address = cluster.scheduler_address.replace("tcp://", "dask://")
-        said: list[str] = []
-        found: list[int] = []
+        messages: list[str] = []
+        reused: list[int] = []
         reported: list[None] = []
 
         def start_one(sentence: str) -> None:
-            said.append(sentence)
+            messages.append(sentence)
             cluster.scale(1)
 
-        seen = Callbacks(on_done=found.append, on_image=lambda: reported.append(None), on_wait=start_one)
-        make(lut, tmp_path / "out", address, 1, seen)
+        callbacks = Callbacks(on_done=reused.append, on_image=lambda: reported.append(None), on_wait=start_one)
+        make_data_set(lut, tmp_path / "out", address, 1, callbacks)
         assert contents(tmp_path / "out") == expected
-        assert sum(found) > SHARD, "images of the shard that was begun count, too"
-        assert sum(found) + len(reported) == IMAGES
-        hint = f"the Dask scheduler has no worker yet; start some with: dask worker {cluster.scheduler_address}"
-        assert said == [hint]
-        # A worker that finds another table at the same path says so.
-        other = make_lut(name="other")
-        assert other.sha256, "looked at before it is changed"
-        shutil.rmtree(other.folder)
+        assert sum(reused) > SHARD, "images of the incomplete shard are not reused"
+        assert sum(reused) + len(reported) == IMAGES
+        hint = f"the Dask scheduler has 0 workers, expected 1 or more; run dask worker {cluster.scheduler_address}"
+        assert messages == [hint]
+        # A worker refuses a different LUT at the same path.
+        other_lut = make_lut(name="other")
+        assert other_lut.sha256, "hash before the change"
+        shutil.rmtree(other_lut.folder)
         make_lut(name="other", unfit=(3,))
         with pytest.raises(InputError):
-            generate_dataset(other, tmp_path / "refused", random_scenes(2, 24, 16), [0], workers=Workers(address))
+            generate_dataset(other_lut, tmp_path / "refused", random_scenes(2, 24, 16), [0], workers=Workers(address))
         # The worker was started in another folder.
         monkeypatch.chdir(tmp_path)
         Path("pictures").mkdir()
         Path("pictures/a.pgm").write_bytes(b"P5 2 2 255 abcd")
-        made = generate_dataset(lut, Path("relative"), find_pictures(["pictures"]), [0], workers=Workers(address))
-        assert made.description.images == 1
+        data_set = generate_dataset(lut, Path("relative"), find_pictures(["pictures"]), [0], workers=Workers(address))
+        assert data_set.description.images == 1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "address"), [("local", None), ("dask", ""), ("dask://node7:8786", "tcp://node7:8786")]
 )
-def test_names_of_engines(name: str, address: str | None) -> None:
+def test_parses_engines(name: str, address: str | None) -> None:
     assert parse_engine(name) == address
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ray", "dask://", "dask://node7", "tcp://node7:8786", ""])
-def test_an_unknown_engine_is_refused(name: str) -> None:
+def test_refuses_unknown_engine(name: str) -> None:
     with pytest.raises(InputError, match="dask://HOST:PORT"):
         parse_engine(name)
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_does_not_answer(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_unreachable_scheduler(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("generator.dataset.making.CONNECT_S", 0.2)
     with pytest.raises(InputError, match=r"127\.0\.0\.1:1"):
         generate_dataset(

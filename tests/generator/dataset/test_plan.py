@@ -1,4 +1,4 @@
-"""Parts of a dataset: by source, by chance, and nobody's business but the source's own."""
+"""Plans: splits, options, shards and jobs."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from tests.generator.conftest import MakeLut
 SHARES = (0.7, 0.1, 0.2)
 
 
-def test_shares_hold_on_average() -> None:
+def test_split_shares_hold_on_average() -> None:
     count = 20_000
-    parts = Counter(split_of(SHARES, 5, None, f"picture-{number}") for number in range(count))
-    for part, share in zip(("train", "validation", "test"), SHARES, strict=True):
-        # Six standard deviations of a binomial count: chance alone fails one of the three in 2·10⁸ runs.
-        assert abs(parts[part] - share * count) < 6 * math.sqrt(count * share * (1 - share))  # pyrefly: ignore[bad-index]
+    splits = Counter(split_of(SHARES, 5, None, f"picture-{number}") for number in range(count))
+    for split, share in zip(("train", "validation", "test"), SHARES, strict=True):
+        # Six standard deviations of a binomial count: fails by chance once in 2·10⁸ runs.
+        assert abs(splits[split] - share * count) < 6 * math.sqrt(count * share * (1 - share))  # pyrefly: ignore[bad-index]
 
 
 @pytest.mark.slow
 @given(st.text(), st.integers(0, 2**64 - 1), st.sampled_from([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]))
-def test_a_part_of_everything_has_everything(name: str, seed: int, shares: tuple[float, float, float]) -> None:
-    part = split_of(shares, seed, None, name)
-    assert part == ("train", "validation", "test")[shares.index(1.0)]
+def test_share_of_1_gets_everything(name: str, seed: int, shares: tuple[float, float, float]) -> None:
+    split = split_of(shares, seed, None, name)
+    assert split == ("train", "validation", "test")[shares.index(1.0)]
 
 
-def test_seeds_divide_differently() -> None:
-    one = [split_of((0.5, 0.0, 0.5), 1, None, str(number)) for number in range(200)]
-    other = [split_of((0.5, 0.0, 0.5), 2, None, str(number)) for number in range(200)]
-    # Equal places are binomial (200, 1/2); beyond 60 … 140 lies chance 2·10⁻⁸.
-    assert 60 < sum(a == b for a, b in zip(one, other, strict=True)) < 140
+def test_seeds_give_different_splits() -> None:
+    first = [split_of((0.5, 0.0, 0.5), 1, None, str(number)) for number in range(200)]
+    second = [split_of((0.5, 0.0, 0.5), 2, None, str(number)) for number in range(200)]
+    # The number of equal splits is binomial (200, 1/2); it is outside 60 … 140 with probability 2·10⁻⁸.
+    assert 60 < sum(a == b for a, b in zip(first, second, strict=True)) < 140
     assert split_of(None, 1, None, "a") is None
 
 
@@ -55,33 +55,35 @@ def write(path: Path, seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_parts_are_of_sources_and_stay_when_others_come(make_lut: MakeLut, tmp_path: Path) -> None:
+def test_splits_depend_on_content_of_source(make_lut: MakeLut, tmp_path: Path) -> None:
     lut = make_lut()
     folder = tmp_path / "pictures"
     for number in range(12):
         write(folder / f"{number:02d}.png", number)
         write(folder / "copies" / f"copy of {number}.png", number)
     options = DatasetOptions(rendering="codes", previews=False, split=(0.5, 0.2, 0.3))
-    made = generate_dataset(lut, tmp_path / "out", find_pictures([folder]), [0, 1, 2], seed=6, options=options)
-    parts: dict[str, set[str | None]] = {}
-    for entry in made.entries:
-        parts.setdefault(entry.source, set()).add(entry.split)
-    assert all(len(of_source) == 1 for of_source in parts.values()), "no source is in two parts"
+    data_set = generate_dataset(lut, tmp_path / "out", find_pictures([folder]), [0, 1, 2], seed=6, options=options)
+    splits: dict[str, set[str | None]] = {}
+    for entry in data_set.entries:
+        splits.setdefault(entry.source, set()).add(entry.split)
+    assert all(len(source_splits) == 1 for source_splits in splits.values()), "a source is in two splits"
     for number in range(12):
-        assert parts[f"{number:02d}.png"] == parts[f"copies/copy of {number}.png"], "two copies of a file go together"
-    for part in ("train", "validation", "test"):
-        named = (tmp_path / "out" / "splits" / f"{part}.txt").read_text().split()
-        assert named == [entry.image for entry in made.entries if entry.split == part]
-        assert len(named) == made.description.splits[part]
-    assert {source.name: {source.split} for source in made.sources} == parts
+        assert splits[f"{number:02d}.png"] == splits[f"copies/copy of {number}.png"], (
+            "copies of a file are in different splits"
+        )
+    for split in ("train", "validation", "test"):
+        listed_images = (tmp_path / "out" / "splits" / f"{split}.txt").read_text().split()
+        assert listed_images == [entry.image for entry in data_set.entries if entry.split == split]
+        assert len(listed_images) == data_set.description.splits[split]
+    assert {source.name: {source.split} for source in data_set.sources} == splits
     for number in range(12, 20):
         write(folder / f"0{number}.png", number)
-    more = generate_dataset(lut, tmp_path / "more", find_pictures([folder]), [3], seed=6, options=options)
-    now = {entry.source: {entry.split} for entry in more.entries}
-    assert {name: now[name] for name in parts} == parts
+    extended = generate_dataset(lut, tmp_path / "more", find_pictures([folder]), [3], seed=6, options=options)
+    new_splits = {entry.source: {entry.split} for entry in extended.entries}
+    assert {name: new_splits[name] for name in splits} == splits
 
 
-def test_shares_of_the_work() -> None:
+def test_parses_share() -> None:
     assert parse_share("3/16") == (3, 16)
     for text in ("16/16", "3", "-1/4", "a/b", "3/"):
         with pytest.raises(InputError):
@@ -89,7 +91,7 @@ def test_shares_of_the_work() -> None:
 
 
 @pytest.mark.parametrize(
-    ("most", "beyond"),
+    ("allowed", "refused"),
     [
         ({"crops": 1}, {"crops": 0}),
         ({"shard_images": 1}, {"shard_images": 0}),
@@ -97,13 +99,13 @@ def test_shares_of_the_work() -> None:
         ({"split": (0.0, 0.0, 1.0)}, {"split": (0.5, 0.5)}),
     ],
 )
-def test_options_at_their_limits_and_beyond(most: dict[str, Any], beyond: dict[str, Any]) -> None:
-    assert most.items() <= vars(DatasetOptions(**most)).items()
+def test_option_limits(allowed: dict[str, Any], refused: dict[str, Any]) -> None:
+    assert allowed.items() <= vars(DatasetOptions(**allowed)).items()
     with pytest.raises(InputError):
-        DatasetOptions(**beyond)
+        DatasetOptions(**refused)
 
 
-def test_a_plan_at_its_limits_and_beyond(make_lut: MakeLut) -> None:
+def test_plan_limits(make_lut: MakeLut) -> None:
     lut = make_lut(bits=2)
 
     def plan(crops: int = 1, **options: Any) -> Plan:
@@ -115,8 +117,8 @@ def test_a_plan_at_its_limits_and_beyond(make_lut: MakeLut) -> None:
         plan((1 << 31) + 1)
 
 
-def test_a_shard_takes_the_pictures_that_its_images_show(make_lut: MakeLut) -> None:
-    """Images 0 to 9 are of two lights of five pictures; three of them make a shard, and the last has one."""
+def test_job_has_sources_of_its_images(make_lut: MakeLut) -> None:
+    """Five pictures under two illuminants give images 0 to 9, in shards of three."""
     scenes = random_scenes(5, 4, 4)
     plan = Plan(make_lut(), scenes, ListedLights((0, 3)), 0, DatasetOptions(shard_images=3))
     jobs = [plan.job(shard) for shard in range(plan.shards)]

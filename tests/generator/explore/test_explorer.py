@@ -1,4 +1,4 @@
-"""`generate explore`: what the server answers, what the page shows, and the command that makes the same."""
+"""`generate explore`: the server, the page, and the command on the page."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def explorer(make_table: MakeTable, tmp_path: Path) -> Explorer:
-    """Return an explorer of a print under three black bodies, with two pictures in a folder with blanks."""
+    """Return an explorer of a print under three black bodies, with two pictures in a folder with spaces."""
     lut = make_table()
     folder = tmp_path / "my pictures"
     folder.mkdir()
@@ -65,115 +65,113 @@ def explorer(make_table: MakeTable, tmp_path: Path) -> Explorer:
     ("light", "rendering"),
     [("1:.3+2:.7", "colorimetric"), ("r=.25,b=.3", "codes")],
 )
-def test_the_command_makes_the_image_that_is_shown(explorer: Explorer, light: str, rendering: Rendering) -> None:
-    shown = explorer.show(1, light)
+def test_command_makes_displayed_image(explorer: Explorer, light: str, rendering: Rendering) -> None:
+    record = explorer.show(1, light)
     image = explorer.counts(1, light, rendering).copy()
     assert image.shape == (round(SIDE * 5 / 9), SIDE, 3)
-    words = shlex.split(shown["commands"][rendering])
-    assert words[0] == "generate"
-    assert words[words.index("--sources") + 1] == "my pictures/it's 1.png", "as it is called from here"
-    assert main(words[1:]) == 0
-    made = open_dataset("dataset")
-    assert (made.read_image(made.entries[0]) == image).all()
-    assert made.entries[0].truth == pytest.approx(shown["truth"], abs=1e-9)
-    assert [made.entries[0].lights[0], len(made.entries)] == [shown["light"], 1]
+    arguments = shlex.split(record["commands"][rendering])
+    assert arguments[0] == "generate"
+    assert arguments[arguments.index("--sources") + 1] == "my pictures/it's 1.png", "relative to the working folder"
+    assert main(arguments[1:]) == 0
+    data_set = open_dataset("dataset")
+    assert (data_set.read_image(data_set.entries[0]) == image).all()
+    assert data_set.entries[0].truth == pytest.approx(record["truth"], abs=1e-9)
+    assert [data_set.entries[0].lights[0], len(data_set.entries)] == [record["light"], 1]
 
 
 @pytest.mark.slow
-def test_the_command_of_a_picture_that_was_sent_is_run_beside_the_picture(explorer: Explorer, tmp_path: Path) -> None:
+def test_command_of_upload_runs_in_picture_folder(explorer: Explorer, tmp_path: Path) -> None:
     number = explorer.add("/somewhere/-far .png", png(7))
     image = explorer.counts(number, "0", "codes").copy()
     assert not explorer.show(number, "0")["is_here"]
     (tmp_path / "-far .png").write_bytes(png(7))
     assert main(shlex.split(explorer.show(number, "0")["commands"]["codes"])[1:]) == 0
-    made = open_dataset("dataset")
-    assert (made.read_image(made.entries[0]) == image).all()
+    data_set = open_dataset("dataset")
+    assert (data_set.read_image(data_set.entries[0]) == image).all()
 
 
-def test_a_table_called_as_the_command_is_named_otherwise(make_table: MakeTable, tmp_path: Path) -> None:
+def test_escapes_lut_named_like_command(make_table: MakeTable, tmp_path: Path) -> None:
     (tmp_path / "cat.png").write_bytes(png(1))
     explorer = Explorer("explore", make_table(name="explore"), find_pictures("cat.png"), SIDE)
     assert main(shlex.split(explorer.show(0, "0")["commands"]["codes"])[1:]) == 0
 
 
-def test_the_table_is_described(explorer: Explorer) -> None:
-    told = explorer.describe()
+def test_describes_lut(explorer: Explorer) -> None:
+    answer = explorer.describe()
     lut = explorer.lut
-    assert [light["label"] for light in told["lights"]] == ["2000 K", "5600 K", "10000 K"]
-    assert np.array([light["rb"] for light in told["lights"]]) == pytest.approx(rb_of(lut.white))
-    assert {tuple(place) for place in told["hull"]} == {tuple(light["rb"]) for light in told["lights"]}
-    assert told["first"] == 1, "the black body nearest to 5600 K"
-    bodies = np.array(told["black_bodies"])
+    assert [light["label"] for light in answer["lights"]] == ["2000 K", "5600 K", "10000 K"]
+    assert np.array([light["rb"] for light in answer["lights"]]) == pytest.approx(rb_of(lut.white))
+    assert {tuple(point) for point in answer["hull"]} == {tuple(light["rb"]) for light in answer["lights"]}
+    assert answer["first"] == 1, "the black body nearest to 5600 K"
+    bodies = np.array(answer["black_bodies"])
     assert bodies[[0, -1], 0].tolist() == [2000, 10000]
     assert bodies[[0, -1], 1:] == pytest.approx(rb_of(lut.white[[0, 2]]))
     assert bodies[9, 1:] == pytest.approx(rb_of(black_body(lut, bodies[9, 0]).white(lut)))
 
 
-def test_two_lights_have_a_line_for_a_gamut_and_one_body_no_curve(make_lut: MakeLut) -> None:
+def test_gamut_of_two_lights_is_a_line(make_lut: MakeLut) -> None:
     lut = make_lut(lights=2)
-    told = Explorer("lut", lut, ()).describe()
-    assert np.sort(told["hull"], axis=0) == pytest.approx(np.sort(rb_of(lut.white), axis=0))
-    assert told["black_bodies"] == []
+    answer = Explorer("lut", lut, ()).describe()
+    assert np.sort(answer["hull"], axis=0) == pytest.approx(np.sort(rb_of(lut.white), axis=0))
+    assert answer["black_bodies"] == []
 
 
-def test_one_light_is_all_that_it_can_make(make_lut: MakeLut) -> None:
+def test_gamut_of_one_light_is_a_point(make_lut: MakeLut) -> None:
     explorer = Explorer("lut", make_lut(lights=1), ())
     assert explorer.describe()["hull"] == [explorer.describe()["lights"][0]["rb"]]
 
 
-def test_what_the_table_cannot_make_becomes_the_nearest_light(explorer: Explorer) -> None:
-    shown = explorer.show(0, "r=.9,b=.05")
-    assert shown["light"] == "0"
+def test_replaces_light_outside_gamut_by_nearest(explorer: Explorer) -> None:
+    record = explorer.show(0, "r=.9,b=.05")
+    assert record["light"] == "0"
     with pytest.raises(InputError):
         explorer.show(0, "sunny")
 
 
-def test_noise_of_a_pixel_is_that_of_the_table(explorer: Explorer) -> None:
+def test_pixel_noise_matches_lut(explorer: Explorer) -> None:
     picture = read_picture(Path("my pictures") / "it's 0.png", SIDE)
-    told = explorer.pixel(0, "1", "codes", 3, 20)
-    assert told["codes"] == picture[20, 3].tolist()
+    answer = explorer.pixel(0, "1", "codes", 3, 20)
+    assert answer["codes"] == picture[20, 3].tolist()
     bits = [int(code) >> 5 for code in picture[20, 3]]
     cell = np.asarray(explorer.lut.samples[1, bits[0] << 6 | bits[1] << 3 | bits[2]], np.float64)
-    # Means of 256 draws are off by a sixteenth of the deviation; four of these are exceeded once in ten thousand.
-    assert np.abs(np.array(told["mean"]) - cell.mean(axis=0)).max() < (cell.std(axis=0) / 4).max()
-    assert np.array(told["deviation"]) == pytest.approx(cell.std(axis=0), rel=0.25)
-    with pytest.raises(InputError, match="no pixel 60, 3"):
+    # Means of 256 samples have a standard error of 1/16 of the deviation; four of these are allowed.
+    assert np.abs(np.array(answer["mean"]) - cell.mean(axis=0)).max() < (cell.std(axis=0) / 4).max()
+    assert np.array(answer["deviation"]) == pytest.approx(cell.std(axis=0), rel=0.25)
+    with pytest.raises(InputError, match="the pixel 60, 3 is outside"):
         explorer.pixel(0, "1", "codes", 60, 3)
 
 
-def test_pictures_that_cannot_be_read_are_named(explorer: Explorer) -> None:
+def test_refuses_unreadable_pictures(explorer: Explorer) -> None:
     with pytest.raises(FormatError, match=r"^cannot read letter\.txt"):
         explorer.add("letter.txt", b"Dear Sir")
     with pytest.raises(InputError, match="no picture 99"):
         explorer.show(99, "0")
 
 
-def test_a_small_file_that_claims_a_large_picture_is_refused(
-    explorer: Explorer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refuses_picture_with_too_many_pixels(explorer: Explorer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("generator.explore.explorer.MOST_DROPPED_PIXELS", 90 * 50 - 1)
     with pytest.raises(FormatError):
         explorer.add("large.png", png(1))
 
 
 @pytest.mark.slow
-def test_sample_pictures_are_made_once_and_what_they_are_said_to_be(tmp_path: Path, pinned: Pinned) -> None:
+def test_sample_pictures(tmp_path: Path, pinned: Pinned) -> None:
     samples = sample_folder(tmp_path)
-    before = {path.name: path.stat().st_mtime_ns for path in samples.iterdir()}
-    assert len(before) == 3
+    original_times = {path.name: path.stat().st_mtime_ns for path in samples.iterdir()}
+    assert len(original_times) == 3
     assert sample_folder(tmp_path) == samples
-    assert before == {path.name: path.stat().st_mtime_ns for path in samples.iterdir()}
+    assert original_times == {path.name: path.stat().st_mtime_ns for path in samples.iterdir()}
     codes = read_picture(samples / "balls.png").astype(np.int64)
     assert codes.shape == (600, 900, 3)
     squares = codes.reshape(20, 30, 30, 30, 3).sum(axis=(1, 3))
-    # They are shaded with powers, of which another processor may round a code in a million otherwise.
+    # Powers may be rounded differently on another processor, in one code of a million.
     pinned("sample pictures", [codes, *squares.transpose(2, 0, 1)], same=2e-5)
     # The red ball: its surface in the middle, brighter towards the lamp on the upper left than away from it.
     x, y, radius = 160, 395, 130
-    middle, near, far = (codes[y + part * radius // 2, x + part * radius // 2] for part in (0, -1, 1))
+    middle, near, far = (codes[y + direction * radius // 2, x + direction * radius // 2] for direction in (0, -1, 1))
     assert middle.argmax() == 0
     assert near.sum() > middle.sum() > far.sum()
-    # Reflected like a mirror does half way between the lamp and the viewer, the lamp's own white.
+    # The highlight is half way between the lamp and the viewer and has the colour of the lamp.
     lamp = np.array([-0.5, -0.65, 0.57]) / np.linalg.norm([-0.5, -0.65, 0.57])
     half = lamp + np.array([0.0, 0.0, 1.0])
     half /= np.linalg.norm(half)
@@ -210,7 +208,7 @@ def server(make_lut: MakeLut) -> Iterator[ExploreServer]:
 def ask(
     server: ExploreServer, path: str, body: bytes | None = None, method: str | None = None, **headers: str
 ) -> tuple[int, http.client.HTTPMessage, bytes]:
-    """Return status, headers and body of the answer; what has a body is sent by PUT."""
+    """Return status, headers and body of the answer; a request with a body uses PUT."""
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
     try:
         method = method or ("GET" if body is None else "PUT")
@@ -221,7 +219,7 @@ def ask(
         connection.close()
 
 
-def test_a_picture_is_sent_and_shown(server: ExploreServer) -> None:
+def test_uploads_and_shows_picture(server: ExploreServer) -> None:
     status, _, body = ask(server, "/picture?name=a.png", PNG)
     assert (status, json.loads(body)) == (200, {"picture": 0})
     status, headers, body = ask(server, "/counts?picture=0&light=1&rendering=codes")
@@ -230,8 +228,8 @@ def test_a_picture_is_sent_and_shown(server: ExploreServer) -> None:
     explorer = server._explorer
     image = explorer.counts(0, "1", "codes")
     assert body[8:] == image.astype("<u2").tobytes()
-    told = json.loads(ask(server, "/shown.json?picture=0&light=0:.5%2B2:.5")[2])
-    assert told["light"] == "0:0.5+2:0.5"
+    answer = json.loads(ask(server, "/shown.json?picture=0&light=0:.5%2B2:.5")[2])
+    assert answer["light"] == "0:0.5+2:0.5"
     pixel = json.loads(ask(server, "/pixel.json?picture=0&light=1&rendering=codes&x=2&y=3")[2])
     assert pixel["draws"] == 256
 
@@ -248,15 +246,15 @@ def test_a_picture_is_sent_and_shown(server: ExploreServer) -> None:
         ("/../lut/lut.json", 404),
     ],
 )
-def test_what_cannot_be_used_is_said_in_a_sentence(server: ExploreServer, path: str, status: int) -> None:
+def test_reports_invalid_requests(server: ExploreServer, path: str, status: int) -> None:
     ask(server, "/picture?name=a.png", PNG)
-    found, headers, body = ask(server, path)
-    assert (found, headers["Content-Type"]) == (status, "text/plain; charset=utf-8")
+    answered_status, headers, body = ask(server, path)
+    assert (answered_status, headers["Content-Type"]) == (status, "text/plain; charset=utf-8")
     assert b"Traceback" not in body
     assert len(body) > 10
 
 
-def test_the_page_stands_alone(server: ExploreServer) -> None:
+def test_page_loads_nothing_external(server: ExploreServer) -> None:
     status, headers, body = ask(server, "/")
     assert status == 200
     policy = headers["Content-Security-Policy"]
@@ -279,14 +277,14 @@ def test_the_page_stands_alone(server: ExploreServer) -> None:
         ({"Transfer_Encoding": "chunked"}, 413),
     ],
 )
-def test_what_others_or_too_much_send_is_not_taken(server: ExploreServer, headers: dict[str, str], status: int) -> None:
+def test_refuses_foreign_and_too_large_uploads(server: ExploreServer, headers: dict[str, str], status: int) -> None:
     body = b"" if set(headers) & {"Content_Length", "Transfer_Encoding"} else PNG
-    found, answered, _ = ask(server, "/picture?name=a.png", body, "PUT", **headers)
-    assert (found, answered["Connection"]) == (status, "close")
-    assert ask(server, "/shown.json?picture=0&light=1")[0] == 422, "nothing was kept"
+    answered_status, answered, _ = ask(server, "/picture?name=a.png", body, "PUT", **headers)
+    assert (answered_status, answered["Connection"]) == (status, "close")
+    assert ask(server, "/shown.json?picture=0&light=1")[0] == 422, "no picture was stored"
 
 
-def test_pictures_are_taken_at_one_address_and_by_put_alone(server: ExploreServer) -> None:
+def test_accepts_uploads_only_by_put(server: ExploreServer) -> None:
     assert ask(server, "/", PNG)[0] == 404
     for method in ("POST", "PATCH", "OPTIONS", "DELETE"):
         assert ask(server, "/picture?name=a.png", PNG, method)[0] == 405
@@ -295,7 +293,7 @@ def test_pictures_are_taken_at_one_address_and_by_put_alone(server: ExploreServe
     assert ask(server, "/picture?name=a.png", b"no picture")[0] == 422
 
 
-def test_for_other_machines_the_address_holds_a_token(make_lut: MakeLut) -> None:
+def test_other_machines_need_token(make_lut: MakeLut) -> None:
     with served(Explorer("lut", make_lut(), ()), "0.0.0.0") as server:
         for path in ("/", "/table.json", "/x/table.json"):
             assert ask(server, path)[0] == 403
@@ -306,7 +304,7 @@ def test_for_other_machines_the_address_holds_a_token(make_lut: MakeLut) -> None
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("table_and_picture")
-def test_the_command_says_where_and_ends_with_ctrl_c(
+def test_command_prints_address_and_stops_with_ctrl_c(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupt(server: ThreadingHTTPServer) -> None:
@@ -326,8 +324,8 @@ def test_the_command_says_where_and_ends_with_ctrl_c(
 
 HOSTILE = "<img src=x onerror='window.hacked=1'>&{data}.png"
 
+# Both renderings of the selection are drawn.
 DRAWN = "panels.length === 2 && panels.every((panel) => panel.drawn === `${state.picture} ${shown?.light}`)"
-"""Both renderings of what is chosen are drawn."""
 
 
 @pytest.fixture(scope="module")
@@ -338,7 +336,7 @@ def tab() -> Iterator[Tab]:
 
 @pytest.fixture
 def page(make_table: MakeTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Explorer:
-    """Return an explorer of a print under three black bodies, with two pictures of names that are markup."""
+    """Return an explorer of a print under three black bodies, with two pictures; one name is markup."""
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "pictures"
     folder.mkdir()
@@ -355,7 +353,7 @@ def shown(
         try:
             tab.errors.clear()
             tab.open(f"http://127.0.0.1:{server.port}/{server.path}", width=width, dark=dark)
-            # The black body nearest to 5600 K comes first, and tests begin with the reddest light.
+            # The page starts with the black body nearest to 5600 K, tests with the reddest illuminant.
             tab.wait_for(f"document.readyState === 'complete' && {DRAWN} && shown.light === '1'")
             tab.value("pick(0)")
             tab.wait_for(f"{DRAWN} && shown.light === '0'")
@@ -366,12 +364,12 @@ def shown(
         assert errors == []
 
 
-def text_of(tab: Tab, place: str) -> str:
-    return tab.value(f"document.getElementById('{place}').textContent")
+def text_of(tab: Tab, element_id: str) -> str:
+    return tab.value(f"document.getElementById('{element_id}').textContent")
 
 
 def place_in_plane(tab: Tab, rb: list[float]) -> tuple[float, float]:
-    """Return where a chromaticity is in the window, px."""
+    """Return the position of a chromaticity in the window, px."""
     x, y = tab.value(
         f"(() => {{ const [x, y] = plane.place({json.dumps(rb)}); "
         "const at = new DOMPoint(x, y).matrixTransform(plane.svg.getScreenCTM()); return [at.x, at.y]; })()"
@@ -380,25 +378,25 @@ def place_in_plane(tab: Tab, rb: list[float]) -> tuple[float, float]:
 
 
 def light(tab: Tab) -> str:
-    """Return the light that is shown, when both renderings of it are drawn."""
+    """Return the displayed illuminant after both renderings are drawn."""
     return tab.wait_for(f"!document.hidden && {DRAWN} && shown.light")
 
 
 def histogram(tab: Tab, panel: int) -> list[list[int]]:
-    """Return which of 96 bins hold pixels of red, green and blue, as drawn: a curve is on the ground in the others."""
+    """Return the nonempty bins of the drawn histogram for red, green and blue."""
     paths = tab.value(f"[...panels[{panel}].histogram.querySelectorAll('path')].map((one) => one.getAttribute('d'))")
     heights = [[float(point.split()[1]) for point in path[1:].split("L")][:96] for path in paths]
     return [[bin_ for bin_, height in enumerate(curve) if height < 110] for curve in heights]
 
 
 @pytest.mark.slow
-def test_a_table_is_seen_at_once(tab: Tab, page: Explorer) -> None:
+def test_page_shows_lut_and_first_picture(tab: Tab, page: Explorer) -> None:
     with shown(tab, page):
         assert tab.value("document.querySelectorAll('circle.light').length") == 3
         assert text_of(tab, "command-codes").endswith("--max-side 100 --light 0 --rendering codes")
         assert text_of(tab, "command-colorimetric").endswith("--max-side 100 --light 0")
         truth = page.lut.white[0] / page.lut.white[0].sum()
-        assert all(f"{part:.3f}".removeprefix("0") in text_of(tab, "light-facts") for part in truth)
+        assert all(f"{number:.3f}" in text_of(tab, "light-facts") for number in truth)
         for panel, rendering in enumerate(("codes", "colorimetric")):
             image = page.counts(0, "0", rendering)
             assert tab.value(f"[...panels[{panel}].counts.slice(0, 600)]") == image.ravel()[:600].tolist()
@@ -413,27 +411,27 @@ def test_a_table_is_seen_at_once(tab: Tab, page: Explorer) -> None:
         assert "undefined" not in tab.value("document.querySelector('main').innerHTML")
         assert HOSTILE.replace("/", "|") in text_of(tab, "picture-name")
         assert tab.value("window.hacked") is None
-        for way in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "new Function"):
-            assert way not in tab.value("document.querySelector('script').textContent")
+        for function in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "new Function"):
+            assert function not in tab.value("document.querySelector('script').textContent")
 
 
 @pytest.mark.slow
-def test_a_light_is_picked_dragged_and_moved_by_keys(tab: Tab, page: Explorer) -> None:
+def test_selects_light_by_click_drag_and_keys(tab: Tab, page: Explorer) -> None:
     rb = rb_of(page.lut.white)
     with shown(tab, page):
         tab.drag([place_in_plane(tab, rb[2].tolist())])
         tab.wait_for("shown.light === '2'")
         assert tab.value("document.getElementById('light').value") == "2"
         middle = rb.mean(axis=0).tolist()
-        tab.drag([place_in_plane(tab, place) for place in (rb[2].tolist(), (rb[:2].mean(axis=0)).tolist(), middle)])
+        tab.drag([place_in_plane(tab, point) for point in (rb[2].tolist(), (rb[:2].mean(axis=0)).tolist(), middle)])
         tab.wait_for("shown.parts.length === 3")
-        # The wanted chromaticity is written with five decimals, and a pixel is a thousandth.
+        # The chromaticity has five decimals, and a pixel is about 0.001.
         tab.wait_for(f"Math.hypot(shown.rb[0] - {middle[0]}, shown.rb[1] - {middle[1]}) < .004")
-        made = rb_of(parse_mixture(light(tab)).white(page.lut)).tolist()
-        assert tab.value("plane.chosen") == pytest.approx(made)
+        data_set = rb_of(parse_mixture(light(tab)).white(page.lut)).tolist()
+        assert tab.value("plane.chosen") == pytest.approx(data_set)
         tab.value("document.getElementById('plane').focus()")
         tab.press("ArrowRight")
-        tab.wait_for(f"Math.abs(shown.rb[0] - {made[0] + 0.001}) < 2e-5")
+        tab.wait_for(f"Math.abs(shown.rb[0] - {data_set[0] + 0.001}) < 2e-5")
         tab.press("PageDown")
         tab.wait_for("shown.light === '1'")
         far = (place_in_plane(tab, rb[0].tolist())[0] + 40, place_in_plane(tab, rb[0].tolist())[1])
@@ -441,15 +439,15 @@ def test_a_light_is_picked_dragged_and_moved_by_keys(tab: Tab, page: Explorer) -
         tab.wait_for("document.getElementById('light-facts').textContent.includes('nearest')")
 
 
-def forget_refusals(tab: Tab) -> None:
-    """Forget what the browser itself logs of an answer that the page tells."""
+def clear_refused_requests(tab: Tab) -> None:
+    """Clear errors that the browser logs for refused requests."""
     assert tab.errors
     assert all("status of 422" in error for error in tab.errors)
     tab.errors.clear()
 
 
 @pytest.mark.slow
-def test_two_lights_are_mixed(tab: Tab, page: Explorer) -> None:
+def test_mixes_two_lights(tab: Tab, page: Explorer) -> None:
     with shown(tab, page):
         tab.value(
             "(() => { const other = $('other'); other.value = '2'; other.dispatchEvent(new Event('change')); })()"
@@ -459,19 +457,19 @@ def test_two_lights_are_mixed(tab: Tab, page: Explorer) -> None:
         tab.wait_for("shown.light === '0:0.8+2:0.2'")
         assert light(tab) == "0:0.8+2:0.2"
         assert text_of(tab, "share-text") == "20 %"
-        for share, alone in (("0", "0"), ("1", "2")):
+        for share, light_number in (("0", "0"), ("1", "2")):
             tab.value(f"(() => {{ $('share').value = '{share}'; $('share').dispatchEvent(new Event('input')); }})()")
-            tab.wait_for(f"shown.light === '{alone}'")
+            tab.wait_for(f"shown.light === '{light_number}'")
         tab.value("(() => { $('text').value = '4000K'; $('write').requestSubmit(); })()")
         tab.wait_for("shown.parts.length === 2 && shown.parts[1][0] === 1")
         tab.value("(() => { $('text').value = 'sunny'; $('write').requestSubmit(); })()")
         tab.wait_for("!document.getElementById('fault').hidden")
         assert "sunny" in text_of(tab, "fault")
-        forget_refusals(tab)
+        clear_refused_requests(tab)
 
 
 @pytest.mark.slow
-def test_of_many_moves_the_last_is_shown(tab: Tab, page: Explorer) -> None:
+def test_shows_last_of_many_selections(tab: Tab, page: Explorer) -> None:
     with shown(tab, page):
         tab.value("(() => { for (let i = 0; i < 60; i++) pick(i % 3); pick(1); })()")
         tab.wait_for("shown.light === '1'")
@@ -480,14 +478,14 @@ def test_of_many_moves_the_last_is_shown(tab: Tab, page: Explorer) -> None:
 
 
 @pytest.mark.slow
-def test_a_pixel_is_measured(tab: Tab, page: Explorer) -> None:
+def test_measures_pixel(tab: Tab, page: Explorer) -> None:
     with shown(tab, page):
         tab.value("document.querySelector('.screen').focus()")
         for key in ("ArrowLeft", "ArrowDown", "ArrowDown"):
             tab.press(key)
-        at = tab.value("state.at")
+        pixel = tab.value("state.at")
         image = page.counts(0, "0", "codes")
-        assert at == [image.shape[1] // 2 - 1, image.shape[0] // 2 + 2]
+        assert pixel == [image.shape[1] // 2 - 1, image.shape[0] // 2 + 2]
         rows = (
             "[...panels[{}].rows.querySelectorAll('tr')].map((row) => [...row.cells].map((cell) => cell.textContent))"
         )
@@ -495,22 +493,22 @@ def test_a_pixel_is_measured(tab: Tab, page: Explorer) -> None:
             tab.wait_for(f"panels[{panel}].rows.textContent.includes('±')")
             image = page.counts(0, "0", rendering)
             for channel, (_, count, spread) in enumerate(tab.value(rows.format(panel))):
-                mean, deviation = (float(part) for part in spread.split("±"))
-                assert int(count) == image[at[1], at[0], channel]
+                mean, deviation = (float(number) for number in spread.split("±"))
+                assert int(count) == image[pixel[1], pixel[0], channel]
                 assert abs(int(count) - mean) < 5 * deviation
         middle = "[...panels[0].loupe.getContext('2d').getImageData(66, 66, 1, 1).data]"
         assert tab.value(middle) == tab.value(
-            f"[...panels[0].canvas.getContext('2d').getImageData({at[0]}, {at[1]}, 1, 1).data]"
+            f"[...panels[0].canvas.getContext('2d').getImageData({pixel[0]}, {pixel[1]}, 1, 1).data]"
         )
         tab.value("pick(2)")
         tab.wait_for("panels[0].drawn === '0 2' && panels[0].rows.textContent.includes('±')")
         count, spread = tab.value(rows.format(0))[1][1:]
-        assert int(count) == page.counts(0, "2", "codes")[at[1], at[0], 1]
-        assert float(spread.split("±")[0]) == pytest.approx(page.pixel(0, "2", "codes", *at)["mean"][1], abs=0.06)
+        assert int(count) == page.counts(0, "2", "codes")[pixel[1], pixel[0], 1]
+        assert float(spread.split("±")[0]) == pytest.approx(page.pixel(0, "2", "codes", *pixel)["mean"][1], abs=0.06)
 
 
 def shades(tab: Tab, view: str) -> np.ndarray[Any, Any]:
-    """Return what the panel by codes shows, (H, W, 3) uint8."""
+    """Return the image in the panel for codes, (H, W, 3) uint8."""
     tab.value(f"document.querySelector('input[value={view}]').click()")
     width, height = tab.value("[panels[0].canvas.width, panels[0].canvas.height]")
     data = "panels[0].canvas.getContext('2d').getImageData(0, 0, panels[0].canvas.width, panels[0].canvas.height).data"
@@ -518,11 +516,11 @@ def shades(tab: Tab, view: str) -> np.ndarray[Any, Any]:
 
 
 @pytest.mark.slow
-def test_views_are_what_they_say(tab: Tab, page: Explorer) -> None:
+def test_views(tab: Tab, page: Explorer) -> None:
     white = page.lut.provenance.white_level
     image = page.counts(0, "0", "codes").astype(np.float64)
     with shown(tab, page):
-        # The browser rounds halves its own way, and brightness is known there to a whole count.
+        # The browser rounds halves differently and uses brightness rounded to counts.
         assert np.abs(shades(tab, "counts") - 255 * image / white).max() <= 0.51
         assert np.abs(shades(tab, "camera").astype(int) - flash(image / white)).max() <= 2
         truth = page.lut.white[0]
@@ -545,7 +543,7 @@ def drop(tab: Tab, name: str, data: bytes) -> None:
 
 
 @pytest.mark.slow
-def test_pictures_are_gone_through_and_dropped(tab: Tab, page: Explorer) -> None:
+def test_browses_and_drops_pictures(tab: Tab, page: Explorer) -> None:
     with shown(tab, page):
         tab.value("document.getElementById('next').click()")
         tab.wait_for(f"shown.picture.name === 'other.png' && {DRAWN}")
@@ -561,11 +559,11 @@ def test_pictures_are_gone_through_and_dropped(tab: Tab, page: Explorer) -> None
         drop(tab, "letter.txt", b"Dear Sir")
         tab.wait_for("document.getElementById('fault').textContent.includes('letter.txt')")
         assert tab.value("state.picture") == 0
-        forget_refusals(tab)
+        clear_refused_requests(tab)
 
 
 @pytest.mark.slow
-def test_a_phone_is_shown_the_same_behind_the_token(tab: Tab, page: Explorer) -> None:
+def test_phone_with_token(tab: Tab, page: Explorer) -> None:
     with shown(tab, page, width=390, dark=True, host="0.0.0.0") as server:
         assert len(server.path) > 20
         drop(tab, "mine.png", png(3, 80, 60))
@@ -574,15 +572,13 @@ def test_a_phone_is_shown_the_same_behind_the_token(tab: Tab, page: Explorer) ->
 
 
 @pytest.mark.slow
-def test_a_rendering_that_cannot_be_is_said_beside_the_other(
-    tab: Tab, page: Explorer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_rendering_is_reported_in_its_panel(tab: Tab, page: Explorer, monkeypatch: pytest.MonkeyPatch) -> None:
     counts = page.counts
 
-    def refused(number: int, chosen: str, rendering: Any) -> Any:
+    def refused(number: int, light: str, rendering: Any) -> Any:
         if rendering == "colorimetric":
             raise QualityError("the print has no contrast; render by codes")
-        return counts(number, chosen, rendering)
+        return counts(number, light, rendering)
 
     monkeypatch.setattr(page, "counts", refused)
     with ExploreServer(page, "127.0.0.1", 0) as server:
@@ -601,18 +597,18 @@ def test_a_rendering_that_cannot_be_is_said_beside_the_other(
 
 
 @pytest.mark.slow
-def test_a_light_without_one_colour_is_balanced_as_well(tab: Tab, page: Explorer) -> None:
+def test_balances_light_without_blue(tab: Tab, page: Explorer) -> None:
     image = page.counts(0, "0", "codes").astype(np.float64)
     with shown(tab, page):
-        # As if the light had a thousandth of its blue: what is divided by that is brighter than any count.
+        # Blue of the ground truth is reduced to 1/1000, so balanced values exceed all counts.
         truth = page.lut.white[0] * [1, 1, 1e-3]
         tab.value(f"shown.truth = {json.dumps((truth / truth.sum()).tolist())}")
-        wanted = flash(image / page.lut.provenance.white_level * truth[1] / truth)
-        assert np.abs(shades(tab, "balanced").astype(int) - wanted).max() <= 2
+        expected = flash(image / page.lut.provenance.white_level * truth[1] / truth)
+        assert np.abs(shades(tab, "balanced").astype(int) - expected).max() <= 2
 
 
 @pytest.mark.slow
-def test_a_picture_that_cannot_be_read_is_named_and_passed(tab: Tab, page: Explorer, tmp_path: Path) -> None:
+def test_unreadable_picture_is_reported_and_skipped(tab: Tab, page: Explorer, tmp_path: Path) -> None:
     with shown(tab, page):
         (tmp_path / "pictures" / "other.png").write_bytes(b"no picture")
         tab.value("document.getElementById('next').click()")
@@ -621,12 +617,12 @@ def test_a_picture_that_cannot_be_read_is_named_and_passed(tab: Tab, page: Explo
         tab.wait_for("panels[0].rows.textContent.includes('±')")
         tab.value("document.getElementById('next').click()")
         tab.wait_for("document.getElementById('fault').hidden && state.picture === 0")
-        forget_refusals(tab)
+        clear_refused_requests(tab)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("width", "dark"), [(390, True), (1280, False)])
-def test_nothing_is_cut_faint_or_nameless(tab: Tab, page: Explorer, width: int, dark: bool) -> None:
+def test_layout_contrast_and_labels(tab: Tab, page: Explorer, width: int, dark: bool) -> None:
     with shown(tab, page, width=width, dark=dark):
         tab.value("move([.25, .3])")
         tab.value("point([20, 20])")

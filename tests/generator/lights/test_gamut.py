@@ -1,8 +1,6 @@
-"""Mixtures of a table's lights: the nearest few for a wanted light, and as the same light photographed."""
+"""Gamut of a LUT: mixtures for a target, and their agreement with photographed illuminants."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -24,25 +22,21 @@ from generator.lights.gamut import (
     rb_of,
     rgb_of,
 )
-from generator.lights.lighting import Mixture, plain
+from generator.lights.lighting import Mixture, single_mixture
 from sim.world.world import Room
 from tests.calibration.lab import SETTINGS, Lab, hang, take
 from tests.generator.conftest import MakeLut
-
-if TYPE_CHECKING:
-    pass
-
 
 PRIMARIES = np.array([[5000.0, 900.0, 300.0], [900.0, 6000.0, 1000.0], [150.0, 1100.0, 4800.0]])
 
 
 def grid(steps: int = 8) -> npt.NDArray[np.float64]:
-    """Return the whites of a triangular grid of lights, each with its brightest primary at full drive."""
+    """Return the ground truths of a triangular grid of illuminants, with the brightest primary at full drive."""
     drives = np.array([[i, steps - i - j, j] for i in range(steps + 1) for j in range(steps + 1 - i)], dtype=np.float64)
     return drives / drives.max(axis=1, keepdims=True) @ PRIMARIES
 
 
-def made(gamut: Gamut, mixture: Mixture) -> npt.NDArray[np.float64]:
+def mixed_rgb(gamut: Gamut, mixture: Mixture) -> npt.NDArray[np.float64]:
     return np.asarray(mixture.weights) @ gamut.white[list(mixture.lights)]
 
 
@@ -52,25 +46,25 @@ _drives = st.tuples(*[st.floats(0.001, 1.0)] * 3)
 
 
 @given(_drives)
-def test_any_light_within_is_matched_by_three_neighbours_at_most(drives: tuple[float, float, float]) -> None:
-    wanted = np.array(drives) @ PRIMARIES
-    match = GRID.match(wanted)
+def test_matches_any_light_with_at_most_three_neighbours(drives: tuple[float, float, float]) -> None:
+    target = np.array(drives) @ PRIMARIES
+    match = GRID.match(target)
     assert len(match.mixture.lights) <= 3
-    off = float(angles_deg(made(GRID, match.mixture), wanted))
-    assert off == pytest.approx(match.angle, abs=1e-9)
-    # Three lights match exactly, but for weights in billionths.
-    assert off < (1e-6 if len(match.mixture.lights) == 3 else TOLERANCE_DEG)
+    angle = float(angles_deg(mixed_rgb(GRID, match.mixture), target))
+    assert angle == pytest.approx(match.angle, abs=1e-9)
+    # Three illuminants match exactly, except for the rounding of weights.
+    assert angle < (1e-6 if len(match.mixture.lights) == 3 else TOLERANCE_DEG)
     assert sum(match.mixture.weights) == pytest.approx(1, abs=1e-12)
-    # Neighbours: no light of the mixture is farther than the farthest side of any triangle of the grid.
+    # Illuminants of the mixture are neighbours: their distance is at most the longest side of a triangle.
     lights = GRID.white[list(match.mixture.lights)]
     longest = angles_deg(GRID.directions[GRID.edges[:, 0]], GRID.directions[GRID.edges[:, 1]]).max()
     assert angles_deg(lights[:, None], lights[None]).max() <= longest + 1e-9
 
 
-def test_the_fewest_lights_that_do() -> None:
-    one = GRID.match(3 * GRID.white[17])
-    assert (one.mixture.lights, one.mixture.weights) == ((17,), (1.0,))
-    assert one.angle < 1e-6
+def test_uses_fewest_lights() -> None:
+    single = GRID.match(3 * GRID.white[17])
+    assert (single.mixture.lights, single.mixture.weights) == ((17,), (1.0,))
+    assert single.angle < 1e-6
     first, second = (int(light) for light in GRID.edges[20])
     two = GRID.match(GRID.white[first] + 2 * GRID.white[second]).mixture
     assert two.lights == (first, second)
@@ -81,56 +75,56 @@ def test_the_fewest_lights_that_do() -> None:
     np.testing.assert_allclose(three.weights, 1 / 3, atol=2e-9)
 
 
-def test_just_within_and_just_beyond_the_tolerance_of_one_light() -> None:
+def test_tolerance_of_one_light() -> None:
     axis = np.cross(GRID.directions[17], [0.3, -0.5, 0.4])
     axis /= np.linalg.norm(axis)
     for share, lights in ((0.9, 1), (1.2, 2)):
-        turned = GRID.directions[17] + np.radians(share * TOLERANCE_DEG) * axis
-        assert len(GRID.match(turned).mixture.lights) >= lights
-        assert (len(GRID.match(turned).mixture.lights) == 1) == (lights == 1)
+        rotated = GRID.directions[17] + np.radians(share * TOLERANCE_DEG) * axis
+        assert len(GRID.match(rotated).mixture.lights) >= lights
+        assert (len(GRID.match(rotated).mixture.lights) == 1) == (lights == 1)
 
 
 @pytest.mark.slow
-def test_a_light_outside_is_refused_with_how_far_and_what_is_nearest() -> None:
-    wanted = rgb_of([0.9, 0.02])
+def test_refuses_light_outside_gamut_with_nearest() -> None:
+    target = rgb_of([0.9, 0.02])
     with pytest.raises(InputError, match=r"r=0\.9000, b=0\.0200.*° outside.*r=") as info:
-        GRID.match(wanted)
-    nearest = GRID.match(wanted, outside="nearest")
-    # By brute force: no mixture of any two lights is nearer.
+        GRID.match(target)
+    nearest = GRID.match(target, outside="nearest")
+    # Brute force over all mixtures of two illuminants.
     share = np.linspace(0, 1, 401)[:, None, None, None]
     pairs = share * GRID.directions[:, None] + (1 - share) * GRID.directions[None]
-    least = angles_deg(pairs.reshape(-1, 3), wanted).min()
-    assert nearest.angle == pytest.approx(least, rel=1e-4)
+    smallest = angles_deg(pairs.reshape(-1, 3), target).min()
+    assert nearest.angle == pytest.approx(smallest, rel=1e-4)
     assert f"{nearest.angle:.2f}°" in str(info.value)
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
-def test_what_is_contained_is_matched_and_what_is_not_is_refused(r: float, b: float) -> None:
+def test_contains_agrees_with_match(r: float, b: float) -> None:
     if r + b > 1:
         r, b = 1 - r, 1 - b
-    wanted = rgb_of([r, b])
-    if GRID.contains(wanted[None])[0]:
-        assert GRID.match(wanted).angle <= TOLERANCE_DEG
+    target = rgb_of([r, b])
+    if GRID.contains(target[None])[0]:
+        assert GRID.match(target).angle <= TOLERANCE_DEG
     else:
-        # Nonnegative drives of the primaries are what is within; rounding and the tolerance blur the border.
-        drives = np.linalg.solve(PRIMARIES.T, wanted)
+        # The gamut is the set of nonnegative drives of the primaries, except for rounding and the tolerance.
+        drives = np.linalg.solve(PRIMARIES.T, target)
         assert drives.min() < 1e-9
 
 
-@pytest.mark.parametrize("wanted", [[0.0, 0, 0], [1, -1, 1], [1, 2], [np.nan, 1, 1], [[1, 2, 3]]])
-def test_what_is_no_light_is_refused(wanted: list[float]) -> None:
+@pytest.mark.parametrize("target", [[0.0, 0, 0], [1, -1, 1], [1, 2], [np.nan, 1, 1], [[1, 2, 3]]])
+def test_refuses_invalid_light(target: list[float]) -> None:
     with pytest.raises(InputError):
-        GRID.match(wanted)
+        GRID.match(target)
 
 
-def test_chromaticities_there_and_back() -> None:
+def test_chromaticity_round_trip() -> None:
     rgb = np.array([[2.0, 5.0, 1.0], [0.1, 0.2, 0.7]])
     np.testing.assert_allclose(rb_of(rgb), [[0.25, 0.125], [0.1, 0.7]])
     np.testing.assert_allclose(rgb_of(rb_of(rgb)), rgb / rgb.sum(axis=1, keepdims=True))
     np.testing.assert_array_equal(GRID.contains(rb_of(GRID.white * 1.0)[40:41]), [True])
 
 
-def test_lights_on_a_line_make_what_lies_between_neighbours() -> None:
+def test_lights_on_a_line_mix_neighbours() -> None:
     line = Gamut(np.array([[1.0, 4.0, 3.0], [3.0, 4.0, 1.0], [2.0, 4.0, 2.0], [2.0, 4.0, 2.0]]))
     assert len(line.triangles) == 0
     match = line.match([1.25, 4, 2.75])
@@ -142,15 +136,15 @@ def test_lights_on_a_line_make_what_lies_between_neighbours() -> None:
 
 
 @pytest.mark.parametrize("lights", [1, 2])
-def test_tables_of_one_and_two_lights(lights: int) -> None:
-    few = Gamut(PRIMARIES[:lights])
-    assert few.match(PRIMARIES[0]).mixture.lights == (0,)
-    assert few.match(PRIMARIES[:lights].sum(axis=0)).mixture.lights == tuple(range(lights))
-    assert few.match([1.0, 0.0, 0.0], "nearest").mixture.lights == (0,)
+def test_gamut_of_one_or_two_lights(lights: int) -> None:
+    small_gamut = Gamut(PRIMARIES[:lights])
+    assert small_gamut.match(PRIMARIES[0]).mixture.lights == (0,)
+    assert small_gamut.match(PRIMARIES[:lights].sum(axis=0)).mixture.lights == tuple(range(lights))
+    assert small_gamut.match([1.0, 0.0, 0.0], "nearest").mixture.lights == (0,)
 
 
-def test_black_bodies_are_joined_by_mired(make_lut: MakeLut) -> None:
-    # The table's black bodies are lights 1 and 3, of 3001 and 3003 K.
+def test_interpolates_black_bodies_in_mired(make_lut: MakeLut) -> None:
+    # The black bodies of the LUT are the illuminants 1 and 3, at 3001 and 3003 K.
     lut = make_lut(lights=5)
     assert black_body(lut, 3001).lights == (1,)
     assert black_body(lut, 3003).lights == (3,)
@@ -163,7 +157,7 @@ def test_black_bodies_are_joined_by_mired(make_lut: MakeLut) -> None:
     assert angles_deg(nearly, lut.white[1]) < angles_deg(nearly, lut.white[3])
 
 
-def test_a_temperature_beyond_the_tables_is_refused(make_lut: MakeLut) -> None:
+def test_refuses_temperature_outside_range(make_lut: MakeLut) -> None:
     lut = make_lut(lights=5)
     for cct_k in (3000.9, 3003.1):
         with pytest.raises(InputError):
@@ -172,6 +166,7 @@ def test_a_temperature_beyond_the_tables_is_refused(make_lut: MakeLut) -> None:
         black_body(make_lut(lights=1, name="none"), 3001)
 
 
+# Three illuminants, the even mixture of the first two, and the even mixture of all three.
 CODES = (
     Colour(255, 100, 40),
     Colour(255, 200, 240),
@@ -179,7 +174,6 @@ CODES = (
     Colour(255, 150, 140),
     Colour(255, 120, 160),
 )
-"""Three lights, the even mixture of the first two, and the even mixture of all three."""
 
 CASES = (
     pytest.param(Mixture((0, 1), (0.5, 0.5)), 3, id="two"),
@@ -208,13 +202,11 @@ def variances(samples: npt.NDArray[np.uint16]) -> npt.NDArray[np.float64]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("mixture", "photographed"), CASES)
-def test_white_and_every_colour_are_those_of_the_real_light(
-    mixture: Mixture, photographed: int, table: Lut, lab: Lab
-) -> None:
+def test_mixture_matches_photographed_light(mixture: Mixture, photographed: int, table: Lut, lab: Lab) -> None:
     truth = lab.world.white(CODES[photographed], SETTINGS)
     white = mixture.white(table)
     assert angles_deg(white, table.white[photographed]) < 0.05
-    # The small chart's table is itself within 0.2° of the room's light.
+    # The LUT of this small chart is itself within 0.2° of the true illuminant.
     assert angles_deg(white, truth) < 0.2
     np.testing.assert_allclose(white / table.white[photographed], 1, atol=0.005)
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
@@ -229,12 +221,9 @@ def test_white_and_every_colour_are_those_of_the_real_light(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("mixture", "photographed"), CASES)
-def test_noise_is_that_of_one_exposure(mixture: Mixture, photographed: int, table: Lut) -> None:
-    """Variances of 512 cells, pooled in each channel; the ratio of two of them follows F.
-
-    The cells of one table share their lens and paper, but their noise is independent, so each channel has 512 · 24
-    degrees of freedom. Six tests at 10⁻⁶ each; averaged noise would be half as large and fail by a hundred orders.
-    """
+def test_mixture_has_noise_of_one_exposure(mixture: Mixture, photographed: int, table: Lut) -> None:
+    # Pooled variances of 512 patches; their ratio follows the F distribution with 512 · 24 degrees of freedom, because
+    # the noise of patches is independent. Six tests at 10⁻⁶ each. Averaged noise would be half as large.
     real = variances(table.samples[photographed])
     mixed = variances(mixture.samples(table))
     freedom = 24 * len(real)
@@ -242,15 +231,15 @@ def test_noise_is_that_of_one_exposure(mixture: Mixture, photographed: int, tabl
     expected = (real + mixed) / 2
     for channel in range(3):
         ratio = mixed[:, channel].sum() / real[:, channel].sum()
-        # The sum over unequal cells has fewer degrees of freedom than their number (Satterthwaite); allow for it.
+        # Patches with unequal variances have fewer degrees of freedom (Satterthwaite).
         cells = expected[:, channel].sum() ** 2 / (expected[:, channel] ** 2).sum()
         spread = np.sqrt(len(real) / cells)
         assert 1 + (low - 1) * spread < ratio < 1 + (high - 1) * spread
 
 
 @pytest.mark.slow
-def test_the_mixture_found_for_a_real_light_is_that_light(table: Lut, lab: Lab) -> None:
-    """Ask for the white of a light that was photographed but left out: its colours come out, too."""
+def test_match_of_photographed_light_reproduces_its_colours(table: Lut, lab: Lab) -> None:
+    # The target was photographed but is not in the gamut's list; its colours must be reproduced as well.
     gamut = Gamut(table.white[:3])
     match = gamut.match(table.white[4])
     assert match.mixture.lights == (0, 1, 2)
@@ -260,4 +249,4 @@ def test_the_mixture_found_for_a_real_light_is_that_light(table: Lut, lab: Lab) 
     mean = match.mixture.samples(table).astype(np.float64).mean(axis=1) / match.mixture.white(table)
     lit = true * table.white[4] > 300
     assert np.sqrt(((mean / true - 1)[lit] ** 2).mean()) < 0.01
-    assert plain(4).samples(table).shape == match.mixture.samples(table).shape
+    assert single_mixture(4).samples(table).shape == match.mixture.samples(table).shape

@@ -1,4 +1,4 @@
-"""Masks of every kind: shares that sum to 1, shapes by their numbers, files, and the same masks for a seed."""
+"""Masks from files and of every computed shape."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.pinned import Pinned
 RAMP = np.tile(np.linspace(0, 1, 64), (48, 1))
 
 
-def save(path: Path, values: npt.NDArray[Any], bits: int = 8) -> None:
+def save_mask(path: Path, values: npt.NDArray[Any], bits: int = 8) -> None:
     """Write a mask from 0 to 1, grey or RGB(A)."""
     scaled = np.rint(values * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
     if scaled.ndim == 3:
@@ -36,94 +36,94 @@ def save(path: Path, values: npt.NDArray[Any], bits: int = 8) -> None:
     assert cv2.imwrite(str(path), scaled)
 
 
-def test_one_mask_is_where_the_second_light_falls(tmp_path: Path) -> None:
-    save(tmp_path / "a.png", RAMP, 16)
+def test_single_mask_is_of_second_light(tmp_path: Path) -> None:
+    save_mask(tmp_path / "a.png", RAMP, 16)
     maps = find_masks(tmp_path, 2).maker(0).weights(48, 64, 2)
     np.testing.assert_allclose(maps[..., 1], RAMP, atol=1 / FULL)
     np.testing.assert_array_equal(np.rint(maps.astype(np.float64) * FULL).sum(axis=2), FULL)
 
 
 @pytest.mark.slow
-def test_as_many_masks_as_lights_are_divided_by_their_sum(tmp_path: Path) -> None:
-    save(tmp_path / "a_7.png", np.full((48, 64), 0.2))
-    save(tmp_path / "a_8.tif", np.full((48, 64), 0.6), 16)
-    save(tmp_path / "a_10.png", np.zeros((48, 64)))
+def test_normalises_masks_of_all_lights(tmp_path: Path) -> None:
+    save_mask(tmp_path / "a_7.png", np.full((48, 64), 0.2))
+    save_mask(tmp_path / "a_8.tif", np.full((48, 64), 0.6), 16)
+    save_mask(tmp_path / "a_10.png", np.zeros((48, 64)))
     maps = find_masks(tmp_path, 3).maker(0).weights(48, 64, 3)
     np.testing.assert_allclose(maps, np.broadcast_to([0.25, 0.75, 0], maps.shape), atol=1e-4)
 
 
-def test_where_all_masks_are_dark_the_first_light_falls(tmp_path: Path) -> None:
-    save(tmp_path / "a_1.png", np.zeros((4, 4)))
-    save(tmp_path / "a_2.png", np.eye(4))
+def test_first_light_where_masks_are_zero(tmp_path: Path) -> None:
+    save_mask(tmp_path / "a_1.png", np.zeros((4, 4)))
+    save_mask(tmp_path / "a_2.png", np.eye(4))
     maps = find_masks(tmp_path, 2).maker(0).weights(4, 4, 2)
     np.testing.assert_array_equal(maps[..., 1], np.eye(4))
 
 
-def test_masks_that_overlap_leave_nothing_for_the_first_light(tmp_path: Path) -> None:
-    save(tmp_path / "a_1.png", np.full((4, 4), 1.0))
-    save(tmp_path / "a_2.png", np.full((4, 4), 1.0))
+def test_overlapping_masks_leave_no_first_light(tmp_path: Path) -> None:
+    save_mask(tmp_path / "a_1.png", np.full((4, 4), 1.0))
+    save_mask(tmp_path / "a_2.png", np.full((4, 4), 1.0))
     maps = find_masks(tmp_path, 3).maker(0).weights(4, 4, 3)
     np.testing.assert_allclose(maps, np.broadcast_to([0, 0.5, 0.5], maps.shape), atol=1e-5)
 
 
-def test_a_colour_picture_is_three_masks_and_a_grey_one_in_colour_is_one(tmp_path: Path) -> None:
+def test_colour_file_has_three_masks_and_grey_file_one(tmp_path: Path) -> None:
     for name, colour, lights in (("colour", [0.2, 0.2, 0.4], 3), ("grey", [0.2, 0.2, 0.2], 2)):
         folder = tmp_path / name
         folder.mkdir()
         picture = np.broadcast_to(colour, (6, 5, 3))
-        save(folder / "b.png", np.concatenate([picture, np.full((6, 5, 1), 0.3)], axis=2))
+        save_mask(folder / "b.png", np.concatenate([picture, np.full((6, 5, 1), 0.3)], axis=2))
         maps = find_masks(folder, lights).maker(0).weights(6, 5, lights)
         expected = [0.25, 0.25, 0.5] if lights == 3 else [0.8, 0.2]
         np.testing.assert_allclose(maps, np.broadcast_to(expected, maps.shape), atol=1e-4)
 
 
-def test_masks_are_made_to_fit_the_image(tmp_path: Path) -> None:
-    save(tmp_path / "a.png", RAMP, 16)
+def test_resizes_masks_to_image(tmp_path: Path) -> None:
+    save_mask(tmp_path / "a.png", RAMP, 16)
     for height, width in ((12, 16), (96, 256), (96, 16)):
         maps = find_masks(tmp_path, 2).maker(0).weights(height, width, 2)
         ramp = np.clip(((np.arange(width) + 0.5) * 64 / width - 0.5) / 63, 0, 1)
         np.testing.assert_allclose(maps[..., 1], np.tile(ramp, (height, 1)), atol=2 / 63)
 
 
-def test_sets_follow_one_another_by_name(tmp_path: Path) -> None:
+def test_uses_sets_in_order_of_names(tmp_path: Path) -> None:
     for name, value in (("b", 0.5), ("a", 0.25), ("c", 0.75)):
-        save(tmp_path / f"{name}.png", np.full((2, 2), value), 16)
+        save_mask(tmp_path / f"{name}.png", np.full((2, 2), value), 16)
     (tmp_path / "notes.txt").write_text("not a mask")
     plan = find_masks(tmp_path, 2)
-    found = [float(plan.maker(number).weights(2, 2, 2)[0, 0, 1]) for number in range(4)]
-    np.testing.assert_allclose(found, [0.25, 0.5, 0.75, 0.25], atol=1e-4)
+    second_weights = [float(plan.maker(number).weights(2, 2, 2)[0, 0, 1]) for number in range(4)]
+    np.testing.assert_allclose(second_weights, [0.25, 0.5, 0.75, 0.25], atol=1e-4)
     described = plan.describe()
     assert (described["masks"], described["sets"]) == ("files", 3)
-    save(tmp_path / "c.png", np.full((2, 2), 0.7), 16)
+    save_mask(tmp_path / "c.png", np.full((2, 2), 0.7), 16)
     assert find_masks(tmp_path, 2).describe()["sha256"] != described["sha256"]
 
 
 @pytest.mark.parametrize("data", [b"", b"no picture"])
-def test_a_file_that_is_no_picture_is_named(tmp_path: Path, data: bytes) -> None:
+def test_refuses_unreadable_mask(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "bad.png").write_bytes(data)
-    with pytest.raises(FormatError, match=r"bad\.png is no picture"):
+    with pytest.raises(FormatError, match=r"bad\.png cannot be read"):
         find_masks(tmp_path, 2)
 
 
-def test_masks_of_a_dataset_go_to_the_images_of_their_numbers(tmp_path: Path) -> None:
-    """Pictures that were passed over leave holes in the numbers."""
+def test_assigns_numbered_masks_to_images(tmp_path: Path) -> None:
+    # Skipped pictures leave gaps in the numbers.
     for image, value in ((1, 0.25), (4, 0.5), (5, 0.75)):
-        save(tmp_path / f"00000{image}_0.png", np.full((2, 2), 1 - value), 16)
-        save(tmp_path / f"00000{image}_1.png", np.full((2, 2), value), 16)
+        save_mask(tmp_path / f"00000{image}_0.png", np.full((2, 2), 1 - value), 16)
+        save_mask(tmp_path / f"00000{image}_1.png", np.full((2, 2), value), 16)
     plan = find_masks(tmp_path, 2)
-    found = [float(plan.maker(number).weights(2, 2, 2)[0, 0, 1]) for number in (1, 4, 5, 0)]
-    np.testing.assert_allclose(found, [0.25, 0.5, 0.75, 0.25], atol=1e-4)
+    second_weights = [float(plan.maker(number).weights(2, 2, 2)[0, 0, 1]) for number in (1, 4, 5, 0)]
+    np.testing.assert_allclose(second_weights, [0.25, 0.5, 0.75, 0.25], atol=1e-4)
 
 
-def test_files_of_a_camera_are_a_mask_each(tmp_path: Path) -> None:
+def test_camera_file_names_are_single_masks(tmp_path: Path) -> None:
     for number, value in ((1, 0.25), (2, 0.5)):
-        save(tmp_path / f"IMG_000{number}.png", np.full((2, 2), value), 16)
+        save_mask(tmp_path / f"IMG_000{number}.png", np.full((2, 2), value), 16)
     plan = find_masks(tmp_path, 2)
-    found = [float(plan.maker(number).weights(2, 2, 2)[0, 0, 1]) for number in range(3)]
-    np.testing.assert_allclose(found, [0.25, 0.5, 0.25], atol=1e-4)
+    second_weights = [float(plan.maker(number).weights(2, 2, 2)[0, 0, 1]) for number in range(3)]
+    np.testing.assert_allclose(second_weights, [0.25, 0.5, 0.25], atol=1e-4)
 
 
-KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
+SHAPES = ("half-plane", "soft-edge", "spots", "smooth", "window")
 
 Map = npt.NDArray[np.float32]
 
@@ -132,13 +132,13 @@ def weights(text: str, height: int, width: int, lights: int = 2, seed: int = 0, 
     return parse_masks(text, lights, seed).maker(number).weights(height, width, lights)
 
 
-def shrunk(fine: Map, height: int, width: int) -> Map:
+def reduced(fine: Map, height: int, width: int) -> Map:
     return np.asarray(cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 @pytest.mark.slow
 @given(
-    st.sampled_from(KINDS),
+    st.sampled_from(SHAPES),
     st.integers(1, 90),
     st.integers(1, 90),
     st.integers(2, 5),
@@ -146,49 +146,48 @@ def shrunk(fine: Map, height: int, width: int) -> Map:
     st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=60)
-def test_weights_are_whole_parts_that_sum_to_one(
-    kind: str, height: int, width: int, lights: int, seed: int, number: int
+def test_weights_are_quantised_and_sum_to_one(
+    shape: str, height: int, width: int, lights: int, seed: int, number: int
 ) -> None:
-    maps = weights(kind, height, width, lights, seed, number)
+    maps = weights(shape, height, width, lights, seed, number)
     assert (maps.shape, maps.dtype) == ((height, width, lights), np.float32)
-    parts = np.rint(maps.astype(np.float64) * FULL)
-    np.testing.assert_array_equal((parts / FULL).astype(np.float32), maps)
-    np.testing.assert_array_equal(parts.sum(axis=2), FULL)
-    assert parts.min() >= 0
+    quantised = np.rint(maps.astype(np.float64) * FULL)
+    np.testing.assert_array_equal((quantised / FULL).astype(np.float32), maps)
+    np.testing.assert_array_equal(quantised.sum(axis=2), FULL)
+    assert quantised.min() >= 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("lights", [2, 3])
-def test_the_same_look_at_every_size(kind: str, lights: int) -> None:
+def test_masks_look_equal_at_every_size(shape: str, lights: int) -> None:
     for number in range(4):
-        fine = weights(kind, 480, 640, lights, number=number)
-        coarse = weights(kind, 96, 128, lights, number=number)
-        off = np.abs(shrunk(fine, 96, 128) - coarse)
-        # Only pixels that an edge crosses may differ, by less than the edge; edges are few.
-        assert off.mean() < 0.004
-        assert np.quantile(off, 0.97) < 0.05
+        fine = weights(shape, 480, 640, lights, number=number)
+        coarse = weights(shape, 96, 128, lights, number=number)
+        difference = np.abs(reduced(fine, 96, 128) - coarse)
+        # Only the few pixels on an edge may differ.
+        assert difference.mean() < 0.004
+        assert np.quantile(difference, 0.97) < 0.05
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_image_and_seed_has_masks_of_its_own(kind: str) -> None:
-    first = weights(kind, 60, 80)
-    np.testing.assert_array_equal(first, weights(kind, 60, 80))
-    for other in (weights(kind, 60, 80, number=1), weights(kind, 60, 80, seed=1)):
-        assert np.abs(first - other).mean() > 0.01
+@pytest.mark.parametrize("shape", SHAPES)
+def test_masks_differ_between_images_and_seeds(shape: str) -> None:
+    first = weights(shape, 60, 80)
+    np.testing.assert_array_equal(first, weights(shape, 60, 80))
+    for changed in (weights(shape, 60, 80, number=1), weights(shape, 60, 80, seed=1)):
+        assert np.abs(first - changed).mean() > 0.01
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_light_falls_somewhere(kind: str) -> None:
-    """Over forty images each of three lights gets its share; over one, none is left out but by chance."""
-    shares = np.array([weights(kind, 30, 40, 3, number=number).mean(axis=(0, 1)) for number in range(40)])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_every_light_gets_a_share(shape: str) -> None:
+    shares = np.array([weights(shape, 30, 40, 3, number=number).mean(axis=(0, 1)) for number in range(40)])
     assert shares.mean(axis=0).min() > 0.08
     assert (shares > 0.01).mean() > 0.8
 
 
-def test_a_half_plane_has_its_angle() -> None:
-    # The first light on the left, the second on the right; then the first above, the second below.
+def test_half_plane_angle() -> None:
+    # The first illuminant is on the left, then above.
     across = weights("half-plane:angle=0", 40, 80)
     assert across[:, 0, 0].min() == 1
     assert across[:, -1, 1].min() == 1
@@ -200,13 +199,13 @@ def test_a_half_plane_has_its_angle() -> None:
     assert ((across[0, :, 0] > 0) & (across[0, :, 0] < 1)).sum() <= 1
 
 
-def test_strips_follow_one_another() -> None:
+def test_strips_are_in_order() -> None:
     strips = weights("half-plane:angle=0", 4, 300, 4)
     assert strips[0].argmax(axis=1).tolist() == sorted(strips[0].argmax(axis=1))
     assert set(strips[0].argmax(axis=1)) == {0, 1, 2, 3}
 
 
-def test_a_soft_edge_has_its_width() -> None:
+def test_soft_edge_width() -> None:
     edge = weights("soft-edge:angle=0,width=.5", 3, 1000)[0, :, 1]
     between = np.flatnonzero((edge > 0) & (edge < 1))
     assert len(between) == pytest.approx(500, abs=6)
@@ -215,12 +214,12 @@ def test_a_soft_edge_has_its_width() -> None:
     np.testing.assert_allclose(edge, 3 * x**2 - 2 * x**3, atol=2e-3)
 
 
-def test_spots_have_their_size() -> None:
+def test_spot_sizes() -> None:
     for number in range(6):
         spot = weights("spots:count=1,radius=.1,softness=.5", 400, 400, number=number)[..., 1]
         if (spot > 0)[[0, -1]].any() or (spot > 0)[:, [0, -1]].any():
             continue
-        # Half its light within 40 px; nothing beyond 40 + 10; by areas of discs.
+        # The share is 0.5 at 40 px and 0 beyond 50 px; areas of discs.
         assert (spot >= 0.5).sum() == pytest.approx(np.pi * 40**2, rel=0.03)
         assert (spot > 0).sum() == pytest.approx(np.pi * 50**2, rel=0.03)
         assert (spot == 1).sum() == pytest.approx(np.pi * 30**2, rel=0.03)
@@ -229,8 +228,8 @@ def test_spots_have_their_size() -> None:
         pytest.fail("no spot lies within the picture")
 
 
-def test_smooth_fields_change_over_their_scale() -> None:
-    def steepness(scale: float) -> float:
+def test_smooth_field_scale() -> None:
+    def mean_gradient(scale: float) -> float:
         return float(
             np.mean(
                 [
@@ -240,19 +239,19 @@ def test_smooth_fields_change_over_their_scale() -> None:
             )
         )
 
-    assert steepness(0.1) / steepness(0.4) == pytest.approx(4, rel=0.35)
+    assert mean_gradient(0.1) / mean_gradient(0.4) == pytest.approx(4, rel=0.35)
     flat = weights("smooth:contrast=0", 50, 50, 4)
     np.testing.assert_allclose(flat, 0.25, atol=2 / FULL)
-    # Nothing is steeper than an edge of the scale; there is no seam where pieces of the spline meet.
+    # The gradient is limited by the scale, and there are no seams between pieces of the spline.
     field = weights("smooth:scale=.5", 400, 400)[..., 0].astype(np.float64)
     assert np.abs(np.diff(field, axis=1)).max() < 0.06
     assert np.abs(np.diff(field, n=2, axis=0)).max() < 0.006
 
 
 @pytest.mark.slow
-def test_a_window_lies_where_it_was_drawn() -> None:
+def test_window_position() -> None:
     drawn = np.full(64, 0.5)
-    # A small one, a tenth of the picture's width to the left and as far down.
+    # A small window, a tenth of the width to the left and equally far down.
     half, drawn[[0, 2, 3]] = (0.5, 0.375), (0, 0.3, 0.5 + 0.1 / 0.375)
 
     class Drawn(RandomStreams):
@@ -266,7 +265,7 @@ def test_a_window_lies_where_it_was_drawn() -> None:
     assert (u[0, columns].mean(), v[rows, 0].mean()) == pytest.approx((-0.1, 0.1), abs=0.006)
 
 
-def test_windows_have_their_panes() -> None:
+def test_window_panes() -> None:
     for number in range(20):
         lit = weights("window:columns=3,rows=2,softness=0.002", 400, 400, number=number)[..., 1] > 0.5
         if lit[[0, -1]].any() or lit[:, [0, -1]].any():
@@ -280,14 +279,14 @@ def test_windows_have_their_panes() -> None:
         pytest.fail("no window lies within the picture")
 
 
-def test_whole_parts_give_what_is_left_to_the_largest() -> None:
+def test_largest_share_absorbs_rounding() -> None:
     out = np.empty((1, 1, 3), np.float32)
     quantise_shares(np.array([1, 1, 1.0001], np.float32).reshape(3, 1, 1), out)
     assert np.rint(out * FULL).ravel().tolist() == [21844, 21844, 21847]
 
 
 @given(hnp.arrays(np.float32, (2, 3, 37), elements=st.floats(0, 1, width=32)))
-def test_whole_parts_of_two_are_those_of_three_one_of_which_is_dark(shares: npt.NDArray[np.float32]) -> None:
+def test_two_lights_equal_three_with_a_dark_one(shares: npt.NDArray[np.float32]) -> None:
     shares[0] += np.float32(2**-20) * (shares.sum(axis=0) == 0)
     two, three = np.empty((3, 37, 2), np.float32), np.empty((3, 37, 3), np.float32)
     quantise_shares(shares, two)
@@ -317,30 +316,30 @@ REFUSED = ("window:columns=1.5", "spots:count=0", "spots:count=21", "smooth:scal
 
 
 @pytest.mark.slow
-def test_masks_of_every_kind(pinned: Pinned) -> None:
-    found: dict[str, Any] = {}
+def test_pinned_masks(pinned: Pinned) -> None:
+    results: dict[str, Any] = {}
     for text in TEXTS:
         for lights in (2, 3, 5):
             plan = parse_masks(text, lights, 2**35 + 4)
-            made = [
+            weight_maps = [
                 plan.maker(number).weights(height, width, lights)
                 for number, (height, width) in enumerate(((11, 14), (16, 5), (1, 1), (1, 9)))
             ]
-            found[f"{text} {lights}"] = [
+            results[f"{text} {lights}"] = [
                 plan.describe(),
-                made[0][5, ::5],
-                b"".join(weights.tobytes() for weights in made),
+                weight_maps[0][5, ::5],
+                b"".join(weights.tobytes() for weights in weight_maps),
             ]
     for text in REFUSED:
         with pytest.raises(CropError) as refused:
             parse_masks(text, 2, 0)
-        found[text] = str(refused.value)
-    # More rows than are computed at a time.
-    found["tall"] = parse_masks("smooth", 2, 1).maker(0).weights(1200, 60, 2)
-    pinned("masks of every kind", found)
+        results[text] = str(refused.value)
+    # More rows than are computed at once.
+    results["tall"] = parse_masks("smooth", 2, 1).maker(0).weights(1200, 60, 2)
+    pinned("masks of every kind", results)
 
 
 @pytest.mark.slow
-def test_streams_are_of_the_words() -> None:
+def test_streams_use_philox_words() -> None:
     words = philox.words(2**40 + 9, np.arange(5), 2, 7, philox.MASKS)[0]
     np.testing.assert_allclose(RandomStreams(2**40 + 9, 7).uniform(2, 5), (words + 0.5) / 2**32, rtol=1e-15)

@@ -1,4 +1,4 @@
-"""Maps written beside images."""
+"""Masks and ground truth maps of images."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ from hypothesis.extra import numpy as hnp
 from foundation.colorimetry import angles_deg
 from foundation.errors import FormatError
 from generator.files import encode_map
-from generator.lights.lighting import Lighting, plain
+from generator.lights.lighting import Lighting, single_mixture
 from generator.masks.making import FULL, find_masks, parse_masks
 from generator.masks.maps import decode_ground_truth, decode_weights, encode_maps
 from tests.generator.conftest import MakeLut
 
 
 @pytest.mark.parametrize("lights", [2, 3])
-def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: MakeLut, lights: int) -> None:
+def test_map_round_trip(tmp_path: Path, make_lut: MakeLut, lights: int) -> None:
     lut = make_lut()
-    shining = [0, 2, 3][:lights]
-    lighting = Lighting(tuple(plain(light) for light in shining), parse_masks("smooth", lights, 1).maker(0))
+    light_numbers = [0, 2, 3][:lights]
+    lighting = Lighting(
+        tuple(single_mixture(light) for light in light_numbers), parse_masks("smooth", lights, 1).maker(0)
+    )
     weights = lighting.weights_of(40, 60)
     names: list[str] = []
     for folder, suffix, data in encode_maps(weights, lighting.whites(lut)):
@@ -38,15 +40,15 @@ def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: Make
     *masks, truths = [(tmp_path / name).read_bytes() for name in names]
     np.testing.assert_array_equal(decode_weights(masks, "it"), weights)
     truth = decode_ground_truth(truths, "it")
-    exact = weights.astype(np.float64) @ lut.white[shining]
+    exact = weights.astype(np.float64) @ lut.white[light_numbers]
     assert angles_deg(truth.astype(np.float64), exact).max() < 0.002
     np.testing.assert_allclose(truth.sum(axis=2), 1, atol=1e-6)
-    # The same by an independent reader; and the masks can be given again.
+    # An independent reader gives the same, and the files are valid input masks.
     with PIL.Image.open(tmp_path / "masks/000004_1.png") as mask:
         assert mask.mode == "I;16"
         np.testing.assert_array_equal(np.asarray(mask), np.rint(weights[..., 1] * FULL))
-    again = find_masks(tmp_path / "masks", lights).maker(0)
-    np.testing.assert_array_equal(again.weights(40, 60, lights), weights)
+    reread = find_masks(tmp_path / "masks", lights).maker(0)
+    np.testing.assert_array_equal(reread.weights(40, 60, lights), weights)
 
 
 @given(
@@ -54,15 +56,15 @@ def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: Make
         lambda channels: hnp.arrays(np.uint16, st.tuples(st.integers(1, 9), st.integers(1, 9), *map(st.just, channels)))
     )
 )
-def test_any_map_is_read_by_others(values: npt.NDArray[np.uint16]) -> None:
+def test_other_readers_read_any_map(values: npt.NDArray[np.uint16]) -> None:
     data = encode_map(values)
     np.testing.assert_array_equal(imagecodecs.png_decode(data), values)
-    seen = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    assert seen is not None
-    np.testing.assert_array_equal(seen if values.ndim == 2 else seen[..., ::-1], values)
+    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert decoded is not None
+    np.testing.assert_array_equal(decoded if values.ndim == 2 else decoded[..., ::-1], values)
 
 
-def test_maps_that_are_damaged_are_named() -> None:
+def test_refuses_damaged_maps() -> None:
     masks = [encode_map(np.ones(shape, np.uint16)) for shape in ((2, 2), (2, 3))]
     with pytest.raises(FormatError):
         decode_weights(masks, "it")

@@ -223,7 +223,7 @@ def test_pictures_of_a_store_are_those_of_a_folder(tmp_path: Path, colours: npt.
         alone.read()
     with pytest.raises(InputError):
         find_pictures([f"memory://{tmp_path.name}/nothing"])
-    with pytest.raises(InputError, match="cannot reach nostore://"):
+    with pytest.raises(InputError, match="cannot open the store nostore://"):
         find_pictures(["nostore://a/b"])
 
 

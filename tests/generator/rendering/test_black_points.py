@@ -17,7 +17,7 @@ from generator.dataset.plan import DatasetOptions
 from generator.dataset.shards import photograph
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_batch
-from generator.lights.lighting import Lighting, Mixture, plain
+from generator.lights.lighting import Lighting, Mixture, single_mixture
 from generator.rendering.black_points import BlackPoint, Veil, black_of, parse_black_point, veil_of, without_veil
 from generator.rendering.matrices import ColourMatrix
 from tests.generator.conftest import MakeLut
@@ -85,7 +85,7 @@ def test_white_stays_to_the_last_bit_and_saturation_stays_saturated() -> None:
     samples = np.concatenate([np.repeat(BLACK[None, None], 25, axis=1), np.full((7, 25, 3), 3500)]).astype(np.uint16)
     provenance = SimpleNamespace(bits=1, white_level=3500, unfit=())
     lut = SimpleNamespace(samples=samples[None], white=WHITE[None] * 1.5, provenance=provenance, folder="lut")
-    got = without_veil(samples, veil_of(lut, plain(0), 0.97), 3500)  # pyrefly: ignore[bad-argument-type]
+    got = without_veil(samples, veil_of(lut, single_mixture(0), 0.97), 3500)  # pyrefly: ignore[bad-argument-type]
     assert (got[1:] == 3500).all()
     assert got[0].max() < 9
 
@@ -107,10 +107,10 @@ def test_nothing_wraps_at_either_end() -> None:
 def test_black_is_that_of_the_light_its_mixture_and_the_nearest_fit_cell(make_lut: MakeLut) -> None:
     lut = make_lut()
     means = lut.samples[:, 0].mean(axis=1)
-    np.testing.assert_allclose(black_of(lut, plain(2)), means[2])
+    np.testing.assert_allclose(black_of(lut, single_mixture(2)), means[2])
     np.testing.assert_allclose(black_of(lut, Mixture((1, 3), (0.25, 0.75))), 0.25 * means[1] + 0.75 * means[3])
     stained = make_lut(unfit=(0,), name="stained")
-    np.testing.assert_allclose(black_of(stained, plain(2)), stained.samples[2, 1].mean(axis=0))
+    np.testing.assert_allclose(black_of(stained, single_mixture(2)), stained.samples[2, 1].mean(axis=0))
     mixture = Mixture((1, 3), (0.25, 0.75))
     half = veil_of(lut, mixture, 0.5)
     np.testing.assert_allclose((mixture.white(lut) - half.taken) * half.stretch, mixture.white(lut))
@@ -210,7 +210,7 @@ def test_black_of_a_picture_is_black_where_mixtures_are_brighter_than_the_black_
 
     lut = make_table(bits=4, change=redden)
     white = lut.white[1]
-    black = float((black_of(lut, plain(1)) / white).min())
+    black = float((black_of(lut, single_mixture(1)) / white).min())
     codes = np.zeros((64, 64, 3), np.uint8)
     codes[32:] = 40
     codes[:, 32:] += 215
@@ -219,7 +219,7 @@ def test_black_of_a_picture_is_black_where_mixtures_are_brighter_than_the_black_
     for share in (0.0, 0.5, 1.0):
         monkeypatch.setattr(BlackPoint, "share", Mock(return_value=share))
         taken = options if share == 0 else replace(options, black_point=BlackPoint("compensate"))
-        image = photograph(lut, codes, Lighting((plain(1),)), taken, 3, 4, 11536).counts
+        image = photograph(lut, codes, Lighting((single_mixture(1),)), taken, 3, 4, 11536).counts
         seen[share] = np.stack([part.mean(axis=(0, 1)) for part in (image[:32, :32], image[32:, :32])]) / white
     dark, grey = seen[0.0]
     # Mixtures make no grey as dark as the black cell, so what is in that cell is too little to take out.

@@ -18,7 +18,7 @@ from foundation.errors import InputError, QualityError
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.shards import photograph
 from generator.kernels.printing import NODES, SIDE
-from generator.lights.lighting import Lighting, Mixture, plain
+from generator.lights.lighting import Lighting, Mixture, single_mixture
 from generator.rendering import print_inverse
 from generator.rendering.black_points import BlackPoint
 from generator.rendering.colorimetric import (
@@ -62,7 +62,7 @@ def test_greys_are_of_the_light_with_the_noise_of_the_table_and_no_step(make_tab
     own = lut.samples[1][np.arange(1 << bits) * (1 + (1 << bits) + (1 << 2 * bits))].mean(axis=1)
     assert angles_deg(own, lut.white[1]).max() > 4
     options = DatasetOptions(rendering="colorimetric", matrix=MINE)
-    for light in (plain(0), plain(1), Mixture((0, 2), (0.3, 0.7))):
+    for light in (single_mixture(0), single_mixture(1), Mixture((0, 2), (0.3, 0.7))):
         image = photograph(lut, RAMP, Lighting((light,)), options, 3, 4, 11536).counts.astype(np.float64)
         means, spreads = image.mean(axis=1), image.std(axis=1)
         assert angles_deg(means, light.white(lut))[20:].max() < 0.4
@@ -85,7 +85,7 @@ def test_greys_are_of_the_light_with_the_noise_of_the_table_and_no_step(make_tab
 def test_a_print_of_known_colours_is_met_where_it_can_be(make_table: MakeTable) -> None:
     lut = make_table(bits=4)
     rendering = ColorimetricRendering(lut, MINE)
-    seen = rendering.seen(plain(1)) / lut.white[1]
+    seen = rendering.seen(single_mixture(1)) / lut.white[1]
     inside = ~rendering.map.outside
     # This print shows just what its codes say, so that all but its noise and the outermost colours are met.
     assert inside.mean() > 0.8
@@ -93,7 +93,7 @@ def test_a_print_of_known_colours_is_met_where_it_can_be(make_table: MakeTable) 
     shown = (seen - seen[0].mean()) / (seen[-1].mean() - seen[0].mean())
     assert np.abs(shown - wanted)[inside].max() < 0.03
     assert rendering.map.distance[inside].mean() < 0.2
-    assert rendering.black(plain(1)) == pytest.approx(profile_of(lut, 1).black, rel=0.1)
+    assert rendering.black(single_mixture(1)) == pytest.approx(profile_of(lut, 1).black, rel=0.1)
 
 
 @pytest.mark.parametrize(("blue_paper", "white"), [(0.85, 0.99 * 0.85), (0.9, 0.97 * 0.9)])
@@ -131,7 +131,7 @@ def test_black_is_as_dark_as_it_can_be_grey(make_table: MakeTable) -> None:
     assert angles_deg(darker, np.ones(3)).min() > BLACK_WITHIN_DEG
     rendering = ColorimetricRendering(tinted, MINE)
     assert rendering.map.distance[0] <= BLACK_WITHIN_DEG
-    assert rendering.black(plain(1)) == pytest.approx(profile.black, rel=0.26)
+    assert rendering.black(single_mixture(1)) == pytest.approx(profile.black, rel=0.26)
 
 
 def test_a_map_is_found_once_for_a_table_and_a_matrix(
@@ -187,18 +187,20 @@ def test_light_adds_but_for_the_tint_of_greys(make_table: MakeTable) -> None:
     lut = make_table(bits=3)
     rendering = ColorimetricRendering(lut, MINE)
     mixed = rendering.seen(Mixture((0, 2), (0.25, 0.75)))
-    sums = 0.25 * rendering.seen(plain(0)) + 0.75 * rendering.seen(plain(2))
+    sums = 0.25 * rendering.seen(single_mixture(0)) + 0.75 * rendering.seen(single_mixture(2))
     np.testing.assert_allclose(mixed, sums, rtol=0.02, atol=2)
     assert angles_deg(mixed[GREYS], Mixture((0, 2), (0.25, 0.75)).white(lut)).max() < 1e-4
-    with pytest.raises(InputError, match="there is no light 9"):
-        rendering.seen(plain(9))
+    with pytest.raises(InputError, match="no illuminant 9"):
+        rendering.seen(single_mixture(9))
 
 
 def test_black_that_is_taken_out_leaves_means_and_white(make_table: MakeTable) -> None:
     lut = make_table(bits=3)
     options = DatasetOptions(rendering="colorimetric", matrix=MINE, black_point=BlackPoint("compensate"))
-    kept = photograph(lut, RAMP, Lighting((plain(1),)), replace(options, black_point=BlackPoint()), 3, 4, 11536).counts
-    bare = photograph(lut, RAMP, Lighting((plain(1),)), options, 3, 4, 11536).counts
+    kept = photograph(
+        lut, RAMP, Lighting((single_mixture(1),)), replace(options, black_point=BlackPoint()), 3, 4, 11536
+    ).counts
+    bare = photograph(lut, RAMP, Lighting((single_mixture(1),)), options, 3, 4, 11536).counts
     black, white = kept[0].mean(axis=0), lut.white[1]
     wanted = (kept.mean(axis=1) - black) / (1 - black / white)
     # Cut off at 0, noise would lift black by .4 of it, 6 counts here.
@@ -220,7 +222,7 @@ def test_the_reference_is_near_in_reciprocal_kelvin_and_sees_every_channel() -> 
 def test_a_table_of_one_light(make_table: MakeTable) -> None:
     rendering = ColorimetricRendering(make_table(bits=1, lights=1), MINE)
     assert rendering.cells.max() < 8
-    assert np.isfinite(rendering.seen(plain(0))).all()
+    assert np.isfinite(rendering.seen(single_mixture(0))).all()
 
 
 def test_a_print_that_is_off_makes_a_fitted_matrix_say_so(make_table: MakeTable) -> None:
@@ -243,7 +245,7 @@ def test_cells_that_clip_and_cells_with_hot_samples_are_not_used(make_table: Mak
     assert profile.usable.sum() > 300
     whole = profile_of(make_table(name="whole"), 1)
     assert profile.white < whole.white
-    shown = ColorimetricRendering(clipped, MINE).seen(plain(1))[GREYS]
+    shown = ColorimetricRendering(clipped, MINE).seen(single_mixture(1))[GREYS]
     assert angles_deg(shown, clipped.white[1]).max() < 0.1
     assert shown.max() < 5000
 
@@ -259,11 +261,11 @@ def test_cells_that_are_not_usable_are_not_seen(make_table: MakeTable, lights: s
 
     spoilt, whole = make_table(change=spoil), make_table(name="whole")
     rendering = ColorimetricRendering(spoilt, MINE)
-    seen, found = rendering.seen(plain(1)), rendering.map
+    seen, found = rendering.seen(single_mixture(1)), rendering.map
     assert 146 in ColorimetricRendering(whole, MINE).cells
     assert 146 not in rendering.cells
     assert not found.weights[found.cells[found.around] == 146].any()
-    np.testing.assert_allclose(seen, ColorimetricRendering(whole, MINE).seen(plain(1)), rtol=0.25)
+    np.testing.assert_allclose(seen, ColorimetricRendering(whole, MINE).seen(single_mixture(1)), rtol=0.25)
 
 
 def test_a_black_that_is_spoilt_is_named_and_makes_no_flat_image(make_table: MakeTable) -> None:
@@ -271,7 +273,7 @@ def test_a_black_that_is_spoilt_is_named_and_makes_no_flat_image(make_table: Mak
         samples[0] = (samples[511] * 0.7).astype(np.uint16)
 
     with pytest.raises(QualityError, match=r"light 1 .*black.*0\.6\d* of white"):
-        ColorimetricRendering(make_table(change=spoil), MINE).seen(plain(1))
+        ColorimetricRendering(make_table(change=spoil), MINE).seen(single_mixture(1))
 
 
 def test_what_is_missed_and_its_slopes_are_those_of_the_print_between_its_cells() -> None:
@@ -342,14 +344,14 @@ def test_maps_of_prints(case: str, make_table: MakeTable, tmp_path: Path, pinned
     found.append(
         nearest_to(colours, 0.2 + 0.5 * source_colours(OWN_MATRIX)[::400], np.full((13, 3), 0.5), profiles[-1].bits)
     )
-    for light in (*map(plain, lights), mixture):
+    for light in (*map(single_mixture, lights), mixture):
         for share in (0.0, 0.7):
             made = said(rendering.printed, light, share)
             found.append(made if isinstance(made, dict) else [rendering.black(light), vars(made)])
     picture = np.random.default_rng(17).integers(0, 256, (21, 37, 3)).astype(np.uint8)
     ramp = np.stack([np.linspace(0, 1, 37)] * 21)
     weights = np.stack([ramp, 1 - ramp], axis=-1).astype(np.float32)
-    found.append(said(rendering.draw, picture, [plain(0), mixture], 0.4, weights))
+    found.append(said(rendering.draw, picture, [single_mixture(0), mixture], 0.4, weights))
     # Places are those at which a descent ends.
     pinned(f"map of a print, {case}", found, same=1e-5, nothing=1e-7)
 
