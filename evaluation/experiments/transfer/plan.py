@@ -81,17 +81,16 @@ def trainable_images(
 
     `leave_out`: excludes images that show a picture of the test; otherwise copies of test images are refused.
     """
-    shared_list = shared_images(training, test)
-    if not shared_list:
+    common = shared_images(training, test)
+    if not common:
         return training.scenes, ""
-    note = (
-        f"{len(shared_list)} of {len(training.scenes)} images of {training.name} are also in {test_name}, by "
-        f"{shared_list[0].by}: {first_of([image.name for image in shared_list], 3)}"
-    )
+    names = first_of([image.name for image in common], 3)
+    count = f"{len(common)} of {len(training.scenes)} images of {training.name}"
+    note = f"{count} are also in {test_name}, by {common[0].by}: {names}"
     if leave_out:
-        shared_positions = {image.position for image in shared_list}
+        shared_positions = {image.position for image in common}
         return tuple(scene for position, scene in enumerate(training.scenes) if position not in shared_positions), note
-    if any(image.by == "content" for image in shared_list):
+    if any(image.by == "content" for image in common):
         raise InputError(f"{note}, expected test images that are not in the training set; use --unseen to exclude them")
     return training.scenes, note
 
@@ -393,10 +392,7 @@ def _trainable(scene_set: SceneSet, test: SceneSet, notes: list[str]) -> tuple[S
         held_out_ids = {id(scene) for scene in held_out}
         trainable = tuple(scene for scene in trainable if id(scene) not in held_out_ids)
     if not trainable:
-        raise InputError(
-            f"0 of {len(scene_set.scenes)} images of {scene_set.name} may be used for training: all are in the test "
-            "set, or in its own validation and test parts; use another set"
-        )
+        raise InputError(f"0 images of {scene_set.name} are outside its test parts and the test set; use another set")
     return trainable
 
 

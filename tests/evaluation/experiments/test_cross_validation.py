@@ -156,7 +156,7 @@ class Hoarder:
         return self
 
     def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
-        return self.lights.get(np.asarray(image).tobytes())
+        return self.known.get(np.asarray(image).tobytes())
 
 
 def test_each_fold_starts_from_fresh_copy() -> None:
