@@ -140,9 +140,8 @@ def errors_csv(
     shares = truths / truths.sum(axis=1, keepdims=True)
     estimated = [result.estimates / result.estimates.sum(axis=1, keepdims=True) for result in results]
     group_head = [] if groups is None else ["group"]
-    rows: list[tuple[object, ...]] = [
-        ("image", "method", *_ESTIMATE_KEYS, *_TRUTH_KEYS, *_ERROR_KINDS, "guessed", "cause", *group_head)
-    ]
+    head = ("image", "method", *_ESTIMATE_KEYS, *_TRUTH_KEYS, *_ERROR_KINDS, "guessed", "cause", *group_head)
+    rows: list[tuple[object, ...]] = [head]
     for index, image in enumerate(images):
         for result, estimates in zip(results, estimated, strict=True):
             numbers = (*estimates[index], *shares[index])

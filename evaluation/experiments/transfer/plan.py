@@ -253,6 +253,7 @@ class NaiveScene:
 
     @property
     def _details(self) -> Mapping[str, str]:
+        # Options that were applied to the generated image, by column of images.csv.
         return self.generated.dataset.details.get(self.generated.entry.image, {})
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
@@ -265,7 +266,6 @@ class NaiveScene:
         return naive_image(codes, light, self.saturation, matrix), None
 
 
-# Variation by options of `generate` is recorded by column in images.csv; only the crop applies to a counterpart.
 @dataclass(frozen=True, eq=False)
 class NaiveMixedScene(NaiveScene):
     """Naive counterpart of an image under several illuminants."""
@@ -396,24 +396,22 @@ def _trainable(scene_set: SceneSet, test: SceneSet, notes: list[str]) -> tuple[S
     return trainable
 
 
-def _with_naive(
-    name: str, images: Sequence[GeneratedScene], pictures: Path | str, notes: list[str]
-) -> list[TrainingSet]:
+def _with_naive(name: str, images: Sequence[GeneratedScene], folder: Path | str, notes: list[str]) -> list[TrainingSet]:
     """Return the generated images with a picture in the folder, and their naive counterparts."""
     dataset = images[0].dataset
     if dataset.description.options.get("variation", {}).get("gradient"):
         # Counterparts have one brightness for the whole image.
         raise InputError(f"{name} was made with a gradient, expected none for naive images; omit --naive")
-    found_pictures, missing = find_source_pictures(dataset, pictures)
+    found_pictures, missing = find_source_pictures(dataset, folder)
     with_picture = tuple(scene for scene in images if scene.entry.source in found_pictures)
     if not with_picture:
         raise InputError(
-            f"0 of {len(missing)} pictures of {name} are in {pictures}, by name and hash (missing: "
+            f"0 of {len(missing)} pictures of {name} are in {folder}, by name and hash (missing: "
             f"{first_of(missing, 3)}), expected the folder that the data set was made from; use that folder"
         )
     if missing:
         notes.append(
-            f"{name}: {len(missing)} of {len(missing) + len(found_pictures)} pictures are not in {pictures}: "
+            f"{name}: {len(missing)} of {len(missing) + len(found_pictures)} pictures are not in {folder}: "
             f"{first_of(missing)}; {len(images) - len(with_picture)} images of them are excluded from all rows"
         )
     sets = [
