@@ -173,12 +173,12 @@ def measure_map(
         if mask is not None:
             is_judged &= ~mask[rows]
         count = int(is_judged.sum())
+        judged_count += count
         estimated = estimate[rows][is_judged] if estimate.ndim == 3 else np.broadcast_to(estimate, (count, 3))
-        estimated, true_colours = estimated.astype(np.float64), truth[rows][is_judged].astype(np.float64)
-        judged_count += len(true_colours)
-        sums[0] += recovery_error(estimated, true_colours).sum()
-        sums[1] += reproduction_error(estimated, true_colours).sum()
-        sums[2] += _rgb_errors(image[rows][is_judged].astype(np.float64), estimated, true_colours, saturation).sum()
+        estimated, actual = estimated.astype(np.float64), truth[rows][is_judged].astype(np.float64)
+        sums[0] += recovery_error(estimated, actual).sum()
+        sums[1] += reproduction_error(estimated, actual).sum()
+        sums[2] += _rgb_errors(image[rows][is_judged].astype(np.float64), estimated, actual, saturation).sum()
         shares = weights[rows][is_judged]
         for index, light in enumerate(lights):
             region_estimates = estimated[shares[:, index] > DOMINANT]
@@ -203,10 +203,10 @@ def _row_bands(shape: tuple[int, ...]) -> Iterator[slice]:
         yield slice(top, top + step)
 
 
-def _rgb_errors(pixels: _Array, estimated: _Array, true_colours: _Array, saturation: float | None) -> _Array:
+def _rgb_errors(pixels: _Array, estimated: _Array, actual: _Array, saturation: float | None) -> _Array:
     corrected = [
         np.minimum(pixels * _gains(light), np.inf if saturation is None else saturation)
-        for light in (estimated, true_colours)
+        for light in (estimated, actual)
     ]
     # A black pixel stays black under every correction: its error is 0, as in LSMI's program. The 1e-4 counts by which
     # that program avoids division by 0 are omitted.

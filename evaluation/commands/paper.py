@@ -279,7 +279,6 @@ def chromaticities(
 
 
 def _treatment(data: SceneSet) -> str:
-    # One sentence, because conditions are printed line by line.
     return f"{'; '.join(f'{aspect}: {text}' for aspect, text in data.treatment.items())}."
 
 

@@ -183,5 +183,5 @@ def _common_side(test: Sequence[Scene], plan: TransferPlan) -> tuple[int | None,
 
 
 def _median_side(scenes: Sequence[Scene]) -> int:
-    # Images evenly spaced in the set's order: an order by size would bias the first ones.
+    # At most `_MAX_MEASURED` images are read, evenly spaced in the order of the set.
     return median_low(max(scene.read()[0].shape) for scene in scenes[:: ceil(len(scenes) / _MAX_MEASURED)])

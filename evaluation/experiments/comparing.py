@@ -20,15 +20,8 @@ import numpy.typing as npt
 from markupsafe import Markup
 from scipy import stats
 
-from evaluation.experiments.bootstrap import (
-    LEVEL,
-    RESAMPLES,
-    STATISTICS,
-    TIE_DEG,
-    PairedFigure,
-    compare_paired,
-    group_ids,
-)
+from evaluation.experiments import bootstrap
+from evaluation.experiments.bootstrap import LEVEL, STATISTICS, TIE_DEG, PairedFigure, group_ids
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import MethodErrors
@@ -188,7 +181,7 @@ def compare(pairs: Sequence[MatchedErrors]) -> tuple[Comparison, ...]:
     tests = [signed_rank(*pair.case_errors()) for pair in pairs]
     corrected = holm([test.p for test in tests])
     return tuple(
-        Comparison(pair, test, p, compare_paired(pair.errors_a, pair.errors_b, groups=pair.groups))
+        Comparison(pair, test, p, bootstrap.compare_paired(pair.errors_a, pair.errors_b, groups=pair.groups))
         for pair, test, p in zip(pairs, tests, corrected, strict=True)
     )
 
@@ -235,8 +228,8 @@ def statistics_table(comparisons: Sequence[Comparison]) -> Table:
         ),
         digits=3,
         notes=(
-            f"Intervals of {LEVEL:.0%}: BCa bootstrap over images, or groups of images, {RESAMPLES} resamples, the "
-            "same for both methods. A single group has no interval.",
+            f"Intervals of {LEVEL:.0%}: BCa bootstrap over images, or groups of them, {bootstrap.RESAMPLES} resamples, "
+            "the same for both methods. A single group has no interval.",
         ),
     )
 

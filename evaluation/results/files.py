@@ -31,9 +31,9 @@ from foundation.files import csv_text, file_sha256, read_text
 ERRORS_FILE = "errors.csv"  # Its name in a results folder
 
 _ERROR_KINDS: tuple[ErrorKind, ...] = ("recovery", "reproduction")
-_TRUTH_COLUMNS = ("truth_r", "truth_g", "truth_b")
-_ESTIMATE_COLUMNS = ("r", "g", "b")
-_NUMBER_COLUMNS = (*_ERROR_KINDS, *_TRUTH_COLUMNS)
+_TRUTH_KEYS = ("truth_r", "truth_g", "truth_b")
+_ESTIMATE_KEYS = ("r", "g", "b")
+_NUMBER_COLUMNS = (*_ERROR_KINDS, *_TRUTH_KEYS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,13 +138,12 @@ def errors_csv(
     `truths`: (N, 3) float64, camera RGB of any length. `groups`: group of each image; None if every image is its own.
     """
     shares = truths / truths.sum(axis=1, keepdims=True)
-    estimate_shares = [result.estimates / result.estimates.sum(axis=1, keepdims=True) for result in results]
-    group_columns = [] if groups is None else ["group"]
-    rows: list[tuple[object, ...]] = [
-        ("image", "method", *_ESTIMATE_COLUMNS, *_TRUTH_COLUMNS, *_ERROR_KINDS, "guessed", "cause", *group_columns)
-    ]
+    estimated = [result.estimates / result.estimates.sum(axis=1, keepdims=True) for result in results]
+    group_head = [] if groups is None else ["group"]
+    head = ("image", "method", *_ESTIMATE_KEYS, *_TRUTH_KEYS, *_ERROR_KINDS, "guessed", "cause", *group_head)
+    rows: list[tuple[object, ...]] = [head]
     for index, image in enumerate(images):
-        for result, estimates in zip(results, estimate_shares, strict=True):
+        for result, estimates in zip(results, estimated, strict=True):
             numbers = (*estimates[index], *shares[index])
             errors = (result.errors[metric][index] for metric in _ERROR_KINDS)
             cause = (result.causes or {}).get(index, "")
@@ -188,7 +187,7 @@ def _degrees(error: float) -> str:
     return f"{error:.6f}" if np.isfinite(error) else ""
 
 
-_ESTIMATES_COLUMNS = ("image", *_ESTIMATE_COLUMNS)
+_ESTIMATES_COLUMNS = ("image", *_ESTIMATE_KEYS)
 _ESTIMATES_TEXT = ",".join(_ESTIMATES_COLUMNS)
 
 

@@ -36,10 +36,8 @@ def describe_method(method: object) -> dict[str, Any]:
     if isinstance(method, GivenEstimates):
         return {"name": method.name, "estimates": {"file": method.file, "sha256": method.sha256}}
     method_class = type(method)
-    record: dict[str, Any] = {
-        "name": getattr(method, "name", ""),
-        "class": f"{method_class.__module__}:{method_class.__qualname__}",
-    }
+    class_name = f"{method_class.__module__}:{method_class.__qualname__}"
+    record: dict[str, Any] = {"name": getattr(method, "name", ""), "class": class_name}
     settings = _settings(method, 0)
     settings.pop("name", None)
     if settings:
@@ -53,10 +51,9 @@ def describe_method(method: object) -> dict[str, Any]:
 def _source_file(method_class: type) -> dict[str, Any]:
     try:
         path = Path(inspect.getfile(method_class)).resolve()
-        source_record = {"class": f"{path.name}:{method_class.__qualname__}", "file_sha256": file_sha256(path)}
+        return {"class": f"{path.name}:{method_class.__qualname__}", "file_sha256": file_sha256(path)}
     except (OSError, TypeError):
         return {}
-    return source_record
 
 
 def _settings(instance: object, depth: int) -> dict[str, Any]:

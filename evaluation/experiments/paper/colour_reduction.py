@@ -112,17 +112,14 @@ def remove_bits(
     def answers_for(scene: Scene) -> list[list[SceneAnswer]]:
         image, mask = scene.read()
         # Clipping is visible only before the reduction. Clipped pixels still influence the operator, as in a camera.
-        is_excluded = ~usable(image, scene.saturation, mask)
+        excluded = ~usable(image, scene.saturation, mask)
         versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
-        return [
-            [read_estimate(method.estimate(version, None, is_excluded)) for method in methods] for version in versions
-        ]
+        return [[read_estimate(method.estimate(version, None, excluded)) for method in methods] for version in versions]
 
     answers = list(report_progress(ordered_map(answers_for, scenes, workers), on_scene))
     names = [method.name for method in methods]
     raw, *reduced = (
-        collect_results(names, truths, [scene_answers[version] for scene_answers in answers])
-        for version in range(1 + len(bits))
+        collect_results(names, truths, [item[version] for item in answers]) for version in range(1 + len(bits))
     )
     return BitsResult(raw, dict(zip(bits, reduced, strict=True)))
 

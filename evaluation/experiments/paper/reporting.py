@@ -170,7 +170,7 @@ def _draw_chromaticities(figure: Any, luts: Sequence[Lut], sets: Mapping[str, np
         axes.legend(loc="upper right", fontsize=8, markerscale=1.6, handletextpad=0.2)
 
 
-_TABLE1_CAPTION = (
+_TABLE1_TEXT = (
     "Performance of White-Patch, Gray-world and Shades-of-Gray on eight generated data sets, {metric} error in degrees"
 )
 
@@ -206,23 +206,21 @@ def table1_report(
 ) -> PaperReport:
     """Return the report of table 1 with both kinds of error, `metric` first; `sizes` may be empty."""
     other_metric: ErrorKind = "recovery" if metric == "reproduction" else "reproduction"
-    tables_first, tables_other = ([block_table(block, name) for block in blocks] for name in (metric, other_metric))
-    noise, print_colours = noise_table(luts), print_table(luts)
+    tables_one, tables_two = ([block_table(block, name) for block in blocks] for name in (metric, other_metric))
+    noise, colours = noise_table(luts), print_table(luts)
     files = {
         "table1.csv": table_to_csv(joint_table(blocks)).encode(),
-        "table1.tex": tables_to_latex(_TABLE1_CAPTION.format(metric=metric), tables_first).encode(),
-        f"table1_{other_metric}.tex": tables_to_latex(
-            _TABLE1_CAPTION.format(metric=other_metric), tables_other
-        ).encode(),
+        "table1.tex": tables_to_latex(_TABLE1_TEXT.format(metric=metric), tables_one).encode(),
+        f"table1_{other_metric}.tex": tables_to_latex(_TABLE1_TEXT.format(metric=other_metric), tables_two).encode(),
         "noise.csv": table_to_csv(noise).encode(),
-        "print.csv": table_to_csv(print_colours).encode(),
+        "print.csv": table_to_csv(colours).encode(),
     }
     elements = [
         *map(pages.paragraph, conditions),
         pages.heading(f"{metric.capitalize()} error, degrees"),
-        *map(table_part, tables_first),
+        *map(table_part, tables_one),
     ]
-    tables = [*tables_first, noise, print_colours]
+    tables = [*tables_one, noise, colours]
     if sizes:
         size_plot = draw_svg(_draw_sizes, sizes, "White-Patch", inches=(7.6, 4.8))
         table = size_table(sizes)
@@ -232,11 +230,9 @@ def table1_report(
             "White-Patch uses the largest value, which increases with the number of pixels: of noise, and of whites."
         )
         elements += [pages.heading("Images of other sizes"), pages.figure(size_plot, caption), table_part(table)]
-    elements += [pages.heading("Look-up tables"), table_part(noise), table_part(print_colours)]
-    elements += [pages.heading(f"{other_metric.capitalize()} error, degrees"), *map(table_part, tables_other)]
-    return PaperReport(
-        "Table 1: statistics-based methods on generated data sets", tuple(tables), tuple(elements), files
-    )
+    elements += [pages.heading("Look-up tables"), table_part(noise), table_part(colours)]
+    elements += [pages.heading(f"{other_metric.capitalize()} error, degrees"), *map(table_part, tables_two)]
+    return PaperReport("Table 1: methods on generated data sets", tuple(tables), tuple(elements), files)
 
 
 def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperReport:

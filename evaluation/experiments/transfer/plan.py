@@ -81,17 +81,16 @@ def trainable_images(
 
     `leave_out`: excludes images that show a picture of the test; otherwise copies of test images are refused.
     """
-    shared_list = shared_images(training, test)
-    if not shared_list:
+    common = shared_images(training, test)
+    if not common:
         return training.scenes, ""
-    note = (
-        f"{len(shared_list)} of {len(training.scenes)} images of {training.name} are also in {test_name}, by "
-        f"{shared_list[0].by}: {first_few([image.name for image in shared_list], 3)}"
-    )
+    names = first_of([image.name for image in common], 3)
+    count = f"{len(common)} of {len(training.scenes)} images of {training.name}"
+    note = f"{count} are also in {test_name}, by {common[0].by}: {names}"
     if leave_out:
-        shared_positions = {image.position for image in shared_list}
+        shared_positions = {image.position for image in common}
         return tuple(scene for position, scene in enumerate(training.scenes) if position not in shared_positions), note
-    if any(image.by == "content" for image in shared_list):
+    if any(image.by == "content" for image in common):
         raise InputError(f"{note}, expected test images that are not in the training set; use --unseen to exclude them")
     return training.scenes, note
 
@@ -254,6 +253,7 @@ class NaiveScene:
 
     @property
     def _details(self) -> Mapping[str, str]:
+        # Options that were applied to the generated image, by column of images.csv.
         return self.generated.dataset.details.get(self.generated.entry.image, {})
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
@@ -266,7 +266,6 @@ class NaiveScene:
         return naive_image(codes, light, self.saturation, matrix), None
 
 
-# Variation by options of `generate` is recorded by column in images.csv; only the crop applies to a counterpart.
 @dataclass(frozen=True, eq=False)
 class NaiveMixedScene(NaiveScene):
     """Naive counterpart of an image under several illuminants."""
@@ -393,31 +392,26 @@ def _trainable(scene_set: SceneSet, test: SceneSet, notes: list[str]) -> tuple[S
         held_out_ids = {id(scene) for scene in held_out}
         trainable = tuple(scene for scene in trainable if id(scene) not in held_out_ids)
     if not trainable:
-        raise InputError(
-            f"0 of {len(scene_set.scenes)} images of {scene_set.name} may be used for training: all are in the test "
-            "set, or in its own validation and test parts; use another set"
-        )
+        raise InputError(f"0 images of {scene_set.name} are outside its test parts and the test set; use another set")
     return trainable
 
 
-def _with_naive(
-    name: str, images: Sequence[GeneratedScene], pictures: Path | str, notes: list[str]
-) -> list[TrainingSet]:
+def _with_naive(name: str, images: Sequence[GeneratedScene], folder: Path | str, notes: list[str]) -> list[TrainingSet]:
     """Return the generated images with a picture in the folder, and their naive counterparts."""
     dataset = images[0].dataset
     if dataset.description.options.get("variation", {}).get("gradient"):
         # Counterparts have one brightness for the whole image.
         raise InputError(f"{name} was made with a gradient, expected none for naive images; omit --naive")
-    found_pictures, missing = find_source_pictures(dataset, pictures)
+    found_pictures, missing = find_source_pictures(dataset, folder)
     with_picture = tuple(scene for scene in images if scene.entry.source in found_pictures)
     if not with_picture:
         raise InputError(
-            f"0 of {len(missing)} pictures of {name} are in {pictures}, by name and hash (missing: "
+            f"0 of {len(missing)} pictures of {name} are in {folder}, by name and hash (missing: "
             f"{first_few(missing, 3)}), expected the folder that the data set was made from; use that folder"
         )
     if missing:
         notes.append(
-            f"{name}: {len(missing)} of {len(missing) + len(found_pictures)} pictures are not in {pictures}: "
+            f"{name}: {len(missing)} of {len(missing) + len(found_pictures)} pictures are not in {folder}: "
             f"{first_few(missing)}; {len(images) - len(with_picture)} images of them are excluded from all rows"
         )
     sets = [

@@ -168,7 +168,7 @@ def transfer(
         crossed = tuple(cross_fit(learner, number, tests, seed_folds, seed) for seed, seed_folds in enumerate(folds))
         fewest = subsets.min_images
         entries.append(TransferRow(learner.name, "cross-validation", generated_name, fewest, crossed))
-        # The constant illuminant reads no image, so N images would only repeat cross-validation with less data.
+        # The constant illuminant uses no image content, so it has no rows with N real images.
         for count in () if isinstance(learner, ConstantLight) else real_counts:
             # All images that a fold leaves are the training images of cross-validation.
             results = crossed if count is None else subsets.results(number, learner, count, subsets.alone)

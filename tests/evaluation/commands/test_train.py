@@ -76,7 +76,7 @@ def test_trains_user_class(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
         "    def estimate(self, image, saturation=None, mask=None):\n"
         "        return self.light\n"
     )
-    class_file = f"{tmp_path / 'class_file.py'}:Mean"
+    class_file = f"{tmp_path / 'mine.py'}:Mean"
     assert main(["cv", class_file, str(data)]) == 0
     assert "My mean" in capsys.readouterr().out
     assert main(["train", class_file, str(data), "--out", str(tmp_path / "model.npz")]) == 2
