@@ -84,7 +84,7 @@ def trainable_images(
     common = shared_images(training, test)
     if not common:
         return training.scenes, ""
-    names = first_of([image.name for image in common], 3)
+    names = first_few([image.name for image in common], 3)
     count = f"{len(common)} of {len(training.scenes)} images of {training.name}"
     note = f"{count} are also in {test_name}, by {common[0].by}: {names}"
     if leave_out:
