@@ -188,7 +188,7 @@ def _thirds(first: int, last: int) -> tuple[int, ...]:
 
 def _jpegs(*sizes: tuple[int, bool]) -> tuple[ImageFile, ...]:
     # JPEG files by size number: fine and normal, or only fine.
-    return tuple(ImageFile(1, size, quality) for size, both in sizes for quality in ((3, 2) if both else (3,)))
+    return tuple(ImageFile(1, size, quality) for size, normal in sizes for quality in ((3, 2) if normal else (3,)))
 
 
 def _raw(size: int = 0) -> ImageFile:

@@ -61,7 +61,7 @@ class Body:
         rows, columns = self.sensor
         for area in (self.visible, *self.masked):
             if min(area) < 0 or area.top + area.height > rows or area.left + area.width > columns:
-                raise ValueError(f"{self.model}: {area} lies outside the sensor of {columns}×{rows} photosites")
+                raise ValueError(f"{self.model}: {area} is outside the sensor of {columns}×{rows} photosites")
         if sorted(self.pattern) != ["B", "G", "G", "R"]:
             raise ValueError(f"{self.model}: pattern is {self.pattern!r}; one R, two G and one B are expected")
 
@@ -69,8 +69,8 @@ class Body:
     def camera(self) -> str:
         """Maker and model without repetition, as `drivers.raw.rawfile` reads them from its files."""
         words = self.model.split(" ")
-        known = not self.maker or words[0].casefold() == self.maker.split(" ")[0].casefold()
-        return self.model if known else f"{self.maker} {self.model}"
+        has_maker = not self.maker or words[0].casefold() == self.maker.split(" ")[0].casefold()
+        return self.model if has_maker else f"{self.maker} {self.model}"
 
     @property
     def half_size(self) -> tuple[int, int]:
@@ -110,13 +110,13 @@ class HotPattern:
         `per_million`: number per million photosites. `dn_per_s`: mean excess at ISO 100, DN per second.
         """
         count = round(per_million * sensor[0] * sensor[1] / 1e6)
-        place = np.sort(random.choice(sensor[0] * sensor[1], count, replace=False))
-        return cls(place // sensor[1], place % sensor[1], random.exponential(dn_per_s, count))
+        index = np.sort(random.choice(sensor[0] * sensor[1], count, replace=False))
+        return cls(index // sensor[1], index % sensor[1], random.exponential(dn_per_s, count))
 
     def within(self, first: int, last: int) -> HotPattern:
         """Return the hot photosites of rows first to last − 1, with rows numbered from `first`."""
-        some = slice(*np.searchsorted(self.rows, [first, last]).tolist())
-        return HotPattern(self.rows[some] - first, self.columns[some], self.dn_per_s[some])
+        selected = slice(*np.searchsorted(self.rows, [first, last]).tolist())
+        return HotPattern(self.rows[selected] - first, self.columns[selected], self.dn_per_s[selected])
 
     def raise_counts(
         self,
@@ -254,11 +254,11 @@ def find_body(
     return changed
 
 
-def _body_of_sensitivities(camera: str, found: Sensitivities) -> Body:
+def _body_of_sensitivities(camera: str, sensitivities: Sensitivities) -> Body:
     if camera in FACTS:
         return FACTS[camera]
     default = BODIES["EOS 550D"]
-    return replace(default, maker=found.maker or "unknown", model=found.camera, sensitivities=camera)
+    return replace(default, maker=sensitivities.maker or "unknown", model=sensitivities.camera, sensitivities=camera)
 
 
 def _checked_pixels(pixels: Any, where: str, key: str) -> tuple[int, int]:

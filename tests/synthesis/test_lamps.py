@@ -108,7 +108,7 @@ def test_names_a_missing_file() -> None:
         (table(hall=1.0, cellar=0.0), "'cellar' has no power from 400 to 700 nm"),
         (table(low=410, hall=1.0), "its wavelengths are 410 to 780"),
         (table(step=40, hall=1.0), "a gap from 380 to 420 nm"),
-        (table(hall=1.0) + "500,2\n", "500 nm stands there twice"),
+        (table(hall=1.0) + "500,2\n", "500 nm occurs twice"),
     ],
 )
 def test_refuses_bad_spectra(text: str, message: str) -> None:

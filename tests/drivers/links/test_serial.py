@@ -59,7 +59,7 @@ class TestSerialLink(LinkContract):
         yield near, far
         near.close()
 
-    def test_what_was_sent_before_hanging_up_is_still_read(self, ends: Ends) -> None:
+    def test_reads_bytes_sent_before_the_end(self, ends: Ends) -> None:
         # A cable that is pulled out takes along what the system had not handed over: only the end is certain.
         near, far = ends
         far.write(b"last words", PATIENCE_S)

@@ -1,4 +1,4 @@
-"""The simulated serial projectors, judged by software that others wrote for the real ones, and their own ends."""
+"""The simulated serial projectors with drivers of other authors, and their two ends."""
 
 from __future__ import annotations
 
@@ -102,13 +102,11 @@ def test_serves_a_serial_projector_until_interrupted(
     ("arguments", "said"),
     [
         (["--serial", "klingon"], ", ".join(built_in_languages())),
-        (["--serial", "epson", "--pjlink", "0"], "either --pjlink PORT or --serial LANGUAGE"),
-        ([], "either --pjlink PORT or --serial LANGUAGE"),
-        (["--serial", "epson", "--password", "x"], "a serial cable has none"),
+        (["--serial", "epson", "--pjlink", "0"], "exactly one of --pjlink PORT and --serial LANGUAGE"),
+        ([], "exactly one of --pjlink PORT and --serial LANGUAGE"),
+        (["--serial", "epson", "--password", "x"], "--serial has no password"),
     ],
 )
-def test_not_exactly_one_cable_or_no_language_ends_with_2(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
-) -> None:
+def test_refuses_wrong_connection_options(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str) -> None:
     assert main(["projector", *arguments]) == 2
     assert said in capsys.readouterr().err

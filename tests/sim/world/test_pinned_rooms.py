@@ -1,4 +1,4 @@
-"""What small rooms of every kind show, photosite by photosite, and every light, ink and shape that they are made of."""
+"""Pinned frames of small rooms, and pinned illuminants, inks and shapes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ ROOMS: dict[str, tuple[Room, Body]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROOMS)
-def test_a_room_shows_what_it_showed(name: str, pinned: Pinned) -> None:
+def test_rooms_are_unchanged(name: str, pinned: Pinned) -> None:
     room, body = ROOMS[name]
     world = World(patches(), body, room)
     rgb = np.array([[0, 0, 0], [255, 255, 255], [200, 30, 90], [3, 128, 254]])
@@ -90,7 +90,7 @@ def test_a_room_shows_what_it_showed(name: str, pinned: Pinned) -> None:
 
 
 @pytest.mark.slow
-def test_every_disturbance_shows_what_it_showed(pinned: Pinned) -> None:
+def test_disturbances_are_unchanged(pinned: Pinned) -> None:
     world = World(patches(), TINY, Room(seed=6, veil=0.02, black_leak=0.002))
     # What was on the screen before, and moments at the ends of what is there for a while.
     moments = [
@@ -129,7 +129,7 @@ def test_every_disturbance_shows_what_it_showed(pinned: Pinned) -> None:
 
 
 @pytest.mark.slow
-def test_several_things_at_once_show_what_they_showed(pinned: Pinned) -> None:
+def test_combined_disturbances_are_unchanged(pinned: Pinned) -> None:
     world = World(patches(), TINY, ROOMS["of a poor lens"][0])
     picture = np.random.default_rng(2).uniform(size=(5, 9, 3)).astype(np.float32)
     situations = {
@@ -147,7 +147,7 @@ def test_several_things_at_once_show_what_they_showed(pinned: Pinned) -> None:
     pinned("a room's situations", [found, world.project(PLACES, "R", situations["all"])], same=SINGLE)
 
 
-def test_lights_and_cameras_are_what_they_were(pinned: Pinned) -> None:
+def test_lights_and_cameras_are_unchanged(pinned: Pinned) -> None:
     found = {
         "lamps": {lamp: projector_primaries(lamp) for lamp in get_args(spectral.LampSpectrum)},
         "daylight": {str(k): daylight(k).power for k in (4000, 5003, 7000, 7001, 12000, 25000)},
