@@ -216,9 +216,9 @@ def _grey_squares() -> Print:
     from sim.world.rendering import Print
 
     column, row = (grid.ravel() for grid in np.meshgrid(np.arange(5), np.arange(3)))
-    left, top = 18 + 54.0 * column, 21 + 60.0 * row
-    boxes = np.stack([left, top, left + 45, top + 45], axis=-1).astype(np.float64)
-    grey = np.linspace(0, 248, len(left)).round().astype(np.uint8)
+    x, top = 18 + 54.0 * column, 21 + 60.0 * row
+    boxes = np.stack([x, top, x + 45, top + 45], axis=-1).astype(np.float64)
+    grey = np.linspace(0, 248, len(x)).round().astype(np.uint8)
     return Print((297, 210), boxes, np.stack([grey] * 3, axis=-1))
 
 

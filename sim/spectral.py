@@ -244,8 +244,8 @@ def known_sensitivities() -> tuple[str, ...]:
     return tuple(sorted(name.removesuffix(SUFFIX) for name in files if name.endswith(SUFFIX)))
 
 
-def read_sensitivities(name: str, more: Sequence[str] = ()) -> Sensitivities:
-    """Return the sensitivities of a name or file; error messages also list the names `more`."""
+def read_sensitivities(name: str, other_names: Sequence[str] = ()) -> Sensitivities:
+    """Return the sensitivities of a name or file; error messages also list the names `other_names`."""
     if name in known_sensitivities():
         data = resources.files("sim").joinpath("data", name + SUFFIX).read_bytes()
         return parse_sensitivities(data, name, name)
@@ -253,7 +253,7 @@ def read_sensitivities(name: str, more: Sequence[str] = ()) -> Sensitivities:
     try:
         data = path.read_bytes()
     except OSError as error:
-        names = [*known_sensitivities(), *more]
+        names = [*known_sensitivities(), *other_names]
         near = f"{nearest_names(name, names)} ".lstrip()
         raise InputError(
             f"no camera {name!r}: {_reading_problem(error)}; {near}expected one of "

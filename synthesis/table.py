@@ -264,9 +264,9 @@ def _require_disk_space(out: Path, needed: int) -> None:
     folder = out.absolute()
     while not folder.exists():
         folder = folder.parent
-    free = shutil.disk_usage(folder).free
-    if free < needed:
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < needed:
         raise StorageError(
-            f"{out}: the LUT needs {needed / 1e9:.2f} GB, the disk has {free / 1e9:.2f} GB left; free space, or choose "
-            "another disk"
+            f"{out}: the LUT needs {needed / 1e9:.2f} GB, the disk has {free_bytes / 1e9:.2f} GB left; free space, or "
+            "choose another disk"
         )

@@ -17,8 +17,8 @@ from drivers.links.link import ClosedAtEnd, Peer
 from drivers.links.network import POLLING_S
 from foundation.errors import LinkClosed
 
-_WAKE: Final = b"w"  # Signals to the thread: report when all input is processed, and end.
-_END: Final = b"e"  # What rings the serving thread: to say when it has caught up, and to end
+_WAKE: Final = b"w"  # Signal to the thread: report when all input is processed
+_END: Final = b"e"  # Signal to the thread: end
 
 _TIMEOUT_S: Final = 10.0  # Limit for processing the input, s; it takes milliseconds unless the machine is overloaded.
 

@@ -1,7 +1,7 @@
 """EOS bodies of the simulated camera: identification, properties, and lists of allowed values.
 
 No recording of an EOS 550D or 6D Mark II has been published. Unknown data are taken from the one recorded body, an EOS
-60D; comments say which. Properties are in the order in which the 60D sends them. A property with value None is sent on
+60D; see the comments. Properties are in the order in which the 60D sends them. A property with value None is sent on
 request only, as by the 60D.
 
 Sources: a recorded EOS 60D (firmware 1.1.0); settings of an EOS 550D (firmware 1.0.9) and a 6D Mark II (1.0.2) listed

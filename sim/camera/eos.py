@@ -2,7 +2,7 @@
 
 The state advances with the clock, and only at calls: due actions are then carried out in their order. With a
 `SimulatedClock`, an initiator must wait by the same clock. Behaviour follows a recorded EOS 60D; where no public
-recording exists, a comment says "assumed". Methods may be called by several threads.
+recording exists, a comment has the word "assumed". Methods may be called by several threads.
 
 Sources: a recorded EOS 60D; ISO 15740:2013 for the standard; libgphoto2 2.5.34 for expectations of initiators.
 """

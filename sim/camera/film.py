@@ -2,7 +2,7 @@
 
 `sim.camera.eos` simulates settings, file names and timing. A `Film` makes the frame: of the `World` under simulated
 light (`WorldFilm`) or under the picture of a real screen (`WatchedFilm`). Raw files are Adobe DNG 1.4 with one
-uncompressed 16-bit mosaic of the whole sensor; the tag `Software` says that the frame is simulated.
+uncompressed 16-bit mosaic of the whole sensor; the tag `Software` marks the frame as simulated.
 
 Sources: DNG 1.4 chapters 2 and 4, Exif 2.32 section 4.6.
 """

@@ -48,7 +48,7 @@ class Moment:
     frame: int  # Number of earlier exposures in the session
     at_s: float = 0.0  # Seconds since the start of the session
     colour: Colour = BLACK  # Ordered colour
-    before: tuple[tuple[float, Colour], ...] = ()  # Second and ordered colour of each earlier frame
+    earlier_frames: tuple[tuple[float, Colour], ...] = ()  # Second and ordered colour of each earlier frame
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class FrozenScreen(Disturbance):
 
     def shown(self, colour: Colour, moment: Moment) -> Colour:
         """Return the colour that was ordered for the last frame before the event."""
-        for frame, (at_s, ordered) in reversed(tuple(enumerate(moment.before))):
+        for frame, (at_s, ordered) in reversed(tuple(enumerate(moment.earlier_frames))):
             if not self.is_there(Moment(frame, at_s)):
                 return ordered
         return BLACK
@@ -148,7 +148,7 @@ class HalfChanged(Disturbance):
 
     def changed(self, situation: Situation, moment: Moment) -> Situation:
         """Add the previous colour in this part."""
-        last = moment.before[-1][1] if moment.before else BLACK
+        last = moment.earlier_frames[-1][1] if moment.earlier_frames else BLACK
         return replace(situation, patches=(*situation.patches, Patch(self.place, last, self.share)))
 
 

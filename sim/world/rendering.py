@@ -3,7 +3,7 @@
 **Geometry.** The print is a sheet whose point (x, y) mm has a `height` mm out of the plane, towards the camera. The
 sheet is rotated by roll, then tilt, then pan, and projected by a pinhole with Brown's lens distortion (D. C. Brown,
 "Close-range camera calibration", 1971; coordinates and coefficients as in OpenCV). Paper does not stretch, and heights
-are small against wavelengths, so points keep their x and y. A fold is a crease that stands off the plane; its flanks
+are small against wavelengths, so points keep their x and y. A fold is a crease above the plane; its flanks
 are inclined to the light.
 
 **Rendering.** `light` is compiled by numba, single-threaded, without interpreter lock; `sim.world.world` calls it for
@@ -11,7 +11,7 @@ blocks of rows from several threads. A row depends only on its arguments, so blo
 result.
 
 Pixels are half-size, centres at integers, x right, y down. Millimetres are on the print, from its top left corner.
-Photosites are those of the visible frame.
+Photosites are counted in the visible frame.
 """
 
 from __future__ import annotations
@@ -356,7 +356,7 @@ def light(
 ) -> None:
     """Write the signal of each photosite of some rows under each primary.
 
-    Blur and aperture of the photosite are one Gaussian whose axes are those of the print. The drawing consists of
+    Blur and aperture of the photosite are one Gaussian with the axes of the print. The drawing consists of
     rectangles, so its integrals are products of differences of normal distributions: exact for any position of edges.
 
     Parameters
