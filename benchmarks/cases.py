@@ -470,7 +470,7 @@ CASES: Final[tuple[NamedCase, ...]] = (
         "a shadow that takes a tenth of the light from a part of the print, in the frame of the red primary",
         _HAND,
         rf"{_STAINED}|{_BRILLIANT}|{_GLARE}",
-        _lights_alone("red", situation=Situation(blobs=(Blob(_HAND_AT, transmittance=0.9),))),
+        _lights_alone("red", situation=Situation(blobs=(Blob(_HAND_AT, left=0.9),))),
     ),
     NamedCase(
         "cut-file",

@@ -119,7 +119,7 @@ class PropertyState:
     """Value of a property and its allowed values."""
 
     value: bytes
-    kind: int
+    list_kind: int
     reported: bool
     choices: tuple[int, ...] = ()
     formats: tuple[ImageFormat, ...] = ()
@@ -339,9 +339,9 @@ class SimulatedEos:
     def _report_list(self, code: int) -> None:
         state = self._properties[code]
         if code in IMAGE_FORMAT_PROPERTIES:
-            self._record(AvailableFormats(code, state.formats, state.kind))
+            self._record(AvailableFormats(code, state.formats, state.list_kind))
         else:
-            self._record(AvailableValues(code, state.choices, state.kind))
+            self._record(AvailableValues(code, state.choices, state.list_kind))
 
     # The values of properties.
 
@@ -710,11 +710,11 @@ class SimulatedEos:
         try:
             if setting.code in IMAGE_FORMAT_PROPERTIES:
                 return ImageFormat.decode(setting.value) in state.formats
-            if state.kind == LIST:
+            if state.list_kind == LIST:
                 return number_of(setting.value) in state.choices
         except ProtocolError:
             raise OperationRefusal(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
-        return state.kind == FREE and setting.code in _FREELY_SET
+        return state.list_kind == FREE and setting.code in _FREELY_SET
 
     def _store(self, code: int, value: bytes) -> None:
         if code == Property.EOS_CAMERA_TIME:

@@ -198,12 +198,12 @@ _BORDER: Final = (50, 140)  # Masked rows above and masked columns left of the i
 
 
 def _areas(width: int, height: int) -> dict[str, Any]:
-    top, left = _BORDER
-    sensor = height + top, width + left
+    rows, columns = _BORDER
+    sensor = height + rows, width + columns
     return {
         "sensor": sensor,
-        "visible": Rectangle(top, left, height, width),
-        "masked": (Rectangle(0, 0, sensor[0], left - 2),),
+        "visible": Rectangle(rows, columns, height, width),
+        "masked": (Rectangle(0, 0, sensor[0], columns - 2),),
     }
 
 
@@ -298,7 +298,7 @@ def counts(
     light: NDArray[np.float32],
     weights: NDArray[np.float32],
     noise: NDArray[np.float32],
-    left: int,
+    first_column: int,
     black: float,
     read_noise: float,
     gain_e: float,
@@ -330,7 +330,7 @@ def counts(
         (rows, sensor columns) uint16, written.
     """
     rows, columns = out.shape
-    right = left + light.shape[2]
+    right = first_column + light.shape[2]
     top = np.float32(saturation)
     half = np.float32(black + 0.5)
     per_dn = np.float32(1 / gain_e)
@@ -339,10 +339,10 @@ def counts(
     red, green, blue = weights[0], weights[1], weights[2]
     nothing = np.float32(0)
     for row in range(rows):
-        for x in range(left):
+        for x in range(first_column):
             out[row, x] = np.uint16(min(max(half + dark * noise[row, x], nothing), top))
-        for x in range(left, right):
-            i = x - left
+        for x in range(first_column, right):
+            i = x - first_column
             signal = red * light[0, row, i] + green * light[1, row, i] + blue * light[2, row, i]
             count = half + signal + math.sqrt(signal * per_dn + floor) * noise[row, x]
             out[row, x] = np.uint16(min(max(count, nothing), top))

@@ -263,13 +263,13 @@ def _relative_position(rectangle: Place, at: NDArray[np.float64]) -> tuple[NDArr
 class Patch:
     """A rectangle of another colour in the projected picture."""
 
-    rectangle: Place
+    place: Place
     colour: Colour
     share: float = 1.0  # Share of the exposure time, 0 to 1
 
     def cover(self, at: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether points (..., 2), relative to the page, are in the rectangle: (...) bool."""
-        left, top, right, bottom = self.rectangle
+        left, top, right, bottom = self.place
         x, y = at[..., 0], at[..., 1]
         return (x >= left) & (x < right) & (y >= top) & (y < bottom)
 
@@ -278,26 +278,26 @@ class Patch:
 class Blob:
     """A dark object between chart and camera: an ellipse with a soft edge that fills a rectangle."""
 
-    rectangle: Place
-    transmittance: float = 0.08  # Relative light from there, 0 to 1
+    place: Place
+    left: float = 0.08  # Relative light from there, 0 to 1
 
     def passed(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the relative light (...) at points (..., 2), relative to the page."""
-        across, down = _relative_position(self.rectangle, at)
+        across, down = _relative_position(self.place, at)
         inside = np.clip((1 + _BLOB_RIM / 2 - np.hypot(across, down)) / _BLOB_RIM, 0, 1)
-        return 1 - (1 - self.transmittance) * inside * inside * (3 - 2 * inside)
+        return 1 - (1 - self.left) * inside * inside * (3 - 2 * inside)
 
 
 @dataclass(frozen=True)
 class Glare:
     """Specular reflection of the print: a broad, soft ellipse with the colour of projector and ambient light."""
 
-    rectangle: Place  # The ellipse touches its sides at 1 / e² of its maximum
+    place: Place  # The ellipse touches its sides at 1 / e² of its maximum
     share: float = 0.03  # Relative to the light from bare paper
 
     def added(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reflected light (...) at points (..., 2), relative to the page, relative to bare paper."""
-        across, down = _relative_position(self.rectangle, at)
+        across, down = _relative_position(self.place, at)
         return self.share * np.exp(-2 * (across**2 + down**2))
 
 

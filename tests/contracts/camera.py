@@ -84,12 +84,12 @@ class CameraContract:
         names: list[str] = []
         for number in range(4):
             into = io.BytesIO()
-            before = bench.now()
+            earliest = bench.now()
             captured = capture(bench.camera, into)
             assert into.getvalue() == bench.frames()[number]
             assert captured.size == len(bench.frames()[number])
             assert captured.released_at.utcoffset() == timedelta(0)
-            assert before <= captured.released_at.astimezone(UTC) <= bench.now()
+            assert earliest <= captured.released_at.astimezone(UTC) <= bench.now()
             names.append(captured.name)
         assert len(bench.frames()) == 4
         assert len(set(names)) == 4
@@ -99,9 +99,9 @@ class CameraContract:
 
     def test_light_may_change_before_the_download(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
-        before = bench.now()
+        earliest = bench.now()
         released_at = bench.camera.expose()
-        assert before <= released_at <= bench.now()
+        assert earliest <= released_at <= bench.now()
         assert len(bench.frames()) == 1
         into = io.BytesIO()
         captured = bench.camera.download(into)

@@ -112,16 +112,16 @@ class ProjectorContract:
         if not bench.counts_hours:
             assert bench.projector.lamps() == ()
             return
-        (before,) = bench.projector.lamps()
-        assert not before.lit
+        (first_lamp,) = bench.projector.lamps()
+        assert not first_lamp.lit
         bench.wait(10 * 3600)
-        assert bench.projector.lamps() == (before,)
+        assert bench.projector.lamps() == (first_lamp,)
         bench.switched_on()
         bench.wait(10 * 3600)
-        assert bench.projector.lamps() == (Lamp(before.hours + 10, lit=True),)
+        assert bench.projector.lamps() == (Lamp(first_lamp.hours + 10, lit=True),)
         bench.projector.switch_off()
         bench.wait(bench.cool_down_s)
-        assert bench.projector.lamps() == (Lamp(before.hours + 10, lit=False),)
+        assert bench.projector.lamps() == (Lamp(first_lamp.hours + 10, lit=False),)
 
     def test_works_after_an_idle_time(self, bench: Bench) -> None:
         assert bench.projector.power() is Power.STANDBY

@@ -85,8 +85,8 @@ class Echo:
             case 0x9F02:
                 return Answer(ok, payload(request.parameters[0]))
             case 0x9F03:
-                taken = data or b""
-                return Answer(PtpResponse(ResponseCode.OK, transaction, (len(taken), zlib.crc32(taken))))
+                sent = data or b""
+                return Answer(PtpResponse(ResponseCode.OK, transaction, (len(sent), zlib.crc32(sent))))
             case 0x9F05:
                 return Answer(PtpResponse(ResponseCode.INCOMPLETE_TRANSFER, transaction), payload(1000))
             case 0x9F06:
@@ -127,9 +127,9 @@ class TransportContract:
         for count in range(6):
             parameters = tuple(0xFFFFFFFF - number for number in range(count))
             request = PtpRequest(ECHO, 7 + count, parameters)
-            done = bench.transport.transact(request, timeout=PATIENCE_S)
-            assert done.response == PtpResponse(ResponseCode.OK, 7 + count, parameters)
-            assert done.data == b""
+            result = bench.transport.transact(request, timeout=PATIENCE_S)
+            assert result.response == PtpResponse(ResponseCode.OK, 7 + count, parameters)
+            assert result.data == b""
 
     @pytest.mark.slow
     def test_transfers_full_packets_in_both_directions(self, bench: Bench) -> None:
@@ -154,9 +154,9 @@ class TransportContract:
     def test_pieces_are_the_complete_data(self, bench: Bench) -> None:
         pieces: list[bytes] = []
         request = PtpRequest(GIVE, 1, (5_000_000,))
-        done = bench.transport.transact(request, receive=pieces.append, timeout=PATIENCE_S)
-        assert done.response.ok
-        assert done.data == b""
+        result = bench.transport.transact(request, receive=pieces.append, timeout=PATIENCE_S)
+        assert result.response.ok
+        assert result.data == b""
         assert b"".join(pieces) == payload(5_000_000)
         assert len(pieces) > 4, "an object must not lie in memory in full"
 
@@ -167,13 +167,13 @@ class TransportContract:
             bench.transport.transact(PtpRequest(GIVE, 1, (MAX_COLLECTED + 1,)), timeout=PATIENCE_S)
 
     def test_returns_an_error_instead_of_data(self, bench: Bench) -> None:
-        done = bench.transport.transact(PtpRequest(REFUSE, 3), timeout=PATIENCE_S)
-        assert done.response == PtpResponse(ResponseCode.DEVICE_BUSY, 3)
+        result = bench.transport.transact(PtpRequest(REFUSE, 3), timeout=PATIENCE_S)
+        assert result.response == PtpResponse(ResponseCode.DEVICE_BUSY, 3)
         _give(bench, 100)
 
     def test_returns_an_error_after_data(self, bench: Bench) -> None:
-        done = bench.transport.transact(PtpRequest(BREAK_OFF, 3), timeout=PATIENCE_S)
-        assert done.response.code == ResponseCode.INCOMPLETE_TRANSFER
+        result = bench.transport.transact(PtpRequest(BREAK_OFF, 3), timeout=PATIENCE_S)
+        assert result.response.code == ResponseCode.INCOMPLETE_TRANSFER
         _give(bench, 100)
 
     def test_delivers_events_once_in_order(self, bench: Bench) -> None:
@@ -232,20 +232,20 @@ def _full(piece: bytes) -> None:
 
 def _awaited(bench: Bench, count: int) -> list[PtpEvent]:
     """Return the next `count` events, which may arrive after the response."""
-    found: list[PtpEvent] = []
+    received: list[PtpEvent] = []
     deadline = time.monotonic() + PATIENCE_S
-    while len(found) < count and time.monotonic() < deadline:
-        found.extend(bench.transport.events())
-    return found
+    while len(received) < count and time.monotonic() < deadline:
+        received.extend(bench.transport.events())
+    return received
 
 
 def _give(bench: Bench, size: int) -> None:
-    done = bench.transport.transact(PtpRequest(GIVE, 1, (size,)), timeout=PATIENCE_S)
-    assert done.response == PtpResponse(ResponseCode.OK, 1)
-    assert done.data == payload(size)
+    result = bench.transport.transact(PtpRequest(GIVE, 1, (size,)), timeout=PATIENCE_S)
+    assert result.response == PtpResponse(ResponseCode.OK, 1)
+    assert result.data == payload(size)
 
 
 def _take(bench: Bench, size: int) -> None:
     data = payload(size)
-    done = bench.transport.transact(PtpRequest(TAKE, 2), send=data, timeout=PATIENCE_S)
-    assert done.response.parameters == (size, zlib.crc32(data))
+    result = bench.transport.transact(PtpRequest(TAKE, 2), send=data, timeout=PATIENCE_S)
+    assert result.response.parameters == (size, zlib.crc32(data))

@@ -37,10 +37,10 @@ def test_setting_the_clock_does_not_change_session_time() -> None:
     clock.sleep(5)
     assert clock.now() == NOON + timedelta(seconds=5)
     for jump in (timedelta(hours=-1), timedelta(days=150)):
-        before = clock.now()
+        earlier = clock.now()
         machine.date += jump
         clock.sleep(2)
-        assert clock.now() - before == timedelta(seconds=2)
+        assert clock.now() - earlier == timedelta(seconds=2)
     assert clock.monotonic() == machine.seconds
 
 

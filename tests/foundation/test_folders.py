@@ -125,12 +125,12 @@ def test_retries_after_a_useless_wait(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("locks")
 def test_makes_a_folder_again_that_was_renamed_before_locking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, final = tmp_path / "making", tmp_path / "made"
-    now: Flock = folders.fcntl.flock
+    system_flock: Flock = folders.fcntl.flock
 
     def finished_first(handle: int, operation: int) -> None:
         if not final.exists():
             folder.rename(final)
-        now(handle, operation)
+        system_flock(handle, operation)
 
     monkeypatch.setattr(folders.fcntl, "flock", finished_first)
     with locked_folder(folder, BUSY):

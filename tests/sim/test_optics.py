@@ -20,8 +20,8 @@ EVEN: dict[str, float] = {"vignetting": 0.0, "projector_falloff": 0.0, "response
 
 def planes(signal: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
     """Return R, G1 and B of each RGGB block, at their positions in the block."""
-    whole = signal[: len(signal) // 2 * 2, : signal.shape[1] // 2 * 2].astype(np.float64)
-    return {"R": whole[::2, ::2], "G": whole[::2, 1::2], "B": whole[1::2, 1::2]}
+    complete = signal[: len(signal) // 2 * 2, : signal.shape[1] // 2 * 2].astype(np.float64)
+    return {"R": complete[::2, ::2], "G": complete[::2, 1::2], "B": complete[1::2, 1::2]}
 
 
 AT_PX = {"R": np.array([-0.25, -0.25]), "G": np.array([0.25, -0.25]), "B": np.array([0.25, 0.25])}
@@ -43,9 +43,9 @@ def test_kernel_has_the_documented_transfer() -> None:
     np.testing.assert_allclose(kernel, kernel.T, rtol=1e-6)
     across = np.arange(len(kernel)) - len(kernel) // 2
     for frequency in (0.02, 0.05, 0.1, 0.2, 0.3):
-        found = (kernel.sum(axis=0) * np.cos(2 * np.pi * frequency * across)).sum()
+        measured = (kernel.sum(axis=0) * np.cos(2 * np.pi * frequency * across)).sum()
         stated = (1 + (2 * np.pi * 3 / 3**0.5 * frequency) ** 2) ** -1.5
-        assert found == pytest.approx(stated, abs=0.005)
+        assert measured == pytest.approx(stated, abs=0.005)
 
 
 @pytest.mark.slow
@@ -78,15 +78,15 @@ def test_channels_are_at_projected_positions() -> None:
     world = World(white_squares(centres, 3.0), BODIES["Test"], room)
     for channel, plane in planes(world.signal(WHITE, REFERENCE_EXPOSURE)).items():
         truth = world.project(centres, channel)
-        for place in truth:
-            column, row = (round(float(along)) for along in place)
+        for position in truth:
+            column, row = (round(float(along)) for along in position)
             rows, columns = slice(row - 15, row + 16), slice(column - 15, column + 16)
             if row < 15 or column < 15 or row + 16 > plane.shape[0] or column + 16 > plane.shape[1]:
                 pytest.fail("the square lies too near to the frame's edge to be measured")
             light = plane[rows, columns] - np.median(plane[rows, columns])
             offsets = np.arange(-15, 16)
-            found = np.array([(light.sum(axis=0) @ offsets), (light.sum(axis=1) @ offsets)]) / light.sum()
-            np.testing.assert_allclose(found + [column, row] + AT_PX[channel], place, atol=0.01)
+            measured = np.array([(light.sum(axis=0) @ offsets), (light.sum(axis=1) @ offsets)]) / light.sum()
+            np.testing.assert_allclose(measured + [column, row] + AT_PX[channel], position, atol=0.01)
 
 
 def test_lateral_aberration_has_the_documented_size() -> None:
@@ -96,6 +96,6 @@ def test_lateral_aberration_has_the_documented_size() -> None:
     assert np.linalg.norm(lens.shifted(corner, "B") - axis) - lens.corner_px == pytest.approx(-0.5)
     half = (corner + axis) / 2
     assert np.linalg.norm(lens.shifted(half, "R") - half) == pytest.approx(0.5 * (1 + 0.25) / 2)
-    places = np.random.default_rng(1).uniform(-20, 2600, (50, 2))
+    positions = np.random.default_rng(1).uniform(-20, 2600, (50, 2))
     for channel in "RGB":
-        np.testing.assert_allclose(lens.unshifted(lens.shifted(places, channel), channel), places, atol=1e-6)
+        np.testing.assert_allclose(lens.unshifted(lens.shifted(positions, channel), channel), positions, atol=1e-6)

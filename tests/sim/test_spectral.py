@@ -40,27 +40,27 @@ NODES = np.arange(380.0, 781.0, 5.0)
 
 def test_interpolates_a_coarser_grid() -> None:
     coarse = np.arange(390.0, 731.0, 10.0)
-    found = resampled(coarse, coarse[:, None] ** 1, NODES)[:, 0]
+    values = resampled(coarse, coarse[:, None] ** 1, NODES)[:, 0]
     inside = (NODES >= 390) & (NODES <= 730)
-    assert found[inside] == pytest.approx(NODES[inside])
-    assert np.count_nonzero(found[~inside]) == 0
+    assert values[inside] == pytest.approx(NODES[inside])
+    assert np.count_nonzero(values[~inside]) == 0
 
 
 @pytest.mark.parametrize("at", [545.3, 546.1, 547.0, 549.9])
 def test_keeps_light_and_position_of_a_narrow_line(at: float) -> None:
     fine = np.arange(380.0, 780.05, 0.1)
     line = np.exp(-0.5 * ((fine - at) / 0.3) ** 2)[:, None]
-    found = resampled(fine, line, NODES)[:, 0]
+    values = resampled(fine, line, NODES)[:, 0]
     light = float(line.sum()) * 0.1
-    assert found.sum() * 5 == pytest.approx(light, rel=1e-3)
-    assert (found * NODES).sum() * 5 / light == pytest.approx(at, abs=0.02)
+    assert values.sum() * 5 == pytest.approx(light, rel=1e-3)
+    assert (values * NODES).sum() * 5 / light == pytest.approx(at, abs=0.02)
 
 
 def test_narrow_line_keeps_the_coarse_part_smooth() -> None:
     # Measured every 10 nm, and every 1 nm about a line: nodes between the coarse steps must not stay dark.
     grid = np.unique(np.concatenate([np.arange(380.0, 781.0, 10.0), np.arange(540.0, 551.0)]))
-    found = resampled(grid, grid[:, None] / 500, NODES)[:, 0]
-    assert found[1:-1] == pytest.approx(NODES[1:-1] / 500, rel=1e-3)
+    values = resampled(grid, grid[:, None] / 500, NODES)[:, 0]
+    assert values[1:-1] == pytest.approx(NODES[1:-1] / 500, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -84,9 +84,9 @@ def test_refuses_incomplete_grids(grid: list[float], message: str) -> None:
 def test_published_lights_are_unchanged() -> None:
     families: tuple[Any, ...] = (colour.SDS_ILLUMINANTS, colour.SDS_LIGHT_SOURCES)
     theirs: dict[str, Any] = {str(name): light for family in families for name, light in family.items()}
-    found = published_spectra()
-    assert set(found) == set(theirs)
-    for name, light in found.items():
+    values = published_spectra()
+    assert set(values) == set(theirs)
+    for name, light in values.items():
         assert light.wavelengths_nm == pytest.approx(theirs[name].wavelengths, abs=1e-9), name
         assert np.array_equal(light.power, theirs[name].values), name
 
@@ -113,23 +113,23 @@ def parsed(content: Any) -> Any:
 
 
 def test_sensitivities_are_interpolated_and_zero_outside() -> None:
-    found = parsed(document())
-    assert found.camera == "Maker M1"
-    at = found.at(WAVELENGTHS_NM)[[0, 15, 16, 80]]
+    values = parsed(document())
+    assert values.camera == "Maker M1"
+    at = values.at(WAVELENGTHS_NM)[[0, 15, 16, 80]]
     assert at[0].tolist() == at[3].tolist() == [0, 0, 0]
-    middle = (found.curves[found.wavelengths_nm == 450] + found.curves[found.wavelengths_nm == 460])[0] / 2
+    middle = (values.curves[values.wavelengths_nm == 450] + values.curves[values.wavelengths_nm == 460])[0] / 2
     assert at[1] == pytest.approx(middle)
     assert at[2, 2] == 1
 
 
-def altered(place: str, value: Any) -> dict[str, Any]:
+def altered(key: str, value: Any) -> dict[str, Any]:
     content = document()
     table = content["spectral_data"]["data"]["main"]
     if value is None:
-        for at in place.split():
+        for at in key.split():
             del table[at]
     else:
-        table[place] = value
+        table[key] = value
     return content
 
 
@@ -187,8 +187,8 @@ def grey_lab(profile: ProfileName, on: PaperName) -> NDArray[np.float64]:
     return relative_lab(printed_reflectance(GREYS, profile, on), on)
 
 
-def difference(wanted: NDArray[np.float64], lab: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(colour.delta_E(wanted, lab, method="CIE 2000"), dtype=np.float64)
+def difference(target: NDArray[np.float64], lab: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(colour.delta_E(target, lab, method="CIE 2000"), dtype=np.float64)
 
 
 @pytest.mark.slow
@@ -206,9 +206,9 @@ def test_unmanaged_greys_have_the_measured_tint(on: PaperName) -> None:
 def test_managed_print_has_the_colours_of_the_file(on: PaperName) -> None:
     rng = np.random.default_rng(3)
     pale = 128 + rng.integers(-40, 41, (400, 3))
-    off = difference(intended_lab(pale, on), relative_lab(printed_reflectance(pale, "managed", on), on))
-    assert np.median(off) < 0.3
-    assert off.max() < 2.5
+    deltas = difference(intended_lab(pale, on), relative_lab(printed_reflectance(pale, "managed", on), on))
+    assert np.median(deltas) < 0.3
+    assert deltas.max() < 2.5
 
 
 @pytest.mark.slow
@@ -216,8 +216,8 @@ def test_srgb_matrix_is_adapted_to_d50() -> None:
     space = colour.RGB_COLOURSPACES["sRGB"]
     whites: Any = [colour.xy_to_XYZ(xy) for xy in (space.whitepoint, (0.3457, 0.3585))]
     adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(*whites, transform="Bradford")
-    found = spectral._SRGB_TO_D50
-    np.testing.assert_allclose(found, adapt @ space.matrix_RGB_to_XYZ, atol=2e-4)
+    values = spectral._SRGB_TO_D50
+    np.testing.assert_allclose(values, adapt @ space.matrix_RGB_to_XYZ, atol=2e-4)
 
 
 LAMPS: tuple[LampSpectrum, ...] = ("uhp", "led")
@@ -332,21 +332,21 @@ def test_solids_of_photo_papers_look_like_measured_ones(on: PaperName) -> None:
     white = relative_lab(print_reflectance([[255] * 3], on), on)
     np.testing.assert_allclose(white, [[100, 0, 0]], atol=1e-6)
     lab = absolute_lab(print_reflectance(SOLID_CODES, on))
-    off = colour.delta_E(np.array(SOLID_LAB[on], dtype=np.float64), lab, method="CIE 2000")
-    assert off.max() < 4.5
-    assert np.mean(off) < 2.5
+    deltas = colour.delta_E(np.array(SOLID_LAB[on], dtype=np.float64), lab, method="CIE 2000")
+    assert deltas.max() < 4.5
+    assert np.mean(deltas) < 2.5
 
 
 @pytest.mark.parametrize("on", PAPERS)
 def test_overprints_follow_demichel_and_yule_nielsen(on: PaperName) -> None:
     """A coverage of 0.5 is 0.64 with dot gain; Demichel's weights, Yule-Nielsen with n = 2."""
-    chosen = paper(on)
-    below = (chosen.white - chosen.surface) / (1 - chosen.surface)
-    cyan, magenta = chosen.inks[0], chosen.inks[1]
+    inked = paper(on)
+    below = (inked.white - inked.surface) / (1 - inked.surface)
+    cyan, magenta = inked.inks[0], inked.inks[1]
     mixed = np.sqrt(below) * (
         0.36 * 0.36
         + 0.64 * 0.36 * (10 ** (-cyan / 2) + 10 ** (-magenta / 2))
         + 0.64 * 0.64 * 10 ** (-(cyan + magenta) / 2)
     )
     seen_under_white = print_reflectance([[127.5, 127.5, 255]], on)[0]
-    np.testing.assert_allclose(seen_under_white, chosen.surface + (1 - chosen.surface) * mixed**2)
+    np.testing.assert_allclose(seen_under_white, inked.surface + (1 - inked.surface) * mixed**2)

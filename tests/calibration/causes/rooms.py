@@ -25,7 +25,7 @@ BRIGHT = renumbered(
 
 Which = Callable[[SessionStep], bool]
 Counts = npt.NDArray[np.uint16]
-HAND = Situation(blobs=(Blob((0.4, 0.3, 0.62, 0.6), transmittance=0.08),))
+HAND = Situation(blobs=(Blob((0.4, 0.3, 0.62, 0.6), left=0.08),))
 """A hand before the middle of the chart."""
 
 

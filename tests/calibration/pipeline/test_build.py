@@ -1681,7 +1681,7 @@ def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tm
     page = np.array(lab.chart.page_mm)
     (place,) = finding.places
     assert place.file == f"frames/{file}.dng"
-    left, top, right, bottom = HAND.blobs[0].rectangle
+    left, top, right, bottom = HAND.blobs[0].place
     assert left - 0.05 < place.x_mm / page[0] < right + 0.05
     assert top - 0.05 < place.y_mm / page[1] < bottom + 0.05
     row = next(row for row in result.verdict.remarks if row.figure.name == finding.figure)
@@ -1696,7 +1696,7 @@ def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tm
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_what_covers_few_cells_costs_these_cells_and_not_the_table(lab: Lab, tmp_path: Path) -> None:
     """A fly of two cells' size in one light: with the limits as they are."""
-    fly = Situation(blobs=(Blob((0.5, 0.5, 0.54, 0.56), transmittance=0.4),))
+    fly = Situation(blobs=(Blob((0.5, 0.5, 0.54, 0.56), left=0.4),))
     light = next(light.index for light in BRIGHT if min(light.colour) > 80)
     with taken(lab, tmp_path / "session", lambda step: step.illumination == light, situation=fly) as session:
         result = build(session, tmp_path / "lut")

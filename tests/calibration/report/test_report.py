@@ -60,7 +60,7 @@ def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path, monkeypat
     assert found["evidence"]["showing"] == pytest.approx(1 / 8)
     ((label, place),) = circled
     assert label.endswith(": hand or object in one frame")
-    left, top, right, bottom = HAND.blobs[0].rectangle
+    left, top, right, bottom = HAND.blobs[0].place
     assert left < place.x_mm / lab.chart.page_mm[0] < right
     assert top < place.y_mm / lab.chart.page_mm[1] < bottom
 

@@ -200,14 +200,14 @@ def test_follows_the_recorded_60d(real: Callable[[], list[Recorded]]) -> None:
         sent = data if recorded["dir"] == "out" else None
         assert host.eos.takes_data(request) == (recorded["dir"] == "out")
         answer = host.eos.answer(request, sent)
-        place = f"transaction {number}, 0x{code:04x}"
-        assert f"{answer.response.code:04x}" == recorded["rc"], place
-        assert len(answer.response.parameters) == len(recorded["rparams"]), place
-        assert (answer.data is None) == (recorded["dir"] != "in"), place
+        position = f"transaction {number}, 0x{code:04x}"
+        assert f"{answer.response.code:04x}" == recorded["rc"], position
+        assert len(answer.response.parameters) == len(recorded["rparams"]), position
+        assert (answer.data is None) == (recorded["dir"] != "in"), position
         if recorded["dir"] == "in" and data is not None:
             assert answer.data is not None
             ours, theirs = (structure_of(code, recorded["params"], octets) for octets in (answer.data, data))
-            assert ours == theirs, place
+            assert ours == theirs, position
     assert sessions == 2
 
 

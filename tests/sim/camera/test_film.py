@@ -116,12 +116,12 @@ def test_tags_follow_the_standard() -> None:
         assert tags[code] == golden, code
     assert set(tags) - set(GOLDEN) == {273, 34665, 50721, 50728}
     # ColorMatrix1 as Adobe has it for the 600D, signed rationals; AsShotNeutral is what it makes of D65, green largest.
-    kind, count, value = tags[50721]
-    assert (kind, count) == (10, 9)
+    value_type, count, value = tags[50721]
+    assert (value_type, count) == (10, 9)
     matrix = fractions(value).reshape(3, 3)
     np.testing.assert_allclose(matrix[0], [0.6461, -0.0907, -0.0882])
-    kind, count, value = tags[50728]
-    assert (kind, count) == (5, 3)
+    value_type, count, value = tags[50728]
+    assert (value_type, count) == (5, 3)
     neutral = matrix @ [0.9505, 1, 1.089]
     np.testing.assert_allclose(fractions(value), neutral / neutral[1], rtol=1e-3)
 
@@ -158,9 +158,9 @@ def test_dcraw_has_the_visible_frame(file: Path, body: Body, counts: NDArray[np.
         pytest.skip("dcraw is not installed")
     subprocess.run([dcraw, "-D", "-4", "-T", str(file)], check=True, timeout=60)
     np.testing.assert_array_equal(tifffile.imread(file.with_suffix(".tiff")), visible(counts, body))
-    told = subprocess.run([dcraw, "-i", "-v", str(file)], check=True, timeout=60, capture_output=True, text=True).stdout
-    assert f"Camera: Canon {body.model.removeprefix('Canon ')}" in told
-    assert "ISO speed: 400" in told
-    assert "Shutter: 1/2.0 sec" in told
-    assert "Aperture: f/5.6" in told
-    assert "Filter pattern: RG/GB" in told
+    text = subprocess.run([dcraw, "-i", "-v", str(file)], check=True, timeout=60, capture_output=True, text=True).stdout
+    assert f"Camera: Canon {body.model.removeprefix('Canon ')}" in text
+    assert "ISO speed: 400" in text
+    assert "Shutter: 1/2.0 sec" in text
+    assert "Aperture: f/5.6" in text
+    assert "Filter pattern: RG/GB" in text

@@ -75,10 +75,10 @@ def test_uniform_screen_is_uniform_light() -> None:
 
 def test_window_counts_for_its_share_of_the_exposure() -> None:
     def pixels(at: float) -> NDArray[np.uint32]:
-        shown = plain(WHITE)
+        screen = plain(WHITE)
         if 0.1 <= at < 0.3:
-            shown[2:5, 3:9] = RED
-        return shown
+            screen[2:5, 3:9] = RED
+        return screen
 
     picture, _ = thrown(pixels, 0.5)
     expected = np.ones((9, 16, 3))
@@ -88,21 +88,21 @@ def test_window_counts_for_its_share_of_the_exposure() -> None:
 
 def test_averages_light_not_codes() -> None:
     clock = SimulatedClock()
-    shown = Shown(clock, lambda at: plain(WHITE if at < 0.5 else 0))
-    with Beam(shown, None, Room().light_of, clock) as beam:
+    screen = Shown(clock, lambda at: plain(WHITE if at < 0.5 else 0))
+    with Beam(screen, None, Room().light_of, clock) as beam:
         picture = beam.gather(1.0).picture
     np.testing.assert_allclose(picture, 0.5, atol=SAMPLE_S)
 
 
 def test_ends_in_time_and_reports_the_middle_once() -> None:
     clock = SimulatedClock()
-    shown = Shown(clock, lambda at: plain(WHITE))
+    screen = Shown(clock, lambda at: plain(WHITE))
     halves: list[float] = []
-    with Beam(shown, None, light_of, clock) as beam:
+    with Beam(screen, None, light_of, clock) as beam:
         beam.gather(0.5, lambda: halves.append(clock.monotonic()))
     assert clock.monotonic() == pytest.approx(0.5)
     assert halves == [pytest.approx(0.25, abs=SAMPLE_S)]
-    assert shown.looks[-1] == -1.0, "the screen is released"
+    assert screen.looks[-1] == -1.0, "the screen is released"
 
 
 def test_unreadable_screen_is_black() -> None:
@@ -118,9 +118,9 @@ def test_unreadable_screen_is_black() -> None:
 
 def test_accepts_a_change_of_mode() -> None:
     def pixels(at: float) -> NDArray[np.uint32]:
-        shown = np.full((9, 16) if at < 0.25 else (18, 20), WHITE, dtype=np.uint32)
-        shown[0, 0] = 0
-        return shown
+        screen = np.full((9, 16) if at < 0.25 else (18, 20), WHITE, dtype=np.uint32)
+        screen[0, 0] = 0
+        return screen
 
     picture, _ = thrown(pixels)
     assert picture.shape == (18, 20, 3)
@@ -145,7 +145,7 @@ class Answers(PjLinkProjector):
     is_frozen: bool | None = False
     source: str | None = "31"
     gone: bool = False
-    asked: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+    queries: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
 
     def power(self) -> Power:
         if self.gone:
@@ -161,7 +161,7 @@ class Answers(PjLinkProjector):
         return self.source
 
     def frozen(self) -> bool:
-        self.asked.release()
+        self.queries.release()
         if self.is_frozen is None:
             raise DeviceRefused("class 1")
         return self.is_frozen
@@ -173,7 +173,7 @@ class Answers(PjLinkProjector):
         """Wait until the current answers were requested and used."""
         # The first answer may have been under way; the second comes after the first was taken in.
         for _ in range(3):
-            self.asked.acquire()
+            self.queries.acquire()
 
 
 @pytest.mark.parametrize(
@@ -236,17 +236,17 @@ def test_refuses_wrong_screen_names(text: str) -> None:
 
 def test_screenshots_reconnect_to_the_server(tmp_path: Path) -> None:
     with virtual_screen(tmp_path, "64x48", cursor=True) as server:
-        whole = Screenshots(ScreenPlace(server.display))
-        part = Screenshots(ScreenPlace(server.display, (8, 4, 20, 10)))
-        off = Screenshots(ScreenPlace(server.display, (60, 4, 20, 10)))
+        full_screen = Screenshots(ScreenPlace(server.display))
+        region = Screenshots(ScreenPlace(server.display, (8, 4, 20, 10)))
+        outside = Screenshots(ScreenPlace(server.display, (60, 4, 20, 10)))
         picture = server.picture()
-        np.testing.assert_array_equal(whole.take()[:20, :20], picture[:20, :20])
-        assert whole.take().shape == (48, 64)
-        np.testing.assert_array_equal(part.take(), picture[4:14, 8:28])
+        np.testing.assert_array_equal(full_screen.take()[:20, :20], picture[:20, :20])
+        assert full_screen.take().shape == (48, 64)
+        np.testing.assert_array_equal(region.take(), picture[4:14, 8:28])
         with pytest.raises(DeviceError, match="shows no 20×10 pixels"):
-            off.take()
+            outside.take()
         server.end()
         with pytest.raises(DeviceError):
-            whole.take()
+            full_screen.take()
         with pytest.raises(DeviceError, match=f"check {server.display}"):
-            whole.take()
+            full_screen.take()

@@ -58,10 +58,10 @@ def bare() -> World:
 
 def frame_counts(world: World, *events: AnyDisturbance, colour: Colour = WHITE, frame: int = 5) -> NDArray[np.float64]:
     """Return the visible counts of a frame above black, after `frame` red frames, one per minute."""
-    before = tuple((60.0 * k, RED) for k in range(frame))
-    moment, happens = Moment(frame, 60.0 * frame, colour, before), Disturbances(events)
-    shown, situation = happens.shown(moment), happens.situation(moment)
-    counts = world.expose(shown, REFERENCE_EXPOSURE, key=(7,), situation=situation)
+    earlier = tuple((60.0 * k, RED) for k in range(frame))
+    moment, happens = Moment(frame, 60.0 * frame, colour, earlier), Disturbances(events)
+    projected, situation = happens.shown(moment), happens.situation(moment)
+    counts = world.expose(projected, REFERENCE_EXPOSURE, key=(7,), situation=situation)
     area = world.body.visible
     counts = happens.counted(counts, moment)[area.top : area.top + area.height, area.left : area.left + area.width]
     return counts.astype(np.float64) - world.body.black
@@ -99,21 +99,21 @@ def _centres(world: World, frame: NDArray[np.float64], *events: Bump) -> NDArray
     green = (frame[:-1:2, 1::2] + frame[1::2, :-1:2]) / 2
     dark = green[: frame.shape[0] // 2].max() - green
     x, y = np.meshgrid([25.37, 66.11, 107.83, 151.29], [24.71, 61.05, 99.43])
-    found: list[tuple[float, float]] = []
+    centres: list[tuple[float, float]] = []
     for middle in world.project(np.stack([x.ravel(), y.ravel()], axis=-1)):
         column, row = (round(float(one)) for one in middle)
-        part = dark[row - 26 : row + 27, column - 26 : column + 27]
-        part = np.where(part > 0.5 * part.max(), 1.0, part / (0.5 * part.max()) * (part > 0.05 * part.max()))
+        spot = dark[row - 26 : row + 27, column - 26 : column + 27]
+        spot = np.where(spot > 0.5 * spot.max(), 1.0, spot / (0.5 * spot.max()) * (spot > 0.05 * spot.max()))
         rows, columns = np.mgrid[row - 26 : row + 27, column - 26 : column + 27]
-        found.append((float((part * columns).sum() / part.sum()), float((part * rows).sum() / part.sum())))
-    return np.array(found)
+        centres.append((float((spot * columns).sum() / spot.sum()), float((spot * rows).sum() / spot.sum())))
+    return np.array(centres)
 
 
 @pytest.mark.parametrize(("px", "direction"), [(0.3, 0.0), (1.0, 30.0), (8.0, 200.0)])
 def test_bump_moves_the_chart(square_world: World, px: float, direction: float) -> None:
-    still = _centres(square_world, frame_counts(square_world))
+    unmoved = _centres(square_world, frame_counts(square_world))
     pushed = _centres(square_world, frame_counts(square_world, Bump(px=px, direction_deg=direction)))
-    by = (pushed - still).mean(axis=0)
+    by = (pushed - unmoved).mean(axis=0)
     expected = px * np.array([np.cos(np.radians(direction)), np.sin(np.radians(direction))])
     # The chart is rolled by 1.5° and turned by more.
     np.testing.assert_allclose(by, expected, atol=0.02 + 0.035 * px)
@@ -126,8 +126,8 @@ def test_defocus_has_the_given_standard_deviation() -> None:
     def spread(*events: Defocus) -> float:
         row = frame_counts(world, *events)[101:401:2, ::2].mean(axis=0)
         step = np.abs(np.diff(row[150:250]))
-        place = np.arange(len(step))
-        return float(np.average((place - np.average(place, weights=step)) ** 2, weights=step))
+        position = np.arange(len(step))
+        return float(np.average((position - np.average(position, weights=step)) ** 2, weights=step))
 
     assert spread(Defocus(px=3.0)) - spread() == pytest.approx(9.0, rel=0.1)
 
@@ -146,8 +146,8 @@ def test_projected_picture_illuminates_each_position(bare: World) -> None:
     picture[45:, 80:] = 0.25
     area = bare.body.visible
 
-    def lit(shown: NDArray[np.float32]) -> NDArray[np.float64]:
-        counts = bare.expose(GREEN, REFERENCE_EXPOSURE, key=(7,), situation=Situation(picture=shown))
+    def lit(projected: NDArray[np.float32]) -> NDArray[np.float64]:
+        counts = bare.expose(GREEN, REFERENCE_EXPOSURE, key=(7,), situation=Situation(picture=projected))
         counts = counts[area.top : area.top + area.height, area.left : area.left + area.width]
         return counts.astype(np.float64) - bare.body.black
 
@@ -164,15 +164,15 @@ def test_projected_picture_illuminates_each_position(bare: World) -> None:
 
 
 def test_stale_file_repeats_the_previous_one(plain_world: World, tmp_path: Path) -> None:
-    shown = [RED, GREEN, GREY]
+    projected = [RED, GREEN, GREY]
     events = Disturbances((StaleFile(from_frame=1, to_frame=1), StaleFile(from_frame=2, to_frame=2, new_header=True)))
-    film = WorldFilm(plain_world, lambda: shown[0], lambda: 1.0, "1", {}, events)
+    film = WorldFilm(plain_world, lambda: projected[0], lambda: 1.0, "1", {}, events)
     files: list[bytes] = []
     for number in range(4):
         into = io.BytesIO()
         film.expose(REFERENCE_EXPOSURE, SIM_START + timedelta(seconds=10 * number), into)
         files.append(into.getvalue())
-        shown.append(shown.pop(0))
+        projected.append(projected.pop(0))
     assert files[1] == files[0]
     assert files[2] != files[0]
     pictures = [_counts(file, tmp_path / f"{number}.dng") for number, file in enumerate(files)]
@@ -257,5 +257,5 @@ def test_reflection_adds_a_share_of_paper_white() -> None:
     for colour in (WHITE, RED):
         added = frame_counts(world, glare, colour=colour) - frame_counts(world, colour=colour)
         white = world.white(colour, REFERENCE_EXPOSURE)
-        for place, share in (((0.49, 0.5), 0.05), ((0.51, 0.5), 0.05), ((0.9, 0.5), 0.05 / np.e**2)):
-            np.testing.assert_allclose(at(world, *place, added), share * white, rtol=0.02, atol=1.5)
+        for position, share in (((0.49, 0.5), 0.05), ((0.51, 0.5), 0.05), ((0.9, 0.5), 0.05 / np.e**2)):
+            np.testing.assert_allclose(at(world, *position, added), share * white, rtol=0.02, atol=1.5)

@@ -94,9 +94,9 @@ def test_field_has_the_given_falloff_and_balance() -> None:
     rows, columns = BODIES["Test"].half_size
     corner = lens_only.view.locate(np.array([[-0.75, -0.75], [(columns - 1) / 2, (rows - 1) / 2]]))
     np.testing.assert_allclose(lens_only.field(corner), [[0.7] * 3, [1] * 3], rtol=2e-3)
-    both = World(BARE, BODIES["Test"], Room())
+    mixed = World(BARE, BODIES["Test"], Room())
     x, y = np.meshgrid(np.linspace(0, 180, 37), np.linspace(0, 125, 26))
-    field = both.field(np.stack([x, y], axis=-1))
+    field = mixed.field(np.stack([x, y], axis=-1))
     assert 0.95 < field[..., 1].max() <= 1
     np.testing.assert_allclose(field.mean(axis=(0, 1)) / field[..., 1].mean(), 1, atol=2e-3)
     assert np.ptp(field / field[..., 1:2]) > 0.01, "the primaries fall off differently"
@@ -124,11 +124,11 @@ def test_photosites_integrate_over_aperture_and_blur() -> None:
     steps = np.linspace(-4.95, 4.95, 100)
     errors: list[float] = []
     for column, row in cast("list[list[int]]", photosites.tolist()):
-        places = np.stack(np.meshgrid(steps, steps), axis=-1) + rng.uniform(-0.05, 0.05, (100, 100, 2))
+        positions = np.stack(np.meshgrid(steps, steps), axis=-1) + rng.uniform(-0.05, 0.05, (100, 100, 2))
         edge = 0.5 / (blur * math.sqrt(2))
-        spread = erf(places / (blur * math.sqrt(2)) + edge) - erf(places / (blur * math.sqrt(2)) - edge)
+        spread = erf(positions / (blur * math.sqrt(2)) + edge) - erf(positions / (blur * math.sqrt(2)) - edge)
         weights = spread.prod(axis=-1)
-        points = world.view.locate((np.array([column, row]) + places - 0.5) / 2)
+        points = world.view.locate((np.array([column, row]) + positions - 0.5) / 2)
         cell = np.floor((points - [15, 10]) / [2.1, 1.9]).astype(int)
         channel = (0, 1, 1, 2)[2 * (row % 2) + column % 2]
         inside = ((cell >= 0) & (cell < [70, 50])).all(axis=-1)
@@ -145,25 +145,25 @@ def test_squares_are_at_projected_positions(square_world: World) -> None:
     """Centroids of the squares in each colour plane, compared with projected areas."""
     signal = square_world.signal(WHITE, REFERENCE_EXPOSURE).astype(np.float64)
     white = square_world.white(WHITE, REFERENCE_EXPOSURE)
-    places: NDArray[np.float64] = np.indices(signal.shape).astype(np.float64)
-    rows, columns = places[0], places[1]
+    positions: NDArray[np.float64] = np.indices(signal.shape).astype(np.float64)
+    rows, columns = positions[0], positions[1]
     for box in square_world.sheet.rectangles_mm:
         steps = (np.arange(40) + 0.5) / 40
         points = np.stack(np.meshgrid(*(a + steps * (b - a) for a, b in zip(box[:2], box[2:], strict=True))), axis=-1)
-        seen = square_world.project(points)
-        by_x = square_world.project(points + np.array([0.01, 0])) - seen
-        by_y = square_world.project(points + np.array([0, 0.01])) - seen
+        expected_px = square_world.project(points)
+        by_x = square_world.project(points + np.array([0.01, 0])) - expected_px
+        by_y = square_world.project(points + np.array([0, 0.01])) - expected_px
         area = np.abs(by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0])
-        expected = (seen * area[..., None]).sum(axis=(0, 1)) / area.sum()
+        expected = (expected_px * area[..., None]).sum(axis=(0, 1)) / area.sum()
         x, y = (round(2 * float(place) + 0.5) for place in expected)
         window = (slice(y - 42, y + 43), slice(x - 42, x + 43))
         for phase, channel in zip(product((0, 1), (0, 1)), (0, 1, 1, 2), strict=True):
             mine: NDArray[np.bool_] = (rows[window] % 2 == phase[0]) & (columns[window] % 2 == phase[1])
             darkness = (white[channel] - signal[window])[mine]
-            found = [
+            measured = [
                 float((darkness * place[window][mine]).sum() / darkness.sum() - 0.5) / 2 for place in (columns, rows)
             ]
-            np.testing.assert_allclose(found, expected, atol=0.003)
+            np.testing.assert_allclose(measured, expected, atol=0.003)
 
 
 def test_frame_depends_on_its_key(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,8 +237,8 @@ def test_colour_wheel_changes_short_exposures(shutter_s: float, percent: float) 
             visible(world.expose(PRIMARIES[i], settings, key=(n,)), body).mean() - body.black for i in range(2)
         )
         ratios.append(float(red / green))
-    found = 100 * np.std(ratios) / np.mean(ratios)
-    assert found == pytest.approx(percent, rel=0.2)
+    measured = 100 * np.std(ratios) / np.mean(ratios)
+    assert measured == pytest.approx(percent, rel=0.2)
 
 
 def test_later_rectangles_cover_earlier_ones() -> None:
@@ -263,12 +263,12 @@ def test_stain_and_fold_have_the_given_depth() -> None:
     x, y = np.meshgrid(np.arange(20, columns - 20, 7), np.arange(20, rows - 20, 7))
     planes = channel_planes(worn.signal(WHITE, REFERENCE_EXPOSURE))[y, x]
     for channel, offset in enumerate((-0.25, 0, 0.25)):
-        places = worn.view.locate((np.stack([x, y], axis=-1) + offset).astype(np.float64))
-        white = np.full((places[..., 0].size, 3), 255)
-        true = worn.seen(white, places.reshape(-1, 2), WHITE, REFERENCE_EXPOSURE)[:, channel].reshape(x.shape)
-        inside = ((places > 2) & (places < np.array(BARE.page_mm) - 2)).all(axis=-1)
+        positions = worn.view.locate((np.stack([x, y], axis=-1) + offset).astype(np.float64))
+        white = np.full((positions[..., 0].size, 3), 255)
+        true = worn.seen(white, positions.reshape(-1, 2), WHITE, REFERENCE_EXPOSURE)[:, channel].reshape(x.shape)
+        inside = ((positions > 2) & (positions < np.array(BARE.page_mm) - 2)).all(axis=-1)
         # A stain's rim is blurred by the lens, paper is not.
-        rim = np.abs(np.linalg.norm(places - worn.stain.centre_mm, axis=-1) - 12.5) < 3
+        rim = np.abs(np.linalg.norm(positions - worn.stain.centre_mm, axis=-1) - 12.5) < 3
         np.testing.assert_allclose(planes[..., channel][inside & ~rim], true[inside & ~rim], rtol=2e-3)
     middle = np.array(worn.stain.centre_mm)
     np.testing.assert_allclose(worn.stain.passed(middle), [0.88, 0.76, 0.6], atol=1e-6)
