@@ -318,7 +318,7 @@ def counts(
         (3,) float32, exposure to each primary.
     noise
         (rows, sensor columns) float32, standard normal values.
-    left
+    first_column
         First visible column.
     black, read_noise
         Mean and standard deviation of a dark count, DN.

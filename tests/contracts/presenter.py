@@ -53,7 +53,7 @@ class PresenterContract:
                 bench.presenter.verify(colour)
             with pytest.raises(DeviceError):
                 bench.presenter.verify(Colour(1, 2, 4))
-            assert bench.seen() == colour, "it only looks"
+            assert bench.seen() == colour, "reading back changes nothing"
         bench.presenter.close()
         with pytest.raises(DeviceError):
             bench.presenter.verify(BLACK)

@@ -23,7 +23,7 @@ GIVE_UP_S = 0.05
 ECHO = 0x9F01
 """Answers with the parameters it was given."""
 GIVE = 0x9F02
-"""Gives as many bytes of data as its parameter says."""
+"""Gives as many bytes of data as its parameter."""
 TAKE = 0x9F03
 """Takes data, and answers with their length and CRC-32."""
 REFUSE = 0x9F04
@@ -31,7 +31,7 @@ REFUSE = 0x9F04
 BREAK_OFF = 0x9F05
 """Gives data, then reports that they are incomplete."""
 RAISE = 0x9F06
-"""Raises as many events as its parameter says."""
+"""Raises as many events as its parameter."""
 HANG = 0x9F07
 """Never answers."""
 MIX_UP = 0x9F08
@@ -138,7 +138,7 @@ class TransportContract:
             _take(bench, size)
             _give(bench, 3)
 
-    # One contract for many cables is what is meant, and a cable may well be used for many transactions.
+    # The fixture is shared by all examples: a transport may be used for many transactions.
     @settings(
         max_examples=40,
         deadline=None,
@@ -158,7 +158,7 @@ class TransportContract:
         assert result.response.ok
         assert result.data == b""
         assert b"".join(pieces) == payload(5_000_000)
-        assert len(pieces) > 4, "an object must not lie in memory in full"
+        assert len(pieces) > 4, "objects must not be kept in memory completely"
 
     @pytest.mark.slow
     def test_refuses_data_above_the_limit(self, bench: Bench) -> None:

@@ -126,9 +126,9 @@ def test_cached_code_depends_on_sources_settings_and_hash(kernels: Kernels) -> N
     assert kernels.run(SQUARED) == ["25 True"]
     assert kernels.run(SQUARED) == ["25 False"], "the next start compiles nothing"
     assert kernels.run(SQUARED, NUMBA_OPT="1") == ["25 True"]
-    assert kernels.code() == [cached], "made anew, and kept in its place"
+    assert kernels.code() == [cached], "the new code replaces the old"
     assert kernels.run(SQUARED, NUMBA_CPU_NAME="generic") == ["25 True"]
-    assert len(kernels.code()) == 2, "another processor's is kept beside it"
+    assert len(kernels.code()) == 2, "code of another processor is cached too"
     kernels.write_power(3)
     assert kernels.run(SQUARED) == ["125 True"], "a file that was compiled into it has changed"
 

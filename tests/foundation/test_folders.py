@@ -1,6 +1,6 @@
 """Folder locks on file systems that lock folders, on those that lock files only, and on those without locks.
 
-A replaced `flock` simulates what a file system cannot lock.
+A replaced `flock` simulates missing locks of a file system.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def refuse_folders(handle: int, operation: int) -> None:
 
 @pytest.fixture(params=["folders", "files"])
 def locks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return what the file system can lock."""
+    """Return the kind of lockable objects."""
     if request.param == "files":
         monkeypatch.setattr(folders.fcntl, "flock", refuse_folders)
     return request.param

@@ -19,7 +19,7 @@ FOREIGN = Piece("one", "of others", {}, "{}")
 def test_restores_pieces() -> None:
     record = ONE.to_line() + TWO.to_line()
     assert read_pieces(record) == read_pieces(record, "of these") == {"one": ONE, "two": TWO}
-    assert read_pieces(record + FOREIGN.to_line())["one"] == FOREIGN, "the last of a name"
+    assert read_pieces(record + FOREIGN.to_line())["one"] == FOREIGN, "the last line of a name is used"
     assert read_pieces(record + FOREIGN.to_line(), "of these")["one"] == ONE
     foreign_line = b"a line\tof something else"
     assert read_pieces(b"%s\t%s\n" % (sha256_of(foreign_line).encode(), foreign_line)) == read_pieces(b"") == {}

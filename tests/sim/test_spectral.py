@@ -152,7 +152,7 @@ def altered(key: str, value: Any) -> dict[str, Any]:
     ],
 )
 def test_refuses_bad_sensitivities(content: Any, message: str) -> None:
-    assert parsed(altered("720", [0.05, 0, 0])).curves[-1, 0] == 0.05, "so much may be left at the end"
+    assert parsed(altered("720", [0.05, 0, 0])).curves[-1, 0] == 0.05, "5 % at the end is allowed"
     with pytest.raises(FormatError, match=message) as refused:
         parsed(content)
     assert str(refused.value).startswith("m1.json")
@@ -177,7 +177,7 @@ def test_unknown_camera_lists_known_names() -> None:
 
 PAPERS: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 MANAGED: tuple[PaperName, ...] = ("poster", "glossy")
-"""Papers whose profiles are worked out here, each in a second: the one with the least black, and the one with most."""
+"""Papers with profiles computed here, each in a second: the one with the least black, and the one with most."""
 GREYS = np.repeat(np.arange(256)[:, None], 3, axis=1)
 
 

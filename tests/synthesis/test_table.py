@@ -48,7 +48,7 @@ class Comparison:
     normal: npt.NDArray[np.float64]
     """(L, C, 3), difference of the means over its standard error."""
     spread: npt.NDArray[np.float64]
-    """(L, 3), mean standard deviation of one table over that of the other."""
+    """(L, 3), mean standard deviation of the first LUT relative to the second."""
     white: npt.NDArray[np.float64]
     """(L, 3), relative difference of the ground truths."""
 

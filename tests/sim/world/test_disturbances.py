@@ -82,7 +82,7 @@ def test_lamp_and_ambient_light_have_the_given_brightness(bare: World, room_ligh
     halfway = frame_counts(bare, LampDrift(percent=-2, from_frame=0, to_frame=10)).mean()
     assert halfway / white == pytest.approx(0.99, abs=1e-4)
     by_time = frame_counts(bare, LampDrift(percent=-2, from_s=200, to_s=300)).mean()
-    assert by_time / white == pytest.approx(0.98, abs=1e-4), "it stays when it has grown"
+    assert by_time / white == pytest.approx(0.98, abs=1e-4), "the effect stays"
 
 
 def test_person_hides_the_chart(bare: World) -> None:

@@ -92,7 +92,7 @@ def test_rooms_are_unchanged(name: str, pinned: Pinned) -> None:
 @pytest.mark.slow
 def test_disturbances_are_unchanged(pinned: Pinned) -> None:
     world = World(patches(), TINY, Room(seed=6, veil=0.02, black_leak=0.002))
-    # What was on the screen before, and moments at the ends of what is there for a while.
+    # Earlier colours, and moments at the limits of events.
     moments = [
         Moment(n, 10.0 * n, ORANGE, ((10.0 * n - 10, WHITE), (10.0 * n - 0.5, Colour(0, 9, 200)))) for n in range(6)
     ]
