@@ -260,6 +260,5 @@ def from_settings(
         return _adapter(record_type).validate_python({**fixed, **values})
     except ValidationError as error:
         first = error.errors()[0]
-        full_key = ".".join([key, *(str(component) for component in first["loc"][:1])])
-        message = f"{where}: {full_key}: {_expectation(full_key, first)}, got {first['input']!r}"
-        raise ConfigurationError(message) from error
+        path = ".".join([key, *(str(component) for component in first["loc"][:1])])
+        raise ConfigurationError(f"{where}: {path}: {_expectation(path, first)}, got {first['input']!r}") from error
