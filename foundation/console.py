@@ -48,7 +48,7 @@ EXIT_CODES = (
 )
 
 # Printed instead of the errors that it causes: all relative paths depend on that folder.
-_NO_WORKING_FOLDER = "the current folder does not exist any more; change to an existing one (cd), then run it again"
+_NO_FOLDER = "the current folder does not exist any more; change to an existing one (cd), then run it again"
 _WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
@@ -149,8 +149,7 @@ def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
     try:
         command()
     except CropError as error:
-        is_consequence = error.exit_code == InputError.exit_code and _lacks_working_folder()
-        print_error(_NO_WORKING_FOLDER if is_consequence else str(error))
+        print_error(_NO_FOLDER if error.exit_code == InputError.exit_code and _lacks_folder() else str(error))
         return error.exit_code
     except KeyboardInterrupt:
         return _report_interruption(is_resumable)
@@ -165,8 +164,8 @@ def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
             action = "write" if error.errno in _WRITE_FAULTS else "use"
             print_error(f"cannot {action} {about}: {error.strerror}; {remedy}")
             return StorageError.exit_code
-        if _lacks_working_folder():
-            print_error(_NO_WORKING_FOLDER)
+        if _lacks_folder():
+            print_error(_NO_FOLDER)
             return InputError.exit_code
         remedy = path_remedy(error)
         if remedy is None or not has_name:
@@ -183,7 +182,7 @@ def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
     return 0
 
 
-def _lacks_working_folder() -> bool:
+def _lacks_folder() -> bool:
     try:
         os.getcwd()  # noqa: PTH109  as Path.cwd(), without an object
     except OSError:

@@ -1,7 +1,7 @@
 """Record file of the finished pieces of a long job, with which a killed program resumes.
 
-A line has the SHA-256 of the rest of the line, the name of a piece, the hash of its inputs, its files as a JSON object
-of names and SHA-256, and its values as JSON, separated by tabs.
+A line has five fields, separated by tabs: SHA-256 of the rest of the line, name of a piece, hash of its inputs, JSON
+object of its file names with their SHA-256, and its values as JSON.
 
 - A line is written after the files of its piece.
 - Damaged lines, and pieces made from other inputs, are ignored, so these pieces are made again.

@@ -143,8 +143,9 @@ def find_mistakes(
             mistakes[key] = unknown_key(key, table.model_fields)
         elif detail["type"] == "missing" and table is not None:
             # A misspelt key is reported once, not also as missing.
-            siblings = (loc for loc in unknown if loc[:-1] == location[:-1])
-            questions = (nearest_names(str(loc[-1]), table.model_fields) for loc in siblings)
+            questions = (
+                nearest_names(str(loc[-1]), table.model_fields) for loc in unknown if loc[:-1] == location[:-1]
+            )
             if f"did you mean {location[-1]!r}?" not in questions:
                 mistakes[key] = _missing(key, _table_at(model, location))
         else:
@@ -166,8 +167,7 @@ def _file_key(location: tuple[int | str, ...], document: Any) -> str:
             break
         components.append(str(component))
         # A missing key ends the location.
-        is_present = isinstance(component, int) or component in document
-        document = cast("Any", document)[component] if is_present else None
+        document = cast("Any", document)[component] if isinstance(component, int) or component in document else None
     return ".".join(components)
 
 
@@ -260,6 +260,5 @@ def from_settings(
         return _adapter(record_type).validate_python({**fixed, **values})
     except ValidationError as error:
         first = error.errors()[0]
-        full_key = ".".join([key, *(str(component) for component in first["loc"][:1])])
-        message = f"{where}: {full_key}: {_expectation(full_key, first)}, got {first['input']!r}"
-        raise ConfigurationError(message) from error
+        path = ".".join([key, *(str(component) for component in first["loc"][:1])])
+        raise ConfigurationError(f"{where}: {path}: {_expectation(path, first)}, got {first['input']!r}") from error

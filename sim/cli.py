@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sim.world.world import World
 
 app = new_app(
-    "Simulated devices on loopback connections, until interrupted; and tables that are computed.\n\n" + EXIT_CODES,
+    "Simulated devices on loopback connections, and computed look-up tables (LUTs).\n\n" + EXIT_CODES,
     no_args_is_help=True,
 )
 
@@ -40,17 +40,15 @@ def main(argv: Sequence[str] | None = None, read_chart: Callable[[Path], Print] 
 
 @app.command()
 def projector(
-    pjlink: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="TCP port for PJLink; 0 picks a free one.")
-    ] = None,
+    pjlink: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port for PJLink; 0 for a free one.")] = None,
     password: Annotated[str | None, typer.Option(help="PJLink password, at most 32 characters.")] = None,
     serial: Annotated[
         str | None,
-        option("LANGUAGE", "Language on a serial port: a name (docs/devices.md), or a language file (.toml)."),
+        option("LANGUAGE", "Language of the serial port: a name (docs/devices.md), or a language file (.toml)."),
     ] = None,
-    lit: Annotated[bool, typer.Option("--lit", help="Begin with the lamp burning, not in standby.")] = False,
-    warm_up: Annotated[float, option("SECONDS", "Time to warm up.", min=0)] = 30.0,
-    cool_down: Annotated[float, option("SECONDS", "Time to cool down.", min=0)] = 60.0,
+    lit: Annotated[bool, typer.Option("--lit", help="Start with the lamp on instead of in standby.")] = False,
+    warm_up: Annotated[float, option("SECONDS", "Duration of warm-up.", min=0)] = 30.0,
+    cool_down: Annotated[float, option("SECONDS", "Duration of cooling.", min=0)] = 60.0,
 ) -> None:
     """Serve a simulated projector: standby, 30 s of warm-up, on, 60 s of cooling.
 
@@ -65,12 +63,12 @@ def projector(
     from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 
     if (pjlink is None) == (serial is None):
-        raise ConfigurationError("one projector has one cable: either --pjlink PORT or --serial LANGUAGE")
+        raise ConfigurationError("expected exactly one of --pjlink PORT and --serial LANGUAGE; give one of them")
     if pjlink is None and password is not None:
-        raise ConfigurationError("--password is PJLink's, and a serial cable has none; leave it out")
+        raise ConfigurationError("--password is given, but --serial has no password; leave it out")
     if password is not None and not 1 <= len(password) <= MAX_PASSWORD:
         raise InputError(
-            f"the password has {len(password)} characters; PJLink allows at least 1, at most {MAX_PASSWORD}"
+            f"the password has {len(password)} characters, expected 1 to {MAX_PASSWORD} (PJLink); choose another"
         )
     traits = ProjectorTraits(warm_up_s=warm_up, cool_down_s=cool_down)
     device = SimulatedProjector(SystemClock(), Power.ON if lit else Power.STANDBY, traits)
@@ -88,7 +86,7 @@ def _serve_serial(device: SimulatedProjector, language_name: str) -> None:
     try:
         from sim.buses.serial import PseudoTerminal
     except ImportError as error:
-        raise ConfigurationError("this system has no pseudo-terminals; --serial needs Linux or macOS") from error
+        raise ConfigurationError("this system has no pseudo-terminals, which --serial needs; use --pjlink") from error
     from sim.projectors.serial import LinePeer
 
     with PseudoTerminal(LinePeer(device, language)) as terminal:
@@ -98,18 +96,18 @@ def _serve_serial(device: SimulatedProjector, language_name: str) -> None:
 @app.command()
 def camera(
     context: typer.Context,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port for PTP/IP; 0 picks a free one.")] = 15740,
-    model: Annotated[str, typer.Option(help="EOS 550D, EOS 6D Mark II, or Test: a small frame.")] = "EOS 550D",
-    chart: Annotated[Path | None, typer.Option(help="chart.json of the print before it; grey squares else.")] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port for PTP/IP; 0 for a free one.")] = 15740,
+    model: Annotated[str, typer.Option(help="EOS 550D, EOS 6D Mark II, or Test, which has small frames.")] = "EOS 550D",
+    chart: Annotated[Path | None, typer.Option(help="chart.json of the print; by default grey squares.")] = None,
     room: Annotated[
-        list[str] | None, option("NAME=VALUE", "What differs from the default room, as LAB.toml's.")
+        list[str] | None, option("NAME=VALUE", "Changed parameter of the default room, as in LAB.toml.")
     ] = None,
     watch_screen: Annotated[
         str | None,
-        option("SCREEN", "X screen that lights the chart: :1, 640x360+0+0, or :1,640x360+0+0."),
+        option("SCREEN", "X screen that illuminates the chart: :1, 640x360+0+0, or :1,640x360+0+0."),
     ] = None,
     watch_projector: Annotated[
-        str | None, option("HOST:PORT", "PJLink projector that throws it; a steady lamp else.")
+        str | None, option("HOST:PORT", "PJLink projector of this screen; by default a constant lamp.")
     ] = None,
 ) -> None:
     """Serve a simulated Canon EOS on a TCP port; by default it photographs grey squares under white light.
@@ -135,11 +133,11 @@ def camera(
     from sim.world.world import REFERENCE_EXPOSURE, World, read_room
 
     if model not in EOS_BODIES:
-        raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
+        raise ConfigurationError(f"--model is {model!r}, expected one of {', '.join(sorted(EOS_BODIES))}")
     if watch_screen is None and watch_projector is not None:
-        raise ConfigurationError("a projector throws a screen's picture: --watch-projector needs --watch-screen")
+        raise ConfigurationError("--watch-projector is given without --watch-screen; give both")
     changes = dict(_setting("--room", text) for text in room or ())
-    # A lamp that ages would be dark by now: unless asked for, its drift counts from no day at all.
+    # Lamp drift is off by default: the simulated lamp would be dark by now.
     world = World(
         _grey_squares() if chart is None else _print(context, chart),
         BODIES[model],
@@ -147,7 +145,7 @@ def camera(
     )
     with ExitStack() as opened:
         film = opened.enter_context(_film(world, watch_screen, watch_projector))
-        # One frame may be exposed while others are still developed.
+        # A frame may be exposed while others are still being developed.
         executor = opened.enter_context(ThreadPoolExecutor(3, "developing"))
         eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, executor=executor)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
@@ -172,21 +170,21 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
         yield WorldFilm(world, lambda: WHITE, lambda: 1.0, serial, {})
         return
     clock, pictures = SystemClock(), Screenshots(ScreenPlace.parse(screen))
-    # A screen that is not there now is a mistake; later it is an accident of the rehearsal.
+    # A screen that is missing now is a mistake of the user; later it is part of the rehearsal.
     pictures.take()
-    asked = None
+    pjlink_projector = None
     if projector is not None:
         host, port = _host_and_port(projector)
-        asked = PjLinkProjector(lambda: TcpLink.connect(host, port, 5.0), label=projector, clock=clock)
-        asked.power()
-    with Beam(pictures, asked, world.room.light_of, clock) as beam:
-        # The first frame would else come seconds late.
+        pjlink_projector = PjLinkProjector(lambda: TcpLink.connect(host, port, 5.0), label=projector, clock=clock)
+        pjlink_projector.power()
+    with Beam(pictures, pjlink_projector, world.room.light_of, clock) as beam:
+        # Renders the room now, so that the first frame is not delayed by seconds.
         world.signal(WHITE, REFERENCE_EXPOSURE)
 
         def gather(number: int, seconds: float) -> tuple[NDArray[np.float32], float]:
             print(f"exposure {number} begins, {seconds:g} s", flush=True)
             thrown = beam.gather(seconds, lambda: print(f"exposure {number} half over", flush=True))
-            dark = f"; no lamp: {beam.trouble}" if beam.trouble else ""
+            dark = f"; no light: {beam.trouble}" if beam.trouble else ""
             print(f"exposure {number} ends: {thrown}{dark}", flush=True)
             return thrown.picture, thrown.lamp
 
@@ -196,7 +194,7 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
 def _print(context: typer.Context, chart: Path) -> Print:
     read: Callable[[Path], Print] | None = context.obj
     if read is None:
-        raise ConfigurationError(f"--chart {chart}: charts are read by the program sim; this is sim.cli alone")
+        raise ConfigurationError(f"--chart {chart} cannot be read by sim.cli alone; use the program sim")
     return read(chart)
 
 
@@ -204,7 +202,7 @@ def _setting(option: str, text: str) -> tuple[str, Any]:
     # Values are in TOML syntax; texts may be without quotes.
     name, equals, value = text.partition("=")
     if not name or not equals:
-        raise InputError(f"{option} {text!r}: NAME=VALUE expected, such as waviness_mm=1.5")
+        raise InputError(f"{option} is {text!r}, expected NAME=VALUE, such as waviness_mm=1.5")
     try:
         return name, tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
@@ -218,9 +216,9 @@ def _grey_squares() -> Print:
     from sim.world.rendering import Print
 
     column, row = (grid.ravel() for grid in np.meshgrid(np.arange(5), np.arange(3)))
-    left, top = 18 + 54.0 * column, 21 + 60.0 * row
-    boxes = np.stack([left, top, left + 45, top + 45], axis=-1).astype(np.float64)
-    grey = np.linspace(0, 248, len(left)).round().astype(np.uint8)
+    x, top = 18 + 54.0 * column, 21 + 60.0 * row
+    boxes = np.stack([x, top, x + 45, top + 45], axis=-1).astype(np.float64)
+    grey = np.linspace(0, 248, len(x)).round().astype(np.uint8)
     return Print((297, 210), boxes, np.stack([grey] * 3, axis=-1))
 
 
@@ -228,18 +226,18 @@ def _host_and_port(text: str) -> tuple[str, int]:
 
     host, _, port = text.rpartition(":")
     if not host or not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:
-        raise InputError(f"{text!r} is no address; expected HOST:PORT, such as 127.0.0.1:4352")
+        raise InputError(f"the address is {text!r}, expected HOST:PORT, such as 127.0.0.1:4352")
     return host, int(port)
 
 
 def _until_interrupted(announcement: str) -> None:
     """Print the address and serve until Ctrl-C or SIGTERM, even if a shell ignores these signals."""
-    asked = queue.SimpleQueue[int]()
+    signals = queue.SimpleQueue[int]()
     for request in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(request, lambda number, _: asked.put(number))
-    # Whoever reads it may interrupt at once: an exception while it is written would have it written twice.
+        signal.signal(request, lambda number, _: signals.put(number))
+    # Handlers are set first: a reader may interrupt at once, and an exception would print the text twice.
     print(announcement, flush=True)
-    asked.get()
+    signals.get()
     print("stopped")
 
 

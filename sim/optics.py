@@ -19,8 +19,8 @@ uniform on it: (1 − v) · light + v · mean light, for each camera channel. A 
 
 **Lateral chromatic aberration**: red and blue are magnified differently from green. At the fraction ρ of the distance
 from axis to corner, a channel is shifted outwards by d · ρ · (1 + ρ²) / 2 relative to green, d in the corner. Half is
-the chromatic difference of magnification (linear), half that of distortion (cubic; W. T. Welford, "Aberrations of
-Optical Systems", 1986, ch. 10). The equal shares are chosen.
+the chromatic difference of magnification (linear), half the chromatic difference of distortion (cubic; W. T. Welford,
+"Aberrations of Optical Systems", 1986, ch. 10). The equal shares are chosen.
 
 **Fall-off** of the lens over the frame is 1 / (1 + c r²)², which is cos⁴ of the angle to the axis. Fall-off of a
 primary of the projector over the page is g / (1 + c d²). `sim.world.rendering.light` uses these constants.

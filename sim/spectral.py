@@ -78,18 +78,18 @@ def require_grid(wavelengths_nm: _Array, where: str) -> None:
     if len(wavelengths_nm) < 2 or wavelengths_nm[0] > low or wavelengths_nm[-1] < high:
         span = "none" if not len(wavelengths_nm) else f"{wavelengths_nm[0]:g} to {wavelengths_nm[-1]:g}"
         raise FormatError(
-            f"{where}: its wavelengths are {span}, {low:g} to {high:g} nm at least expected; "
-            "convert them to nanometres if they are not, or measure the rest"
+            f"{where}: its wavelengths are {span}, expected at least {low:g} to {high:g} nm; "
+            "convert them to nanometres, or measure the missing ones"
         )
     steps = np.diff(wavelengths_nm)
     if steps.min() <= 0:
-        raise FormatError(f"{where}: {wavelengths_nm[int(steps.argmin())]:g} nm stands there twice; leave one out")
+        raise FormatError(f"{where}: {wavelengths_nm[int(steps.argmin())]:g} nm occurs twice; delete one")
     inside = (wavelengths_nm[:-1] < high) & (wavelengths_nm[1:] > low)
     if steps[inside].max() > WIDEST_STEP_NM:
         at = int(np.flatnonzero(inside)[steps[inside].argmax()])
         raise FormatError(
-            f"{where}: there is a gap from {wavelengths_nm[at]:g} to {wavelengths_nm[at + 1]:g} nm, "
-            f"{WIDEST_STEP_NM:g} nm at most expected; measure what lies between"
+            f"{where}: a gap from {wavelengths_nm[at]:g} to {wavelengths_nm[at + 1]:g} nm, "
+            f"{WIDEST_STEP_NM:g} nm at most expected; measure the wavelengths between"
         )
 
 
@@ -109,15 +109,15 @@ def resampled(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array
     ([0.6, 0.4], 5.0)
     """
     step = float(onto_nm[1] - onto_nm[0])
-    found = np.zeros((len(onto_nm), curves.shape[1]))
+    values = np.zeros((len(onto_nm), curves.shape[1]))
     if float(np.diff(wavelengths_nm).min()) > 0.999 * step:
         for number in range(curves.shape[1]):
-            found[:, number] = np.interp(onto_nm, wavelengths_nm, curves[:, number], left=0, right=0)
-        return found
+            values[:, number] = np.interp(onto_nm, wavelengths_nm, curves[:, number], left=0, right=0)
+        return values
     if float(np.diff(wavelengths_nm).max()) > 0.999 * step:
-        # Where steps are wider, a wavelength would stand for nodes that lie between it and the next.
+        # Otherwise a wavelength would also represent nodes in the wide step after it.
         wavelengths_nm, curves = _densified(wavelengths_nm, curves, step)
-    # Each wavelength stands for half the way to its neighbours.
+    # Each wavelength represents half the distance to its neighbours.
     edges = np.concatenate([wavelengths_nm[:1], (wavelengths_nm[1:] + wavelengths_nm[:-1]) / 2, wavelengths_nm[-1:]])
     share = np.clip(1 - np.abs(onto_nm[:, None] - wavelengths_nm[None]) / step, 0, None)
     weights = share * np.diff(edges)[None] / step
@@ -131,10 +131,10 @@ def _densified(wavelengths_nm: _Array, curves: _Array, step: float) -> tuple[_Ar
     widths = np.repeat(np.diff(wavelengths_nm) / counts, counts)
     within = np.arange(len(starts)) - np.repeat(np.cumsum(counts) - counts, counts)
     filled = np.append(starts + within * widths, wavelengths_nm[-1])
-    found = np.empty((len(filled), curves.shape[1]))
+    values = np.empty((len(filled), curves.shape[1]))
     for number in range(curves.shape[1]):
-        found[:, number] = np.interp(filled, wavelengths_nm, curves[:, number])
-    return filled, found
+        values[:, number] = np.interp(filled, wavelengths_nm, curves[:, number])
+    return filled, values
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,13 +176,13 @@ def _components() -> dict[str, PublishedSpectrum]:
 
 def _read(name: str) -> dict[str, PublishedSpectrum]:
     # One line per spectrum: name, first wavelength, step, values.
-    found: dict[str, PublishedSpectrum] = {}
+    spectra: dict[str, PublishedSpectrum] = {}
     text = resources.files("sim").joinpath("data", name).read_text("utf-8")
     for line in text.splitlines()[1:]:
         light, first, step, values = line.split(";")
         power = np.array(values.split(), dtype=np.float64)
-        found[light] = PublishedSpectrum(float(first) + float(step) * np.arange(len(power), dtype=np.float64), power)
-    return found
+        spectra[light] = PublishedSpectrum(float(first) + float(step) * np.arange(len(power), dtype=np.float64), power)
+    return spectra
 
 
 # End of the file names in `sim.data`: first and last wavelength and step, as in rawtoaces-data.
@@ -244,8 +244,8 @@ def known_sensitivities() -> tuple[str, ...]:
     return tuple(sorted(name.removesuffix(SUFFIX) for name in files if name.endswith(SUFFIX)))
 
 
-def read_sensitivities(name: str, more: Sequence[str] = ()) -> Sensitivities:
-    """Return the sensitivities of a name or file; error messages also list the names `more`."""
+def read_sensitivities(name: str, other_names: Sequence[str] = ()) -> Sensitivities:
+    """Return the sensitivities of a name or file; error messages also list the names `other_names`."""
     if name in known_sensitivities():
         data = resources.files("sim").joinpath("data", name + SUFFIX).read_bytes()
         return parse_sensitivities(data, name, name)
@@ -253,17 +253,17 @@ def read_sensitivities(name: str, more: Sequence[str] = ()) -> Sensitivities:
     try:
         data = path.read_bytes()
     except OSError as error:
-        known = [*known_sensitivities(), *more]
-        near = f"{nearest_names(name, known)} ".lstrip()
+        names = [*known_sensitivities(), *other_names]
+        near = f"{nearest_names(name, names)} ".lstrip()
         raise InputError(
-            f"no camera {name!r}: {_reading_problem(error)}; {near}known by name are "
-            f"{', '.join(known)}; name one of them, or a file of spectral sensitivities"
+            f"no camera {name!r}: {_reading_problem(error)}; {near}expected one of "
+            f"{', '.join(names)}, or a file of spectral sensitivities; choose one"
         ) from error
     return parse_sensitivities(data, path.name.removesuffix(SUFFIX).removesuffix(".json"), str(path))
 
 
 def _reading_problem(error: OSError) -> str:
-    return "there is no such file" if isinstance(error, FileNotFoundError) else f"cannot read it ({error.strerror})"
+    return "no such file" if isinstance(error, FileNotFoundError) else f"cannot read it ({error.strerror})"
 
 
 def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:
@@ -271,26 +271,26 @@ def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:
     try:
         document = _Document.model_validate(json.loads(data, object_pairs_hook=_unique_keys))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise FormatError(f"{where} is no JSON: {error}; expected a file of rawtoaces-data's layout") from error
+        raise FormatError(f"{where} is not JSON: {error}; expected a file in the format of rawtoaces-data") from error
     except _DuplicateKeyError as error:
-        raise FormatError(f"{where}: {error.args[0]!r} stands there twice; leave one out") from error
+        raise FormatError(f"{where}: {error.args[0]!r} occurs twice, expected once; delete one") from error
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"])) or "document"
         raise FormatError(
-            f"{where}: {key}: {first['msg']}; expected rawtoaces-data's layout: spectral_data with units, index.main "
-            "and data.main"
+            f"{where}: {key}: {first['msg']}; expected the format of rawtoaces-data: spectral_data with units, "
+            "index.main and data.main"
         ) from error
     spectra = document.spectral_data
     if spectra.units != "relative":
         raise FormatError(
-            f"{where}: spectral_data.units is {spectra.units!r}, 'relative' expected: responses to light of equal "
-            "power; multiply a quantum efficiency by the wavelength first"
+            f"{where}: spectral_data.units is {spectra.units!r}, expected 'relative', the response to equal "
+            "power; multiply quantum efficiencies by the wavelength"
         )
     if tuple(spectra.index.get("main", ())) != _CHANNELS or "main" not in spectra.data:
         raise FormatError(
-            f"{where}: spectral_data.index.main is {spectra.index.get('main')}, with data.main under it; "
-            f"{list(_CHANNELS)} expected"
+            f"{where}: spectral_data.index.main is {spectra.index.get('main')}, expected "
+            f"{list(_CHANNELS)} and data.main; correct it"
         )
     wavelengths, curves = _sorted(spectra.data["main"], where)
     _require_camera(wavelengths, curves, where)
@@ -304,12 +304,12 @@ class _DuplicateKeyError(Exception):
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     # json would silently use the last of two equal keys.
-    found: dict[str, Any] = {}
+    document: dict[str, Any] = {}
     for key, value in pairs:
-        if key in found:
+        if key in document:
             raise _DuplicateKeyError(key)
-        found[key] = value
-    return found
+        document[key] = value
+    return document
 
 
 def _sorted(table: Mapping[str, list[float]], where: str) -> tuple[_Array, _Array]:
@@ -319,9 +319,9 @@ def _sorted(table: Mapping[str, list[float]], where: str) -> tuple[_Array, _Arra
         try:
             wavelength = float(text)
         except ValueError as error:
-            raise FormatError(f"{where}: {text!r} is no wavelength; a number of nanometres expected") from error
+            raise FormatError(f"{where}: the wavelength is {text!r}, expected a number in nm; correct it") from error
         if len(values) != len(_CHANNELS) or not all(map(math.isfinite, [wavelength, *values])):
-            raise FormatError(f"{where}: at {text} nm stand {values}; three numbers expected, for R, G and B")
+            raise FormatError(f"{where}: at {text} nm are {values}, expected three numbers for R, G and B; correct it")
         rows.append((wavelength, values))
     rows.sort(key=lambda row: row[0])
     wavelengths = np.array([row[0] for row in rows], dtype=np.float64)
@@ -334,24 +334,23 @@ def _require_camera(wavelengths: _Array, curves: _Array, where: str) -> None:
         row, channel = np.unravel_index(int(curves.argmin()), curves.shape)
         raise FormatError(
             f"{where}: {_CHANNELS[channel]} is {curves[row, channel]:g} at {wavelengths[row]:g} nm, 0 or more "
-            "expected; set to 0 what is a measurement's noise about 0"
+            "expected; replace negative values of measurement noise by 0"
         )
     peak = curves.max(axis=0)
     if peak.min() <= 0:
-        raise FormatError(f"{where}: {_CHANNELS[int(peak.argmin())]} is 0 at every wavelength; it sees no light at all")
-    for place in (0, -1):
-        left = curves[place] / peak
-        if left.max() > EDGE_SHARE:
+        raise FormatError(f"{where}: {_CHANNELS[int(peak.argmin())]} is 0 at all wavelengths; correct it")
+    for edge in (0, -1):
+        edge_share = curves[edge] / peak
+        if edge_share.max() > EDGE_SHARE:
             raise FormatError(
-                f"{where}: {_CHANNELS[int(left.argmax())]} still has {left.max():.0%} of its peak at its last "
-                f"wavelength, {wavelengths[place]:g} nm; {EDGE_SHARE:.0%} at most expected, so it goes on beyond: add "
-                "what is lacking"
+                f"{where}: {_CHANNELS[int(edge_share.argmax())]} has {edge_share.max():.0%} of its peak at its last "
+                f"wavelength, {wavelengths[edge]:g} nm, {EDGE_SHARE:.0%} at most expected; add the missing wavelengths"
             )
 
 
-def describe_sensitivities(found: Sensitivities) -> dict[str, Any]:
+def describe_sensitivities(source: Sensitivities) -> dict[str, Any]:
     """Return name, camera and hash for a record."""
-    return {"name": found.name, "camera": found.camera, "sha256": found.sha256}
+    return {"name": source.name, "camera": source.camera, "sha256": source.sha256}
 
 
 # Wavelengths of all spectra of the models, (81,) float64.
@@ -406,7 +405,7 @@ def projector_primaries(lamp: LampSpectrum = "uhp") -> NDArray[np.float64]:
         continuum = 0.55 * _gauss(560, 130) + 0.35 * _gauss(640, 90)
         lines = 0.6 * _gauss(405, 4) + 1.9 * _gauss(437, 5, 8) + 2.1 * _gauss(547, 5, 8) + 1.9 * _gauss(579, 6, 8)
         arc = (continuum + lines) * _rise(412, 4) * (1 - _rise(700, 6))
-        # The notch keeps the yellow line out of green and out of red, as such wheels have it for purer primaries.
+        # The notch removes the yellow line from green and red, as in real wheels, for purer primaries.
         power = arc * np.stack([_rise(600, 3), _rise(505, 4) * (1 - _rise(568, 3)), 1 - _rise(493, 4)])
         balance = (1.29, 1.0, 1.12)
     return power * np.array(balance)[:, None]
@@ -475,7 +474,7 @@ def paper(name: PaperName) -> InkedPaper:
         return InkedPaper(white, _photo_inks(MATT_BLACK), MATT_SURFACE, 1.0, 0.5)
     if name == "glossy":
         return InkedPaper(paper_white(), _photo_inks(GLOSSY_BLACK), GLOSSY_SURFACE, 1.0, 0.5)
-    raise ValueError(f"paper {name!r}: known are {', '.join(get_args(PaperName))}")
+    raise ValueError(f"the paper is {name!r}, expected one of {', '.join(get_args(PaperName))}")
 
 
 def ink_coverage(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
@@ -532,20 +531,20 @@ def printed_reflectance(
 ) -> NDArray[np.float64]:
     """Return the reflectance (N, 81) float64 of printed sRGB codes (N, 3), 0 to 255, at `WAVELENGTHS_NM`."""
     if profile not in get_args(ProfileName):
-        raise ValueError(f"profile {profile!r}: known are {', '.join(get_args(ProfileName))}")
+        raise ValueError(f"the profile is {profile!r}, expected one of {', '.join(get_args(ProfileName))}")
     return print_reflectance(ink_codes(rgb, on) if profile == "managed" else rgb, on)
 
 
 def ink_codes(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
     """Return the ink codes (N, 3) float64, 0 to 255, of the managed profile of a paper for sRGB codes (N, 3)."""
     table = _table(on)
-    place = np.clip(np.asarray(rgb, dtype=np.float64), 0, 255) / 255 * (NODES - 1)
-    corner = np.minimum(place.astype(np.int64), NODES - 2)
-    share = place - corner
-    # From the corner to its opposite, one channel after another, that with the largest share first: a tetrahedron.
+    nodes = np.clip(np.asarray(rgb, dtype=np.float64), 0, 255) / 255 * (NODES - 1)
+    corner = np.minimum(nodes.astype(np.int64), NODES - 2)
+    share = nodes - corner
+    # A tetrahedron: from the corner to its opposite, one channel after the other, largest share first.
     order = np.argsort(-share, axis=1, kind="stable")
     sorted_share = np.take_along_axis(share, order, axis=1)
-    weights = -np.diff(np.concatenate([np.ones((len(place), 1)), sorted_share, np.zeros((len(place), 1))], axis=1))
+    weights = -np.diff(np.concatenate([np.ones((len(nodes), 1)), sorted_share, np.zeros((len(nodes), 1))], axis=1))
     at = corner.copy()
     codes = weights[:, :1] * table[at[:, 0], at[:, 1], at[:, 2]]
     for step in range(3):
@@ -581,7 +580,7 @@ class _Inks:
 
     def __init__(self, on: PaperName) -> None:
         if YULE_NIELSEN_N != 2:
-            raise ValueError(f"the Yule-Nielsen factor is {YULE_NIELSEN_N}; the square form holds for 2 alone")
+            raise ValueError(f"the Yule-Nielsen factor is {YULE_NIELSEN_N}; the quadratic form needs 2")
         inked, observer = paper(on), _observer()
         roots = np.sqrt(inked.overprints())
         white = inked.white @ observer
@@ -602,8 +601,8 @@ class _Inks:
 
         axis = np.linspace(0, 1, 9)
         grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        seen = _lab(self.xyz(grid))
-        share = grid[cKDTree(seen).query(lab)[1]]
+        grid_lab = _lab(self.xyz(grid))
+        share = grid[cKDTree(grid_lab).query(lab)[1]]
         chroma = np.hypot(lab[:, 1], lab[:, 2])
         along = np.where(chroma[:, None] > 1e-6, lab[:, 1:] / np.maximum(chroma, 1e-6)[:, None], [1.0, 0.0])
         turn = np.zeros((len(lab), 3, 3))
@@ -617,13 +616,13 @@ class _Inks:
             codes, difference, matrix = share[active], error[active], turn[active]
             slope = np.empty((len(active), 3, 3))
             for channel in range(3):
-                # Away from the border that is nearer, so that no code leaves 0 … 1.
+                # Away from the nearer bound, so that codes stay in 0 to 1.
                 nudge = np.where(codes[:, channel] < 0.5, 1e-5, -1e-5)
                 moved = codes.copy()
                 moved[:, channel] += nudge
                 slope[:, :, channel] = (self._difference(moved, lab[active], matrix) - difference) / nudge[:, None]
             downhill = (difference[:, None] @ slope)[:, 0]
-            # A code at its border that wants beyond it stays there.
+            # A code at its bound stays there if the descent leads outside.
             fixed = ((codes <= 0) & (downhill > 0)) | ((codes >= 1) & (downhill < 0))
             slope = np.where(fixed[:, None], 0, slope)
             curvature = slope.swapaxes(1, 2) @ slope
@@ -632,12 +631,12 @@ class _Inks:
             gradient = np.where(fixed, 0, downhill)[..., None]
             step: _Array = np.asarray(-np.linalg.solve(curvature, gradient)[..., 0], dtype=np.float64)
             candidates: _Array = np.clip(codes + step, 0, 1)
-            found = self._difference(candidates, lab[active], matrix)
-            gain = (difference**2).sum(axis=1) - (found**2).sum(axis=1)
+            new_difference = self._difference(candidates, lab[active], matrix)
+            gain = (difference**2).sum(axis=1) - (new_difference**2).sum(axis=1)
             is_better = gain > 0
-            share[active[is_better]], error[active[is_better]] = candidates[is_better], found[is_better]
+            share[active[is_better]], error[active[is_better]] = candidates[is_better], new_difference[is_better]
             damping[active] *= np.where(is_better, 0.2, 8)
-            is_done = ((found**2).sum(axis=1) < 1e-6) | (is_better & (gain < 1e-7)) | (damping[active] > 1e6)
+            is_done = ((new_difference**2).sum(axis=1) < 1e-6) | (is_better & (gain < 1e-7)) | (damping[active] > 1e6)
             active = active[~is_done]
             if len(active) == 0:
                 break

@@ -116,8 +116,7 @@ def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
     headings = [heading.strip() for heading in rows[0]] if rows else []
     if len(headings) < 2 or headings[0].lower().split(" ")[0].split("_")[0] != WAVELENGTH or not all(headings):
         raise FormatError(
-            f"{where}: its first line is {','.join(headings)[:80]!r}, expected {WAVELENGTH!r} and the name of each "
-            "illuminant; add this line"
+            f"{where}: its first line is {','.join(headings)[:80]!r}, expected {WAVELENGTH!r} and names; correct it"
         )
     numeric = [name for name in headings[1:] if re.fullmatch(r"[\d.:+]+", name)]
     if numeric:

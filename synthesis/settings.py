@@ -62,10 +62,10 @@ class TableSettings(Settings):
     window: int = WINDOW
     """Side of the window of a patch, in half-size pixels: 3, 5, 7 or 9."""
     camera: dict[str, Any] = Field(default_factory=dict[str, Any])
-    """Properties that replace those of the camera; see `sim.world.sensors.find_body`."""
+    """Changed properties of the camera; see `sim.world.sensors.find_body`."""
     exposure: ComputedExposure = ComputedExposure()
     room: dict[str, bool | int | float | str] = Field(default_factory=dict[str, bool | int | float | str])
-    """Parameters that replace those of the default room; see `sim.world.world.Room`."""
+    """Changed parameters of the default room; see `sim.world.world.Room`."""
     chart: ComputedChart = ComputedChart()
     citation: CitationSettings = CitationSettings()
     """Title, authors, licence, note and address, as in `[citation]` of LAB.toml."""

@@ -122,9 +122,8 @@ def _require_unclipped(whites: _Array, frame_name: str) -> None:
     usable = int(np.isfinite(whites).all(axis=1).sum())
     if usable < MIN_REFERENCES:
         raise QualityError(
-            f"{frame_name}: bare paper is clipped in {len(whites) - usable} of {len(whites)} white references, "
-            f"expected {MIN_REFERENCES} or more unclipped; expose less: reduce room.white_level_share, or "
-            "with the projector exposure.shutter_s, in the settings"
+            f"{frame_name}: {usable} of {len(whites)} references are unclipped, {MIN_REFERENCES} or more expected; "
+            "expose less: reduce room.white_level_share, or with the projector exposure.shutter_s, in the settings"
         )
 
 
@@ -264,9 +263,9 @@ def _require_disk_space(out: Path, needed: int) -> None:
     folder = out.absolute()
     while not folder.exists():
         folder = folder.parent
-    free = shutil.disk_usage(folder).free
-    if free < needed:
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < needed:
         raise StorageError(
-            f"{out}: the LUT needs {needed / 1e9:.2f} GB, the disk has {free / 1e9:.2f} GB left; free space, or choose "
-            "another disk"
+            f"{out}: the LUT needs {needed / 1e9:.2f} GB, the disk has {free_bytes / 1e9:.2f} GB left; free space, or "
+            "choose another disk"
         )

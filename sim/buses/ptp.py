@@ -68,7 +68,7 @@ class PtpIpService:
                 case _:
                     _send(channel, InitFail(FailReason.UNSPECIFIED))
         except ProtocolError as error:
-            raise LinkClosed(f"a stream without packets is of no use: {error}") from error
+            raise LinkClosed(f"the bytes are not PTP/IP packets: {error}") from error
 
     def _serve_commands(self, channel: Channel) -> None:
         initiator = _Initiator(next(self._numbers), channel)
@@ -93,7 +93,7 @@ class PtpIpService:
                     case Ping():
                         _send(channel, Pong())
                     case _:
-                        # What is left of a transaction that was called off.
+                        # Rest of a cancelled transaction.
                         pass
         finally:
             initiator.hang_up()
@@ -123,7 +123,7 @@ class PtpIpService:
                     pass
 
     def _operate(self, initiator: _Initiator, request: PtpRequest, sends_data: bool) -> None:
-        initiator.cancelled = None  # what was given up before has ended
+        initiator.cancelled = None  # The transaction that was cancelled last has ended
         command, data = initiator.command, None
         if sends_data:
             data = _collect(command)

@@ -17,8 +17,8 @@ from drivers.links.link import ClosedAtEnd, Peer
 from drivers.links.network import POLLING_S
 from foundation.errors import LinkClosed
 
-_WAKE: Final = b"w"  # Signals to the thread: report when all input is processed, and end.
-_END: Final = b"e"  # What rings the serving thread: to say when it has caught up, and to end
+_WAKE: Final = b"w"  # Signal to the thread: report when all input is processed
+_END: Final = b"e"  # Signal to the thread: end
 
 _TIMEOUT_S: Final = 10.0  # Limit for processing the input, s; it takes milliseconds unless the machine is overloaded.
 
@@ -31,11 +31,10 @@ class PseudoTerminal(ClosedAtEnd):
         try:
             self._master, self._slave = os.openpty()
         except OSError as error:
-            raise LinkClosed(f"the system gives no pseudo-terminal: {error}; close programs that use them") from error
+            raise LinkClosed(f"cannot open a pseudo-terminal: {error}; close programs that use them") from error
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
-        """The port's name, as any serial software takes it."""
         self._bell, self._ringer = os.pipe()
         self._caught_up = threading.Event()
         self._closed = False
@@ -70,7 +69,7 @@ class PseudoTerminal(ClosedAtEnd):
             received = os.read(self._master, 4096) if self._master in ready else b""
             self._send(self._peer.receive(received))
             if is_awaited and not ready:
-                # The system takes a moment to carry bytes across: only silence shows that none are on their way.
+                # Bytes take a moment to cross the system: only a silent interval shows that none are on the way.
                 is_awaited = False
                 self._caught_up.set()
 

@@ -103,9 +103,9 @@ class _Exchange:
     events: deque[memoryview] = field(default_factory=deque[memoryview])  # Transfers to the host on the interrupt pipe
 
 
-def endpoint_descriptor(address: int, kind: int, packet: int, interval: int = 0) -> bytes:
-    """Return the 7-byte descriptor of an endpoint; `kind` is 2 for bulk, 3 for interrupt."""
-    return struct.pack("<BBBBHB", 7, _ENDPOINT, address, kind, packet, interval)
+def endpoint_descriptor(address: int, transfer_type: int, packet: int, interval: int = 0) -> bytes:
+    """Return the 7-byte descriptor of an endpoint; `transfer_type` is 2 for bulk, 3 for interrupt."""
+    return struct.pack("<BBBBHB", 7, _ENDPOINT, address, transfer_type, packet, interval)
 
 
 class PtpUsbDevice:
@@ -238,7 +238,7 @@ class PtpUsbDevice:
                     exchange.complete = (exchange.request, bytes(exchange.payload))
                     exchange.request = None
             case _:
-                raise ProtocolError(f"{type(message).__name__} was not due")
+                raise ProtocolError(f"unexpected {type(message).__name__}")
 
     def _answer(self, request: PtpRequest, payload: bytes | None) -> None:
         try:
@@ -392,7 +392,7 @@ class SimulatedBus(IBackend):
         """Return whether the interface is claimed on this bus."""
         return any(attachment.device is device for attachment in self._claims)
 
-    # What pyusb asks of a backend; see usb.backend.IBackend.
+    # Methods of usb.backend.IBackend, called by pyusb.
 
     def enumerate_devices(self) -> list[Attachment]:
         """Return the plugged-in devices."""
@@ -552,24 +552,24 @@ class SimulatedBus(IBackend):
 
 def _error(number: int) -> usb.core.USBError:
     code, text = _ERRORS[number]
-    kind = usb.core.USBTimeoutError if number == errno.ETIMEDOUT else usb.core.USBError
-    return kind(text, code, number)
+    error_class = usb.core.USBTimeoutError if number == errno.ETIMEDOUT else usb.core.USBError
+    return error_class(text, code, number)
 
 
-def _descriptor(descriptors: bytes, kind: int, index: int = 0) -> SimpleNamespace:
-    """Return the fields of a descriptor of type `kind`, the one with number `index`."""
-    names = _FIELDS[kind].split()
+def _descriptor(descriptors: bytes, code: int, index: int = 0) -> SimpleNamespace:
+    """Return the fields of a descriptor of type `code`, the one with number `index`."""
+    names = _FIELDS[code].split()
     layout = "<" + "".join("H" if name.startswith(("w", "id", "bcd")) else "B" for name in names)
     at = 0
     while at < len(descriptors):
-        if descriptors[at + 1] == kind:
+        if descriptors[at + 1] == code:
             if not index:
                 fields = struct.unpack_from(layout, descriptors, at + 2)
                 values = dict(zip(names, fields, strict=True))
-                return SimpleNamespace(bLength=descriptors[at], bDescriptorType=kind, **values, extra_descriptors=[])
+                return SimpleNamespace(bLength=descriptors[at], bDescriptorType=code, **values, extra_descriptors=[])
             index -= 1
         at += descriptors[at]
-    raise IndexError(f"descriptor {index} of type {kind}")
+    raise IndexError(f"descriptor {index} of type {code}")
 
 
 class MemoryTransport(UsbTransport):

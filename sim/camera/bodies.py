@@ -1,7 +1,7 @@
 """EOS bodies of the simulated camera: identification, properties, and lists of allowed values.
 
 No recording of an EOS 550D or 6D Mark II has been published. Unknown data are taken from the one recorded body, an EOS
-60D; comments say which. Properties are in the order in which the 60D sends them. A property with value None is sent on
+60D; see the comments. Properties are in the order in which the 60D sends them. A property with value None is sent on
 request only, as by the 60D.
 
 Sources: a recorded EOS 60D (firmware 1.1.0); settings of an EOS 550D (firmware 1.0.9) and a 6D Mark II (1.0.2) listed
@@ -188,7 +188,7 @@ def _thirds(first: int, last: int) -> tuple[int, ...]:
 
 def _jpegs(*sizes: tuple[int, bool]) -> tuple[ImageFile, ...]:
     # JPEG files by size number: fine and normal, or only fine.
-    return tuple(ImageFile(1, size, quality) for size, both in sizes for quality in ((3, 2) if both else (3,)))
+    return tuple(ImageFile(1, size, quality) for size, normal in sizes for quality in ((3, 2) if normal else (3,)))
 
 
 def _raw(size: int = 0) -> ImageFile:

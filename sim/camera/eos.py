@@ -2,7 +2,7 @@
 
 The state advances with the clock, and only at calls: due actions are then carried out in their order. With a
 `SimulatedClock`, an initiator must wait by the same clock. Behaviour follows a recorded EOS 60D; where no public
-recording exists, a comment says "assumed". Methods may be called by several threads.
+recording exists, a comment has the word "assumed". Methods may be called by several threads.
 
 Sources: a recorded EOS 60D; ISO 15740:2013 for the standard; libgphoto2 2.5.34 for expectations of initiators.
 """
@@ -119,7 +119,7 @@ class PropertyState:
     """Value of a property and its allowed values."""
 
     value: bytes
-    kind: int
+    list_kind: int
     reported: bool
     choices: tuple[int, ...] = ()
     formats: tuple[ImageFormat, ...] = ()
@@ -250,7 +250,7 @@ class SimulatedEos:
         self._handles = itertools.count(_MEMORY + 1)
         self._mirror_lockup = False
         self._is_asleep = False
-        # What a session has and loses.
+        # State of a session.
         self._session = 0
         self._last_transaction = 0
         self._remote_mode = 0
@@ -261,7 +261,7 @@ class SimulatedEos:
         self._hints: list[PtpEvent] = []
         self._idle_since = clock.monotonic()
         self._is_warned = False
-        # What is under way: (when, order, what happens then), the earliest first.
+        # Scheduled actions: (time, order, action), earliest first.
         self._due: list[tuple[float, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self._unfinished = 0
@@ -290,8 +290,8 @@ class SimulatedEos:
             yield
 
     def _update(self) -> None:
-        now = self._clock.monotonic()
-        while self._due and self._due[0][0] <= now:
+        now_s = self._clock.monotonic()
+        while self._due and self._due[0][0] <= now_s:
             _, _, action = heapq.heappop(self._due)
             action()
         limit = number_of(self._properties[Property.EOS_AUTO_POWER_OFF].value)
@@ -339,9 +339,9 @@ class SimulatedEos:
     def _report_list(self, code: int) -> None:
         state = self._properties[code]
         if code in IMAGE_FORMAT_PROPERTIES:
-            self._record(AvailableFormats(code, state.formats, state.kind))
+            self._record(AvailableFormats(code, state.formats, state.list_kind))
         else:
-            self._record(AvailableValues(code, state.choices, state.kind))
+            self._record(AvailableValues(code, state.choices, state.list_kind))
 
     # The values of properties.
 
@@ -371,7 +371,7 @@ class SimulatedEos:
         for code in codes:
             self._record(PropertyChanged(code, self._value(code)))
             if code == Property.EOS_CUSTOM_FUNCTIONS and Property.EOS_MIRROR_UP_SETTING not in self._properties:
-                # Custom functions come as one record a group.
+                # One record per group of custom functions.
                 self._record(PropertyChanged(code, custom_functions(3, {MIRROR_LOCKUP: int(self._mirror_lockup)})))
 
     def _change(self, code: int, value: bytes) -> None:
@@ -401,7 +401,7 @@ class SimulatedEos:
         choices = destinations if self._card is not None else (CaptureDestination.HOST,)
         self._set_choices(Property.EOS_CAPTURE_DESTINATION, choices)
         if not self._session or self._number_of(Property.EOS_CAPTURE_DESTINATION) not in choices:
-            # The 60D without a card reports the card as destination all the same.
+            # Without a card, the 60D reports the card as destination too.
             self._change(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.CARD))
             self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
 
@@ -410,19 +410,19 @@ class SimulatedEos:
             code for minimum, code in ((0.88, 2), (0.63, 4), (0.38, 1), (0.1, 5), (-1, 0)) if self._battery > minimum
         )
 
-    # Who is in control, and what there is room for.
+    # Remote control, and free space.
 
     def _require_remote(self) -> None:
-        # Assumed: nothing shows what a body says to whoever has not taken control of it.
+        # Assumed: no recording shows the answer without remote control.
         if not self._remote_mode:
             raise OperationRefusal(ResponseCode.EOS_OPERATION_REFUSED)
 
     def _blank_card(self, capacity: int) -> Card:
-        now = self._clock.now()
+        created_at = self._clock.now()
         card = Card(capacity)
         for folder in (
-            StoredObject(DCIM, CARD, ObjectFormat.ASSOCIATION, "DCIM", now),
-            StoredObject(FOLDER, CARD, ObjectFormat.ASSOCIATION, "100CANON", now, DCIM),
+            StoredObject(DCIM, CARD, ObjectFormat.ASSOCIATION, "DCIM", created_at),
+            StoredObject(FOLDER, CARD, ObjectFormat.ASSOCIATION, "100CANON", created_at, DCIM),
         ):
             card.objects[folder.handle] = folder
         return card
@@ -438,7 +438,7 @@ class SimulatedEos:
             free_bytes = card
         return min(max(free_bytes, 0) // self.body.frame_bytes, _MOST_SHOTS)
 
-    # What an initiator can ask of the files, and do with them.
+    # Operations on files.
 
     def _get_storage_ids(self, _: Arguments) -> OperationResult:
         return OperationResult(encode_u32_array((EMPTY_SLOT if self._card is None else CARD,)))
@@ -543,7 +543,7 @@ class SimulatedEos:
         request = EosEvent.REQUEST_OBJECT_TRANSFER_64 if wide else EosEvent.REQUEST_OBJECT_TRANSFER
         self._record(TransferRequest(item.handle, item.format, len(item.data), item.name, request))
 
-    # What a finger on the release does, at the camera or far away.
+    # The release.
 
     def _remote_release_on(self, arguments: Arguments) -> None:
         self._require_remote()
@@ -645,7 +645,7 @@ class SimulatedEos:
                 self._film.accept(settings)
                 self._film.expose(settings, opened, into)
             except (DeviceError, CropError):
-                # A film that has no such picture is a camera whose frame never comes.
+                # The frame never arrives, as from a real camera with an internal error.
                 return None
             return into.getvalue()
 
@@ -667,8 +667,8 @@ class SimulatedEos:
             for index, file in enumerate(frame.formats.files):
                 name = f"IMG_{frame.number:04d}"
                 if file.is_raw:
-                    kind = _FORMATS_BY_SUFFIX.get(suffix, ObjectFormat.CR2)
-                    self._deliver(frame, index, f"{name}{suffix.upper()}", kind, raw)
+                    raw_format = _FORMATS_BY_SUFFIX.get(suffix, ObjectFormat.CR2)
+                    self._deliver(frame, index, f"{name}{suffix.upper()}", raw_format, raw)
                 else:
                     self._deliver(frame, index, f"{name}.JPG", ObjectFormat.EXIF_JPEG, _small_jpeg(name))
         self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_SHUTTER_COUNTER, Property.EOS_BATTERY_POWER)
@@ -676,21 +676,21 @@ class SimulatedEos:
             self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.IDLE))
         self._idle_since = self._clock.monotonic()
 
-    def _deliver(self, frame: _Frame, index: int, name: str, kind: int, data: bytes) -> None:
+    def _deliver(self, frame: _Frame, index: int, name: str, file_format: int, data: bytes) -> None:
         wide = self.body.wide_objects
         if frame.destination != CaptureDestination.HOST and self._card is not None:
             handle = FOLDER | frame.number << 4 | index + 1
-            item = StoredObject(handle, CARD, kind, name, frame.taken_at, FOLDER, data)
+            item = StoredObject(handle, CARD, file_format, name, frame.taken_at, FOLDER, data)
             self._card.objects[handle] = item
             self._record(ObjectEvent(EosEvent.OBJECT_ADDED_64 if wide else EosEvent.OBJECT_ADDED, item.entry))
             self._record(Notice(EosEvent.STORAGE_INFO_CHANGED, CARD))
         if frame.destination & CaptureDestination.HOST:
             handle = next(self._handles)
-            self._memory[handle] = StoredObject(handle, 0, kind, name, frame.taken_at, data=data)
+            self._memory[handle] = StoredObject(handle, 0, file_format, name, frame.taken_at, data=data)
             self._host_bytes = max(self._host_bytes - len(data), 0)
             self._offer_transfer(self._memory[handle])
 
-    # What an initiator can ask of the settings, and set.
+    # Operations on settings.
 
     def _set_device_prop_value_ex(self, arguments: Arguments) -> None:
         self._require_remote()
@@ -701,7 +701,7 @@ class SimulatedEos:
         state = self._properties.get(setting.code)
         if state is None:
             raise OperationRefusal(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
-        # The recorded 60D answers 2019 to a value that its list does not hold, not 201c.
+        # The recorded 60D answers 2019, not 201c, to a value that is not in its list.
         if self._is_busy or not self._allows(setting, state):
             raise OperationRefusal(ResponseCode.DEVICE_BUSY)
         self._store(setting.code, setting.value)
@@ -710,11 +710,11 @@ class SimulatedEos:
         try:
             if setting.code in IMAGE_FORMAT_PROPERTIES:
                 return ImageFormat.decode(setting.value) in state.formats
-            if state.kind == LIST:
+            if state.list_kind == LIST:
                 return number_of(setting.value) in state.choices
         except ProtocolError:
             raise OperationRefusal(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
-        return state.kind == FREE and setting.code in _FREELY_SET
+        return state.list_kind == FREE and setting.code in _FREELY_SET
 
     def _store(self, code: int, value: bytes) -> None:
         if code == Property.EOS_CAMERA_TIME:
@@ -785,7 +785,7 @@ class SimulatedEos:
         """Carry out a request."""
         with self._updated():
             if self._is_asleep:
-                raise LinkClosed(f"the simulated {self.body.model} has switched itself off; wake it up")
+                raise LinkClosed(f"the simulated {self.body.model} has switched itself off; call wake()")
             try:
                 reply = self._carry_out(request, data)
             except OperationRefusal as no:
@@ -806,7 +806,7 @@ class SimulatedEos:
         with self._updated():
             self._end_session()
 
-    # The hand on the camera.
+    # Controls of the camera.
 
     @property
     def asleep(self) -> bool:
@@ -937,7 +937,7 @@ class SimulatedEos:
             self._record(Notice(EosEvent.CTG_INFO_CHECK_COMPLETE, CARD))
         for code in self._properties:
             self._report_list(code)
-        # Assumed: a frame that nobody fetched is offered to the next who listens.
+        # Assumed: a frame that was not fetched is offered to the next initiator.
         for item in self._memory.values():
             self._offer_transfer(item)
 

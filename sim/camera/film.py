@@ -2,7 +2,7 @@
 
 `sim.camera.eos` simulates settings, file names and timing. A `Film` makes the frame: of the `World` under simulated
 light (`WorldFilm`) or under the picture of a real screen (`WatchedFilm`). Raw files are Adobe DNG 1.4 with one
-uncompressed 16-bit mosaic of the whole sensor; the tag `Software` says that the frame is simulated.
+uncompressed 16-bit mosaic of the whole sensor; the tag `Software` marks the frame as simulated.
 
 Sources: DNG 1.4 chapters 2 and 4, Exif 2.32 section 4.6.
 """
@@ -59,7 +59,7 @@ def write_dng(
     if counts.shape != body.sensor:
         raise ValueError(f"counts are {counts.shape}; the sensor of the {body.model} is {body.sensor}")
     if taken_at.tzinfo is None:
-        raise ValueError(f"{taken_at} has no timezone")
+        raise ValueError(f"the date {taken_at} has no time zone, expected one")
     rows, columns = body.sensor
     stamp = text(taken_at.astimezone(UTC).strftime("%Y:%m:%d %H:%M:%S"))
     exif: Tags = {
@@ -221,7 +221,7 @@ class WorldFilm:
         seconds = (released_at - SIM_START).total_seconds()
         moment = Moment(len(self._earlier_frames), seconds, colour, tuple(self._earlier_frames))
         lamp = self._light() * (1 - self._world.room.lamp_drift_per_hour * seconds / 3600)
-        # The noise is that of the frame that was ordered, whatever there is to see.
+        # The noise depends on the ordered colour, not on the displayed one.
         key = (*colour, self._exposed[colour])
         self._exposed[colour] += 1
         self._earlier_frames.append((seconds, colour))
@@ -255,4 +255,4 @@ def _accept(settings: ExposureSettings) -> None:
         ("shutter_s", settings.shutter_s, 1 / 8000, 30.0),
     ):
         if value is not None and not low <= value <= high:
-            raise DeviceRefused(f"the simulated camera offers {name} {low:g} … {high:g}, not {value:g}")
+            raise DeviceRefused(f"{name} is {value:g}, expected {low:g} to {high:g} on the simulated camera")

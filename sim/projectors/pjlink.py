@@ -71,12 +71,12 @@ class PjLinkPeer:
         return answer
 
     def _new_connection(self) -> tuple[_Connection, bytes]:
-        now = self._projector.clock.monotonic()
+        now_s = self._projector.clock.monotonic()
         if self._password is None:
-            return _Connection(now), wire.encode_greeting(None)
+            return _Connection(now_s), wire.encode_greeting(None)
         seed = self._fixed_seed or secrets.token_hex(4)
         digest = wire.authentication_digest(seed, self._password)
-        return _Connection(now, expected_digest=digest), wire.encode_greeting(seed)
+        return _Connection(now_s, expected_digest=digest), wire.encode_greeting(seed)
 
     def _reply(self, request: PjLinkRequest) -> PjLinkReply | Refused:
         if self._connection.expected_digest:
@@ -107,7 +107,7 @@ class PjLinkPeer:
 
 
 _LONGEST = wire.MAX_LINE + wire.DIGEST_LENGTH  # Length limit of the first command of a connection, bytes.
-_INPUTS = tuple(kind + number for kind in "123456" for number in "123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ")
+_INPUTS = tuple(source + number for source in "123456" for number in "123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ")
 _Answers = Mapping[str, Mapping[str, Callable[[], str | None]]]  # Command to parameter to what is done; None is OK
 
 
@@ -128,7 +128,7 @@ def _class_1(projector: SimulatedProjector) -> _Answers:
             "31": mute,
             "10": show,
             "30": show,
-            # It has no loudspeaker.
+            # Sound only: it has no loudspeaker.
             "20": lambda: None,
             "21": lambda: None,
         },

@@ -80,7 +80,6 @@ class SimulatedProjector:
         self._input = "31"
         self._frozen = False
         self.signal: Resolution | NoResolution = PANEL
-        """What arrives at its input; change it at will."""
 
     def identity(self) -> ProjectorIdentity:
         """Return maker, model and name."""
@@ -142,7 +141,7 @@ class SimulatedProjector:
     def faults(self) -> tuple[Fault, ...]:
         """Return all injected faults that are not repaired."""
         with self._lock:
-            return tuple(Fault(part, self._faults[part]) for part in FAULT_PARTS if part in self._faults)
+            return tuple(Fault(name, self._faults[name]) for name in FAULT_PARTS if name in self._faults)
 
     def lamps(self) -> tuple[Lamp, ...]:
         """Return the state of its only lamp."""
@@ -170,7 +169,7 @@ class SimulatedProjector:
     def break_part(self, part: str, severity: Severity) -> None:
         """Inject a fault of one of `drivers.projector.FAULT_PARTS`; an error of the lamp switches it off."""
         if part not in FAULT_PARTS:
-            raise ValueError(f"{part} is no part that can be reported; choose of {', '.join(FAULT_PARTS)}")
+            raise ValueError(f"the part is {part!r}, expected one of {', '.join(FAULT_PARTS)}")
         with self._lock:
             self._update()
             self._faults[part] = severity
@@ -189,9 +188,9 @@ class SimulatedProjector:
         if self._power in (Power.WARMING, Power.COOLING):
             if self._power is change:
                 busy = self._power.value
-            raise DeviceRefused(f"the simulated projector is {busy}; wait until it is done")
+            raise DeviceRefused(f"the simulated projector is {busy}; wait until it has finished")
         if change is Power.WARMING and self._faults.get("lamp") is Severity.ERROR:
-            raise DeviceFault("the lamp of the simulated projector is dead; repair it")
+            raise DeviceFault("the lamp of the simulated projector is broken; repair it")
         self._enter(change, self.clock.monotonic())
 
     @contextmanager

@@ -22,9 +22,9 @@ class LinePeer:
         self._projector = projector
         self._language = language
         self._network = network
-        self._begin, end = (part.strip("\r\n") for part in language.line.command.split("{}"))
+        self._begin, end = (text.strip("\r\n") for text in language.line.command.split("{}"))
         self._end = end
-        # CR by all makers; a language may end its commands with another character.
+        # All makers use CR, but a language may define another character.
         self._last = language.line.command[-1:].encode("ascii")
         self._handshake = language.network.handshake if network and language.network is not None else None
         self._is_greeted = self._handshake is None
@@ -48,7 +48,7 @@ class LinePeer:
         """Process bytes; return the answers to complete lines, and unsolicited messages."""
         answer = self._late_answer()
         if self._switching_to is not None:
-            # It accepts no command until it has carried out the one that it has.
+            # It accepts no command until the current one is completed.
             return answer
         answer += self._news()
         self._received += data
@@ -83,7 +83,7 @@ class LinePeer:
         """Return the unsolicited messages about changes since the last call."""
         power, faults = self._projector.power(), self._errors()
         new_power = power if power is not self._sent_power else None
-        failed = [part for part in faults if part not in self._sent_faults]
+        failed = [fault for fault in faults if fault not in self._sent_faults]
         self._sent_power, self._sent_faults = power, faults
         messages = [
             message.text
@@ -169,9 +169,9 @@ class LinePeer:
         # One fault at a time, errors only.
         words = self._language.faults
         assert words is not None
-        for part in self._errors():
+        for faulty_part in self._errors():
             for code, meaning in words.parts.items():
-                if meaning == part:
+                if meaning == faulty_part:
                     return code
         return words.healthy
 

@@ -52,12 +52,12 @@ class ScreenPlace:
     @classmethod
     def parse(cls, text: str) -> ScreenPlace:
         """Parse ``:1``, ``1920x1080+2560+0``, or both with a comma."""
-        found = _PLACE.fullmatch(text)
-        if not text or found is None:
+        match = _PLACE.fullmatch(text)
+        if not text or match is None:
             raise InputError(
-                f"{text!r} is no screen; expected DISPLAY, WIDTHxHEIGHT+X+Y or both, such as :1,640x360+0+0"
+                f"the screen is {text!r}, expected DISPLAY, WIDTHxHEIGHT+X+Y or both, such as :1,640x360+0+0"
             )
-        display, region = found["display"], found["region"]
+        display, region = match["display"], match["region"]
         if region is None:
             return cls(display)
         width, height, x, y = (int(number) for number in re.split(r"[x+]", region))
@@ -67,8 +67,8 @@ class ScreenPlace:
 class Screenshots:
     """Pictures of an X screen; connects at the first call, and again after a failure."""
 
-    def __init__(self, place: ScreenPlace) -> None:
-        self._place = place
+    def __init__(self, screen_place: ScreenPlace) -> None:
+        self._place = screen_place
         self._screen: XScreen | None = None
 
     def take(self) -> NDArray[np.uint32]:
@@ -110,7 +110,7 @@ def ask(projector: PjLinkProjector) -> LampState:
     except DeviceError as fault:
         return LampState(0.0, trouble=str(fault))
     frozen, source = False, None
-    # Class 1 knows no freeze, and some projectors no input.
+    # PJLink class 1 has no freeze, and some projectors do not report their input.
     with contextlib.suppress(DeviceError):
         source = projector.input()
     with contextlib.suppress(DeviceError):
@@ -165,7 +165,7 @@ class Beam:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self, error_type: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._ended.set()
         if self._projector is not None:
@@ -188,14 +188,14 @@ class Beam:
         while ends - at > _INSTANT_S:
             share, picture = self._thrown()
             self._clock.sleep(min(SAMPLE_S, max(ends - self._clock.monotonic(), 0.0)))
-            # A look stands for the time until the next one.
+            # A picture represents the time until the next one.
             end = min(self._clock.monotonic(), ends)
             lit += share * (end - at)
             total = _sum(total, picture.astype(np.float64) * (share * (end - at)))
             if at < half <= end:
                 halfway()
             at = end
-        # What is dark has no picture.
+        # Without light, there is no picture.
         mean = total / lit if lit else total
         return ThrownLight(mean.astype(np.float32), lit / seconds)
 
@@ -225,7 +225,7 @@ class Beam:
         with self._lock:
             self._state = state
             if self._screen_input is None:
-                # The screen hangs at the input that is shown when the projector is first seen lit.
+                # The screen is assumed at the input that is selected when the lamp is first seen on.
                 self._screen_input = state.source
             if state.frozen:
                 self._frozen_picture = self._last_picture if self._frozen_picture is None else self._frozen_picture
@@ -253,9 +253,9 @@ def picture_light(pixels: NDArray[np.uint32], light: NDArray[np.float32]) -> NDA
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def _sum(total: NDArray[np.float64], part: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sum(total: NDArray[np.float64], addend: NDArray[np.float64]) -> NDArray[np.float64]:
     # A change of the screen mode may change the size; the larger size is used.
-    if total.shape != part.shape and (1, 1) not in (total.shape[:2], part.shape[:2]):
-        rows, columns = (max(one, other) for one, other in zip(total.shape[:2], part.shape[:2], strict=True))
-        total, part = (np.asarray(cv2.resize(one, (columns, rows)), dtype=np.float64) for one in (total, part))
-    return total + part
+    if total.shape != addend.shape and (1, 1) not in (total.shape[:2], addend.shape[:2]):
+        rows, columns = (max(sizes) for sizes in zip(total.shape[:2], addend.shape[:2], strict=True))
+        total, addend = (np.asarray(cv2.resize(p, (columns, rows)), dtype=np.float64) for p in (total, addend))
+    return total + addend

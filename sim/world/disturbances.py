@@ -48,7 +48,7 @@ class Moment:
     frame: int  # Number of earlier exposures in the session
     at_s: float = 0.0  # Seconds since the start of the session
     colour: Colour = BLACK  # Ordered colour
-    before: tuple[tuple[float, Colour], ...] = ()  # Second and ordered colour of each earlier frame
+    earlier_frames: tuple[tuple[float, Colour], ...] = ()  # Second and ordered colour of each earlier frame
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Disturbance:
     def __post_init__(self) -> None:
         for name, first, last in (("frame", self.from_frame, self.to_frame), ("s", self.from_s, self.to_s)):
             if first is not None and last is not None and last < first:
-                raise ValueError(f"it ends with to_{name} = {last:g} before it begins with from_{name} = {first:g}")
+                raise ValueError(f"its end to_{name} = {last:g} is before its start from_{name} = {first:g}")
 
     def is_there(self, moment: Moment) -> bool:
         """Return whether the event is active at a moment."""
@@ -96,7 +96,7 @@ class _Gradual(Disturbance):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.to_frame is None and self.to_s is None:
-            raise ValueError("it grows until to_frame or to_s: one of them must be given")
+            raise ValueError("its end is missing, expected to_frame or to_s; add one")
 
     def is_there(self, moment: Moment) -> bool:
         return self.from_frame <= moment.frame and (self.from_s is None or self.from_s <= moment.at_s)
@@ -118,7 +118,7 @@ class FrozenScreen(Disturbance):
 
     def shown(self, colour: Colour, moment: Moment) -> Colour:
         """Return the colour that was ordered for the last frame before the event."""
-        for frame, (at_s, ordered) in reversed(tuple(enumerate(moment.before))):
+        for frame, (at_s, ordered) in reversed(tuple(enumerate(moment.earlier_frames))):
             if not self.is_there(Moment(frame, at_s)):
                 return ordered
         return BLACK
@@ -148,7 +148,7 @@ class HalfChanged(Disturbance):
 
     def changed(self, situation: Situation, moment: Moment) -> Situation:
         """Add the previous colour in this part."""
-        last = moment.before[-1][1] if moment.before else BLACK
+        last = moment.earlier_frames[-1][1] if moment.earlier_frames else BLACK
         return replace(situation, patches=(*situation.patches, Patch(self.place, last, self.share)))
 
 
@@ -351,7 +351,7 @@ _LISTED: Final[TypeAdapter[tuple[AnyDisturbance, ...]]] = TypeAdapter(
     tuple[Annotated[AnyDisturbance, Field(discriminator="what")], ...]
 )
 
-KINDS: Final = tuple(str(kind.what) for kind in get_args(AnyDisturbance))  # Names of events in settings.
+KINDS: Final = tuple(str(event.what) for event in get_args(AnyDisturbance))  # Names of events in settings.
 
 
 @dataclass(frozen=True)
@@ -403,8 +403,8 @@ def read_disturbances(tables: Sequence[Any], where: str, key: str = "simulated.e
         return Disturbances(_LISTED.validate_python(tables))
     except ValidationError as error:
         first = error.errors()[0]
-        place = [component for component in first["loc"] if component not in KINDS]
-        full_key = ".".join([f"{key}[{place[0]}]" if place else key, *(str(component) for component in place[1:])])
+        path = [component for component in first["loc"] if component not in KINDS]
+        full_key = ".".join([f"{key}[{path[0]}]" if path else key, *(str(component) for component in path[1:])])
         raise ConfigurationError(f"{where}: {full_key}{_message(first)}") from error
 
 
@@ -412,9 +412,9 @@ def _message(fault: ErrorDetails) -> str:
     # Follows the key; gives the value, the expectation and the remedy.
     value = f" = {fault['input']!r}"
     kinds = ", ".join(KINDS)
-    messages = {"union_tag_not_found": f"{value} does not say what happens; add what, one of {kinds}"}
-    messages["union_tag_invalid"] = f"{value}: there is no such event; what is one of {kinds}"
-    messages["extra_forbidden"] = messages["unexpected_keyword_argument"] = " is no key of this event; remove it"
+    messages = {"union_tag_not_found": f"{value} has no event name; add what, one of {kinds}"}
+    messages["union_tag_invalid"] = f"{value}: unknown event, expected one of {kinds}; correct it"
+    messages["extra_forbidden"] = messages["unexpected_keyword_argument"] = " is not a key of this event; remove it"
     messages["missing"] = " is missing; add it"
     for words, expected in _EXPECTED.items():
         if fault["type"].startswith(words):

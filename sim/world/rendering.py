@@ -3,7 +3,7 @@
 **Geometry.** The print is a sheet whose point (x, y) mm has a `height` mm out of the plane, towards the camera. The
 sheet is rotated by roll, then tilt, then pan, and projected by a pinhole with Brown's lens distortion (D. C. Brown,
 "Close-range camera calibration", 1971; coordinates and coefficients as in OpenCV). Paper does not stretch, and heights
-are small against wavelengths, so points keep their x and y. A fold is a crease that stands off the plane; its flanks
+are small against wavelengths, so points keep their x and y. A fold is a crease above the plane; its flanks
 are inclined to the light.
 
 **Rendering.** `light` is compiled by numba, single-threaded, without interpreter lock; `sim.world.world` calls it for
@@ -11,7 +11,7 @@ blocks of rows from several threads. A row depends only on its arguments, so blo
 result.
 
 Pixels are half-size, centres at integers, x right, y down. Millimetres are on the print, from its top left corner.
-Photosites are those of the visible frame.
+Photosites are counted in the visible frame.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Waviness:
         if wave_mm:
             length, direction = wave_mm * random.uniform(0.85, 1.15, modes), random.uniform(0, np.pi, modes)
             cycles = np.column_stack([np.cos(direction), np.sin(direction)]) * np.array(page_mm) / length[:, None]
-            # Damp paper cockles: ridges beside each other, not quite regular.
+            # Damp paper has parallel ridges, not quite regular.
             amplitudes = np.where(np.arange(modes) == 0, 1.0, _RIPPLE)
         shape = cls(cycles, random.uniform(0, 2 * np.pi, modes), amplitudes, page_mm)
         x, y = np.meshgrid(np.linspace(0, page_mm[0], 201), np.linspace(0, page_mm[1], 201))
@@ -224,10 +224,10 @@ class Print:
         count = len(self.rectangles_mm)
         if self.rectangles_mm.shape != (count, 4) or self.rgb.shape != (count, 3):
             raise ValueError(
-                f"rectangles {self.rectangles_mm.shape} and codes {self.rgb.shape}; (N, 4), (N, 3) expected"
+                f"rectangles {self.rectangles_mm.shape} and codes {self.rgb.shape}, expected (N, 4) and (N, 3)"
             )
         if np.any(self.rectangles_mm[:, 2:] < self.rectangles_mm[:, :2]):
-            raise ValueError("a rectangle's right or bottom lies before its left or top")
+            raise ValueError("a rectangle has its right or bottom before its left or top")
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +248,7 @@ def label_map(sheet: Print) -> LabelMap:
     (x_lines, left, right), (y_lines, top, bottom) = _lines(boxes[:, 0::2]), _lines(boxes[:, 1::2])
     labels = np.full((len(y_lines) + 1, len(x_lines) + 1), len(codes), dtype=np.int32)
     label = label.reshape(-1).astype(np.int32)
-    # The page, which comes last, lies under everything.
+    # The page, which is last in the list, is below all rectangles.
     for k in (len(label) - 1, *range(len(label) - 1)):
         labels[top[k] + 1 : bottom[k] + 1, left[k] + 1 : right[k] + 1] = label[k]
     return LabelMap(x_lines, y_lines, labels, codes)
@@ -356,7 +356,7 @@ def light(
 ) -> None:
     """Write the signal of each photosite of some rows under each primary.
 
-    Blur and aperture of the photosite are one Gaussian whose axes are those of the print. The drawing consists of
+    Blur and aperture of the photosite are one Gaussian with the axes of the print. The drawing consists of
     rectangles, so its integrals are products of differences of normal distributions: exact for any position of edges.
 
     Parameters
@@ -440,7 +440,7 @@ def light(
                     _shares(x_lines, u, u_sigma, i, i1, u_share)
                     _shares(y_lines, v, v_sigma, j, j1, v_share)
                     red, green, blue = np.float32(0), np.float32(0), np.float32(0)
-                    # Unsigned, for whether a signed index counts from the end is asked at each of hundreds of shares.
+                    # Unsigned indices are faster: negative indices need not be checked at hundreds of shares.
                     for b in range(np.uintp(j), np.uintp(j1 + 1)):
                         row_share = v_share[b]
                         for a in range(np.uintp(i), np.uintp(i1 + 1)):

@@ -61,7 +61,7 @@ class Body:
         rows, columns = self.sensor
         for area in (self.visible, *self.masked):
             if min(area) < 0 or area.top + area.height > rows or area.left + area.width > columns:
-                raise ValueError(f"{self.model}: {area} lies outside the sensor of {columns}×{rows} photosites")
+                raise ValueError(f"{self.model}: {area} is outside the sensor of {columns}×{rows} photosites")
         if sorted(self.pattern) != ["B", "G", "G", "R"]:
             raise ValueError(f"{self.model}: pattern is {self.pattern!r}; one R, two G and one B are expected")
 
@@ -69,8 +69,8 @@ class Body:
     def camera(self) -> str:
         """Maker and model without repetition, as `drivers.raw.rawfile` reads them from its files."""
         words = self.model.split(" ")
-        known = not self.maker or words[0].casefold() == self.maker.split(" ")[0].casefold()
-        return self.model if known else f"{self.maker} {self.model}"
+        has_maker = not self.maker or words[0].casefold() == self.maker.split(" ")[0].casefold()
+        return self.model if has_maker else f"{self.maker} {self.model}"
 
     @property
     def half_size(self) -> tuple[int, int]:
@@ -110,13 +110,13 @@ class HotPattern:
         `per_million`: number per million photosites. `dn_per_s`: mean excess at ISO 100, DN per second.
         """
         count = round(per_million * sensor[0] * sensor[1] / 1e6)
-        place = np.sort(random.choice(sensor[0] * sensor[1], count, replace=False))
-        return cls(place // sensor[1], place % sensor[1], random.exponential(dn_per_s, count))
+        index = np.sort(random.choice(sensor[0] * sensor[1], count, replace=False))
+        return cls(index // sensor[1], index % sensor[1], random.exponential(dn_per_s, count))
 
     def within(self, first: int, last: int) -> HotPattern:
         """Return the hot photosites of rows first to last − 1, with rows numbered from `first`."""
-        some = slice(*np.searchsorted(self.rows, [first, last]).tolist())
-        return HotPattern(self.rows[some] - first, self.columns[some], self.dn_per_s[some])
+        selected = slice(*np.searchsorted(self.rows, [first, last]).tolist())
+        return HotPattern(self.rows[selected] - first, self.columns[selected], self.dn_per_s[selected])
 
     def raise_counts(
         self,
@@ -198,12 +198,12 @@ _BORDER: Final = (50, 140)  # Masked rows above and masked columns left of the i
 
 
 def _areas(width: int, height: int) -> dict[str, Any]:
-    top, left = _BORDER
-    sensor = height + top, width + left
+    rows, columns = _BORDER
+    sensor = height + rows, width + columns
     return {
         "sensor": sensor,
-        "visible": Rectangle(top, left, height, width),
-        "masked": (Rectangle(0, 0, sensor[0], left - 2),),
+        "visible": Rectangle(rows, columns, height, width),
+        "masked": (Rectangle(0, 0, sensor[0], columns - 2),),
     }
 
 
@@ -254,11 +254,11 @@ def find_body(
     return changed
 
 
-def _body_of_sensitivities(camera: str, found: Sensitivities) -> Body:
+def _body_of_sensitivities(camera: str, sensitivities: Sensitivities) -> Body:
     if camera in FACTS:
         return FACTS[camera]
     default = BODIES["EOS 550D"]
-    return replace(default, maker=found.maker or "unknown", model=found.camera, sensitivities=camera)
+    return replace(default, maker=sensitivities.maker or "unknown", model=sensitivities.camera, sensitivities=camera)
 
 
 def _checked_pixels(pixels: Any, where: str, key: str) -> tuple[int, int]:
@@ -298,7 +298,7 @@ def counts(
     light: NDArray[np.float32],
     weights: NDArray[np.float32],
     noise: NDArray[np.float32],
-    left: int,
+    first_column: int,
     black: float,
     read_noise: float,
     gain_e: float,
@@ -318,7 +318,7 @@ def counts(
         (3,) float32, exposure to each primary.
     noise
         (rows, sensor columns) float32, standard normal values.
-    left
+    first_column
         First visible column.
     black, read_noise
         Mean and standard deviation of a dark count, DN.
@@ -330,7 +330,7 @@ def counts(
         (rows, sensor columns) uint16, written.
     """
     rows, columns = out.shape
-    right = left + light.shape[2]
+    right = first_column + light.shape[2]
     top = np.float32(saturation)
     half = np.float32(black + 0.5)
     per_dn = np.float32(1 / gain_e)
@@ -339,10 +339,10 @@ def counts(
     red, green, blue = weights[0], weights[1], weights[2]
     nothing = np.float32(0)
     for row in range(rows):
-        for x in range(left):
+        for x in range(first_column):
             out[row, x] = np.uint16(min(max(half + dark * noise[row, x], nothing), top))
-        for x in range(left, right):
-            i = x - left
+        for x in range(first_column, right):
+            i = x - first_column
             signal = red * light[0, row, i] + green * light[1, row, i] + blue * light[2, row, i]
             count = half + signal + math.sqrt(signal * per_dn + floor) * noise[row, x]
             out[row, x] = np.uint16(min(max(count, nothing), top))

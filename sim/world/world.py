@@ -210,7 +210,7 @@ class Room:
             "vignetting", "projector_falloff", "black_leak", "ambient", "stain_depth", "shoulder_share", "veil",
         ):  # fmt: skip
             if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; 0 … below 1 is expected")
+                raise ValueError(f"{name} is {getattr(self, name)}; 0 to below 1 is expected")
         for name in (
             "waviness_mm", "wave_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz",
             "shutter_jitter_s", "stain_mm", "fold_mm", "hot_per_million", "hot_dn_per_s",
@@ -253,9 +253,9 @@ def wear(room: Room, page_mm: tuple[float, float], random: np.random.Generator) 
     return stain, Fold(crease, direction, room.fold_mm, _SLANT) if room.fold_mm else None
 
 
-def _relative_position(place: Place, at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _relative_position(rectangle: Place, at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     # Position relative to the centre of a rectangle, across and down: ±1 at its sides.
-    left, top, right, bottom = place
+    left, top, right, bottom = rectangle
     return (2 * at[..., 0] - left - right) / (right - left), (2 * at[..., 1] - top - bottom) / (bottom - top)
 
 
@@ -351,17 +351,17 @@ class Situation:
             )
         at = points_mm / np.array(page_mm)
         for patch in self.patches:
-            here = patch.cover(at)
-            light[here] += patch.share * (decoded(patch.colour) - light[here])
+            covered = patch.cover(at)
+            light[covered] += patch.share * (decoded(patch.colour) - light[covered])
         return light
 
     def passed(self, points_mm: NDArray[np.float64], page_mm: tuple[float, float]) -> NDArray[np.float64]:
         """Return the relative light (...) float64 that passes objects in front of points (..., 2) mm."""
         at = points_mm / np.array(page_mm)
-        left = np.ones(points_mm.shape[:-1])
+        transmitted = np.ones(points_mm.shape[:-1])
         for blob in self.blobs:
-            left *= blob.passed(at)
-        return left
+            transmitted *= blob.passed(at)
+        return transmitted
 
     def mirrored(self, points_mm: NDArray[np.float64], page_mm: tuple[float, float]) -> NDArray[np.float64]:
         """Return the specularly reflected light (...) float64 at points (..., 2) mm, relative to bare paper."""
@@ -396,7 +396,7 @@ def sampled(picture: NDArray[np.float32], place_mm: Place, points_mm: NDArray[np
     x = (points_mm[..., 0] - left) / (right - left) * columns - 0.5
     y = (points_mm[..., 1] - top) / (bottom - top) * rows - 0.5
     at = np.stack([y, x])
-    channels = [map_coordinates(picture[..., one], at, np.float64, order=1, mode="nearest") for one in range(3)]
+    channels = [map_coordinates(picture[..., channel], at, np.float64, order=1, mode="nearest") for channel in range(3)]
     return np.stack(channels, axis=-1)
 
 
@@ -497,10 +497,10 @@ class World:
             # Rows above, within and below the visible frame.
             edges = sorted({first, last, *(e for e in (visible.top, visible.top + visible.height) if first < e < last)})
             for top, bottom in pairwise(edges):
-                seen = visible.top <= top < visible.top + visible.height
-                part = light[:, top - visible.top : bottom - visible.top] if seen else light[:, : bottom - top, :0]
+                is_lit = visible.top <= top < visible.top + visible.height
+                strip = light[:, top - visible.top : bottom - visible.top] if is_lit else light[:, : bottom - top, :0]
                 noise_rows, rows = noise[top - first : bottom - first], frame[top:bottom]
-                counts(part, weights, noise_rows, visible.left, black, noise_dn, gain_e, body.saturation, rows)
+                counts(strip, weights, noise_rows, visible.left, black, noise_dn, gain_e, body.saturation, rows)
             self._raise_hot_counts(frame[first:last], noise, light, weights, settings, first)
 
         _run_in_blocks(body.sensor[0], block)
@@ -518,9 +518,9 @@ class World:
         # `frame` has the rows of the sensor from `first`.
         hot, visible = self.hot.within(first, first + len(frame)), self.body.visible
         y, x = hot.rows + first - visible.top, hot.columns - visible.left
-        seen = (y >= 0) & (y < visible.height) & (x >= 0) & (x < visible.width)
+        is_visible = (y >= 0) & (y < visible.height) & (x >= 0) & (x < visible.width)
         hot_light = np.zeros(len(hot.rows))
-        hot_light[seen] = drive.astype(np.float64) @ light[:, y[seen], x[seen]]
+        hot_light[is_visible] = drive.astype(np.float64) @ light[:, y[is_visible], x[is_visible]]
         hot.raise_counts(frame, noise, hot_light, self.body, settings.iso, settings.shutter_s)
 
     def _lighting(
@@ -536,12 +536,12 @@ class World:
 
         def block(first: int, last: int) -> None:
             points = self._points(nodes, first, last)
-            shown = self._collected(situation.shown(points, page, plain, self.decoded), settings, lamp, ambient)
-            shown *= situation.passed(points, page)[..., None]
+            weights = self._collected(situation.shown(points, page, plain, self.decoded), settings, lamp, ambient)
+            weights *= situation.passed(points, page)[..., None]
             patch_light = self.lens.unveiled(light[:, first:last], veil, first)
             if situation.glares:
                 patch_light = patch_light + self._mirrored(points, situation, first)
-            frame_light[:, first:last] = patch_light * shown.transpose(2, 0, 1)
+            frame_light[:, first:last] = patch_light * weights.transpose(2, 0, 1)
 
         _run_in_blocks(self.body.visible.height, block)
         self.lens.veiled(frame_light, self.body.pattern)
@@ -641,22 +641,22 @@ class World:
         ambient: float | NDArray[np.float64],
     ) -> NDArray[np.float64]:
         leak = self.room.black_leak
-        shown = lamp * (leak + (1 - leak) * linear) + self.room.ambient + ambient
+        relative_light = lamp * (leak + (1 - leak) * linear) + self.room.ambient + ambient
         reference = REFERENCE_EXPOSURE
         time = settings.shutter_s / reference.shutter_s
-        # A lens that the body does not set stands as it does for the reference.
+        # A lens without contacts keeps the reference aperture.
         opening = 1.0 if settings.aperture is None else (REFERENCE_APERTURE / settings.aperture) ** 2
-        return shown * time * opening * (settings.iso / reference.iso)
+        return relative_light * time * opening * (settings.iso / reference.iso)
 
     def worn(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the relative light (..., 3) float64 in R, G, B that stain and fold leave at points (..., 2) mm."""
         points = np.asarray(points_mm, dtype=np.float64)
-        left = np.ones((*points.shape[:-1], 3))
+        transmitted = np.ones((*points.shape[:-1], 3))
         if self.stain is not None:
-            left *= self.stain.passed(points)
+            transmitted *= self.stain.passed(points)
         if self.fold is not None:
-            left *= self.fold.shade(points)[..., None]
-        return left
+            transmitted *= self.fold.shade(points)[..., None]
+        return transmitted
 
     def field(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the light at points of the print: lens vignetting times fall-off of the projector.
@@ -685,8 +685,8 @@ class World:
 
     def _signals(self, reflectance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return DN (N, 3, 3) [colour, channel, primary] of reflectances (N, 81) at the reference exposure."""
-        seen = self._primaries[None] * self._sensitivities.T[:, None] * self._dn
-        return (reflectance @ seen.reshape(9, -1).T).reshape(-1, 3, 3)
+        weighted = self._primaries[None] * self._sensitivities.T[:, None] * self._dn
+        return (reflectance @ weighted.reshape(9, -1).T).reshape(-1, 3, 3)
 
     def _random(self, *key: int) -> np.random.Generator:
         return np.random.Generator(np.random.SFC64([self.room.seed, *key]))
@@ -714,19 +714,19 @@ class World:
             views = [self._nodes(situation, channel) for channel in _CHANNELS]
         sigma = ((2 * room.blur_px) ** 2 + (2 * situation.defocus_px) ** 2 + APERTURE_VARIANCE) ** 0.5
         out = np.empty((3, visible.height, visible.width), dtype=np.float32)
-        # The projector stays where it is.
+        # The projector does not move with the chart.
         falloff = self._falloff.copy()
         falloff[:, :2] = self._undisplaced(falloff[:, :2], situation)
 
-        places, lines, spread = np.stack(views), (drawing.x_lines, drawing.y_lines), room.shoulder_share > 0
+        node_grids, lines, spread = np.stack(views), (drawing.x_lines, drawing.y_lines), room.shoulder_share > 0
 
         def block(first: int, last: int) -> None:
-            # Shoulders lie between the print and the photosites' response.
+            # Shoulders are applied before the response of the photosites.
             response = np.ones((last - first, visible.width), np.float32) if spread else self._response(first, last)
             if self.stain is not None or self.fold is not None:
                 response *= self._worn_rows(nodes, channels, first, last)
             rows, lens = out[:, first:last], self._vignetting
-            light(first, places, sigma, *lines, drawing.labels, table, channels, lens, falloff, response, rows)
+            light(first, node_grids, sigma, *lines, drawing.labels, table, channels, lens, falloff, response, rows)
 
         def respond(first: int, last: int) -> None:
             out[:, first:last] *= self._response(first, last)
@@ -746,7 +746,7 @@ class World:
 
     def _undisplaced(self, points_mm: NDArray[np.float64], situation: Situation) -> NDArray[np.float64]:
         if not any(situation.view):
-            # Rounding would make other counts of the undisturbed chart, here and there one.
+            # Rounding errors would change some counts of the undisturbed chart.
             return points_mm
         return undisplaced(points_mm, np.array(self.sheet.page_mm) / 2, self._shift_mm(situation), situation.turn_deg)
 
@@ -776,8 +776,8 @@ class World:
         visible = self.body.visible
         y, x = (np.arange(-1, (size - 1) // GRID_PX + 3) * GRID_PX for size in (visible.height, visible.width))
         photosites = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)
-        seen = self.lens.unshifted((photosites - 0.5) / 2, channel)
-        return self._undisplaced(self.view.locate(seen), situation)
+        green_px = self.lens.unshifted((photosites - 0.5) / 2, channel)
+        return self._undisplaced(self.view.locate(green_px), situation)
 
 
 def _run_in_blocks(rows: int, work: Callable[[int, int], None]) -> None:

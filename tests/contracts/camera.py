@@ -1,6 +1,6 @@
-"""What every camera keeps to, written once: a suite names its camera by the fixture `bench`.
+"""Contract of all cameras; a test module supplies its camera by the fixture `bench`.
 
-The camera photographs with a `SeededFilm`, so that each frame can be compared with what was exposed.
+The camera exposes a `SeededFilm`, so that each frame can be compared with the exposed one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SETTINGS = ExposureSettings(iso=100, aperture=8, shutter_s=1 / 60)
 
 
 class SeededFilm:
-    """A `sim.camera.film.Film` whose pictures are noise, each another one, and remembered."""
+    """Film (`sim.camera.film.Film`) whose frames are different noise, and are kept."""
 
     suffix = ".cr2"
 
@@ -47,10 +47,9 @@ class SeededFilm:
 
 @dataclass(frozen=True)
 class Bench:
-    """A camera under test, the film in it, and what is true of it.
+    """A camera under test and its film.
 
-    `keeps_names` tells whether frames come under the names that the camera gave them; `develop` brings `film` up to
-    date where it is the image of one elsewhere.
+    `keeps_names`: whether frames keep the file names of the camera. `develop` updates `film` if it is a copy.
     """
 
     camera: Camera
@@ -61,36 +60,36 @@ class Bench:
     develop: Callable[[], None] = lambda: None
 
     def frames(self) -> list[bytes]:
-        """Return what has been exposed."""
+        """Return the exposed frames."""
         self.develop()
         return self.film.frames
 
 
 class CameraContract:
-    """Subclass as ``TestX`` and supply the fixture `bench`."""
+    """Subclass it as ``TestX`` and supply the fixture `bench`."""
 
     def test_names_itself(self, bench: Bench) -> None:
         assert bench.camera.identity() == bench.identity
         assert bench.camera.identity() == bench.identity
 
-    def test_takes_nothing_before_it_knows_how(self, bench: Bench) -> None:
+    def test_requires_settings_before_an_exposure(self, bench: Bench) -> None:
         with pytest.raises(DeviceRefused):
             bench.camera.expose()
         with pytest.raises(DeviceError):
             bench.camera.download(io.BytesIO())
         assert bench.frames() == []
 
-    def test_every_frame_is_the_one_that_was_exposed(self, bench: Bench) -> None:
+    def test_delivers_the_exposed_frame(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         names: list[str] = []
         for number in range(4):
             into = io.BytesIO()
-            before = bench.now()
+            earliest = bench.now()
             captured = capture(bench.camera, into)
             assert into.getvalue() == bench.frames()[number]
             assert captured.size == len(bench.frames()[number])
             assert captured.released_at.utcoffset() == timedelta(0)
-            assert before <= captured.released_at.astimezone(UTC) <= bench.now()
+            assert earliest <= captured.released_at.astimezone(UTC) <= bench.now()
             names.append(captured.name)
         assert len(bench.frames()) == 4
         assert len(set(names)) == 4
@@ -98,11 +97,11 @@ class CameraContract:
         if bench.keeps_names:
             assert names == ["IMG_0001.CR2", "IMG_0002.CR2", "IMG_0003.CR2", "IMG_0004.CR2"]
 
-    def test_the_light_may_change_between_exposure_and_download(self, bench: Bench) -> None:
+    def test_light_may_change_before_the_download(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
-        before = bench.now()
+        earliest = bench.now()
         released_at = bench.camera.expose()
-        assert before <= released_at <= bench.now()
+        assert earliest <= released_at <= bench.now()
         assert len(bench.frames()) == 1
         into = io.BytesIO()
         captured = bench.camera.download(into)
@@ -111,7 +110,7 @@ class CameraContract:
         with pytest.raises(DeviceError):
             bench.camera.download(io.BytesIO())
 
-    def test_a_download_that_failed_is_tried_again_with_a_new_stream(self, bench: Bench) -> None:
+    def test_failed_download_can_be_repeated(self, bench: Bench) -> None:
         class Full(io.BytesIO):
             def write(self, data: object) -> int:
                 raise StorageError("the disk is full")
@@ -125,7 +124,7 @@ class CameraContract:
         bench.camera.download(into)
         assert [into.getvalue()] == bench.frames()
 
-    def test_an_exposure_that_was_not_downloaded_gives_way_to_the_next(self, bench: Bench) -> None:
+    def test_new_exposure_replaces_an_unread_one(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         bench.camera.expose()
         bench.camera.expose()
@@ -135,7 +134,7 @@ class CameraContract:
         with pytest.raises(DeviceError):
             bench.camera.download(io.BytesIO())
 
-    def test_exposes_as_configured(self, bench: Bench) -> None:
+    def test_exposes_with_the_settings(self, bench: Bench) -> None:
         applied = [SETTINGS, replace(SETTINGS, iso=200), replace(SETTINGS, aperture=11.0, shutter_s=1 / 125), SETTINGS]
         for settings in applied:
             bench.camera.configure(settings)
@@ -143,7 +142,7 @@ class CameraContract:
         bench.develop()
         assert bench.film.settings == applied
 
-    def test_lists_the_shutter_times_that_it_takes(self, bench: Bench) -> None:
+    def test_accepts_the_listed_shutter_times(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         speeds = bench.camera.shutter_speeds()
         assert speeds == tuple(sorted(set(speeds)))
@@ -152,7 +151,7 @@ class CameraContract:
         for speed in speeds[:: len(speeds) // 5]:
             bench.camera.configure(replace(SETTINGS, shutter_s=speed))
 
-    def test_writes_where_the_file_stands(self, bench: Bench) -> None:
+    def test_writes_at_the_position_of_the_stream(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         into = io.BytesIO(b"before")
         into.seek(0, io.SEEK_END)
@@ -160,7 +159,7 @@ class CameraContract:
         assert into.getvalue() == b"before" + bench.frames()[0]
         assert captured.size == len(bench.frames()[0])
 
-    def test_refuses_what_it_does_not_offer_and_stays_usable(self, bench: Bench) -> None:
+    def test_refuses_impossible_settings_and_stays_usable(self, bench: Bench) -> None:
         with pytest.raises(DeviceRefused, match="100"):
             bench.camera.configure(replace(SETTINGS, iso=110))
         assert bench.frames() == []
@@ -169,7 +168,7 @@ class CameraContract:
         capture(bench.camera, into)
         assert into.getvalue() == bench.frames()[-1]
 
-    def test_a_closed_camera_is_closed(self, bench: Bench) -> None:
+    def test_refuses_calls_after_close(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         bench.camera.close()
         bench.camera.close()

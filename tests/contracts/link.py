@@ -1,4 +1,4 @@
-"""What every cable keeps to, written once: a suite names its cable by the fixture `ends`."""
+"""Contract of all links; a test module supplies its link by the fixture `ends`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PATIENCE_S = 10.0
 
 
 def read_exactly(link: Link, size: int) -> bytes:
-    """Return `size` bytes, however the cable cuts them."""
+    """Return `size` bytes from any number of reads."""
     data = b""
     while len(data) < size:
         data += link.read(size - len(data), PATIENCE_S)
@@ -23,30 +23,30 @@ def read_exactly(link: Link, size: int) -> bytes:
 
 
 class LinkContract:
-    """Subclass as ``TestX`` and supply the fixture `ends`."""
+    """Subclass it as ``TestX`` and supply the fixture `ends`."""
 
-    def test_carries_bytes_both_ways(self, ends: Ends) -> None:
+    def test_transfers_bytes_in_both_directions(self, ends: Ends) -> None:
         near, far = ends
         near.write(b"\x00question\r\n", PATIENCE_S)
         assert read_exactly(far, 11) == b"\x00question\r\n"
         far.write(b"answer\xff", PATIENCE_S)
         assert read_exactly(near, 7) == b"answer\xff"
 
-    def test_keeps_order_and_loses_nothing(self, ends: Ends) -> None:
+    def test_keeps_order_and_all_bytes(self, ends: Ends) -> None:
         near, far = ends
         pieces = [bytes([number]) * (number + 1) for number in range(100)]
         for piece in pieces:
             far.write(piece, PATIENCE_S)
         assert read_exactly(near, 5050) == b"".join(pieces)
 
-    def test_reads_no_more_than_the_limit(self, ends: Ends) -> None:
+    def test_read_respects_its_limit(self, ends: Ends) -> None:
         near, far = ends
         far.write(b"abcdef", PATIENCE_S)
         first = near.read(2, PATIENCE_S)
         assert 1 <= len(first) <= 2
         assert first + read_exactly(near, 6 - len(first)) == b"abcdef"
 
-    def test_silence_is_a_timeout_and_the_link_survives_it(self, ends: Ends) -> None:
+    def test_silence_raises_a_timeout_and_keeps_the_link(self, ends: Ends) -> None:
         near, far = ends
         assert near.read(10, 0.0) == b""
         with pytest.raises(LinkTimeout):
@@ -54,7 +54,7 @@ class LinkContract:
         far.write(b"late", PATIENCE_S)
         assert read_exactly(near, 4) == b"late"
 
-    def test_what_was_sent_before_hanging_up_is_still_read(self, ends: Ends) -> None:
+    def test_reads_bytes_sent_before_the_end(self, ends: Ends) -> None:
         near, far = ends
         far.write(b"last words", PATIENCE_S)
         far.close()
@@ -62,14 +62,14 @@ class LinkContract:
         with pytest.raises(LinkClosed):
             near.read(1, PATIENCE_S)
 
-    def test_a_far_end_that_left_is_noticed_by_the_next_exchange(self, ends: Ends) -> None:
+    def test_detects_that_the_other_end_closed(self, ends: Ends) -> None:
         near, far = ends
         far.close()
         # A cable may take the bytes before it learns that nobody is there.
         with pytest.raises(LinkClosed):
             _exchange(near)
 
-    def test_a_closed_end_is_closed(self, ends: Ends) -> None:
+    def test_refuses_calls_after_close(self, ends: Ends) -> None:
         near, _ = ends
         near.close()
         near.close()

@@ -1,4 +1,4 @@
-"""What every presenter keeps to, written once: a suite names its presenter by the fixture `bench`."""
+"""Contract of all presenters; a test module supplies its presenter by the fixture `bench`."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ RAMPS = tuple(
 
 @dataclass(frozen=True)
 class Bench:
-    """A presenter under test; `seen` looks at the light itself, past the presenter, and gives codes."""
+    """A presenter under test; `seen` returns the displayed codes independently of the presenter."""
 
     presenter: Presenter
     seen: Callable[[], Colour]
 
 
 class PresenterContract:
-    """Subclass as ``TestX`` and supply the fixture `bench`."""
+    """Subclass it as ``TestX`` and supply the fixture `bench`."""
 
-    def test_is_black_from_the_start(self, bench: Bench) -> None:
+    def test_starts_black(self, bench: Bench) -> None:
         assert bench.seen() == BLACK
 
-    def test_shows_each_channel_at_every_height(self, bench: Bench) -> None:
+    def test_shows_all_codes_of_each_channel(self, bench: Bench) -> None:
         for colour in RAMPS:
             bench.presenter.show(colour)
             assert bench.seen() == colour
 
-    def test_keeps_the_channels_apart(self, bench: Bench) -> None:
+    def test_separates_the_channels(self, bench: Bench) -> None:
         for colour in (Colour(1, 2, 3), Colour(254, 128, 127), Colour(3, 2, 1), WHITE, BLACK):
             bench.presenter.show(colour)
             assert bench.seen() == colour
 
-    def test_shows_the_same_twice(self, bench: Bench) -> None:
+    def test_repeats_a_colour(self, bench: Bench) -> None:
         for _ in range(2):
             bench.presenter.show(Colour(200, 100, 50))
             assert bench.seen() == Colour(200, 100, 50)
 
-    def test_reads_back_what_it_shows_where_it_can(self, bench: Bench) -> None:
+    def test_reads_back_the_displayed_colour(self, bench: Bench) -> None:
         if not isinstance(bench.presenter, ReadsBack):
             pytest.skip("it cannot read back")
         for colour in (Colour(1, 2, 3), WHITE, BLACK):
@@ -53,12 +53,12 @@ class PresenterContract:
                 bench.presenter.verify(colour)
             with pytest.raises(DeviceError):
                 bench.presenter.verify(Colour(1, 2, 4))
-            assert bench.seen() == colour, "it only looks"
+            assert bench.seen() == colour, "reading back changes nothing"
         bench.presenter.close()
         with pytest.raises(DeviceError):
             bench.presenter.verify(BLACK)
 
-    def test_is_black_when_closed_and_stays_closed(self, bench: Bench) -> None:
+    def test_is_black_after_close(self, bench: Bench) -> None:
         bench.presenter.show(WHITE)
         bench.presenter.close()
         bench.presenter.close()

@@ -1,6 +1,6 @@
-"""What every projector keeps to, written once: a suite names its projector by the fixture `bench`.
+"""Contract of all projectors; a test module supplies its projector by the fixture `bench`.
 
-The projector is found in standby. `Bench.wait` lets seconds pass for it, by a simulated clock.
+The projector is in standby at first. `Bench.wait` advances its simulated clock.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from sim.projectors.projector import SimulatedProjector
 
 @dataclass(frozen=True)
 class Bench:
-    """A projector under test and what is needed to play with it.
+    """A projector under test.
 
-    `break_part` and `repair` make it ill and well again; `identity`, `warm_up_s` and `cool_down_s` say what is true;
-    `told` is what of the true faults its language can say; `counts_hours`, whether it can say its lamp's hours.
+    `break_part` and `repair` change its faults; `identity`, `warm_up_s` and `cool_down_s` are the true values; `told`
+    are the faults that its protocol can report; `counts_hours` is whether it reports lamp hours.
     """
 
     projector: Projector
@@ -35,25 +35,25 @@ class Bench:
 
     @classmethod
     def of(cls, projector: Projector, device: SimulatedProjector) -> Bench:
-        """Return the bench of a driver on a simulated projector, all of whose faults it can tell."""
+        """Return the bench of a driver on a simulated projector that can report all faults."""
         traits = device.traits
         play = device.clock.sleep, device.break_part, device.repair
         return cls(projector, *play, traits.identity, traits.warm_up_s, traits.cool_down_s)
 
     def switched_on(self) -> Projector:
-        """Return the projector when it has warmed up."""
+        """Return the projector after warm-up."""
         self.projector.switch_on()
         self.wait(self.warm_up_s)
         return self.projector
 
 
 class ProjectorContract:
-    """Subclass as ``TestX`` and supply the fixture `bench`."""
+    """Subclass it as ``TestX`` and supply the fixture `bench`."""
 
     def test_names_itself(self, bench: Bench) -> None:
         assert bench.projector.identity() == bench.identity
 
-    def test_goes_round_its_four_states(self, bench: Bench) -> None:
+    def test_passes_its_four_states(self, bench: Bench) -> None:
         projector = bench.projector
         assert projector.power() is Power.STANDBY
         projector.switch_on()
@@ -69,14 +69,14 @@ class ProjectorContract:
         bench.wait(1)
         assert projector.power() is Power.STANDBY
 
-    def test_switching_to_where_it_is_changes_nothing(self, bench: Bench) -> None:
+    def test_switching_to_the_current_state_does_nothing(self, bench: Bench) -> None:
         bench.projector.switch_off()
         assert bench.projector.power() is Power.STANDBY
         projector = bench.switched_on()
         projector.switch_on()
         assert projector.power() is Power.ON
 
-    def test_refuses_to_turn_back_half_way(self, bench: Bench) -> None:
+    def test_refuses_switching_during_a_transition(self, bench: Bench) -> None:
         projector = bench.projector
         projector.switch_on()
         with pytest.raises(DeviceRefused):
@@ -87,7 +87,7 @@ class ProjectorContract:
             projector.switch_on()
         assert projector.power() is Power.COOLING
 
-    def test_mutes_and_shows(self, bench: Bench) -> None:
+    def test_mutes_and_unmutes(self, bench: Bench) -> None:
         projector = bench.switched_on()
         assert not projector.muted()
         projector.set_muted(True)
@@ -95,11 +95,11 @@ class ProjectorContract:
         projector.set_muted(False)
         assert not projector.muted()
 
-    def test_refuses_to_mute_while_dark(self, bench: Bench) -> None:
+    def test_refuses_to_mute_without_light(self, bench: Bench) -> None:
         with pytest.raises(DeviceRefused):
             bench.projector.set_muted(True)
 
-    def test_reports_faults_and_forgets_them_when_repaired(self, bench: Bench) -> None:
+    def test_reports_faults_until_repaired(self, bench: Bench) -> None:
         assert bench.projector.faults() == ()
         bench.break_part("temperature", Severity.WARNING)
         bench.break_part("fan", Severity.ERROR)
@@ -108,29 +108,29 @@ class ProjectorContract:
         bench.repair()
         assert bench.projector.faults() == ()
 
-    def test_lamp_hours_count_while_lit(self, bench: Bench) -> None:
+    def test_counts_lamp_hours(self, bench: Bench) -> None:
         if not bench.counts_hours:
             assert bench.projector.lamps() == ()
             return
-        (before,) = bench.projector.lamps()
-        assert not before.lit
+        (first_lamp,) = bench.projector.lamps()
+        assert not first_lamp.lit
         bench.wait(10 * 3600)
-        assert bench.projector.lamps() == (before,)
+        assert bench.projector.lamps() == (first_lamp,)
         bench.switched_on()
         bench.wait(10 * 3600)
-        assert bench.projector.lamps() == (Lamp(before.hours + 10, lit=True),)
+        assert bench.projector.lamps() == (Lamp(first_lamp.hours + 10, lit=True),)
         bench.projector.switch_off()
         bench.wait(bench.cool_down_s)
-        assert bench.projector.lamps() == (Lamp(before.hours + 10, lit=False),)
+        assert bench.projector.lamps() == (Lamp(first_lamp.hours + 10, lit=False),)
 
-    def test_survives_idleness(self, bench: Bench) -> None:
+    def test_works_after_an_idle_time(self, bench: Bench) -> None:
         assert bench.projector.power() is Power.STANDBY
         bench.wait(24 * 3600)
         assert bench.projector.power() is Power.STANDBY
         bench.projector.switch_on()
         assert bench.projector.power() is Power.WARMING
 
-    def test_closing_twice_leaves_the_power_alone(self, bench: Bench) -> None:
+    def test_second_close_keeps_the_power_state(self, bench: Bench) -> None:
         projector = bench.switched_on()
         projector.close()
         projector.close()

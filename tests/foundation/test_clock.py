@@ -37,17 +37,17 @@ def test_setting_the_clock_does_not_change_session_time() -> None:
     clock.sleep(5)
     assert clock.now() == NOON + timedelta(seconds=5)
     for jump in (timedelta(hours=-1), timedelta(days=150)):
-        before = clock.now()
+        earlier = clock.now()
         machine.date += jump
         clock.sleep(2)
-        assert clock.now() - before == timedelta(seconds=2)
+        assert clock.now() - earlier == timedelta(seconds=2)
     assert clock.monotonic() == machine.seconds
 
 
 def test_reports_a_clock_step_once() -> None:
     machine = SetClock()
     clock = steady(machine, NOON + timedelta(hours=2))
-    assert clock.step_s() == 0, "it was behind at the start, and is told of that"
+    assert clock.step_s() == 0, "the offset at the start is no step"
     machine.date += timedelta(hours=1)
     clock.sleep(5)
     assert clock.step_s() == 3600

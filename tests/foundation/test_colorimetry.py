@@ -38,7 +38,7 @@ def test_observer_equals_cie_1931(science: Any) -> None:
     theirs = science.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     assert np.array_equal(wavelengths, theirs.wavelengths)
     assert np.array_equal(functions, theirs.values)
-    # CIE 15:2018, table 1: the greatest value of ȳ, and the wavelength at which it stands.
+    # CIE 15:2018, table 1: the maximum of ȳ, and its wavelength.
     assert (wavelengths[functions[:, 1].argmax()], functions[:, 1].max()) == (555, 1.0)
 
 

@@ -121,14 +121,14 @@ def kernels(process: Kernels) -> Kernels:
 def test_cached_code_depends_on_sources_settings_and_hash(kernels: Kernels) -> None:
     # Beside a copy of the decorator's files: numba by itself would go on with the old code.
     assert kernels.run(SQUARED) == ["25 True"]
-    (kept,) = kernels.code()
-    kept.write_bytes(kept.read_bytes()[:-1])
+    (cached,) = kernels.code()
+    cached.write_bytes(cached.read_bytes()[:-1])
     assert kernels.run(SQUARED) == ["25 True"]
     assert kernels.run(SQUARED) == ["25 False"], "the next start compiles nothing"
     assert kernels.run(SQUARED, NUMBA_OPT="1") == ["25 True"]
-    assert kernels.code() == [kept], "made anew, and kept in its place"
+    assert kernels.code() == [cached], "the new code replaces the old"
     assert kernels.run(SQUARED, NUMBA_CPU_NAME="generic") == ["25 True"]
-    assert len(kernels.code()) == 2, "another processor's is kept beside it"
+    assert len(kernels.code()) == 2, "code of another processor is cached too"
     kernels.write_power(3)
     assert kernels.run(SQUARED) == ["125 True"], "a file that was compiled into it has changed"
 
@@ -175,13 +175,13 @@ def test_compiles_without_a_writable_folder(kernels: Kernels) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system binds no process to processors")
 def test_a_process_bound_to_one_processor_counts_one() -> None:
-    before = os.sched_getaffinity(0)
-    assert processor_count() == len(before)
+    previous = os.sched_getaffinity(0)
+    assert processor_count() == len(previous)
     try:
-        os.sched_setaffinity(0, {min(before)})
+        os.sched_setaffinity(0, {min(previous)})
         assert processor_count() == 1
     finally:
-        os.sched_setaffinity(0, before)
+        os.sched_setaffinity(0, previous)
 
 
 def test_counts_all_processors_without_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,24 +193,24 @@ def test_counts_all_processors_without_affinity(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_map_keeps_order_and_limits_its_queue() -> None:
-    taken: list[int] = []
+    consumed: list[int] = []
 
     def items() -> Iterator[int]:
         for number in range(100):
-            taken.append(number)
+            consumed.append(number)
             yield number
 
     for number, value in enumerate(ordered_map(lambda item: item**2, items(), 3)):
         assert value == number**2
-        assert len(taken) <= number + 7
+        assert len(consumed) <= number + 7
 
 
 def test_map_cancels_waiting_calls_after_an_error() -> None:
-    begun: list[int] = []
+    started: list[int] = []
     release = Event()
 
     def work(item: int) -> int:
-        begun.append(item)
+        started.append(item)
         if item == 0:
             raise KeyError(item)
         release.wait()
@@ -220,4 +220,4 @@ def test_map_cancels_waiting_calls_after_an_error() -> None:
     release.set()
     with pytest.raises(KeyError):
         list(pulling)
-    assert len(begun) <= 5
+    assert len(started) <= 5

@@ -52,8 +52,8 @@ def test_error_has_its_remedy_as_attribute(error: errors.CropError, problem: str
     assert error.without_remedy() == problem
     assert error.while_waiting() == waiting
     assert str(error).startswith(waiting)
-    again = pickle.loads(pickle.dumps(error))
-    assert (str(again), again.remedy) == (str(error), error.remedy)
+    restored = pickle.loads(pickle.dumps(error))
+    assert (str(restored), restored.remedy) == (str(error), error.remedy)
 
 
 # The tree in the docstring of foundation.errors.
@@ -139,7 +139,7 @@ def ended(program: str, output: int) -> tuple[int, str]:
     # Buffered, as a user has it, whatever the surroundings of this test.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     text = f"from foundation.console import run\nimport sys\n{program}"
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", text],
         stdout=output,
         stderr=subprocess.PIPE,
@@ -148,7 +148,7 @@ def ended(program: str, output: int) -> tuple[int, str]:
         timeout=60,
         env=environment,
     )
-    return done.returncode, done.stderr
+    return result.returncode, result.stderr
 
 
 @pytest.mark.slow
@@ -187,13 +187,13 @@ def test_full_output_device_exits_with_5(lines: int) -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_ignored_hang_up_stays_ignored(number: int) -> None:
     """As under nohup."""
-    before = signal.signal(number, signal.SIG_IGN)
+    previous = signal.signal(number, signal.SIG_IGN)
     try:
         with orderly_end():
             signal.raise_signal(number)
         assert signal.getsignal(number) == signal.SIG_IGN
     finally:
-        signal.signal(number, before)
+        signal.signal(number, previous)
 
 
 @pytest.mark.usefixtures("hang_up")
@@ -248,12 +248,12 @@ class TestEndRequest:
     def test_ctrl_c_waits_for_a_postponed_block(self, capfd: pytest.CaptureFixture[str]) -> None:
         # A shell that is not interactive starts what it puts in the background with SIGINT ignored.
         inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
-        before = signal.getsignal(signal.SIGINT)
+        previous = signal.getsignal(signal.SIGINT)
         with orderly_end() as ending, ending.postponed("ending soon"):
             signal.raise_signal(signal.SIGINT)
             assert ending.is_requested
         assert "ending soon" in capfd.readouterr().err
-        assert signal.getsignal(signal.SIGINT) == before
+        assert signal.getsignal(signal.SIGINT) == previous
         signal.signal(signal.SIGINT, inherited)
 
 
@@ -277,18 +277,18 @@ def test_reports_a_missing_working_folder(
 def test_quiet_shows_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
     from foundation import console as command_line
 
-    seen: list[bool] = []
+    visibility: list[bool] = []
 
     def quiet() -> None:
         command_line._log_errors_only(True)
-        seen.append(shows_progress())
+        visibility.append(shows_progress())
         with progress("frames") as tell:
             tell(1, 2)
         logging.getLogger("drivers").warning("not heard")
         logging.getLogger("drivers").error("heard")
 
     assert run(quiet) == 0
-    assert seen == [False]
+    assert visibility == [False]
     assert shows_progress()
     printed = capsys.readouterr().err
     assert printed.endswith("ERROR drivers: heard\n")
@@ -330,18 +330,18 @@ PRINTING = "from foundation.console import run; import sys; sys.exit(run(lambda:
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
 def test_replaces_characters_that_a_terminal_lacks(encoding: str) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": encoding}
-    done = subprocess.run([sys.executable, "-c", PRINTING], capture_output=True, check=False, env=environment)
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert done.stdout.startswith(b"30 ")
+    result = subprocess.run([sys.executable, "-c", PRINTING], capture_output=True, check=False, env=environment)
+    assert (result.returncode, result.stderr) == (0, b"")
+    assert result.stdout.startswith(b"30 ")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", ["1", "2"])
 def test_closed_streams_are_no_error(closed: str) -> None:
     words = ["sh", "-c", f'exec "$0" -c "$1" {closed}>&-', sys.executable, PRINTING]
-    done = subprocess.run(words, capture_output=True, check=False)
-    assert done.returncode == 0
-    assert b"Traceback" not in done.stderr
+    result = subprocess.run(words, capture_output=True, check=False)
+    assert result.returncode == 0
+    assert b"Traceback" not in result.stderr
 
 
 @pytest.mark.slow

@@ -82,7 +82,7 @@ def test_injected_error_hits_one_call(disk: FailingCalls, tmp_path: Path) -> Non
 
 def save_old(path: Path) -> None:
     write_atomic(path, "old")
-    assert [other.name for other in path.parent.iterdir()] == [path.name]
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
 
 
 def test_file_is_complete_or_error_is_reported(disk: FailingCalls, tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_file_is_complete_or_error_is_reported(disk: FailingCalls, tmp_path: Pat
         assert path.read_text() in ("old", "new" * 5000)
         if ran.error is None:
             assert path.read_text() == "new" * 5000
-        assert {other.name for other in tmp_path.iterdir()} <= {"frames.csv", ".frames.csv.partial"}
+        assert {entry.name for entry in tmp_path.iterdir()} <= {"frames.csv", ".frames.csv.partial"}
         faults += ran.error is not None
     assert faults > 50
 
@@ -140,10 +140,10 @@ def test_folder_is_locked_or_error_is_reported(
 
 
 def test_path_is_checked_or_error_is_reported(disk: FailingCalls, tmp_path: Path) -> None:
-    place = tmp_path / "out"
-    place.mkdir()
-    for _ in each_call(disk, lambda: require_free(place, "the table")):
+    target = tmp_path / "out"
+    target.mkdir()
+    for _ in each_call(disk, lambda: require_free(target, "the table")):
         pass
-    place.rmdir()
-    for _ in each_call(disk, lambda: require_free(place, "the table"), numbers=(errno.EIO, errno.ESTALE)):
+    target.rmdir()
+    for _ in each_call(disk, lambda: require_free(target, "the table"), numbers=(errno.EIO, errno.ESTALE)):
         pass

@@ -39,13 +39,13 @@ def names(folder: Path) -> list[str]:
 def small_disk(limit: int) -> Generator[None]:
     """Limit the size of files: the kernel raises EFBIG, as a full disk raises ENOSPC."""
     resource = pytest.importorskip("resource")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    previous = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, previous[1]))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        resource.setrlimit(resource.RLIMIT_FSIZE, previous)
         signal.signal(signal.SIGXFSZ, handler)
 
 
@@ -146,8 +146,8 @@ class TestAtomicFile:
             "with atomic_file(pathlib.Path(sys.argv[1])) as stream:\n"
             "    stream.write(b'half'); stream.flush(); os.kill(os.getpid(), 9)\n"
         )
-        done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "a")], check=False)
-        assert done.returncode == -signal.SIGKILL
+        result = subprocess.run([sys.executable, "-c", program, str(tmp_path / "a")], check=False)
+        assert result.returncode == -signal.SIGKILL
         assert (tmp_path / "a").read_text() == "old"
         assert [is_partial(name) for name in names(tmp_path)] == [True, False]
         write_atomic(tmp_path / "a", "new")

@@ -1,6 +1,6 @@
 """Folder locks on file systems that lock folders, on those that lock files only, and on those without locks.
 
-A replaced `flock` simulates what a file system cannot lock.
+A replaced `flock` simulates missing locks of a file system.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def refuse_folders(handle: int, operation: int) -> None:
 
 @pytest.fixture(params=["folders", "files"])
 def locks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return what the file system can lock."""
+    """Return the kind of lockable objects."""
     if request.param == "files":
         monkeypatch.setattr(folders.fcntl, "flock", refuse_folders)
     return request.param
@@ -125,12 +125,12 @@ def test_retries_after_a_useless_wait(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("locks")
 def test_makes_a_folder_again_that_was_renamed_before_locking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, final = tmp_path / "making", tmp_path / "made"
-    now: Flock = folders.fcntl.flock
+    system_flock: Flock = folders.fcntl.flock
 
     def finished_first(handle: int, operation: int) -> None:
         if not final.exists():
             folder.rename(final)
-        now(handle, operation)
+        system_flock(handle, operation)
 
     monkeypatch.setattr(folders.fcntl, "flock", finished_first)
     with locked_folder(folder, BUSY):

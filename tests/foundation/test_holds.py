@@ -29,9 +29,9 @@ def held_elsewhere(key: str) -> Generator[int]:
 def test_refusal_names_the_process() -> None:
     with held_elsewhere("test_holds one") as pid:
         for _ in range(3):
-            with pytest.raises(DeviceRefused, match=f"process {pid}") as told, hold("the lab", "test_holds one"):
+            with pytest.raises(DeviceRefused, match=f"process {pid}") as refusal, hold("the lab", "test_holds one"):
                 pass
-            assert told.value.value == pid
+            assert refusal.value.value == pid
         with hold("another lab", "test_holds two"):
             pass
     with hold("the lab", "test_holds one"):

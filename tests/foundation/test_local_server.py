@@ -75,7 +75,7 @@ class Probe:
     """A socket of a machine with routes to networks of both address families."""
 
     def __init__(self, family: socket.AddressFamily, kind: socket.SocketKind) -> None:
-        assert kind == socket.SOCK_DGRAM, "nothing is to be sent"
+        assert kind == socket.SOCK_DGRAM, "no bytes may be sent"
         self.own = "192.168.1.7" if family == socket.AF_INET else "fd00::7"
 
     def __enter__(self) -> Probe:
@@ -170,7 +170,7 @@ def test_keeps_a_connection_with_occasional_requests() -> None:
         assert request_on(link) == b"here"
     with served(idle_s=0.05) as server, connect(server) as link:
         assert request_on(link) == b"here"
-        assert link.recv(1) == b"", "an idle one ends"
+        assert link.recv(1) == b"", "an idle connection ends"
 
 
 def is_closed(far: socket.socket) -> bool:

@@ -66,7 +66,7 @@ def test_page_is_complete_and_fetches_nothing() -> None:
             pages.row([pages.figure(b"\x89PNG\r\n", "a 'quoted' caption"), pages.figure(draw_svg(draw), "drawn")]),
         ],
     )
-    found = checked(text)
+    checker = checked(text)
     for words in (
         "A <b> & 'c'",
         "H & H",
@@ -80,8 +80,8 @@ def test_page_is_complete_and_fetches_nothing() -> None:
         "<series> & more",
         "1.00",
     ):
-        assert words in found.text
-    assert all(address.startswith(("data:", "#")) for address in found.addresses)
+        assert words in checker.text
+    assert all(address.startswith(("data:", "#")) for address in checker.addresses)
     assert "script-src" not in text
     assert "default-src 'none'" in text
 
@@ -95,18 +95,18 @@ def test_policy_allows_only_own_script_and_style(tmp_path: Path, monkeypatch: py
     (folder / "two.js").write_text("a += '&';\n")
     (folder / "own.css").write_text("p > b { color: red }\n")
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    made = pages.render(
+    rendered = pages.render(
         "pages_of_a_test", "own.html", scripts=("one.js", "two.js"), styles=("own.css",), uses_server=True,
         title="T", name="<i>",
     )  # fmt: skip
-    script, style = (re.search(f"(?s)<{name}>(.*)</{name}>", made.text) for name in ("script", "style"))
+    script, style = (re.search(f"(?s)<{name}>(.*)</{name}>", rendered.text) for name in ("script", "style"))
     assert script
     assert script[1] == "let a = '<';\na += '&';\n"
     assert style
     assert style[1].endswith("p > b { color: red }\n")
-    assert "<p>&lt;i&gt;</p>" in made.text
-    rules = dict(rule.strip().split(" ", 1) for rule in made.policy.split(";"))
-    assert f'content="{made.policy}"' in made.text
+    assert "<p>&lt;i&gt;</p>" in rendered.text
+    rules = dict(rule.strip().split(" ", 1) for rule in rendered.policy.split(";"))
+    assert f'content="{rendered.policy}"' in rendered.text
     for name, text in (("script-src", script[1]), ("style-src", style[1])):
         assert rules[name] == f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
     assert rules["default-src"] == "'none'"

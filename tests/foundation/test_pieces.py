@@ -19,19 +19,19 @@ FOREIGN = Piece("one", "of others", {}, "{}")
 def test_restores_pieces() -> None:
     record = ONE.to_line() + TWO.to_line()
     assert read_pieces(record) == read_pieces(record, "of these") == {"one": ONE, "two": TWO}
-    assert read_pieces(record + FOREIGN.to_line())["one"] == FOREIGN, "the last of a name"
+    assert read_pieces(record + FOREIGN.to_line())["one"] == FOREIGN, "the last line of a name is used"
     assert read_pieces(record + FOREIGN.to_line(), "of these")["one"] == ONE
-    other = b"a line\tof something else"
-    assert read_pieces(b"%s\t%s\n" % (sha256_of(other).encode(), other)) == read_pieces(b"") == {}
+    foreign_line = b"a line\tof something else"
+    assert read_pieces(b"%s\t%s\n" % (sha256_of(foreign_line).encode(), foreign_line)) == read_pieces(b"") == {}
 
 
 @given(st.data())
 def test_ignores_damaged_lines_only(data: st.DataObject) -> None:
     line = ONE.to_line()
-    place = data.draw(st.integers(1, len(line) - 2))
-    byte = data.draw(st.integers(0, 255).filter(lambda byte: byte != line[place]))
-    changed = line[:place] + bytes([byte]) + line[place + 1 :]
-    for damaged in (line[:place], changed):
+    position = data.draw(st.integers(1, len(line) - 2))
+    byte = data.draw(st.integers(0, 255).filter(lambda byte: byte != line[position]))
+    changed = line[:position] + bytes([byte]) + line[position + 1 :]
+    for damaged in (line[:position], changed):
         assert read_pieces(damaged + TWO.to_line()) == {"two": TWO}
 
 

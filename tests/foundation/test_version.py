@@ -23,11 +23,11 @@ def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize("hidden", ["generator", "evaluation", "foundation"])
 def test_names_a_file_that_hides_a_package(tmp_path: Path, hidden: str) -> None:
     (tmp_path / f"{hidden}.py").write_text("x = 1\n")
-    done = run("import croplab; croplab.open_lut", tmp_path)
-    assert f"{tmp_path / hidden}.py hides the package {hidden} of CroP" in done.stderr.splitlines()[-1]
-    done = run("import croplab, sys; sys.argv = ['generate', '--help']; sys.exit(croplab.generate())", tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {tmp_path / hidden}.py hides the package {hidden}")
+    result = run("import croplab; croplab.open_lut", tmp_path)
+    assert f"{tmp_path / hidden}.py hides the package {hidden} of CroP" in result.stderr.splitlines()[-1]
+    result = run("import croplab, sys; sys.argv = ['generate', '--help']; sys.exit(croplab.generate())", tmp_path)
+    assert result.returncode == 2
+    assert result.stderr.startswith(f"error: {tmp_path / hidden}.py hides the package {hidden}")
 
 
 @pytest.mark.slow
@@ -43,8 +43,8 @@ try:
 except AttributeError:
     print("done")
 """
-    done = run(code, tmp_path)
-    assert done.stdout == "done\n", done.stderr
+    result = run(code, tmp_path)
+    assert result.stdout == "done\n", result.stderr
 
 
 @pytest.mark.slow
@@ -65,5 +65,5 @@ import generator
 print(generator.open_lut.__module__)
 """
     (tmp_path / "elsewhere").mkdir()
-    done = run(code, tmp_path / "elsewhere")
-    assert done.stdout.splitlines() == ["mine", "generator"], done.stderr
+    result = run(code, tmp_path / "elsewhere")
+    assert result.stdout.splitlines() == ["mine", "generator"], result.stderr

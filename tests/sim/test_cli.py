@@ -1,4 +1,4 @@
-"""`sim` as its user meets it."""
+"""The command `sim` as users run it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_serves_a_projector_until_interrupted() -> None:
     "arguments",
     [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"]],
 )
-def test_a_taken_port_is_one_line(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
+def test_used_port_is_one_line(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
     with TcpServer(lambda link: None) as server:
         assert main([*arguments, str(server.address[1])]) == 3
     error = capsys.readouterr().err
@@ -37,9 +37,7 @@ def test_a_taken_port_is_one_line(capsys: pytest.CaptureFixture[str], arguments:
     assert error.count("\n") == 1
 
 
-def test_a_screen_or_projector_that_is_not_there_ends_with_3(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_missing_screen_or_projector_exits_with_3(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     arguments = ["camera", "--port", "0", "--model", "Test", "--watch-screen"]
     assert main([*arguments, ":999"]) == 3
     assert "check :999" in capsys.readouterr().err
@@ -51,7 +49,7 @@ def test_a_screen_or_projector_that_is_not_there_ends_with_3(
 
 
 @pytest.mark.slow
-def test_a_projector_takes_its_time_as_told() -> None:
+def test_projector_has_the_given_warm_up_time() -> None:
     options = ("--warm-up", "0", "--cool-down", "0")
     with sim_serving("projector", "--pjlink", "0", *options) as (line,):
         host, port = line.split()[-1].split(":")

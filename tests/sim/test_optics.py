@@ -1,4 +1,4 @@
-"""Shoulders, veil and lateral aberration of the simulated lens, waves and curl of the paper, against their formulas."""
+"""Shoulders, veiling glare and lateral aberration of the lens, waves and curl of the paper, compared with formulas."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ EVEN: dict[str, float] = {"vignetting": 0.0, "projector_falloff": 0.0, "response
 
 
 def planes(signal: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
-    """Return R, G1 and B of each RGGB block; each lies at its own place in the block."""
-    whole = signal[: len(signal) // 2 * 2, : signal.shape[1] // 2 * 2].astype(np.float64)
-    return {"R": whole[::2, ::2], "G": whole[::2, 1::2], "B": whole[1::2, 1::2]}
+    """Return R, G1 and B of each RGGB block, at their positions in the block."""
+    complete = signal[: len(signal) // 2 * 2, : signal.shape[1] // 2 * 2].astype(np.float64)
+    return {"R": complete[::2, ::2], "G": complete[::2, 1::2], "B": complete[1::2, 1::2]}
 
 
 AT_PX = {"R": np.array([-0.25, -0.25]), "G": np.array([0.25, -0.25]), "B": np.array([0.25, 0.25])}
@@ -36,21 +36,21 @@ def white_squares(centres: NDArray[np.float64], side: float) -> Print:
     return Print(PAGE_MM, boxes, rgb)
 
 
-def test_the_kernel_has_the_transfer_that_is_stated() -> None:
-    """Against the closed form of a two-dimensional exponential, at frequencies below a third of the sampling's."""
+def test_kernel_has_the_documented_transfer() -> None:
+    """Closed form of a two-dimensional exponential, up to a third of the sampling frequency."""
     kernel = PhotographicLens((100, 100), 0.1, 3.0, 0, 0, 0).kernel().astype(np.float64)
     np.testing.assert_allclose(kernel, kernel[::-1], rtol=1e-6)
     np.testing.assert_allclose(kernel, kernel.T, rtol=1e-6)
     across = np.arange(len(kernel)) - len(kernel) // 2
     for frequency in (0.02, 0.05, 0.1, 0.2, 0.3):
-        found = (kernel.sum(axis=0) * np.cos(2 * np.pi * frequency * across)).sum()
+        measured = (kernel.sum(axis=0) * np.cos(2 * np.pi * frequency * across)).sum()
         stated = (1 + (2 * np.pi * 3 / 3**0.5 * frequency) ** 2) ** -1.5
-        assert found == pytest.approx(stated, abs=0.005)
+        assert measured == pytest.approx(stated, abs=0.005)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("situation", [Situation(), Situation(blobs=(Blob((0.2, 0.2, 0.7, 0.9)),))])
-def test_a_veil_is_the_share_of_each_channels_mean_light_also_when_someone_stands_in_it(situation: Situation) -> None:
+def test_veil_is_a_share_of_the_mean_light(situation: Situation) -> None:
     centres = np.array([[60.0, 50.0], [120.0, 70.0]])
     veil, settings = 0.03, REFERENCE_EXPOSURE
     frames: list[dict[str, NDArray[np.float64]]] = []
@@ -69,8 +69,8 @@ def test_a_veil_is_the_share_of_each_channels_mean_light_also_when_someone_stand
         assert lifted == pytest.approx(veil * plane.mean(), abs=0.3)
 
 
-def test_each_channel_lies_where_project_says() -> None:
-    """Centroids of white squares on black, in each channel, with a wavy and turned print."""
+def test_channels_are_at_projected_positions() -> None:
+    """Centroids of white squares in each channel, with a wavy and rotated print."""
     x, y = np.meshgrid([12.0, 50.0, 90.0, 131.0, 168.0], [12.0, 62.0, 113.0])
     centres = np.column_stack([x.ravel(), y.ravel()])
     room = Room(lateral_red_px=1.5, lateral_blue_px=-0.8, blur_px=0.8, seed=4, tilt_deg=3, pan_deg=4)
@@ -78,24 +78,24 @@ def test_each_channel_lies_where_project_says() -> None:
     world = World(white_squares(centres, 3.0), BODIES["Test"], room)
     for channel, plane in planes(world.signal(WHITE, REFERENCE_EXPOSURE)).items():
         truth = world.project(centres, channel)
-        for place in truth:
-            column, row = (round(float(along)) for along in place)
+        for position in truth:
+            column, row = (round(float(along)) for along in position)
             rows, columns = slice(row - 15, row + 16), slice(column - 15, column + 16)
             if row < 15 or column < 15 or row + 16 > plane.shape[0] or column + 16 > plane.shape[1]:
                 pytest.fail("the square lies too near to the frame's edge to be measured")
             light = plane[rows, columns] - np.median(plane[rows, columns])
             offsets = np.arange(-15, 16)
-            found = np.array([(light.sum(axis=0) @ offsets), (light.sum(axis=1) @ offsets)]) / light.sum()
-            np.testing.assert_allclose(found + [column, row] + AT_PX[channel], place, atol=0.01)
+            measured = np.array([(light.sum(axis=0) @ offsets), (light.sum(axis=1) @ offsets)]) / light.sum()
+            np.testing.assert_allclose(measured + [column, row] + AT_PX[channel], position, atol=0.01)
 
 
-def test_lateral_aberration_is_as_large_as_stated_and_half_of_it_cubic() -> None:
+def test_lateral_aberration_has_the_documented_size() -> None:
     lens = PhotographicLens((1732, 2601), 0, 3.0, 0, 1.0, -0.5)
     corner, axis = np.array([[-0.5, -0.5]]), np.array(lens.centre_px)
     assert np.linalg.norm(lens.shifted(corner, "R") - axis) - lens.corner_px == pytest.approx(1.0)
     assert np.linalg.norm(lens.shifted(corner, "B") - axis) - lens.corner_px == pytest.approx(-0.5)
     half = (corner + axis) / 2
     assert np.linalg.norm(lens.shifted(half, "R") - half) == pytest.approx(0.5 * (1 + 0.25) / 2)
-    places = np.random.default_rng(1).uniform(-20, 2600, (50, 2))
+    positions = np.random.default_rng(1).uniform(-20, 2600, (50, 2))
     for channel in "RGB":
-        np.testing.assert_allclose(lens.unshifted(lens.shifted(places, channel), channel), places, atol=1e-6)
+        np.testing.assert_allclose(lens.unshifted(lens.shifted(positions, channel), channel), positions, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Spectra come to another grid without losing light, and without being smoothed where nothing need be gathered."""
+"""Spectra, sensitivities and print models: resampling, published values, refusals."""
 
 from __future__ import annotations
 
@@ -38,41 +38,41 @@ from tests.sim.world.lab import intended_lab, relative_lab
 NODES = np.arange(380.0, 781.0, 5.0)
 
 
-def test_a_coarser_grid_is_joined_by_straight_lines() -> None:
+def test_interpolates_a_coarser_grid() -> None:
     coarse = np.arange(390.0, 731.0, 10.0)
-    found = resampled(coarse, coarse[:, None] ** 1, NODES)[:, 0]
+    values = resampled(coarse, coarse[:, None] ** 1, NODES)[:, 0]
     inside = (NODES >= 390) & (NODES <= 730)
-    assert found[inside] == pytest.approx(NODES[inside])
-    assert np.count_nonzero(found[~inside]) == 0
+    assert values[inside] == pytest.approx(NODES[inside])
+    assert np.count_nonzero(values[~inside]) == 0
 
 
 @pytest.mark.parametrize("at", [545.3, 546.1, 547.0, 549.9])
-def test_a_narrow_line_between_the_nodes_keeps_its_light_and_its_place(at: float) -> None:
+def test_keeps_light_and_position_of_a_narrow_line(at: float) -> None:
     fine = np.arange(380.0, 780.05, 0.1)
     line = np.exp(-0.5 * ((fine - at) / 0.3) ** 2)[:, None]
-    found = resampled(fine, line, NODES)[:, 0]
+    values = resampled(fine, line, NODES)[:, 0]
     light = float(line.sum()) * 0.1
-    assert found.sum() * 5 == pytest.approx(light, rel=1e-3)
-    assert (found * NODES).sum() * 5 / light == pytest.approx(at, abs=0.02)
+    assert values.sum() * 5 == pytest.approx(light, rel=1e-3)
+    assert (values * NODES).sum() * 5 / light == pytest.approx(at, abs=0.02)
 
 
-def test_a_line_among_coarse_steps_leaves_the_rest_smooth() -> None:
+def test_narrow_line_keeps_the_coarse_part_smooth() -> None:
     # Measured every 10 nm, and every 1 nm about a line: nodes between the coarse steps must not stay dark.
     grid = np.unique(np.concatenate([np.arange(380.0, 781.0, 10.0), np.arange(540.0, 551.0)]))
-    found = resampled(grid, grid[:, None] / 500, NODES)[:, 0]
-    assert found[1:-1] == pytest.approx(NODES[1:-1] / 500, rel=1e-3)
+    values = resampled(grid, grid[:, None] / 500, NODES)[:, 0]
+    assert values[1:-1] == pytest.approx(NODES[1:-1] / 500, rel=1e-3)
 
 
 @pytest.mark.parametrize(
     ("grid", "message"),
     [
         ([], "its wavelengths are none"),
-        ([410, 700], "410 to 700, 400 to 700 nm at least"),
-        ([400, 420, 420, *range(440, 701, 20)], "420 nm stands there twice"),
+        ([410, 700], "410 to 700, expected at least 400 to 700 nm"),
+        ([400, 420, 420, *range(440, 701, 20)], "420 nm occurs twice"),
         ([400, *range(425, 701, 5)], "a gap from 400 to 425 nm"),
     ],
 )
-def test_a_grid_that_does_not_cover_the_visible_range_is_refused(grid: list[float], message: str) -> None:
+def test_refuses_incomplete_grids(grid: list[float], message: str) -> None:
     with pytest.raises(FormatError, match=f"lamp: .*{message}"):
         require_grid(np.array(grid, dtype=np.float64), "lamp")
 
@@ -81,19 +81,19 @@ def test_a_grid_that_does_not_cover_the_visible_range_is_refused(grid: list[floa
 
 
 @pytest.mark.slow
-def test_every_light_is_the_published_one() -> None:
+def test_published_lights_are_unchanged() -> None:
     families: tuple[Any, ...] = (colour.SDS_ILLUMINANTS, colour.SDS_LIGHT_SOURCES)
     theirs: dict[str, Any] = {str(name): light for family in families for name, light in family.items()}
-    found = published_spectra()
-    assert set(found) == set(theirs)
-    for name, light in found.items():
+    values = published_spectra()
+    assert set(values) == set(theirs)
+    for name, light in values.items():
         assert light.wavelengths_nm == pytest.approx(theirs[name].wavelengths, abs=1e-9), name
         assert np.array_equal(light.power, theirs[name].values), name
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cct_k", [4000, 5003, 6504, 7000, 7001, 12_000, 25_000])
-def test_daylight_is_the_cie_s(cct_k: float) -> None:
+def test_daylight_equals_the_cie(cct_k: float) -> None:
     theirs = colour.sd_CIE_illuminant_D_series(colour.temperature.CCT_to_xy_CIE_D(cct_k))
     assert daylight(cct_k).power == pytest.approx(theirs.values, abs=1e-9)
     assert np.array_equal(daylight(cct_k).wavelengths_nm, theirs.wavelengths)
@@ -112,47 +112,47 @@ def parsed(content: Any) -> Any:
     return parse_sensitivities(json.dumps(content).encode(), "m1", "m1.json")
 
 
-def test_another_grid_is_resampled_by_straight_lines_and_is_blind_beyond() -> None:
-    found = parsed(document())
-    assert found.camera == "Maker M1"
-    at = found.at(WAVELENGTHS_NM)[[0, 15, 16, 80]]
+def test_sensitivities_are_interpolated_and_zero_outside() -> None:
+    values = parsed(document())
+    assert values.camera == "Maker M1"
+    at = values.at(WAVELENGTHS_NM)[[0, 15, 16, 80]]
     assert at[0].tolist() == at[3].tolist() == [0, 0, 0]
-    middle = (found.curves[found.wavelengths_nm == 450] + found.curves[found.wavelengths_nm == 460])[0] / 2
+    middle = (values.curves[values.wavelengths_nm == 450] + values.curves[values.wavelengths_nm == 460])[0] / 2
     assert at[1] == pytest.approx(middle)
     assert at[2, 2] == 1
 
 
-def altered(place: str, value: Any) -> dict[str, Any]:
+def altered(key: str, value: Any) -> dict[str, Any]:
     content = document()
     table = content["spectral_data"]["data"]["main"]
     if value is None:
-        for at in place.split():
+        for at in key.split():
             del table[at]
     else:
-        table[place] = value
+        table[key] = value
     return content
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ([], "expected rawtoaces"),
+        ([], "expected the format of rawtoaces"),
         ({"spectral_data": {}}, r"spectral_data\.index: Field required"),
-        (document(units="quantum efficiency"), "units is 'quantum efficiency', 'relative' expected"),
+        (document(units="quantum efficiency"), "units is 'quantum efficiency', expected 'relative'"),
         (document(index={"main": ["X", "Y", "Z"]}), r"index\.main is \['X', 'Y', 'Z'\]"),
         (altered("500 510 520", None), "a gap from 490 to 530 nm, 20 nm at most"),
         (altered("500", [0.1, -0.2, 0.1]), "G is -0.2 at 500 nm, 0 or more expected"),
-        (altered("500", [0.1, 0.2]), r"at 500 nm stand \[0.1, 0.2\]; three numbers expected"),
-        (altered("blue", [0.1, 0.2, 0.3]), "'blue' is no wavelength"),
-        (altered("500.0", [0.1, 0.2, 0.3]), "500 nm stands there twice"),
-        (document(low=420), "its wavelengths are 420 to 720, 400 to 700 nm at least"),
+        (altered("500", [0.1, 0.2]), r"at 500 nm are \[0.1, 0.2\], expected three numbers"),
+        (altered("blue", [0.1, 0.2, 0.3]), "the wavelength is 'blue'"),
+        (altered("500.0", [0.1, 0.2, 0.3]), "500 nm occurs twice"),
+        (document(low=420), "its wavelengths are 420 to 720, expected at least 400 to 700 nm"),
         (document(low=0.39, high=0.72, step=0.01), "convert them to nanometres"),
-        (altered("390", [0, 0, 0.3]), "B still has 30% of its peak at its last wavelength, 390 nm"),
-        (altered("720", [0.051, 0, 0]), "R still has 5% of its peak at its last wavelength, 720 nm"),
+        (altered("390", [0, 0, 0.3]), "B has 30% of its peak at its last wavelength, 390 nm"),
+        (altered("720", [0.051, 0, 0]), "R has 5% of its peak at its last wavelength, 720 nm"),
     ],
 )
-def test_what_cannot_be_a_cameras_is_refused(content: Any, message: str) -> None:
-    assert parsed(altered("720", [0.05, 0, 0])).curves[-1, 0] == 0.05, "so much may be left at the end"
+def test_refuses_bad_sensitivities(content: Any, message: str) -> None:
+    assert parsed(altered("720", [0.05, 0, 0])).curves[-1, 0] == 0.05, "5 % at the end is allowed"
     with pytest.raises(FormatError, match=message) as refused:
         parsed(content)
     assert str(refused.value).startswith("m1.json")
@@ -161,70 +161,70 @@ def test_what_cannot_be_a_cameras_is_refused(content: Any, message: str) -> None
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (json.dumps(document()).replace('"500"', '"490"'), "'490' stands there twice"),
-        ("[" * 100_000, "is no JSON"),
+        (json.dumps(document()).replace('"500"', '"490"'), "'490' occurs twice"),
+        ("[" * 100_000, "is not JSON"),
     ],
 )
-def test_what_json_would_pass_over_or_fall_over_is_refused(text: str, message: str) -> None:
+def test_refuses_bad_json(text: str, message: str) -> None:
     with pytest.raises(FormatError, match=message):
         parse_sensitivities(text.encode(), "m1", "m1.json")
 
 
-def test_no_such_camera_names_those_that_are_known() -> None:
+def test_unknown_camera_lists_known_names() -> None:
     with pytest.raises(InputError, match=r"no camera 'Canon_EOS_1'.*Canon_EOS_5DS"):
         read_sensitivities("Canon_EOS_1")
 
 
 PAPERS: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 MANAGED: tuple[PaperName, ...] = ("poster", "glossy")
-"""Papers whose profiles are worked out here, each in a second: the one with the least black, and the one with most."""
+"""Papers with profiles computed here, each in a second: the one with the least black, and the one with most."""
 GREYS = np.repeat(np.arange(256)[:, None], 3, axis=1)
 
 
 @cache
-def seen(profile: ProfileName, on: PaperName) -> NDArray[np.float64]:
+def grey_lab(profile: ProfileName, on: PaperName) -> NDArray[np.float64]:
     """Return CIELAB of all greys under D50, relative to paper."""
     return relative_lab(printed_reflectance(GREYS, profile, on), on)
 
 
-def difference(wanted: NDArray[np.float64], lab: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(colour.delta_E(wanted, lab, method="CIE 2000"), dtype=np.float64)
+def difference(target: NDArray[np.float64], lab: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(colour.delta_E(target, lab, method="CIE 2000"), dtype=np.float64)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("on", PAPERS)
-def test_unmanaged_greys_have_the_tint_that_measured_prints_have(on: PaperName) -> None:
+def test_unmanaged_greys_have_the_measured_tint(on: PaperName) -> None:
     # Papers printed without colour management (head of `sim.world.world`): the largest chroma is 5 to 14, but for one
     # printer, an Epson P800, whose driver balances its greys (1.3).
-    lab = seen("unmanaged", on)
+    lab = grey_lab("unmanaged", on)
     assert 5 < np.hypot(lab[:, 1], lab[:, 2]).max() < 14
     assert np.diff(lab[:, 0]).min() > 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("on", MANAGED)
-def test_a_managed_print_has_the_colours_of_the_file_where_inks_reach(on: PaperName) -> None:
+def test_managed_print_has_the_colours_of_the_file(on: PaperName) -> None:
     rng = np.random.default_rng(3)
     pale = 128 + rng.integers(-40, 41, (400, 3))
-    off = difference(intended_lab(pale, on), relative_lab(printed_reflectance(pale, "managed", on), on))
-    assert np.median(off) < 0.3
-    assert off.max() < 2.5
+    deltas = difference(intended_lab(pale, on), relative_lab(printed_reflectance(pale, "managed", on), on))
+    assert np.median(deltas) < 0.3
+    assert deltas.max() < 2.5
 
 
 @pytest.mark.slow
-def test_srgb_under_d50_is_the_adapted_matrix_of_its_primaries() -> None:
+def test_srgb_matrix_is_adapted_to_d50() -> None:
     space = colour.RGB_COLOURSPACES["sRGB"]
     whites: Any = [colour.xy_to_XYZ(xy) for xy in (space.whitepoint, (0.3457, 0.3585))]
     adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(*whites, transform="Bradford")
-    found = spectral._SRGB_TO_D50
-    np.testing.assert_allclose(found, adapt @ space.matrix_RGB_to_XYZ, atol=2e-4)
+    values = spectral._SRGB_TO_D50
+    np.testing.assert_allclose(values, adapt @ space.matrix_RGB_to_XYZ, atol=2e-4)
 
 
 LAMPS: tuple[LampSpectrum, ...] = ("uhp", "led")
 
 
 def absolute_lab(reflectance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return CIELAB (N, 3) under D50 relative to an ideal white, as instruments measure prints."""
+    """Return CIELAB (N, 3) under D50 relative to an ideal white, as instruments report it."""
     shape = colour.SpectralShape(380, 780, 5)
     observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape).values
     light = observer * colour.SDS_ILLUMINANTS["D50"].copy().align(shape).values[:, None]
@@ -248,14 +248,14 @@ def interpolated(
 
 
 @pytest.mark.parametrize("lamp", LAMPS)
-def test_the_projectors_white_is_near_d65(lamp: LampSpectrum) -> None:
+def test_projector_white_is_near_d65(lamp: LampSpectrum) -> None:
     observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(colour.SpectralShape(380, 780, 5))
     white = projector_primaries(lamp).sum(axis=0) @ observer.values
     np.testing.assert_allclose((white / white.sum())[:2], [0.3127, 0.3290], atol=0.02)
 
 
 def bell(peak_nm: float, width_nm: float) -> dict[str, NDArray[np.float64]]:
-    """Return a Gaussian with its full width at half maximum, in the layout of a measured primary."""
+    """Return a Gaussian with its full width at half maximum, in the format of a measured primary."""
     wavelength = np.arange(380.0, 781.0, 4.0)
     power = np.exp(-4 * np.log(2) * ((wavelength - peak_nm) / width_nm) ** 2)
     return {"wavelength_nm": wavelength, "power (median of 7 scans)": power}
@@ -279,14 +279,14 @@ def test_led_primaries_resemble_a_measured_led_projector(
 ) -> None:
     table = table_of()
     wavelength, power = table["wavelength_nm"], table["power (median of 7 scans)"]
-    ours = interpolated(wavelength, WAVELENGTHS_NM, projector_primaries("led")[lamp_index])
-    assert abs(wavelength[power.argmax()] - wavelength[ours.argmax()]) <= 4
-    overlap = float(ours @ power / np.sqrt((ours @ ours) * (power @ power)))
+    lab_of_code = interpolated(wavelength, WAVELENGTHS_NM, projector_primaries("led")[lamp_index])
+    assert abs(wavelength[power.argmax()] - wavelength[lab_of_code.argmax()]) <= 4
+    overlap = float(lab_of_code @ power / np.sqrt((lab_of_code @ lab_of_code) * (power @ power)))
     assert overlap > 0.98
 
 
 def documented_paper() -> dict[str, NDArray[np.float64]]:
-    """Return the values of measured photo paper that `sim.world.world` documents, in the layout of the whole."""
+    """Return the documented values of measured photo paper."""
     # Between 450 and 600 nm the white falls evenly; the inks are given as densities over white.
     white = np.array([0.64, 0.93, 0.882, 0.85])
     return {
@@ -307,12 +307,12 @@ def test_paper_and_inks_resemble_measured_photo_paper(table_of: Callable[[], dic
     table = table_of()
     at = table["wavelength_nm"]
 
-    def ours(code: list[int]) -> NDArray[np.float64]:
+    def lab_of_code(code: list[int]) -> NDArray[np.float64]:
         return interpolated(at, WAVELENGTHS_NM, print_reflectance([code])[0])
 
-    assert np.abs(ours([255, 255, 255]) - table["white"]).max() < 0.05
-    assert np.nanmean(np.abs(ours([255, 255, 0]) - table["yellow_4/4"])) < 0.05
-    assert np.nanmean(np.abs(ours([255, 0, 255]) - table["m_4/4"])) < 0.06
+    assert np.abs(lab_of_code([255, 255, 255]) - table["white"]).max() < 0.05
+    assert np.nanmean(np.abs(lab_of_code([255, 255, 0]) - table["yellow_4/4"])) < 0.05
+    assert np.nanmean(np.abs(lab_of_code([255, 0, 255]) - table["m_4/4"])) < 0.06
 
 
 # CIELAB (D50, CIE 1931, ideal white) of solids that an Epson XP-960 printed without colour management, computed from
@@ -332,21 +332,21 @@ def test_solids_of_photo_papers_look_like_measured_ones(on: PaperName) -> None:
     white = relative_lab(print_reflectance([[255] * 3], on), on)
     np.testing.assert_allclose(white, [[100, 0, 0]], atol=1e-6)
     lab = absolute_lab(print_reflectance(SOLID_CODES, on))
-    off = colour.delta_E(np.array(SOLID_LAB[on], dtype=np.float64), lab, method="CIE 2000")
-    assert off.max() < 4.5
-    assert np.mean(off) < 2.5
+    deltas = colour.delta_E(np.array(SOLID_LAB[on], dtype=np.float64), lab, method="CIE 2000")
+    assert deltas.max() < 4.5
+    assert np.mean(deltas) < 2.5
 
 
 @pytest.mark.parametrize("on", PAPERS)
-def test_inks_lie_over_each_other_by_chance_and_light_spreads_between_them(on: PaperName) -> None:
-    """A half covered is 0.64 covered for dots that grow; Demichel's shares, mixed in the root (Yule-Nielsen, n = 2)."""
-    chosen = paper(on)
-    below = (chosen.white - chosen.surface) / (1 - chosen.surface)
-    cyan, magenta = chosen.inks[0], chosen.inks[1]
+def test_overprints_follow_demichel_and_yule_nielsen(on: PaperName) -> None:
+    """A coverage of 0.5 is 0.64 with dot gain; Demichel's weights, Yule-Nielsen with n = 2."""
+    inked = paper(on)
+    below = (inked.white - inked.surface) / (1 - inked.surface)
+    cyan, magenta = inked.inks[0], inked.inks[1]
     mixed = np.sqrt(below) * (
         0.36 * 0.36
         + 0.64 * 0.36 * (10 ** (-cyan / 2) + 10 ** (-magenta / 2))
         + 0.64 * 0.64 * 10 ** (-(cyan + magenta) / 2)
     )
     seen_under_white = print_reflectance([[127.5, 127.5, 255]], on)[0]
-    np.testing.assert_allclose(seen_under_white, chosen.surface + (1 - chosen.surface) * mixed**2)
+    np.testing.assert_allclose(seen_under_white, inked.surface + (1 - inked.surface) * mixed**2)

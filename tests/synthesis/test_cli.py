@@ -72,4 +72,4 @@ def test_refuses_bad_arguments(
 
 def test_also_has_the_device_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["projector"]) == 2
-    assert "one projector has one cable" in capsys.readouterr().err
+    assert "exactly one of --pjlink PORT and --serial LANGUAGE" in capsys.readouterr().err

@@ -26,13 +26,13 @@ def table(step: int = 5, low: int = 380, high: int = 780, **lights: float) -> st
 def test_reads_a_light_from_each_column(tmp_path: Path) -> None:
     path = tmp_path / "lamps.csv"
     path.write_text(table(hall=2.0, stage=7.0), encoding="utf-8-sig")
-    found = read_lights(str(path))
-    assert [light.name for light in found.lights] == ["hall", "stage"]
+    spectra = read_lights(str(path))
+    assert [light.name for light in spectra.lights] == ["hall", "stage"]
     # Proportions within a light count, its brightness does not.
-    assert np.array_equal(found.lights[0].power, np.ones(81))
-    assert np.array_equal(found.lights[1].power, np.ones(81))
-    assert found.source["file"] == "lamps.csv"
-    assert len(found.source["sha256"]) == 64
+    assert np.array_equal(spectra.lights[0].power, np.ones(81))
+    assert np.array_equal(spectra.lights[1].power, np.ones(81))
+    assert spectra.source["file"] == "lamps.csv"
+    assert len(spectra.source["sha256"]) == 64
 
 
 @pytest.mark.parametrize(("step", "low", "high"), [(1, 380, 780), (5, 400, 700), (10, 350, 900), (20, 400, 700)])
@@ -45,14 +45,14 @@ def test_light_does_not_depend_on_the_grid(step: int, low: int, high: int) -> No
 
 
 def test_published_illuminants_equal_the_cie() -> None:
-    found = {light.name: light for light in read_lights("A,D65,FL2,LED-B3").lights}
+    lamps = {light.name: light for light in read_lights("A,D65,FL2,LED-B3").lights}
     # CIE 15, illuminants A and D65: relative power at 400, 500, 560 and 700 nm, over that at 560 nm.
     at = np.searchsorted(WAVELENGTHS_NM, [400, 500, 560, 700])
-    assert found["A"].power[at] / found["A"].power[at[2]] == pytest.approx([0.147080, 0.598611, 1, 1.98261], rel=1e-4)
-    assert found["D65"].power[at] / found["D65"].power[at[2]] == pytest.approx(
+    assert lamps["A"].power[at] / lamps["A"].power[at[2]] == pytest.approx([0.147080, 0.598611, 1, 1.98261], rel=1e-4)
+    assert lamps["D65"].power[at] / lamps["D65"].power[at[2]] == pytest.approx(
         [0.827549, 1.09354, 1, 0.716091], rel=1e-4
     )
-    assert all(light.cct_k is None for light in found.values())
+    assert all(light.cct_k is None for light in lamps.values())
 
 
 def test_black_body_follows_planck_and_keeps_its_temperature() -> None:
@@ -61,10 +61,10 @@ def test_black_body_follows_planck_and_keeps_its_temperature() -> None:
     planck = [w**-5 / np.expm1(1.4387769e7 / (w * 6000)) for w in (450.0, 650.0)]
     at = np.searchsorted(WAVELENGTHS_NM, [450, 650])
     assert lights[1].power[at[0]] / lights[1].power[at[1]] == pytest.approx(planck[0] / planck[1], rel=2e-3)
-    shown = table_illuminations(lights)
-    assert [light.kind for light in shown] == ["blackbody"] * 3
+    illuminations = table_illuminations(lights)
+    assert [light.kind for light in illuminations] == ["blackbody"] * 3
     # The projector's black body of the same temperature has the same codes, to rounding.
-    for light, cct_k in zip(shown, (2000, 6000, 10_000), strict=True):
+    for light, cct_k in zip(illuminations, (2000, 6000, 10_000), strict=True):
         expected = shown_colour(blackbody_light(cct_k))
         assert np.abs(np.subtract(light.colour, (expected.red, expected.green, expected.blue))).max() <= 1
 
@@ -108,7 +108,7 @@ def test_names_a_missing_file() -> None:
         (table(hall=1.0, cellar=0.0), "'cellar' has no power from 400 to 700 nm"),
         (table(low=410, hall=1.0), "its wavelengths are 410 to 780"),
         (table(step=40, hall=1.0), "a gap from 380 to 420 nm"),
-        (table(hall=1.0) + "500,2\n", "500 nm stands there twice"),
+        (table(hall=1.0) + "500,2\n", "500 nm occurs twice"),
     ],
 )
 def test_refuses_bad_spectra(text: str, message: str) -> None:
@@ -130,13 +130,13 @@ EVEN = Room(response_spread=0.0, hot_per_million=0.0)
 def test_photosite_has_the_light_of_its_channel_and_patch() -> None:
     sensor = PatchSensor.of(BODY, 2, 3, EVEN, 0.5)
     signals = np.array([[[10.0, 1], [20, 2], [30, 3]], [[40, 4], [50, 5], [60, 6]]])
-    found = sensor.light(signals)
-    assert found.shape == (3, 2 * 2 * 3, 2 * 3)
+    light = sensor.light(signals)
+    assert light.shape == (3, 2 * 2 * 3, 2 * 3)
     assert BODY.pattern == "RGGB"
     blocks = [np.tile([[red, green], [green, blue]], (3, 3)) for red, green, blue in ((10, 20, 30), (40, 50, 60))]
-    np.testing.assert_array_equal(found[0], np.concatenate(blocks))
-    np.testing.assert_array_equal(found[1], found[0] / 10)
-    assert not found[2].any()
+    np.testing.assert_array_equal(light[0], np.concatenate(blocks))
+    np.testing.assert_array_equal(light[1], light[0] / 10)
+    assert not light[2].any()
     # Half-size pixels: patches of three of them, one below the other.
     assert (sensor.sites.rows.tolist(), sensor.sites.columns.tolist(), sensor.sites.window) == ([1, 4], [1, 1], 3)
 
@@ -164,11 +164,11 @@ def test_black_level_error_depends_on_masked_area(masked: tuple[Rectangle, ...],
     sensor = PatchSensor.of(body, 1, 3, EVEN, 0.5)
     dark = np.zeros((3, 6, 6), np.float32)
     frames = range(400)
-    found = np.array([sensor.expose(dark, np.ones(3), 400, frame)[1] for frame in frames]) - body.black
+    errors = np.array([sensor.expose(dark, np.ones(3), 400, frame)[1] for frame in frames]) - body.black
     if photosites is None:
-        assert not found.any()
+        assert not errors.any()
         return
     # The variances of read noise and of rounding to whole counts; 1600 numbers tell a spread to 1.8 %.
     error = np.sqrt((0.09 + 1 / 12) / photosites)
-    assert found.std() == pytest.approx(error, rel=4 * 0.018)
-    assert abs(found.mean()) < 4 * error / 40
+    assert errors.std() == pytest.approx(error, rel=4 * 0.018)
+    assert abs(errors.mean()) < 4 * error / 40

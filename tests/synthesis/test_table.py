@@ -48,17 +48,19 @@ class Comparison:
     normal: npt.NDArray[np.float64]
     """(L, C, 3), difference of the means over its standard error."""
     spread: npt.NDArray[np.float64]
-    """(L, 3), mean standard deviation of one table over that of the other."""
+    """(L, 3), mean standard deviation of the first LUT relative to the second."""
     white: npt.NDArray[np.float64]
     """(L, 3), relative difference of the ground truths."""
 
 
-def compared(one: Lut, other: Lut) -> Comparison:
-    a, b = np.asarray(one.samples, dtype=np.float64), np.asarray(other.samples, dtype=np.float64)
+def compared(first: Lut, second: Lut) -> Comparison:
+    a, b = np.asarray(first.samples, dtype=np.float64), np.asarray(second.samples, dtype=np.float64)
     spreads = [table.var(axis=2, ddof=1) for table in (a, b)]
     error = np.sqrt((spreads[0] + spreads[1]) / a.shape[2])
     normal = (a.mean(axis=2) - b.mean(axis=2)) / error
-    return Comparison(normal, np.sqrt(spreads[0].mean(axis=1) / spreads[1].mean(axis=1)), one.white / other.white - 1)
+    return Comparison(
+        normal, np.sqrt(spreads[0].mean(axis=1) / spreads[1].mean(axis=1)), first.white / second.white - 1
+    )
 
 
 @pytest.fixture(scope="module")
@@ -79,18 +81,18 @@ def computed(tmp_path_factory: pytest.TempPathFactory) -> Lut:
 
 @pytest.mark.slow
 def test_equals_a_photographed_lut_within_noise(computed: Lut, photographed: Lut) -> None:
-    found = compared(computed, photographed)
+    comparison = compared(computed, photographed)
     lit = np.asarray(photographed.samples).mean(axis=(1, 2)) > 20
     # Student's t of 48 degrees of freedom has a standard deviation of 1.02; 512 cells tell it to 3 %.
-    spread = found.normal.std(axis=1)[lit]
+    spread = comparison.normal.std(axis=1)[lit]
     assert spread.min() > 0.93
     assert spread.max() < 1.15
     assert abs(float(spread.mean()) - 1.022) < 0.02
     # The mean over 512 cells has a standard error of .044, and both ground truths' errors move a whole light.
-    assert float(np.abs(found.normal.mean(axis=1)[lit]).max()) < 0.35
-    assert float(np.abs(found.normal).max()) < 6.5
-    assert float(np.abs(found.spread - 1)[lit].max()) < 0.03
-    assert abs(float(found.spread[lit].mean()) - 1) < 0.004
+    assert float(np.abs(comparison.normal.mean(axis=1)[lit]).max()) < 0.35
+    assert float(np.abs(comparison.normal).max()) < 6.5
+    assert float(np.abs(comparison.spread - 1)[lit].max()) < 0.03
+    assert abs(float(comparison.spread[lit].mean()) - 1) < 0.004
 
 
 @pytest.mark.slow
@@ -106,8 +108,8 @@ def test_ground_truths_agree_within_their_errors(computed: Lut, photographed: Lu
 def test_comparison_detects_another_sensor(photographed: Lut, tmp_path: Path, changes: dict[str, float | str]) -> None:
     body = replace(BODIES["Test"], **changes)  # pyrefly: ignore[bad-argument-type]
     compute_table(replace(task_of(), body=body), tmp_path / "lut", threads=2)
-    found = compared(open_lut(tmp_path / "lut"), photographed)
-    assert abs(float(found.spread.mean()) - 1) > 0.01 or float(np.abs(found.normal.mean(axis=1)).max()) > 1
+    comparison = compared(open_lut(tmp_path / "lut"), photographed)
+    assert abs(float(comparison.spread.mean()) - 1) > 0.01 or float(np.abs(comparison.normal.mean(axis=1)).max()) > 1
 
 
 @pytest.mark.slow
@@ -123,18 +125,18 @@ def test_is_complete_and_recorded_as_computed(computed: Lut) -> None:
 def test_bytes_depend_on_seed_not_on_threads(computed: Lut, tmp_path: Path) -> None:
     alone = compute_table(task_of(), tmp_path / "alone", threads=1)
     assert open_lut(alone.folder).sha256 == computed.sha256
-    other = compute_table(replace(task_of(), room=replace(ROOM, seed=7)), tmp_path / "other", threads=2)
-    assert open_lut(other.folder).provenance.samples_sha256 != computed.provenance.samples_sha256
+    second = compute_table(replace(task_of(), room=replace(ROOM, seed=7)), tmp_path / "other", threads=2)
+    assert open_lut(second.folder).provenance.samples_sha256 != computed.provenance.samples_sha256
 
 
 @pytest.mark.slow
 def test_lists_clipped_cells_and_refuses_clipped_paper(tmp_path: Path, pinned: Pinned) -> None:
     # The middle of the page is brighter than its corners, where enough references are still below the limit.
-    done = compute_table(
+    result = compute_table(
         task_of(white_level_share=2.0, projector_falloff=0.7, vignetting=0.25), tmp_path / "bright", threads=2
     )
-    lut = open_lut(done.folder)
-    assert done.unfit == len(lut.provenance.unfit) > 0
+    lut = open_lut(result.folder)
+    assert result.unfit == len(lut.provenance.unfit) > 0
     assert all(cell.cause.startswith("clipped: ") for cell in lut.provenance.unfit)
     assert {cell.colour for cell in lut.provenance.unfit} < set(range(512))
     pinned("overexposed cells of a computed table", [lut.provenance.unfit[::9], lut.white])
@@ -159,8 +161,8 @@ def test_refuses_existing_folder_and_small_disk(tmp_path: Path, monkeypatch: pyt
 def test_does_not_record_the_path_of_sensitivities(tmp_path: Path) -> None:
     data = resources.files("sim").joinpath("data", "Canon_EOS_5DS_380_780_5.json").read_bytes()
     records: list[dict[str, Any]] = []
-    for place in ("here", "there"):
-        path = tmp_path / place / "mine.json"
+    for folder in ("here", "there"):
+        path = tmp_path / folder / "mine.json"
         path.parent.mkdir()
         path.write_bytes(data)
         records.append(table_task(str(path), parse_settings({"chart": {"bits": 1}}, "here"), "here").record)
@@ -204,8 +206,8 @@ def lut(lights: LightSpectra, tmp_path_factory: pytest.TempPathFactory) -> Lut:
 @pytest.mark.slow
 def test_ground_truth_is_the_response_to_bare_paper(lut: Lut, lights: LightSpectra) -> None:
     powers = np.array([light.power for light in lights.lights])
-    seen = np.einsum("lw,w,wc->lc", powers, print_reflectance([(255, 255, 255)])[0], sensitivities(CAMERA))
-    truth = seen / seen.sum(axis=1, keepdims=True)
+    response = np.einsum("lw,w,wc->lc", powers, print_reflectance([(255, 255, 255)])[0], sensitivities(CAMERA))
+    truth = response / response.sum(axis=1, keepdims=True)
     # Some sixty white patches of 25 samples, each noisy by a percent at most.
     assert lut.ground_truth == pytest.approx(truth, rel=2e-3)
 
@@ -216,9 +218,9 @@ def test_patches_are_the_response_to_their_ink(lut: Lut, lights: LightSpectra) -
     for number, light in enumerate(lights.lights):
         curves = light.power[:, None] * sensitivities(CAMERA)
         cells = print_reflectance(codes) @ curves / (print_reflectance([(255, 255, 255)]) @ curves)
-        found = lut.samples[number].astype(np.float64)
-        error = found.std(axis=1, ddof=1) / 5 + 2e-3 * found.mean(axis=1)
-        assert float(np.abs((found.mean(axis=1) - cells * lut.white[number]) / error).max()) < 5
+        samples = lut.samples[number].astype(np.float64)
+        error = samples.std(axis=1, ddof=1) / 5 + 2e-3 * samples.mean(axis=1)
+        assert float(np.abs((samples.mean(axis=1) - cells * lut.white[number]) / error).max()) < 5
 
 
 @pytest.mark.slow
@@ -283,7 +285,7 @@ CASES: dict[str, tuple[str, dict[str, Any], str | None]] = {
 def content_of(folder: Path) -> dict[str, Any]:
     """Return the content of a LUT, without software versions and hashes that depend on them."""
     described = json.loads((folder / "lut.json").read_text())
-    kept = (
+    keys = (
         "camera",
         "bits",
         "white_level",
@@ -297,7 +299,7 @@ def content_of(folder: Path) -> dict[str, Any]:
     lists = {path.name: rows_of(path.read_text()) for path in sorted(folder.glob("*.csv"))}
     lut = open_lut(folder)
     return {
-        "described": {name: described.get(name) for name in kept},
+        "described": {name: described.get(name) for name in keys},
         "lists": {name: rows[:30] for name, rows in lists.items()},
         "white": lut.white,
         "means": np.asarray(lut.samples).mean(axis=2),
@@ -311,12 +313,12 @@ def test_pinned_luts_of_spectra(name: str, tmp_path: Path, pinned: Pinned) -> No
     citation = {"note": "a note", "licence": "CC0-1.0", "authors": ["One"]}
     settings = parse_settings({**document, "citation": citation}, "here")
     task = table_task(camera, settings, "here", None if lights is None else read_lights(lights))
-    done = compute_table(task, tmp_path / "lut", 1)
-    pinned(f"computed table, {name}", [done.unfit, done.cells, content_of(done.folder)])
+    result = compute_table(task, tmp_path / "lut", 1)
+    pinned(f"computed table, {name}", [result.unfit, result.cells, content_of(result.folder)])
 
 
 @pytest.mark.slow
 def test_pinned_lut_of_the_projector(tmp_path: Path, pinned: Pinned) -> None:
     task = task_of(bits=1, page="A6", hot_per_million=200.0)
-    done = compute_table(replace(task, illuminations=task.illuminations[:3]), tmp_path / "lut", 1)
-    pinned("computed table, the projector", content_of(done.folder))
+    result = compute_table(replace(task, illuminations=task.illuminations[:3]), tmp_path / "lut", 1)
+    pinned("computed table, the projector", content_of(result.folder))

@@ -1,4 +1,4 @@
-"""The simulated EOS against the conversation of a real one, and against the rules that PTP and Canon's bodies keep."""
+"""The simulated EOS compared with a recorded conversation, and with the rules of PTP and Canon bodies."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ REAL = {"the transcript": transcript} | {name: make for name, make in conversati
 
 
 class NumberedFilm:
-    """Film whose frames tell their number, and that notes how each was exposed."""
+    """Film whose frames have numbers, and that records the settings."""
 
     suffix = ".dng"
 
@@ -74,7 +74,7 @@ class NumberedFilm:
 
 
 class Host:
-    """An initiator that holds a body by its wire."""
+    """An initiator connected to a body."""
 
     def __init__(self, eos: SimulatedEos, clock: SimulatedClock, film: NumberedFilm) -> None:
         self.eos = eos
@@ -124,7 +124,7 @@ class Host:
         return code
 
     def shoot(self) -> tuple[Record, ...]:
-        """Take a picture and wait until it is announced."""
+        """Take a frame and wait for its announcement."""
         assert self.press() == ResponseCode.OK
         self.clock.sleep(60)
         return self.events()
@@ -159,8 +159,8 @@ def host() -> Host:
 # The real one.
 
 
-def kind_of(code: int, parameters: list[int], data: bytes) -> object:
-    """Return what a data phase is, without the values that differ from body to body."""
+def structure_of(code: int, parameters: list[int], data: bytes) -> object:
+    """Return the structure of a data phase, without values that differ between bodies."""
     match code:
         case Operation.GET_DEVICE_INFO:
             info = DeviceInfo.decode(data)
@@ -184,7 +184,7 @@ def kind_of(code: int, parameters: list[int], data: bytes) -> object:
 
 
 @pytest.mark.parametrize("real", REAL.values(), ids=REAL)
-def test_holds_the_conversation_of_a_real_60d(real: Callable[[], list[Recorded]]) -> None:
+def test_follows_the_recorded_60d(real: Callable[[], list[Recorded]]) -> None:
     host = host_of(EOS_550D)
     host.eos.turn_dial(AeMode.APERTURE_PRIORITY)
     sessions = 0
@@ -200,18 +200,18 @@ def test_holds_the_conversation_of_a_real_60d(real: Callable[[], list[Recorded]]
         sent = data if recorded["dir"] == "out" else None
         assert host.eos.takes_data(request) == (recorded["dir"] == "out")
         answer = host.eos.answer(request, sent)
-        place = f"transaction {number}, 0x{code:04x}"
-        assert f"{answer.response.code:04x}" == recorded["rc"], place
-        assert len(answer.response.parameters) == len(recorded["rparams"]), place
-        assert (answer.data is None) == (recorded["dir"] != "in"), place
+        position = f"transaction {number}, 0x{code:04x}"
+        assert f"{answer.response.code:04x}" == recorded["rc"], position
+        assert len(answer.response.parameters) == len(recorded["rparams"]), position
+        assert (answer.data is None) == (recorded["dir"] != "in"), position
         if recorded["dir"] == "in" and data is not None:
             assert answer.data is not None
-            ours, theirs = (kind_of(code, recorded["params"], octets) for octets in (answer.data, data))
-            assert ours == theirs, place
+            ours, theirs = (structure_of(code, recorded["params"], octets) for octets in (answer.data, data))
+            assert ours == theirs, position
     assert sessions == 2
 
 
-def test_tells_of_itself_in_the_order_of_the_60d() -> None:
+def test_reports_properties_in_the_order_of_the_60d() -> None:
     theirs = EOS_60D_PROPERTIES
     ours = [spec.code for spec in EOS_550D.properties]
     assert [code for code in theirs if code in ours] == [code for code in ours if code in theirs]
@@ -231,7 +231,7 @@ LISTED_ISO_6D2 = (
 )
 
 
-def test_a_550d_can_be_the_one_that_was_listed() -> None:
+def test_550d_has_the_listed_settings() -> None:
     host = host_of(EOS_550D_AS_LISTED)
     host.ok(Operation.OPEN_SESSION, 1)
     host.ok(Operation.EOS_SET_EVENT_MODE, 1)
@@ -243,7 +243,7 @@ def test_a_550d_can_be_the_one_that_was_listed() -> None:
     )
 
 
-def test_a_6d_mark_ii_is_the_one_that_was_listed() -> None:
+def test_6d_mark_ii_has_the_listed_settings() -> None:
     host = host_of(EOS_6D_MARK_II)
     info = DeviceInfo.decode(host.ok(Operation.GET_DEVICE_INFO))
     assert (info.manufacturer, info.model, info.device_version) == ("Canon.Inc", "Canon EOS 6D Mark II", "3-1.0.2")
@@ -271,7 +271,7 @@ def test_a_6d_mark_ii_is_the_one_that_was_listed() -> None:
     parameters=st.lists(st.integers(0, 0xFFFFFFFF) | st.sampled_from([0, 1, 2, 3, CARD, FOLDER, DCIM]), max_size=5),
     data=st.none() | st.binary(max_size=40),
 )
-def test_answers_whatever_is_asked(code: int, parameters: list[int], data: bytes | None) -> None:
+def test_answers_all_requests(code: int, parameters: list[int], data: bytes | None) -> None:
     host = host_of().take_control()
     assert host.shoot()
     answer = host.ask(code, *parameters, data=data)
@@ -306,7 +306,7 @@ def test_is_busy_until_the_frame_is_written(host: Host) -> None:
     assert len(host.film.frames) == 1
 
 
-def test_film_is_developed_beside_the_answers() -> None:
+def test_develops_film_in_the_background() -> None:
     gate = ThreadEvent()
 
     class SlowFilm(NumberedFilm):
@@ -334,7 +334,7 @@ def test_film_is_developed_beside_the_answers() -> None:
 # What spoils a series.
 
 
-def test_goes_to_sleep_unless_kept_awake(host: Host) -> None:
+def test_switches_off_unless_kept_on(host: Host) -> None:
     host.eos.set_menu(Property.EOS_AUTO_POWER_OFF, 30)
     host.ok(Operation.EOS_KEEP_DEVICE_ON)
     host.events()

@@ -1,4 +1,4 @@
-"""The simulated cameras' files hold what DNG 1.4 and Exif 2.32 ask; raw converters read the counts back unchanged."""
+"""Raw files of the simulated cameras follow DNG 1.4 and Exif 2.32, and raw converters read the counts unchanged."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SETTINGS = ExposureSettings(iso=400, aperture=5.6, shutter_s=0.5)
 
 
 def mosaic(body: Body) -> NDArray[np.uint16]:
-    """Return counts of every size, and black borders as a sensor has them."""
+    """Return counts of all sizes, with black borders."""
     rng = np.random.default_rng(8)
     counts = rng.integers(0, 1 << body.bits, body.sensor, dtype=np.uint16)
     for area in body.masked:
@@ -99,7 +99,7 @@ GOLDEN = {
 
 
 def tags_of(data: bytes) -> dict[int, tuple[int, int, Any]]:
-    """Return type, number of values and value of each tag of a file's only picture, as tifffile reads them."""
+    """Return type, number of values and value of each tag of the only image, as read by tifffile."""
     with tifffile.TiffFile(io.BytesIO(data)) as tiff:
         assert len(tiff.pages) == 1
         page = cast("tifffile.TiffPage", tiff.pages[0])
@@ -110,23 +110,23 @@ def fractions(value: Sequence[int]) -> NDArray[np.float64]:
     return np.array(value[::2], dtype=np.float64) / np.array(value[1::2], dtype=np.float64)
 
 
-def test_the_tags_of_a_550d_file_are_those_of_the_standard() -> None:
+def test_tags_follow_the_standard() -> None:
     tags = tags_of(dng(BODIES["EOS 550D"]))
     for code, golden in GOLDEN.items():
         assert tags[code] == golden, code
     assert set(tags) - set(GOLDEN) == {273, 34665, 50721, 50728}
     # ColorMatrix1 as Adobe has it for the 600D, signed rationals; AsShotNeutral is what it makes of D65, green largest.
-    kind, count, value = tags[50721]
-    assert (kind, count) == (10, 9)
+    value_type, count, value = tags[50721]
+    assert (value_type, count) == (10, 9)
     matrix = fractions(value).reshape(3, 3)
     np.testing.assert_allclose(matrix[0], [0.6461, -0.0907, -0.0882])
-    kind, count, value = tags[50728]
-    assert (kind, count) == (5, 3)
+    value_type, count, value = tags[50728]
+    assert (value_type, count) == (5, 3)
     neutral = matrix @ [0.9505, 1, 1.089]
     np.testing.assert_allclose(fractions(value), neutral / neutral[1], rtol=1e-3)
 
 
-def test_libraw_reads_the_counts_and_the_exposure_back(file: Path, body: Body, counts: NDArray[np.uint16]) -> None:
+def test_libraw_reads_counts_and_exposure(file: Path, body: Body, counts: NDArray[np.uint16]) -> None:
     area = body.visible
     with rawpy.imread(str(file)) as raw:
         np.testing.assert_array_equal(raw.raw_image, counts)
@@ -144,7 +144,7 @@ def test_libraw_reads_the_counts_and_the_exposure_back(file: Path, body: Body, c
         assert raw.other.aperture == pytest.approx(5.6)
 
 
-def test_our_own_reader_sees_the_whole_visible_frame(file: Path, body: Body, counts: NDArray[np.uint16]) -> None:
+def test_our_reader_has_the_visible_frame(file: Path, body: Body, counts: NDArray[np.uint16]) -> None:
     read = read_raw(file)
     np.testing.assert_array_equal(read.counts, visible(counts, body))
     assert read.pattern == body.pattern
@@ -152,15 +152,15 @@ def test_our_own_reader_sees_the_whole_visible_frame(file: Path, body: Body, cou
     np.testing.assert_array_equal(read.masked_black(), np.full((2, 2), body.black))
 
 
-def test_dcraw_sees_the_whole_visible_frame(file: Path, body: Body, counts: NDArray[np.uint16]) -> None:
+def test_dcraw_has_the_visible_frame(file: Path, body: Body, counts: NDArray[np.uint16]) -> None:
     dcraw = shutil.which("dcraw")
     if dcraw is None:
         pytest.skip("dcraw is not installed")
     subprocess.run([dcraw, "-D", "-4", "-T", str(file)], check=True, timeout=60)
     np.testing.assert_array_equal(tifffile.imread(file.with_suffix(".tiff")), visible(counts, body))
-    told = subprocess.run([dcraw, "-i", "-v", str(file)], check=True, timeout=60, capture_output=True, text=True).stdout
-    assert f"Camera: Canon {body.model.removeprefix('Canon ')}" in told
-    assert "ISO speed: 400" in told
-    assert "Shutter: 1/2.0 sec" in told
-    assert "Aperture: f/5.6" in told
-    assert "Filter pattern: RG/GB" in told
+    text = subprocess.run([dcraw, "-i", "-v", str(file)], check=True, timeout=60, capture_output=True, text=True).stdout
+    assert f"Camera: Canon {body.model.removeprefix('Canon ')}" in text
+    assert "ISO speed: 400" in text
+    assert "Shutter: 1/2.0 sec" in text
+    assert "Aperture: f/5.6" in text
+    assert "Filter pattern: RG/GB" in text

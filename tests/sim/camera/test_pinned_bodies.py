@@ -1,4 +1,4 @@
-"""Answers of every simulated body, and what the driver makes of them."""
+"""Answers of all simulated bodies, and a series of the driver with them."""
 
 from __future__ import annotations
 
@@ -32,73 +32,79 @@ BODIES: dict[str, tuple[EosModel, dict[str, Any]]] = {
 
 
 def short(data: bytes | None) -> str:
-    """Return bytes as hex, the end of many by their digest."""
+    """Return bytes as hexadecimal digits, long ones with a digest."""
     if data is None:
         return "-"
     text = data.hex()
     return text if len(text) <= 48 else f"{text[:32]}…{len(data)} {hashlib.sha256(data).hexdigest()[:8]}"
 
 
-def told(host: Host, code: int, *parameters: int, data: bytes | None = None) -> str:
-    """Ask and return question and answer as a line."""
-    asked = f"{code:04x} {' '.join(f'{one:x}' for one in parameters)} {short(data)}"
+def exchange(host: Host, code: int, *parameters: int, data: bytes | None = None) -> str:
+    """Send a request; return request and answer as a line."""
+    requests = f"{code:04x} {' '.join(f'{number:x}' for number in parameters)} {short(data)}"
     try:
         answer = host.ask(code, *parameters, data=data)
     except LinkClosed:
-        return f"{asked} > closed"
-    response = " ".join(f"{one:x}" for one in (answer.response.code, *answer.response.parameters))
-    events = " ".join(f"{one.code:x}{one.parameters}" for one in host.eos.events())
-    return f"{asked} > {response} | {short(answer.data)} | {events}"
+        return f"{requests} > closed"
+    response = " ".join(f"{number:x}" for number in (answer.response.code, *answer.response.parameters))
+    events = " ".join(f"{number.code:x}{number.parameters}" for number in host.eos.events())
+    return f"{requests} > {response} | {short(answer.data)} | {events}"
 
 
 def host_of(name: str) -> Host:
     body, own = BODIES[name]
-    given: dict[str, Any] = {"auto_power_off_s": 0, **own}
+    options: dict[str, Any] = {"auto_power_off_s": 0, **own}
     clock, film = SimulatedClock(), NumberedFilm(700)
-    return Host(SimulatedEos(body, film, clock, **given), clock, film)
+    return Host(SimulatedEos(body, film, clock, **options), clock, film)
 
 
 def opening(host: Host) -> list[str]:
-    """Take control as hosts do."""
+    """Take control as initiators do."""
     return [
-        told(host, Operation.CLOSE_SESSION),
-        told(host, Operation.OPEN_SESSION, 1),
-        told(host, Operation.EOS_SET_REMOTE_MODE, 1),
-        told(host, Operation.EOS_SET_EVENT_MODE, 1),
+        exchange(host, Operation.CLOSE_SESSION),
+        exchange(host, Operation.OPEN_SESSION, 1),
+        exchange(host, Operation.EOS_SET_REMOTE_MODE, 1),
+        exchange(host, Operation.EOS_SET_EVENT_MODE, 1),
     ]
 
 
 @pytest.mark.parametrize("name", list(BODIES)[:3])
-def test_a_body_says_of_itself_what_it_said(name: str, pinned: Pinned) -> None:
+def test_answers_of_bodies_are_unchanged(name: str, pinned: Pinned) -> None:
     host = host_of(name)
-    found = [told(host, Operation.GET_DEVICE_INFO), told(host, Operation.GET_STORAGE_IDS), *opening(host)]
+    answers = [
+        exchange(host, Operation.GET_DEVICE_INFO),
+        exchange(host, Operation.GET_STORAGE_IDS),
+        *opening(host),
+    ]
     host.events()
     codes = [spec.code for spec in BODIES[name][0].properties] + [0x5001, 0xD303, 0xD402, 0xD406, 0xD407, 0x5010]
     for ask in (Operation.GET_DEVICE_PROP_DESC, Operation.GET_DEVICE_PROP_VALUE):
-        found += [told(host, ask, code) for code in codes[::6] + codes[-6:]]
+        answers += [exchange(host, ask, code) for code in codes[::6] + codes[-6:]]
     for ask in (Operation.EOS_GET_DEVICE_INFO_EX, Operation.EOS_GET_REMOTE_MODE, Operation.GET_DEVICE_INFO):
-        found.append(told(host, ask))
+        answers.append(exchange(host, ask))
     for ask in (Operation.EOS_GET_STORAGE_INFO, Operation.GET_STORAGE_INFO, Operation.GET_NUM_OBJECTS):
-        found += [told(host, ask, store, 0, parent) for store in (CARD, 0, 0x20000) for parent in (0, 0xFFFFFFFF, DCIM)]
-    pinned(f"a body, {name}, of itself", "\n".join(found).encode())
+        answers += [
+            exchange(host, ask, store, 0, parent) for store in (CARD, 0, 0x20000) for parent in (0, 0xFFFFFFFF, DCIM)
+        ]
+    pinned(f"a body, {name}, of itself", "\n".join(answers).encode())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BODIES)
-def test_the_driver_takes_what_it_took(name: str, pinned: Pinned) -> None:
-    """A series by our own driver: what goes over the cable, when, and what comes of it."""
-    body, given = BODIES[name]
-    kept = {key: value for key, value in given.items() if key not in ("battery", "auto_power_off_s")}
-    lab = Lab(body, 400_000 if name == "Test" else 600, **kept)
-    asked: list[str] = []
+def test_series_of_the_driver_is_unchanged(name: str, pinned: Pinned) -> None:
+    """Bytes, times and results of a series of our driver."""
+    body, options = BODIES[name]
+    used_options = {key: value for key, value in options.items() if key not in ("battery", "auto_power_off_s")}
+    lab = Lab(body, 400_000 if name == "Test" else 600, **used_options)
+    requests: list[str] = []
     answer = lab.eos.answer
 
     def noted(request: Any, data: bytes | None) -> Any:
-        found = answer(request, data)
+        answers = answer(request, data)
         words = f"{request.code:x} {' '.join(f'{one:x}' for one in request.parameters)} {short(data)}"
-        code, size = found.response.code, len(found.data or b"")
-        asked.append(f"{lab.clock.monotonic():.3f} {words} {code:x} {size}")
-        return found
+        code, size = answers.response.code, len(answers.data or b"")
+        requests.append(f"{lab.clock.monotonic():.3f} {words} {code:x} {size}")
+        return answers
 
     lab.eos.answer = noted  # to listen  # pyrefly: ignore[method-assign]
     outcomes: list[Any] = []
@@ -113,4 +119,4 @@ def test_the_driver_takes_what_it_took(name: str, pinned: Pinned) -> None:
         except DeviceError:
             outcomes.append({"refused": 1})
     lab.camera.close()
-    pinned(f"a series that is taken with a body, {name}", {"asked": "\n".join(asked).encode(), "outcomes": outcomes})
+    pinned(f"a series that is taken with a body, {name}", {"asked": "\n".join(requests).encode(), "outcomes": outcomes})

@@ -1,8 +1,4 @@
-"""The simulated projector's PJLink port: the standard's bytes, and another program's client.
-
-What aiopjlink understands, which knows both classes, we cannot have misread alone. The projector's time is handed in,
-so nobody waits for a lamp.
-"""
+"""The simulated PJLink projector: bytes of the standard, and aiopjlink as an independent client."""
 
 from __future__ import annotations
 
@@ -34,7 +30,7 @@ PATIENCE_S = 30.0
 
 @dataclass
 class Served:
-    """A simulated projector behind a TCP server, and the password it asks for."""
+    """A simulated projector behind a TCP server, with its password."""
 
     device: SimulatedProjector
     clock: SimulatedClock
@@ -42,7 +38,7 @@ class Served:
     password: str | None
 
     def talk(self, conversation: Callable[[aiopjlink.PJLink], Awaitable[None]], password: str | None = None) -> None:
-        """Let aiopjlink connect and have a conversation."""
+        """Connect aiopjlink and run a conversation."""
 
         async def connected() -> None:
             host, port = self.server.address
@@ -60,7 +56,7 @@ def served(request: pytest.FixtureRequest) -> Iterator[Served]:
         yield Served(device, clock, server, request.param)
 
 
-def test_aiopjlink_goes_round_the_four_states(served: Served) -> None:
+def test_aiopjlink_passes_the_four_states(served: Served) -> None:
     async def conversation(link: aiopjlink.PJLink) -> None:
         states = aiopjlink.Power.State
         assert await link.power.get() is states.OFF
@@ -164,7 +160,7 @@ def test_aiopjlink_is_refused_with_a_wrong_password() -> None:
             gc.collect()
 
 
-def test_aiopjlink_is_told_by_class_1_that_it_knows_no_class_2() -> None:
+def test_class_1_refuses_class_2_commands() -> None:
     clock = SimulatedClock()
     device = SimulatedProjector(clock, Power.ON, ProjectorTraits(pjlink_class=1))
 
@@ -177,7 +173,7 @@ def test_aiopjlink_is_told_by_class_1_that_it_knows_no_class_2() -> None:
         Served(device, clock, server, None).talk(conversation)
 
 
-def test_aiopjlink_is_hung_up_on_after_thirty_idle_seconds(served: Served) -> None:
+def test_closes_the_connection_after_thirty_idle_seconds(served: Served) -> None:
     async def conversation(link: aiopjlink.PJLink) -> None:
         await link.power.get()
         served.clock.sleep(30)

@@ -1,4 +1,4 @@
-"""The simulated projector and screen: the contracts, and the light."""
+"""The simulated projector and screen: contracts and light."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_light_follows_the_lamp_and_the_mute() -> None:
     assert device.light() == 0.0
 
 
-def test_a_dead_lamp_goes_out_and_is_not_struck_again() -> None:
+def test_broken_lamp_stays_off() -> None:
     clock = SimulatedClock()
     device = SimulatedProjector(clock, Power.ON)
     device.break_part("lamp", Severity.ERROR)

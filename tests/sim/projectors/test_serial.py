@@ -1,4 +1,4 @@
-"""The simulated serial projectors, judged by software that others wrote for the real ones, and their own ends."""
+"""The simulated serial projectors with drivers of other authors, and their two ends."""
 
 from __future__ import annotations
 
@@ -80,14 +80,14 @@ def test_epson_projector_drives_the_simulated_epson(device: SimulatedProjector) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("named", ["optoma", "lantern.toml"])
+@pytest.mark.parametrize("language_name", ["optoma", "lantern.toml"])
 def test_serves_a_serial_projector_until_interrupted(
-    named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    language_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("lantern.toml").write_text(TEXT)
-    language = load_language(named)
-    with sim_serving("projector", "--serial", named) as (line,):
+    language = load_language(language_name)
+    with sim_serving("projector", "--serial", language_name) as (line,):
         assert line.startswith(f"{language.maker} projector at /dev/")
         path = line.split()[-1]
         projector = LineProjector(language, lambda: SerialLink.open(path, language.line.baud))
@@ -99,16 +99,14 @@ def test_serves_a_serial_projector_until_interrupted(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "text"),
     [
         (["--serial", "klingon"], ", ".join(built_in_languages())),
-        (["--serial", "epson", "--pjlink", "0"], "either --pjlink PORT or --serial LANGUAGE"),
-        ([], "either --pjlink PORT or --serial LANGUAGE"),
-        (["--serial", "epson", "--password", "x"], "a serial cable has none"),
+        (["--serial", "epson", "--pjlink", "0"], "exactly one of --pjlink PORT and --serial LANGUAGE"),
+        ([], "exactly one of --pjlink PORT and --serial LANGUAGE"),
+        (["--serial", "epson", "--password", "x"], "--serial has no password"),
     ],
 )
-def test_not_exactly_one_cable_or_no_language_ends_with_2(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
-) -> None:
+def test_refuses_wrong_connection_options(capsys: pytest.CaptureFixture[str], arguments: list[str], text: str) -> None:
     assert main(["projector", *arguments]) == 2
-    assert said in capsys.readouterr().err
+    assert text in capsys.readouterr().err

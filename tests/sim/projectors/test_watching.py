@@ -1,4 +1,4 @@
-"""A screen that is watched lights the chart by what its pixels showed, where and for as long as they did."""
+"""A watched screen illuminates the chart with its pixels, at their positions and for their time."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def light_of(codes: NDArray[np.int64]) -> NDArray[np.float64]:
 
 @dataclass
 class Shown(Screenshots):
-    """A screen whose pixels are a function of the time."""
+    """A screen whose pixels are a function of time."""
 
     clock: SimulatedClock
     pixels: Callable[[float], NDArray[np.uint32]]
@@ -67,18 +67,18 @@ def thrown(pixels: Callable[[float], NDArray[np.uint32]], seconds: float = 0.5) 
     return light.picture, light.lamp
 
 
-def test_a_plain_screen_is_plain_light() -> None:
+def test_uniform_screen_is_uniform_light() -> None:
     picture, lamp = thrown(lambda at: plain(0x336699))
     np.testing.assert_allclose(picture, [[[0x33 / 255, 0x66 / 255, 0x99 / 255]]], rtol=1e-6)
     assert lamp == pytest.approx(1.0)
 
 
-def test_a_window_lights_its_place_for_its_share_of_the_exposure() -> None:
+def test_window_counts_for_its_share_of_the_exposure() -> None:
     def pixels(at: float) -> NDArray[np.uint32]:
-        shown = plain(WHITE)
+        screen = plain(WHITE)
         if 0.1 <= at < 0.3:
-            shown[2:5, 3:9] = RED
-        return shown
+            screen[2:5, 3:9] = RED
+        return screen
 
     picture, _ = thrown(pixels, 0.5)
     expected = np.ones((9, 16, 3))
@@ -86,26 +86,26 @@ def test_a_window_lights_its_place_for_its_share_of_the_exposure() -> None:
     np.testing.assert_allclose(picture, expected, atol=SAMPLE_S / 0.5)
 
 
-def test_half_the_time_is_half_the_light_not_half_the_code() -> None:
+def test_averages_light_not_codes() -> None:
     clock = SimulatedClock()
-    shown = Shown(clock, lambda at: plain(WHITE if at < 0.5 else 0))
-    with Beam(shown, None, Room().light_of, clock) as beam:
+    screen = Shown(clock, lambda at: plain(WHITE if at < 0.5 else 0))
+    with Beam(screen, None, Room().light_of, clock) as beam:
         picture = beam.gather(1.0).picture
     np.testing.assert_allclose(picture, 0.5, atol=SAMPLE_S)
 
 
-def test_the_shutter_closes_in_time_and_halfway_is_told_once() -> None:
+def test_ends_in_time_and_reports_the_middle_once() -> None:
     clock = SimulatedClock()
-    shown = Shown(clock, lambda at: plain(WHITE))
+    screen = Shown(clock, lambda at: plain(WHITE))
     halves: list[float] = []
-    with Beam(shown, None, light_of, clock) as beam:
+    with Beam(screen, None, light_of, clock) as beam:
         beam.gather(0.5, lambda: halves.append(clock.monotonic()))
     assert clock.monotonic() == pytest.approx(0.5)
     assert halves == [pytest.approx(0.25, abs=SAMPLE_S)]
-    assert shown.looks[-1] == -1.0, "the screen is released"
+    assert screen.looks[-1] == -1.0, "the screen is released"
 
 
-def test_a_screen_that_cannot_be_read_is_black() -> None:
+def test_unreadable_screen_is_black() -> None:
     def pixels(at: float) -> NDArray[np.uint32]:
         if at < 0.25:
             return plain(WHITE)
@@ -116,18 +116,18 @@ def test_a_screen_that_cannot_be_read_is_black() -> None:
     assert lamp == pytest.approx(1.0), "the lamp still burns, and leaks"
 
 
-def test_a_change_of_mode_within_an_exposure() -> None:
+def test_accepts_a_change_of_mode() -> None:
     def pixels(at: float) -> NDArray[np.uint32]:
-        shown = np.full((9, 16) if at < 0.25 else (18, 20), WHITE, dtype=np.uint32)
-        shown[0, 0] = 0
-        return shown
+        screen = np.full((9, 16) if at < 0.25 else (18, 20), WHITE, dtype=np.uint32)
+        screen[0, 0] = 0
+        return screen
 
     picture, _ = thrown(pixels)
     assert picture.shape == (18, 20, 3)
     np.testing.assert_allclose(picture[9:, 10:], 1, atol=1e-6)
 
 
-def test_a_large_picture_is_averaged_in_light() -> None:
+def test_averages_large_pictures_in_light() -> None:
     pixels = np.zeros((1080, 1920), dtype=np.uint32)
     pixels[::2] = WHITE
     picture = picture_light(pixels, LINEAR)
@@ -138,14 +138,14 @@ def test_a_large_picture_is_averaged_in_light() -> None:
 
 @dataclass
 class Answers(PjLinkProjector):
-    """A projector that says what it is told to say; a test changes it and waits until it was asked again."""
+    """A projector with given answers; a test changes them and waits for the next query."""
 
     state: Power = Power.ON
     is_muted: bool = False
     is_frozen: bool | None = False
     source: str | None = "31"
     gone: bool = False
-    asked: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+    queries: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
 
     def power(self) -> Power:
         if self.gone:
@@ -161,7 +161,7 @@ class Answers(PjLinkProjector):
         return self.source
 
     def frozen(self) -> bool:
-        self.asked.release()
+        self.queries.release()
         if self.is_frozen is None:
             raise DeviceRefused("class 1")
         return self.is_frozen
@@ -170,10 +170,10 @@ class Answers(PjLinkProjector):
         pass
 
     def await_questions(self) -> None:
-        """Return when what it is now was asked for, and taken in."""
+        """Wait until the current answers were requested and used."""
         # The first answer may have been under way; the second comes after the first was taken in.
         for _ in range(3):
-            self.asked.acquire()
+            self.queries.acquire()
 
 
 @pytest.mark.parametrize(
@@ -189,12 +189,12 @@ class Answers(PjLinkProjector):
         (Answers(is_frozen=True), LampState(1.0, True, "31")),
     ],
 )
-def test_what_a_projector_says_is_its_light(answers: Answers, state: LampState) -> None:
+def test_light_follows_the_reported_state(answers: Answers, state: LampState) -> None:
     assert ask(answers) == state
 
 
 @pytest.mark.parametrize("pjlink_class", [1, 2])
-def test_the_question_is_understood_by_a_projector_of_either_class(pjlink_class: int) -> None:
+def test_queries_projectors_of_both_classes(pjlink_class: int) -> None:
     device = SimulatedProjector(SimulatedClock(), Power.ON, ProjectorTraits(pjlink_class=pjlink_class))
     peer = PjLinkPeer(device)
     projector = PjLinkProjector(lambda: PeerLink(peer))
@@ -206,7 +206,7 @@ def test_the_question_is_understood_by_a_projector_of_either_class(pjlink_class:
 
 
 @pytest.mark.slow
-def test_a_frozen_picture_stays_and_another_input_is_black() -> None:
+def test_frozen_picture_stays_and_other_input_is_black() -> None:
     clock, answers = SimulatedClock(), Answers()
     codes = [RED]
     with Beam(Shown(clock, lambda at: plain(codes[0])), answers, light_of, clock) as beam:
@@ -229,24 +229,24 @@ def test_a_frozen_picture_stays_and_another_input_is_black() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "1", ":", "640x360", ":1,640x360", ":1;640x360+0+0", "HDMI-1"])
-def test_what_names_no_screen_is_refused(text: str) -> None:
+def test_refuses_wrong_screen_names(text: str) -> None:
     with pytest.raises(InputError, match="DISPLAY"):
         ScreenPlace.parse(text)
 
 
-def test_screenshots_are_of_the_place_and_come_back_with_the_server(tmp_path: Path) -> None:
+def test_screenshots_reconnect_to_the_server(tmp_path: Path) -> None:
     with virtual_screen(tmp_path, "64x48", cursor=True) as server:
-        whole = Screenshots(ScreenPlace(server.display))
-        part = Screenshots(ScreenPlace(server.display, (8, 4, 20, 10)))
-        off = Screenshots(ScreenPlace(server.display, (60, 4, 20, 10)))
+        full_screen = Screenshots(ScreenPlace(server.display))
+        region = Screenshots(ScreenPlace(server.display, (8, 4, 20, 10)))
+        outside = Screenshots(ScreenPlace(server.display, (60, 4, 20, 10)))
         picture = server.picture()
-        np.testing.assert_array_equal(whole.take()[:20, :20], picture[:20, :20])
-        assert whole.take().shape == (48, 64)
-        np.testing.assert_array_equal(part.take(), picture[4:14, 8:28])
+        np.testing.assert_array_equal(full_screen.take()[:20, :20], picture[:20, :20])
+        assert full_screen.take().shape == (48, 64)
+        np.testing.assert_array_equal(region.take(), picture[4:14, 8:28])
         with pytest.raises(DeviceError, match="no area of 20×10 px"):
-            off.take()
+            outside.take()
         server.end()
         with pytest.raises(DeviceError):
-            whole.take()
+            full_screen.take()
         with pytest.raises(DeviceError, match=f"check {server.display}"):
-            whole.take()
+            full_screen.take()

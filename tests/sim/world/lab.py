@@ -1,4 +1,4 @@
-"""CIELAB of prints, and what the managed profile of a paper wants it to be."""
+"""CIELAB of prints, and the target of the managed profile of a paper."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from sim.spectral import PaperName
 
 
 def intended_lab(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
-    """Return (N, 3) float64: CIELAB under D50, relative to paper, that the managed profile wants of codes (N, 3)."""
+    """Return the target CIELAB (N, 3) float64 of the managed profile under D50, relative to paper, for codes (N, 3)."""
     return spectral._lab(spectral._target_xyz(np.asarray(rgb, dtype=np.float64) / 255, spectral._black(on)))
 
 
 def relative_lab(reflectance: NDArray[np.float64], on: PaperName = "poster") -> NDArray[np.float64]:
-    """Return (N, 3) float64: CIELAB of the CIE 1931 observer under D50 of reflectances (N, 81), relative to paper."""
+    """Return CIELAB (N, 3) float64 of reflectances (N, 81) under D50 (CIE 1931 observer), relative to paper."""
     observer = spectral._observer()
     return spectral._lab(reflectance @ observer / (spectral.paper(on).white @ observer))

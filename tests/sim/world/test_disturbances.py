@@ -1,4 +1,4 @@
-"""What goes wrong in the simulated lab goes wrong by as much as was said, where it was said, and nowhere else."""
+"""Disturbances of the simulated laboratory have the given sizes and positions."""
 
 from __future__ import annotations
 
@@ -51,43 +51,43 @@ STRAIGHT = Room(
 
 @pytest.fixture(scope="module")
 def bare() -> World:
-    """Return bare paper in even light, seen straight on by photosites without noise to speak of."""
+    """Bare paper in uniform light, seen straight by photosites with negligible noise."""
     quiet = replace(TEST, read_noise_dn=0.01, sensor_noise_e=0.0, electrons_per_dn=1e6)
     return World(BARE, quiet, STRAIGHT)
 
 
-def taken(world: World, *events: AnyDisturbance, colour: Colour = WHITE, frame: int = 5) -> NDArray[np.float64]:
-    """Return a frame's visible counts above black, with `frame` red frames before it, a minute each."""
-    before = tuple((60.0 * k, RED) for k in range(frame))
-    moment, happens = Moment(frame, 60.0 * frame, colour, before), Disturbances(events)
-    shown, situation = happens.shown(moment), happens.situation(moment)
-    counts = world.expose(shown, REFERENCE_EXPOSURE, key=(7,), situation=situation)
+def frame_counts(world: World, *events: AnyDisturbance, colour: Colour = WHITE, frame: int = 5) -> NDArray[np.float64]:
+    """Return the visible counts of a frame above black, after `frame` red frames, one per minute."""
+    earlier = tuple((60.0 * k, RED) for k in range(frame))
+    moment, happens = Moment(frame, 60.0 * frame, colour, earlier), Disturbances(events)
+    projected, situation = happens.shown(moment), happens.situation(moment)
+    counts = world.expose(projected, REFERENCE_EXPOSURE, key=(7,), situation=situation)
     area = world.body.visible
     counts = happens.counted(counts, moment)[area.top : area.top + area.height, area.left : area.left + area.width]
     return counts.astype(np.float64) - world.body.black
 
 
 def at(world: World, x: float, y: float, frame: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return R, G, B at a place on the page, in shares of it: the 2×2 block that sees it."""
+    """Return R, G, B of the 2×2 block at a position relative to the page."""
     column, row = np.round(world.project(np.array(PAGE_MM) * (x, y))).astype(int)
     block = frame[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
     return np.array([block[0, 0], (block[0, 1] + block[1, 0]) / 2, block[1, 1]])
 
 
 @pytest.mark.parametrize("room_light", [0.0, 0.02])
-def test_lamp_and_room_light_are_as_bright_as_said(bare: World, room_light: float) -> None:
-    white = taken(bare).mean()
-    frame = taken(bare, LampStep(percent=-10), AmbientStep(percent=100 * room_light)).mean()
+def test_lamp_and_ambient_light_have_the_given_brightness(bare: World, room_light: float) -> None:
+    white = frame_counts(bare).mean()
+    frame = frame_counts(bare, LampStep(percent=-10), AmbientStep(percent=100 * room_light)).mean()
     assert frame / white == pytest.approx(0.9 + room_light, abs=1e-3)
-    halfway = taken(bare, LampDrift(percent=-2, from_frame=0, to_frame=10)).mean()
+    halfway = frame_counts(bare, LampDrift(percent=-2, from_frame=0, to_frame=10)).mean()
     assert halfway / white == pytest.approx(0.99, abs=1e-4)
-    by_time = taken(bare, LampDrift(percent=-2, from_s=200, to_s=300)).mean()
-    assert by_time / white == pytest.approx(0.98, abs=1e-4), "it stays when it has grown"
+    by_time = frame_counts(bare, LampDrift(percent=-2, from_s=200, to_s=300)).mean()
+    assert by_time / white == pytest.approx(0.98, abs=1e-4), "the effect stays"
 
 
-def test_a_person_hides_what_is_behind(bare: World) -> None:
-    white = taken(bare)
-    frame = taken(bare, Person(place=(0.2, 0.2, 0.6, 0.8), left=0.05))
+def test_person_hides_the_chart(bare: World) -> None:
+    white = frame_counts(bare)
+    frame = frame_counts(bare, Person(place=(0.2, 0.2, 0.6, 0.8), left=0.05))
     ratio = at(bare, 0.4, 0.5, frame) / at(bare, 0.4, 0.5, white)
     np.testing.assert_allclose(ratio, 0.05, atol=2e-3)
     np.testing.assert_array_equal(at(bare, 0.65, 0.5, frame), at(bare, 0.65, 0.5, white))
@@ -95,63 +95,63 @@ def test_a_person_hides_what_is_behind(bare: World) -> None:
 
 
 def _centres(world: World, frame: NDArray[np.float64], *events: Bump) -> NDArray[np.float64]:
-    """Return (12, 2) half-size px: where the black squares of `tests.sim.conftest.squares` are, by their weight."""
+    """Return the centroids (12, 2) of the black squares of `tests.sim.conftest.squares`, half-size px."""
     green = (frame[:-1:2, 1::2] + frame[1::2, :-1:2]) / 2
     dark = green[: frame.shape[0] // 2].max() - green
     x, y = np.meshgrid([25.37, 66.11, 107.83, 151.29], [24.71, 61.05, 99.43])
-    found: list[tuple[float, float]] = []
+    centres: list[tuple[float, float]] = []
     for middle in world.project(np.stack([x.ravel(), y.ravel()], axis=-1)):
         column, row = (round(float(one)) for one in middle)
-        part = dark[row - 26 : row + 27, column - 26 : column + 27]
-        part = np.where(part > 0.5 * part.max(), 1.0, part / (0.5 * part.max()) * (part > 0.05 * part.max()))
+        spot = dark[row - 26 : row + 27, column - 26 : column + 27]
+        spot = np.where(spot > 0.5 * spot.max(), 1.0, spot / (0.5 * spot.max()) * (spot > 0.05 * spot.max()))
         rows, columns = np.mgrid[row - 26 : row + 27, column - 26 : column + 27]
-        found.append((float((part * columns).sum() / part.sum()), float((part * rows).sum() / part.sum())))
-    return np.array(found)
+        centres.append((float((spot * columns).sum() / spot.sum()), float((spot * rows).sum() / spot.sum())))
+    return np.array(centres)
 
 
 @pytest.mark.parametrize(("px", "direction"), [(0.3, 0.0), (1.0, 30.0), (8.0, 200.0)])
-def test_a_bump_moves_the_chart_by_so_many_pixels(square_world: World, px: float, direction: float) -> None:
-    still = _centres(square_world, taken(square_world))
-    pushed = _centres(square_world, taken(square_world, Bump(px=px, direction_deg=direction)))
-    by = (pushed - still).mean(axis=0)
+def test_bump_moves_the_chart(square_world: World, px: float, direction: float) -> None:
+    unmoved = _centres(square_world, frame_counts(square_world))
+    pushed = _centres(square_world, frame_counts(square_world, Bump(px=px, direction_deg=direction)))
+    by = (pushed - unmoved).mean(axis=0)
     expected = px * np.array([np.cos(np.radians(direction)), np.sin(np.radians(direction))])
     # The chart is rolled by 1.5° and turned by more.
     np.testing.assert_allclose(by, expected, atol=0.02 + 0.035 * px)
 
 
-def test_defocus_blurs_edges_by_its_standard_deviation() -> None:
+def test_defocus_has_the_given_standard_deviation() -> None:
     page = Print(PAGE_MM, np.array([[0.0, 0.0, 90.0, 125.0]]), np.zeros((1, 3), dtype=np.uint8))
     world = World(page, TEST, STRAIGHT)
 
     def spread(*events: Defocus) -> float:
-        row = taken(world, *events)[101:401:2, ::2].mean(axis=0)
+        row = frame_counts(world, *events)[101:401:2, ::2].mean(axis=0)
         step = np.abs(np.diff(row[150:250]))
-        place = np.arange(len(step))
-        return float(np.average((place - np.average(place, weights=step)) ** 2, weights=step))
+        position = np.arange(len(step))
+        return float(np.average((position - np.average(position, weights=step)) ** 2, weights=step))
 
     assert spread(Defocus(px=3.0)) - spread() == pytest.approx(9.0, rel=0.1)
 
 
-def test_a_warming_sensor_raises_black_and_nothing_else(bare: World) -> None:
-    dark = taken(bare, colour=BLACK)
-    warm = taken(bare, SensorWarming(dn=6, from_frame=0, to_frame=10), colour=BLACK)
+def test_warming_sensor_only_raises_the_black_level(bare: World) -> None:
+    dark = frame_counts(bare, colour=BLACK)
+    warm = frame_counts(bare, SensorWarming(dn=6, from_frame=0, to_frame=10), colour=BLACK)
     assert (warm - dark).mean() == pytest.approx(3.0, abs=0.05)
-    difference = taken(bare, SensorWarming(dn=6, from_frame=0, to_frame=10)) - taken(bare)
+    difference = frame_counts(bare, SensorWarming(dn=6, from_frame=0, to_frame=10)) - frame_counts(bare)
     assert difference.mean() == pytest.approx(3.0, abs=0.05)
 
 
-def test_a_projected_picture_lights_each_place_by_its_own(bare: World) -> None:
+def test_projected_picture_illuminates_each_position(bare: World) -> None:
     picture = np.zeros((90, 160, 3), dtype=np.float32)
     picture[:45, :80, 0] = 1
     picture[45:, 80:] = 0.25
     area = bare.body.visible
 
-    def lit(shown: NDArray[np.float32]) -> NDArray[np.float64]:
-        counts = bare.expose(GREEN, REFERENCE_EXPOSURE, key=(7,), situation=Situation(picture=shown))
+    def lit(projected: NDArray[np.float32]) -> NDArray[np.float64]:
+        counts = bare.expose(GREEN, REFERENCE_EXPOSURE, key=(7,), situation=Situation(picture=projected))
         counts = counts[area.top : area.top + area.height, area.left : area.left + area.width]
         return counts.astype(np.float64) - bare.body.black
 
-    frame, red, white = lit(picture), taken(bare, colour=RED), taken(bare)
+    frame, red, white = lit(picture), frame_counts(bare, colour=RED), frame_counts(bare)
     np.testing.assert_allclose(at(bare, 0.25, 0.25, frame), at(bare, 0.25, 0.25, red), atol=1)
     np.testing.assert_allclose(at(bare, 0.75, 0.75, frame), 0.25 * at(bare, 0.75, 0.75, white), atol=1)
     np.testing.assert_allclose(at(bare, 0.75, 0.25, frame), 0, atol=1)
@@ -163,16 +163,16 @@ def test_a_projected_picture_lights_each_place_by_its_own(bare: World) -> None:
     np.testing.assert_allclose(at(bare, 0.5, 0.5, plain), 0.5 * at(bare, 0.5, 0.5, white), atol=1)
 
 
-def test_a_stale_file_is_the_one_before(plain_world: World, tmp_path: Path) -> None:
-    shown = [RED, GREEN, GREY]
+def test_stale_file_repeats_the_previous_one(plain_world: World, tmp_path: Path) -> None:
+    projected = [RED, GREEN, GREY]
     events = Disturbances((StaleFile(from_frame=1, to_frame=1), StaleFile(from_frame=2, to_frame=2, new_header=True)))
-    film = WorldFilm(plain_world, lambda: shown[0], lambda: 1.0, "1", {}, events)
+    film = WorldFilm(plain_world, lambda: projected[0], lambda: 1.0, "1", {}, events)
     files: list[bytes] = []
     for number in range(4):
         into = io.BytesIO()
         film.expose(REFERENCE_EXPOSURE, SIM_START + timedelta(seconds=10 * number), into)
         files.append(into.getvalue())
-        shown.append(shown.pop(0))
+        projected.append(projected.pop(0))
     assert files[1] == files[0]
     assert files[2] != files[0]
     pictures = [_counts(file, tmp_path / f"{number}.dng") for number, file in enumerate(files)]
@@ -194,9 +194,7 @@ def _counts(file: bytes, path: Path) -> NDArray[np.uint16]:
         ({"from_frame": 4, "to_frame": 4}, {(4, 0): 0.0, (5, 0): 1.0}),
     ],
 )
-def test_what_is_gradual_grows_evenly_to_its_end_and_stays(
-    limits: dict[str, Any], moments: dict[tuple[int, float], float | None]
-) -> None:
+def test_gradual_events_grow_linearly(limits: dict[str, Any], moments: dict[tuple[int, float], float | None]) -> None:
     for (frame, at_s), grown in moments.items():
         drift = LampDrift(percent=-20, rgb=(0, 0, 50), **limits)
         happens = Disturbances((drift, SensorWarming(dn=8, **limits)))
@@ -207,7 +205,7 @@ def test_what_is_gradual_grows_evenly_to_its_end_and_stays(
         assert len(happens.at(Moment(frame, at_s))) == (0 if grown is None else 2)
 
 
-def test_what_is_not_said_of_an_event_is_as_documented() -> None:
+def test_events_have_the_documented_defaults() -> None:
     page = (Path(__file__).parents[3] / "docs" / "lab.md").read_text(encoding="utf-8")
     table = page.partition("| what | keys and their defaults |")[2].partition("## ")[0]
     kinds = {kind.what: kind for kind in get_args(AnyDisturbance)}
@@ -228,8 +226,8 @@ def test_what_is_not_said_of_an_event_is_as_documented() -> None:
 @pytest.mark.parametrize(
     ("event", "words"),
     [
-        ({"what": "earthquake"}, "there is no such event; what is one of frozen screen, pop-up, half-changed"),
-        ({"from_frame": 3}, "does not say what happens; add what, one of frozen screen"),
+        ({"what": "earthquake"}, "unknown event, expected one of frozen screen, pop-up, half-changed"),
+        ({"from_frame": 3}, "has no event name; add what, one of frozen screen"),
         ({"what": "bump", "px": "far"}, "simulated.events[0].px = 'far': a number is expected"),
         ({"what": "bump", "px": 1, "from_frame": 1.5}, "simulated.events[0].from_frame = 1.5: a whole number"),
         ("bump", "simulated.events[0] = 'bump'"),
@@ -237,11 +235,11 @@ def test_what_is_not_said_of_an_event_is_as_documented() -> None:
         ({"what": "pop-up", "colour": [1, 2]}, "simulated.events[0].colour"),
         ({"what": "pop-up", "colour": [-1, 0, 0]}, "simulated.events[0].colour"),
         ({"what": "pop-up", "colour": [0, 0, 256]}, "= 256: a code from 0 to 255 is expected; correct it"),
-        ({"what": "lamp drift"}, "to_frame or to_s: one of them must be given"),
-        ({"what": "person", "from_frame": 5, "to_frame": 3}, "ends with to_frame = 3 before it begins"),
+        ({"what": "lamp drift"}, "expected to_frame or to_s"),
+        ({"what": "person", "from_frame": 5, "to_frame": 3}, "end to_frame = 3 is before its start"),
     ],
 )
-def test_an_event_that_cannot_be_is_one_sentence(event: Any, words: str) -> None:
+def test_refuses_bad_events(event: Any, words: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         read_disturbances([event], "LAB.toml")
     assert str(caught.value).startswith("LAB.toml: simulated.events[0]")
@@ -250,14 +248,14 @@ def test_an_event_that_cannot_be_is_one_sentence(event: Any, words: str) -> None
     assert "valid" not in str(caught.value)
 
 
-def test_a_reflection_adds_a_share_of_papers_light_whatever_is_printed() -> None:
-    """In the middle of its spot 5 % of what paper sends, at 1 / e² of that on its rim, on black ink as on paper."""
+def test_reflection_adds_a_share_of_paper_white() -> None:
+    """5 % of the light from paper in its centre and 5 % / e² on its edge, on black ink as on paper."""
     quiet = replace(TEST, read_noise_dn=0.01, sensor_noise_e=0.0, electrons_per_dn=1e6)
     black = Print(PAGE_MM, np.array([[0.0, 0.0, PAGE_MM[0] / 2, PAGE_MM[1]]]), np.zeros((1, 3), dtype=np.uint8))
     world = World(black, quiet, STRAIGHT)
     glare = Reflection(place=(0.1, 0.2, 0.9, 0.8), percent=5)
     for colour in (WHITE, RED):
-        added = taken(world, glare, colour=colour) - taken(world, colour=colour)
+        added = frame_counts(world, glare, colour=colour) - frame_counts(world, colour=colour)
         white = world.white(colour, REFERENCE_EXPOSURE)
-        for place, share in (((0.49, 0.5), 0.05), ((0.51, 0.5), 0.05), ((0.9, 0.5), 0.05 / np.e**2)):
-            np.testing.assert_allclose(at(world, *place, added), share * white, rtol=0.02, atol=1.5)
+        for position, share in (((0.49, 0.5), 0.05), ((0.51, 0.5), 0.05), ((0.9, 0.5), 0.05 / np.e**2)):
+            np.testing.assert_allclose(at(world, *position, added), share * white, rtol=0.02, atol=1.5)

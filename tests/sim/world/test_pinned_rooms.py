@@ -1,4 +1,4 @@
-"""What small rooms of every kind show, photosite by photosite, and every light, ink and shape that they are made of."""
+"""Pinned frames of small rooms, and pinned illuminants, inks and shapes."""
 
 from __future__ import annotations
 
@@ -55,20 +55,20 @@ ROOMS: dict[str, tuple[Room, Body]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROOMS)
-def test_a_room_shows_what_it_showed(name: str, pinned: Pinned) -> None:
+def test_rooms_are_unchanged(name: str, pinned: Pinned) -> None:
     room, body = ROOMS[name]
     world = World(patches(), body, room)
     rgb = np.array([[0, 0, 0], [255, 255, 255], [200, 30, 90], [3, 128, 254]])
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         "exposed": [
             world.expose(WHITE, REFERENCE_EXPOSURE, key=(1,)),
             world.expose(ORANGE, BRIGHT, key=(2, 3), lamp=0.8, situation=Situation(black_dn=7.5)),
             world.expose(BLACK, ExposureSettings(100, None, 2.0), key=(0,)),
         ],
     }
-    pinned(f"frames of a room, {name}", found, same=COUNT)
+    pinned(f"frames of a room, {name}", values, same=COUNT)
     spots = PLACES[:2, :2].reshape(-1, 2)
-    found = {
+    values = {
         "signal": [world.signal(WHITE, REFERENCE_EXPOSURE), world.signal(ORANGE, BRIGHT, 0.7)],
         "seen at": np.stack([world.project(PLACES, channel) for channel in "RGGB"]),
         "found at": world.view.locate(np.array([[-4.0, -2], [20, 30], [82, 58], [50.3, 11.1]])),
@@ -86,17 +86,17 @@ def test_a_room_shows_what_it_showed(name: str, pinned: Pinned) -> None:
         "shoulder": world.lens.kernel(),
         "noise": [[body.gain_e(iso), body.noise_dn(iso)] for iso in (100, 400, 6400)],
     }
-    pinned(f"light of a room, {name}", found, same=SINGLE)
+    pinned(f"light of a room, {name}", values, same=SINGLE)
 
 
 @pytest.mark.slow
-def test_every_disturbance_shows_what_it_showed(pinned: Pinned) -> None:
+def test_disturbances_are_unchanged(pinned: Pinned) -> None:
     world = World(patches(), TINY, Room(seed=6, veil=0.02, black_leak=0.002))
-    # What was on the screen before, and moments at the ends of what is there for a while.
+    # Earlier colours, and moments at the limits of events.
     moments = [
         Moment(n, 10.0 * n, ORANGE, ((10.0 * n - 10, WHITE), (10.0 * n - 0.5, Colour(0, 9, 200)))) for n in range(6)
     ]
-    others: dict[str, dict[str, Any]] = {
+    variants: dict[str, dict[str, Any]] = {
         "bump": {"px": 3.0, "mm": 1.5, "direction_deg": 200.0, "turn_deg": 1.2},
         "dead primary": {"primary": "blue"},
         "half-changed": {"share": 0.4},
@@ -105,31 +105,31 @@ def test_every_disturbance_shows_what_it_showed(pinned: Pinned) -> None:
         "screen saver": {"share": 0.3, "seed": 7},
         "scrambled rows": {"seed": 5, "top": 0.11},
     }
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for kind in get_args(AnyDisturbance):
         name = str(kind.what)
-        for title, more in ((name, {}), *([(f"{name}, other", others[name])] if name in others else [])):
-            one = kind(from_frame=1, to_frame=4, from_s=None, to_s=None, **more)
+        for title, changes in ((name, {}), *([(f"{name}, other", variants[name])] if name in variants else [])):
+            one = kind(from_frame=1, to_frame=4, from_s=None, to_s=None, **changes)
             timed = kind(from_s=15.0, to_s=40.0)
-            events, there = Disturbances((one,)), moments[2]
-            situation = events.situation(there)
+            events, active_moment = Disturbances((one,)), moments[2]
+            situation = events.situation(active_moment)
             counts = np.arange(131 * 187, dtype=np.uint16).reshape(131, 187)
-            counted = events.counted(counts, there)
-            found[title] = {
+            counted = events.counted(counts, active_moment)
+            values[title] = {
                 "situation": {
                     name: one for name, one in vars(situation).items() if one is not getattr(UNDISTURBED, name)
                 },
                 "later": events.situation(moments[4]).lamp,
                 "counted": None if np.array_equal(counted, counts) else counted,
-                "at": [[len(every.at(moment)) for moment in moments] for every in (events, Disturbances((timed,)))],
-                "signal": world.signal(events.shown(there), BRIGHT, situation=situation),
-                "stale": events.stale(there) is not None,
+                "at": [[len(group.at(moment)) for moment in moments] for group in (events, Disturbances((timed,)))],
+                "signal": world.signal(events.shown(active_moment), BRIGHT, situation=situation),
+                "stale": events.stale(active_moment) is not None,
             }
-    pinned("a room's disturbances", found, same=SINGLE)
+    pinned("a room's disturbances", values, same=SINGLE)
 
 
 @pytest.mark.slow
-def test_several_things_at_once_show_what_they_showed(pinned: Pinned) -> None:
+def test_combined_disturbances_are_unchanged(pinned: Pinned) -> None:
     world = World(patches(), TINY, ROOMS["of a poor lens"][0])
     picture = np.random.default_rng(2).uniform(size=(5, 9, 3)).astype(np.float32)
     situations = {
@@ -141,14 +141,14 @@ def test_several_things_at_once_show_what_they_showed(pinned: Pinned) -> None:
         "all": Situation(picture=picture, patches=(Patch((0.1, 0.2, 0.6, 0.7), WHITE),), glares=(Glare((0, 0, 1, 1)),),
                          bump_px=(2, -1), bump_mm=(0.5, 3), turn_deg=-2, defocus_px=1.5),
     }  # fmt: skip
-    found = {name: world.signal(ORANGE, BRIGHT, 1.1, one) for name, one in situations.items()}
+    values = {name: world.signal(ORANGE, BRIGHT, 1.1, one) for name, one in situations.items()}
     for name, room in (("stain", Room(stain_mm=40)), ("fold", Room(fold_mm=4)), ("curl", Room(curl_mm=9, wave_mm=90))):
-        found[name] = World(patches(), TINY, room).signal(WHITE, REFERENCE_EXPOSURE)
-    pinned("a room's situations", [found, world.project(PLACES, "R", situations["all"])], same=SINGLE)
+        values[name] = World(patches(), TINY, room).signal(WHITE, REFERENCE_EXPOSURE)
+    pinned("a room's situations", [values, world.project(PLACES, "R", situations["all"])], same=SINGLE)
 
 
-def test_lights_and_cameras_are_what_they_were(pinned: Pinned) -> None:
-    found = {
+def test_lights_and_cameras_are_unchanged(pinned: Pinned) -> None:
+    values = {
         "lamps": {lamp: projector_primaries(lamp) for lamp in get_args(spectral.LampSpectrum)},
         "daylight": {str(k): daylight(k).power for k in (4000, 5003, 7000, 7001, 12000, 25000)},
         "cameras": {
@@ -159,4 +159,4 @@ def test_lights_and_cameras_are_what_they_were(pinned: Pinned) -> None:
         "a body with changes": find_body("Canon_EOS_5DS", {"pixels": [64, 17], "black": 100, "read_noise_dn": 9.5}),
         "observer": spectral._observer(),
     }
-    pinned("lights and cameras", found)
+    pinned("lights and cameras", values)

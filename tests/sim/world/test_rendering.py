@@ -1,4 +1,4 @@
-"""Project and locate are each other's inverse, and both are what the lens's equations say."""
+"""`project` and `locate` are inverse to each other and follow the equations of the lens."""
 
 from __future__ import annotations
 
@@ -28,30 +28,36 @@ def corners() -> NDArray[np.float64]:
     return np.array([[0, 0], [width, 0], [width, height], [0, height], [width / 2, height / 2], [300, 700]])
 
 
-def test_the_flat_print_face_on_fills_its_share_of_the_frame() -> None:
+def test_flat_print_fills_its_share_of_the_frame() -> None:
     surface = Sheet(Waviness.random(1, 0, PAGE_MM))
     straight = View.framed(
         surface, FRAME_PX, fill=0.94, focal_diagonals=1.3, turn_deg=(0, 0, 0), distortion=(0, 0, 0, 0)
     )
-    seen = straight.project(corners())
+    pixels = straight.project(corners())
     # The height binds: 841 mm over 0.94 · 1732 px.
     scale = 0.94 * 1732 / 841
-    np.testing.assert_allclose(seen, (corners() - [1189 / 2, 841 / 2]) * scale + [1300, 865.5], atol=1e-9)
+    np.testing.assert_allclose(pixels, (corners() - [1189 / 2, 841 / 2]) * scale + [1300, 865.5], atol=1e-9)
 
 
-def test_a_turned_print_through_a_lens_is_seen_as_opencv_sees_it() -> None:
-    one = view()
+def test_project_equals_opencv() -> None:
+    face = view()
     points = corners()
     flat = points - np.array(PAGE_MM) / 2
-    space = np.column_stack([flat, -one.surface.height(points)])
-    turn, _ = cv2.Rodrigues(one.rotation)
-    camera = np.array([[one.focal_px, 0, one.centre_px[0]], [0, one.focal_px, one.centre_px[1]], [0, 0, 1]])
-    away = np.array([0.0, 0.0, one.distance_mm])
-    expected, _ = cv2.projectPoints(space, turn, away, camera, np.array(one.distortion))
-    np.testing.assert_allclose(one.project(points), expected[:, 0], atol=1e-6)
+    space = np.column_stack([flat, -face.surface.height(points)])
+    turn, _ = cv2.Rodrigues(face.rotation)
+    camera = np.array(
+        [
+            [face.focal_px, 0, face.centre_px[0]],
+            [0, face.focal_px, face.centre_px[1]],
+            [0, 0, 1],
+        ]
+    )
+    away = np.array([0.0, 0.0, face.distance_mm])
+    expected, _ = cv2.projectPoints(space, turn, away, camera, np.array(face.distortion))
+    np.testing.assert_allclose(face.project(points), expected[:, 0], atol=1e-6)
 
 
-def test_a_point_nearer_to_the_camera_lies_farther_from_the_axis() -> None:
+def test_nearer_points_are_farther_from_the_axis() -> None:
     flat, wavy = view(0, (0, 0, 0), 0), view(20, (0, 0, 0), 0)
     points = np.random.default_rng(2).uniform(0, 1, (200, 2)) * PAGE_MM
     centre = np.array(flat.centre_px)
@@ -73,13 +79,13 @@ def test_a_point_nearer_to_the_camera_lies_farther_from_the_axis() -> None:
 def test_locate_inverts_project(
     x: float, y: float, tilt: float, pan: float, roll: float, waviness: float, k1: float
 ) -> None:
-    one = view(waviness, (tilt, pan, roll), k1)
+    face = view(waviness, (tilt, pan, roll), k1)
     pixel = np.array([[x, y]])
-    np.testing.assert_allclose(one.project(one.locate(pixel)), pixel, atol=1e-6)
+    np.testing.assert_allclose(face.project(face.locate(pixel)), pixel, atol=1e-6)
 
 
 @given(seed=st.integers(0, 2**32), height=st.floats(0.1, 20))
-def test_the_paper_is_as_wavy_as_asked(seed: int, height: float) -> None:
+def test_paper_has_the_given_waviness(seed: int, height: float) -> None:
     surface = Waviness.random(seed, height, PAGE_MM)
     x, y = np.meshgrid(np.linspace(0, PAGE_MM[0], 97), np.linspace(0, PAGE_MM[1], 83))
     assert 0.97 * height <= np.ptp(surface.height(np.stack([x, y], axis=-1))) <= 1.03 * height

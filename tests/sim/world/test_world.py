@@ -1,6 +1,6 @@
-"""The simulated room keeps its rules: light adds, noise follows photon transfer, places are where `project` puts them.
+"""The simulated room: light is additive, noise follows photon transfer, positions follow `project`.
 
-Probabilities of a false alarm are about one in a million for each statistical test; the seeds are fixed.
+Each statistical test has a false alarm rate of about one in a million; seeds are fixed.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ def visible(frame: NDArray[np.uint16], body: Body) -> NDArray[np.float64]:
 
 
 def channel_planes(signal: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return (rows, columns, 3): R, mean G and B of each RGGB block."""
+    """Return R, mean G and B of each RGGB block, (rows, columns, 3)."""
     rows, columns = (size // 2 * 2 for size in signal.shape)
     mosaic = signal[:rows, :columns].astype(np.float64)
     green = (mosaic[::2, 1::2] + mosaic[1::2, ::2]) / 2
     return np.stack([mosaic[::2, ::2], green, mosaic[1::2, 1::2]], axis=-1)
 
 
-def test_light_adds(plain_world: World) -> None:
+def test_light_is_additive(plain_world: World) -> None:
     together = plain_world.signal(WHITE, REFERENCE_EXPOSURE)
     apart = sum((plain_world.signal(one, REFERENCE_EXPOSURE) for one in PRIMARIES), np.zeros_like(together))
     np.testing.assert_allclose(apart, together, rtol=1e-5)
 
 
 @pytest.mark.parametrize("code", [1, 10, 11, 128, 254])
-def test_a_code_gives_the_light_of_srgb(plain_world: World, code: int) -> None:
+def test_codes_follow_srgb(plain_world: World, code: int) -> None:
     # IEC 61966-2-1: linear = c / 12.92 up to c = 0.04045, ((c + 0.055) / 1.055)^2.4 above.
     c = code / 255
     linear = c / 12.92 if c <= 0.04045 else math.pow((c + 0.055) / 1.055, 2.4)
@@ -56,7 +56,7 @@ def test_a_code_gives_the_light_of_srgb(plain_world: World, code: int) -> None:
     np.testing.assert_allclose(plain_world.white(Colour(code, code, code), REFERENCE_EXPOSURE), full * linear)
 
 
-def test_a_power_law_projector_and_its_leak_and_the_rooms_own_light() -> None:
+def test_power_law_leak_and_ambient_light() -> None:
     room = Room(transfer=2.0, black_leak=0.01, ambient=0.003)
     world = World(BARE, BODIES["Test"], room)
     full = World(BARE, BODIES["Test"], replace(room, black_leak=0, ambient=0)).white(WHITE, REFERENCE_EXPOSURE)
@@ -67,7 +67,7 @@ def test_a_power_law_projector_and_its_leak_and_the_rooms_own_light() -> None:
 
 
 @pytest.mark.parametrize("name", BODIES)
-def test_paper_white_stands_where_the_room_says(name: str) -> None:
+def test_paper_white_has_the_level_of_the_room(name: str) -> None:
     body = BODIES[name]
     white = World(BARE, body, Room()).white(WHITE, REFERENCE_EXPOSURE)
     assert white.max() / (body.saturation - body.black) == pytest.approx(0.70)
@@ -75,7 +75,7 @@ def test_paper_white_stands_where_the_room_says(name: str) -> None:
 
 
 @pytest.mark.parametrize("colour", PRIMARIES, ids=["red", "green", "blue"])
-def test_a_patch_has_the_signal_that_truth_gives(plain_world: World, colour: Colour) -> None:
+def test_patches_have_the_exact_signal(plain_world: World, colour: Colour) -> None:
     sheet = plain_world.sheet
     centres = (sheet.rectangles_mm[:, :2] + sheet.rectangles_mm[:, 2:]) / 2
     primary = PRIMARIES.index(colour)
@@ -89,14 +89,14 @@ def test_a_patch_has_the_signal_that_truth_gives(plain_world: World, colour: Col
         np.testing.assert_allclose(planes[y, x, channel], truth[:, channel] * field, rtol=3e-5)
 
 
-def test_the_field_falls_as_asked_and_is_balanced_over_the_sheet() -> None:
+def test_field_has_the_given_falloff_and_balance() -> None:
     lens_only = World(BARE, BODIES["Test"], Room(projector_falloff=0, vignetting=0.3))
     rows, columns = BODIES["Test"].half_size
     corner = lens_only.view.locate(np.array([[-0.75, -0.75], [(columns - 1) / 2, (rows - 1) / 2]]))
     np.testing.assert_allclose(lens_only.field(corner), [[0.7] * 3, [1] * 3], rtol=2e-3)
-    both = World(BARE, BODIES["Test"], Room())
+    mixed = World(BARE, BODIES["Test"], Room())
     x, y = np.meshgrid(np.linspace(0, 180, 37), np.linspace(0, 125, 26))
-    field = both.field(np.stack([x, y], axis=-1))
+    field = mixed.field(np.stack([x, y], axis=-1))
     assert 0.95 < field[..., 1].max() <= 1
     np.testing.assert_allclose(field.mean(axis=(0, 1)) / field[..., 1].mean(), 1, atol=2e-3)
     assert np.ptp(field / field[..., 1:2]) > 0.01, "the primaries fall off differently"
@@ -105,8 +105,8 @@ def test_the_field_falls_as_asked_and_is_balanced_over_the_sheet() -> None:
     assert 0.001 < np.ptp(field / field.mean(axis=-1, keepdims=True)) < 0.2
 
 
-def test_each_photosite_integrates_the_print_over_aperture_and_blur() -> None:
-    """Against a sum over ten thousand points of the print for each of some photosites, found by `locate`."""
+def test_photosites_integrate_over_aperture_and_blur() -> None:
+    """Compared with a sum over ten thousand points of the print per photosite, found by `locate`."""
     rng = np.random.default_rng(11)
     x, y = (grid.ravel() for grid in np.meshgrid(2.1 * np.arange(70) + 15, 1.9 * np.arange(50) + 10))
     sheet = Print(
@@ -124,11 +124,11 @@ def test_each_photosite_integrates_the_print_over_aperture_and_blur() -> None:
     steps = np.linspace(-4.95, 4.95, 100)
     errors: list[float] = []
     for column, row in cast("list[list[int]]", photosites.tolist()):
-        places = np.stack(np.meshgrid(steps, steps), axis=-1) + rng.uniform(-0.05, 0.05, (100, 100, 2))
+        positions = np.stack(np.meshgrid(steps, steps), axis=-1) + rng.uniform(-0.05, 0.05, (100, 100, 2))
         edge = 0.5 / (blur * math.sqrt(2))
-        spread = erf(places / (blur * math.sqrt(2)) + edge) - erf(places / (blur * math.sqrt(2)) - edge)
+        spread = erf(positions / (blur * math.sqrt(2)) + edge) - erf(positions / (blur * math.sqrt(2)) - edge)
         weights = spread.prod(axis=-1)
-        points = world.view.locate((np.array([column, row]) + places - 0.5) / 2)
+        points = world.view.locate((np.array([column, row]) + positions - 0.5) / 2)
         cell = np.floor((points - [15, 10]) / [2.1, 1.9]).astype(int)
         channel = (0, 1, 1, 2)[2 * (row % 2) + column % 2]
         inside = ((cell >= 0) & (cell < [70, 50])).all(axis=-1)
@@ -141,32 +141,32 @@ def test_each_photosite_integrates_the_print_over_aperture_and_blur() -> None:
     assert np.abs(errors).max() < 0.01
 
 
-def test_squares_are_where_project_says(square_world: World) -> None:
-    """The centroid of each square's darkness, in each colour plane by itself, against its projected area's."""
+def test_squares_are_at_projected_positions(square_world: World) -> None:
+    """Centroids of the squares in each colour plane, compared with projected areas."""
     signal = square_world.signal(WHITE, REFERENCE_EXPOSURE).astype(np.float64)
     white = square_world.white(WHITE, REFERENCE_EXPOSURE)
-    places: NDArray[np.float64] = np.indices(signal.shape).astype(np.float64)
-    rows, columns = places[0], places[1]
+    positions: NDArray[np.float64] = np.indices(signal.shape).astype(np.float64)
+    rows, columns = positions[0], positions[1]
     for box in square_world.sheet.rectangles_mm:
         steps = (np.arange(40) + 0.5) / 40
         points = np.stack(np.meshgrid(*(a + steps * (b - a) for a, b in zip(box[:2], box[2:], strict=True))), axis=-1)
-        seen = square_world.project(points)
-        by_x = square_world.project(points + np.array([0.01, 0])) - seen
-        by_y = square_world.project(points + np.array([0, 0.01])) - seen
+        expected_px = square_world.project(points)
+        by_x = square_world.project(points + np.array([0.01, 0])) - expected_px
+        by_y = square_world.project(points + np.array([0, 0.01])) - expected_px
         area = np.abs(by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0])
-        expected = (seen * area[..., None]).sum(axis=(0, 1)) / area.sum()
+        expected = (expected_px * area[..., None]).sum(axis=(0, 1)) / area.sum()
         x, y = (round(2 * float(place) + 0.5) for place in expected)
         window = (slice(y - 42, y + 43), slice(x - 42, x + 43))
         for phase, channel in zip(product((0, 1), (0, 1)), (0, 1, 1, 2), strict=True):
             mine: NDArray[np.bool_] = (rows[window] % 2 == phase[0]) & (columns[window] % 2 == phase[1])
             darkness = (white[channel] - signal[window])[mine]
-            found = [
+            measured = [
                 float((darkness * place[window][mine]).sum() / darkness.sum() - 0.5) / 2 for place in (columns, rows)
             ]
-            np.testing.assert_allclose(found, expected, atol=0.003)
+            np.testing.assert_allclose(measured, expected, atol=0.003)
 
 
-def test_a_frame_is_its_key(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frame_depends_on_its_key(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     frame = world.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1))
     np.testing.assert_array_equal(frame, world.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1)))
     monkeypatch.setattr("sim.world.world.processor_count", lambda: 1)
@@ -178,7 +178,7 @@ def test_a_frame_is_its_key(world: World, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("iso", [100, 800])
-def test_masked_borders_and_darkness_are_black_with_read_noise(world: World, iso: int) -> None:
+def test_masked_borders_and_dark_frames_have_read_noise(world: World, iso: int) -> None:
     settings = ExposureSettings(iso=iso, aperture=8, shutter_s=0.5)
     body = world.body
     lit = world.expose(WHITE, settings, key=(4,))
@@ -199,7 +199,7 @@ def check_normal(counts: NDArray[np.number], mean: float, deviation: float) -> N
 
 @pytest.mark.parametrize("iso", [100, 400])
 def test_noise_follows_photon_transfer(world: World, iso: int) -> None:
-    """EMVA 1288: the variance of a count is signal / gain + read noise², + 1/12 DN² for rounding."""
+    """EMVA 1288: variance of counts = signal / gain + read noise² + 1/12 DN² for rounding."""
     settings = ExposureSettings(iso=iso, aperture=8, shutter_s=0.5 * 100 / iso)
     body = world.body
     signal = world.signal(WHITE, settings).astype(np.float64)
@@ -217,15 +217,15 @@ def test_noise_follows_photon_transfer(world: World, iso: int) -> None:
         assert abs(bias) < SIX_SIGMA * math.sqrt(expected / 2 / count)
 
 
-def test_counts_end_at_saturation(world: World) -> None:
+def test_counts_stop_at_saturation(world: World) -> None:
     frame = world.expose(WHITE, ExposureSettings(iso=100, aperture=4, shutter_s=2), key=(7,))
     assert frame.max() == world.body.saturation
     assert (visible(frame, world.body) == world.body.saturation).mean() > 0.3
 
 
 @pytest.mark.parametrize(("shutter_s", "percent"), [(1 / 60, 7), (1.0, 0.11)])
-def test_a_colour_wheel_shakes_the_colour_of_short_exposures(shutter_s: float, percent: float) -> None:
-    """Against an independent simulation of R/G with 0.5 ms of jitter and one turn in 1/60 s."""
+def test_colour_wheel_changes_short_exposures(shutter_s: float, percent: float) -> None:
+    """Compared with a separate simulation of R/G with 0.5 ms of jitter and one rotation in 1/60 s."""
     body = replace(BODIES["Test"], sensor=(4, 16), visible=Rectangle(0, 8, 4, 8), masked=(), electrons_per_dn=1e9)
     flat = Room(wheel_hz=60, response_spread=0, white_level_share=0.5, black_leak=0)
     world = World(BARE, replace(body, read_noise_dn=1e-3, sensor_noise_e=0), flat)
@@ -237,11 +237,11 @@ def test_a_colour_wheel_shakes_the_colour_of_short_exposures(shutter_s: float, p
             visible(world.expose(PRIMARIES[i], settings, key=(n,)), body).mean() - body.black for i in range(2)
         )
         ratios.append(float(red / green))
-    found = 100 * np.std(ratios) / np.mean(ratios)
-    assert found == pytest.approx(percent, rel=0.2)
+    measured = 100 * np.std(ratios) / np.mean(ratios)
+    assert measured == pytest.approx(percent, rel=0.2)
 
 
-def test_later_rectangles_cover_earlier_ones_and_paper_shows_between() -> None:
+def test_later_rectangles_cover_earlier_ones() -> None:
     boxes = np.array([[20.0, 20, 160, 100], [40, 40, 100, 80], [60, 50, 80, 70]])
     codes = np.array([[0, 0, 0], [255, 255, 255], [200, 0, 0]], dtype=np.uint8)
     world = World(Print((180, 125), boxes, codes), BODIES["Test"], Room(response_spread=0, black_leak=0))
@@ -252,8 +252,8 @@ def test_later_rectangles_cover_earlier_ones_and_paper_shows_between() -> None:
     np.testing.assert_allclose(planes[y, x], expected * world.field(points)[:, 1, None], rtol=3e-3)
 
 
-def test_a_stain_and_a_fold_are_where_the_room_tells_and_as_deep() -> None:
-    """Bare paper beside itself, worn: what is lost is what `worn` says, and nothing elsewhere."""
+def test_stain_and_fold_have_the_given_depth() -> None:
+    """Bare paper with and without wear: the loss of light is `worn`."""
     room = Room(response_spread=0, stain_mm=25, stain_depth=0.4, fold_mm=2)
     clean, worn = (World(BARE, BODIES["Test"], it) for it in (replace(room, stain_mm=0, fold_mm=0), room))
     assert worn.stain is not None
@@ -263,12 +263,12 @@ def test_a_stain_and_a_fold_are_where_the_room_tells_and_as_deep() -> None:
     x, y = np.meshgrid(np.arange(20, columns - 20, 7), np.arange(20, rows - 20, 7))
     planes = channel_planes(worn.signal(WHITE, REFERENCE_EXPOSURE))[y, x]
     for channel, offset in enumerate((-0.25, 0, 0.25)):
-        places = worn.view.locate((np.stack([x, y], axis=-1) + offset).astype(np.float64))
-        white = np.full((places[..., 0].size, 3), 255)
-        true = worn.seen(white, places.reshape(-1, 2), WHITE, REFERENCE_EXPOSURE)[:, channel].reshape(x.shape)
-        inside = ((places > 2) & (places < np.array(BARE.page_mm) - 2)).all(axis=-1)
+        positions = worn.view.locate((np.stack([x, y], axis=-1) + offset).astype(np.float64))
+        white = np.full((positions[..., 0].size, 3), 255)
+        true = worn.seen(white, positions.reshape(-1, 2), WHITE, REFERENCE_EXPOSURE)[:, channel].reshape(x.shape)
+        inside = ((positions > 2) & (positions < np.array(BARE.page_mm) - 2)).all(axis=-1)
         # A stain's rim is blurred by the lens, paper is not.
-        rim = np.abs(np.linalg.norm(places - worn.stain.centre_mm, axis=-1) - 12.5) < 3
+        rim = np.abs(np.linalg.norm(positions - worn.stain.centre_mm, axis=-1) - 12.5) < 3
         np.testing.assert_allclose(planes[..., channel][inside & ~rim], true[inside & ~rim], rtol=2e-3)
     middle = np.array(worn.stain.centre_mm)
     np.testing.assert_allclose(worn.stain.passed(middle), [0.88, 0.76, 0.6], atol=1e-6)
@@ -294,7 +294,7 @@ def test_a_stain_and_a_fold_are_where_the_room_tells_and_as_deep() -> None:
         (lambda: replace(BODIES["Test"], sensor=(100, 100)), "outside the sensor"),
     ],
 )
-def test_what_cannot_be_is_refused(change: object, named: str) -> None:
+def test_refuses_impossible_rooms(change: object, named: str) -> None:
     assert callable(change)
     with pytest.raises(ValueError, match=named):
         change()
@@ -304,12 +304,12 @@ HOT = Room(hot_per_million=40, hot_dn_per_s=3000, response_spread=0, black_leak=
 
 
 def dark_excess(world: World, settings: ExposureSettings, frames: int = 8) -> NDArray[np.float64]:
-    """Return the mean of dark frames over black, of the whole sensor."""
+    """Return the mean of dark frames above black, for the whole sensor."""
     dark = [world.expose(BLACK, settings, key=(k,)).astype(np.float64) for k in range(frames)]
     return np.mean(dark, axis=0) - world.body.black
 
 
-def test_hot_photosites_are_few_the_same_in_all_frames_and_grow_with_time_and_gain() -> None:
+def test_hot_photosites_are_constant_and_grow_with_time() -> None:
     world = World(BARE, BODIES["Test"], HOT)
     rows, columns = BODIES["Test"].sensor
     assert len(world.hot.rows) == round(40 * rows * columns / 1e6) == 21
