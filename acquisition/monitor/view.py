@@ -230,7 +230,7 @@ def read_session(folder: Path, earlier: SessionView | None = None) -> SessionVie
 
 def _without_own_files(folder: Path) -> str:
     missing = [str(folder / name) for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
-    return f"{' and '.join(missing)}: missing; restore from a copy of the session" if missing else ""
+    return f"{' and '.join(missing)}: missing; restore it from a copy of the session" if missing else ""
 
 
 def _lights_of(folder: Path) -> tuple[Illumination, ...]:
@@ -450,7 +450,7 @@ class SessionWatch:
 
     def _head(self) -> Head:
         if self._trouble is not None or self._known is None:
-            return self._trouble or Head("absent", f"the session {self.folder} does not exist yet; this page waits")
+            return self._trouble or Head("absent", f"there is no session {self.folder} yet; this page waits for it")
         return self._known.view.head(datetime.now(UTC))
 
     def _news(self, numbered: _Numbered, since: str) -> Json:

@@ -71,7 +71,7 @@ CHART = design_chart(1)
 def planned(
     free: float = 1000 * GB, answers: Answers | None = None, settings: LabSettings = SETTINGS, work: Work | None = None
 ) -> RunPlan:
-    given = answers or Answers(camera=EOS, offered_s=SPEEDS, projector="Epson, in standby: it will be lit", lit=False)
+    given = answers or Answers(camera=EOS, offered_s=SPEEDS, projector="Epson, in standby", lit=False)
     return make_plan(settings, work or work_of(), given, int(free))
 
 
@@ -98,7 +98,7 @@ class TestExposure:
         settings = settings_with(camera={"shutter_s": 0.45})
         (fault,) = planned(settings=settings).faults
         assert isinstance(fault, DeviceRefused)
-        assert str(fault).startswith("camera.shutter_s = 0.45: the body does not offer it; ")
+        assert str(fault).startswith("camera.shutter_s = 0.45 s is not offered")
         assert "0.4, 0.5, 0.6 s" in str(fault)
 
 
@@ -110,7 +110,7 @@ class TestExposure:
         (Supplies(battery=0.25, mains=True), ""),
         (Supplies(battery=0.5), ""),
         (Supplies(), ""),
-        (Supplies(card_free_bytes=GB, saves_to_host=False), "are missing; put in an empty card of"),
+        (Supplies(card_free_bytes=GB, saves_to_host=False), "are missing; insert an empty card"),
         (Supplies(card_free_bytes=GB, saves_to_host=True), ""),
         (Supplies(card_free_bytes=100 * GB, saves_to_host=False), ""),
         (Supplies(card_free_bytes=None, saves_to_host=False), ""),
@@ -151,7 +151,7 @@ class TestAsking:
         assert answers.camera == EOS
         assert answers.supplies == Supplies(0.75)
         assert (answers.lit, answers.faults) == (False, ())
-        assert "in standby: it will be lit" in answers.projector
+        assert "in standby: it will be switched on" in answers.projector
         assert answers.warnings == ("night light is on: switch it off",)
         assert clock.monotonic() == 0
 
@@ -194,11 +194,11 @@ def small_disk(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("target", "said", "unsaid"),
     [
         ("{there}/tell --phone", "", "s3cret"),
-        ("{there}/gone --phone s3cret", "{there}/gone … is no command that is there", "s3cret"),
+        ("{there}/gone --phone s3cret", "the command {there}/gone … does not exist", "s3cret"),
         ("{there}/plain --phone", "chmod +x {there}/plain", "--phone"),
         (
             "ntfy.example/s3cret",
-            "ntfy.example/… is no command that is there; an address begins",
+            "ntfy.example/… does not exist; if it is an address",
             "s3cret",
         ),
         ("https://ntfy.example/s3cret", "", "s3cret"),
@@ -230,7 +230,7 @@ def test_doubts_unlikely_times() -> None:
     assert doubts(control) == 0
     assert doubts(control, settle_s=500.0) == 1
     assert doubts(control, warm_up_s=20.0) == 1
-    assert doubts(real, warm_up_s=20.0) == 0, "the lamp is not under control"
+    assert doubts(real, warm_up_s=20.0) == 0, "the lamp is not controlled"
 
 
 class TestDryRun:
@@ -242,7 +242,7 @@ class TestDryRun:
         text = capsys.readouterr().out
         assert "night: new, 8 frames to take (4 light, 2 white, 2 dark); 0 frames of 8 done" in text
         assert "shuffled by seed 1" in text
-        assert "in standby: it will be lit" in text
+        assert "in standby: it will be switched on" in text
         assert "notices     to https://ntfy.example/…" in text
         assert "alive       to https://ping.example/…" in text
         assert "s3cret" not in text
@@ -276,9 +276,9 @@ class TestDryRun:
         assert main(["run", str(lab), str(night), "--dry-run"]) == 0
         assert contents(lab.parent) == before
         text = capsys.readouterr().out
-        assert "night: taken up again, 1 frame to take (1 light); 7 frames of 8 done" in text
-        assert "the largest of the session so far" in text
-        assert "median of the session so far" in text
+        assert "night: resumed, 1 frame to take (1 light); 7 frames of 8 done" in text
+        assert "the largest file of the session" in text
+        assert "median of the session" in text
 
     @pytest.mark.parametrize("dry", [["--dry-run"], []])
     def test_refuses_retake_in_new_session(self, lab: Path, capsys: pytest.CaptureFixture[str], dry: list[str]) -> None:
