@@ -203,9 +203,7 @@ def measure_level(shot: Shot, saturation: Saturation, white: _Array | None = Non
     return TriedTime(shot.shutter_s, (red, green, blue), max(red, green, blue) >= CLIPPING_SHARE)
 
 
-def try_times(
-    first: TriedTime, measure: Callable[[float], TriedTime], times_s: Sequence[float]
-) -> tuple[TriedTime, ...]:
+def search(first: TriedTime, measure: Callable[[float], TriedTime], times_s: Sequence[float]) -> tuple[TriedTime, ...]:
     """Return the tried times, `first` included, until the best offered time is among them.
 
     `measure`: takes a frame at a shutter time, s, and returns its white level.

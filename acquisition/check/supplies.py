@@ -64,8 +64,7 @@ def _card(supplies: Supplies, needed: int) -> Finding:
     if supplies.saves_to_host:
         return Finding("card", "good", "frames are saved on this computer, the card is not used")
     if supplies.card_free_bytes is None:
-        remedy = f"make sure that {bytes_text(needed, up=True)} are free on it"
-        return not_checked("card", "frames are saved on the camera's card, but its free space is not reported", remedy)
+        return not_checked("card", "free space on the card is not reported", f"keep {bytes_text(needed, up=True)} free")
     return judge_value(
         CARD,
         supplies.card_free_bytes / max(needed, 1),

@@ -281,17 +281,15 @@ class ProjectorModel:
         squares, number = self.brightness
         return replace(self, covariance=covariance, brightness=(squares + step**2, number + 1))
 
-    def _scatter(
-        self, errors: _Array, innovation: _Array, count: int
-    ) -> tuple[tuple[float, float], tuple[float, float]]:
-        mean = float(errors.mean())
+    def _scatter(self, logs: _Array, innovation: _Array, count: int) -> tuple[tuple[float, float], tuple[float, float]]:
+        mean = float(logs.mean())
         # Uncertainty of the model is no scatter: a frame is weighted by the part of its deviation that is scatter.
         own = self.chroma_sd**2 * (1 - 1 / count) if count > 1 else 0.0
         spread = float(np.mean(np.diag(innovation)) - np.mean(innovation))
         weight = min(1.0, own / max(spread, 1e-12)) * (count - 1)
         chroma = (
             self.chroma[0]
-            + weight * min(float(((errors - mean) ** 2).sum()) / max(count - 1, 1), (8 * self.chroma_sd) ** 2),
+            + weight * min(float(((logs - mean) ** 2).sum()) / max(count - 1, 1), (8 * self.chroma_sd) ** 2),
             self.chroma[1] + weight,
         )
         together = min(1.0, self.brightness_sd**2 / max(float(np.mean(innovation)), 1e-12))

@@ -275,8 +275,8 @@ def head_of(
     was stopped by a signal. `free_bytes`: on the session's disk; None if unknown.
     """
     steps, attempts, heartbeat = view.steps, view.attempts, view.heartbeat
-    accepted = {attempt.step for attempt in attempts if attempt.verdict == ACCEPTED}
-    complete = accepted & {step.number for step in steps} - {*view.lost}
+    numbers = {step.number for step in steps} - {*view.lost}
+    complete = {attempt.step for attempt in attempts if attempt.verdict == ACCEPTED} & numbers
     verdicts = [attempt.verdict for attempt in attempts]
     missing = len(steps) - len(complete)
     intervals = [attempt.seconds for attempt in attempts[-RECENT:] if attempt.seconds is not None]

@@ -232,7 +232,7 @@ def frame_bytes(largest: int | None, model: str, simulated: int | None = None) -
     """Return the size of a raw file, bytes.
 
     `largest`: largest file of the session; None if it has none. `model`: as the camera reports it; "" if it could not
-    be asked. `given`: size of simulated files; None for a real camera.
+    be asked. `simulated`: size of simulated files; None for a real camera.
     """
     if largest is not None:
         return Estimate(largest, "the largest file of the session", True)

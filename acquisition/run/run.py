@@ -139,8 +139,7 @@ class Notices:
             failure = self._posted(*notice) if is_webhook(self._target) else self._run(*notice)
             if failure:
                 # Only scheme and host, or the program, are named: the rest of the target may be a secret.
-                label = target_label(self._target)
-                self._failed.put(f"{label} did not receive a notice: {failure}; the run continues without it")
+                self._failed.put(f"{target_label(self._target)} did not receive a notice: {failure}; the run continues")
 
     def _run(self, event: str, message: str, body: bytes) -> str:
         variables = {"CROP_EVENT": event, "CROP_MESSAGE": message, "CROP_SESSION": self._session}
@@ -273,13 +272,13 @@ class Terminal:
             MofNCompleteColumn(),
             TextColumn("frames"),
             TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
-            TextColumn("{task.fields[said]}"),
+            TextColumn("{task.fields[remaining]}"),
+            TextColumn("{task.fields[status]}"),
             console=console,
             redirect_stdout=sys.stdout.isatty(),
             disable=not shows_progress() or self._plain,
         )
-        self._task = self._bar.add_task("frames", total=None, remaining="", said="")
+        self._task = self._bar.add_task("frames", total=None, remaining="", status="")
 
     def __enter__(self) -> Self:
         return self
@@ -288,7 +287,7 @@ class Terminal:
         self, error_type: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._bar.live.is_started:
-            self._bar.update(self._task, remaining="", said="")
+            self._bar.update(self._task, remaining="", status="")
             self._bar.stop()
 
     def progress(self, done_count: int, total: int) -> None:
@@ -309,7 +308,7 @@ class Terminal:
         self._attempts.append(TimedAttempt(seconds, frame.judgement.accepted))
         self._since = now_s
         self._reported = verdict_line(frame)
-        self._bar.update(self._task, said=self._reported)
+        self._bar.update(self._task, status=self._reported)
 
     def announce(self, sentence: str) -> None:
         """Print a permanent line."""
@@ -318,7 +317,7 @@ class Terminal:
     def state(self, sentence: str) -> None:
         """Show the reason of a wait until the next frame; this time does not count as a frame's time."""
         self._since = None
-        self._bar.update(self._task, said=sentence, remaining="")
+        self._bar.update(self._task, status=sentence, remaining="")
         self._print_line(sentence)
 
     def _print_line(self, line: str, is_last: bool = False) -> None:
