@@ -158,7 +158,7 @@ SEQUENCE = SequenceSettings(warm_up_s=600)
 
 
 class Timed(SimulatedClock):
-    """A clock by which things happen at their times, while somebody waits."""
+    """A clock with events at given times, which happen during waits."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -176,7 +176,7 @@ class Timed(SimulatedClock):
 
 @dataclass
 class PausedRoom:
-    """RetryPolicy with everything that it tells, and something that is broken until a time."""
+    """A RetryPolicy with its reports, and a device that is broken until a given time."""
 
     limit_s: float = 600.0
     clock: Timed = field(default_factory=Timed)
@@ -200,7 +200,7 @@ class PausedRoom:
         return [what for what, _ in self.said]
 
     def broken(self, fault: Callable[[float], CropError | None], takes_s: float = 0.0) -> Callable[[], str]:
-        """Return an action that fails as `fault` says of the time, in seconds."""
+        """Return an action that fails with `fault` of the time, s."""
 
         def action() -> str:
             now = self.clock.monotonic()
@@ -216,7 +216,7 @@ class PausedRoom:
 
 @dataclass
 class Room(PausedRoom):
-    """A projector behind PJLink, and everything that is said of it."""
+    """A projector behind PJLink, with all reports about it."""
 
     power: Power = Power.ON
 
@@ -494,7 +494,7 @@ def test_back_off_continues_across_pauses() -> None:
 
 @pytest.mark.slow
 def test_full_disk_keeps_frame_in_camera(tmp_path: Path) -> None:
-    """The real driver, and a kernel that lets no file grow: the download is repeated when there is space again."""
+    """The real driver, with a kernel that refuses larger files: the download is repeated when there is space again."""
     resource = pytest.importorskip("resource")
     chart, light = design_chart(1), Illumination(0, "uniform", None, WHITE)
     document = {"rig": "simulated", "chart": "c", "illuminations": "i", "simulated": {"body": "Test"}}
@@ -618,7 +618,7 @@ def test_reports_late_step_once() -> None:
     watch = RunWatch(lambda sentence, begun: caught.append(sentence), time)
 
     def pass_s(seconds: float) -> None:
-        """Let time pass in pieces that are no gap."""
+        """Let time pass in steps that are shorter than a gap."""
         for _ in range(round(seconds)):
             time.now += 1
             watch.look()

@@ -174,7 +174,7 @@ SCRIPTS: dict[str, tuple[dict[int, bytes | Exception], dict[int, Judgement]]] = 
 
 
 def journal_of(session: Session) -> dict[str, Any]:
-    """Return when each step was attempted, with what verdict, and how often each event happened."""
+    """Return the times and verdicts of all attempts, and the number of each event."""
     attempts, events = session.journal.attempts(), session.journal.events()
     verdicts: dict[str, list[int]] = {}
     for one in attempts:
