@@ -14,7 +14,7 @@ from calibration.figures.single_frames import BATTERY, CARD, DISK, NOISE_REDUCTI
 from drivers.camera import Camera, ReportsSupplies, Supplies
 from foundation.errors import DeviceError, StorageError
 
-CHARGE = 440  # frames for one battery charge; source: see `BATTERY`
+CHARGE = 440  # Frames for one battery charge; source: see `BATTERY`
 
 
 def judge_disk(folder: Path, frames: int, frame_bytes: int) -> Finding:

@@ -340,7 +340,7 @@ def _judge_exposure(
     )
 
 
-UNKNOWN_PLACE: npt.NDArray[np.float64] = np.full(2, np.nan)  # position of a chart that could not be measured
+UNKNOWN_PLACE: npt.NDArray[np.float64] = np.full(2, np.nan)  # Position of a chart that could not be measured
 
 _UNRECOGNISED = (
     "the chart was not detected at its last position: it is covered, out of focus, or has moved by more than its tags "
@@ -421,9 +421,9 @@ def _movement_reason(shift_px: Sequence[float], allowed_px: float) -> str:
     )
 
 
-_SIGMAS = 6.0  # standard deviations of the noise of a mean that are no change
+_SIGMAS = 6.0  # Standard deviations of the noise of a mean that are no change
 
-_TILES = 16  # tiles averaged before their change in the dark is judged: a lamp in a corner lights as many
+_TILES = 16  # Tiles averaged before their change in the dark is judged: a lamp in a corner lights as many
 
 # Immediate repetitions of contradicted first frames: a passing disturbance ends within a minute, and one that returns a
 # third time needs a person.
@@ -693,17 +693,17 @@ def _is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
     return is_changed_lamp or is_overexposed or CAUSES[cause].lasts or state.refusals[1] >= limits.LASTING_FRAMES
 
 
-_SAME_SD = 0.0015  # least relative scatter of amounts between two frames of one illuminant
+_SAME_SD = 0.0015  # Least relative scatter of amounts between two frames of one illuminant
 
-_SAME_FLOOR = 4e-4  # the same without light, share of a full primary
+_SAME_FLOOR = 4e-4  # The same without light, share of a full primary
 
-_NEAREST = 12  # illuminants of the plan that are compared in full with a wrong one
+_NEAREST = 12  # Illuminants of the plan that are compared in full with a wrong one
 
 _PRIMARIES = ("red", "green", "blue")
 
-_ORDERED_LEAST = 0.005  # least ordered light of a primary, share of its full light, that can be missing
+_ORDERED_LEAST = 0.005  # Least ordered light of a primary, share of its full light, that can be missing
 
-_MISSING = 0.05  # share of the ordered light of a primary below which it is missing: leaked black is less
+_MISSING = 0.05  # Share of the ordered light of a primary below which it is missing: leaked black is less
 
 _Array = npt.NDArray[np.float64]
 
@@ -1002,25 +1002,25 @@ def _codes_text(codes: Codes) -> str:
     return "black" if not any(codes) else "({}, {}, {})".format(*codes)
 
 
-# median relative deviation below which places are reported as covered
+# Median relative deviation below which places are reported as covered
 _DARKER = -0.1
 
 # Share of squared deviation that the previous illuminant may leave unexplained if a place still shows it: 6° off.
 _PREVIOUS_RESIDUAL = 0.01
 
-_WHOLE_FRAME = 0.5  # share of deviating tiles above which the whole frame deviates
+_WHOLE_FRAME = 0.5  # Share of deviating tiles above which the whole frame deviates
 
 # Trial blurs σ, half-size px, for rows that deviate.
 _BLURS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 
-_EXPLAINED = 0.4  # share of the median deviation of rows that may remain if a blur is the cause
+_EXPLAINED = 0.4  # Share of the median deviation of rows that may remain if a blur is the cause
 
 # Median relative deviation of rows above which a blur is tried: below it only some rows deviate.
 _BLURRED = 0.02
 
-_CONTRAST = 2.0  # contrast of the chart at the edges of a tile, relative: tags, paper, patches
+_CONTRAST = 2.0  # Contrast of the chart at the edges of a tile, relative: tags, paper, patches
 
-_BY_TURNS = 0.1  # share of deviating rows of either sign above which they belong to other places
+_BY_TURNS = 0.1  # Share of deviating rows of either sign above which they belong to other places
 
 # Median step from row to row over the median deviation, above which rows belong to several places. Shadows, windows and
 # parts of a picture have at most 0.03, scrambled rows at least 0.2 (simulated).
@@ -1029,7 +1029,7 @@ _RAGGED = 0.1
 # Movement or blur, px, that rows at the edges of the chart tolerate: smaller ones cannot always be measured.
 _UNSEEN_PX = 1.0
 
-_EDGE = 0.15  # relative deviation of a row per px of sideways movement: other patches at the ends of a strip
+_EDGE = 0.15  # Relative deviation of a row per px of sideways movement: other patches at the ends of a strip
 
 
 def _judge_evenness(
@@ -1063,7 +1063,7 @@ def _judge_evenness(
 def _share_of_previous(
     basis: Basis, light: FrameLight, frame: Measured, deviating: npt.NDArray[np.bool_], previous: RecentFrame | None
 ) -> float:
-    """Return the share of the exposure during which tiles `off` (T,) bool showed the previous illuminant.
+    """Return the share of the exposure during which tiles `deviating` (T,) bool showed the previous illuminant.
 
     0 if another illuminant was shown, or a shadow explains the deviation as well.
     """

@@ -59,12 +59,12 @@ from foundation.colorimetry import decode_srgb
 from foundation.errors import CropError, FormatError, first_of
 from foundation.files import write_whole
 
-RUN_STARTS = "start"  # event at the start of the first frame of a run
+RUN_STARTS = "start"  # Event at the start of the first frame of a run
 
 # Durations of recent frames after which a frame is late: a repeated download takes twice as long.
 LATE_FRAMES = 3
 
-AT_WORK = ("running", "waiting", "paused", "late")  # states of an active run
+AT_WORK = ("running", "waiting", "paused", "late")  # States of an active run
 
 # Names of devices in sentences, for which a run may hang or wait.
 CAUSES = ("the camera", "the screen", "the projector", "the disk", "the frames")
@@ -72,7 +72,7 @@ CAUSES = ("the camera", "the screen", "the projector", "the disk", "the frames")
 # Free space below which a disk is full before the first frame: a row of the journal has 100 kB.
 LEAST_FREE_BYTES = 1 << 20
 
-LOOK = "look at the camera, its cable and the machine"  # remedy if a run reports nothing
+LOOK = "look at the camera, its cable and the computer"  # Remedy if a run reports nothing
 
 # Largest difference, s, between the clocks of lab and computer at which the end is shown as a time of day. The time of
 # a simulated lab passes differently, and an older attempt cannot predict the end.
@@ -358,7 +358,7 @@ def _state_of(
     return heartbeat.state, heartbeat.sentence
 
 
-Json = dict[str, Any]  # a JSON object
+Json = dict[str, Any]  # A JSON object
 
 
 # Age of a file, s, below which it is read again: it may change within the resolution of its time stamp (10 ms at the
@@ -373,7 +373,7 @@ LOOK_AGAIN_S = 10.0
 _SENT_AGAIN = 3
 
 
-MOST_PICTURE_BYTES = 4 << 20  # size limit of a preview: many times that of 640 px
+MOST_PICTURE_BYTES = 4 << 20  # Size limit of a preview: many times that of 640 px
 
 _JPEG = b"\xff\xd8\xff"
 
@@ -639,7 +639,7 @@ def _read_picture(folder: Path, file: str) -> bytes:
     return b""
 
 
-REPORT_FILE = "report.html"  # name of the report in the session's folder
+REPORT_FILE = "report.html"  # Name of the report in the session's folder
 
 # Total size of the pictures in a report: with the third added by base64 it can still be mailed (10 MB on most servers).
 MOST_PICTURES_BYTES = 6 << 20

@@ -69,11 +69,11 @@ from foundation.errors import CropError, DeviceRefused, InputError, StorageError
 from foundation.secret_texts import is_webhook, target_label
 from foundation.version import software
 
-LIMIT_S: Final = 20.0  # time for a receiver to accept a notice, s; a message to a telephone takes seconds
-ENDING_S: Final = 2.0  # additional time for the last notice, s, so that a slow receiver is reported by name
+LIMIT_S: Final = 20.0  # Time for a receiver to accept a notice, s; a message to a telephone takes seconds
+ENDING_S: Final = 2.0  # Additional time for the last notice, s, so that a slow receiver is reported by name
 # Interval between two notices of pauses with the same cause, s: more notices would not bring anybody sooner.
 QUIET_S: Final = 3600.0
-QUEUED: Final = 100  # notices that can wait for a slow receiver; more are dropped
+QUEUED: Final = 100  # Notices that can wait for a slow receiver; more are dropped
 
 
 class Notices:
@@ -334,7 +334,7 @@ def _print(line: str) -> None:
         print(line, file=sys.stderr)
 
 
-ALIVE_S: Final = 60.0  # interval between two signs to a dead man's switch, s: such services count minutes
+ALIVE_S: Final = 60.0  # Interval between two signs to a dead man's switch, s: such services count minutes
 
 # Share of the watchdog's time between two signs: sd_watchdog_enabled(3) recommends at most half.
 WATCHDOG_SHARE: Final = 0.25
@@ -404,7 +404,7 @@ def _watchdog_s(environment: Mapping[str, str]) -> float:
         return 0.0
 
 
-# expected time for a camera to accept its settings, s: a dozen messages with answers
+# Expected time for a camera to accept its settings, s: a dozen messages with answers
 CONFIGURE_S = 10.0
 
 
@@ -680,7 +680,7 @@ def _make_ready(job: Job) -> None:
         make_ready(devices.projector, settings.sequence, job.retry)
 
 
-BEGINS = "a run begins: it looks at its frames and opens its devices"  # sign of life of a run before its first frame
+BEGINS = "a run begins: it looks at its frames and opens its devices"  # Sign of life of a run before its first frame
 
 
 # Reports that a run is alive, and what it waits for; "" while it takes frames.

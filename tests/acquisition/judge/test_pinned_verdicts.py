@@ -44,7 +44,7 @@ from tests.pinned import Pinned
 ORANGE, SKY, BLUE = (255, 197, 126), (113, 188, 255), (0, 0, 255)
 WHITE_STEP = SessionStep(901, "white", None, WHITE)
 DARK_STEP = SessionStep(902, "dark", None, BLACK)
-ROUNDED = 0.011  # checks are rounded to two digits, which may change in single precision
+ROUNDED = 0.011  # Checks are rounded to two digits, which may change in single precision
 
 
 def said(judgement: Judgement) -> dict[str, Any]:

@@ -50,7 +50,7 @@ SETTINGS = LabSettings.model_validate(
         "sequence": {"reference_every": 5, "warm_up_s": 30, "patience_s": 300},
     }
 )
-OPERATIONS = 1200  # approximate number of operations on the camera's cable in an undisturbed session
+OPERATIONS = 1200  # Approximate number of operations on the camera's cable in an undisturbed session
 
 
 class ColourFilm:
