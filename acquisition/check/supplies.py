@@ -37,8 +37,9 @@ def judge_disk(folder: Path, frames: int, frame_bytes: int) -> Finding:
 def judge_supplies(camera: Camera, frames: int, frame_bytes: int) -> list[Finding]:
     """Judge battery and card, if the camera reports them."""
     if not isinstance(camera, ReportsSupplies):
-        remedy = "look at the display of the camera"
-        return [not_checked(name, f"this camera does not report its {name}", remedy) for name in ("battery", "card")]
+        return [
+            not_checked(name, "this camera does not report it", "look at its display") for name in ("battery", "card")
+        ]
     try:
         supplies = camera.supplies()
     except DeviceError as error:

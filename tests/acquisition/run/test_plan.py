@@ -236,9 +236,9 @@ def test_doubts_unlikely_times() -> None:
 class TestDryRun:
     def test_prints_new_session_without_creating_it(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         lab.write_text(lab.read_text() + '[notify]\nalive = "https://ping.example/s3cret"\n')
-        before = contents(lab.parent)
+        files = contents(lab.parent)
         assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 0
-        assert contents(lab.parent) == before
+        assert contents(lab.parent) == files
         text = capsys.readouterr().out
         assert "night: new, 8 frames to take (4 light, 2 white, 2 dark); 0 frames of 8 done" in text
         assert "shuffled by seed 1" in text
@@ -249,8 +249,8 @@ class TestDryRun:
 
     def test_prints_session_without_changing_it(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         night = lab.parent / "night"
-        found = json_of(main, ["run", lab, night], capsys)
-        assert found == {
+        document = json_of(main, ["run", lab, night], capsys)
+        assert document == {
             "command": "acquire run",
             "session": str(night),
             "frames": 8,
@@ -259,22 +259,22 @@ class TestDryRun:
             "doubts": [],
         }
         with Session.open_for_run(night) as session:
-            taken = sorted(frame.taken_at for frame in session.frames())
+            times = sorted(frame.taken_at for frame in session.frames())
             frame_s = outline(load_lab(lab), night, session).frame_s
             session.retake("2")
         # Frames overlap: an attempt lasts longer than the interval between frames.
         assert frame_s is not None
-        gaps = sorted(after - before for before, after in pairwise(taken))
+        gaps = sorted(later - earlier for earlier, later in pairwise(times))
         assert timedelta(seconds=frame_s) == gaps[len(gaps) // 2]
-        before = contents(lab.parent)
+        files = contents(lab.parent)
         capsys.readouterr()
         assert main(["run", str(lab), str(night), "--dry-run", "--retake", "0-1,2"]) == 0
         assert "3 frames to take (3 light); 5 frames of 8 done" in capsys.readouterr().out
-        assert contents(lab.parent) == before
+        assert contents(lab.parent) == files
         assert main(["run", str(lab), str(night), "--dry-run", "--retake", "9"]) == 2
         assert "has no light 9" in capsys.readouterr().err
         assert main(["run", str(lab), str(night), "--dry-run"]) == 0
-        assert contents(lab.parent) == before
+        assert contents(lab.parent) == files
         text = capsys.readouterr().out
         assert "night: resumed, 1 frame to take (1 light); 7 frames of 8 done" in text
         assert "the largest file of the session" in text
@@ -289,13 +289,13 @@ class TestDryRun:
     @pytest.mark.usefixtures("small_disk")
     def test_full_disk_sets_exit_code(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 5
-        said = capsys.readouterr()
-        assert "the disk of" not in said.out, "a fault is said once"
-        assert "are missing" in said.err
-        found = json_of(main, ["run", lab, lab.parent / "night", "--dry-run"], capsys, code=5)
-        assert (found["command"], found["frames"]) == ("acquire run", 8)
-        assert found["needed_bytes"] > found["free_bytes"] == 10**8
-        (fault,) = found["faults"]
+        printed = capsys.readouterr()
+        assert "the disk of" not in printed.out, "a fault is said once"
+        assert "are missing" in printed.err
+        document = json_of(main, ["run", lab, lab.parent / "night", "--dry-run"], capsys, code=5)
+        assert (document["command"], document["frames"]) == ("acquire run", 8)
+        assert document["needed_bytes"] > document["free_bytes"] == 10**8
+        (fault,) = document["faults"]
         assert fault.startswith("the disk of")
 
     def test_refuses_changed_settings(self, lab: Path) -> None:
