@@ -37,9 +37,7 @@ def judge_disk(folder: Path, frames: int, frame_bytes: int) -> Finding:
 def judge_supplies(camera: Camera, frames: int, frame_bytes: int) -> list[Finding]:
     """Judge battery and card, if the camera reports them."""
     if not isinstance(camera, ReportsSupplies):
-        return [
-            not_checked(name, "this camera does not report it", "look at its display") for name in ("battery", "card")
-        ]
+        return [not_checked(name, "the camera does not report it", "see its display") for name in ("battery", "card")]
     try:
         supplies = camera.supplies()
     except DeviceError as error:

@@ -239,9 +239,8 @@ class LiveJudge:
         white = np.maximum(first, 1.0)
         if np.isnan(first).any():
             white = np.full(3, max(frame.measured.brightest_dn, 1.0))
-        grid = frame.measured.places
-        tiles = [] if result.deviating is None else np.flatnonzero(result.deviating).tolist()
-        boxes = [grid.tile_box(tile) for tile in tiles]
+        grid, deviating = frame.measured.places, result.deviating
+        boxes = [] if deviating is None else [grid.tile_box(tile) for tile in np.flatnonzero(deviating).tolist()]
         outlines = () if self._state.anchor is None else self._state.anchor.outlines
         return preview_jpeg(mosaic, black, white, outlines, boxes, cause.reason if cause else "")
 

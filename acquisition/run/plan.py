@@ -637,7 +637,6 @@ def _camera_text(answers: Answers) -> str:
 def _frames_text(work: Work) -> str:
     counts = Counter(step.kind for step in work.steps if step.number not in work.done)
     kinds_text = ", ".join(f"{counts[name]} {name}" for name in KINDS if counts[name])
-
     open_text = f"{counted(work.remaining, 'frame')} to take ({kinds_text})" if work.remaining else "complete"
     return f"{open_text}; {counted(len(work.done), 'frame')} of {len(work.steps)} done"
 
