@@ -447,7 +447,7 @@ def import_(
 
     with progress("files") as advance:
         imported = import_session(frames, chart, session, advance)
-    output.add(session=session, refused=imported.refused, left=imported.left)
+    output.add(session=session, refused=imported.refused, left=imported.missing)
     print(f"{session}: imported; {len(imported.refused)} frames refused")
     if imported.unchecked:
         print(
@@ -456,9 +456,9 @@ def import_(
         )
     for line in imported.refused:
         print(f"  {line}")
-    if imported.left:
+    if imported.missing:
         raise QualityError(
-            f"{session}: {len(imported.left)} without an accepted frame: {first_few(imported.left)}; list other "
+            f"{session}: {len(imported.missing)} without an accepted frame: {first_few(imported.missing)}; list other "
             "files and import them into a new folder"
         )
 

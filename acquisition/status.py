@@ -13,7 +13,7 @@ from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, Check, doubts_of, duration_text
 from foundation.errors import CropError, counted
 
-LAST = 5  # verdicts and events to show: chosen, as many as fit on a screen
+LAST = 5  # Verdicts and events to show: chosen, as many as fit on a screen
 
 
 # Mark of a value beyond its limits that did not refuse the frame.

@@ -1,1 +1,1 @@
-"""Is the lab ready for a session: a verdict on each of exposure, light, optics, print, sensor and supplies."""
+"""Check a rig before a session: verdicts on exposure, light, optics, print, sensor and supplies."""

@@ -24,7 +24,7 @@ from acquisition.check.exposure import (
     judge_exposure,
     measure_level,
     measure_saturation,
-    try_times,
+    search,
 )
 from acquisition.check.findings import CheckReport, Finding, judge_value, not_checked
 from acquisition.check.picture import check_png
@@ -188,7 +188,7 @@ def _try_exposures(
     def level(shot: Shot) -> TriedTime:
         return measure_level(shot, saturation, _paper(shot, chart))
 
-    trials = try_times(level(first), lambda seconds: level(camera.take(WHITE, seconds)), times)
+    trials = search(level(first), lambda seconds: level(camera.take(WHITE, seconds)), times)
     return TriedExposures(first, trials, tuple(times), saturation)
 
 

@@ -90,19 +90,19 @@ class Photographer:
             self._shutter_s = shutter_s
 
 
-TARGET = 0.7  # white level to search for, as a share of saturation
+TARGET = 0.7  # White level to search for, as a share of saturation
 
 # White levels, as shares of saturation, at which no other time is proposed (judgement). Above, brighter places and the
 # drift of the lamp clip; below, each stop doubles the noise of dark patches.
 SUITABLE = (0.6, 0.8)
 
-TRIALS = 8  # tries at most: five steps of 16 and a last one lead from any time to any other
+TRIALS = 8  # Tries at most: five steps of 16 and a last one lead from any time to any other
 
 # Factor of the exposure that saturates the sensor: the weakest channel of white has a third of the strongest, which is
 # at 0.7 of saturation in a good exposure.
 LONGER = 8.0
 
-LONGEST_S = 30.0  # longest shutter time to try: longer frames cost waiting time and have more hot photosites
+LONGEST_S = 30.0  # Longest shutter time to try: longer frames cost waiting time and have more hot photosites
 
 # Share of the expected counts below which a photosite is saturated. Shutter times are stated as engraved (0.3 s for
 # 0.315 s), so that a ratio of two is wrong by up to 8 %.
@@ -203,9 +203,7 @@ def measure_level(shot: Shot, saturation: Saturation, white: _Array | None = Non
     return TriedTime(shot.shutter_s, (red, green, blue), max(red, green, blue) >= CLIPPING_SHARE)
 
 
-def try_times(
-    first: TriedTime, measure: Callable[[float], TriedTime], times_s: Sequence[float]
-) -> tuple[TriedTime, ...]:
+def search(first: TriedTime, measure: Callable[[float], TriedTime], times_s: Sequence[float]) -> tuple[TriedTime, ...]:
     """Return the tried times, `first` included, until the best offered time is among them.
 
     `measure`: takes a frame at a shutter time, s, and returns its white level.

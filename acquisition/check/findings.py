@@ -13,7 +13,7 @@ from typing import Any, Literal
 from calibration.figures.figure import Limit, Outcome, Range
 
 Grade = Literal["fault", "remark", "not checked", "good"]
-GRADES: tuple[Grade, ...] = ("fault", "remark", "not checked", "good")  # in the order of the report
+GRADES: tuple[Grade, ...] = ("fault", "remark", "not checked", "good")  # In the order of the report
 
 _GRADES: Mapping[Outcome, Grade] = {"accept": "good", "accept with remarks": "remark", "refuse": "fault"}
 

@@ -23,7 +23,7 @@ from experiment.framing.sharpness import MAX_BLUR_PX, edge_blurs
 # Colours of the grades, dark enough to be read on white.
 COLOURS = {"fault": "#b42318", "remark": "#b54708", "not checked": "#667085", "good": "#027a48"}
 
-_LINE = 150  # characters in a line of the verdicts
+_LINE = 150  # Characters in a line of the verdicts
 
 
 def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:

@@ -14,7 +14,7 @@ from calibration.figures.single_frames import BATTERY, CARD, DISK, NOISE_REDUCTI
 from drivers.camera import Camera, ReportsSupplies, Supplies
 from foundation.errors import DeviceError, StorageError
 
-CHARGE = 440  # frames for one battery charge; source: see `BATTERY`
+CHARGE = 440  # Frames for one battery charge; source: see `BATTERY`
 
 
 def judge_disk(folder: Path, frames: int, frame_bytes: int) -> Finding:
@@ -37,8 +37,7 @@ def judge_disk(folder: Path, frames: int, frame_bytes: int) -> Finding:
 def judge_supplies(camera: Camera, frames: int, frame_bytes: int) -> list[Finding]:
     """Judge battery and card, if the camera reports them."""
     if not isinstance(camera, ReportsSupplies):
-        remedy = "look at the display of the camera"
-        return [not_checked(name, f"this camera does not report its {name}", remedy) for name in ("battery", "card")]
+        return [not_checked(name, "the camera does not report it", "see its display") for name in ("battery", "card")]
     try:
         supplies = camera.supplies()
     except DeviceError as error:
@@ -64,8 +63,7 @@ def _card(supplies: Supplies, needed: int) -> Finding:
     if supplies.saves_to_host:
         return Finding("card", "good", "frames are saved on this computer, the card is not used")
     if supplies.card_free_bytes is None:
-        remedy = f"make sure that {bytes_text(needed, up=True)} are free on it"
-        return not_checked("card", "frames are saved on the camera's card, but its free space is not reported", remedy)
+        return not_checked("card", "free space on the card is not reported", f"keep {bytes_text(needed, up=True)} free")
     return judge_value(
         CARD,
         supplies.card_free_bytes / max(needed, 1),

@@ -29,9 +29,9 @@ from experiment.session.records import MIDDLE, FrameKind, Judgement, SessionStep
 from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError, QualityError, RegistrationError
 
-WHITES = 3  # white frames at the beginning and at the end: their scatter is the flicker of the lamp
+WHITES = 3  # White frames at the beginning and at the end: their scatter is the flicker of the lamp
 
-SERIES = 8  # shutter times of a linearity series
+SERIES = 8  # Shutter times of a linearity series
 
 PRIMARIES = {"red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255)}
 

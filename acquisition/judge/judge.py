@@ -141,8 +141,8 @@ class LiveJudge:
             refused = state.updated(step, replace(examined, accepted=False, cause=conflict.name))
             self._state = refused.restarted(self._base)
         if cause is None:
-            untold = {check.name for check in checks if check.value is None and check.name in ("movement", "blur")}
-            self._state = replace(self._state, unmeasured=self._state.unmeasured | untold)
+            unmeasured = {check.name for check in checks if check.value is None and check.name in ("movement", "blur")}
+            self._state = replace(self._state, unmeasured=self._state.unmeasured | unmeasured)
             voids = lasting = False
         elif conflict is not None:
             voids, lasting = True, self._state.restarts > MOST_RESTARTS
@@ -192,9 +192,9 @@ class LiveJudge:
             light = None if state.basis is None else state.basis.light(measured)
             return _FrameChecks(frame, (*checks, *dark), light)
         if frame.anchor is None and anchor is not None:
-            movement, place = _judge_movement(state, anchor, mosaic, black, frame, settings.judge)
+            movement, position = _judge_movement(state, anchor, mosaic, black, frame, settings.judge)
             checks += movement
-            frame = replace(frame, moved_px=place)
+            frame = replace(frame, moved_px=position)
         if step.kind == "white":
             checks.append(judge_white(state.first_white, frame))
         if is_brightest_grey(step):
@@ -239,9 +239,8 @@ class LiveJudge:
         white = np.maximum(first, 1.0)
         if np.isnan(first).any():
             white = np.full(3, max(frame.measured.brightest_dn, 1.0))
-        grid = frame.measured.places
-        tiles = [] if result.deviating is None else np.flatnonzero(result.deviating).tolist()
-        boxes = [grid.tile_box(tile) for tile in tiles]
+        grid, deviating = frame.measured.places, result.deviating
+        boxes = [] if deviating is None else [grid.tile_box(tile) for tile in np.flatnonzero(deviating).tolist()]
         outlines = () if self._state.anchor is None else self._state.anchor.outlines
         return preview_jpeg(mosaic, black, white, outlines, boxes, cause.reason if cause else "")
 
@@ -264,10 +263,10 @@ def _judge_basis(state: JudgeState, following: JudgeState) -> Check | None:
     if all(check.passed for check in checks):
         return None
     uneven = next((check for check in checks if check.name == "uniformity"), Check(UNIFORMITY.name))
-    by = "" if uneven.passed else f" by {uneven.value} %, limit {uneven.high} %"
+    text = "" if uneven.passed else f" by {uneven.value} %, limit {uneven.high} %"
     return replace(
         uneven,
-        reason=f"red + green + blue differ from the white or grey frame before them{by}; somebody may have stood in "
+        reason=f"red + green + blue differ from the white or grey frame before them{text}; somebody may have stood in "
         "front of the chart, or a window may have covered the picture. These frames are repeated",
     )
 
@@ -289,7 +288,7 @@ def _judge_origin(
                     f"the {name} is {value}, but {expected} in the first frame of the session; connect the camera with "
                     "which the session was started, and set it to full-size raw"
                 )
-    differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
+    difference = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
     empty = ""
     if measured.empty > EMPTY_PHOTOSITES.accept:
         empty = (
@@ -298,17 +297,16 @@ def _judge_origin(
         )
     return (
         Check(OTHER_CAMERA.name, reason=reason),
-        Check("settings", reason=differs or ""),
+        Check("settings", reason=difference or ""),
         Check(EMPTY_PHOTOSITES.name, round(100 * measured.empty, 4), None, 100 * EMPTY_PHOTOSITES.accept, "%", empty),
     )
 
 
 def _judge_repeated(state: JudgeState, measured: Measured) -> Check:
-    """Check whether the camera returned an earlier frame: its noise is the same."""
     reason = f"{REPEATED.why}; {REPEATED.remedy}"
     if measured.digest in state.digests:
         return Check(REPEATED.name, 0.0, REPEATED.accept, None, "", reason)
-    values = [_independence(measured, seen.measured) for seen in state.recent]
+    values = [_independence(measured, earlier.measured) for earlier in state.recent]
     value = min((value for value in values if value is not None), default=None)
     if value is None:
         return Check(REPEATED.name)
@@ -341,7 +339,7 @@ def _judge_exposure(
     )
 
 
-UNKNOWN_PLACE: npt.NDArray[np.float64] = np.full(2, np.nan)  # position of a chart that could not be measured
+UNKNOWN_PLACE: npt.NDArray[np.float64] = np.full(2, np.nan)  # Position of a chart that could not be measured
 
 _UNRECOGNISED = (
     "the chart was not detected at its last position: it is covered, out of focus, or has moved by more than its tags "
@@ -350,7 +348,6 @@ _UNRECOGNISED = (
 
 
 def _best_channel(measured: Measured) -> tuple[Channel, float]:
-    """Return the channel with the best signal-to-noise ratio, and its mean counts above black."""
     level = np.maximum(measured.level, 0)
     best = int((level / np.sqrt(measured.noise.variance(level))).argmax())
     return CHANNELS[best], float(level[best])
@@ -387,22 +384,22 @@ def _judge_movement(
         ], UNKNOWN_PLACE
     shift = anchor.shift(mosaic, black, channel)
     if shift.gauges == 0:
-        far = anchor.displacement(mosaic, black, channel)
-        if far is None:
+        large_shift_px = anchor.displacement(mosaic, black, channel)
+        if large_shift_px is None:
             return [Check("movement", None, None, judge.moved_px, "px", _UNRECOGNISED)], UNKNOWN_PLACE
-        reason, distance = _movement_reason(far, judge.moved_px), round(float(np.hypot(*far)), 3)
-        return [Check("movement", distance, None, judge.moved_px, "px", reason)], np.array(far)
-    place = np.array([shift.dx, shift.dy])
-    change = place - (state.moved_px if state.moved_px is not None else np.zeros(2))
+        reason, distance = _movement_reason(large_shift_px, judge.moved_px), round(float(np.hypot(*large_shift_px)), 3)
+        return [Check("movement", distance, None, judge.moved_px, "px", reason)], np.array(large_shift_px)
+    position = np.array([shift.dx, shift.dy])
+    change = position - (state.moved_px if state.moved_px is not None else np.zeros(2))
     moved = float(np.hypot(*change))
     reason = ""
     if moved > judge.moved_px:
-        steady = float(np.hypot(*(place - np.array(state.candidate[1:])))) <= limits.STEADY_PX
-        followed = steady and float(np.hypot(*place)) <= limits.MOVED_FOLLOWED_PX
+        steady = float(np.hypot(*(position - np.array(state.candidate[1:])))) <= limits.STEADY_PX
+        followed = steady and float(np.hypot(*position)) <= limits.MOVED_FOLLOWED_PX
         reason = "" if followed or state.rested else _movement_reason(change.tolist(), judge.moved_px)
     checks = [Check("movement", round(moved, 3), None, judge.moved_px, "px", reason)]
     if paper < limits.BLUR_DIM_DN:
-        return [*checks, Check("blur", None, None, judge.blur_px, "px")], place
+        return [*checks, Check("blur", None, None, judge.blur_px, "px")], position
     softer = float(np.sign(shift.blur_growth_px2) * np.sqrt(abs(shift.blur_growth_px2)))
     blurred = ""
     low = -limits.SHARPER * judge.blur_px
@@ -412,7 +409,7 @@ def _judge_movement(
             f"{abs(softer):.2f} px, at most {judge.blur_px if softer > 0 else -low:g} px allowed; check the focus, "
             "switch off autofocus and stabilisation, and look for vibrations"
         )
-    return [*checks, Check("blur", round(softer, 3), low, judge.blur_px, "px", blurred)], place
+    return [*checks, Check("blur", round(softer, 3), low, judge.blur_px, "px", blurred)], position
 
 
 def _movement_reason(shift_px: Sequence[float], allowed_px: float) -> str:
@@ -423,9 +420,9 @@ def _movement_reason(shift_px: Sequence[float], allowed_px: float) -> str:
     )
 
 
-_SIGMAS = 6.0  # standard deviations of the noise of a mean that are no change
+_SIGMAS = 6.0  # Standard deviations of the noise of a mean that are no change
 
-_TILES = 16  # tiles averaged before their change in the dark is judged: a lamp in a corner lights as many
+_TILES = 16  # Tiles averaged before their change in the dark is judged: a lamp in a corner lights as many
 
 # Immediate repetitions of contradicted first frames: a passing disturbance ends within a minute, and one that returns a
 # third time needs a person.
@@ -501,7 +498,6 @@ def dark_level(tiles: _Array, scale: _Array) -> float:
 
 
 def _by_region(tiles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return means (24, 3) of 4×4 tiles each."""
     side = round(_TILES**0.5)
     grid = tiles.reshape(TILE_ROWS // side, side, TILE_COLUMNS // side, side, 3)
     return np.asarray(grid.mean(axis=(1, 3))).reshape(-1, 3)
@@ -571,7 +567,6 @@ def judge_first_frames(state: JudgeState, step: SessionStep, cause: Check | None
 
 
 def _inconsistent_white(state: JudgeState, judge: JudgeSettings) -> Check | None:
-    """Return why the first white frame disagrees with the prediction of the others; None if it agrees."""
     white = next((frame.measured for frame in state.first_frames if frame.codes == (255, 255, 255)), None)
     model = state.model_without_white()
     if white is None or model is None or state.basis is None:
@@ -685,13 +680,11 @@ def _without_consequences(checks: Sequence[Check]) -> tuple[Check, ...]:
 
 
 def _voids_others(state: JudgeState, cause: str) -> bool:
-    """Return whether a refused reference voids the frames since the last good one."""
     hidden = CAUSES[cause].is_hidden or (CAUSES[cause].in_each_light and not state.modelled)
     return hidden or cause in state.unmeasured
 
 
 def _is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
-    """Return whether repeating the frame cannot help; `state` includes it."""
     # If the lamp has changed at the start of a run, all illuminants up to the next white frame would be lost.
     is_changed_lamp = cause == WHITE_DRIFT.name and is_brightest_grey(step)
     # If the first frame of a session is overexposed, so is its repetition.
@@ -699,17 +692,17 @@ def _is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
     return is_changed_lamp or is_overexposed or CAUSES[cause].lasts or state.refusals[1] >= limits.LASTING_FRAMES
 
 
-_SAME_SD = 0.0015  # least relative scatter of amounts between two frames of one illuminant
+_SAME_SD = 0.0015  # Least relative scatter of amounts between two frames of one illuminant
 
-_SAME_FLOOR = 4e-4  # the same without light, share of a full primary
+_SAME_FLOOR = 4e-4  # The same without light, share of a full primary
 
-_NEAREST = 12  # illuminants of the plan that are compared in full with a wrong one
+_NEAREST = 12  # Illuminants of the plan that are compared in full with a wrong one
 
 _PRIMARIES = ("red", "green", "blue")
 
-_ORDERED_LEAST = 0.005  # least ordered light of a primary, share of its full light, that can be missing
+_ORDERED_LEAST = 0.005  # Least ordered light of a primary, share of its full light, that can be missing
 
-_MISSING = 0.05  # share of the ordered light of a primary below which it is missing: leaked black is less
+_MISSING = 0.05  # Share of the ordered light of a primary below which it is missing: leaked black is less
 
 _Array = npt.NDArray[np.float64]
 
@@ -815,15 +808,15 @@ class _LightComparison:
     def cause(self, is_wrong: bool, room: float, *, was_refused: bool) -> tuple[str, float]:
         """Return the message about a wrong colour, or "", and the light added to the ordered illuminant.
 
-        `wrong`: whether the colour is beyond its limit. `room`: allowed change of log lamp brightness. `again`: whether
-        the previous frame was also refused for its light.
+        `is_wrong`: whether the colour is beyond its limit. `room`: allowed change of log lamp brightness.
+        `was_refused`: whether the previous frame was also refused for its light.
         """
         fit = self.fit
         squared = fit.distance**2 + (fit.brightness / fit.brightness_sd) ** 2
         same = self._distance_to_previous()
         changed = self.previous is not None and self.previous.codes != self.codes
-        fits_before = same < limits.LIGHT_SIGMAS and squared - same**2 > limits.STALE_ADVANTAGE
-        if self.previous is not None and changed and fits_before:
+        fits_previous = same < limits.LIGHT_SIGMAS and squared - same**2 > limits.STALE_ADVANTAGE
+        if self.previous is not None and changed and fits_previous:
             return _stale_reason(self.previous, self.codes), 0.0
         missing = self._missing_reason()
         if missing:
@@ -839,14 +832,14 @@ class _LightComparison:
         if is_wrong:
             if ambient is not None:
                 return _ambient_reason(ambient[0]), ambient[0]
-            other = self._other_reason(squared)
-            coloured = 0.0 if other else self._coloured_light()
+            other_illuminant = self._other_reason(squared)
+            coloured = 0.0 if other_illuminant else self._coloured_light()
             if coloured:
                 return _ambient_reason(coloured), coloured
             repeated = was_refused and not changed and same < limits.LIGHT_SIGMAS
-            if repeated and not other and fit.angle_deg <= limits.LIGHT_FOLLOWED_DEG:
+            if repeated and not other_illuminant and fit.angle_deg <= limits.LIGHT_FOLLOWED_DEG:
                 return "", 0.0
-            return other or self._wrong_reason(), 0.0
+            return other_illuminant or self._wrong_reason(), 0.0
         if fit.brightness > room and ambient is not None and ambient[1] + 9 < fit.distance**2:
             return _ambient_reason(ambient[0]), ambient[0]
         if fit.distance > limits.STALE_SIGMAS:
@@ -868,7 +861,6 @@ class _LightComparison:
         return _light_distance(self.light.amounts, self.previous.amounts, self.model.chroma_sd)
 
     def _missing_reason(self) -> str:
-        """Return the message about missing primaries, if the others are as ordered; else ""."""
         amounts, ordered = self.light.amounts, self.expected.amounts
         sd = np.sqrt(
             np.diag(self.expected.with_lamp + self.light.covariance) + (self.model.brightness_sd * ordered) ** 2
@@ -883,8 +875,8 @@ class _LightComparison:
             return ""
         names = " and ".join(name for name, missing in zip(_PRIMARIES, is_missing, strict=True) if missing)
         return (
-            f"{names} is missing, the rest is as ordered ({self._amounts_text()}); check lamp, panel and filter of "
-            f"the projector for {names}, the video cable, and the picture mode"
+            f"the light of {names} is missing, the rest is as ordered ({self._amounts_text()}); check the {names} "
+            "lamp, panel and filter of the projector, the video cable, and the picture mode"
         )
 
     def _amounts_text(self) -> str:
@@ -1009,25 +1001,25 @@ def _codes_text(codes: Codes) -> str:
     return "black" if not any(codes) else "({}, {}, {})".format(*codes)
 
 
-# median relative deviation below which places are reported as covered
+# Median relative deviation below which places are reported as covered
 _DARKER = -0.1
 
 # Share of squared deviation that the previous illuminant may leave unexplained if a place still shows it: 6° off.
 _PREVIOUS_RESIDUAL = 0.01
 
-_WHOLE_FRAME = 0.5  # share of deviating tiles above which the whole frame deviates
+_WHOLE_FRAME = 0.5  # Share of deviating tiles above which the whole frame deviates
 
 # Trial blurs σ, half-size px, for rows that deviate.
 _BLURS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 
-_EXPLAINED = 0.4  # share of the median deviation of rows that may remain if a blur is the cause
+_EXPLAINED = 0.4  # Share of the median deviation of rows that may remain if a blur is the cause
 
 # Median relative deviation of rows above which a blur is tried: below it only some rows deviate.
 _BLURRED = 0.02
 
-_CONTRAST = 2.0  # contrast of the chart at the edges of a tile, relative: tags, paper, patches
+_CONTRAST = 2.0  # Contrast of the chart at the edges of a tile, relative: tags, paper, patches
 
-_BY_TURNS = 0.1  # share of deviating rows of either sign above which they belong to other places
+_BY_TURNS = 0.1  # Share of deviating rows of either sign above which they belong to other places
 
 # Median step from row to row over the median deviation, above which rows belong to several places. Shadows, windows and
 # parts of a picture have at most 0.03, scrambled rows at least 0.2 (simulated).
@@ -1036,7 +1028,7 @@ _RAGGED = 0.1
 # Movement or blur, px, that rows at the edges of the chart tolerate: smaller ones cannot always be measured.
 _UNSEEN_PX = 1.0
 
-_EDGE = 0.15  # relative deviation of a row per px of sideways movement: other patches at the ends of a strip
+_EDGE = 0.15  # Relative deviation of a row per px of sideways movement: other patches at the ends of a strip
 
 
 def _judge_evenness(
@@ -1070,7 +1062,7 @@ def _judge_evenness(
 def _share_of_previous(
     basis: Basis, light: FrameLight, frame: Measured, deviating: npt.NDArray[np.bool_], previous: RecentFrame | None
 ) -> float:
-    """Return the share of the exposure during which tiles `off` (T,) bool showed the previous illuminant.
+    """Return the share of the exposure during which tiles `deviating` (T,) bool showed the previous illuminant.
 
     0 if another illuminant was shown, or a shadow explains the deviation as well.
     """
@@ -1098,7 +1090,6 @@ def _neighbour_contrast(basis: Basis) -> _Array:
 
 
 def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Array, uneven: bool) -> list[Check]:
-    """Check that rows have the expected content, and measure their blur if they have not."""
     down = float(moved_px[1])
     rest = basis.strips(frame, light.amounts, down)
     if rest is None:
@@ -1192,7 +1183,6 @@ def _uneven_reason(rest: Residuals, deviating: npt.NDArray[np.bool_], late: floa
 
 
 def _position_text(deviating: npt.NDArray[np.bool_]) -> str:
-    """Return the position of tiles in words: "top left", "right", "in the middle"."""
     rows, columns = np.nonzero(deviating.reshape(TILE_ROWS, TILE_COLUMNS))
     y, x = (float(np.mean(rows)) + 0.5) / TILE_ROWS, (float(np.mean(columns)) + 0.5) / TILE_COLUMNS
     words = ["top" if y < 0.38 else "bottom" if y > 0.62 else "", "left" if x < 0.38 else "right" if x > 0.62 else ""]

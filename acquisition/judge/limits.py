@@ -33,9 +33,9 @@ OTHER_ADVANTAGE: Final = 20.0
 # Light in dark frames, percent of white, at which `build-lut` adds a remark: the user must see it during the night.
 ROOM_LIGHT_PERCENT: Final = 100 * LEAK_SHARE.accept
 
-UNEVEN_WHITE: Final = 0.25  # deviation of a tile, relative, if the camera's own colours replace unknown primaries
+UNEVEN_WHITE: Final = 0.25  # Deviation of a tile, relative, if the camera's own colours replace unknown primaries
 
-UNEVEN_TILES: Final = 0.05  # share of the tiles that must deviate by it
+UNEVEN_TILES: Final = 0.05  # Share of the tiles that must deviate by it
 
 # Standard deviations of the noise of a tile: none of 384 tiles in 767 frames of 100 sessions exceeds them by chance.
 UNEVEN_SIGMAS: Final = 7.0
@@ -54,7 +54,7 @@ LEAST_NOISE: Final = 0.4
 # `build-lut` adds a remark at half of this.
 ADDED_LEAST: Final = 2 * DARK_DRIFT.accept
 
-ADDED_MOST: Final = 0.1  # largest light that a room can add, share of white; more is another picture
+ADDED_MOST: Final = 0.1  # Largest light that a room can add, share of white; more is another picture
 
 # Largest step of log lamp brightness (5 %) that is accepted if the repeated frame shows it again. Each illuminant has
 # its own ground truth, so that brightness does no harm; a larger step means that the lamp fails.
@@ -72,7 +72,7 @@ LIGHT_FOLLOWED_DEG: Final = OFF_CODES_DEG.accept
 # shifts its grid up to this, and adds a remark beyond.
 MOVED_FOLLOWED_PX: Final = 1.0
 
-STEADY_PX: Final = 0.1  # largest difference of two positions, half-size px, of a chart at rest
+STEADY_PX: Final = 0.1  # Largest difference of two positions, half-size px, of a chart at rest
 
 # Counts of paper above black below which a frame is too dark to measure movement (0.02 px at 66 counts) and blur.
 DIM_DN: Final = 40.0
@@ -81,9 +81,9 @@ DIM_DN: Final = 40.0
 # px (200 of a million photosites, `benchmarks.detection`).
 BLUR_DIM_DN: Final = 500.0
 
-SHARPER: Final = 2.0  # factor by which a loss of blur may exceed a growth: it harms no sample
+SHARPER: Final = 2.0  # Factor by which a loss of blur may exceed a growth: it harms no sample
 
-# refusals in a row for one cause that make it a lasting one: the default number of attempts
+# Refusals in a row for one cause that make it a lasting one: the default number of attempts
 LASTING_FRAMES: Final = 3
 
 # Angle between the linear codes of two illuminants above which they cannot look alike, if no primaries are known.

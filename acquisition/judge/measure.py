@@ -50,9 +50,9 @@ from foundation.errors import FormatError
 
 _Array = npt.NDArray[np.float64]
 
-_TEXTURE_PX = 32  # side of a textured place that replaces a tag, half-size px
+_TEXTURE_PX = 32  # Side of a textured place that replaces a tag, half-size px
 
-_TEXTURES = (4, 2)  # textured places along width and height: as many as gauges are measured
+_TEXTURES = (4, 2)  # Textured places along width and height: as many as gauges are measured
 
 # Search radius around the predicted position of a white reference, half-size px: lens distortion and waves of the paper
 # move it as far.
@@ -65,7 +65,7 @@ _PAPER_LEVEL = 0.7
 # high noise in this frame, so that all later frames would seem darker by 0.2 %.
 _PAPER_PX = 7
 
-_MOST_PAPER = 300  # white references to measure: their mean is accurate to 0.1 % if each is to 2 %
+_MOST_PAPER = 300  # White references to measure: their mean is accurate to 0.1 % if each is to 2 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +213,7 @@ def _textures(plane: Plane) -> ChartPose:
     return ChartPose(plane, tuple(tags), (), np.eye(3), 0.0, float("nan"), 1.0, True, 0.0)
 
 
-VERSION = 1  # version of the byte format
+VERSION = 1  # Version of the byte format
 
 
 @dataclass(frozen=True, eq=False)

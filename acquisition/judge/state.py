@@ -42,7 +42,7 @@ from foundation.robust import huber_weights, robust_sigma
 # Codes of the nodes of a tone curve; between them a curve bends by less than 0.001.
 _NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 184, 200, 216, 232, 255.0])
 
-_POWER = 2.2  # exponent of the mean tone curve: displays have 1.8 to 2.6
+_POWER = 2.2  # Exponent of the mean tone curve: displays have 1.8 to 2.6
 
 # Prior standard deviations of exponent and bends of a tone curve (log), and correlation length of the bends in log
 # code: sRGB, S-shaped curves and any exponent from 1.4 to 3 lie within two standard deviations.
@@ -54,7 +54,7 @@ _OWN = 0.15
 # Prior standard deviation of a primary's frame at `TOP`, relative: 0.5 % for a colour wheel, and the lamp.
 _LEVEL = 0.01
 
-_OVERLAP = 0.25  # prior standard deviation of light added by overlaps: white segments add up to half
+_OVERLAP = 0.25  # Prior standard deviation of light added by overlaps: white segments add up to half
 
 # Share by which the added light may deviate from the assumed form: except for white, it need not follow the least code.
 # It widens the limits of mixed illuminants only if light does not add.
@@ -65,7 +65,7 @@ LAMP_STEP = 3e-4
 
 RESTED = 0.05  # Standard deviation of log lamp brightness after a pause: the lamp may be cold, aged or replaced.
 
-RESTED_COLOUR = 0.01  # standard deviation of the log level of each primary after a pause
+RESTED_COLOUR = 0.01  # Standard deviation of the log level of each primary after a pause
 
 # Standard deviation of an amount in the dark, share of a full primary: drift of black level and stray light.
 _ABSOLUTE = 3e-4
@@ -74,12 +74,12 @@ _ABSOLUTE = 3e-4
 # with a jitter of 0.5 ms give 0.24 % of R/G at 0.5 s, and 0.47 % at 0.25 s.
 _CHROMA, _BRIGHTNESS = 0.004, 0.002
 
-_PRIOR_WEIGHT = 12.0  # weight of this prior scatter, in number of amounts
+_PRIOR_WEIGHT = 12.0  # Weight of this prior scatter, in number of amounts
 
 # Lower bounds of the scatter: tiles and tone curves are not more accurate.
 _LEAST_CHROMA, _LEAST_BRIGHTNESS = 0.0006, 0.0006
 
-_ITERATIONS = 6  # iterations of an update: an overlap of 60 % needs four for 0.1 %
+_ITERATIONS = 6  # Iterations of an update: an overlap of 60 % needs four for 0.1 %
 
 # Overlapping primaries: each pair, and all three.
 _SUBSETS: tuple[tuple[int, ...], ...] = ((0, 1), (0, 2), (1, 2), (0, 1, 2))
@@ -90,12 +90,12 @@ _TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if pr
 # Number of nodes. The state holds three curves, three levels, the overlaps, and the lamp brightness, in this order.
 _N = len(_NODES)
 
-_CURVES = 3 * _N  # entries of the state for curves
+_CURVES = 3 * _N  # Entries of the state for curves
 
 _OVERLAPS = slice(_CURVES + 3, _CURVES + 3 + len(_TERMS))
-_LAMP = _CURVES + 3 + len(_TERMS)  # last entry of the state: log lamp brightness
+_LAMP = _CURVES + 3 + len(_TERMS)  # Last entry of the state: log lamp brightness
 
-_SIZE = _LAMP + 1  # entries of the state
+_SIZE = _LAMP + 1  # Entries of the state
 
 _Array = npt.NDArray[np.float64]
 Codes = tuple[int, int, int]
@@ -281,17 +281,15 @@ class ProjectorModel:
         squares, number = self.brightness
         return replace(self, covariance=covariance, brightness=(squares + step**2, number + 1))
 
-    def _scatter(
-        self, errors: _Array, innovation: _Array, count: int
-    ) -> tuple[tuple[float, float], tuple[float, float]]:
-        mean = float(errors.mean())
+    def _scatter(self, logs: _Array, innovation: _Array, count: int) -> tuple[tuple[float, float], tuple[float, float]]:
+        mean = float(logs.mean())
         # Uncertainty of the model is no scatter: a frame is weighted by the part of its deviation that is scatter.
         own = self.chroma_sd**2 * (1 - 1 / count) if count > 1 else 0.0
         spread = float(np.mean(np.diag(innovation)) - np.mean(innovation))
         weight = min(1.0, own / max(spread, 1e-12)) * (count - 1)
         chroma = (
             self.chroma[0]
-            + weight * min(float(((errors - mean) ** 2).sum()) / max(count - 1, 1), (8 * self.chroma_sd) ** 2),
+            + weight * min(float(((logs - mean) ** 2).sum()) / max(count - 1, 1), (8 * self.chroma_sd) ** 2),
             self.chroma[1] + weight,
         )
         together = min(1.0, self.brightness_sd**2 / max(float(np.mean(innovation)), 1e-12))
@@ -327,7 +325,7 @@ class ProjectorModel:
 
 _LIT = 0.01  # Least share of the median tile's white for a tile to be used: a black backdrop has 4 %.
 
-_SYSTEMATIC = 0.003  # relative error of a tile's counts, in addition to noise, in the weights of the fit
+_SYSTEMATIC = 0.003  # Relative error of a tile's counts, in addition to noise, in the weights of the fit
 
 # Standard deviation of a frame's black level in each channel, counts. The mean of a masked border is accurate to 0.1,
 # but the black level of the image differs from it by some tenths. It matters if white has only some hundred counts.
@@ -339,7 +337,7 @@ _FAINT = 0.1
 # Movement, half-size px, up to which strips are not shifted: the error of its measurement in a dim frame.
 _AT_REST_PX = 0.02
 
-_ROUNDS = 6  # iterations of the reweighted fit
+_ROUNDS = 6  # Iterations of the reweighted fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -497,7 +495,7 @@ def _residuals(
     return Residuals(relative, np.sqrt(variance) / reference, signed)
 
 
-RECENT = 6  # frames whose noise is compared with the next: a memory card returns no older ones
+RECENT = 6  # Frames whose noise is compared with the next: a memory card returns no older ones
 
 LEANING = 3  # Frames whose small deviations are averaged. More frames would take a drift of the lamp for a step.
 

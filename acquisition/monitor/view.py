@@ -59,12 +59,12 @@ from foundation.colorimetry import decode_srgb
 from foundation.errors import CropError, FormatError, first_few
 from foundation.files import write_atomic
 
-RUN_STARTS = "start"  # event at the start of the first frame of a run
+RUN_STARTS = "start"  # Event at the start of the first frame of a run
 
 # Durations of recent frames after which a frame is late: a repeated download takes twice as long.
 LATE_FRAMES = 3
 
-AT_WORK = ("running", "waiting", "paused", "late")  # states of an active run
+AT_WORK = ("running", "waiting", "paused", "late")  # States of an active run
 
 # Names of devices in sentences, for which a run may hang or wait.
 CAUSES = ("the camera", "the screen", "the projector", "the disk", "the frames")
@@ -72,7 +72,7 @@ CAUSES = ("the camera", "the screen", "the projector", "the disk", "the frames")
 # Free space below which a disk is full before the first frame: a row of the journal has 100 kB.
 LEAST_FREE_BYTES = 1 << 20
 
-LOOK = "look at the camera, its cable and the machine"  # remedy if a run reports nothing
+LOOK = "look at the camera, its cable and the computer"  # Remedy if a run reports nothing
 
 # Largest difference, s, between the clocks of lab and computer at which the end is shown as a time of day. The time of
 # a simulated lab passes differently, and an older attempt cannot predict the end.
@@ -230,7 +230,7 @@ def read_session(folder: Path, earlier: SessionView | None = None) -> SessionVie
 
 def _without_own_files(folder: Path) -> str:
     missing = [str(folder / name) for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
-    return f"{' and '.join(missing)}: missing; restore from a copy of the session" if missing else ""
+    return f"{' and '.join(missing)}: missing; restore it from a copy of the session" if missing else ""
 
 
 def _lights_of(folder: Path) -> tuple[Illumination, ...]:
@@ -275,8 +275,8 @@ def head_of(
     was stopped by a signal. `free_bytes`: on the session's disk; None if unknown.
     """
     steps, attempts, heartbeat = view.steps, view.attempts, view.heartbeat
-    accepted = {attempt.step for attempt in attempts if attempt.verdict == ACCEPTED}
-    complete = accepted & {step.number for step in steps} - {*view.lost}
+    numbers = {step.number for step in steps} - {*view.lost}
+    complete = {attempt.step for attempt in attempts if attempt.verdict == ACCEPTED} & numbers
     verdicts = [attempt.verdict for attempt in attempts]
     missing = len(steps) - len(complete)
     intervals = [attempt.seconds for attempt in attempts[-RECENT:] if attempt.seconds is not None]
@@ -358,7 +358,7 @@ def _state_of(
     return heartbeat.state, heartbeat.sentence
 
 
-Json = dict[str, Any]  # a JSON object
+Json = dict[str, Any]  # A JSON object
 
 
 # Age of a file, s, below which it is read again: it may change within the resolution of its time stamp (10 ms at the
@@ -373,7 +373,7 @@ LOOK_AGAIN_S = 10.0
 _SENT_AGAIN = 3
 
 
-MOST_PICTURE_BYTES = 4 << 20  # size limit of a preview: many times that of 640 px
+MOST_PICTURE_BYTES = 4 << 20  # Size limit of a preview: many times that of 640 px
 
 _JPEG = b"\xff\xd8\xff"
 
@@ -450,7 +450,7 @@ class SessionWatch:
 
     def _head(self) -> Head:
         if self._trouble is not None or self._known is None:
-            return self._trouble or Head("absent", f"the session {self.folder} does not exist yet; this page waits")
+            return self._trouble or Head("absent", f"there is no session {self.folder} yet; this page waits for it")
         return self._known.view.head(datetime.now(UTC))
 
     def _news(self, numbered: _Numbered, since: str) -> Json:
@@ -639,7 +639,7 @@ def _read_picture(folder: Path, file: str) -> bytes:
     return b""
 
 
-REPORT_FILE = "report.html"  # name of the report in the session's folder
+REPORT_FILE = "report.html"  # Name of the report in the session's folder
 
 # Total size of the pictures in a report: with the third added by base64 it can still be mailed (10 MB on most servers).
 MOST_PICTURES_BYTES = 6 << 20

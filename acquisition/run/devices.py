@@ -50,19 +50,19 @@ from foundation.errors import (
 # Receiver of an event and its sentence: the terminal first, then the journal, then the target of notices.
 Report = Callable[[str, str], object]
 
-POWER_LIMIT_S: Final = 300.0  # time for a lamp to light, s; makers state up to 130 s with repeated ignition
+POWER_LIMIT_S: Final = 300.0  # Time for a lamp to light, s; makers state up to 130 s with repeated ignition
 RELIGHT_S: Final = 15.0  # s; no lamp lights again, with its projector back on the network, in less
 
-QUESTIONS_SHARE: Final = 0.01  # share of a frame's time that questions may always take: five answers of 4 ms in 2.3 s
+QUESTIONS_SHARE: Final = 0.01  # Share of a frame's time that questions may always take: five answers of 4 ms in 2.3 s
 
 _NAME: Final = "the projector"
 
 # Time for a projector to begin to switch off, s: projectors confirm the command before they execute it.
 OBEYS_S: Final = 5.0
-LOOK_S: Final = 0.5  # interval between two questions for the power state, s
+LOOK_S: Final = 0.5  # Interval between two questions for the power state, s
 
-TRIES: Final = 3  # tries to switch off the lamp: after one lost answer it must not burn until the morning
-AGAIN_S: Final = 2.0  # interval between two of them, s: a busy controller answers then
+TRIES: Final = 3  # Tries to switch off the lamp: after one lost answer it must not burn until the morning
+AGAIN_S: Final = 2.0  # Interval between two of them, s: a busy controller answers then
 
 _BY_HAND: Final = "switch it off by hand"
 
@@ -440,7 +440,7 @@ def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> No
 
 # Time before the second try, s: enough for a notification over the picture, or a cable that is plugged in again.
 RETRY_S: Final = 1.0
-PAUSE_S: Final = 5.0  # interval between two tries in a pause, s: too short for an operator to notice
+PAUSE_S: Final = 5.0  # Interval between two tries in a pause, s: too short for an operator to notice
 # Duration of a failed try, s, after which the pause is reported at once: its driver has already tried often.
 SLOW_S: Final = 10.0
 # Longest time between signs of life during a try, s: a camera's driver waits 90 s for a frame of 30 s, then 70 s over a
@@ -452,10 +452,10 @@ TRY_S: Final = 300.0
 RECURS_WITHIN: Final = 10
 # Time between the second and the third try of a refused frame, s; every later pause is twice as long.
 BACK_OFF_S: Final = 5.0
-LONGEST_BACK_OFF_S: Final = 300.0  # longest such time, s: an operator can wait for five minutes
-FRAMES: Final = "the frames"  # name of the "device" in pauses for refused frames
-REPORTED_LATE: Final = " (this was at "  # end of a sentence that the full disk could not store at once
-INSTANT_S: Final = 1e-6  # resolution of simulated time, s
+LONGEST_BACK_OFF_S: Final = 300.0  # Longest such time, s: an operator can wait for five minutes
+FRAMES: Final = "the frames"  # Name of the "device" in pauses for refused frames
+REPORTED_LATE: Final = " (this was at "  # End of a sentence that the full disk could not store at once
+INSTANT_S: Final = 1e-6  # Resolution of simulated time, s
 
 _Result = TypeVar("_Result")
 
@@ -672,15 +672,15 @@ def _family(fault: CropError) -> type[CropError]:
     return next(error_class for error_class in type(fault).__mro__ if error_class.__module__ == errors.__name__)
 
 
-TICK_S: Final = 1.0  # interval between two looks at the time, s
+TICK_S: Final = 1.0  # Interval between two looks at the time, s
 
-# delay of a look, s, after which the program was stopped: a busy machine delays a thread by 1 to 2 s
+# Delay of a look, s, after which the program was stopped: a busy machine delays a thread by 1 to 2 s
 GAP_S: Final = 10.0
 
 # Factor of the expected duration after which a step is late: a download that is tried again takes twice as long.
 LATE_TIMES: Final = 3.0
 
-LATE_S: Final = 10.0  # additional seconds: a busy disk or machine may stall for some
+LATE_S: Final = 10.0  # Additional seconds: a busy disk or machine may stall for some
 
 
 @dataclass

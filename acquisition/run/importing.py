@@ -46,12 +46,12 @@ class Imported:
     """Result of an import.
 
     - `refused`: one sentence for each refused frame.
-    - `left`: illuminants and kinds of frames without an accepted frame, in words.
+    - `missing`: illuminants and kinds of frames without an accepted frame, in words.
     - `unchecked`: suffixes of formats that cannot be checked for completeness.
     """
 
     refused: tuple[str, ...]
-    left: tuple[str, ...]
+    missing: tuple[str, ...]
     unchecked: tuple[str, ...]
 
 

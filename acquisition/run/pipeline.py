@@ -66,7 +66,7 @@ DOWNLOADS = 2
 # frame; its download over a slow cable.
 COMMIT_S, SHOW_S, RELEASE_S, JUDGE_S, DOWNLOAD_S = 1.0, 2.0, 3.0, 5.0, 10.0
 
-PROMISE = "ending after this frame; press Ctrl-C again to end at once"  # answer to a request to end the run
+PROMISE = "ending after this frame; press Ctrl-C again to end at once"  # Answer to a request to end the run
 
 _CAMERA, _SCREEN, _DISK = "the camera", "the screen", "the disk"
 

@@ -58,7 +58,7 @@ FIXED: Final = (
     "sequence.reference_every",
 )  # fmt: skip
 
-KNOWN_AFTER: Final = 5  # frames after which their measured times and sizes replace assumptions
+KNOWN_AFTER: Final = 5  # Frames after which their measured times and sizes replace assumptions
 
 
 @dataclass(frozen=True)
@@ -186,14 +186,14 @@ def order_of(steps: Sequence[SessionStep], settings: LabSettings) -> str:
 
 # Share of repeated frames for which there must be space: chosen; disturbances during one hour of a run.
 RETAKEN_SHARE: Final = 0.1
-EXTRA_BYTES: Final = 150_000  # per frame: a preview of 640 px, and its rows in the journal
+EXTRA_BYTES: Final = 150_000  # Per frame: a preview of 640 px, and its rows in the journal
 # Reserve for other users of the disk, and for file systems that are slow when they are full.
 SPARE_BYTES: Final = 500_000_000
 # Lossless raw files of 14 bits: 1.34 at ISO 100 (EOS 550D, 25 MB; EOS 6D Mark II, 36 MB), more with noise.
 BYTES_PER_PIXEL: Final = 1.5
 # Cameras that may write each photosite in 16 bits (Sony), and the simulated cameras, which do.
 LOOSE_BYTES_PER_PIXEL: Final = 2.0
-UNKNOWN_BYTES: Final = 60_000_000  # assumed for an unknown camera: 40 million photosites
+UNKNOWN_BYTES: Final = 60_000_000  # Assumed for an unknown camera: 40 million photosites
 # Millions of photosites, and the models with at most as many: the makers' numbers plus 5 % for masked borders. From
 # general knowledge, except for the EOS 550D, 6D Mark II, 5D Mark II, 5DS and 1Ds Mark III.
 _MODELS: Final = (
@@ -232,7 +232,7 @@ def frame_bytes(largest: int | None, model: str, simulated: int | None = None) -
     """Return the size of a raw file, bytes.
 
     `largest`: largest file of the session; None if it has none. `model`: as the camera reports it; "" if it could not
-    be asked. `given`: size of simulated files; None for a real camera.
+    be asked. `simulated`: size of simulated files; None for a real camera.
     """
     if largest is not None:
         return Estimate(largest, "the largest file of the session", True)
@@ -361,11 +361,11 @@ def projector_state(projector: Projector) -> tuple[str, bool | None]:
 DOWNLOAD_BYTES_PER_S: Final = 25e6
 # Assumed time per frame in addition to exposure and transfer, s: release, mirror, read-back of the screen, journal.
 STEP_S: Final = 0.4
-LIGHTING_S: Final = 60.0  # assumed time to light the lamp, s; makers state 30 to 40 s, and up to 130 s
+LIGHTING_S: Final = 60.0  # Assumed time to light the lamp, s; makers state 30 to 40 s, and up to 130 s
 # Charge at which a long series needs mains power: cameras report in steps of a quarter, and refuse to release soon
 # after.
 LOW_BATTERY: Final = 0.25
-FEW_FRAMES: Final = 50  # frames that are taken even with a low battery
+FEW_FRAMES: Final = 50  # Frames that are taken even with a low battery
 # Largest relative difference of a shutter time from one that the camera offers; drivers accept no more.
 OFFERED_WITHIN: Final = 0.01
 
@@ -637,9 +637,8 @@ def _camera_text(answers: Answers) -> str:
 def _frames_text(work: Work) -> str:
     counts = Counter(step.kind for step in work.steps if step.number not in work.done)
     kinds_text = ", ".join(f"{counts[name]} {name}" for name in KINDS if counts[name])
-    done_text = f"{counted(len(work.done), 'frame')} of {len(work.steps)} done"
     open_text = f"{counted(work.remaining, 'frame')} to take ({kinds_text})" if work.remaining else "complete"
-    return f"{open_text}; {done_text}"
+    return f"{open_text}; {counted(len(work.done), 'frame')} of {len(work.steps)} done"
 
 
 def _turns_text(settings: LabSettings) -> str:

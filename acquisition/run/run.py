@@ -69,11 +69,11 @@ from foundation.errors import CropError, DeviceRefused, InputError, StorageError
 from foundation.secret_texts import is_webhook, target_label
 from foundation.version import software
 
-LIMIT_S: Final = 20.0  # time for a receiver to accept a notice, s; a message to a telephone takes seconds
-ENDING_S: Final = 2.0  # additional time for the last notice, s, so that a slow receiver is reported by name
+LIMIT_S: Final = 20.0  # Time for a receiver to accept a notice, s; a message to a telephone takes seconds
+ENDING_S: Final = 2.0  # Additional time for the last notice, s, so that a slow receiver is reported by name
 # Interval between two notices of pauses with the same cause, s: more notices would not bring anybody sooner.
 QUIET_S: Final = 3600.0
-QUEUED: Final = 100  # notices that can wait for a slow receiver; more are dropped
+QUEUED: Final = 100  # Notices that can wait for a slow receiver; more are dropped
 
 
 class Notices:
@@ -139,8 +139,7 @@ class Notices:
             failure = self._posted(*notice) if is_webhook(self._target) else self._run(*notice)
             if failure:
                 # Only scheme and host, or the program, are named: the rest of the target may be a secret.
-                label = target_label(self._target)
-                self._failed.put(f"{label} did not receive a notice: {failure}; the run continues without it")
+                self._failed.put(f"{target_label(self._target)} did not receive a notice: {failure}; the run continues")
 
     def _run(self, event: str, message: str, body: bytes) -> str:
         variables = {"CROP_EVENT": event, "CROP_MESSAGE": message, "CROP_SESSION": self._session}
@@ -273,13 +272,13 @@ class Terminal:
             MofNCompleteColumn(),
             TextColumn("frames"),
             TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
-            TextColumn("{task.fields[said]}"),
+            TextColumn("{task.fields[remaining]}"),
+            TextColumn("{task.fields[status]}"),
             console=console,
             redirect_stdout=sys.stdout.isatty(),
             disable=not shows_progress() or self._plain,
         )
-        self._task = self._bar.add_task("frames", total=None, remaining="", said="")
+        self._task = self._bar.add_task("frames", total=None, remaining="", status="")
 
     def __enter__(self) -> Self:
         return self
@@ -288,7 +287,7 @@ class Terminal:
         self, error_type: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._bar.live.is_started:
-            self._bar.update(self._task, remaining="", said="")
+            self._bar.update(self._task, remaining="", status="")
             self._bar.stop()
 
     def progress(self, done_count: int, total: int) -> None:
@@ -309,7 +308,7 @@ class Terminal:
         self._attempts.append(TimedAttempt(seconds, frame.judgement.accepted))
         self._since = now_s
         self._reported = verdict_line(frame)
-        self._bar.update(self._task, said=self._reported)
+        self._bar.update(self._task, status=self._reported)
 
     def announce(self, sentence: str) -> None:
         """Print a permanent line."""
@@ -318,7 +317,7 @@ class Terminal:
     def state(self, sentence: str) -> None:
         """Show the reason of a wait until the next frame; this time does not count as a frame's time."""
         self._since = None
-        self._bar.update(self._task, said=sentence, remaining="")
+        self._bar.update(self._task, status=sentence, remaining="")
         self._print_line(sentence)
 
     def _print_line(self, line: str, is_last: bool = False) -> None:
@@ -335,7 +334,7 @@ def _print(line: str) -> None:
         print(line, file=sys.stderr)
 
 
-ALIVE_S: Final = 60.0  # interval between two signs to a dead man's switch, s: such services count minutes
+ALIVE_S: Final = 60.0  # Interval between two signs to a dead man's switch, s: such services count minutes
 
 # Share of the watchdog's time between two signs: sd_watchdog_enabled(3) recommends at most half.
 WATCHDOG_SHARE: Final = 0.25
@@ -405,7 +404,7 @@ def _watchdog_s(environment: Mapping[str, str]) -> float:
         return 0.0
 
 
-# expected time for a camera to accept its settings, s: a dozen messages with answers
+# Expected time for a camera to accept its settings, s: a dozen messages with answers
 CONFIGURE_S = 10.0
 
 
@@ -681,7 +680,7 @@ def _make_ready(job: Job) -> None:
         make_ready(devices.projector, settings.sequence, job.retry)
 
 
-BEGINS = "a run begins: it looks at its frames and opens its devices"  # sign of life of a run before its first frame
+BEGINS = "a run begins: it looks at its frames and opens its devices"  # Sign of life of a run before its first frame
 
 
 # Reports that a run is alive, and what it waits for; "" while it takes frames.

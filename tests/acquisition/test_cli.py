@@ -37,7 +37,7 @@ def test_writes_all_print_files(chart: Run, capsys: pytest.CaptureFixture[str]) 
     printed = capsys.readouterr()
     assert printed.err == ""
     assert printed.out.startswith("out: 8 colours, 4 tags, ")
-    assert "cells of 5.29 mm" in printed.out
+    assert "patches of 5.29 mm" in printed.out
     assert sorted(path.name for path in Path("out").iterdir()) == [
         "PRINTING.txt",
         "chart.json",
@@ -62,7 +62,7 @@ def test_small_page_gets_small_patches(chart: Run, capsys: pytest.CaptureFixture
     printed = capsys.readouterr()
     assert printed.err == "", "a camera goes nearer to a small sheet, so its cells are as large in the frame"
     # 85 px: 16 × 10 slots, less 4 × 16 of tags, are the 64 colours and 32 references; of 90 px there are 15 × 9.
-    assert "on 74 × 52 mm, cells of 3.60 mm" in printed.out
+    assert "on 74 × 52 mm, patches of 3.60 mm" in printed.out
     assert not Path("out/chart.tif").exists()
 
 
@@ -79,7 +79,7 @@ def test_warns_of_small_patches(chart: Run, capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.slow
 def test_arranges_chart_of_paper(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert chart("out", "--arrangement", "paper", "--bits", "2", "--page", "A6", "--no-tiff") == 0
-    assert "64 colours, 0 tags, 10 references on 148 × 105 mm, cells of 16.47 × 11.09 mm" in capsys.readouterr().out
+    assert "64 colours, 0 tags, 10 references on 148 × 105 mm, patches of 16.47 × 11.09 mm" in capsys.readouterr().out
     assert load_chart(Path("out/chart.json")).tags == ()
 
 

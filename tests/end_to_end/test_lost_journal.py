@@ -297,7 +297,7 @@ def test_a_complete_session_whose_files_go_is_complete_no_more(
     clock.sleep(LOOK_AGAIN_S)
     assert watch.head().state == "incomplete", "a page that is open looks again"
     assert main(["status", str(folder)]) == 4
-    assert "incomplete: frames/0002_light_000.dng: gone or cut" in capsys.readouterr().out
+    assert "incomplete: frames/0002_light_000.dng: deleted or truncated" in capsys.readouterr().out
     assert read_session(folder).head(lab.clock.now()).done == len(lab.session.steps) - 1
 
 

@@ -238,7 +238,7 @@ def test_following_what_a_check_recommends_leads_to_a_good_exposure(
     text = lab.read_text() + "[camera]\nshutter_s = "
     lab.write_text(f"{text}1.3\n")
     assert run("check", lab) == 4
-    (said,) = re.findall(r"set camera\.shutter_s = (\S+) \(tried: [\d.]+ %\)", capsys.readouterr().out)
+    (said,) = re.findall(r"set camera\.shutter_s = (\S+) \(measured: [\d.]+ %\)", capsys.readouterr().out)
     assert abs(float(said) * 60 - round(float(said) * 60)) < 0.01, "whole turns of a wheel of 60 Hz"
     lab.write_text(f"{text}{said}\n")
     assert run("check", lab) == 0

@@ -36,7 +36,7 @@ from foundation.holds import hold
 __all__ = ["Attached", "attached_devices", "identify_displays"]
 
 
-CONNECT_S = 5.0  # time for a projector to accept a connection, s; milliseconds on a local network
+CONNECT_S = 5.0  # Time for a projector to accept a connection, s; milliseconds on a local network
 
 
 def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, shows: bool = True) -> Devices:

@@ -27,8 +27,7 @@ def open_rig(
     """
     if settings.rig == "imported":
         raise ConfigurationError(
-            'rig is "imported", expected "lab" or "simulated": no frames can be added to a session whose frames were '
-            "taken by other means; start a new session"
+            'rig is "imported", expected "lab" or "simulated": frames were taken by other means; start a new session'
         )
     with ExitStack() as opened:
         # Drivers and the simulated world are imported only if they are needed.

@@ -36,7 +36,7 @@ from sim.world.rendering import Print
 from sim.world.sensors import BODIES, Body, find_body
 from sim.world.world import Room, World, read_room
 
-SERIAL = "0000000001"  # serial number of the simulated camera and in its frames; one laboratory has one camera
+SERIAL = "0000000001"  # Serial number of the simulated camera and in its frames; one laboratory has one camera
 
 
 def open_simulated(settings: LabSettings, chart: Chart, session: Session | None, opened: ExitStack) -> Devices:

@@ -34,7 +34,7 @@ from tests.calibration.lab import hang_chart
 
 pytestmark = pytest.mark.slow
 
-UNREPORTED = {"battery", "card", "noise_reduction"}  # a camera need not report these
+UNREPORTED = {"battery", "card", "noise_reduction"}  # A camera need not report these
 
 
 def finding_of(report: CheckReport, name: str) -> Finding:

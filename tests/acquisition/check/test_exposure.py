@@ -15,7 +15,7 @@ from acquisition.check.exposure import (
     judge_exposure,
     measure_level,
     measure_saturation,
-    try_times,
+    search,
 )
 from acquisition.run.devices import ENGRAVED_S
 from drivers.raw.rawfile import Mosaic
@@ -63,7 +63,7 @@ def trials_of(rate: float, start_s: float, times: list[float]) -> tuple[TriedTim
         level = min(rate * seconds, 1.0)
         return TriedTime(seconds, (0.4 * level, level, 0.7 * level), level >= 0.95)
 
-    return try_times(measure(start_s), measure, times)
+    return search(measure(start_s), measure, times)
 
 
 def test_search_ends_at_good_time() -> None:

@@ -94,7 +94,7 @@ def bench(folder: Path, room: Room, count: int = 12, every: int = 6, lab: str = 
 
 
 @pytest.fixture(scope="session")
-def taught(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     """Make a bench after a small accepted session with a colour wheel."""
     lab = bench(tmp_path_factory.mktemp("judge"), Room(seed=3, wheel_hz=60, transfer=2.2), count=12, every=6)
     for step in lab.steps:

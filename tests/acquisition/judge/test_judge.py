@@ -76,18 +76,18 @@ DARK_STEP = SessionStep(902, "dark", None, BLACK)
 
 
 @pytest.fixture
-def few(taught: Bench, tmp_path: Path) -> Bench:
-    """Return a lab with a plan of six illuminants and no frames, in the room of `taught`."""
+def few(trained: Bench, tmp_path: Path) -> Bench:
+    """Return a lab with a plan of six illuminants and no frames, in the room of `trained`."""
     lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
-    lab.world = taught.world
+    lab.world = trained.world
     return lab
 
 
 @pytest.fixture(scope="module")
-def earlier(taught: Bench, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[SessionStep, bytes]]:
+def earlier(trained: Bench, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[SessionStep, bytes]]:
     """Return steps and measurements of an earlier run of such a plan without its last two frames."""
     lab = bench(tmp_path_factory.mktemp("earlier"), Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
-    lab.world = taught.world
+    lab.world = trained.world
     measurements: list[tuple[SessionStep, bytes]] = []
     for step in lab.steps[:-2]:
         judgement = lab.take(step)
@@ -114,8 +114,8 @@ def check(judgement: Judgement, name: str) -> Check:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("codes", [SKY, DEEP_BLUE, (48, 255, 188)])
-def test_accepts_ordered_illuminants(taught: Bench, codes: tuple[int, int, int]) -> None:
-    lab = taught.fork()
+def test_accepts_ordered_illuminants(trained: Bench, codes: tuple[int, int, int]) -> None:
+    lab = trained.fork()
     judgements = [lab.take(lab.light(*codes)) for _ in range(2)]
     assert [judgement.reason for judgement in judgements] == ["", ""]
     assert judgements[0].seen is not None
@@ -124,8 +124,10 @@ def test_accepts_ordered_illuminants(taught: Bench, codes: tuple[int, int, int])
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("shown", "ordered"), [(ORANGE, SKY), (SKY, ORANGE), ((255, 249, 255), (255, 245, 246))])
-def test_reports_previous_illuminant(taught: Bench, shown: tuple[int, int, int], ordered: tuple[int, int, int]) -> None:
-    lab = taught.fork()
+def test_reports_previous_illuminant(
+    trained: Bench, shown: tuple[int, int, int], ordered: tuple[int, int, int]
+) -> None:
+    lab = trained.fork()
     assert lab.take(lab.light(*shown)).accepted
     stale = lab.take(lab.light(*shown))
     assert stale.accepted  # the same light ordered again is no fault
@@ -136,8 +138,8 @@ def test_reports_previous_illuminant(taught: Bench, shown: tuple[int, int, int],
 
 
 @pytest.mark.slow
-def test_reports_other_illuminant_of_plan(taught: Bench) -> None:
-    lab = taught.fork()
+def test_reports_other_illuminant_of_plan(trained: Bench) -> None:
+    lab = trained.fork()
     assert lab.take(lab.light(*DEEP_BLUE)).accepted
     other = lab.lights[300].colour
     judgement = lab.show(lab.counts(lab.light(*other)), lab.light(*ORANGE))
@@ -146,8 +148,8 @@ def test_reports_other_illuminant_of_plan(taught: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_follows_small_bump_and_stops_at_large_one(taught: Bench) -> None:
-    lab = taught.fork()
+def test_follows_small_bump_and_stops_at_large_one(trained: Bench) -> None:
+    lab = trained.fork()
     small = Bump(px=0.45)
     assert cause(lab.take(lab.light(*ORANGE), small)) == "movement"
     followed = lab.take(lab.light(*ORANGE), small)
@@ -159,8 +161,8 @@ def test_follows_small_bump_and_stops_at_large_one(taught: Bench) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("percent", [-3.0, -50.0])
-def test_reports_lamp_step(taught: Bench, percent: float) -> None:
-    lab = taught.fork()
+def test_reports_lamp_step(trained: Bench, percent: float) -> None:
+    lab = trained.fork()
     judgement = lab.take(lab.light(*SKY), LampStep(percent=percent))
     assert cause(judgement) == "off_brightness"
     assert check(judgement, "off_brightness").value == pytest.approx(percent, abs=1.0)
@@ -171,17 +173,17 @@ def test_reports_lamp_step(taught: Bench, percent: float) -> None:
 
 
 @pytest.mark.slow
-def test_reports_room_light(taught: Bench) -> None:
+def test_reports_room_light(trained: Bench) -> None:
     lit = AmbientStep(percent=1.0)
-    lab = taught.fork()
+    lab = trained.fork()
     blue = lab.take(lab.light(*DEEP_BLUE), lit)
     assert cause(blue) == "stray_share", blue.reason
     assert check(blue, "stray_share").value == pytest.approx(1.0, rel=0.2)
-    lab = taught.fork()
+    lab = trained.fork()
     dark = lab.take(DARK_STEP, lit)
     assert cause(dark) == "dark_drift"
     assert dark.voids
-    lab = taught.fork()
+    lab = trained.fork()
     neutral = [lab.take(lab.light(*codes), lit) for codes in ((255, 245, 246), SKY)]
     assert not all(judgement.accepted for judgement in neutral)
 
@@ -200,9 +202,9 @@ def test_reports_room_light(taught: Bench) -> None:
     ],
 )
 def test_reports_uneven_and_late_pictures(
-    taught: Bench, codes: tuple[int, int, int], event: AnyDisturbance, name: str, words: str
+    trained: Bench, codes: tuple[int, int, int], event: AnyDisturbance, name: str, words: str
 ) -> None:
-    lab = taught.fork()
+    lab = trained.fork()
     assert lab.take(lab.light(*SKY)).accepted
     judgement = lab.take(lab.light(*codes), event, before=Colour(*SKY))
     assert cause(judgement) == name
@@ -211,31 +213,31 @@ def test_reports_uneven_and_late_pictures(
 
 
 @pytest.mark.slow
-def test_distinguishes_person_from_movement(taught: Bench) -> None:
-    passing = taught.fork().take(WHITE_STEP, Person(place=(0.2, -0.2, 0.55, 1.2), left=0.9))
+def test_distinguishes_person_from_movement(trained: Bench) -> None:
+    passing = trained.fork().take(WHITE_STEP, Person(place=(0.2, -0.2, 0.55, 1.2), left=0.9))
     assert cause(passing) == "uniformity"
     assert "walked past" in passing.reason
     # A moved or defocused chart is not reported as a person.
-    assert cause(taught.fork().take(WHITE_STEP, Bump(px=0.4))) == "movement"
-    assert cause(taught.fork().take(WHITE_STEP, Defocus(px=0.5))) == "blur"
+    assert cause(trained.fork().take(WHITE_STEP, Bump(px=0.4))) == "movement"
+    assert cause(trained.fork().take(WHITE_STEP, Defocus(px=0.5))) == "blur"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("codes", [ORANGE, (40, 180, 220)])
-def test_reports_missing_primary(taught: Bench, codes: tuple[int, int, int]) -> None:
-    lab = taught.fork()
+def test_reports_missing_primary(trained: Bench, codes: tuple[int, int, int]) -> None:
+    lab = trained.fork()
     assert "red is missing" in lab.take(lab.light(*codes), DeadPrimary()).reason
     # A dimmed primary, or another illuminant without red, is not reported as missing.
     for other in ((codes[0] // 2, *codes[1:]), (0, codes[1], codes[2] // 2)):
-        lab = taught.fork()
+        lab = trained.fork()
         judgement = lab.show(lab.counts(lab.light(*other)), lab.light(*codes))
         assert not judgement.accepted
         assert "is missing" not in judgement.reason
 
 
 @pytest.mark.slow
-def test_reports_window_over_picture(taught: Bench) -> None:
-    lab = taught.fork()
+def test_reports_window_over_picture(trained: Bench) -> None:
+    lab = trained.fork()
     judgement = lab.take(WHITE_STEP, PopUp())
     assert cause(judgement) == "uniformity"
     assert not judgement.voids  # every light since was judged by itself
@@ -244,8 +246,8 @@ def test_reports_window_over_picture(taught: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_reports_repeated_frame_by_noise(taught: Bench) -> None:
-    lab = taught.fork()
+def test_reports_repeated_frame_by_noise(trained: Bench) -> None:
+    lab = trained.fork()
     step = lab.light(*ORANGE)
     counts = lab.counts(step)
     assert lab.show(counts, step).accepted
@@ -258,8 +260,8 @@ def test_reports_repeated_frame_by_noise(taught: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_reports_missing_and_misplaced_rows(taught: Bench) -> None:
-    lab = taught.fork()
+def test_reports_missing_and_misplaced_rows(trained: Bench) -> None:
+    lab = trained.fork()
     assert cause(lab.take(lab.light(*ORANGE), ZeroedStrip(top=0.5, bottom=0.51))) == "data"
     assert cause(lab.take(lab.light(*ORANGE), ScrambledRows())) == "rows"
     # Among the tags, whose edges look softer by it.
@@ -270,8 +272,8 @@ def test_reports_missing_and_misplaced_rows(taught: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_reports_wrong_camera_exposure_or_file(taught: Bench, tmp_path: Path) -> None:
-    lab = taught.fork()
+def test_reports_wrong_camera_exposure_or_file(trained: Bench, tmp_path: Path) -> None:
+    lab = trained.fork()
     step = lab.light(*ORANGE)
     other = lab.show(lab.counts(step), step, serial="7")
     assert cause(other) == "other_camera"
@@ -285,8 +287,8 @@ def test_reports_wrong_camera_exposure_or_file(taught: Bench, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_reports_dark_and_clipped_frames(taught: Bench) -> None:
-    lab = taught.fork()
+def test_reports_dark_and_clipped_frames(trained: Bench) -> None:
+    lab = trained.fork()
     assert cause(lab.show(lab.counts(DARK_STEP), lab.light(*ORANGE))) == "exposure"
     assert cause(lab.show(lab.counts(lab.light(*ORANGE)), DARK_STEP)) == "leak_share"
     bright = lab.world.expose(WHITE, replace(EXPOSURE, shutter_s=1.2), key=(5,))
@@ -294,8 +296,8 @@ def test_reports_dark_and_clipped_frames(taught: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_reports_lit_screen_in_dark_frame(taught: Bench) -> None:
-    lab = taught.fork()
+def test_reports_lit_screen_in_dark_frame(trained: Bench) -> None:
+    lab = trained.fork()
     assert lab.take(lab.light(*ORANGE)).accepted
     assert "previous illuminant" in lab.show(lab.counts(lab.light(*ORANGE)), DARK_STEP).reason
 
@@ -383,9 +385,9 @@ def test_follows_chart_that_moved_between_runs(few: Bench, earlier: list[tuple[S
 
 
 @pytest.mark.slow
-def test_judges_without_response_frames(tmp_path: Path, taught: Bench) -> None:
+def test_judges_without_response_frames(tmp_path: Path, trained: Bench) -> None:
     lab = bench(tmp_path, Room(seed=3), count=6, every=3, response=False)
-    lab.world = taught.world
+    lab.world = trained.world
     for step in lab.steps:
         assert (judgement := lab.take(step)).accepted, judgement.reason
     assert lab.take(lab.light(*SKY)).accepted
@@ -395,8 +397,8 @@ def test_judges_without_response_frames(tmp_path: Path, taught: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_reports_missing_chart_in_first_frame(tmp_path: Path, taught: Bench) -> None:
-    wall = taught.world.expose(Colour(0, 0, 0), EXPOSURE, key=(1,))
+def test_reports_missing_chart_in_first_frame(tmp_path: Path, trained: Bench) -> None:
+    wall = trained.world.expose(Colour(0, 0, 0), EXPOSURE, key=(1,))
     wall[60:, 60:] += np.uint16(3000)
     lab = bench(tmp_path, Room(seed=3))
     judgement = lab.show(wall, WHITE_STEP)
@@ -407,9 +409,9 @@ def test_reports_missing_chart_in_first_frame(tmp_path: Path, taught: Bench) -> 
 
 
 @pytest.mark.slow
-def test_reports_non_additive_projector_without_refusing(tmp_path: Path, taught: Bench) -> None:
+def test_reports_non_additive_projector_without_refusing(tmp_path: Path, trained: Bench) -> None:
     lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=10, every=5)
-    lab.world = taught.world
+    lab.world = trained.world
 
     def shown(colour: Colour) -> Situation:
         alone = lab.world.room.light_of(np.array(colour)) / 1.4
@@ -449,8 +451,8 @@ def test_stops_at_clipped_first_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_measures_blur_at_next_reference_after_dim_illuminant(taught: Bench) -> None:
-    lab = taught.fork()
+def test_measures_blur_at_next_reference_after_dim_illuminant(trained: Bench) -> None:
+    lab = trained.fork()
     dim = lab.take(lab.light(0, 0, 56), Defocus(px=1))
     assert check(dim, "blur").value is None
     assert dim.accepted, dim.reason

@@ -1,4 +1,4 @@
-"""All that the judge says and knows, number by number, in sessions in which everything goes wrong once."""
+"""Verdicts and states of the judge in numbers, in sessions with every disturbance once."""
 
 from __future__ import annotations
 
@@ -44,8 +44,7 @@ from tests.pinned import Pinned
 ORANGE, SKY, BLUE = (255, 197, 126), (113, 188, 255), (0, 0, 255)
 WHITE_STEP = SessionStep(901, "white", None, WHITE)
 DARK_STEP = SessionStep(902, "dark", None, BLACK)
-ROUNDED = 0.011
-"""Checks are rounded to two digits, which the last digits of single precision may move."""
+ROUNDED = 0.011  # Checks are rounded to two digits, which may change in single precision
 
 
 def said(judgement: Judgement) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from acquisition.judge.state import LAMP_STEP, ProjectorModel
 from experiment.session.records import TOP
 
 NODES = len(state._NODES)
-LEVELS = 3 * NODES  # first entry of the three levels in the state, after the curves
+LEVELS = 3 * NODES  # First entry of the three levels in the state, after the curves
 # Prior scatter of a projector, and standard deviation of an amount in the dark.
 CHROMA, BRIGHTNESS, ABSOLUTE = 0.004, 0.002, 3e-4
 UNKNOWN = ProjectorModel.unknown()

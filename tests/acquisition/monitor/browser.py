@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-LIMIT_S = 60.0  # time limit of an answer on a busy machine
+LIMIT_S = 60.0  # Time limit of an answer on a busy machine
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (Debian: chromium)")
 
@@ -121,7 +121,7 @@ class Tab:
         self.call("Emulation.setEmulatedMedia", features=scheme)
 
     def value(self, expression: str) -> Any:
-        """Return what a script's expression comes to."""
+        """Return the value of a script's expression."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         if "exceptionDetails" in answer:
             raise RuntimeError(f"{expression}: {answer['exceptionDetails']}")
@@ -141,7 +141,7 @@ class Tab:
         return str(self.value("document.body ? document.body.innerText : ''"))
 
     def drag(self, path: list[tuple[float, float]]) -> None:
-        """Press the mouse at the first place of a path, px of the window, move along it, and let go at the last."""
+        """Press the mouse at the first position (px of the window), move along the path, and release it at the last."""
         kinds = [(path[0], "mousePressed"), *((place, "mouseMoved") for place in path[1:]), (path[-1], "mouseReleased")]
         for (x, y), kind in kinds:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
@@ -178,7 +178,7 @@ class Tab:
 
 @contextmanager
 def browser_tab() -> Generator[Tab]:
-    """Run a browser with a profile of its own, and yield a tab of it."""
+    """Run a browser with its own profile, and yield one of its tabs."""
     assert CHROMIUM is not None
     to_browser, ours_out = os.pipe()
     ours_in, from_browser = os.pipe()

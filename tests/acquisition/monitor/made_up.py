@@ -38,9 +38,9 @@ def jpeg(colour: Sequence[int], text: str = "") -> bytes:
 
 @dataclass
 class MadeUpRun:
-    """Writes a session's journal, frame after frame, as a run does; `clock` is the lab's time.
+    """Writes the journal of a session as a run does; `clock` is the time of the lab.
 
-    `journal` is open for a run; close it in the end.
+    `journal` is open for a run and must be closed.
     """
 
     folder: Path
@@ -52,7 +52,7 @@ class MadeUpRun:
 
     @classmethod
     def begin(cls, folder: Path, lights: Sequence[Illumination] = LIGHTS, *, response: bool = False) -> MadeUpRun:
-        """Make the folder and the plan."""
+        """Create the folder and the plan."""
         folder.mkdir()
         (folder / "previews").mkdir()
         design_chart(1, A_SERIES_MM["A5"]).save(folder / "chart.json")
@@ -67,16 +67,16 @@ class MadeUpRun:
         return run
 
     def beat(self, state: str, sentence: str, within_s: float = 60.0) -> None:
-        """Give a sign of life, by the wall clock."""
+        """Give a sign of life, by the computer's clock."""
         self.journal.beat(state, sentence, datetime.now(UTC) + timedelta(seconds=within_s))  # pyrefly: ignore[bad-argument-type]
 
     def expose(self, step: SessionStep, try_: int = 1) -> int:
-        """Begin an attempt; return its number."""
+        """Start an attempt; return its number."""
         stem = step.stem if try_ == 1 else f"{step.stem}_try{try_}"
         return self.journal.begin(step, f"frames/{stem}", self.clock)
 
     def seen(self, step: SessionStep) -> tuple[float, float, float]:
-        """Return what the camera would see of a step's light, counts."""
+        """Return the RGB counts of the camera under a step's illuminant."""
         linear = decode_srgb([code / 255 for code in step.colour])
         counts = (CROSSTALK @ linear + 0.0005) * 9000 * (1 + self.random.normal(0, 0.0005, 3))
         return float(counts[0]), float(counts[1]), float(counts[2])
@@ -84,7 +84,7 @@ class MadeUpRun:
     def take(
         self, step: SessionStep, reason: str = "", *, check: str = "off_codes_deg", value: float | None = None
     ) -> int:
-        """Take a frame of a step; with a `reason` it is refused by `check`, whose value is then `value`."""
+        """Take a frame of a step; with a `reason`, `check` refuses it with `value`."""
         tries = self.journal.kept_files(step) + 1
         attempt = self.expose(step, tries)
         self.clock += timedelta(seconds=FRAME_S + float(self.random.normal(0, 0.05)))
@@ -129,7 +129,7 @@ class MadeUpRun:
 
 
 def whole_night(folder: Path, share: float = 0.6, *, grid: int = 35, previews: bool = True) -> MadeUpRun:
-    """Return a run of the paper's lights, `share` of them taken, with what a night may bring; the run is still open."""
+    """Return an open run of the paper's illuminants, `share` of them taken, with the usual events of a night."""
     run = MadeUpRun.begin(folder, plan_illuminations(grid, tuple(range(2000, 10001, 200))), response=True)
     run.previews = previews
     last = int(share * len(run.steps))
@@ -150,5 +150,5 @@ def whole_night(folder: Path, share: float = 0.6, *, grid: int = 35, previews: b
 
 
 def closed(run: MadeUpRun) -> closing[Journal]:
-    """Return a block at whose end the run's journal is closed."""
+    """Return a block after which the run's journal is closed."""
     return closing(run.journal)

@@ -60,7 +60,7 @@ def _no_errors(tab: Tab) -> Iterator[None]:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[MadeUpRun]:
-    """Return a run of 27 lights and black bodies with a third of its frames, one refused, and one under way."""
+    """Return a run of 27 illuminants with a third of its frames, one refused, and one active."""
     name = f"night {HOSTILE}".replace("/", "|")
     new_run = MadeUpRun.begin(tmp_path / name, plan_illuminations(5, (3000, 6500)), response=True)
     new_run.journal.record(f"camera {HOSTILE}", HOSTILE)
@@ -101,7 +101,7 @@ def test_follows_run_frame_by_frame(tab: Tab, run: MadeUpRun) -> None:
         assert marks(tab, "seen", "accepted") == lights
         run.take(run.steps[29])
         tab.wait_for(f"document.querySelectorAll('#planned .mark.accepted').length === {lights + 1}")
-        assert f"lights {lights + 1} of 23" in " ".join(tab.text().split())
+        assert f"illuminants {lights + 1} of 23" in " ".join(tab.text().split())
         assert tab.value("document.querySelectorAll('.plot').length") >= 8
         assert tab.value("document.getElementById('wall').textContent") == "Between two frames"
         following = run.steps[30].colour
@@ -158,8 +158,8 @@ def test_reports_killed_run(tab: Tab, tmp_path: Path) -> None:
             banner = tab.value("document.getElementById('banner').innerText")
             assert "killed or power lost" in banner
             assert "run the same command again" in banner
-            assert tab.value("document.getElementById('wall').textContent") == "Not known: nothing is being taken"
-            assert "stands still" in tab.text()
+            assert tab.value("document.getElementById('wall').textContent") == "Unknown: no run is active"
+            assert "no run active" in tab.text()
             assert marks(tab, "planned", "shown") == 0
     finally:
         child.kill()
@@ -172,7 +172,7 @@ def test_shows_refused_frames_with_picture_and_reason(tab: Tab, run: MadeUpRun) 
     with shown(tab, run.folder):
         card = "document.querySelector('.refusal')"
         assert "the light is another one" in tab.value(f"{card}.innerText")
-        assert "taken again since and accepted" in tab.value(f"{card}.innerText")
+        assert "repeated and accepted" in tab.value(f"{card}.innerText")
         tab.value(f"{card}.querySelector('button').click()")
         assert tab.value("document.getElementById('frame-title').textContent") == "Chosen frame"
         assert tab.value("document.querySelector('#checks tr.bad th').textContent") == "✕ off_codes_deg"
@@ -206,7 +206,7 @@ def test_reports_missing_answers(tab: Tab, run: MadeUpRun) -> None:
 
 def test_waits_for_session(tab: Tab, tmp_path: Path) -> None:
     with shown(tab, tmp_path / "later"):
-        assert tab.value("document.getElementById('state').textContent") == "… not begun"
+        assert tab.value("document.getElementById('state').textContent") == "… not started"
         assert "waits for it" in tab.value("document.getElementById('banner').innerText")
         for key in ("ArrowLeft", "ArrowRight", "Escape"):
             tab.press(key)

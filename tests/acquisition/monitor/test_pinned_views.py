@@ -31,26 +31,32 @@ CHECKS = (
 
 
 def test_states_of_a_session(pinned: Pinned) -> None:
-    chance, found = random.Random(3), list[Any]()
+    chance, heads = random.Random(3), list[Any]()
     for number in range(40):
         count = chance.choice((0, 1, 2, 3, 5, 8, 8))
         verdict = chance.choice(("accepted", "accepted", "refused", "failed", None))
-        taken = attempts(count, verdict, chance.choice((5, 40)))
+        rows = attempts(count, verdict, chance.choice((5, 40)))
         if count > 3:
-            odd = replace(taken[2], verdict=chance.choice(("voided", "refused")), reason="off")
-            taken = (*taken[:2], odd, *taken[3:])
+            changed_row = replace(rows[2], verdict=chance.choice(("voided", "refused")), reason="off")
+            rows = (*rows[:2], changed_row, *rows[3:])
         state = chance.choice(get_args(RunState))
-        at = NOW - timedelta(seconds=chance.choice((0, 44, 45, 46, 49, 51, 170, 331, 4000)))
-        words = chance.choice(("as it should", "the camera: no answer (the run waits)", "the disk: full; free space"))
+        beat_at = NOW - timedelta(seconds=chance.choice((0, 44, 45, 46, 49, 51, 170, 331, 4000)))
+        sentence = chance.choice(
+            ("as it should", "the camera: no answer (the run waits)", "the disk: full; free space")
+        )
         within = timedelta(seconds=chance.choice((10, 300)))
-        beat = Heartbeat(at, chance.choice((HERE, ELSEWHERE)), state, words, at + within) if number % 8 else None
-        session = SessionView("night", "night", STEPS, (), {}, taken, (), beat, None, 25_000_000)
+        beat = (
+            Heartbeat(beat_at, chance.choice((HERE, ELSEWHERE)), state, sentence, beat_at + within)
+            if number % 8
+            else None
+        )
+        session = SessionView("night", "night", STEPS, (), {}, rows, (), beat, None, 25_000_000)
         if number % 11 == 0:
             session = replace(session, lost={0: "frames/0.cr2"}, unreadable="chart.json: gone")
         alive, stopped = chance.choice((True, True, False, None)), chance.random() < 0.1
-        stands = head_of(session, NOW, alive, is_stopped=stopped, free_bytes=chance.choice((None, 10**7, 10**12)))
-        found.append(asdict(stands))
-    pinned("how sessions stand", {"heads": found})
+        state_head = head_of(session, NOW, alive, is_stopped=stopped, free_bytes=chance.choice((None, 10**7, 10**12)))
+        heads.append(asdict(state_head))
+    pinned("how sessions stand", {"heads": heads})
 
 
 @pytest.mark.slow
@@ -60,20 +66,20 @@ def test_view_of_a_night(tmp_path: Path, pinned: Pinned) -> None:
         night = read_session(tmp_path / "night")
         now = run.clock
     whites = night.whites()
-    frames = [view._attempt_json(one, whites[one.id], None) for one in night.attempts]
-    shown = view._session_json(night)
+    frames = [view._attempt_json(item, whites[item.id], None) for item in night.attempts]
+    session_json = view._session_json(night)
     status = status_json(night, now)
     pinned(
         "a night as it is shown",
         {
-            "session": {name: shown[name][::5] for name in ("steps", "lights", "records")},
+            "session": {name: session_json[name][::5] for name in ("steps", "lights", "records")},
             "frames": [*frames[:3], *frames[::6]],
             "events": len(night.events),
             "json": {name: status[name] for name in ("white_drift", "checks", "without_accepted_frame", "doubts")},
             "head": {name: status[name] for name in HEAD},
             "spread": [view._spread(count) for count in (0, 1, 5, 17)],
-            "places": [view.place_of(*one) for one in ((0, 0, 0), (1, 2, 3), (-1, 0, 0.5), (float("nan"), 1, 1))],
-            "seconds": [one.seconds for one in with_seconds(night.attempts[:9], [night.attempts[4].started_at])],
-            "rounded": [view._rounded(one) for one in (1.23456789, 1e-9, float("inf"), 123456789.0)],
+            "places": [view.place_of(*item) for item in ((0, 0, 0), (1, 2, 3), (-1, 0, 0.5), (float("nan"), 1, 1))],
+            "seconds": [item.seconds for item in with_seconds(night.attempts[:9], [night.attempts[4].started_at])],
+            "rounded": [view._rounded(item) for item in (1.23456789, 1e-9, float("inf"), 123456789.0)],
         },
     )

@@ -25,7 +25,7 @@ SCRIPT = "<script>alert(1)</script>"
 
 
 def begun(folder: Path) -> MadeUpRun:
-    """Return a run of four lights with hostile names and reasons: white and dark taken, the first light refused."""
+    """Return a run of four illuminants with hostile names and reasons; white and dark are accepted."""
     made = MadeUpRun.begin(folder / "night <b>1")
     made.take(made.steps[0])
     made.take(made.steps[1])
@@ -51,8 +51,8 @@ def opened(run: MadeUpRun) -> Iterator[MonitorServer]:
 
 
 @pytest.fixture(scope="module")
-def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MonitorServer]:
-    """Serve one such run to all who only ask."""
+def read_only_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MonitorServer]:
+    """Serve such a run for tests that only read."""
     made = begun(tmp_path_factory.mktemp("served"))
     with served(made.folder) as monitor:
         yield monitor
@@ -62,7 +62,7 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MonitorServer]:
 def ask(
     monitor: MonitorServer, path: str, method: str = "GET", **headers: str
 ) -> tuple[int, http.client.HTTPMessage, bytes]:
-    """Return status, headers and body of the answer; names of headers with _ for -."""
+    """Return status, headers and body of an answer; in the names of headers _ replaces -."""
     connection = http.client.HTTPConnection("127.0.0.1", monitor.port, timeout=20)
     try:
         connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
@@ -78,8 +78,8 @@ def state_of(monitor: MonitorServer, since: str = "") -> dict[str, Any]:
     return json.loads(body)
 
 
-def test_serves_state_to_scripts(still: MonitorServer) -> None:
-    told = json.loads(ask(still, "/status.json")[2])
+def test_serves_state_to_scripts(read_only_server: MonitorServer) -> None:
+    told = json.loads(ask(read_only_server, "/status.json")[2])
     assert (told["state"], told["alive"]) == ("running", True)
     assert (told["done"], told["total"]) == (2, 8)
     assert (told["lights_done"], told["lights_total"]) == (0, 4)
@@ -87,8 +87,8 @@ def test_serves_state_to_scripts(still: MonitorServer) -> None:
     assert told["remaining_s"] == pytest.approx(6 * 5 * 3 / 2, abs=1), "two of three attempts gave a frame"
 
 
-def test_page_is_self_contained_without_session_markup(still: MonitorServer) -> None:
-    status, headers, body = ask(still, "/")
+def test_page_is_self_contained_without_session_markup(read_only_server: MonitorServer) -> None:
+    status, headers, body = ask(read_only_server, "/")
     text = body.decode()
     assert status == 200
     assert "night &lt;b&gt;1" in text
@@ -145,20 +145,20 @@ def test_serves_only_files_of_previews(opened: MonitorServer, run: MadeUpRun) ->
 
 
 @pytest.mark.parametrize("since", ["x", "..", "a.b.c", "%00", "0.-1.0", "'", "9" * 5000])
-def test_sends_everything_for_unknown_cursor(still: MonitorServer, since: str) -> None:
-    assert "session" in state_of(still, since)
+def test_sends_everything_for_unknown_cursor(read_only_server: MonitorServer, since: str) -> None:
+    assert "session" in state_of(read_only_server, since)
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
-def test_is_read_only(still: MonitorServer, method: str) -> None:
-    status, headers, _ = ask(still, "/", method)
+def test_is_read_only(read_only_server: MonitorServer, method: str) -> None:
+    status, headers, _ = ask(read_only_server, "/", method)
     assert (status, headers["Allow"]) == (405, "GET, HEAD")
 
 
-def test_compresses_large_answers(still: MonitorServer) -> None:
-    _, headers, body = ask(still, "/", Accept_Encoding="gzip")
+def test_compresses_large_answers(read_only_server: MonitorServer) -> None:
+    _, headers, body = ask(read_only_server, "/", Accept_Encoding="gzip")
     assert headers["Content-Encoding"] == "gzip"
-    assert gzip.decompress(body) == ask(still, "/")[2]
+    assert gzip.decompress(body) == ask(read_only_server, "/")[2]
 
 
 def test_follows_deleted_and_restored_session(opened: MonitorServer, run: MadeUpRun) -> None:

@@ -50,7 +50,7 @@ SETTINGS = LabSettings.model_validate(
         "sequence": {"reference_every": 5, "warm_up_s": 30, "patience_s": 300},
     }
 )
-OPERATIONS = 1200  # approximate number of operations on the camera's cable in an undisturbed session
+OPERATIONS = 1200  # Approximate number of operations on the camera's cable in an undisturbed session
 
 
 class ColourFilm:
@@ -82,7 +82,7 @@ class ContentJudge:
 
 
 class EventfulClock(SimulatedClock):
-    """Simulated time at whose moments things happen."""
+    """Simulated time with events at given times."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -97,7 +97,7 @@ class EventfulClock(SimulatedClock):
 
 
 class Screen:
-    """A presenter that fails, is covered, or keeps its picture at the calls with given numbers."""
+    """A presenter that fails, is covered, or is frozen at the calls with given numbers."""
 
     def __init__(self, clock: SimulatedClock) -> None:
         self.clock = clock
@@ -125,7 +125,7 @@ class Screen:
 
 
 class TroubledLab:
-    """Simulated devices on cables of memory, in trouble by chance."""
+    """Simulated devices in memory, with random faults."""
 
     def __init__(self, seed: int) -> None:
         self.chance = random.Random(seed)
@@ -151,7 +151,7 @@ class TroubledLab:
         return self.cables.get(number, lambda good: good)(UsbTransport(pipes, self.clock))  # pyrefly: ignore[implicit-any-lambda]
 
     def take(self, session: Session) -> RunOutcome | CropError:
-        """Take the session as far as it goes; return how it ended."""
+        """Take the session until it ends; return how it ended."""
         camera = CanonEos(self.open, self.clock)
         devices = Devices(camera, self.screen, self.beamer.projector, self.clock)
         try:
@@ -163,7 +163,7 @@ class TroubledLab:
             return error
 
     def calm_down(self) -> None:
-        """Let nothing more go wrong; the camera was switched off and on."""
+        """Stop all faults, as after switching the camera off and on."""
         self.eos = SimulatedEos(EOS_550D, self.film, self.clock, auto_power_off_s=0)
         self.device, self.pipes, self.cables, self.breaks = self.eos, {}, {}, []
         self.screen.fails, self.screen.covered, self.screen.stuck = set(), set(), set()
@@ -292,7 +292,7 @@ def journal_fails(lab: TroubledLab) -> None:
 
 
 def once(lab: TroubledLab, owner: Any, name: str, call: int, error: Exception) -> None:
-    """Let the call with a number fail, before it does anything."""
+    """Let one call fail, by its number, before it does anything."""
     real, calls = getattr(owner, name), [0]
 
     def failing(*given: Any, **named: Any) -> Any:
@@ -312,7 +312,7 @@ MISHAPS: tuple[Callable[[TroubledLab], None], ...] = (
 
 
 def take_all(folder: Path, seed: int) -> bool:
-    """Take a session with its mishaps, and then what they left; return whether the first run was complete."""
+    """Take a session with faults, then the missing frames; return whether the first run was complete."""
     lab = TroubledLab(seed)
     with new_session(folder) as session:
         ended = lab.take(session)
@@ -332,12 +332,12 @@ def take_all(folder: Path, seed: int) -> bool:
 
 
 def new_session(folder: Path) -> Session:
-    """Make a session of twenty lights."""
+    """Make a session of 20 illuminants."""
     return Session.create(folder, SETTINGS.to_toml(), design_chart(bits=1), LIGHTS, plan_steps(LIGHTS, 5))
 
 
 def require_whole(session: Session) -> None:
-    """Require that every step has one accepted frame, of its own light, and that no exposure counts twice."""
+    """Require that every step has one accepted frame, of its own illuminant, and that no exposure counts twice."""
     colours = {step.number: step.colour for step in session.steps}
     accepted = session.journal.accepted_files()
     assert sorted(frame.step for frame in accepted) == sorted(colours), "each step once"

@@ -42,7 +42,7 @@ DOWNLOAD_S = 0.3
 
 
 def raw(level: int, exposure: ExposureSettings = EXPOSURE) -> bytes:
-    """Return a raw file whose every photosite has `level` counts above black, and which states `exposure`."""
+    """Return a raw file in which every photosite has `level` counts above black, and which states `exposure`."""
     stream = io.BytesIO()
     counts = np.full(BODY.sensor, BODY.black + level, dtype=np.uint16)
     for area in BODY.masked:
@@ -57,10 +57,10 @@ TURNED = raw(6000, ExposureSettings(100, 8.0, 0.4))
 
 @dataclass
 class Screen:
-    """A presenter that remembers what it showed, and fails where it is told to.
+    """A presenter that records its colours, and fails as scripted.
 
-    `covered` are the numbers of the exposures, from 0, after which something lies over the picture; `fails` those of
-    the calls of `show` that raise.
+    `covered`: numbers of the exposures, from 0, after which something covers the picture. `fails`: numbers of the
+    failing calls of `show`.
     """
 
     shown: list[Colour] = field(default_factory=list[Colour])
@@ -86,10 +86,10 @@ class Screen:
 
 
 class ScriptedCamera:
-    """Photographs black as dark and every other colour as well exposed, unless the script says otherwise.
+    """A camera that records black as dark and other colours as well exposed, unless the script differs.
 
-    The script maps the number of an exposure, from 0, to the bytes it gives or the error that it raises; `downloads`
-    maps the number of a download to the error that it raises, `after` how many exposures are over to what happens then.
+    The script maps the number of an exposure, from 0, to the bytes or the error of its file. `downloads` maps the
+    number of a download to its error, `after` maps a number of exposures to an action.
     """
 
     def __init__(self, screen: Screen, clock: SimulatedClock, script: dict[int, bytes | Exception]) -> None:
@@ -148,7 +148,7 @@ class ScriptedCamera:
 
 
 class Lab:
-    """Scripted devices around a fresh session."""
+    """Scripted devices with a fresh session."""
 
     def __init__(
         self,
@@ -173,7 +173,7 @@ class Lab:
         return [attempt.verdict for attempt in self.session.journal.attempts()]
 
     def taken(self) -> list[tuple[str, str | None]]:
-        """Return the steps of the attempts in their order, ``w0``, ``d1``, ``l2``, with their verdicts."""
+        """Return the steps of the attempts in order, ``w0``, ``d1``, ``l2``, with their verdicts."""
         return [(f"{attempt.kind[0]}{attempt.step}", attempt.verdict) for attempt in self.session.journal.attempts()]
 
 
@@ -188,7 +188,7 @@ SAYS = {
 
 
 class Broken:
-    """A device all of whose verbs fail but that it can be closed."""
+    """A device whose methods all fail, except `close`."""
 
     def __init__(self, says: str) -> None:
         self._says = says
@@ -225,7 +225,7 @@ class Beamer:
 
 
 class Hurried(SimulatedClock):
-    """A clock that calls somebody when a pause is slept through."""
+    """A clock that calls a function during the sleep of a pause."""
 
     def __init__(self) -> None:
         super().__init__()

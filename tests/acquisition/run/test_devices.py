@@ -82,13 +82,13 @@ ON, OFF = Power.ON, Power.COOLING
 def test_leaves_lamp_as_configured_and_reports_it(end: RunEnd, settings: SequenceSettings, power: Power) -> None:
     clock = SimulatedClock()
     projector, screen = SimulatedProjector(clock, power=ON), Screen()
-    said: list[tuple[str, str]] = []
+    reports: list[tuple[str, str]] = []
     devices = Devices(ScriptedCamera(screen, clock, {}), screen, projector, clock)
-    leave_lab(devices, end, settings, lambda what, sentence: said.append((what, sentence)))
+    leave_lab(devices, end, settings, lambda event, sentence: reports.append((event, sentence)))
     assert projector.power() is power
     assert screen.shown == [BLACK]
-    ((what, sentence),) = said
-    assert what == "lamp"
+    ((event, sentence),) = reports
+    assert event == "lamp"
     assert ("was switched off" in sentence) == (power is OFF)
     assert ("burns on" in sentence) == (power is ON and end is not RunEnd.INTERRUPTED)
     assert ("left as it is" in sentence) == (end is RunEnd.INTERRUPTED)
@@ -116,8 +116,8 @@ def test_leaves_lamp_that_is_off() -> None:
             raise AssertionError
 
     clock = SimulatedClock()
-    said = settle_lamp(Untouched(clock), RunEnd.COMPLETE, SequenceSettings(), clock)
-    assert said == "it is already off: the projector is in standby"
+    sentence = settle_lamp(Untouched(clock), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert sentence == "it is already off: the projector is in standby"
 
 
 def test_reports_lamp_that_stays_on() -> None:
@@ -125,9 +125,9 @@ def test_reports_lamp_that_stays_on() -> None:
         def switch_off(self) -> None: ...
 
     clock = SimulatedClock()
-    said = settle_lamp(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
-    assert "still burns" in said
-    assert "by hand" in said
+    sentence = settle_lamp(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert "still burns" in sentence
+    assert "by hand" in sentence
     assert clock.monotonic() == 5
 
 
@@ -138,10 +138,10 @@ def test_end_raises_no_device_or_disk_error() -> None:
 
     clock, screen = SimulatedClock(), Broken()
     projector = SimulatedProjector(clock, power=ON)
-    said: list[str] = []
+    reports: list[str] = []
 
-    def report(what: str, sentence: str) -> None:
-        said.append(f"{what}: {sentence}")
+    def report(event: str, sentence: str) -> None:
+        reports.append(f"{event}: {sentence}")
         raise StorageError("the disk is full")
 
     leave_lab(
@@ -150,7 +150,7 @@ def test_end_raises_no_device_or_disk_error() -> None:
         SequenceSettings(),
         report,
     )
-    assert said == ["screen: it could not be set to black: the display is gone", "lamp: it was switched off"]
+    assert reports == ["screen: it could not be set to black: the display is gone", "lamp: it was switched off"]
     assert projector.power() is OFF
 
 
@@ -158,7 +158,7 @@ SEQUENCE = SequenceSettings(warm_up_s=600)
 
 
 class Timed(SimulatedClock):
-    """A clock by which things happen at their times, while somebody waits."""
+    """A clock with events at given times, which happen during waits."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -176,7 +176,7 @@ class Timed(SimulatedClock):
 
 @dataclass
 class PausedRoom:
-    """RetryPolicy with everything that it tells, and something that is broken until a time."""
+    """A RetryPolicy with its reports, and a device that is broken until a given time."""
 
     limit_s: float = 600.0
     clock: Timed = field(default_factory=Timed)
@@ -190,25 +190,25 @@ class PausedRoom:
         return RetryPolicy(
             self.clock,
             self.limit_s,
-            lambda what, sentence: self.said.append((what, sentence)),
+            lambda event, sentence: self.said.append((event, sentence)),
             lambda: self.idled.append(self.clock.monotonic()),
             lambda state, sentence, within_s: self.beats.append((self.clock.monotonic(), state, sentence, within_s)),
         )
 
     @property
     def words(self) -> list[str]:
-        return [what for what, _ in self.said]
+        return [event for event, _ in self.said]
 
     def broken(self, fault: Callable[[float], CropError | None], takes_s: float = 0.0) -> Callable[[], str]:
-        """Return an action that fails as `fault` says of the time, in seconds."""
+        """Return an action that fails with `fault` of the time, s."""
 
         def action() -> str:
-            now = self.clock.monotonic()
-            self.tries.append(now)
+            now_s = self.clock.monotonic()
+            self.tries.append(now_s)
             self.clock.sleep(takes_s)
-            found = fault(now)
-            if found is not None:
-                raise found
+            current = fault(now_s)
+            if current is not None:
+                raise current
             return "done"
 
         return action
@@ -216,7 +216,7 @@ class PausedRoom:
 
 @dataclass
 class Room(PausedRoom):
-    """A projector behind PJLink, and everything that is said of it."""
+    """A projector behind PJLink, with all reports about it."""
 
     power: Power = Power.ON
 
@@ -494,7 +494,7 @@ def test_back_off_continues_across_pauses() -> None:
 
 @pytest.mark.slow
 def test_full_disk_keeps_frame_in_camera(tmp_path: Path) -> None:
-    """The real driver, and a kernel that lets no file grow: the download is repeated when there is space again."""
+    """The real driver, with a kernel that refuses larger files: the download is repeated when there is space again."""
     resource = pytest.importorskip("resource")
     chart, light = design_chart(1), Illumination(0, "uniform", None, WHITE)
     document = {"rig": "simulated", "chart": "c", "illuminations": "i", "simulated": {"body": "Test"}}
@@ -618,7 +618,7 @@ def test_reports_late_step_once() -> None:
     watch = RunWatch(lambda sentence, begun: caught.append(sentence), time)
 
     def pass_s(seconds: float) -> None:
-        """Let time pass in pieces that are no gap."""
+        """Let time pass in steps that are shorter than a gap."""
         for _ in range(round(seconds)):
             time.now += 1
             watch.look()

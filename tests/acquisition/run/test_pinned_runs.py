@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_plans_runs(pinned: Pinned) -> None:
-    chance, found = random.Random(5), list[Any]()
+    chance, plans = random.Random(5), list[Any]()
     supplies = [
         None,
         Supplies(0.25, None, None, saves_to_host=True),
@@ -51,9 +51,9 @@ def test_plans_runs(pinned: Pinned) -> None:
     ]
     for number in range(18):
         settings = settings_with(**chance.choice(rigs))
-        done = chance.choice((0, 0, 50, 59, 60, 61, 110))
+        done_count = chance.choice((0, 0, 50, 59, 60, 61, 110))
         largest, frame_s = chance.choice((None, 25_000_000)), chance.choice((None, 3.25))
-        work = work_of(settings, done, frame_bytes=largest, frame_s=frame_s)
+        work = work_of(settings, done_count, frame_bytes=largest, frame_s=frame_s)
         if number % 9 == 0:
             steps = tuple(replace(step, colour=BLACK) if step.illumination == 3 else step for step in work.steps)
             work = replace(work, steps=steps)
@@ -65,40 +65,42 @@ def test_plans_runs(pinned: Pinned) -> None:
             lit=chance.choice((None, True, False)),
             unasked=chance.choice(((), ("this",))),
         )
-        free, given = chance.choice((GB, 3 * GB, 5 * GB, 10**12)), chance.choice((None, 10**6))
-        one = make_plan(settings, work, answers, free, given)
-        numbers = [one.frame_bytes, one.frame_s, one.warm_up_s, one.time_s, one.needed_bytes]
-        found.append([numbers, len(one.faults)])
+        free_bytes, simulated_bytes = chance.choice((GB, 3 * GB, 5 * GB, 10**12)), chance.choice((None, 10**6))
+        run_plan = make_plan(settings, work, answers, free_bytes, simulated_bytes)
+        numbers = [run_plan.frame_bytes, run_plan.frame_s, run_plan.warm_up_s, run_plan.time_s, run_plan.needed_bytes]
+        plans.append([numbers, len(run_plan.faults)])
     models = [frame_bytes(None, model).value for model in ("", "ILCE-7M4", "CroP Test", *plan.MEGAPIXELS)]
     needs = [needed_bytes(frames, size) for frames in (0, 1, 766) for size in (1, 25e6)]
     offered = [plan.is_offered(time, SPEEDS) for time in (0.5, 0.505, 0.506, 0.495, 0.494, 1.01, 1.02)]
-    pinned("plans of runs", [found, models, needs, offered])
+    pinned("plans of runs", [plans, models, needs, offered])
 
 
 def test_counts_turns_in_shutter_times(pinned: Pinned) -> None:
     wheels = (24.0, 50.0, 59.94, 60.0, 120.0, 180.0)
     turns = {str(hz): [time for time in ENGRAVED_S if holds_whole_turns(time, 1 / hz)] for hz in wheels}
-    odd = [[n, holds_whole_turns(n / 60, 1 / 60)] for n in (0.4, 0.5, 0.994, 0.995, 1.005, 1.0051, 30.14, 30.16, 300.9)]
+    fractions = [
+        [n, holds_whole_turns(n / 60, 1 / 60)] for n in (0.4, 0.5, 0.994, 0.995, 1.005, 1.0051, 30.14, 30.16, 300.9)
+    ]
     assert not holds_whole_turns(1e-5, 1 / 60), "next to nothing is no turn, however near to a whole number of them"
-    said: list[bool] = []
+    is_accepted: list[bool] = []
     for time, cable in product(
         (0.5, 0.3, 0.01, 1 / 60, 31.0, 0.5026),
         (ProjectorCable(), ProjectorCable(colour_wheel_hz=180), ProjectorCable(refresh_hz=50)),
     ):
         try:
             require_whole_turns(CameraSettings(shutter_s=time), cable)
-            said.append(True)
+            is_accepted.append(True)
         except CropError:
-            said.append(False)
+            is_accepted.append(False)
     plain, wheel = settings_with(), settings_with(lab={"projector": {"colour_wheel_hz": 90}})
     rigs = [plain, wheel, plain.model_copy(update={"rig": "simulated"})]
     pinned(
         "whole turns",
         {
             "turns": turns,
-            "odd": odd,
-            "accepted": said,
-            "rigs": [[wheel_of(one), period_s(one)] for one in rigs],
+            "odd": fractions,
+            "accepted": is_accepted,
+            "rigs": [[wheel_of(rig), period_s(rig)] for rig in rigs],
             "times": ENGRAVED_S,
         },
     )
@@ -106,7 +108,7 @@ def test_counts_turns_in_shutter_times(pinned: Pinned) -> None:
 
 def test_waits_for_faults(pinned: Pinned) -> None:
     faults = [DeviceError("covered by 3 windows"), LinkClosed("nothing at 10.0.0.1"), DeviceFault("off; switch it on")]
-    found: dict[str, Any] = {}
+    waits: dict[str, Any] = {}
     for limit, takes, pattern in product(
         (0.0, 60.0, 600.0, math.inf), (0.0, 2.5), ((0.9,), (1.0, 30.0), (0.5, 4.0, 9.0), (45.0, 80.0), (1e9,))
     ):
@@ -119,10 +121,12 @@ def test_waits_for_faults(pinned: Pinned) -> None:
             return next((faults[n] for n, end in enumerate(pattern) if now < end), None)
 
         try:
-            for again in range(2):
-                retry.attempt(room.broken(lambda now, again=again: fault(now - 100 * again), takes), "the camera")
+            for repetition in range(2):
+                retry.attempt(
+                    room.broken(lambda now, repetition=repetition: fault(now - 100 * repetition), takes), "the camera"
+                )
                 retry.accepted()
-                room.clock.sleep(max(100 * (again + 1) - room.clock.monotonic(), 0))
+                room.clock.sleep(max(100 * (repetition + 1) - room.clock.monotonic(), 0))
             pause = retry.pause("frames")
             for _ in range(4):
                 pause.back_off(DeviceError("late"))
@@ -130,38 +134,37 @@ def test_waits_for_faults(pinned: Pinned) -> None:
         except CropError:
             ended = True
         times = [len(room.beats), len(room.idled), len(room.tries), room.tries[-1], room.clock.monotonic()]
-        found[f"{limit:g} s, {takes:g} s, {pattern}"] = [*times, ended]
-    pinned("waits for what fails", found)
+        waits[f"{limit:g} s, {takes:g} s, {pattern}"] = [*times, ended]
+    pinned("waits for what fails", waits)
 
 
 def test_orders_steps(pinned: Pinned) -> None:
-    chance, found = random.Random(2), list[Any]()
+    chance, orders = random.Random(2), list[Any]()
     for number in range(60):
-        done = set(chance.sample(range(10), chance.randrange(9)))
+        done_numbers = set(chance.sample(range(10), chance.randrange(9)))
         bad = {n: chance.randrange(1, 5) for n in chance.sample(range(12), chance.randrange(4))}
-        queue = queue_of(done, chance.choice((1, 2, 3)))
+        queue = queue_of(done_numbers, chance.choice((1, 2, 3)))
         if number % 3 == 0:
-            queue.void(chance.sample(sorted(done), len(done) // 2), "doubtful")
+            queue.void(chance.sample(sorted(done_numbers), len(done_numbers) // 2), "doubtful")
         order = take(queue, bad)
-        found.append([*order, len(queue), queue.is_stuck])
-    pinned("steps in their order", found)
+        orders.append([*order, len(queue), queue.is_stuck])
+    pinned("steps in their order", orders)
 
 
 def test_reports_accepted_changes(pinned: Pinned) -> None:
-    grey, found = Colour(250, 250, 250), list[Any]()
+    grey, counts = Colour(250, 250, 250), list[Any]()
     first, light = SessionStep(3, "response", None, grey), SessionStep(5, "light", 0, grey)
     dark = SessionStep(1, "dark", None, BLACK)
     steps = (first, light, dark, replace(first, number=9))
     for step, value in product(steps, (-2.0, -1.0, -0.2, 0.0, 0.2, 0.5, 0.51, 1.0, 1.01)):
         for name in ("movement", "off_brightness", "leak_share"):
             judged = Judgement((Check(name, value, -1.5, 1.5),))
-            found.append(len(list(pipeline._accepted_changes(step, judged, steps, JudgeSettings()))))
-    pinned("changes that a run follows", found)
+            counts.append(len(list(pipeline._accepted_changes(step, judged, steps, JudgeSettings()))))
+    pinned("changes that a run follows", counts)
 
 
 LASTS = refused("moved", lasting=True)
-SEEDS = (29, 30, 34, 37, 41)
-"""Runs in which five things and more go wrong, none of them with the disk, which is written to beside."""
+SEEDS = (29, 30, 34, 37, 41)  # runs with at least five faults, none of them of the disk
 
 SCRIPTS: dict[str, tuple[dict[int, bytes | Exception], dict[int, Judgement]]] = {
     "calm": ({}, {}),
@@ -174,7 +177,7 @@ SCRIPTS: dict[str, tuple[dict[int, bytes | Exception], dict[int, Judgement]]] = 
 
 
 def journal_of(session: Session) -> dict[str, Any]:
-    """Return when each step was attempted, with what verdict, and how often each event happened."""
+    """Return the times and verdicts of all attempts, and the number of each event."""
     attempts, events = session.journal.attempts(), session.journal.events()
     verdicts: dict[str, list[int]] = {}
     for one in attempts:

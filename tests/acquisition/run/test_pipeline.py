@@ -133,7 +133,7 @@ class TestRefusals:
     @pytest.mark.slow
     @pytest.mark.parametrize(
         ("bad", "reason"),
-        [(NIGHT, "is the projector on"), (GLARE, "clipped"), (TURNED, "0.4 instead of 0.5"), (b"garbage", "raw")],
+        [(NIGHT, "the projector is on"), (GLARE, "clipped"), (TURNED, "0.4 instead of 0.5"), (b"garbage", "raw")],
     )
     def test_repeats_refused_frame(self, folder: Path, bad: bytes, reason: str) -> None:
         lab = Lab(folder, {2: bad})

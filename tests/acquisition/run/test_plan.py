@@ -71,7 +71,7 @@ CHART = design_chart(1)
 def planned(
     free: float = 1000 * GB, answers: Answers | None = None, settings: LabSettings = SETTINGS, work: Work | None = None
 ) -> RunPlan:
-    given = answers or Answers(camera=EOS, offered_s=SPEEDS, projector="Epson, in standby: it will be lit", lit=False)
+    given = answers or Answers(camera=EOS, offered_s=SPEEDS, projector="Epson, in standby", lit=False)
     return make_plan(settings, work or work_of(), given, int(free))
 
 
@@ -98,7 +98,7 @@ class TestExposure:
         settings = settings_with(camera={"shutter_s": 0.45})
         (fault,) = planned(settings=settings).faults
         assert isinstance(fault, DeviceRefused)
-        assert str(fault).startswith("camera.shutter_s = 0.45: the body does not offer it; ")
+        assert str(fault).startswith("camera.shutter_s = 0.45 s is not offered")
         assert "0.4, 0.5, 0.6 s" in str(fault)
 
 
@@ -110,7 +110,7 @@ class TestExposure:
         (Supplies(battery=0.25, mains=True), ""),
         (Supplies(battery=0.5), ""),
         (Supplies(), ""),
-        (Supplies(card_free_bytes=GB, saves_to_host=False), "are missing; put in an empty card of"),
+        (Supplies(card_free_bytes=GB, saves_to_host=False), "are missing; insert an empty card"),
         (Supplies(card_free_bytes=GB, saves_to_host=True), ""),
         (Supplies(card_free_bytes=100 * GB, saves_to_host=False), ""),
         (Supplies(card_free_bytes=None, saves_to_host=False), ""),
@@ -151,7 +151,7 @@ class TestAsking:
         assert answers.camera == EOS
         assert answers.supplies == Supplies(0.75)
         assert (answers.lit, answers.faults) == (False, ())
-        assert "in standby: it will be lit" in answers.projector
+        assert "in standby: it will be switched on" in answers.projector
         assert answers.warnings == ("night light is on: switch it off",)
         assert clock.monotonic() == 0
 
@@ -194,11 +194,11 @@ def small_disk(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("target", "said", "unsaid"),
     [
         ("{there}/tell --phone", "", "s3cret"),
-        ("{there}/gone --phone s3cret", "{there}/gone … is no command that is there", "s3cret"),
+        ("{there}/gone --phone s3cret", "the command {there}/gone … does not exist", "s3cret"),
         ("{there}/plain --phone", "chmod +x {there}/plain", "--phone"),
         (
             "ntfy.example/s3cret",
-            "ntfy.example/… is no command that is there; an address begins",
+            "ntfy.example/… does not exist; if it is an address",
             "s3cret",
         ),
         ("https://ntfy.example/s3cret", "", "s3cret"),
@@ -230,27 +230,27 @@ def test_doubts_unlikely_times() -> None:
     assert doubts(control) == 0
     assert doubts(control, settle_s=500.0) == 1
     assert doubts(control, warm_up_s=20.0) == 1
-    assert doubts(real, warm_up_s=20.0) == 0, "the lamp is not under control"
+    assert doubts(real, warm_up_s=20.0) == 0, "the lamp is not controlled"
 
 
 class TestDryRun:
     def test_prints_new_session_without_creating_it(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         lab.write_text(lab.read_text() + '[notify]\nalive = "https://ping.example/s3cret"\n')
-        before = contents(lab.parent)
+        files = contents(lab.parent)
         assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 0
-        assert contents(lab.parent) == before
+        assert contents(lab.parent) == files
         text = capsys.readouterr().out
         assert "night: new, 8 frames to take (4 light, 2 white, 2 dark); 0 frames of 8 done" in text
         assert "shuffled by seed 1" in text
-        assert "in standby: it will be lit" in text
+        assert "in standby: it will be switched on" in text
         assert "notices     to https://ntfy.example/…" in text
         assert "alive       to https://ping.example/…" in text
         assert "s3cret" not in text
 
     def test_prints_session_without_changing_it(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         night = lab.parent / "night"
-        found = json_of(main, ["run", lab, night], capsys)
-        assert found == {
+        document = json_of(main, ["run", lab, night], capsys)
+        assert document == {
             "command": "acquire run",
             "session": str(night),
             "frames": 8,
@@ -259,26 +259,26 @@ class TestDryRun:
             "doubts": [],
         }
         with Session.open_for_run(night) as session:
-            taken = sorted(frame.taken_at for frame in session.frames())
+            times = sorted(frame.taken_at for frame in session.frames())
             frame_s = outline(load_lab(lab), night, session).frame_s
             session.retake("2")
         # Frames overlap: an attempt lasts longer than the interval between frames.
         assert frame_s is not None
-        gaps = sorted(after - before for before, after in pairwise(taken))
+        gaps = sorted(later - earlier for earlier, later in pairwise(times))
         assert timedelta(seconds=frame_s) == gaps[len(gaps) // 2]
-        before = contents(lab.parent)
+        files = contents(lab.parent)
         capsys.readouterr()
         assert main(["run", str(lab), str(night), "--dry-run", "--retake", "0-1,2"]) == 0
         assert "3 frames to take (3 light); 5 frames of 8 done" in capsys.readouterr().out
-        assert contents(lab.parent) == before
+        assert contents(lab.parent) == files
         assert main(["run", str(lab), str(night), "--dry-run", "--retake", "9"]) == 2
         assert "has no illuminant 9" in capsys.readouterr().err
         assert main(["run", str(lab), str(night), "--dry-run"]) == 0
-        assert contents(lab.parent) == before
+        assert contents(lab.parent) == files
         text = capsys.readouterr().out
-        assert "night: taken up again, 1 frame to take (1 light); 7 frames of 8 done" in text
-        assert "the largest of the session so far" in text
-        assert "median of the session so far" in text
+        assert "night: resumed, 1 frame to take (1 light); 7 frames of 8 done" in text
+        assert "the largest file of the session" in text
+        assert "median of the session" in text
 
     @pytest.mark.parametrize("dry", [["--dry-run"], []])
     def test_refuses_retake_in_new_session(self, lab: Path, capsys: pytest.CaptureFixture[str], dry: list[str]) -> None:
@@ -289,13 +289,13 @@ class TestDryRun:
     @pytest.mark.usefixtures("small_disk")
     def test_full_disk_sets_exit_code(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 5
-        said = capsys.readouterr()
-        assert "the disk of" not in said.out, "a fault is said once"
-        assert "are missing" in said.err
-        found = json_of(main, ["run", lab, lab.parent / "night", "--dry-run"], capsys, code=5)
-        assert (found["command"], found["frames"]) == ("acquire run", 8)
-        assert found["needed_bytes"] > found["free_bytes"] == 10**8
-        (fault,) = found["faults"]
+        printed = capsys.readouterr()
+        assert "the disk of" not in printed.out, "a fault is said once"
+        assert "are missing" in printed.err
+        document = json_of(main, ["run", lab, lab.parent / "night", "--dry-run"], capsys, code=5)
+        assert (document["command"], document["frames"]) == ("acquire run", 8)
+        assert document["needed_bytes"] > document["free_bytes"] == 10**8
+        (fault,) = document["faults"]
         assert fault.startswith("the disk of")
 
     def test_refuses_changed_settings(self, lab: Path) -> None:

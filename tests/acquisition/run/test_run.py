@@ -71,7 +71,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def lab_with_response(folder: Path) -> Lab:
-    """Return a lab whose session begins with white, dark, red, green."""
+    """Return a lab whose session starts with white, dark, red, green."""
     lab = Lab(folder)
     lab.session.close()
     (folder / "journal.sqlite").unlink()
@@ -285,9 +285,9 @@ def settings(**changes: object) -> LabSettings:
 
 @dataclass
 class LatePictureJudge:
-    """Sees the colours that the camera exposed, those of `late` exposures one exposure late.
+    """Judges the colours that the camera exposed; those of `late` exposures are one exposure late.
 
-    As the judge does: the same cause in three frames in a row is lasting, and a wrong white voids.
+    Like the live judge, it reports a cause as lasting after three frames, and a wrong white frame voids others.
     """
 
     lab: Lab
@@ -311,7 +311,7 @@ class LatePictureJudge:
 
 @dataclass
 class Night:
-    """A session of forty lights, and what was said of it."""
+    """A session of 40 illuminants, and its reports."""
 
     lab: Lab
     said: list[str] = field(default_factory=list[str])
@@ -419,7 +419,7 @@ AT = datetime(2026, 1, 1, 3, 12, 45, tzinfo=UTC)
 
 @dataclass
 class Receiver:
-    """What a server on this machine got, and how it answers."""
+    """Requests that a server on this computer received, and its answers."""
 
     code: int = 200
     headers: dict[str, str] = field(default_factory=dict[str, str])
@@ -466,7 +466,7 @@ def no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def notices(target: str, *events: str) -> list[str]:
-    """Tell a target some events; return the warnings."""
+    """Send events to a target; return the warnings."""
     warnings: list[str] = []
     told_by = Notices(target, "night", warnings.append)
     for event in events or ("paused",):
@@ -514,9 +514,7 @@ class TestWebhook:
     def test_reports_refusal_once_without_secret(self, receiver: Receiver, why: str) -> None:
         with served(receiver):
             warnings = notices(f"http://u:s3cret@127.0.0.1:{receiver.port}/s3cret?s3cret", "paused", "resumed")
-        assert warnings == [
-            f"http://127.0.0.1:{receiver.port}/… did not receive a notice: {why}; the run continues without it"
-        ]
+        assert warnings == [f"http://127.0.0.1:{receiver.port}/… did not receive a notice: {why}; the run continues"]
         assert len(receiver.got) == 2
 
     def test_reports_missing_server(self) -> None:
@@ -559,7 +557,7 @@ class TestCommand:
         ],
     )
     def test_reports_failed_command(self, target: str, label: str, why: str) -> None:
-        expected = [f"{label} did not receive a notice: {why}; the run continues without it"] if why else []
+        expected = [f"{label} did not receive a notice: {why}; the run continues"] if why else []
         assert notices(target, "paused", "resumed") == expected
 
     @pytest.mark.slow
@@ -589,7 +587,7 @@ def test_notices_never_block() -> None:
 
 
 class Manager:
-    """Takes datagrams as systemd does."""
+    """Receives datagrams as systemd does."""
 
     def __init__(self, address: str) -> None:
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -741,7 +739,7 @@ def test_estimates_time_without_pauses(monkeypatch: pytest.MonkeyPatch, capsys: 
     with Terminal(lambda: now[0]) as terminal:
 
         def left(*frames_s: float, reason: str = "") -> str:
-            """Return what is said of ten frames left after others that took so long."""
+            """Return the text for ten remaining frames after frames of the given durations."""
             for seconds in frames_s:
                 now[0] += seconds
                 terminal.show_frame(Taken(STEP, Judgement((Check("file", reason=reason),)), 10))
