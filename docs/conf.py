@@ -43,8 +43,9 @@ default_role = "name"
 napoleon_google_docstring = False
 napoleon_use_ivar = True
 autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
 autodoc_member_order = "bysource"
-autodoc_default_options = {"members": True, "undoc-members": True, "show-inheritance": True}
+autodoc_default_options = {"members": True}
 # Docstrings also name internal modules, which have no page.
 suppress_warnings = ["ref.python"]
 

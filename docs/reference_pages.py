@@ -11,6 +11,7 @@ import csv
 import inspect
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from calibration.causes.rules import CAUSES, RULES, UNKNOWN, Condition, Evidence, Rule
@@ -20,6 +21,7 @@ from calibration.figures.single_frames import FRAME_LIMITS, RIG_LIMITS
 
 _DOCS = Path(__file__).parent
 _RESULTS = _DOCS / "results"
+_SOURCE_COLUMNS = ("command", "version", "date", "machine")
 
 _FIGURES_HEAD = """# Figures
 
@@ -140,13 +142,24 @@ def fill_results(page: str) -> str:
 
 
 def _results_table(path: Path) -> str:
+    """Return a table of results, and a table of their numbered sources: command, version, date and machine."""
     with path.open(encoding="utf-8", newline="") as file:
-        header, *rows = csv.reader(file)
-    command = header.index("command")
+        rows = list(csv.DictReader(file))
+    columns = [name for name in rows[0] if name not in _SOURCE_COLUMNS]
+    source_columns = [name for name in _SOURCE_COLUMNS if name in rows[0]]
+    sources = list(dict.fromkeys(tuple(row[name] for name in source_columns) for row in rows))
+    results = [[*columns, "source"]]
     for row in rows:
-        row[command] = f"`{row[command]}`"
-    lines = [header, ["---"] * len(header), *rows]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+        # Non-breaking spaces keep numbers and units together.
+        cells = [row[name].replace(" %", "\N{NO-BREAK SPACE}%") for name in columns]
+        results.append([*cells, str(1 + sources.index(tuple(row[name] for name in source_columns)))])
+    numbered = [[str(number), f"`{source[0]}`", *source[1:]] for number, source in enumerate(sources, 1)]
+    return f"{_markdown_table(results)}\n{_markdown_table([['source', *source_columns], *numbered])}"
+
+
+def _markdown_table(rows: Sequence[Sequence[str]]) -> str:
+    header, *body = rows
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in (header, ["---"] * len(header), *body))
 
 
 def generated_pages() -> dict[Path, str]:
