@@ -85,17 +85,17 @@ from generator.dataset.records import (
 )
 from generator.files import FILE_FORMATS, FULL, ImageMetadata, encode_pieces, encode_preview, preview_of, suffix_of
 from generator.kernels.mixing import mix_samples
-from generator.kernels.printing import nearest_nodes
+from generator.kernels.printing import count_by_node
 from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, draw_samples
 from generator.kernels.unfit import colours_in, replace_unfit_colours
 from generator.lights.lighting import Lighting, Mixture
 from generator.masks.maps import encode_maps, mean_weights
-from generator.pictures.sources import Cut, Picture, Source, hash_since
-from generator.rendering.black_points import veil_of, without_veil
+from generator.pictures.sources import Cut, Picture, Source, changed_sha256
+from generator.rendering.black_points import black_subtraction, subtract_black
 from generator.rendering.colorimetric import rendering_with
 from generator.rendering.matrices import matrix_for
 from generator.stores import DESCRIPTION, LocalStore, Pieces, Store, open_store
-from generator.variation.variation import Varied
+from generator.variation.variation import AppliedVariation
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -210,13 +210,13 @@ def photograph(
     weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
     if options.rendering == "colorimetric":
         rendering = rendering_with(lut, options.matrix or matrix_for(lut))
-        outside, distance = rendering.map.missed(nearest_nodes(picture))
+        outside, distance = rendering.map.gamut_error(count_by_node(picture))
         counts = rendering.draw(
             picture,
             lighting.mixtures,
             share or 0.0,
             weights,
-            most=lut.provenance.white_level if weights is None else white_level,
+            white_level=lut.provenance.white_level if weights is None else white_level,
             seed=seed,
             image=number,
             out=_reused(picture.shape),
@@ -237,8 +237,8 @@ def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: i
     if not share:
         return samples
     colours = colours_in(picture, lut.provenance.bits) if picture.size < 3 * WHOLE_LIGHT_PIXELS else None
-    veil = veil_of(lut, mixture, share)
-    return without_veil(samples, veil, lut.provenance.white_level, colours)
+    veil = black_subtraction(lut, mixture, share)
+    return subtract_black(samples, veil, lut.provenance.white_level, colours)
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
@@ -267,7 +267,7 @@ class _ImageLight:
 
 
 def _image_light(
-    lut: Lut, lighting: Lighting, weights: npt.NDArray[np.float32] | None, varied: Varied, tints: bool
+    lut: Lut, lighting: Lighting, weights: npt.NDArray[np.float32] | None, varied: AppliedVariation, tints: bool
 ) -> _ImageLight:
     """Return the light of an image.
 
@@ -566,7 +566,7 @@ def _known_source(job: ShardJob, position: int, finished: Mapping[int, FinishedI
     if first is None or any(source != first for source in known):
         return None
     # Of a file on a store no hash is known before it is read.
-    return first if hash_since(job.sources[position - job.position], -math.inf) == first.sha256 else None
+    return first if changed_sha256(job.sources[position - job.position], -math.inf) == first.sha256 else None
 
 
 def _photographed(
@@ -585,7 +585,7 @@ def _photographed(
     # What exceeds saturation may be below it once it is exposed anew, and is cut then.
     most = white_level if options.variation is None else FULL
     raw = photograph(lut, cut.picture, lighting, options, job.seed, number, most)
-    varied = Varied()
+    varied = AppliedVariation()
     if options.variation is not None:
         varied = options.variation.apply(raw.counts, white_level, job.seed, number)
     light = _image_light(lut, lighting, raw.weights, varied, options.tints)

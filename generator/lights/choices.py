@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from foundation.errors import InputError, first_few, nearest_names, value_text
 from generator import philox
-from generator.kernels.rendering import known_light
+from generator.kernels.rendering import valid_light
 from generator.lights.distributions import Distribution
 from generator.lights.gamut import TOLERANCE_DEG, Gamut, Match, OutsideGamut, black_body, rgb_of
 from generator.lights.lighting import LightChoice, Lighting, ListedLights, Mixture, parse_mixture, plain
@@ -277,7 +277,7 @@ def light_of(given: int | str | Mixture, lut: Lut) -> Mixture:
     if isinstance(given, Mixture):
         given.white(lut)
         return given
-    return plain(known_light(lut, given))
+    return plain(valid_light(lut, given))
 
 
 def listed_lights(given: Iterable[int | str | Mixture] | str | float | Mixture, lut: Lut) -> ListedLights:
@@ -286,7 +286,7 @@ def listed_lights(given: Iterable[int | str | Mixture] | str | float | Mixture, 
         raise InputError(f"the lights are {value_text(given)}, expected a list, such as [0, 3] or ['D65']")
     # Numbers stay numbers: a dataset is the same by whatever way its lights were given.
     return ListedLights(
-        tuple(light_of(light, lut) if isinstance(light, str | Mixture) else known_light(lut, light) for light in given)
+        tuple(light_of(light, lut) if isinstance(light, str | Mixture) else valid_light(lut, light) for light in given)
     )
 
 
