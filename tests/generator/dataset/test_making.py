@@ -195,7 +195,7 @@ def test_nothing_is_left_of_a_dataset_that_cannot_be(make_lut: MakeLut, pictures
     lut = make_lut()
     sources = find_pictures([pictures])
     before, threads = contents(tmp_path), threading.active_count()
-    with pytest.raises(InputError, match="there is no light 9"):
+    with pytest.raises(InputError, match="there is no illuminant 9"):
         generate_dataset(lut, tmp_path / "out", sources, [0, 9], workers=2)
     with pytest.raises(FormatError, match="none of the 1 pictures"):
         generate_dataset(lut, tmp_path / "out", find_pictures([pictures / "broken.jpg"]), [0])
