@@ -46,7 +46,7 @@ from generator.kernels.printing import NODES, PrintedLight, draw_printed
 from generator.kernels.rendering import draw_samples
 from generator.kernels.vector import GROUP, LINE, copy8, offset_at
 from generator.masks.making import parse_masks
-from generator.rendering.black_points import Veil, without_veil
+from generator.rendering.black_points import BlackSubtraction, subtract_black
 
 SAMPLES = 25
 REPEATS = 7
@@ -262,8 +262,8 @@ print(middle - begin, time.process_time() - middle)
 
 def measure_black(samples: npt.NDArray[np.uint16]) -> None:
     """Report how long taking the print's black out of all samples of a light takes."""
-    veil = Veil(np.array([300.0, 380.0, 330.0]), np.array([1.04, 1.04, 1.04]))
-    call = partial(without_veil, samples, veil, WHITE)
+    veil = BlackSubtraction(np.array([300.0, 380.0, 330.0]), np.array([1.04, 1.04, 1.04]))
+    call = partial(subtract_black, samples, veil, WHITE)
     report("black taken out of a light's samples, one thread", in_turns({"": call}, time.thread_time)[""], "s")
 
 

@@ -17,7 +17,7 @@ from benchmarks.generator import in_turns, noisy_table, photograph, report
 from generator.files import ImageMetadata, encode_image
 from generator.kernels.rendering import draw_samples
 from generator.variation.iso_speed import parse_iso
-from generator.variation.variation import Variation, parse_exposure, parse_gradient, varied_by
+from generator.variation.variation import Variation, parse_exposure, parse_gradient, variation_of
 
 WIDTH, HEIGHT, WHITE = 3000, 2000, 12000
 
@@ -28,7 +28,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         lut = noisy_table(Path(scratch) / "lut", 2)
         start = time.process_time()
-        everything = varied_by(
+        everything = variation_of(
             lut, parse_exposure("clip:share=.01"), parse_gradient("smooth:stops=1"), parse_iso("1600/100")
         )
         report("noise of a table", time.process_time() - start, "s")

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from calibration.table.lut import open_lut
 from foundation.colorimetry import angles_deg
-from generator.kernels.printing import NODES, SIDE, nearest_nodes
+from generator.kernels.printing import NODES, SIDE, count_by_node
 from generator.lights.choices import light_numbers
 from generator.lights.lighting import single_mixture
 from generator.pictures.sources import open_picture
@@ -46,7 +46,7 @@ def kept(seen: Array, wanted: Array, shares: Array) -> str:
 def row(rendering: ColorimetricRendering, light: int, shares: Array) -> list[str]:
     """Return the figures of one light."""
     lut, white = rendering.lut, rendering.lut.white[light]
-    wanted, seen = source_colours(rendering.matrix), rendering.seen(single_mixture(light)) / white
+    wanted, seen = source_colours(rendering.matrix), rendering.node_means(single_mixture(light)) / white
     black = seen[0]
     bare = (seen - black) / (seen[-1] - black)
     side = 1 << lut.provenance.bits
@@ -78,7 +78,7 @@ def main() -> int:
     lights = light_numbers(given.lights, total) if given.lights else range(total - 1, -1, -given.every)
     shares = np.full(NODES, 1 / NODES)
     if given.picture:
-        counts = [nearest_nodes(open_picture(path).picture) for path in given.picture]
+        counts = [count_by_node(open_picture(path).picture) for path in given.picture]
         shares = np.mean([count / count.sum() for count in counts], axis=0)
     matrix = matrix_for(lut)
     print(f"matrix of {matrix.name}: {matrix.source}")

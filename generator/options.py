@@ -377,15 +377,15 @@ class VariationOptions:
 
     def variation(self, lut: Lut) -> Variation | None:
         """Return the variation of the images, or None."""
-        from generator.variation.iso_speed import known_of_table, parse_iso
-        from generator.variation.variation import parse_exposure, parse_gradient, varied_by
+        from generator.variation.iso_speed import parse_iso, recorded_speed
+        from generator.variation.variation import parse_exposure, parse_gradient, variation_of
 
         exposure = None if self.exposure is None else parse_exposure(self.exposure)
         gradient = None if self.gradient is None else parse_gradient(self.gradient)
-        iso = None if self.iso is None else parse_iso(self.iso, *known_of_table(lut))
+        iso = None if self.iso is None else parse_iso(self.iso, *recorded_speed(lut))
         if exposure is None and gradient is None and iso is None:
             return None
-        return varied_by(lut, exposure, gradient, iso)
+        return variation_of(lut, exposure, gradient, iso)
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ from generator.dataset.shards import (
 )
 from generator.lights.choices import listed_lights
 from generator.lights.lighting import LightChoice, Mixture
-from generator.pictures.sources import Source, hash_since
+from generator.pictures.sources import Source, changed_sha256
 from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
 
 if TYPE_CHECKING:
@@ -395,7 +395,7 @@ def _differing_pictures(dataset: Dataset, plan: Plan, out: Path | str) -> list[s
         name, sha256 = recorded.get(position, ("", None))
         if source.name != name:
             return [f"source {position} {name}, now {source.name}"]
-        if sha256 is not None and since is not None and hash_since(source, since) not in (None, sha256):
+        if sha256 is not None and since is not None and changed_sha256(source, since) not in (None, sha256):
             return [f"the content of {name}"]
     return []
 

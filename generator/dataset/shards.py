@@ -82,17 +82,17 @@ from generator.dataset.records import (
 )
 from generator.files import FILE_FORMATS, FULL, ImageMetadata, encode_pieces, encode_preview, preview_of, suffix_of
 from generator.kernels.mixing import mix_samples
-from generator.kernels.printing import nearest_nodes
+from generator.kernels.printing import count_by_node
 from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, draw_samples
 from generator.kernels.unfit import colours_in, replace_unfit_colours
 from generator.lights.lighting import Lighting, Mixture
 from generator.masks.maps import encode_maps, mean_weights
-from generator.pictures.sources import Cut, Picture, Source, hash_since
-from generator.rendering.black_points import veil_of, without_veil
+from generator.pictures.sources import Cut, Picture, Source, changed_sha256
+from generator.rendering.black_points import black_subtraction, subtract_black
 from generator.rendering.colorimetric import rendering_with
 from generator.rendering.matrices import matrix_for
 from generator.stores import DESCRIPTION, LocalStore, Pieces, Store, open_store
-from generator.variation.variation import Varied
+from generator.variation.variation import AppliedVariation
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -191,13 +191,13 @@ def photograph(
     weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
     if options.rendering == "colorimetric":
         rendering = rendering_with(lut, options.matrix or matrix_for(lut))
-        outside, distance = rendering.map.missed(nearest_nodes(picture))
+        outside, distance = rendering.map.gamut_error(count_by_node(picture))
         counts = rendering.draw(
             picture,
             lighting.mixtures,
             share or 0.0,
             weights,
-            most=lut.provenance.white_level if weights is None else white_level,
+            white_level=lut.provenance.white_level if weights is None else white_level,
             seed=seed,
             image=number,
             out=_reused(picture.shape),
@@ -218,8 +218,8 @@ def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: i
     if not share:
         return samples
     colours = colours_in(picture, lut.provenance.bits) if picture.size < 3 * WHOLE_LIGHT_PIXELS else None
-    veil = veil_of(lut, mixture, share)
-    return without_veil(samples, veil, lut.provenance.white_level, colours)
+    veil = black_subtraction(lut, mixture, share)
+    return subtract_black(samples, veil, lut.provenance.white_level, colours)
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
@@ -242,7 +242,7 @@ class _ImageLight:
 
 
 def _image_light(
-    lut: Lut, lighting: Lighting, weights: npt.NDArray[np.float32] | None, varied: Varied, tints: bool
+    lut: Lut, lighting: Lighting, weights: npt.NDArray[np.float32] | None, varied: AppliedVariation, tints: bool
 ) -> _ImageLight:
     labels = [mixture.label for mixture in lighting.mixtures]
     whites = lighting.whites(lut)
@@ -527,7 +527,7 @@ def _unchanged_source(job: ShardJob, position: int, finished: Mapping[int, Finis
     if first is None or any(source != first for source in records):
         return None
     # For a file in a store the hash is unknown before reading it.
-    return first if hash_since(job.sources[position - job.position], -math.inf) == first.sha256 else None
+    return first if changed_sha256(job.sources[position - job.position], -math.inf) == first.sha256 else None
 
 
 def _rendered(
@@ -546,7 +546,7 @@ def _rendered(
     # A variation may reduce the exposure, so values above saturation are kept and clipped afterwards.
     limit = white_level if options.variation is None else FULL
     raw = photograph(lut, cut.picture, lighting, options, job.seed, number, limit)
-    varied = Varied()
+    varied = AppliedVariation()
     if options.variation is not None:
         varied = options.variation.apply(raw.counts, white_level, job.seed, number)
     light = _image_light(lut, lighting, raw.weights, varied, options.tints)

@@ -1,1 +1,1 @@
-"""From codes to samples: what is compiled, and the arithmetic it rests on."""
+"""Compiled kernels that convert source codes to samples, and their arithmetic."""

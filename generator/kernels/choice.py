@@ -1,25 +1,16 @@
-"""Which of a colour's samples a pixel gets: a pure function of (seed, image number, light's place, x, y).
+"""Choose the sample of each pixel, and check the arguments of all kernels.
 
-Its steps are LLVM's vectors (`kernels/vector.py`) and can be called from compiled functions only, as can those that
-prefetch. Beside that what all kernels share: the colours of a table, and their arguments, which are checked before
-compiled code reads their memory.
+The choice is a pure function of (seed, image number, stream, x, y). Tiles, threads and workers cannot change it. The
+rule is part of the data set format (reasons: `docs/decisions/0010-compiled-kernel.md`). All arithmetic is modulo 2³²
+except for p and q::
 
-Tiles, threads and workers cannot change a choice. The rule is part of the dataset format
-(`docs/decisions/0010-compiled-kernel.md` says why it is this one); all arithmetic is modulo 2³² but for p and q::
-
-    keys     k0, k1, k2: the first words of Philox4x32-10 with counter (y, place, image, 0) and the seed as key
+    keys     k0, k1, k2: first words of Philox4x32-10 with counter (y, stream, image, 0) and the seed as key
     word     i = 8 ⌊x/16⌋ + x mod 8,  h = (i ⊕ k0) · 0x21F0AAAD ⊕ k1,  h = (h ⊕ ⌊h/2¹⁶⌋) · 0x735A2D97 ⊕ k2,
              h = (h ⊕ ⌊h/2¹⁵⌋) · 0x31848BAB
-    sample   p = h S and q = (p mod 2³²) S, S the samples of a colour; ⌊p/2³²⌋ where x mod 16 < 8, else ⌊q/2³²⌋
+    sample   p = h S and q = (p mod 2³²) S, S samples of a colour; ⌊p/2³²⌋ if x mod 16 < 8, else ⌊q/2³²⌋
 
-`place` is 0 but where lights are mixed per pixel: there it is the light's place among them. Rows are keyed by 96
-random bits, so rows, images, seeds and places are as independent as Philox makes them. Within a row three keyed rounds
-of multiplying and shifting are needed: with one, pictures of two seeds are each other's with neighbours swapped; with
-two, pixels whose distance is near a power of two depend on each other. The two choices from one word are its first two
-digits in base S and differ from independent ones by less than S²/2³² of their probability.
-
-The multipliers are odd numbers found by others to spread changes well: C. Wellons, "Prospecting for hash functions",
-2018, and its collection of improved constants.
+The stream is 0, or the index of the illuminant if several illuminants are mixed per pixel. Functions decorated with
+`step` write LLVM vectors (`kernels/vector.py`) and can be called from compiled functions only.
 """
 
 from __future__ import annotations
@@ -59,14 +50,14 @@ from generator.kernels.vector import (
 )
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES, key_of
 
-# Groups of pixels by which choosing offsets leads fetching samples, so that the processor computes while it waits.
+# Number of groups by which offsets are chosen ahead of fetching their samples. It hides the latency of memory.
 LEAD: Final = 2
-OFFSETS_BYTES: Final = 4 * GROUP  # Bytes of a group's offsets, uint32 each
-# Bytes by which prefetching the picture leads reading it, some 21 groups: time for the memory to answer.
+OFFSETS_BYTES: Final = 4 * GROUP  # Bytes of the offsets of a group, uint32 each
+# Bytes by which the picture is prefetched before it is read, about 21 groups. It hides the latency of memory.
 _PREFETCH_BYTES: Final = 2048
-# Bytes of scratch memory for the last pixels of a row: a group's 96, rounded up to whole lines of the cache.
+# Bytes of scratch memory for the last pixels of a row: 96 bytes of a group, rounded up to whole cache lines.
 EDGE_BYTES: Final = 128
-# Bytes of scratch memory a thread needs: a row's last pixels, and the offsets of four groups, LEAD + 1 in use.
+# Bytes of scratch memory per thread: the last pixels of a row, and offsets of four groups, LEAD + 1 of them in use.
 SCRATCH_BYTES: Final = EDGE_BYTES + 4 * OFFSETS_BYTES
 
 _P0: Final = np.uint64(MULTIPLIERS[0])
@@ -76,23 +67,26 @@ _W1: Final = np.uint32(KEY_STEPS[1])
 _HALF: Final = np.uint64(32)
 _PURPOSE: Final = np.uint32(SAMPLES)
 _PAIRS: Final = ir.VectorType(I64, LANES // 2)
-_MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)  # Of the three rounds of the rule
+# Odd multipliers of the three rounds, which spread changes of bits well: C. Wellons, "Prospecting for hash functions",
+# 2018, and its collection of improved constants.
+_MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
 
 
 def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
-    """Return the colour indices of the 16 pixels (48 bytes) at `picture`."""
     codes = pixel_codes(builder, picture)
 
-    def field(place: int) -> Value:
-        shift = builder.sub(ir.Constant(I32, 8 * (place + 1)), builder.mul(bits, ir.Constant(I32, place + 1)))
+    def field(digit: int) -> Value:
+        shift = builder.sub(ir.Constant(I32, 8 * (digit + 1)), builder.mul(bits, ir.Constant(I32, digit + 1)))
         ones = builder.sub(builder.shl(ir.Constant(I32, 1), bits), ir.Constant(I32, 1))
-        mask = builder.shl(ones, builder.mul(bits, ir.Constant(I32, place)))
+        mask = builder.shl(ones, builder.mul(bits, ir.Constant(I32, digit)))
         return builder.and_(builder.lshr(codes, broadcast(builder, shift, WORDS)), broadcast(builder, mask, WORDS))
 
     return builder.or_(builder.or_(field(0), field(1)), field(2))
 
 
 def _hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
+    # Three keyed rounds are needed. With one, images of two seeds are equal after swapping neighbours. With two, pixels
+    # at distances near a power of two depend on each other.
     numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
     h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
     h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
@@ -103,21 +97,22 @@ def _hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
     return h
 
 
-def _digits(builder: Builder, h: Value, count: Value) -> tuple[Value, ...]:
-    """Return the choices of the first and the second 16 pixels of a group, from its words."""
+def _choices_of_words(builder: Builder, h: Value, count: Value) -> tuple[Value, ...]:
+    # The two choices from one word are its first two digits in base S. Their probabilities differ from those of
+    # independent choices by less than S²/2³².
     counts = broadcast(builder, count, WORDS)
 
-    def upper(numbers: Value) -> Value:
-        """Return the upper halves of the products with `count`, even and odd lanes by one 64-bit product each."""
+    def upper_halves(numbers: Value) -> Value:
+        # One 64-bit product for the even and one for the odd lanes.
         low, half = constant(_PAIRS, 0xFFFFFFFF), constant(_PAIRS, 32)
         pairs, factor = builder.bitcast(numbers, _PAIRS), builder.and_(builder.bitcast(counts, _PAIRS), low)
-        even = builder.lshr(builder.mul(builder.and_(pairs, low), factor), half)
-        odd = builder.mul(builder.lshr(pairs, half), factor)
-        odd = builder.and_(odd, constant(_PAIRS, 0xFFFFFFFF << 32))
-        return builder.bitcast(builder.or_(even, odd), WORDS)
+        even_lanes = builder.lshr(builder.mul(builder.and_(pairs, low), factor), half)
+        odd_lanes = builder.mul(builder.lshr(pairs, half), factor)
+        odd_lanes = builder.and_(odd_lanes, constant(_PAIRS, 0xFFFFFFFF << 32))
+        return builder.bitcast(builder.or_(even_lanes, odd_lanes), WORDS)
 
-    first, second = upper(h), upper(builder.mul(h, counts))
-    # Eight words serve eight pixels by their first digits and the next eight by their second.
+    first, second = upper_halves(h), upper_halves(builder.mul(h, counts))
+    # The first digits of eight words serve eight pixels, the second digits the next eight.
     return tuple(
         builder.shuffle_vector(
             first, second, constant(WORDS, [*range(half, half + EIGHT), *range(LANES + half, LANES + half + EIGHT)])
@@ -138,12 +133,12 @@ def choose(
     bits: Value,
     target: Value,
 ) -> None:
-    """Write to `target` the offsets, uint32 bytes, of the samples chosen for the 32 pixels at `picture`.
+    """Write the byte offsets (uint32) of the samples of the 32 pixels at `picture` to `target`.
 
-    `word` is the number of the group's first word; 96 bytes are read, 128 written.
+    `word` is the number of the first word of the group. 96 bytes are read, 128 written.
     """
     stride = broadcast(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
-    for half, choices in enumerate(_digits(builder, _hashed(builder, word, (k0, k1, k2)), count)):
+    for half, choices in enumerate(_choices_of_words(builder, _hashed(builder, word, (k0, k1, k2)), count)):
         begin = builder.add(picture, ir.Constant(I64, 3 * LANES * half))
         colours = builder.mul(_colours(builder, begin, bits), stride)
         offsets = builder.add(colours, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
@@ -157,51 +152,51 @@ def write_colours(
     bits: Value,
     stride: Value,
     target: Value,
-    other_stride: Value,
-    other_target: Value,
+    second_stride: Value,
+    second_target: Value,
 ) -> None:
-    """Write the colours of the 32 pixels at `picture` as uint32: their indices times each stride, at each target."""
+    """Write the colour indices of the 32 pixels at `picture` as uint32, times each stride, to each target."""
     for half in range(2):
         colours = _colours(builder, builder.add(picture, ir.Constant(I64, 3 * LANES * half)), bits)
-        for factor, place in ((stride, target), (other_stride, other_target)):
-            store(builder, builder.mul(colours, broadcast(builder, factor, WORDS)), place, 4 * LANES * half)
+        for factor, address in ((stride, target), (second_stride, second_target)):
+            store(builder, builder.mul(colours, broadcast(builder, factor, WORDS)), address, 4 * LANES * half)
 
 
 @step(ADDRESS, "uint32", "uint32", "uint32", "uint32", "uint32", ADDRESS)
 def choose_for_colours(
     builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
 ) -> None:
-    """Write what `choose` writes for the 32 pixels whose colours stand at `colours`, times the bytes of a colour."""
-    for half, choices in enumerate(_digits(builder, _hashed(builder, word, (k0, k1, k2)), count)):
-        named = load(builder, colours, 4 * LANES * half, WORDS)
-        offsets = builder.add(named, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
+    """Do `choose` for 32 pixels whose colour offsets (index times bytes of a colour) are at `colours`."""
+    for half, choices in enumerate(_choices_of_words(builder, _hashed(builder, word, (k0, k1, k2)), count)):
+        colour_offsets = load(builder, colours, 4 * LANES * half, WORDS)
+        offsets = builder.add(colour_offsets, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
         store(builder, offsets, target, 4 * LANES * half)
 
 
 def emit_prefetch(builder: Builder, address: Value, locality: int) -> None:
-    """Write LLVM's prefetch with that locality: 3 keeps the line in every cache, 0 in none."""
+    """Emit an LLVM prefetch; locality 3 keeps the line in every cache, 0 in none."""
     pointer = I8.as_pointer()
-    kind = ir.FunctionType(ir.VoidType(), [pointer, I32, I32, I32])
-    function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
-    numbers = [ir.Constant(I32, number) for number in (0, locality, 1)]  # to read, how near, data
-    builder.call(function, [pointer_at(builder, address, 0, I8), *numbers])
+    function_type = ir.FunctionType(ir.VoidType(), [pointer, I32, I32, I32])
+    function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], function_type)
+    arguments = [ir.Constant(I32, number) for number in (0, locality, 1)]  # read access, locality, data cache
+    builder.call(function, [pointer_at(builder, address, 0, I8), *arguments])
 
 
 @step(ADDRESS)
 def prefetch(builder: Builder, address: Value) -> None:
-    """Prefetch the line of `address` into all caches; an address without memory is ignored."""
+    """Prefetch the line of `address` into all caches; an invalid address is ignored."""
     emit_prefetch(builder, address, 3)
 
 
 @step(ADDRESS)
 def prefetch_once(builder: Builder, address: Value) -> None:
-    """Prefetch a line that is read once, so that it takes no place in the larger caches."""
+    """Prefetch a line that is read once, without filling the larger caches."""
     emit_prefetch(builder, address, 0)
 
 
 @inlined
 def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
-    """Return the four words of Philox4x32-10, compiled; words and counter are uint32, `seed` is uint64."""
+    """Return the four words of Philox4x32-10; words and counter are uint32, `seed` is uint64."""
     k0, k1 = uint32(seed), uint32(seed >> _HALF)
     for _ in range(ROUNDS):
         p0, p1 = uint64(c0) * _P0, uint64(c2) * _P1
@@ -216,23 +211,23 @@ def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
 
 
 @inlined
-def row_keys(y: Any, place: Any, image: Any, seed: Any) -> Any:
+def row_keys(y: Any, stream: Any, image: Any, seed: Any) -> Any:
     """Return the three keys (uint32) of row `y`; `seed` is uint64."""
-    k0, k1, k2, _ = philox4x32(uint32(y), uint32(place), uint32(image), _PURPOSE, seed)
+    k0, k1, k2, _ = philox4x32(uint32(y), uint32(stream), uint32(image), _PURPOSE, seed)
     return k0, k1, k2
 
 
 @inlined
 def offsets_slot(scratch: int, group: int) -> int:
-    """Return where in a thread's scratch memory the offsets of `group` stand until they are used."""
+    """Return the address in scratch memory at which the offsets of `group` are buffered."""
     return scratch + EDGE_BYTES + OFFSETS_BYTES * (group & 3)
 
 
 @inlined
 def group_address(row: int, width: int, group: int, scratch: int) -> int:
-    """Return where the pixels from x = 32 `group` on can be read; `row` is the address of a row's first pixel.
+    """Return an address from which the pixels at x = 32 `group` can be read; `row` is the address of the row.
 
-    Of a group that reaches beyond the row only the pixels in the row are copied to scratch memory.
+    A group that is longer than the rest of the row is copied to scratch memory.
     """
     source = row + 3 * GROUP * group
     if GROUP * (group + 1) > width:
@@ -244,7 +239,7 @@ def group_address(row: int, width: int, group: int, scratch: int) -> int:
 
 @inlined
 def prefetch_group(row: int, group: int) -> None:
-    """Prefetch a group's share of the pixels that will be read soon; to be called for every group in turn."""
+    """Prefetch the pixels that are read some groups later; call it for every group in turn."""
     line = row + 3 * GROUP * group + _PREFETCH_BYTES
     prefetch_once(line)
     prefetch_once(line + LINE)
@@ -252,21 +247,21 @@ def prefetch_group(row: int, group: int) -> None:
 
 @inlined
 def choose_group(row: int, width: int, group: int, keys: Any, count: Any, bits: Any, scratch: int, target: int) -> None:
-    """Write the offsets, uint32 bytes, of the samples of a row's pixels from x = 32 `group` on at `target`."""
+    """Write the byte offsets (uint32) of the samples of the pixels at x = 32 `group` of a row to `target`."""
     source = group_address(row, width, group, scratch)
     choose(source, uint32(LANES * group), keys[0], keys[1], keys[2], count, bits, target)
 
 
-def bits_of(colours: int) -> int:
-    """Return the bits a channel of a table with `colours` = 8**bits colours."""
+def channel_bits(colours: int) -> int:
+    """Return the bits per channel of samples with `colours` = 8**bits colours."""
     for bits in range(1, 6):
         if colours == 8**bits:
             return bits
-    raise InputError(f"the samples are of {colours} colours, expected 8, 64, 512, 4096 or 32768")
+    raise InputError(f"the samples have {colours} colours, expected 8, 64, 512, 4096 or 32768; pass those of a LUT")
 
 
 def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
-    """Return the codes (..., 3) int64, 0 … 2**bits − 1, of red, green and blue, of colour indices (...) int."""
+    """Return the channel codes (..., 3) int64, 0 … 2**bits − 1, of colour indices (...) int."""
     colours = np.asarray(colours, dtype=np.int64)
     mask = (1 << bits) - 1
     return np.stack([colours >> 2 * bits & mask, colours >> bits & mask, colours & mask], axis=-1)
@@ -275,29 +270,29 @@ def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
 Samples = npt.NDArray[np.uint16]
 Picture = npt.NDArray[np.uint8]
 
-# Bytes of a page, the smallest unit of memory protection on x86-64 and arm64; larger pages are whole multiples.
-_PAGE: Final = 4096
-_OFFSETS: Final = 0xFFFFFFFF  # Most bytes of a light's samples: compiled code counts them in 32 bits
+# Bytes of a memory page on x86-64 and arm64, the smallest unit of protection; larger pages are multiples of it.
+_PAGE_BYTES: Final = 4096
+_MOST_BYTES: Final = 0xFFFFFFFF  # Largest size of an illuminant's samples: offsets have 32 bits
 
 
 def check_samples(samples: Samples) -> int:
-    """Return the bits a channel of a light's samples; they must be uint16 (8**bits, S, 3), S ≥ 1."""
+    """Check the samples of an illuminant, uint16 (8**bits, S, 3), S ≥ 1; return the bits per channel."""
     if samples.dtype != np.uint16 or samples.ndim != 3 or samples.shape[2] != 3 or not samples.shape[1]:
         raise InputError(f"the samples are {samples.dtype} {samples.shape}, expected uint16 (8**bits, samples, 3)")
-    if samples.nbytes > _OFFSETS:
-        raise InputError(f"the samples of a light take {samples.nbytes} bytes, expected at most {_OFFSETS}")
-    return bits_of(samples.shape[0])
+    if samples.nbytes > _MOST_BYTES:
+        raise InputError(f"an illuminant has {samples.nbytes} bytes of samples, at most {_MOST_BYTES} are allowed")
+    return channel_bits(samples.shape[0])
 
 
 def check_tables(tables: Samples | Sequence[Samples]) -> list[Samples]:
-    """Return the samples of several lights as a list; they must be uint16 (8**bits, S, 3), all of one shape."""
+    """Check the samples of several illuminants, uint16 (8**bits, S, 3) of one shape; return them as a list."""
     checked = list(tables)
     if not checked:
-        raise InputError("no light was given to mix; give at least one")
+        raise InputError("0 illuminants were given to mix, expected 1 or more")
     for table in checked:
         check_samples(table)
         if table.shape != checked[0].shape:
-            raise InputError(f"the lights' samples are {checked[0].shape} and {table.shape}, expected one shape")
+            raise InputError(f"samples have shapes {checked[0].shape} and {table.shape}, expected equal shapes")
     return checked
 
 
@@ -305,7 +300,7 @@ def check_picture(picture: Any) -> None:
     """Check that `picture` is uint8 (H, W, 3)."""
     if getattr(picture, "dtype", None) != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
         raise InputError(
-            f"the picture is {value_text(picture)}, expected an array uint8 (height, width, 3), such as "
+            f"the picture is {value_text(picture)}, expected an array uint8 (height, width, 3), for example "
             "read_picture(FILE)"
         )
 
@@ -313,18 +308,18 @@ def check_picture(picture: Any) -> None:
 def check_out(
     out: npt.NDArray[Any] | None, shape: tuple[int, ...], dtype: type[np.uint16] | type[np.float32]
 ) -> npt.NDArray[Any]:
-    """Return `out`, of that shape and that dtype, or a new array of them if it is None."""
+    """Return `out` after checking its shape and dtype, or a new array if it is None."""
     if out is None:
         return np.empty(shape, dtype)
     if out.dtype != dtype or out.shape != shape:
-        raise InputError(f"the target is {out.dtype} {out.shape}, expected {np.dtype(dtype)} {shape}")
+        raise InputError(f"`out` is {out.dtype} {out.shape}, expected {np.dtype(dtype)} {shape}")
     if not out.flags.writeable:
-        raise InputError("the target may not be written to; give an array whose flags.writeable is True")
+        raise InputError("`out` is read-only, expected an array with flags.writeable = True")
     return out
 
 
 def check_seed(seed: int, image: int) -> np.uint64:
-    """Return the seed as uint64 after checking it and the image number."""
+    """Check the seed and the image number; return the seed as uint64."""
     key_of(seed)
     if not 0 <= image < 1 << 32:
         raise InputError(f"the image number is {image}, expected 0 to 2^32 - 1")
@@ -334,30 +329,31 @@ def check_seed(seed: int, image: int) -> np.uint64:
 def check_white_level(white_level: int) -> None:
     """Check that `white_level` is 1 … 65535."""
     if not 1 <= white_level <= 65535:
-        raise InputError(f"the white level is {white_level}, expected 1 to 65535")
+        raise InputError(f"the saturation level is {white_level}, expected 1 to 65535")
 
 
 def check_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
-    """Return the weights (K,) of `lights` lights as (K,) float64."""
+    """Check the weights of `lights` illuminants; return them as (K,) float64."""
     checked = np.asarray(weights, dtype=np.float64)
     if checked.shape != (lights,) or not np.isfinite(checked).all() or (checked < 0).any():
-        raise InputError(f"the weights are {np.asarray(weights).tolist()}, expected {lights} finite numbers from 0")
+        raise InputError(f"the weights are {np.asarray(weights).tolist()}, expected {lights} finite numbers ≥ 0")
     return checked
 
 
 def packed_rows(picture: Picture) -> Picture:
-    """Return `picture` (H, W, 3) uint8 with the bytes of each row contiguous: itself, or a copy if they are not."""
+    """Return `picture` (H, W, 3) uint8 if the bytes of each row are contiguous, else a contiguous copy."""
     return picture if picture.strides[1:] == (3, 1) else np.ascontiguousarray(picture)
 
 
 def readable(samples: Samples) -> Samples:
-    """Return samples (8**bits, S, 3) uint16 as a contiguous array behind which two more bytes can be read.
+    """Return samples (8**bits, S, 3) uint16 as a contiguous array with two readable bytes after its end.
 
-    Samples, of six bytes, are fetched eight bytes at a time. The two bytes behind an array can be read if they are on
-    the page of its last byte, whoever owns them; if not, or if the samples are not contiguous, a copy is returned.
+    A copy is returned if the samples are not contiguous, or if the two bytes are on another memory page.
     """
-    last = samples.ctypes.data + samples.nbytes - 1
-    if samples.flags.c_contiguous and last // _PAGE == (last + 2) // _PAGE:
+    # Samples have six bytes and are fetched eight bytes at a time. Bytes on the page of the last byte can be read,
+    # even if another object owns them.
+    last_byte = samples.ctypes.data + samples.nbytes - 1
+    if samples.flags.c_contiguous and last_byte // _PAGE_BYTES == (last_byte + 2) // _PAGE_BYTES:
         return samples
     padded = np.empty(samples.size + 1, np.uint16)
     padded[:-1] = samples.reshape(-1)
@@ -365,27 +361,27 @@ def readable(samples: Samples) -> Samples:
 
 
 def writable(target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Return `target`, (H, W, 3) or (H, W) uint16, if compiled code can write its rows, else a new array of its shape.
+    """Return `target` (H, W, 3) or (H, W) uint16 if compiled code can write its rows, else a new array of its shape.
 
-    Rows must be contiguous and at even addresses. A new array is to be given to `copied_back` when it is filled.
+    Rows must be contiguous and at even addresses. Pass a new array to `copied_back` when it is filled.
     """
-    piece = (6, 2) if target.ndim == 3 else (2,)
-    return target if target.strides[1:] == piece and target.flags.aligned else np.empty(target.shape, target.dtype)
+    packed = (6, 2) if target.ndim == 3 else (2,)
+    return target if target.strides[1:] == packed and target.flags.aligned else np.empty(target.shape, target.dtype)
 
 
 def copied_back(work: npt.NDArray[np.uint16], target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Return `target`, (H, W, 3) or (H, W) uint16, with the content of `work`: itself, or the array from `writable`."""
+    """Return `target` with the content of `work`; `work` is `target` or the array from `writable`."""
     if work is not target:
         target[...] = work
     return target
 
 
 def run_in_threads(fill: Callable[[int, int], object], count: int, threads: int) -> None:
-    """Call `fill(first, end)` for as many parts of 0 … count − 1 as there are threads, a thread each."""
+    """Call `fill(first, end)` on `threads` equal ranges of 0 … count − 1, each in its own thread."""
     threads = min(threads, count)
     if threads <= 1:
         fill(0, count)
         return
-    edges = [count * part // threads for part in range(threads + 1)]
+    edges = [count * thread // threads for thread in range(threads + 1)]
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(fill, edges[:-1], edges[1:]))

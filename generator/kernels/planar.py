@@ -1,16 +1,16 @@
-"""Crops for training: float32, one plane a channel, of any window of a picture.
+"""Draw training crops: float32 planes of any window of a picture.
 
-A crop is the window of the image that `rendering.draw_samples` makes of the whole picture, mirrored if asked for,
-times a gain, in units of the sensor's saturation and cut off there:
+A crop is a window of the image that `rendering.draw_samples` makes of the whole picture. It is mirrored on request,
+multiplied by a gain, divided by the saturation level and clipped at 1::
 
     out[c, y, x] = min(float32(sample) · float32(gain / white_level), 1)
 
-A gain is digital: it scales signal and noise alike, and saturated pixels darken with it. Where a share of the print's
-black is taken out of a crop (`generator.rendering.black_points`), s[c] = gain · stretch[c] / white_level and
+The gain is digital: it scales signal and noise alike, and saturated pixels become darker with it. If a part of the
+print's black is subtracted (`generator.rendering.black_points`), with s[c] = gain · stretch[c] / white_level::
 
-    out[c, y, x] = min(float32(sample) · float32(s[c]) + float32(-taken[c] · s[c]), float32(min(gain, 1)))
+    out[c, y, x] = min(float32(sample) · float32(s[c]) + float32(-black_counts[c] · s[c]), float32(min(gain, 1)))
 
-What noise takes below 0 stays below 0: cut off there, black would be too bright.
+Negative values are kept: if noise were clipped at 0, black would be too bright.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from generator.kernels.choice import (
 )
 from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored
 
-Window = tuple[int, int, int, int]  # x and y of a window's first pixel in the picture, and its width and height, px
+Window = tuple[int, int, int, int]  # x, y, width and height of a window in the picture, px
 
-SCALES: Final = 7  # Numbers of an item that `vector.planes8` takes: factors and summands of three channels, and a limit
+SCALES: Final = 7  # Values per crop for `vector.planes8`: three factors, three summands, one limit
 
 
 @compiled
@@ -63,12 +63,10 @@ def _crop(
     end: int,
     scratch: int,
 ) -> None:
-    """Fill the items `first` to `end` of a batch.
-
-    The offsets of a row are chosen, and their samples prefetched, before the row above is fetched: the samples may lie
-    in memory that is in no cache. `last` is the table's last light as `arguments.readable` returns it. Of each item
-    `scales`, (N, 7) float32 at address `lines`, has what `planes8` takes.
-    """
+    # `plan` (N, 9) int64 has the columns that are unpacked below. `scales` (N, 7) float32 lies at address `lines`, and
+    # `last` is the address of the last illuminant's samples from `choice.readable`.
+    # Offsets of a row are chosen, and their samples prefetched, before the row above is fetched: samples may be in
+    # memory that no cache holds.
     row_bytes = OFFSETS_BYTES * (width // GROUP + 2)
     for item in range(first, end):
         light, picture, pitch, picture_width, x0, y0, flip, image, lights = plan[item]
@@ -79,12 +77,12 @@ def _crop(
             if y < height:
                 keys = row_keys(y0 + y, 0, image, seeds[item])
                 row = picture + y * pitch
-                chosen = scratch + EDGE_BYTES + row_bytes * (y & 1)
+                row_offsets = scratch + EDGE_BYTES + row_bytes * (y & 1)
                 for group in range(low, high + 1):
-                    to = chosen + OFFSETS_BYTES * (group - low)
-                    choose_group(row, picture_width, group, keys, count, bits, scratch, to)
+                    group_offsets = row_offsets + OFFSETS_BYTES * (group - low)
+                    choose_group(row, picture_width, group, keys, count, bits, scratch, group_offsets)
                     for i in range(GROUP):
-                        prefetch(samples + offset_at(to + 4 * i))
+                        prefetch(samples + offset_at(group_offsets + 4 * i))
             if y == 0:
                 continue
             offsets = scratch + EDGE_BYTES + row_bytes * ((y - 1) & 1) + 4 * (x0 - GROUP * low)
@@ -100,7 +98,7 @@ def _crop(
                         plane1(sample + 2 * channel, factor, summand, limit, red + channel * pitches[1] + 4 * x)
             else:
                 for start in range(0, width, EIGHT):
-                    # The last eight may overlap the ones before.
+                    # The last eight pixels may overlap the previous ones.
                     x = min(start, width - EIGHT)
                     if flip:
                         planes8_mirrored(samples, offsets - 4 * x, line, red + 4 * x, green + 4 * x, blue + 4 * x)
@@ -129,42 +127,39 @@ def draw_batch(
     gains: npt.ArrayLike = 1.0,
     seeds: npt.ArrayLike = 0,
     images: npt.ArrayLike = 0,
-    taken: npt.ArrayLike | None = None,
+    black_counts: npt.ArrayLike | None = None,
     stretches: npt.ArrayLike = 1.0,
     threads: int = 1,
     out: npt.NDArray[np.float32] | None = None,
 ) -> npt.NDArray[np.float32]:
-    """Return N crops; the rule stands at the head of this file.
+    """Draw N training crops; the module docstring has the formula.
 
-    Tables are not copied, so that they may be gigabytes mapped from disk. All work is done without the interpreter's
-    lock.
+    Samples are not copied, so `tables` may be gigabytes mapped from disk. The work is done without the GIL.
 
     Parameters
     ----------
     tables
-        (L, 8**bits, S, 3) uint16, for example `lut.samples`.
+        (L, 8**bits, S, 3) uint16, samples of L illuminants, for example `lut.samples`.
     lights
-        (N,) int, the light of each item.
+        (N,) int, index of the illuminant of each crop, 0 … L − 1.
     pictures
-        N pictures (H, W, 3) uint8, of any sizes; one may serve many items.
+        N source pictures (H, W, 3) uint8 of any sizes. The same array may be given several times.
     windows
-        (N, 4) int, x, y, width, height; all of one width and height.
+        (N, 4) int, x, y, width, height of each crop in px; all of one width and height.
     white_level
-        Sample value of the sensor's saturation, which becomes 1; 1 … 65535.
+        Saturation level, 1 … 65535 counts. It becomes 1.
     flips
-        (N,) bool, or one for all: whether the window is mirrored left to right. The choices stay with the picture's
-        pixels.
+        (N,) bool, or one value for all: mirror the crop left to right. Each pixel keeps its sample.
     gains
-        (N,) float ≥ 0, or one for all: factor on the values before they are cut off at 1.
+        (N,) float ≥ 0, or one value for all: factor on the values before they are clipped at 1.
     seeds, images
-        (N,) int, or one for all, as for `draw_samples`.
-    taken
-        (N, 3) float ≥ 0, counts that are taken out of the channels of each item's samples; None takes out nothing.
+        (N,) int, or one value for all, as for `draw_samples`.
+    black_counts
+        (N, 3) float ≥ 0, counts subtracted from the channels of each crop; None subtracts nothing.
     stretches
-        (N, 3) float > 0, or one for all: what the rest is then multiplied by. Nothing is multiplied where `taken` is
-        None.
+        (N, 3) float > 0, or one value for all: factor after the subtraction. Unused if `black_counts` is None.
     threads
-        Threads that share the items; no byte depends on it.
+        Number of threads that share the crops. The result does not depend on it.
     out
         (N, 3, height, width) float32 to fill instead of a new array.
 
@@ -176,7 +171,7 @@ def draw_batch(
     Raises
     ------
     InputError
-        A shape, type or number is not as above.
+        If a shape, type or value is not as described above.
 
     Examples
     --------
@@ -187,55 +182,55 @@ def draw_batch(
     ((2, 3, 4, 4), dtype('float32'))
     """
     if tables.ndim != 4 or not len(tables):
-        raise InputError(f"the tables are {tables.shape}, expected (lights, 8**bits, samples, 3)")
+        raise InputError(f"the samples have shape {tables.shape}, expected (illuminants, 8**bits, samples, 3)")
     bits = check_samples(tables[0])
     check_white_level(white_level)
     count = len(pictures)
-    frames = np.asarray(windows, dtype=np.int64)
-    if frames.shape != (count, 4) or not count:
-        raise InputError(f"{count} pictures and windows {frames.shape} were given, expected one window of 4 a picture")
-    width, height = int(frames[0, 2]), int(frames[0, 3])
-    if (frames[:, 2:] != frames[0, 2:]).any():
-        raise InputError("the windows of a batch differ in size; give all one width and height")
-    numbers = np.asarray(lights, dtype=np.int64)
-    if numbers.shape != (count,) or numbers.min() < 0 or numbers.max() >= len(tables):
-        raise InputError(f"lights {numbers.tolist()} were given, expected {count} from 0 to {len(tables) - 1}")
-    gained = np.broadcast_to(np.asarray(gains, dtype=np.float64), count)
-    if not (np.isfinite(gained) & (gained >= 0)).all():
-        raise InputError(f"the gain is {gained.min()}, expected a finite number from 0")
-    seeded, imaged = _whole_numbers(seeds, count, 64, "seed"), _whole_numbers(images, count, 32, "image number")
+    boxes = np.asarray(windows, dtype=np.int64)
+    if boxes.shape != (count, 4) or not count:
+        raise InputError(f"{count} pictures have windows of shape {boxes.shape}, expected (pictures, 4)")
+    width, height = int(boxes[0, 2]), int(boxes[0, 3])
+    if (boxes[:, 2:] != boxes[0, 2:]).any():
+        raise InputError("the windows of a batch differ in size, expected one width and height for all")
+    light_ids = np.asarray(lights, dtype=np.int64)
+    if light_ids.shape != (count,) or light_ids.min() < 0 or light_ids.max() >= len(tables):
+        raise InputError(f"the illuminants are {light_ids.tolist()}, expected {count} from 0 to {len(tables) - 1}")
+    item_gains = np.broadcast_to(np.asarray(gains, dtype=np.float64), count)
+    if not (np.isfinite(item_gains) & (item_gains >= 0)).all():
+        raise InputError(f"the smallest gain is {item_gains.min()}, expected finite numbers ≥ 0")
+    seed_ids, image_ids = _whole_numbers(seeds, count, 64, "seed"), _whole_numbers(images, count, 32, "image number")
     target = check_out(out, (count, 3, height, width), np.float32)
     work = target if target.strides[3] == 4 or width == 1 else np.empty(target.shape, np.float32)
     if not tables[0].flags.c_contiguous:
         tables = np.ascontiguousarray(tables)
-    last = readable(tables[-1])
-    # Most batches show a picture more than once; each is checked once.
+    last_samples = readable(tables[-1])
+    # Most batches contain a picture more than once; each is checked once.
     distinct = {id(picture): picture for picture in pictures}
     for picture in distinct.values():
         check_picture(picture)
     sources = [packed_rows(picture) for picture in distinct.values()]
-    layouts = np.array([(one.ctypes.data, one.strides[0], one.shape[1], one.shape[0]) for one in sources], np.int64)
-    places = {identity: place for place, identity in enumerate(distinct)}
-    shown = layouts[[places[id(picture)] for picture in pictures]]
-    outside = (frames[:, :2] < 0).any(axis=1) | (frames[:, :2] + frames[:, 2:] > shown[:, 2:]).any(axis=1)
-    for item in np.flatnonzero(outside | (min(width, height) < 1))[:1]:
-        _checked_window(frames[item].tolist(), pictures[int(item)])
+    layouts = np.array([(source.ctypes.data, source.strides[0], *source.shape[1::-1]) for source in sources], np.int64)
+    rows = {identity: row for row, identity in enumerate(distinct)}
+    layout = layouts[[rows[id(picture)] for picture in pictures]]
+    is_outside = (boxes[:, :2] < 0).any(axis=1) | (boxes[:, :2] + boxes[:, 2:] > layout[:, 2:]).any(axis=1)
+    for item in np.flatnonzero(is_outside | (min(width, height) < 1))[:1]:
+        _checked_window(boxes[item].tolist(), pictures[int(item)])
     plan = np.zeros((count, 9), np.int64)
-    plan[:, 0], plan[:, 1], plan[:, 2:4] = numbers, shown[:, 0] + frames[:, 1] * shown[:, 1], shown[:, 1:3]
-    plan[:, 4:6], plan[:, 6] = frames[:, :2], np.broadcast_to(flips, count)
-    plan[:, 7], plan[:, 8] = imaged, len(tables)
-    scales = scales_of(gained, white_level, taken, stretches)
+    plan[:, 0], plan[:, 1], plan[:, 2:4] = light_ids, layout[:, 0] + boxes[:, 1] * layout[:, 1], layout[:, 1:3]
+    plan[:, 4:6], plan[:, 6] = boxes[:, :2], np.broadcast_to(flips, count)
+    plan[:, 7], plan[:, 8] = image_ids, len(tables)
+    scales = scales_of(item_gains, white_level, black_counts, stretches)
 
     def fill(first: int, end: int) -> None:
         scratch = np.empty(EDGE_BYTES + 2 * OFFSETS_BYTES * (width // GROUP + 2), np.uint8)
         _crop(
             plan,
-            seeded,
+            seed_ids,
             scales,
             scales.ctypes.data,
             tables.ctypes.data,
             tables.strides[0],
-            last.ctypes.data,
+            last_samples.ctypes.data,
             np.uint32(tables.shape[2]),
             np.uint32(bits),
             width,
@@ -254,29 +249,28 @@ def draw_batch(
 
 
 def scales_of(
-    gains: npt.NDArray[np.float64], white_level: int, taken: npt.ArrayLike | None, stretches: npt.ArrayLike
+    gains: npt.NDArray[np.float64], white_level: int, black_counts: npt.ArrayLike | None, stretches: npt.ArrayLike
 ) -> npt.NDArray[np.float32]:
-    """Return (N, 7) float32: what `vector.planes8` takes of each item."""
+    """Return (N, 7) float32: factors, summands and limit of each crop, as `vector.planes8` expects them."""
     scales = np.empty((len(gains), SCALES), np.float32)
-    if taken is None:
-        # A number is itself with -0 added to it.
+    if black_counts is None:
+        # Adding -0 changes no number, and keeps the sign of 0.
         scales[:, :3], scales[:, 3:6], scales[:, 6] = (gains / white_level)[:, None], -0.0, 1.0
         return scales
-    counts = np.broadcast_to(np.asarray(taken, np.float64), (len(gains), 3))
-    factors = np.broadcast_to(np.asarray(stretches, np.float64), counts.shape)
-    if not ((counts >= 0) & (factors > 0) & np.isfinite(counts) & np.isfinite(factors)).all():
-        raise InputError("what is taken out of samples is to be finite numbers from 0, stretches numbers above 0")
-    exact = (gains / white_level)[:, None] * factors
-    scales[:, :3], scales[:, 3:6], scales[:, 6] = exact, -counts * exact, np.minimum(gains, 1)
+    blacks = np.broadcast_to(np.asarray(black_counts, np.float64), (len(gains), 3))
+    factors = np.broadcast_to(np.asarray(stretches, np.float64), blacks.shape)
+    if not ((blacks >= 0) & (factors > 0) & np.isfinite(blacks) & np.isfinite(factors)).all():
+        raise InputError("the black counts or stretches are out of range, expected finite numbers ≥ 0 and > 0")
+    scaled_gains = (gains / white_level)[:, None] * factors
+    scales[:, :3], scales[:, 3:6], scales[:, 6] = scaled_gains, -blacks * scaled_gains, np.minimum(gains, 1)
     return scales
 
 
 def _whole_numbers(numbers: npt.ArrayLike, count: int, bits: int, name: str) -> npt.NDArray[np.uint64]:
-    """Return `count` whole numbers 0 … 2**bits − 1 as (count,) uint64; a single one is repeated."""
-    given = np.asarray(numbers)
-    if given.dtype.kind not in "iu":
-        given = np.asarray(numbers, dtype=object)
-    least, most = int(given.min()), int(given.max())
-    if least < 0 or most >= 1 << bits:
-        raise InputError(f"a {name} is {least} or {most}, expected 0 to 2^{bits} - 1")
-    return np.ascontiguousarray(np.broadcast_to(given.astype(np.uint64), count))
+    values = np.asarray(numbers)
+    if values.dtype.kind not in "iu":
+        values = np.asarray(numbers, dtype=object)
+    smallest, largest = int(values.min()), int(values.max())
+    if smallest < 0 or largest >= 1 << bits:
+        raise InputError(f"the {name}s are {smallest} to {largest}, expected 0 to 2^{bits} - 1")
+    return np.ascontiguousarray(np.broadcast_to(values.astype(np.uint64), count))

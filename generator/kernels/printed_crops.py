@@ -1,4 +1,4 @@
-"""Crops by colour for training batches, each at its own place, scale and mirroring; the rule is `printing.py`'s."""
+"""Draw training crops by colour, each with its own window, scale and mirroring; `printing.py` has the rule."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _print_crops(
     first: int,
     end: int,
     size: Any,
-    rest: Any,
+    shared_addresses: Any,
     members: Any,
     shares: Any,
     count: Any,
@@ -38,8 +38,8 @@ def _print_crops(
     pitches: Any,
     scales: int,
 ) -> None:
-    """Fill crops `first` to `end` - 1; `plan` (N, 9): source, pitch, x, y, flip, means, bases, members from and to."""
-    samples, roots, owners = members
+    # Columns of `plan` (N, 9) int64: source, pitch, x, y, flip, means, bases, first and last member.
+    member_samples, roots, owners = members
     for item in range(first, end):
         source, pitch, x, y, flip, means, bases, begin, stop = plan[item]
         print_segments(
@@ -47,8 +47,8 @@ def _print_crops(
             pitch,
             (x, y, size[0], size[1]),
             flip != 0,
-            (means, bases, rest[0], rest[1], rest[2]),
-            (samples[begin:stop], roots[begin:stop], owners[begin:stop]),
+            (means, bases, shared_addresses[0], shared_addresses[1], shared_addresses[2]),
+            (member_samples[begin:stop], roots[begin:stop], owners[begin:stop]),
             shares,
             False,
             count,
@@ -75,20 +75,20 @@ def draw_printed_crops(
     threads: int = 1,
     out: npt.NDArray[np.float32],
 ) -> npt.NDArray[np.float32]:
-    """Return N crops by colour in `out` (N, 3, height, width) float32, 1 = saturation.
+    """Fill `out` (N, 3, height, width) float32 with N crops rendered by colour, 1 = saturation; return it.
 
-    `lights`, `pictures` and `windows` (N, 4: x, y, width, height, inside the picture) are one for each; `scales`
-    (N, 7) float32 as of `planar.scales_of`. An InputError says that `out` is of another shape or type.
+    `lights`, `pictures` and `windows` (N, 4: x, y, width, height, inside the picture) have one entry per crop. `scales`
+    (N, 7) float32 is from `planar.scales_of`. An InputError is raised if `out` has another shape or type.
     """
     width, height = windows[0, 2:].tolist()
     check_out(out, (len(pictures), 3, height, width), np.float32)
     count = len(pictures)
-    # Most batches show a light more than once.
-    known = {id(light): light for light in lights}
-    members, rest = PrintedMembers(samples, list(known.values())), SharedTables(samples, cells)
-    of_lights = {
-        name: (light.means.ctypes.data, light.bases.ctypes.data, *ends)
-        for (name, light), ends in zip(known.items(), pairwise(members.starts.tolist()), strict=True)
+    # Most batches contain an illuminant more than once.
+    distinct_lights = {id(light): light for light in lights}
+    members, shared = PrintedMembers(samples, list(distinct_lights.values())), SharedTables(samples, cells)
+    light_columns = {
+        identity: (light.means.ctypes.data, light.bases.ctypes.data, *ends)
+        for (identity, light), ends in zip(distinct_lights.items(), pairwise(members.starts.tolist()), strict=True)
     }
     sources = [
         at_least_a_block(picture[y : y + height, x : x + width])
@@ -97,10 +97,10 @@ def draw_printed_crops(
     plan = np.empty((count, 9), np.int64)
     plan[:, :2] = [(source.ctypes.data, source.strides[0]) for source in sources]
     plan[:, 2:4], plan[:, 4] = windows[:, :2], flips
-    plan[:, 5:] = [of_lights[id(light)] for light in lights]
-    whole = width >= PRINTED_BLOCK and out.strides[3] == 4
-    work = out if whole else np.empty((count, 3, height, max(width, PRINTED_BLOCK)), np.float32)
-    unmasked = np.zeros((1, 1, 1), np.float32)
+    plan[:, 5:] = [light_columns[id(light)] for light in lights]
+    fills_out_directly = width >= PRINTED_BLOCK and out.strides[3] == 4
+    work = out if fills_out_directly else np.empty((count, 3, height, max(width, PRINTED_BLOCK)), np.float32)
+    no_shares = np.zeros((1, 1, 1), np.float32)
 
     def fill(first: int, end: int) -> None:
         memory = PrintMemory(members.most)
@@ -109,9 +109,9 @@ def draw_printed_crops(
             first,
             end,
             (work.shape[3], height),
-            rest.addresses,
+            shared.addresses,
             members.arrays,
-            unmasked,
+            no_shares,
             np.uint32(samples.shape[2]),
             seeds,
             memory.arrays,
@@ -121,7 +121,7 @@ def draw_printed_crops(
         )
 
     run_in_threads(fill, count, threads)
-    if not whole:
+    if not fills_out_directly:
         for item, flip in enumerate(flips.tolist()):
             out[item] = work[item, :, :, -width:] if flip else work[item, :, :, :width]
     return out

@@ -1,14 +1,11 @@
-"""From source codes to linear camera RGB: each pixel becomes one of the table's samples of its colour.
+"""Convert source codes to linear camera RGB: each pixel becomes one sample of its colour (paper, section 3.4).
 
-Source: paper, section 3.4. With n the table's bits (5 in the paper), a pixel R, G, B at (x, y) becomes
+With n bits per channel of the look-up table (LUT; 5 in the paper), a pixel R, G, B at (x, y) becomes ::
 
     samples[((R >> (8 - n)) << 2n) | ((G >> (8 - n)) << n) | (B >> (8 - n)), choice(seed, image, x, y)]
 
-where the choice is that of `kernels/choice.py`. Here are whole images;
-`kernels/planar.py` has crops for training and `kernels/mixing.py` several lights.
-
-Compiled loops are not split by numba's own threads: their pool cannot be entered from two Python threads at once and
-does not survive a fork. Rows are split by plain threads instead.
+`kernels/choice.py` defines the choice. This module makes whole images, `kernels/planar.py` makes training crops, and
+`kernels/mixing.py` mixes several illuminants.
 """
 
 from __future__ import annotations
@@ -64,7 +61,7 @@ if TYPE_CHECKING:
 def choose_first_groups(
     row: int, width: int, keys: Any, count: Any, bits: Any, scratch: int, begin: int, limit: int
 ) -> None:
-    """Choose the offsets of the first `LEAD` groups from `begin` on, which `draw_groups` expects in scratch memory."""
+    """Choose the offsets of the first `LEAD` groups from `begin`, which `draw_groups` expects in scratch memory."""
     for group in range(begin, min(begin + LEAD, limit)):
         choose_group(row, width, group, keys, count, bits, scratch, offsets_slot(scratch, group))
 
@@ -85,33 +82,34 @@ def draw_groups(
     lines_per_group: int,
     base: int,
 ) -> None:
-    """Write the samples of groups `begin` … `end` − 1 of a row; its first pixel would go to `base`.
+    """Write the samples of groups `begin` … `end` − 1 of a row; `base` is the target address of its first pixel.
 
-    Offsets are chosen `LEAD` groups before the samples they point to are fetched, but none from group `limit` on. With
-    each group `lines_per_group` further lines of the cache are prefetched, the first at address `prefetch_from`. Two
-    bytes are written behind the last pixel, if it is not the row's last.
+    Offsets are chosen `LEAD` groups before their samples are fetched, up to group `limit` − 1. With each group,
+    `lines_per_group` more cache lines are prefetched, starting at address `prefetch_from`. Two bytes after the last
+    pixel are overwritten unless it is the last of the row.
     """
-    done, whole = begin, min(limit, width // GROUP)
-    while done < end:
-        while done < min(end, whole - LEAD):
-            source, word = row + 3 * GROUP * (done + LEAD), uint32(LANES * (done + LEAD))
-            prefetch_group(row, done + LEAD)
-            _prefetch_lines(prefetch_from, lines_per_group, done - begin)
-            choose(source, word, keys[0], keys[1], keys[2], count, bits, offsets_slot(scratch, done + LEAD))
-            _copy_group(samples, offsets_slot(scratch, done), base + SAMPLE_BYTES * GROUP * done)
-            done += 1
-        # For the last groups no offsets are left to choose, or they have fewer pixels.
-        if done < end:
-            _prefetch_lines(prefetch_from, lines_per_group, done - begin)
-            if done + LEAD < limit:
-                choose_group(row, width, done + LEAD, keys, count, bits, scratch, offsets_slot(scratch, done + LEAD))
-            offsets, at, pixels = offsets_slot(scratch, done), base + SAMPLE_BYTES * GROUP * done, width - GROUP * done
+    group, whole_groups = begin, min(limit, width // GROUP)
+    while group < end:
+        while group < min(end, whole_groups - LEAD):
+            source, word = row + 3 * GROUP * (group + LEAD), uint32(LANES * (group + LEAD))
+            prefetch_group(row, group + LEAD)
+            _prefetch_lines(prefetch_from, lines_per_group, group - begin)
+            choose(source, word, keys[0], keys[1], keys[2], count, bits, offsets_slot(scratch, group + LEAD))
+            _copy_group(samples, offsets_slot(scratch, group), base + SAMPLE_BYTES * GROUP * group)
+            group += 1
+        # The last groups have fewer pixels, or all offsets are chosen already.
+        if group < end:
+            _prefetch_lines(prefetch_from, lines_per_group, group - begin)
+            if group + LEAD < limit:
+                choose_group(row, width, group + LEAD, keys, count, bits, scratch, offsets_slot(scratch, group + LEAD))
+            offsets, pixels = offsets_slot(scratch, group), width - GROUP * group
+            address = base + SAMPLE_BYTES * GROUP * group
             if pixels > GROUP:
-                _copy_group(samples, offsets, at)
+                _copy_group(samples, offsets, address)
             else:
                 for i in range(pixels):
-                    copy6(samples + offset_at(offsets + 4 * i), at + SAMPLE_BYTES * i)
-            done += 1
+                    copy6(samples + offset_at(offsets + 4 * i), address + SAMPLE_BYTES * i)
+            group += 1
 
 
 @inlined
@@ -122,15 +120,15 @@ def _prefetch_lines(prefetch_from: int, lines: int, group: int) -> None:
 
 @inlined
 def _copy_group(samples: int, offsets: int, target: int) -> None:
-    """Write the samples of a whole group, and two bytes more: each copy's last two are the next one's first two."""
+    # Each copy writes two bytes too many; the next copy overwrites them.
     for i in range(GROUP):
         copy8(samples + offset_at(offsets + 4 * i), target + SAMPLE_BYTES * i)
 
 
-# Pixels from which copying all samples of a light (5 MB) is cheaper than reading their pages in random order.
+# Number of pixels from which copying all samples of an illuminant (5 MB) is faster than reading pages in random order.
 WHOLE_LIGHT_PIXELS: Final = 1 << 20
 
-# Groups of pixels that are put together before they are streamed: 3 KiB, which stay in the first-level cache.
+# Groups of pixels that are buffered before they are streamed: 3 KiB, which fit into the first-level cache.
 _SEGMENT_GROUPS: Final = 16
 
 
@@ -151,29 +149,26 @@ def _gather(
     streamed: bool,
     scratch: int,
 ) -> None:
-    """Fill rows of 3-channel pixels; picture, samples, target and scratch are addresses, pitches bytes from row to row.
-
-    Picture and image leave the caches to the samples: the picture is prefetched as data that are read once; the image,
-    if `streamed`, is put together in scratch memory and written past the caches, a line at a time.
-    """
+    # Picture, samples, target and scratch are addresses; pitches are bytes from row to row. The caches are left to the
+    # samples: the picture is prefetched for one use, and a `streamed` image is written past the caches line by line.
     groups = (width + GROUP - 1) // GROUP
     lines = first_line(scratch + SCRATCH_BYTES)
     for y in range(rows):
         keys = row_keys(first_row + y, 0, image, seed)
-        row, to = picture + y * pitch, target + y * target_pitch
-        begin, held = to, to & (LINE - 1)
+        row, row_target = picture + y * pitch, target + y * target_pitch
+        begin, buffered = row_target, row_target & (LINE - 1)
         choose_first_groups(row, width, keys, count, bits, scratch, 0, groups)
-        done = 0
-        while done < groups:
-            end, base = groups, to
+        group = 0
+        while group < groups:
+            end, base = groups, row_target
             if streamed:
-                end, base = min(done + _SEGMENT_GROUPS, groups), lines + held - SAMPLE_BYTES * GROUP * done
-            draw_groups(row, width, keys, samples, count, bits, scratch, done, end, groups, 0, 0, base)
+                end, base = min(group + _SEGMENT_GROUPS, groups), lines + buffered - SAMPLE_BYTES * GROUP * group
+            draw_groups(row, width, keys, samples, count, bits, scratch, group, end, groups, 0, 0, base)
             if streamed:
-                stop = to + SAMPLE_BYTES * min(GROUP * end, width)
-                held = stream_lines(lines, begin, stop, end == groups)
-                begin = stop - held
-            done = end
+                stop = row_target + SAMPLE_BYTES * min(GROUP * end, width)
+                buffered = stream_lines(lines, begin, stop, end == groups)
+                begin = stop - buffered
+            group = end
     if streamed:
         store_fence()
 
@@ -188,22 +183,22 @@ def draw_samples(
     threads: int = 1,
     out: npt.NDArray[np.uint16] | None = None,
 ) -> npt.NDArray[np.uint16]:
-    """Return the raw linear image of `picture` under one light; the rule stands at the head of this file.
+    """Draw the raw linear image of `picture` under one illuminant; the module docstring has the formula.
 
     Parameters
     ----------
     samples
-        (8**bits, S, 3) uint16, linear camera RGB of one light, S ≥ 1; for example `lut.samples[light]`.
+        (8**bits, S, 3) uint16, linear camera RGB in counts, S ≥ 1; for example `lut.samples[light]`.
     picture
-        (H, W, 3) uint8 sRGB codes; the 8 − bits low bits of a code do not matter.
+        (H, W, 3) uint8, sRGB codes. The lowest 8 − bits bits of a code are ignored.
     seed
         0 … 2⁶⁴ − 1.
     image
-        Number of the image in its dataset, 0 … 2³² − 1.
+        Number of the image in its data set, 0 … 2³² − 1.
     first_row
-        The row of the whole picture that `picture` begins with: a picture done in bands is the same picture.
+        Row of the whole picture at which `picture` begins. Bands of a picture give the same pixels as the whole.
     threads
-        Threads that share the rows; no byte depends on it.
+        Number of threads that share the rows. The result does not depend on it.
     out
         (H, W, 3) uint16 to fill instead of a new array.
 
@@ -215,11 +210,11 @@ def draw_samples(
     Raises
     ------
     InputError
-        A shape, type or number is not as above.
+        If a shape, type or value is not as described above.
 
     Examples
     --------
-    A table of one bit a channel has 8 colours, here with two samples each; the picture is white, the last colour:
+    A LUT of 1 bit per channel has 8 colours, here with 2 samples each. The picture is white, the last colour:
 
     >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(8, 2, 3)
     >>> draw_samples(samples, np.full((1, 4, 3), 255, np.uint8), seed=0)
@@ -254,27 +249,28 @@ def draw_samples(
             scratch.ctypes.data,
         )
 
+    # Not numba's own threads: two Python threads cannot enter their pool at once, and it does not survive a fork.
     run_in_threads(fill, len(picture), threads)
     return copied_back(work, target)
 
 
-def known_light(lut: Lut, light: int) -> int:
-    """Return the number of a light; an InputError if the table has no such light."""
+def valid_light(lut: Lut, light: int) -> int:
+    """Return the index of an illuminant as int; raise InputError if the LUT has no such illuminant."""
     try:
         number = operator.index(light)
     except TypeError as error:
         raise InputError(
-            f"light {light!r} is no light; give its whole number from 0, or a text such as 5600K"
+            f"{light!r} is no illuminant; give its index, a whole number ≥ 0, or a text such as 5600K"
         ) from error
     if not 0 <= number < len(lut.samples):
-        raise InputError(f"there is no light {number}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
+        raise InputError(f"there is no illuminant {number}; the LUT {lut.folder} has 0 to {len(lut.samples) - 1}")
     return number
 
 
 def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.NDArray[np.uint16]:
-    """Return the samples (8**bits, S, 3) uint16 of light number `light`.
+    """Return the samples (8**bits, S, 3) uint16 of illuminant `light`.
 
-    For a picture of `WHOLE_LIGHT_PIXELS` or more they are copied to memory, else they stay on disk until they are used.
+    They are copied to memory for a picture of `WHOLE_LIGHT_PIXELS` or more, else they stay on disk until they are used.
     """
-    mapped = lut.light_samples(known_light(lut, light))
+    mapped = lut.light_samples(valid_light(lut, light))
     return np.array(mapped) if pixels >= WHOLE_LIGHT_PIXELS else mapped

@@ -1,7 +1,7 @@
-"""Colours whose samples must not be used are replaced by the nearest fit one, and counted.
+"""Replace colours that are unfit for use by the nearest fit colour, and count the replaced pixels.
 
-A table lists the cells whose samples must not be used. A pixel of such a colour takes the nearest fit colour, and the
-number of those pixels is printed and recorded with the dataset; nothing is replaced in silence.
+A look-up table (LUT) lists the patches whose samples must not be used. The number of pixels with such colours is
+printed and recorded with the data set.
 """
 
 from __future__ import annotations
@@ -23,18 +23,17 @@ if TYPE_CHECKING:
 
 
 def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
-    """Return for each unfit colour the nearest fit one.
+    """Return the nearest fit colour of each unfit colour, by Euclidean distance of the codes.
 
-    Nearest by Euclidean distance of the codes; of several equally near the lowest index.
-
-    `unfit`: (N,) int, distinct colour indices 0 … 8**bits − 1. Returns (N,) int64 colour indices, none of them unfit.
+    If several colours are equally near, the lowest index is taken. `unfit`: (N,) int, distinct colour indices
+    0 … 8**bits − 1. Returns (N,) int64 colour indices, none of them unfit.
     """
     unfit = np.asarray(unfit, dtype=np.int64)
     is_fit = np.ones(8**bits, dtype=bool)
     is_fit[unfit] = False
     fit = np.flatnonzero(is_fit)
     if not fit.size:
-        raise QualityError(f"all {8**bits} colours of the table are unfit for use; build the table again")
+        raise QualityError(f"all {8**bits} colours of the LUT are unfit, expected 1 or more fit; build the LUT again")
     codes = channels_of(fit, bits)
     nearest = [
         fit[np.argmin(((codes - channel) ** 2).sum(axis=1))] for channel in channels_of(unfit, bits).reshape(-1, 3)
@@ -43,48 +42,46 @@ def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64
 
 
 def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple[npt.NDArray[np.uint8], int]:
-    """Return `picture` with unfit colours replaced, and the number of pixels replaced.
+    """Return `picture` (H, W, 3) uint8 with unfit colours replaced, and the number of replaced pixels.
 
-    `picture`: (H, W, 3) uint8 sRGB codes. Returns (H, W, 3) uint8, the same array if nothing had to be replaced; and
-    the count.
+    The same array is returned if no colour is unfit.
     """
     bits = provenance.bits
     unfit = tuple(sorted({cell.colour for cell in provenance.unfit}))
     if not unfit or not colours_in(picture, bits)[list(unfit)].any():
         return picture, 0
-    is_unfit, instead = _replacements(unfit, bits)
+    is_unfit, replacement_codes = _replacements(unfit, bits)
     replaced = np.array(picture, order="C")
-    return replaced, int(_replace(replaced, np.uint32(bits), is_unfit, instead))
+    return replaced, int(_replace(replaced, np.uint32(bits), is_unfit, replacement_codes))
 
 
 @lru_cache(maxsize=4)
 def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8]]:
-    """Return which colours of a table are unfit, (8**bits,) bool, and their replacements, (8**bits, 3) uint8."""
-    is_unfit, instead = np.zeros(8**bits, np.bool_), np.zeros((8**bits, 3), np.uint8)
+    is_unfit, replacement_codes = np.zeros(8**bits, np.bool_), np.zeros((8**bits, 3), np.uint8)
     is_unfit[list(unfit)] = True
-    instead[list(unfit)] = channels_of(nearest_fit_colours(unfit, bits), bits) << (8 - bits)
-    return is_unfit, instead
+    replacement_codes[list(unfit)] = channels_of(nearest_fit_colours(unfit, bits), bits) << (8 - bits)
+    return is_unfit, replacement_codes
 
 
 def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool_]:
-    """Return which colours of a table, (8**bits,) bool, are in a picture (H, W, 3) uint8."""
-    found = np.zeros(8**bits, np.bool_)
+    """Return (8**bits,) bool: the colours that occur in a picture (H, W, 3) uint8."""
+    is_present = np.zeros(8**bits, np.bool_)
     pixels = np.ascontiguousarray(picture)
     scratch = np.ones(EDGE_BYTES + 2 * OFFSETS_BYTES + 1, np.uint8)
-    _find(pixels.ctypes.data, pixels.size // 3, np.uint32(bits), found.ctypes.data, scratch.ctypes.data)
-    return found
+    _mark_colours(pixels.ctypes.data, pixels.size // 3, np.uint32(bits), is_present.ctypes.data, scratch.ctypes.data)
+    return is_present
 
 
 @compiled
-def _find(pixels: int, count: int, bits: Any, found: int, scratch: int) -> None:
-    """Set the byte at `found` of each colour that is among the pixels to 1, the last byte of scratch memory."""
-    places, others = scratch + EDGE_BYTES, scratch + EDGE_BYTES + OFFSETS_BYTES
-    one = others + OFFSETS_BYTES
+def _mark_colours(pixels: int, count: int, bits: Any, is_present: int, scratch: int) -> None:
+    # Copies the last byte of scratch memory, a 1, to the byte of each colour that occurs.
+    indices, unused = scratch + EDGE_BYTES, scratch + EDGE_BYTES + OFFSETS_BYTES
+    one_byte = unused + OFFSETS_BYTES
     for group in range((count + GROUP - 1) // GROUP):
         source = group_address(pixels, count, group, scratch)
-        write_colours(source, bits, uint32(1), places, uint32(0), others)
+        write_colours(source, bits, uint32(1), indices, uint32(0), unused)
         for i in range(min(GROUP, count - GROUP * group)):
-            copy1(one, found + offset_at(places + 4 * i))
+            copy1(one_byte, is_present + offset_at(indices + 4 * i))
 
 
 @inlined
@@ -95,13 +92,13 @@ def _colour_at(picture: Any, y: int, x: int, bits: Any) -> Any:
 
 
 @compiled
-def _replace(picture: Any, bits: Any, is_unfit: Any, instead: Any) -> int:
+def _replace(picture: Any, bits: Any, is_unfit: Any, replacement_codes: Any) -> int:
     count = 0
     for y in range(picture.shape[0]):
         for x in range(picture.shape[1]):
             colour = _colour_at(picture, y, x, bits)
             if is_unfit[colour]:
                 for channel in range(3):
-                    picture[y, x, channel] = instead[colour, channel]
+                    picture[y, x, channel] = replacement_codes[colour, channel]
                 count += 1
     return count

@@ -1,14 +1,12 @@
-"""Steps of the kernels written in LLVM's own terms: vectors of 16 32-bit numbers, and loads and stores by address.
+"""Kernel steps written as LLVM code: vectors of 16 numbers of 32 bits, and loads and stores by address.
 
-numba compiles loops well, but does not put many pixels into one vector where bytes must be shuffled, and knows no load
-of eight bytes from any address. These functions can be called from compiled functions only. LLVM makes of them
-whatever the processor has: one vector of AVX-512, two of AVX2, four of NEON. Bytes change places within 16, which all
-can do.
+numba does not vectorise pixel loops that shuffle bytes, and cannot load eight bytes from any address. These functions
+can be called from compiled functions only. LLVM maps the vectors to the processor: one of AVX-512, two of AVX2 or four
+of NEON. Shuffles stay within 16 bytes, which all of these can do.
 
-Addresses are plain integers; whoever calls must keep them inside arrays. What may be read or written beyond is said
-with each function. First come steps that all kernels share, then those that write past the caches an image that they
-could not keep, so that they keep the table, then those of `mixing.py`.
-What chooses samples, and prefetches, is in `choice.py`.
+Addresses are plain integers; the caller must keep them inside arrays. Each docstring lists bytes that are read or
+written beyond. First come general steps, then steps that write large images past the caches, so that the samples stay
+in them, then the steps of `mixing.py`. The choice of samples and prefetching are in `choice.py`.
 """
 
 from __future__ import annotations
@@ -22,11 +20,11 @@ from llvmlite import ir
 
 from foundation.compiled import inlined, intrinsic
 
-LANES: Final = 16  # Numbers of 32 bits in a vector: one register of AVX-512
-GROUP: Final = 2 * LANES  # Pixels whose choices come from one vector of words, two from each word; see `choice.py`
-EIGHT: Final = 8  # Pixels that are written to float32 planes at a time: one register of AVX2 a channel
+LANES: Final = 16  # 32-bit numbers per vector: one register of AVX-512
+GROUP: Final = 2 * LANES  # Pixels whose samples are chosen by one vector of words, two by each word
+EIGHT: Final = 8  # Pixels written to float32 planes at a time: one register of AVX2 per channel
 SAMPLE_BYTES: Final = 6  # Bytes of a sample: red, green and blue, uint16 each
-LINE: Final = 64  # Bytes of a line of the cache, on x86-64 and on most arm64 processors
+LINE: Final = 64  # Bytes of a cache line on x86-64 and on most arm64 processors
 
 I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 F32 = ir.FloatType()
@@ -40,70 +38,71 @@ Builder = Any
 Value = Any
 
 
-def constant(kind: Any, numbers: int | Sequence[int]) -> Value:
-    """Return a constant vector, of one number in every lane or of a number a lane."""
-    return ir.Constant(kind, [numbers] * kind.count if isinstance(numbers, int) else list(numbers))
+def constant(ir_type: Any, numbers: int | Sequence[int]) -> Value:
+    """Return a constant vector: one number in every lane, or one number per lane."""
+    return ir.Constant(ir_type, [numbers] * ir_type.count if isinstance(numbers, int) else list(numbers))
 
 
-def broadcast(builder: Builder, number: Value, kind: Any) -> Value:
-    """Return a vector whose every lane is `number`."""
-    unset = ir.Constant(kind, ir.Undefined)
+def broadcast(builder: Builder, number: Value, ir_type: Any) -> Value:
+    """Return a vector with `number` in every lane."""
+    unset = ir.Constant(ir_type, ir.Undefined)
     first = builder.insert_element(unset, number, ir.Constant(I32, 0))
-    return builder.shuffle_vector(first, unset, constant(ir.VectorType(I32, kind.count), 0))
+    return builder.shuffle_vector(first, unset, constant(ir.VectorType(I32, ir_type.count), 0))
 
 
-def pointer_at(builder: Builder, address: Value, offset: int, kind: Any) -> Value:
-    """Return a pointer of that kind to the memory `offset` bytes behind `address`."""
-    return builder.inttoptr(builder.add(address, ir.Constant(I64, offset)), kind.as_pointer())
+def pointer_at(builder: Builder, address: Value, offset: int, ir_type: Any) -> Value:
+    """Return a pointer of type `ir_type` to the memory `offset` bytes after `address`."""
+    return builder.inttoptr(builder.add(address, ir.Constant(I64, offset)), ir_type.as_pointer())
 
 
-def load(builder: Builder, address: Value, offset: int, kind: Any) -> Value:
-    """Return the value of that kind `offset` bytes behind `address`, aligned or not."""
-    loaded = builder.load(pointer_at(builder, address, offset, kind))
+def load(builder: Builder, address: Value, offset: int, ir_type: Any) -> Value:
+    """Return the value of type `ir_type` at `offset` bytes after `address`, aligned or not."""
+    loaded = builder.load(pointer_at(builder, address, offset, ir_type))
     loaded.align = 1
     return loaded
 
 
 def store(builder: Builder, value: Value, address: Value, offset: int) -> None:
-    """Write `value` to the memory `offset` bytes behind `address`, aligned or not."""
+    """Write `value` to the memory `offset` bytes after `address`, aligned or not."""
     builder.store(value, pointer_at(builder, address, offset, value.type)).align = 1
 
 
-def concatenated(builder: Builder, parts: Sequence[Value]) -> Value:
-    """Return the vectors of `parts` as one; they are of one size and a power of two in number."""
-    while len(parts) > 1:
-        lanes = constant(ir.VectorType(I32, 2 * parts[0].type.count), range(2 * parts[0].type.count))
-        parts = [builder.shuffle_vector(*parts[i : i + 2], lanes) for i in range(0, len(parts), 2)]
-    return parts[0]
+def concatenated(builder: Builder, vectors: Sequence[Value]) -> Value:
+    """Return vectors of equal size as one; their number is a power of two."""
+    while len(vectors) > 1:
+        lanes = constant(ir.VectorType(I32, 2 * vectors[0].type.count), range(2 * vectors[0].type.count))
+        vectors = [builder.shuffle_vector(*vectors[i : i + 2], lanes) for i in range(0, len(vectors), 2)]
+    return vectors[0]
 
 
 def pixel_codes(builder: Builder, picture: Value) -> Value:
     """Return blue | green << 8 | red << 16 of the 16 pixels (48 bytes) at `picture`."""
-    # Four pixels for each 16 bytes of the vector; the last four are loaded so that nothing behind them is.
+    # Four pixels for each 16 bytes of the vector. The last load starts earlier, so that it ends with the last pixel.
     starts = (0, 12, 24, 32)
     loaded = concatenated(builder, [load(builder, picture, start, ir.VectorType(I8, 16)) for start in starts])
     lanes: list[int] = []
-    for four, start in enumerate(starts):
+    for quarter, start in enumerate(starts):
         for pixel in range(4):
-            first = 16 * four + 12 * four - start + 3 * pixel
+            first = 16 * quarter + 12 * quarter - start + 3 * pixel
             lanes += [first + 2, first + 1, first, 4 * LANES]
-    nothing = constant(loaded.type, 0)
+    zeros = constant(loaded.type, 0)
     mask = constant(ir.VectorType(I32, 4 * LANES), lanes)
-    return builder.bitcast(builder.shuffle_vector(loaded, nothing, mask), WORDS)
+    return builder.bitcast(builder.shuffle_vector(loaded, zeros, mask), WORDS)
 
 
 def signature(returned: str, *kinds: str) -> Any:
-    """Return numba's type of a function that returns one kind and takes others, by their names."""
+    """Return numba's type of a function from the names of its return type and argument types."""
     from numba import types
 
-    named: Any = types
-    return getattr(named, returned)(*(getattr(named, kind) for kind in kinds))
+    numba_types: Any = types
+    return getattr(numba_types, returned)(*(getattr(numba_types, ir_type) for ir_type in kinds))
 
 
 def step(*kinds: str, returned: str = "void") -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that makes a step for compiled functions to call of a function that writes it in LLVM's terms.
+    """Return a decorator that turns an emitter of LLVM code into a function callable from compiled functions.
 
-    The function takes a builder and a value of each of `kinds`, by numba's names, and returns what the step does.
+    The emitter takes a builder and one value for each of `kinds` (numba type names), and returns the result of the
+    step.
     """
 
     def decorate(emit: Callable[..., Any]) -> Any:
@@ -124,13 +123,13 @@ def step(*kinds: str, returned: str = "void") -> Callable[[Callable[..., Any]], 
 
 @step(ADDRESS, returned="int64")
 def offset_at(builder: Builder, source: Value) -> Value:
-    """Return the uint32 at `source` as an address can be added to it."""
+    """Return the uint32 at `source` as int64, to be added to an address."""
     return builder.zext(load(builder, source, 0, I32), I64)
 
 
 @step(ADDRESS, ADDRESS)
 def copy8(builder: Builder, source: Value, target: Value) -> None:
-    """Copy a sample and the two bytes behind it."""
+    """Copy a sample and the two bytes after it."""
     store(builder, load(builder, source, 0, I64), target, 0)
 
 
@@ -149,13 +148,13 @@ def copy2(builder: Builder, source: Value, target: Value) -> None:
 
 @step(ADDRESS, ADDRESS)
 def copy_line(builder: Builder, source: Value, target: Value) -> None:
-    """Copy a line's bytes."""
+    """Copy the bytes of a cache line."""
     store(builder, load(builder, source, 0, _LINE), target, 0)
 
 
 @step(ADDRESS, ADDRESS)
 def stream_line(builder: Builder, source: Value, target: Value) -> None:
-    """Copy a line's bytes past the caches to `target`, a multiple of `LINE`; to be followed by `store_fence`."""
+    """Copy a cache line past the caches to `target`, a multiple of `LINE`; call `store_fence` afterwards."""
     written = builder.store(load(builder, source, 0, _LINE), pointer_at(builder, target, 0, _LINE))
     written.align = LINE
     written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(I32, 1)]))
@@ -163,7 +162,7 @@ def stream_line(builder: Builder, source: Value, target: Value) -> None:
 
 @step()
 def store_fence(builder: Builder) -> None:
-    """Wait until all threads can see what was streamed."""
+    """Wait until all threads can see the streamed bytes."""
     builder.fence("seq_cst")
 
 
@@ -174,7 +173,7 @@ def copy1(builder: Builder, source: Value, target: Value) -> None:
 
 
 def _channels(builder: Builder, samples: Value, offsets: Value, step: int) -> list[Value]:
-    """Return red, green and blue, eight float32 each, of the samples whose offsets are `step` bytes apart."""
+    # Red, green and blue, eight float32 each, of the samples whose offsets are `step` bytes apart.
     pairs = [
         [
             load(
@@ -205,23 +204,22 @@ def minimum(builder: Builder, first: Value, second: Value) -> Value:
 def _write_planes8(
     builder: Builder, samples: Value, offsets: Value, stride: int, line: Value, targets: Sequence[Value]
 ) -> None:
-    """Write eight pixels whose offsets are `stride` bytes apart to three planes."""
 
-    def number(place: int) -> Value:
-        return broadcast(builder, load(builder, line, 4 * place, F32), _EIGHT_FLOATS)
+    def broadcast_value(index: int) -> Value:
+        return broadcast(builder, load(builder, line, 4 * index, F32), _EIGHT_FLOATS)
 
-    for place, (channel, target) in enumerate(zip(_channels(builder, samples, offsets, stride), targets, strict=True)):
-        value = builder.fadd(builder.fmul(channel, number(place)), number(3 + place))
-        store(builder, minimum(builder, value, number(6)), target, 0)
+    for index, (channel, target) in enumerate(zip(_channels(builder, samples, offsets, stride), targets, strict=True)):
+        value = builder.fadd(builder.fmul(channel, broadcast_value(index)), broadcast_value(3 + index))
+        store(builder, minimum(builder, value, broadcast_value(6)), target, 0)
 
 
 @step(*[ADDRESS] * 6)
 def planes8(
     builder: Builder, samples: Value, offsets: Value, line: Value, red: Value, green: Value, blue: Value
 ) -> None:
-    """Write eight pixels as float32 to three planes: sample times factor, plus summand, at most a limit.
+    """Write eight pixels as float32 to three planes: min(sample · factor + summand, limit).
 
-    At `line` are seven float32: factors and summands of red, green and blue, and the limit.
+    `line` is the address of seven float32: factors and summands of red, green and blue, and the limit.
     """
     _write_planes8(builder, samples, offsets, 4, line, (red, green, blue))
 
@@ -230,135 +228,133 @@ def planes8(
 def planes8_mirrored(
     builder: Builder, samples: Value, offsets: Value, line: Value, red: Value, green: Value, blue: Value
 ) -> None:
-    """Do `planes8` from right to left: `offsets` points to the first pixel's offset, the others' stand before it."""
+    """Do `planes8` from right to left: `offsets` is the address of the last offset, the first is read last."""
     _write_planes8(builder, samples, offsets, -4, line, (red, green, blue))
 
 
 @step(ADDRESS, "float32", "float32", "float32", ADDRESS)
 def plane1(builder: Builder, source: Value, factor: Value, summand: Value, limit: Value, target: Value) -> None:
-    """Write one channel of one pixel as float32: `planes8` for what is narrower."""
+    """Write one channel of one pixel as float32; `planes8` for crops narrower than eight pixels."""
     value = builder.fmul(builder.uitofp(load(builder, source, 0, I16), F32), factor)
     store(builder, minimum(builder, builder.fadd(value, summand), limit), target, 0)
 
 
-BLOCK: Final = 8  # Pixels that are mixed at a time: their weights under two lights fill a vector of 16
-MEAN_BYTES: Final = 16  # Bytes of a colour's mean under one light: red, green, blue and padding, float32
-PLAN_ENTRIES: Final = 6  # Addresses that `mix` takes of each pair of lights
-FAULT_BYTES: Final = 4 * LANES  # Bytes of the 16 float32 that become NaN where a weight is faulty
+BLOCK: Final = 8  # Pixels mixed at a time: their weights under two illuminants fill a vector of 16
+MEAN_BYTES: Final = 16  # Bytes of the mean of a colour under one illuminant: red, green, blue, padding; float32
+PLAN_ENTRIES: Final = 6  # Addresses per pair of illuminants in the plan of `mix`
+FAULT_BYTES: Final = 4 * LANES  # Bytes of the 16 float32 that become NaN if a weight is faulty
 
-_QUAD: Final = 4  # Numbers of a pixel in a vector, a quarter of it: red, green, blue and padding
+_QUAD: Final = 4  # Numbers per pixel in a vector: red, green, blue and padding
 _SHORTS: Final = ir.VectorType(I16, 2 * LANES)
-# Which two of eight pixels share a vector, so that pixels are packed without crossing its quarters.
+# Pairs of the eight pixels that share a vector, so that packing does not cross its quarters.
 _PIXEL_PAIRS: Final = ((0, 2), (4, 6), (1, 3), (5, 7))
-# Pixel and light of each of a block's weights in the order of `arrange_weights`, in the quarters of `_PIXEL_PAIRS`.
+# Pixel and illuminant of each weight of a block in the order of `arrange_weights`, which follows `_PIXEL_PAIRS`.
 _ORDER: Final = tuple((_PIXEL_PAIRS[lane % _QUAD][lane // (2 * _QUAD)], lane // _QUAD % 2) for lane in range(LANES))
 
 
 @step(ADDRESS, "int64", ADDRESS, returned="int64")
 def mean4(builder: Builder, source: Value, count: Value, target: Value) -> Value:
-    """Write the mean of `count` ≥ 1 samples in a row as four float32, the fourth is padding.
+    """Write the mean of `count` ≥ 1 consecutive samples as four float32, the fourth is padding.
 
-    Returns the largest number of the samples.
+    Returns the largest value of the samples.
     """
     from numba.core import cgutils
 
-    wide, real = ir.VectorType(I64, _QUAD), ir.VectorType(ir.DoubleType(), _QUAD)
-    total, most = (cgutils.alloca_once_value(builder, ir.Constant(wide, [0] * _QUAD)) for _ in range(2))
+    integers, reals = ir.VectorType(I64, _QUAD), ir.VectorType(ir.DoubleType(), _QUAD)
+    total, largest = (cgutils.alloca_once_value(builder, ir.Constant(integers, [0] * _QUAD)) for _ in range(2))
     with cgutils.for_range(builder, count) as loop:
-        at = builder.add(source, builder.mul(loop.index, ir.Constant(I64, SAMPLE_BYTES)))
-        sample = builder.zext(load(builder, at, 0, ir.VectorType(I16, _QUAD)), wide)
+        address = builder.add(source, builder.mul(loop.index, ir.Constant(I64, SAMPLE_BYTES)))
+        sample = builder.zext(load(builder, address, 0, ir.VectorType(I16, _QUAD)), integers)
         builder.store(builder.add(builder.load(total), sample), total)
-        before = builder.load(most)
-        builder.store(builder.select(builder.icmp_unsigned(">", sample, before), sample, before), most)
-    mean = builder.fdiv(
-        builder.sitofp(builder.load(total), real), broadcast(builder, builder.sitofp(count, ir.DoubleType()), real)
-    )
+        previous = builder.load(largest)
+        builder.store(builder.select(builder.icmp_unsigned(">", sample, previous), sample, previous), largest)
+    divisor = broadcast(builder, builder.sitofp(count, ir.DoubleType()), reals)
+    mean = builder.fdiv(builder.sitofp(builder.load(total), reals), divisor)
     store(builder, builder.fptrunc(mean, ir.VectorType(F32, _QUAD)), target, 0)
-    largest = ir.Constant(I64, 0)
+    largest_channel = ir.Constant(I64, 0)
     for channel in range(3):
-        value = builder.extract_element(builder.load(most), ir.Constant(I32, channel))
-        largest = builder.select(builder.icmp_unsigned(">", value, largest), value, largest)
-    return largest
+        value = builder.extract_element(builder.load(largest), ir.Constant(I32, channel))
+        largest_channel = builder.select(builder.icmp_unsigned(">", value, largest_channel), value, largest_channel)
+    return largest_channel
 
 
-def _for_each_line(builder: Builder, weights: Value, count: Value, do: Callable[[Value, Value], None]) -> None:
-    """Call `do` with the weights of each eight pixels under a pair of lights, WORDS, and the number of those eight."""
+def _for_each_line(builder: Builder, weights: Value, count: Value, process: Callable[[Value, Value], None]) -> None:
+    # Calls `process` with the weights of each eight pixels under a pair of illuminants, and the index of the block.
     with _blocks(builder, count) as (block, begin):
-        do(load(builder, builder.add(weights, builder.shl(begin, ir.Constant(I64, 3))), 0, WORDS), block)
+        process(load(builder, builder.add(weights, builder.shl(begin, ir.Constant(I64, 3))), 0, WORDS), block)
 
 
 def _any_nonzero(builder: Builder, words: Value) -> Value:
-    """Return two bits: whether one of the even lanes, and whether one of the odd lanes, is not 0."""
-    answer = ir.Constant(I64, 0)
+    # Bit 0: an even lane is not 0; bit 1: an odd lane is not 0.
+    flags = ir.Constant(I64, 0)
     for light in range(2):
         lanes = constant(_EIGHT_WORDS, range(light, LANES, 2))
-        its = builder.shuffle_vector(words, words, lanes)
-        other = builder.bitcast(builder.icmp_unsigned("!=", its, constant(_EIGHT_WORDS, 0)), I8)
-        other = builder.zext(builder.icmp_unsigned("!=", other, ir.Constant(I8, 0)), I64)
-        answer = builder.or_(answer, builder.shl(other, ir.Constant(I64, light)))
-    return answer
+        light_words = builder.shuffle_vector(words, words, lanes)
+        is_nonzero = builder.bitcast(builder.icmp_unsigned("!=", light_words, constant(_EIGHT_WORDS, 0)), I8)
+        is_nonzero = builder.zext(builder.icmp_unsigned("!=", is_nonzero, ir.Constant(I8, 0)), I64)
+        flags = builder.or_(flags, builder.shl(is_nonzero, ir.Constant(I64, light)))
+    return flags
 
 
 @step(ADDRESS, "int64", returned="int64")
 def weight_flags(builder: Builder, weights: Value, count: Value) -> Value:
-    """Return four bits on the weights of two lights, two float32 for each of `count` ≥ 8 pixels.
+    """Return four flags for the weights of two illuminants, two float32 for each of `count` ≥ 8 pixels.
 
-    Bits 0 and 1 are set where some weight of the first and of the second light is not 0, bits 2 and 3 where some weight
-    of theirs is not 1.
+    Bits 0 and 1 are set if any weight of the first and second illuminant is not 0; bits 2 and 3 if any is not 1.
     """
     from numba.core import cgutils
 
     ones = builder.bitcast(ir.Constant(FLOATS, [1.0] * LANES), WORDS)
-    found = [cgutils.alloca_once_value(builder, constant(WORDS, 0)) for _ in range(2)]
+    accumulators = [cgutils.alloca_once_value(builder, constant(WORDS, 0)) for _ in range(2)]
 
-    def see(line: Value, block: Value) -> None:
+    def accumulate(line: Value, block: Value) -> None:
         del block
-        for seen, other in zip(found, (line, builder.xor(line, ones)), strict=True):
-            builder.store(builder.or_(builder.load(seen), other), seen)
+        for accumulator, words in zip(accumulators, (line, builder.xor(line, ones)), strict=True):
+            builder.store(builder.or_(builder.load(accumulator), words), accumulator)
 
-    _for_each_line(builder, weights, count, see)
-    lit, less = (_any_nonzero(builder, builder.load(seen)) for seen in found)
-    return builder.or_(lit, builder.shl(less, ir.Constant(I64, 2)))
+    _for_each_line(builder, weights, count, accumulate)
+    nonzero, not_one = (_any_nonzero(builder, builder.load(accumulator)) for accumulator in accumulators)
+    return builder.or_(nonzero, builder.shl(not_one, ir.Constant(I64, 2)))
 
 
 @step(ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
 def interleave_weights(
     builder: Builder, first: Value, first_step: Value, second: Value, second_step: Value, target: Value
 ) -> None:
-    """Write eight pixels' weights of two lights by turns, as `weight_flags` takes them; steps are bytes to the next."""
+    """Write the weights of eight pixels under two illuminants alternately; steps are in bytes."""
     line = ir.Constant(FLOATS, ir.Undefined)
     for lane in range(LANES):
         weights, stride = ((first, first_step), (second, second_step))[lane % 2]
-        at = builder.add(weights, builder.mul(stride, ir.Constant(I64, lane // 2)))
-        line = builder.insert_element(line, load(builder, at, 0, F32), ir.Constant(I32, lane))
+        address = builder.add(weights, builder.mul(stride, ir.Constant(I64, lane // 2)))
+        line = builder.insert_element(line, load(builder, address, 0, F32), ir.Constant(I32, lane))
     store(builder, line, target, 0)
 
 
 @step(ADDRESS, "int64", ADDRESS, returned="int64")
 def arrange_weights(builder: Builder, weights: Value, count: Value, target: Value) -> Value:
-    """Write the weights that `weight_flags` takes in the order in which `mix` takes them, 64 bytes for eight pixels.
+    """Write weights, given as for `weight_flags`, in the order that `mix` expects, 64 bytes for eight pixels.
 
     Returns bits 0 and 1 of `weight_flags`.
     """
     from numba.core import cgutils
 
     lanes = constant(WORDS, [2 * pixel + light for pixel, light in _ORDER])
-    seen = cgutils.alloca_once_value(builder, constant(WORDS, 0))
+    accumulator = cgutils.alloca_once_value(builder, constant(WORDS, 0))
 
-    def put(line: Value, block: Value) -> None:
-        builder.store(builder.or_(builder.load(seen), line), seen)
-        to = builder.add(target, builder.shl(block, ir.Constant(I64, 6)))
-        store(builder, builder.shuffle_vector(line, line, lanes), to, 0)
+    def write_line(line: Value, block: Value) -> None:
+        builder.store(builder.or_(builder.load(accumulator), line), accumulator)
+        address = builder.add(target, builder.shl(block, ir.Constant(I64, 6)))
+        store(builder, builder.shuffle_vector(line, line, lanes), address, 0)
 
-    _for_each_line(builder, weights, count, put)
-    return _any_nonzero(builder, builder.load(seen))
+    _for_each_line(builder, weights, count, write_line)
+    return _any_nonzero(builder, builder.load(accumulator))
 
 
 @contextmanager
 def _blocks(builder: Builder, count: Value) -> Generator[tuple[Value, Value]]:
-    """Loop over `count` ≥ 8 pixels eight by eight: yield the number of each eight, and the first of its pixels.
+    """Loop over `count` ≥ 8 pixels eight by eight; yield the index of each block and its first pixel.
 
-    Where `count` is no multiple of eight, the last eight overlap the ones before.
+    If `count` is no multiple of eight, the last block overlaps the previous one.
     """
     from numba.core import cgutils
 
@@ -369,62 +365,57 @@ def _blocks(builder: Builder, count: Value) -> Generator[tuple[Value, Value]]:
         yield loop.index, builder.select(builder.icmp_signed("<", begin, last), begin, last)
 
 
-def _store_pixels(builder: Builder, even: Value, odd: Value, target: Value) -> None:
-    """Write the red, green and blue of eight pixels as uint16, given those of even and of odd places as 32 bits."""
-    both = builder.bitcast(builder.or_(even, builder.shl(odd, constant(WORDS, 16))), _SHORTS)
-    # Of each quarter: red, red, green, green, blue, blue of two pixels, and two of padding.
+def _store_pixels(builder: Builder, even_pixels: Value, odd_pixels: Value, target: Value) -> None:
+    packed = builder.bitcast(builder.or_(even_pixels, builder.shl(odd_pixels, constant(WORDS, 16))), _SHORTS)
+    # Each quarter holds red, red, green, green, blue, blue of two pixels, and two numbers of padding.
     lanes = [8 * quarter + lane for quarter in range(_QUAD) for lane in (0, 2, 4, 1, 3, 5)]
-    for part in (slice(0, 16), slice(16, 24)):
-        kind = ir.VectorType(I32, len(lanes[part]))
-        store(builder, builder.shuffle_vector(both, both, constant(kind, lanes[part])), target, 2 * part.start)
+    for span in (slice(0, 16), slice(16, 24)):
+        ir_type = ir.VectorType(I32, len(lanes[span]))
+        store(builder, builder.shuffle_vector(packed, packed, constant(ir_type, lanes[span])), target, 2 * span.start)
 
 
 def _pair(
-    builder: Builder, addresses: Sequence[Value], block: Value, place: Value, means: Value
+    builder: Builder, addresses: Sequence[Value], block: Value, position: Value, means: Value
 ) -> tuple[list[Value], Value]:
-    """Return what a pair of lights adds to the pixels of even and of odd places, and a mark of faulty weights.
-
-    The mark is 16 float32: 0, or NaN where a weight is faulty.
-    """
-    weights, *rest = addresses
-    offsets, samples, mean_base = rest[:2], rest[2:4], rest[4]
+    # The sum of a pair of illuminants in even and in odd pixels, and a mark of faulty weights.
+    weights, *other_addresses = addresses
+    offsets, samples, mean_base = other_addresses[:2], other_addresses[2:4], other_addresses[4]
     name = f"llvm.sqrt.v{LANES}f32"
-    kind = ir.FunctionType(FLOATS, [FLOATS])
-    root_of = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+    function_type = ir.FunctionType(FLOATS, [FLOATS])
+    square_root = builder.module.globals.get(name) or ir.Function(builder.module, function_type, name)
     weight = load(builder, builder.add(weights, builder.shl(block, ir.Constant(I64, 6))), 0, FLOATS)
-    root = builder.call(root_of, [weight])
+    root = builder.call(square_root, [weight])
     remainder = builder.fsub(weight, root)
-    # The root of a negative number, and 0 times infinity, are NaN.
+    # The mark is 0, or NaN for a faulty weight: the root of a negative number, and 0 times infinity, are NaN.
     fault = builder.fmul(root, ir.Constant(FLOATS, [0.0] * LANES))
     sums: list[Value] = []
     for lane, pixels in enumerate(_PIXEL_PAIRS):
 
-        def found(base: Value, places: Value, pixel: int, kind: Any) -> Value:
-            offset = builder.zext(load(builder, builder.add(places, place), 4 * pixel, I32), I64)
-            return load(builder, builder.add(base, offset), 0, kind)
+        def fetch(base: Value, offset_row: Value, pixel: int, value_type: Any) -> Value:
+            offset = builder.zext(load(builder, builder.add(offset_row, position), 4 * pixel, I32), I64)
+            return load(builder, builder.add(base, offset), 0, value_type)
 
-        def each(numbers: Value, lane: int = lane) -> Value:
-            """Return the numbers of a pair of pixels under both lights, four times each."""
-            lanes = [_QUAD * (place // _QUAD) + lane for place in range(LANES)]
+        def repeated(numbers: Value, lane: int = lane) -> Value:
+            lanes = [_QUAD * (position // _QUAD) + lane for position in range(LANES)]
             return builder.shuffle_vector(numbers, numbers, constant(WORDS, lanes))
 
         drawn = [
-            found(base, places, pixel, ir.VectorType(I16, 4))
+            fetch(base, offset_row, pixel, ir.VectorType(I16, 4))
             for pixel in pixels
-            for base, places in zip(samples, offsets, strict=True)
+            for base, offset_row in zip(samples, offsets, strict=True)
         ]
-        mean = [found(mean_base, means, pixel, ir.VectorType(F32, 2 * _QUAD)) for pixel in pixels]
-        noisy = builder.fmul(builder.sitofp(builder.zext(concatenated(builder, drawn), WORDS), FLOATS), each(root))
-        sums.append(builder.fadd(noisy, builder.fmul(concatenated(builder, mean), each(remainder))))
+        mean = [fetch(mean_base, means, pixel, ir.VectorType(F32, 2 * _QUAD)) for pixel in pixels]
+        noisy = builder.fmul(builder.sitofp(builder.zext(concatenated(builder, drawn), WORDS), FLOATS), repeated(root))
+        sums.append(builder.fadd(noisy, builder.fmul(concatenated(builder, mean), repeated(remainder))))
     totals: list[Value] = []
-    for two in (sums[:2], sums[2:]):
-        parts = [
+    for pair_sums in (sums[:2], sums[2:]):
+        light_sums = [
             builder.shuffle_vector(
-                *two, constant(WORDS, [8 * pixel + _QUAD * light + i for pixel in range(4) for i in range(4)])
+                *pair_sums, constant(WORDS, [8 * pixel + _QUAD * light + i for pixel in range(4) for i in range(4)])
             )
             for light in range(2)
         ]
-        totals.append(builder.fadd(*parts))
+        totals.append(builder.fadd(*light_sums))
     return totals, fault
 
 
@@ -432,12 +423,11 @@ def _pair(
 def mix(
     builder: Builder, plan: Value, pairs: Value, count: Value, means: Value, faults: Value, white: Value, target: Value
 ) -> None:
-    """Write `count` ≥ 8 pixels under pairs of lights as uint16, rounded, from 0 to `white`; see `mixing.py`.
+    """Write `count` ≥ 8 pixels under pairs of illuminants as uint16, rounded, 0 … `white`; formula in `mixing.py`.
 
-    `plan` is the address of `PLAN_ENTRIES` addresses a pair: of the weights as `arrange_weights` has them, of the first
-    and second light's offsets in their samples, of the first and second light's samples, and of the means; `means` is
-    that of the offsets in the means. Of the 16 float32 at `faults` some become NaN as soon as a weight is negative,
-    infinite or NaN.
+    `plan` is the address of `PLAN_ENTRIES` addresses per pair: weights from `arrange_weights`, sample offsets of the
+    first and second illuminant, samples of the first and second illuminant, and means. `means` is the address of the
+    offsets in the means. Some of the 16 float32 at `faults` become NaN if a weight is negative, infinite or NaN.
     """
     from numba.core import cgutils
 
@@ -449,76 +439,76 @@ def mix(
         return [load(builder, entry, 8 * i, I64) for i in range(PLAN_ENTRIES)]
 
     zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
-    most = broadcast(builder, white, FLOATS)
+    upper_limit = broadcast(builder, white, FLOATS)
     fault = cgutils.alloca_once_value(builder, load(builder, faults, 0, FLOATS))
     sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(2)]
 
-    def fill(total: Callable[[Value, Value], Sequence[Value]]) -> None:
+    def fill(compute: Callable[[Value, Value], Sequence[Value]]) -> None:
         with _blocks(builder, count) as (block, begin):
             rounded: list[Value] = []
-            for value in total(block, builder.shl(begin, number(2))):
-                lifted = builder.fadd(value, half)
-                lifted = builder.select(builder.fcmp_ordered(">", lifted, zero), lifted, zero)
-                rounded.append(builder.fptosi(minimum(builder, lifted, most), WORDS))
+            for value in compute(block, builder.shl(begin, number(2))):
+                shifted = builder.fadd(value, half)
+                shifted = builder.select(builder.fcmp_ordered(">", shifted, zero), shifted, zero)
+                rounded.append(builder.fptosi(minimum(builder, shifted, upper_limit), WORDS))
             _store_pixels(
                 builder, rounded[0], rounded[1], builder.add(target, builder.mul(begin, number(SAMPLE_BYTES)))
             )
 
-    def of_pair(entries: Sequence[Value], block: Value, place: Value) -> Sequence[Value]:
-        totals, nothing = _pair(builder, entries, block, place, means)
-        builder.store(builder.fadd(builder.load(fault), nothing), fault)
+    def of_pair(entries: Sequence[Value], block: Value, position: Value) -> Sequence[Value]:
+        totals, pair_fault = _pair(builder, entries, block, position, means)
+        builder.store(builder.fadd(builder.load(fault), pair_fault), fault)
         return totals
 
-    def of_all(block: Value, place: Value) -> Sequence[Value]:
-        for one in sums:
-            builder.store(zero, one)
+    def of_all(block: Value, position: Value) -> Sequence[Value]:
+        for total in sums:
+            builder.store(zero, total)
         with cgutils.for_range(builder, pairs) as loop:
-            for one, value in zip(sums, of_pair(addresses(loop.index), block, place), strict=True):
-                builder.store(builder.fadd(builder.load(one), value), one)
-        return [builder.load(one) for one in sums]
+            for total, value in zip(sums, of_pair(addresses(loop.index), block, position), strict=True):
+                builder.store(builder.fadd(builder.load(total), value), total)
+        return [builder.load(total) for total in sums]
 
     with builder.if_else(builder.icmp_signed("==", pairs, number(1))) as (single, several):
         with single:
             entries = addresses(number(0))
-            fill(lambda block, place: of_pair(entries, block, place))
+            fill(lambda block, position: of_pair(entries, block, position))
         with several:
             fill(of_all)
     store(builder, builder.load(fault), faults, 0)
 
 
-# Bytes of an image from which it is streamed: the size of a desktop processor's last-level cache.
+# Bytes from which an image is streamed: size of the last-level cache of a desktop processor.
 STREAMED_BYTES: Final = 24 << 20
 
 
 def line_buffer_bytes(segment_bytes: int) -> int:
-    """Return the bytes of memory for a segment that begins anywhere in a line, and a line behind it."""
+    """Return the buffer size for a segment that begins anywhere in a cache line, plus one line."""
     return segment_bytes + 3 * LINE
 
 
 @inlined
 def first_line(buffer: int) -> int:
-    """Return the address of the first whole line in the memory at `buffer`."""
+    """Return the address of the first whole cache line in the memory at `buffer`."""
     return (buffer + LINE - 1) & -LINE
 
 
 @inlined
 def stream_lines(lines: int, begin: int, stop: int, last: bool) -> int:
-    """Stream the content of `lines` to its target, from the line of address `begin` up to `stop`; both are even.
+    """Stream the buffered `lines` to their target, from the cache line of address `begin` up to `stop`; both are even.
 
-    Nothing is written before `begin`. The last line, not full yet, is kept for the next call, and the number of its
-    bytes returned, unless this is the row's `last` segment.
+    Nothing is written before `begin`. Unless this is the `last` segment of the row, an incomplete last line is kept for
+    the next call. Returns the number of its bytes.
     """
-    source, to = lines, begin & -LINE
-    if begin > to:
-        for i in range(begin - to, min(LINE, stop - to), 2):
-            copy2(source + i, to + i)
-        source, to = source + LINE, to + LINE
-    while to + LINE <= stop:
-        stream_line(source, to)
-        source, to = source + LINE, to + LINE
+    source, line_target = lines, begin & -LINE
+    if begin > line_target:
+        for i in range(begin - line_target, min(LINE, stop - line_target), 2):
+            copy2(source + i, line_target + i)
+        source, line_target = source + LINE, line_target + LINE
+    while line_target + LINE <= stop:
+        stream_line(source, line_target)
+        source, line_target = source + LINE, line_target + LINE
     if last:
-        for i in range(0, stop - to, 2):
-            copy2(source + i, to + i)
+        for i in range(0, stop - line_target, 2):
+            copy2(source + i, line_target + i)
     else:
         copy_line(source, lines)
-    return stop - to
+    return stop - line_target

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from foundation.errors import InputError, first_few, nearest_names, value_text
 from generator import philox
-from generator.kernels.rendering import known_light
+from generator.kernels.rendering import valid_light
 from generator.lights.distributions import Distribution
 from generator.lights.gamut import TOLERANCE_DEG, Gamut, Match, OutsideGamut, black_body, rgb_of
 from generator.lights.lighting import LightChoice, Lighting, ListedLights, Mixture, parse_mixture, single_mixture
@@ -267,7 +267,7 @@ def light_of(light: int | str | Mixture, lut: Lut) -> Mixture:
     if isinstance(light, Mixture):
         light.white(lut)
         return light
-    return single_mixture(known_light(lut, light))
+    return single_mixture(valid_light(lut, light))
 
 
 def listed_lights(lights: Iterable[int | str | Mixture] | str | float | Mixture, lut: Lut) -> ListedLights:
@@ -276,7 +276,7 @@ def listed_lights(lights: Iterable[int | str | Mixture] | str | float | Mixture,
         raise InputError(f"lights is {value_text(lights)}, expected a list such as [0, 3] or ['D65']")
     # Numbers stay numbers, so that `describe` gives the same record as for the command.
     return ListedLights(
-        tuple(light_of(light, lut) if isinstance(light, str | Mixture) else known_light(lut, light) for light in lights)
+        tuple(light_of(light, lut) if isinstance(light, str | Mixture) else valid_light(lut, light) for light in lights)
     )
 
 

@@ -1,1 +1,1 @@
-"""Source pictures: found, read, converted to sRGB codes; and the tone mapping that makes raw images visible."""
+"""Source pictures: find and read files, convert them to sRGB codes, or make random ones."""

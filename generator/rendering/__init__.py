@@ -1,7 +1,7 @@
-"""Rendering by colour: cells of the chart that together show a camera what it should see of a picture."""
+"""Rendering by colour: the camera records the colours of the source picture."""
 
 from typing import Final, Literal
 
 Rendering = Literal["codes", "colorimetric"]
 
-DEFAULT: Final[Rendering] = "colorimetric"  # Rendering unless said otherwise (decision 0043)
+DEFAULT: Final[Rendering] = "colorimetric"  # Default rendering (decision 0043)

@@ -1,13 +1,13 @@
-"""Colour matrices of cameras: from linear sRGB to the camera's own RGB.
+"""Colour matrices of cameras, from linear sRGB to camera RGB.
 
-A manufacturer's matrix leads from XYZ to camera RGB under D65. After that of sRGB (IEC 61966-2-1), which is of D65
-too, and with rows scaled to sum 1, white becomes (1, 1, 1), so that the light can be multiplied in.
+The matrix of a manufacturer converts XYZ to camera RGB under D65. It is multiplied by the matrix from sRGB to XYZ
+(IEC 61966-2-1), which is for D65, too. Rows are scaled to sum 1, so white becomes (1, 1, 1) and can be multiplied by
+the illuminant.
 
-For cameras whose matrix is not known it comes from the table itself. The chart's cells were printed from sRGB codes.
-If the print shop's machine shows them as sRGB, the camera's colours of the cells are C · linear sRGB of their codes,
-and least squares give C. A print whose colours were not managed shows other colours than its codes say: then C holds
-the print's faults as well as the camera, mostly as colours that are too pale. How well C fits is said in its source,
-so that one can see it.
+For other cameras the matrix is fitted to the look-up table (LUT). The patches were printed from sRGB codes. If the
+print shop reproduces sRGB, the camera RGB of the patches is C · linear sRGB, and least squares give C. If the print was
+not colour-managed, C also contains the errors of the print, mostly colours that are too pale. The `source` of the
+matrix reports the residual.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
-# XYZ under D65 to camera RGB, row by row in ten-thousandths: the numbers that Adobe's DNG converter writes as
-# ColorMatrix2, as the tables `adobe_coeff` of dcraw 9.28 and LibRaw (src/tables/colordata.cpp, commit e419de0) list
-# them; the two agree on all that both have. The 5DS R has that of the 5DS.
+# XYZ under D65 to camera RGB, row by row, in 1/10000: ColorMatrix2 of Adobe's DNG converter, from the tables
+# `adobe_coeff` of dcraw 9.28 and LibRaw (src/tables/colordata.cpp, commit e419de0). The two agree on all cameras that
+# both list. The 5DS R has the matrix of the 5DS.
 _TO_CAMERA: Final = {
     "Canon EOS 550D": (6941, -1164, -857, -3825, 11597, 2534, -416, 1540, 6039),
     "Canon EOS 600D": (6461, -907, -882, -4300, 12184, 2378, -819, 1944, 5931),
@@ -42,23 +42,23 @@ _TO_CAMERA: Final = {
     "Canon EOS 200D": (7377, -742, -998, -4235, 11981, 2549, -673, 1918, 5538),
 }
 
-# Where the matrices of named cameras come from.
+# Source of the matrices of listed cameras.
 SOURCE: Final = "ColorMatrix2 as listed by dcraw 9.28 and LibRaw (adobe_coeff)"
 
 # Linear sRGB to XYZ, white D65: IEC 61966-2-1:1999, clause 5.2.
 _SRGB_TO_XYZ: Final = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 
-_LEAST_SUM: Final = 1e-6  # Least sum of a row: that of a row that leaves white black cannot be made 1
+_SMALLEST_ROW_SUM: Final = 1e-6  # Smallest sum of a row: a smaller one cannot be scaled to 1
 
-# Largest number of a matrix in a file: rows in ten-thousandths have some 10⁴, and sums of such are exact enough.
+# Largest number of a matrix in a file: rows in 1/10000 have about 10⁴, whose sums are exact enough.
 _LARGEST: Final = 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class ColourMatrix:
-    """A colour matrix and where it comes from.
+    """A colour matrix and its source.
 
-    - `name`: the camera, or the file.
+    - `name`: name of the camera or file.
     - `rows`: (3, 3) float64, linear sRGB to camera RGB; each row has sum 1.
     - `source`: where the numbers come from, for notes below tables.
     """
@@ -69,27 +69,27 @@ class ColourMatrix:
 
 
 def cameras() -> tuple[str, ...]:
-    """Return the names of the cameras whose matrices are known."""
+    """Return the names of the cameras with a listed matrix."""
     return tuple(_TO_CAMERA)
 
 
 def camera_matrix(camera: str) -> ColourMatrix | None:
-    """Return the matrix of a camera by its name, or None if it is not known.
+    """Return the matrix of a camera by its name, or None if it is not listed.
 
-    Upper and lower case, blanks, hyphens and the maker's name make no difference.
+    Case, blanks, hyphens and the name of the maker are ignored.
     """
-    wanted = _bare(camera)
+    simplified_name = _simplified_name(camera)
     for name, coefficients in _TO_CAMERA.items():
-        if wanted and wanted in (_bare(name), _bare(name).removeprefix("eos")):
+        if simplified_name and simplified_name in (_simplified_name(name), _simplified_name(name).removeprefix("eos")):
             to_camera = np.array(coefficients, dtype=np.float64).reshape(3, 3) / 10_000
             return ColourMatrix(name, _normalised(to_camera @ _SRGB_TO_XYZ, name), SOURCE)
     return None
 
 
 def read_matrix(path: Path) -> ColourMatrix:
-    r"""Return the matrix of a text file: three rows of three numbers, linear sRGB to camera RGB, `#` for remarks.
+    """Return the matrix of a text file: three rows of three numbers, linear sRGB to camera RGB, `#` for comments.
 
-    Blanks, commas and semicolons part numbers. Rows are scaled to sum 1.
+    Numbers are separated by blanks, commas or semicolons. Rows are scaled to sum 1.
     """
     expected = "expected three rows of three numbers, linear sRGB to camera RGB"
     try:
@@ -106,72 +106,71 @@ def read_matrix(path: Path) -> ColourMatrix:
 
 
 def choose_matrix(text: str) -> ColourMatrix | None:
-    """Return the matrix that an option names: a camera, a file, or None for the word `none`."""
+    """Return the matrix of a camera or a file, or None for the word `none`."""
     if text.strip().lower() == "none":
         return None
-    found = camera_matrix(text)
-    if found is None and Path(text).is_file():
+    matrix = camera_matrix(text)
+    if matrix is None and Path(text).is_file():
         return read_matrix(Path(text))
-    if found is None:
+    if matrix is None:
         raise InputError(
-            f"{text!r} is neither a file nor a camera whose colour matrix is known; the cameras are "
-            f"{', '.join(_TO_CAMERA)}; for another write its 3 x 3 numbers, linear sRGB to camera RGB, into a file"
+            f"{text!r} is neither a file nor a camera with a listed colour matrix, expected one of "
+            f"{', '.join(_TO_CAMERA)}; for another camera write 3 × 3 numbers, linear sRGB to camera RGB, into a file"
         )
-    return found
+    return matrix
 
 
-def _bare(camera: str) -> str:
+def _simplified_name(camera: str) -> str:
     return "".join(camera.lower().replace("-", " ").split()).removeprefix("canon")
 
 
 def _normalised(rows: npt.NDArray[np.float64], name: str) -> npt.NDArray[np.float64]:
-    """Return `rows` (3, 3) float64 with sums of 1."""
     sums = rows.sum(axis=1, keepdims=True)
-    if sums.min() < _LEAST_SUM:
+    if sums.min() < _SMALLEST_ROW_SUM:
         raise InputError(
-            f"{name}: the rows of the colour matrix have sums {' '.join(f'{part:g}' for part in sums[:, 0])}, expected "
-            "sums above 0: what the camera sees of white"
+            f"{name}: the rows of the colour matrix have sums {' '.join(f'{row_sum:g}' for row_sum in sums[:, 0])}, "
+            "expected sums > 0, the camera RGB of white"
         )
     return rows / sums
 
 
-# Temperature of the light for the fit, kelvin: sRGB's white is D65 (IEC 61966-2-1, clause 4.1).
+# Temperature of the illuminant for the fit, K: the white of sRGB is D65 (IEC 61966-2-1, clause 4.1).
 DAYLIGHT_K: Final = 6500.0
 
-TABLE: Final = "table"  # The word that asks for the matrix from the table
+TABLE: Final = "table"  # Word for the matrix fitted to the LUT
 
 
 def matrix_for(lut: Lut, text: str | None = None) -> ColourMatrix:
-    """Return the colour matrix that an option names, or the one for a table's camera.
+    """Return the colour matrix for a LUT.
 
-    `text`: A camera's name, a file, `table` for the one fitted from the table, or `none` for linear sRGB as it is.
-    None: that of the table's camera, or, where it is not known, the fitted one.
+    `text`: name of a camera, a file, `table` for the matrix fitted to the LUT, or `none` for the identity. None: the
+    matrix of the LUT's camera, or the fitted one if it is not listed.
     """
     if text is None:
         return camera_matrix(lut.provenance.camera) or fitted_matrix(lut)
     if text.strip().lower() == TABLE:
         return fitted_matrix(lut)
-    return choose_matrix(text) or ColourMatrix("none", np.eye(3), "none asked for: linear sRGB taken for camera RGB")
+    return choose_matrix(text) or ColourMatrix("none", np.eye(3), "no matrix: linear sRGB is used as camera RGB")
 
 
 def fitted_matrix(lut: Lut) -> ColourMatrix:
-    """Return the colour matrix that explains a table's colours best, under its light nearest to 6500 K.
+    """Return the colour matrix fitted to the colours of a LUT under its illuminant nearest to 6500 K.
 
-    A table without black bodies is fitted under the light whose white has the most equal shares of brightness.
+    If the LUT has no black body, the illuminant with the most even white is used.
     """
     bodies = [(abs(light.cct_k - DAYLIGHT_K), light.index) for light in lut.illuminations if light.cct_k is not None]
     light = min(bodies)[1] if bodies else int(np.ptp(np.log(lut.white), axis=1).argmin())
     rows, residual = fit_matrix(profile_of(lut, light))
-    source = f"least squares over the table's colours under light {light}; {residual:.1f} degrees off in the median"
+    source = f"least squares over the LUT's colours under illuminant {light}; median residual {residual:.1f} degrees"
     return ColourMatrix(TABLE, rows, source)
 
 
 def fit_matrix(profile: PrintProfile) -> tuple[npt.NDArray[np.float64], float]:
-    """Return the matrix (3, 3) float64, rows of sum 1, from linear sRGB of the codes to colours, and its residual.
+    """Return the matrix (3, 3) float64 with rows of sum 1 from linear sRGB codes to colours, and its residual, degrees.
 
-    Colours are taken between the print's black cell and its paper, channel by channel. Least squares with rows bound
-    to sum 1 are those without bounds of differences to green: a - G = c_r (R - G) + c_b (B - G). The residual is the
-    median angle in degrees between what the matrix gives, on the print, and what the camera sees.
+    Colours are scaled between the print's black and paper, channel by channel. Least squares with row sums of 1 equal
+    unconstrained least squares of differences to green: a - G = c_r (R - G) + c_b (B - G). The residual is the median
+    angle between predicted and recorded colours.
     """
     bits = profile.bits
     codes = channels_of(np.flatnonzero(profile.usable), bits) / (2.0**bits - 1)
@@ -180,9 +179,9 @@ def fit_matrix(profile: PrintProfile) -> tuple[npt.NDArray[np.float64], float]:
     black = profile.colours[0] if profile.usable[0] else np.full(3, profile.black)
     paper = profile.colours[-1] if profile.usable[-1] else np.full(3, profile.white)
     span = np.maximum(paper - black, 1e-6)
-    seen = (colours - black) / span
+    reflectances = (colours - black) / span
     differences = linear[:, [0, 2]] - linear[:, [1]]
-    found = np.asarray(np.linalg.lstsq(differences, seen - linear[:, [1]], rcond=None)[0], np.float64).T
-    rows = np.stack([found[:, 0], 1 - found.sum(axis=1), found[:, 1]], axis=1)
-    shown = black + span * np.clip(linear @ rows.T, 0, 1)
-    return rows, float(np.median(angles_deg(shown, colours)))
+    coefficients = np.asarray(np.linalg.lstsq(differences, reflectances - linear[:, [1]], rcond=None)[0], np.float64).T
+    rows = np.stack([coefficients[:, 0], 1 - coefficients.sum(axis=1), coefficients[:, 1]], axis=1)
+    predicted = black + span * np.clip(linear @ rows.T, 0, 1)
+    return rows, float(np.median(angles_deg(predicted, colours)))

@@ -1,4 +1,4 @@
-"""One picture under one light of a table, by colour or by codes: the pixels of a dataset in one call."""
+"""Render one picture under one illuminant of a look-up table (LUT), by colour or by codes."""
 
 from __future__ import annotations
 
@@ -34,37 +34,36 @@ def render(
 ) -> npt.NDArray[np.uint16]:
     """Return the raw linear image of `picture` printed, lit by `light` and photographed.
 
-    It is image number `image` of the dataset that `generate` makes with the same seed, where that shows the whole
-    picture and keeps the print's black.
+    The result is image number `image` of the data set that `generate` makes with the same seed, if that data set uses
+    whole pictures and keeps the print's black.
 
     Parameters
     ----------
     lut
-        A table, from `calibration.table.lut.open_lut`.
+        LUT, from `calibration.table.lut.open_lut`.
     picture
-        (H, W, 3) uint8 sRGB codes, from `pictures.sources.read_picture` or any array.
+        (H, W, 3) uint8, sRGB codes, from `pictures.sources.read_picture` or any array.
     light
-        Number of the light in the table; a text as the command's ``--light`` takes it, such as ``"D65"``, ``"5600K"``
-        or ``"12:0.25+40:0.75"``; or a mixture that `lights.choices.parse_light` made of one, whose ``white(lut)`` is
-        the ground truth.
+        Illuminant: its index in the LUT; a text as for the option ``--light``, such as ``"D65"``, ``"5600K"`` or
+        ``"12:0.25+40:0.75"``; or a mixture from `lights.choices.parse_light`, whose ``white(lut)`` is the ground truth.
     rendering
-        ``"colorimetric"``: the print shows the camera the picture's colours; where in the chart they are takes seconds
-        a table, once. ``"codes"``: a picture's codes are those of the print, as in the paper; colours that the table
-        lists as unfit are replaced by the nearest fit one.
+        ``"colorimetric"``: the camera records the colours of the picture; the first use of a LUT takes seconds.
+        ``"codes"``: the codes of the picture are those of the print, as in the paper. Colours that the LUT lists as
+        unfit are replaced by the nearest fit colour.
     seed, image, threads
         As for `kernels.rendering.draw_samples`.
 
     Returns
     -------
     ndarray
-        (H, W, 3) uint16, linear camera RGB, `lut.provenance.white_level` = saturation of the sensor.
+        (H, W, 3) uint16, linear camera RGB in counts; `lut.provenance.white_level` = saturation.
 
     Raises
     ------
     InputError
-        The table has no such light, there is no such rendering, or table or picture are none.
+        If the LUT has no such illuminant, the rendering is unknown, or `lut` or `picture` has the wrong type.
     QualityError
-        The print has no contrast under the light, so that there is no rendering by colour.
+        If the print has no contrast under the illuminant, so that rendering by colour is impossible.
 
     Examples
     --------
@@ -77,11 +76,11 @@ def render(
     require_lut(lut)
     check_picture(picture)
     if rendering not in get_args(Rendering):
-        raise InputError(f"{rendering!r} is no rendering; use one of {', '.join(get_args(Rendering))}")
+        raise InputError(f"the rendering is {rendering!r}, expected one of {', '.join(get_args(Rendering))}")
     mixture = light_of(light, lut)
     if rendering == "codes":
-        fit, _ = replace_unfit_colours(picture, lut.provenance)
-        samples = mixture.samples(lut, seed, fit)
-        return draw_samples(samples, fit, seed=seed, image=image, threads=threads)
-    by_colour, most = rendering_with(lut, matrix_for(lut)), lut.provenance.white_level
-    return by_colour.draw(picture, [mixture], most=most, seed=seed, image=image, threads=threads)
+        fit_picture, _ = replace_unfit_colours(picture, lut.provenance)
+        samples = mixture.samples(lut, seed, fit_picture)
+        return draw_samples(samples, fit_picture, seed=seed, image=image, threads=threads)
+    by_colour, white_level = rendering_with(lut, matrix_for(lut)), lut.provenance.white_level
+    return by_colour.draw(picture, [mixture], white_level=white_level, seed=seed, image=image, threads=threads)

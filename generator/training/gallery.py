@@ -1,8 +1,8 @@
-"""Many pictures unpacked once, so that training can cut crops from them without decoding.
+"""Decoded pictures for training, so that crops can be cut without decoding.
 
 A gallery is a folder of two files: `codes.u8`, the sRGB codes of all pictures one after another, row by row, R, G, B;
-and `gallery.json`, with the size of each. It is memory-mapped, so workers share one copy, and pictures
-that are not read take no memory.
+and `gallery.json`, with the size of each. It is memory-mapped: workers share one copy, and unused pictures take no
+memory.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ class Gallery:
     Attributes
     ----------
     names
-        The pictures' names, P of them.
+        Names of the P pictures.
     codes
-        (N,) uint8, the sRGB codes of all pictures one after another.
+        (N,) uint8, sRGB codes of all pictures one after another.
     sizes
         (P, 2) int64, height and width, px.
     offsets
-        (P,) int64, index in `codes` of each picture's first value.
+        (P,) int64, index in `codes` of the first value of each picture.
     folder
-        The gallery's folder; None for one in memory.
+        Folder of the gallery; None if it is in memory.
 
     Examples
     --------
@@ -71,7 +71,7 @@ class Gallery:
     folder: Path | None = None
 
     def __repr__(self) -> str:
-        """Return one line, of however many pictures."""
+        """Return a summary in one line."""
         return f"Gallery of {len(self)} pictures" + ("" if self.folder is None else f" in {str(self.folder)!r}")
 
     def __len__(self) -> int:
@@ -79,13 +79,24 @@ class Gallery:
         return len(self.names)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A worker maps the file again rather than being sent gigabytes.
+        # A worker maps the files again instead of receiving gigabytes.
         if self.folder is not None:
             return open_gallery, (self.folder,)
         return Gallery, (self.names, self.codes, self.sizes, self.offsets)
 
     def picture(self, number: int) -> Picture:
-        """Return a picture (H, W, 3) uint8, sRGB codes; a view."""
+        """Return a picture.
+
+        Parameters
+        ----------
+        number
+            Index of the picture, 0 … P − 1.
+
+        Returns
+        -------
+        ndarray
+            (H, W, 3) uint8, sRGB codes; a view.
+        """
         height, width = (int(side) for side in self.sizes[number])
         start = int(self.offsets[number])
         return self.codes[start : start + 3 * height * width].reshape(height, width, 3)
@@ -97,14 +108,19 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
     Parameters
     ----------
     pictures
-        (H, W, 3) uint8 each, sRGB codes.
+        1 or more pictures (H, W, 3) uint8, sRGB codes.
     names
-        Their names; numbers if None.
+        Name of each picture; numbers if None.
+
+    Returns
+    -------
+    Gallery
+        The gallery; its codes are a copy.
 
     Raises
     ------
     InputError
-        There is none, one is of another shape or type, or there are not as many names.
+        If there is no picture, a picture has another shape or type, or the number of names differs.
 
     Examples
     --------
@@ -113,46 +129,50 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
     (2, (84,), (2, 2, 3))
     """
     if isinstance(pictures, str) or not len(pictures):
-        raise InputError(f"a gallery of {value_text(pictures)} was asked for, expected a list of 1 or more pictures")
+        raise InputError(f"the pictures are {value_text(pictures)}, expected a list, such as [read_picture(FILE)]")
     if names is not None and len(names) != len(pictures):
-        raise InputError(f"{len(pictures)} pictures of a gallery have {len(names)} names, expected one each")
+        raise InputError(f"{len(pictures)} pictures have {len(names)} names, expected one name each")
     for picture in pictures:
         check_picture(picture)
         if not picture.size:
-            raise InputError(f"a picture is {picture.shape[1]}x{picture.shape[0]} px, expected 1 or more")
+            raise InputError(f"a picture has {picture.shape[1]}x{picture.shape[0]} px, expected 1x1 or more")
     sizes = np.array([picture.shape[:2] for picture in pictures], dtype=np.int64)
     codes = np.concatenate([picture.reshape(-1) for picture in pictures])
-    chosen = [str(number) for number in range(len(pictures))] if names is None else names
-    return Gallery(tuple(chosen), codes, sizes, _offsets(sizes))
+    gallery_names = [str(number) for number in range(len(pictures))] if names is None else names
+    return Gallery(tuple(gallery_names), codes, sizes, _offsets(sizes))
 
 
 def _offsets(sizes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return the index (P,) int64 of the first value of each picture of `sizes` (P, 2) int64."""
     return np.concatenate([[0], np.cumsum(3 * sizes.prod(axis=1))[:-1]]).astype(np.int64)
 
 
 def save_gallery(
     sources: Sequence[Source], folder: Path, on_skip: Callable[[Source, str], None] | None = None
 ) -> Gallery:
-    """Read pictures and keep them unpacked in a new folder.
+    """Decode pictures and save them as a gallery in a new folder.
 
     Parameters
     ----------
     sources
-        The pictures; see `pictures.sources.find_pictures`. One that cannot be read is left out and listed.
+        The pictures; see `pictures.sources.find_pictures`. A picture that cannot be read is skipped and listed.
     folder
-        Where the gallery is to be; must be free. It appears when it is complete.
+        Folder of the gallery, which must not exist. It appears when it is complete.
     on_skip
-        Called with each source that cannot be read, and the reason.
+        Called with each skipped source and the reason.
+
+    Returns
+    -------
+    Gallery
+        The saved gallery, memory-mapped.
 
     Raises
     ------
     InputError
-        The folder is taken.
+        If the folder exists.
     FormatError
-        No source can be read.
+        If no picture can be read.
     StorageError
-        The disk is full or gone; nothing is left behind.
+        If the disk is full or fails; no files are left.
 
     Examples
     --------
@@ -183,19 +203,29 @@ def save_gallery(
         except OSError as error:
             raise storage_error(path, error) from error
         if not entries:
-            raise FormatError(f"none of the {len(sources)} pictures can be read; name other pictures")
+            raise FormatError(f"0 of {len(sources)} pictures can be read, expected 1 or more; name other pictures")
         head = _Head(pictures=entries, skipped=skipped)
         write_atomic(partial / "gallery.json", head.model_dump_json(indent=2) + "\n")
     return open_gallery(folder)
 
 
 def open_gallery(folder: Path | str) -> Gallery:
-    """Map a gallery that `save_gallery` made.
+    """Open a gallery made by `save_gallery`, memory-mapped.
+
+    Parameters
+    ----------
+    folder
+        Folder of the gallery.
+
+    Returns
+    -------
+    Gallery
+        The gallery.
 
     Raises
     ------
     FormatError
-        The folder is none, or its files disagree.
+        If the folder is not a gallery, or its files are inconsistent.
 
     Examples
     --------
@@ -213,11 +243,11 @@ def open_gallery(folder: Path | str) -> Gallery:
         codes = np.memmap(folder / "codes.u8", np.uint8, "r")
     except (OSError, ValueError) as error:
         reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
-        raise FormatError(f"{folder} is no gallery of pictures: {reason}; make one with save_gallery") from error
+        raise FormatError(f"{folder} is not a gallery: {reason}; make one with save_gallery") from error
     sizes = np.array([(entry.height, entry.width) for entry in head.pictures], dtype=np.int64)
-    wanted = int(3 * sizes.prod(axis=1).sum())
-    if codes.size != wanted:
+    expected_size = int(3 * sizes.prod(axis=1).sum())
+    if codes.size != expected_size:
         raise FormatError(
-            f"{folder / 'codes.u8'} has {codes.size} bytes, expected {wanted}; it is damaged, make the gallery again"
+            f"{folder / 'codes.u8'} has {codes.size} bytes, expected {expected_size}; make the gallery again"
         )
     return Gallery(tuple(entry.name for entry in head.pictures), codes, sizes, _offsets(sizes), folder)

@@ -1,1 +1,1 @@
-"""What makes photographs differ beside scene and light: exposure, uneven light, the noise of another ISO speed."""
+"""Variation between images besides scene and illuminant: exposure, uneven light, noise of another ISO speed."""

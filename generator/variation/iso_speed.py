@@ -1,4 +1,4 @@
-"""The ISO speed whose noise images are to have, beside that of their table."""
+"""The ISO speed whose noise images get, instead of the speed of their look-up table (LUT)."""
 
 from __future__ import annotations
 
@@ -16,62 +16,63 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class IsoSpeed:
-    """A speed at or above that of the table: noise can be added, and not be taken away.
+    """An ISO speed at or above that of the LUT; noise can be added, but not removed.
 
-    - `wanted`, `base`: the speed that images are to have, and that with which the table was photographed.
+    - `speed`: ISO speed of the images.
+    - `base`: ISO speed at which the LUT was photographed.
     - `sensor_electrons`: read noise of a photosite before the amplifier, electrons; see `sensor_noise`.
 
-    Raises `InputError`: the wanted speed is below that of the table, or a number is not above 0.
+    Raises `InputError` if the speed is below that of the LUT, or if a value is not above 0.
     """
 
-    wanted: float
+    speed: float
     base: float
     sensor_electrons: float = SENSOR_ELECTRONS
 
     def __post_init__(self) -> None:
-        if not (0 < self.base < float("inf") and 0 < self.wanted < float("inf") and 0 <= self.sensor_electrons < 1e6):
+        if not (0 < self.base < float("inf") and 0 < self.speed < float("inf") and 0 <= self.sensor_electrons < 1e6):
             raise InputError(
-                f"ISO {self.wanted:g} of a table of ISO {self.base:g} with {self.sensor_electrons:g} electrons of read "
-                "noise was asked for, expected numbers above 0"
+                f"the ISO speed is {self.speed:g} for a LUT of ISO {self.base:g} with {self.sensor_electrons:g} "
+                "electrons of read noise, expected numbers > 0"
             )
-        if self.wanted < self.base:
+        if self.speed < self.base:
             raise InputError(
-                f"ISO {self.wanted:g} was asked for, below the ISO {self.base:g} of the table, whose noise cannot be "
-                f"taken away; ask for {self.base:g} or more"
+                f"ISO {self.speed:g} is below the ISO {self.base:g} of the LUT, whose noise cannot be removed; use "
+                f"{self.base:g} or more"
             )
 
     @property
     def ratio(self) -> float:
-        """The wanted speed over that of the table, 1 or more."""
-        return self.wanted / self.base
+        """ISO speed relative to the LUT, 1 or more."""
+        return self.speed / self.base
 
     def describe(self) -> dict[str, Any]:
-        """Return the speeds as plain values."""
-        return {"wanted": self.wanted, "table": self.base, "sensor_electrons": self.sensor_electrons}
+        """Return the speeds and the read noise as plain values."""
+        return {"wanted": self.speed, "table": self.base, "sensor_electrons": self.sensor_electrons}
 
 
 def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SENSOR_ELECTRONS) -> IsoSpeed:
-    """Return the speed that a text names: ``1600/100``, wanted over the table's, with ``:read=2.8`` electrons."""
-    speeds, _, rest = text.strip().partition(":")
-    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*(?:/\s*(\d+(?:\.\d*)?)\s*)?", speeds, re.ASCII)
-    own = base if match is None or match[2] is None else float(match[2])
-    if match is None or own is None:
+    """Return the ISO speed of a text: ``1600/100``, images over LUT, optionally with ``:read=2.8`` electrons."""
+    speed_text, _, options = text.strip().partition(":")
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*(?:/\s*(\d+(?:\.\d*)?)\s*)?", speed_text, re.ASCII)
+    table_speed = base if match is None or match[2] is None else float(match[2])
+    if match is None or table_speed is None:
         raise InputError(
-            f"{text!r} is no ISO speed of a table that does not say its own; write the wanted one over that with which "
-            "the table was photographed, such as 1600/100"
+            f"the ISO speed is {text!r}, and the LUT records none; write the speed of the images over that of the LUT, "
+            "such as 1600/100"
         )
-    if base is not None and own != base:
+    if base is not None and table_speed != base:
         raise InputError(
-            f"{text!r} says that the table is of ISO {own:g}, and the table says {base:g}; write {match[1]}"
+            f"{text!r} gives ISO {table_speed:g} for the LUT, which records ISO {base:g}; write {match[1]}"
         )
-    numbers = parse_numbers(rest, {"read": (0.0, 1000.0)}, "an ISO speed")
-    return IsoSpeed(float(match[1]), own, numbers.get("read", sensor_electrons))
+    numbers = parse_numbers(options, {"read": (0.0, 1000.0)}, "an ISO speed")
+    return IsoSpeed(float(match[1]), table_speed, numbers.get("read", sensor_electrons))
 
 
-def known_of_table(lut: Lut) -> tuple[float | None, float]:
-    """Return the ISO speed of a table, None if it does not say it, and the read noise before the amplifier, electrons.
+def recorded_speed(lut: Lut) -> tuple[float | None, float]:
+    """Return the ISO speed of a LUT, None if it is not recorded, and the read noise before the amplifier, electrons.
 
-    Computed tables say both. Photographed ones say the speed, where they were built by software that keeps it; their
+    Computed LUTs record both. Photographed LUTs record the speed, unless they were built by an old version; their read
     noise is `SENSOR_ELECTRONS`.
     """
     computed, origin = lut.provenance.computed or {}, lut.provenance.origin

@@ -1,23 +1,19 @@
-"""All that makes one image of a dataset differ from the plain picture of a print: a value, and what it does.
+"""Variation of the images of a data set: exposure, fall-off of the light, and noise.
 
-In this order: the light falls off, then it is exposed, then noise is what it would have been, then counts are rounded
-and cut at saturation. All of it happens in one pass (`exposing`). The ground truth is the light's, which neither
-exposure nor noise changes.
+The light falls off, then it is exposed, noise is adapted, and counts are rounded and clipped at saturation, all in one
+pass (`exposing`). The ground truth is that of the illuminant; exposure and noise do not change it.
 
-Where light falls off, the light of a pixel is that of the image times, in each channel,
+With fall-off, the light of a pixel is multiplied in each channel by
 
     (1 − w) + w · end,        0 < end ≤ 1,
 
-where w, 0 … 1, is the mask of a second light (`generator.masks`), drawn anew for each image. So nowhere is it brighter
-than the light that was photographed, and noise can always be added to what it was. The end is 2 to the power of minus
-some stops, times the tint where one is asked for.
-
-Where the end has no tint, the chromaticity of the light is the same in every pixel, and the ground truth is that of
-the light. With a tint the image has two lights of one name, and masks and maps as other images of several lights have.
+where w, 0 … 1, is the mask of a second illuminant (`generator.masks`), drawn for each image. No pixel becomes brighter
+than the photographed light, so noise can always be added. The end is 2 to the power of minus some stops, times a tint
+on request. Without a tint, the chromaticity of the light is equal in all pixels. With a tint, the image has two
+illuminants of one name, and masks and maps like other images with several illuminants.
 
 The factor of an exposure is drawn for each image from the words of Philox with counter (0, 0, number of the image,
-12), or chosen by the image itself, as a camera's automatic exposure does: so that a share of its pixels reaches a
-level.
+12), or set so that a share of the pixels reaches a level, like the automatic exposure of a camera.
 """
 
 from __future__ import annotations
@@ -50,74 +46,74 @@ _GRADIENT_OPTIONS: Final[dict[str, Range]] = {"stops": (0.0, 6.0), "least": (0.0
 
 @dataclass(frozen=True)
 class Falloff:
-    """The uneven light of one image.
+    """Fall-off of the light of one image.
 
-    - `masks`: (height, width, 2) weights of the light itself, and of its far end.
-    - `end`: red, green and blue light at the far end over that of the image, above 0 up to 1.
+    - `masks`: (height, width, 2) weights of the near and the far end.
+    - `end`: red, green and blue light of the far end relative to the near end, > 0 and ≤ 1.
     """
 
     masks: MadeMasks
     end: Three
 
     def weights(self, height: int, width: int) -> Weights:
-        """Return (height, width, 2) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel."""
+        """Return (height, width, 2) float32, 0 … 1 in multiples of 1/65535, with sum 1 in each pixel."""
         return self.masks.weights(height, width, 2)
 
 
 @dataclass(frozen=True)
 class Gradient:
-    """How light falls off on each image.
+    """Random fall-off of the light.
 
-    - `shape`: where, as of the masks of two lights.
-    - `stops`, `least`: the far end is darker by a number of stops between `least` and `stops`, each as likely.
-    - `colour`: most that ln(R/G) and ln(B/G) of the far end differ from those of the light, each drawn evenly and on
-      its own.
+    - `shape`: shape of the fall-off, as for masks of two illuminants.
+    - `stops`, `min_stops`: the far end is darker by a uniformly drawn number of stops between `min_stops` and `stops`.
+    - `colour`: largest difference of ln(R/G) and of ln(B/G) between far end and near end; both are drawn uniformly and
+      independently.
     """
 
     shape: Shape = SmoothFields()  # noqa: RUF009  frozen
     stops: float = 1.0
-    least: float = 0.0
+    min_stops: float = 0.0
     colour: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (0 <= self.least <= self.stops < math.inf and 0 <= self.colour < math.inf):
+        if not (0 <= self.min_stops <= self.stops < math.inf and 0 <= self.colour < math.inf):
             raise InputError(
-                f"a gradient of {self.least:g} to {self.stops:g} stops and colour {self.colour:g} was asked for; "
-                "expected rising stops from 0, and a colour from 0"
+                f"the gradient has {self.min_stops:g} to {self.stops:g} stops and colour {self.colour:g}, expected "
+                "rising stops ≥ 0 and a colour ≥ 0"
             )
 
     def of_image(self, seed: int, number: int) -> Falloff:
-        """Return the uneven light of image `number`: words of Philox with counter (0, 64, number, 13), masks below."""
-        drawn = [(int(word) + 0.5) / (1 << 32) for word in philox.words(seed, 0, 64, number, philox.GRADIENTS)]
-        level = 2.0 ** -(self.least + (self.stops - self.least) * drawn[0])
-        red, blue = (math.exp(self.colour * (2 * place - 1)) for place in drawn[1:3])
-        most = max(red, 1.0, blue)
-        end = (level * red / most, level / most, level * blue / most)
+        """Return the fall-off of image `number`, from words of Philox with counter (0, 64, number, 13)."""
+        uniform = [(int(word) + 0.5) / (1 << 32) for word in philox.words(seed, 0, 64, number, philox.GRADIENTS)]
+        level = 2.0 ** -(self.min_stops + (self.stops - self.min_stops) * uniform[0])
+        red, blue = (math.exp(self.colour * (2 * value - 1)) for value in uniform[1:3])
+        brightest = max(red, 1.0, blue)
+        end = (level * red / brightest, level / brightest, level * blue / brightest)
         return Falloff(MadeMasks(self.shape, RandomStreams(seed, number, philox.GRADIENTS)), end)
 
     def describe(self) -> dict[str, Any]:
-        """Return the shape and the numbers as plain values."""
-        return {**self.shape.describe(), "stops": self.stops, "least": self.least, "colour": self.colour}
+        """Return shape and numbers as plain values."""
+        return {**self.shape.describe(), "stops": self.stops, "least": self.min_stops, "colour": self.colour}
 
 
 def parse_gradient(text: str) -> Gradient:
-    """Return the gradient that a text names: a kind of masks with its numbers, and ``stops``, ``least``, ``colour``."""
-    kind, _, rest = text.strip().partition(":")
-    entries = [entry for entry in rest.split(",") if entry.strip()]
-    own = [entry for entry in entries if entry.partition("=")[0].strip().lower() in _GRADIENT_OPTIONS]
-    numbers = parse_numbers(",".join(own), _GRADIENT_OPTIONS, f"the gradient {kind}")
-    others = ",".join(entry for entry in entries if entry not in own)
-    shape = parse_shape(f"{kind}:{others}" if others else kind)
+    """Return the gradient of a text: a mask shape with its numbers, and ``stops``, ``least``, ``colour``."""
+    shape_name, _, numbers_text = text.strip().partition(":")
+    entries = [entry for entry in numbers_text.split(",") if entry.strip()]
+    gradient_entries = [entry for entry in entries if entry.partition("=")[0].strip().lower() in _GRADIENT_OPTIONS]
+    numbers = parse_numbers(",".join(gradient_entries), _GRADIENT_OPTIONS, f"the gradient {shape_name}")
+    shape_entries = ",".join(entry for entry in entries if entry not in gradient_entries)
+    shape = parse_shape(f"{shape_name}:{shape_entries}" if shape_entries else shape_name)
     stops = numbers.get("stops", max(Gradient.stops, numbers.get("least", 0.0)))
-    return Gradient(shape, stops, numbers.get("least", Gradient.least), numbers.get("colour", Gradient.colour))
+    return Gradient(shape, stops, numbers.get("least", Gradient.min_stops), numbers.get("colour", Gradient.colour))
 
 
-# Largest factor of an automatic exposure unless said otherwise: 3 stops, as cameras' own limits of automatic ISO.
-MOST: Final = 8.0
+# Default of the largest factor of automatic exposure: 3 stops, like the automatic ISO of cameras.
+LARGEST_FACTOR: Final = 8.0
 
-# Least and most stops: 2⁻¹² of a 14-bit sensor's range is within its noise, 2⁶ shows nothing but the table's noise.
+# Smallest and largest stops: 2⁻¹² of the range of a 14-bit sensor is within its noise, 2⁶ shows only noise of the LUT.
 _STOPS: Range = (-12.0, 6.0)
-_TAILS: Final = 3.0  # Standard deviations at which a normal distribution of stops is cut, 0.3 % of it
+_TAIL_SIGMAS: Final = 3.0  # Standard deviations at which a normal distribution of stops is truncated, 0.3 % of it
 
 _EXPOSURE_OPTIONS: Final[dict[str, dict[str, Range]]] = {
     "stops": {"low": _STOPS, "high": _STOPS},
@@ -129,9 +125,9 @@ _EXPOSURE_OPTIONS: Final[dict[str, dict[str, Range]]] = {
 
 @dataclass(frozen=True)
 class DrawnExposure:
-    """A factor of 2 to the power of stops, drawn by quantiles: of probability 0 … 1 in even steps, linear between.
+    """A factor of 2 to the power of stops, drawn from quantiles at equally spaced probabilities, linear between them.
 
-    Two quantiles are an even distribution between them, one is a fixed factor.
+    Two quantiles are a uniform distribution between them, one is a fixed factor.
     """
 
     stops: tuple[float, ...]
@@ -140,178 +136,177 @@ class DrawnExposure:
         _check_quantiles(self.stops, "stops of exposure")
 
     @property
-    def seen(self) -> float | None:
-        """Share of an image's brightest pixels that the factor depends on: None, the image does not matter."""
+    def metered_share(self) -> float | None:
+        """Share of the brightest pixels on which the factor depends; None if the image has no influence."""
         return None
 
     def factor(self, seed: int, number: int, brightness: float) -> float:
         """Return the factor > 0 of image `number`.
 
-        `brightness`: largest channel, over saturation, that the share `seen` of the pixels reaches; any number where
-        that is None.
+        `brightness`: largest channel, relative to saturation, that the share `metered_share` of the pixels reaches;
+        ignored if that is None.
         """
         del brightness
         return 2.0 ** _quantile(self.stops, _uniform(seed, number))
 
     def describe(self) -> dict[str, Any]:
-        """Return the kind and its numbers."""
+        """Return kind and numbers as plain values."""
         return {"exposure": "stops", "quantiles": list(self.stops)}
 
 
 @dataclass(frozen=True)
 class NormalExposure:
-    """A factor of 2 to the power of stops from a normal distribution, cut at 3 standard deviations."""
+    """A factor of 2 to the power of stops, normally distributed and truncated at 3 standard deviations."""
 
     mean: float
     sd: float
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.mean) and 0 <= self.sd < math.inf):
-            raise InputError(f"stops of mean {self.mean} and sd {self.sd} were asked for, expected numbers, sd from 0")
+            raise InputError(f"the stops have mean {self.mean} and sd {self.sd}, expected finite numbers and sd ≥ 0")
 
     @property
-    def seen(self) -> float | None:
-        """None: the image does not matter."""
+    def metered_share(self) -> float | None:
+        """None: the image has no influence."""
         return None
 
     def factor(self, seed: int, number: int, brightness: float) -> float:
         """Return the factor of image `number`; see `DrawnExposure.factor`."""
         del brightness
-        tail = NormalDist().cdf(-_TAILS)
-        place = tail + (1 - 2 * tail) * _uniform(seed, number)
-        return 2.0 ** (self.mean + self.sd * NormalDist().inv_cdf(place))
+        tail = NormalDist().cdf(-_TAIL_SIGMAS)
+        probability = tail + (1 - 2 * tail) * _uniform(seed, number)
+        return 2.0 ** (self.mean + self.sd * NormalDist().inv_cdf(probability))
 
     def describe(self) -> dict[str, Any]:
-        """Return the kind and its numbers."""
+        """Return kind and numbers as plain values."""
         return {"exposure": "normal", "mean": self.mean, "sd": self.sd}
 
 
 @dataclass(frozen=True)
 class AutomaticExposure:
-    """The factor with which a share of the pixels reaches a level: automatic exposure.
+    """The factor at which a share of the pixels reaches a level: automatic exposure.
 
-    - `share`: of the pixels, the brightest by their largest channel; 0 lets none reach the level.
-    - `levels`: over saturation, 0 … 1: quantiles that each image's level is drawn by, as of `DrawnExposure`, in the
-      logarithm. Level 1 clips that share.
-    - `most`: largest factor, so that a dark picture stays dark.
+    - `share`: share of the pixels, the brightest by their largest channel; with 0 no pixel reaches the level.
+    - `levels`: quantiles of the level, relative to saturation, 0 … 1, as for `DrawnExposure` but interpolated in the
+      logarithm. Level 1 saturates the share.
+    - `limit`: limit of the factor, so that a dark picture stays dark.
     """
 
     share: float
     levels: tuple[float, ...] = (1.0,)
-    most: float = MOST
+    limit: float = LARGEST_FACTOR
 
     def __post_init__(self) -> None:
         _check_quantiles(self.levels, "levels of exposure")
-        if not (0 <= self.share < 1 and min(self.levels) > 0 and max(self.levels) <= 1 and 0 < self.most < math.inf):
+        if not (0 <= self.share < 1 and min(self.levels) > 0 and max(self.levels) <= 1 and 0 < self.limit < math.inf):
             raise InputError(
-                f"an exposure of share {self.share}, levels {self.levels} and most {self.most} was asked for; expected "
-                "a share from 0 and below 1, levels above 0 up to 1, and a factor above 0"
+                f"the exposure has share {self.share}, levels {self.levels} and most {self.limit}; expected a "
+                "share ≥ 0 and < 1, levels > 0 and ≤ 1, and most > 0"
             )
 
     @property
-    def seen(self) -> float | None:
-        """The share of the pixels."""
+    def metered_share(self) -> float | None:
+        """Share of the pixels that reaches the level."""
         return self.share
 
     def factor(self, seed: int, number: int, brightness: float) -> float:
         """Return the factor of image `number`; see `DrawnExposure.factor`."""
         logarithms = tuple(math.log(level) for level in self.levels)
         level = math.exp(_quantile(logarithms, _uniform(seed, number)))
-        return min(level / brightness, self.most) if brightness > 0 else self.most
+        return min(level / brightness, self.limit) if brightness > 0 else self.limit
 
     def describe(self) -> dict[str, Any]:
-        """Return the kind and its numbers."""
-        return {"exposure": "automatic", "share": self.share, "levels": list(self.levels), "most": self.most}
+        """Return kind and numbers as plain values."""
+        return {"exposure": "automatic", "share": self.share, "levels": list(self.levels), "most": self.limit}
 
 
 ExposureChoice = DrawnExposure | NormalExposure | AutomaticExposure  # The factor on the counts of each image
 
 
 def parse_exposure(text: str) -> ExposureChoice:
-    """Return the exposure that a text names.
+    """Return the exposure of a text.
 
-    A number is a factor; ``stops:low=-2,high=1`` draws evenly in stops, ``normal:mean=-1,sd=.5`` normally;
-    ``clip:share=.01`` clips that share of the pixels; ``level:share=.01,low=.3,high=.9`` lets that share of them reach
-    a level between those, over saturation. ``most=4`` limits the factor of the last two.
+    A number is a factor. ``stops:low=-2,high=1`` is uniform in stops, ``normal:mean=-1,sd=0.5`` normally distributed.
+    ``clip:share=0.01`` saturates that share of the pixels. ``level:share=0.01,low=0.3,high=0.9`` lets that share reach
+    a level in that range, relative to saturation. ``most=4`` limits the factor of the last two.
     """
-    kind, _, rest = text.strip().partition(":")
+    kind, _, numbers_text = text.strip().partition(":")
     if kind not in _EXPOSURE_OPTIONS:
-        return _fixed(text)
-    given = parse_numbers(rest, _EXPOSURE_OPTIONS[kind], f"the exposure {kind}")
-    needed = {"stops": ("low", "high"), "normal": ("mean", "sd"), "clip": ("share",), "level": ("share", "low")}[kind]
-    missing = [name for name in needed if name not in given]
+        return _parse_factor(text)
+    values = parse_numbers(numbers_text, _EXPOSURE_OPTIONS[kind], f"the exposure {kind}")
+    required = {"stops": ("low", "high"), "normal": ("mean", "sd"), "clip": ("share",), "level": ("share", "low")}[kind]
+    missing = [name for name in required if name not in values]
     if missing:
         raise InputError(f"the exposure {text!r} lacks {' and '.join(missing)}; write for example {_EXAMPLES[kind]}")
-    if "low" in given and given.get("high", given["low"]) < given["low"]:
-        raise InputError(f"the exposure {text!r}: low is above high; exchange them")
+    if "low" in values and values.get("high", values["low"]) < values["low"]:
+        raise InputError(f"the exposure {text!r} has low above high; exchange them")
     if kind == "stops":
-        return DrawnExposure((given["low"], given["high"]))
+        return DrawnExposure((values["low"], values["high"]))
     if kind == "normal":
-        return NormalExposure(given["mean"], given["sd"])
-    levels = (1.0,) if kind == "clip" else (given["low"], given.get("high", given["low"]))
-    return AutomaticExposure(given["share"], levels, given.get("most", MOST))
+        return NormalExposure(values["mean"], values["sd"])
+    levels = (1.0,) if kind == "clip" else (values["low"], values.get("high", values["low"]))
+    return AutomaticExposure(values["share"], levels, values.get("most", LARGEST_FACTOR))
 
 
 _EXAMPLES: Final = {
     "stops": "stops:low=-2,high=1",
-    "normal": "normal:mean=-1,sd=.5",
-    "clip": "clip:share=.01",
-    "level": "level:share=.01,low=.3,high=.9",
+    "normal": "normal:mean=-1,sd=0.5",
+    "clip": "clip:share=0.01",
+    "level": "level:share=0.01,low=0.3,high=0.9",
 }
 
 
-def _fixed(text: str) -> ExposureChoice:
-    least, most = (2.0**stops for stops in _STOPS)
+def _parse_factor(text: str) -> ExposureChoice:
+    smallest, largest = (2.0**stops for stops in _STOPS)
     try:
         factor = float(text)
     except ValueError:
         factor = math.nan
-    if not least <= factor <= most:
+    if not smallest <= factor <= largest:
         raise InputError(
-            f"{text!r} is no exposure; write a factor from {least:.2g} to {most:g}, or {', '.join(_EXAMPLES.values())}"
+            f"the exposure is {text!r}, expected a factor from {smallest:.2g} to {largest:g}, or "
+            f"{', '.join(_EXAMPLES.values())}"
         )
     return DrawnExposure((math.log2(factor),))
 
 
-def _check_quantiles(quantiles: tuple[float, ...], what: str) -> None:
+def _check_quantiles(quantiles: tuple[float, ...], name: str) -> None:
     ordered = all(low <= high for low, high in pairwise(quantiles))
     if not quantiles or not ordered or not all(map(math.isfinite, quantiles)):
-        raise InputError(f"the {what} are {quantiles}, expected one or more rising numbers")
+        raise InputError(f"the {name} are {quantiles}, expected 1 or more rising numbers")
 
 
-def _quantile(quantiles: tuple[float, ...], place: float) -> float:
+def _quantile(quantiles: tuple[float, ...], probability: float) -> float:
     steps: npt.NDArray[np.float64] = np.linspace(0.0, 1.0, len(quantiles))
-    return float(np.interp(place, steps, quantiles))
+    return float(np.interp(probability, steps, quantiles))
 
 
 def _uniform(seed: int, number: int) -> float:
-    """Return a number between 0 and 1."""
     return (int(philox.words(seed, 0, 0, number, philox.EXPOSURES)[0]) + 0.5) / (1 << 32)
 
 
-# Exposures tried until the share of the pixels that reach a level is the one asked for, noise included: of 60
-# photographs at ISO 3200 a share of .02 was .85 to 3.8 times as large without, within 3 % with one, .5 % with two.
+# Trial exposures to include noise in the share of pixels that reach a level. For 60 photographs at ISO 3200 and a share
+# of 0.02, the result was 0.85 to 3.8 times the share without trials, within 3 % with one, 0.5 % with two.
 _TRIALS: Final = 2
-_LARGEST: Final = 65535  # Largest value of 16 bits
-_EVEN: Final[Three] = (1.0, 1.0, 1.0)  # Light that is the same everywhere
+_LARGEST_COUNT: Final = 65535  # Largest 16-bit count
+_EVEN_LIGHT: Final[Three] = (1.0, 1.0, 1.0)  # Far end of even light
 
 
 @dataclass(frozen=True, eq=False)
-class Varied:
-    """What was done to an image.
+class AppliedVariation:
+    """The variation of one image.
 
-    - `details`: for `images.csv`.
-    - `weights`: (H, W, 2) float32, how much of each pixel's light is that of the near and the far end; None if it is
-      even.
-    - `end`: light of the far end over that of the near one, of each channel.
+    - `details`: columns of `images.csv`.
+    - `weights`: (H, W, 2) float32, shares of near-end and far-end light in each pixel; None for even light.
+    - `end`: light of the far end relative to the near end, by channel.
     """
 
     details: dict[str, int | float | str] = field(default_factory=dict[str, int | float | str])
     weights: npt.NDArray[np.float32] | None = None
-    end: Three = _EVEN
+    end: Three = _EVEN_LIGHT
 
     def intensity(self) -> npt.NDArray[np.float32] | None:
-        """Return the light of each pixel over that of the near end, (H, W) float32, of an end without a tint."""
+        """Return the light relative to the near end, (H, W) float32, for a far end without tint."""
         if self.weights is None:
             return None
         return np.float32(1) - self.weights[..., 1] * np.float32(1 - self.end[1])
@@ -319,12 +314,12 @@ class Varied:
 
 @dataclass(frozen=True)
 class Variation:
-    """What differs from image to image; something is set.
+    """Differences between images; at least one of the first three is set.
 
-    - `exposure`: how much light; None as the table.
-    - `gradient`: how it falls off over the image; None not at all.
-    - `iso`: ISO speed whose noise images have; None the table's.
-    - `noise`: of the table's samples; see `varied_by`.
+    - `exposure`: amount of light; None for that of the LUT.
+    - `gradient`: fall-off over the image; None for even light.
+    - `iso`: ISO speed that determines the noise; None for that of the LUT.
+    - `noise`: noise of the samples of the LUT; see `variation_of`.
     """
 
     exposure: ExposureChoice | None = None
@@ -334,38 +329,37 @@ class Variation:
 
     def __post_init__(self) -> None:
         if self.exposure is None and self.gradient is None and self.iso is None:
-            raise InputError("a variation has neither exposure, gradient nor ISO speed; set one, or give no variation")
+            raise InputError("a variation has no exposure, gradient or ISO speed, expected 1 or more; set one")
 
     @property
     def tints(self) -> bool:
-        """Whether the light of an image changes its colour over it, so that images have maps of it."""
+        """Whether the colour of the light varies over an image, so that images have maps of it."""
         return self.gradient is not None and self.gradient.colour > 0
 
-    def apply(self, image: npt.NDArray[np.uint16], white_level: int, seed: int, number: int) -> Varied:
-        """Change an image in place and return what was done to it.
+    def apply(self, image: npt.NDArray[np.uint16], white_level: int, seed: int, number: int) -> AppliedVariation:
+        """Change an image in place and return the applied variation.
 
-        `image`: (H, W, 3) uint16, contiguous; counts of the table, as drawn.
+        `image`: (H, W, 3) uint16, contiguous, counts as drawn from the LUT.
         """
         noise = self.noise
         details: dict[str, int | float | str] = {}
-        weights, end = None, _EVEN
+        weights, far_end = None, _EVEN_LIGHT
         if self.gradient is not None:
             falloff = self.gradient.of_image(seed, number)
-            weights, end = falloff.weights(*image.shape[:2]), falloff.end
-            details |= dict(zip(("end_r", "end_g", "end_b"), end, strict=True))
-        ratio, electrons = (1.0, None) if self.iso is None else (self.iso.ratio, self.iso.sensor_electrons)
-        wanted = noise if electrons is None else noise.at(ratio, electrons)
+            weights, far_end = falloff.weights(*image.shape[:2]), falloff.end
+            details |= dict(zip(("end_r", "end_g", "end_b"), far_end, strict=True))
+        iso_ratio, electrons = (1.0, None) if self.iso is None else (self.iso.ratio, self.iso.sensor_electrons)
+        target_noise = noise if electrons is None else noise.at(iso_ratio, electrons)
 
-        def exposed(factor: float, saturation: int, out: npt.NDArray[np.uint16]) -> float:
-            """Fill `out` with the image exposed anew; return the share of its pixels at saturation."""
+        def expose_with(factor: float, saturation: int, out: npt.NDArray[np.uint16]) -> float:
             return expose(
                 image,
                 factor,
                 noise,
-                wanted=wanted,
-                ratio=ratio,
+                target_noise=target_noise,
+                iso_ratio=iso_ratio,
                 weights=weights,
-                end=end,
+                far_end=far_end,
                 white_level=saturation,
                 seed=seed,
                 number=number,
@@ -374,32 +368,32 @@ class Variation:
 
         factor = 1.0
         if self.exposure is not None:
-            seen, brightness = self.exposure.seen, 0.0
-            if seen is not None:
-                brightness = brightness_reached(image, seen, weights, end) / white_level
+            metered_share, brightness = self.exposure.metered_share, 0.0
+            if metered_share is not None:
+                brightness = brightness_reached(image, metered_share, weights, far_end) / white_level
             factor = self.exposure.factor(seed, number, brightness)
-            if seen is not None and (factor < 1 or weights is not None or self.iso is not None):
-                # Noise lifts what the brightest pixels reach, so what they reach with it decides.
+            if metered_share is not None and (factor < 1 or weights is not None or self.iso is not None):
+                # Noise raises the level that the brightest pixels reach, so it is included in the metering.
                 trial = np.empty_like(image)
                 for _ in range(_TRIALS):
-                    exposed(factor, _LARGEST, trial)
-                    brightness = brightness_reached(trial, seen) / white_level / factor
+                    expose_with(factor, _LARGEST_COUNT, trial)
+                    brightness = brightness_reached(trial, metered_share) / white_level / factor
                     factor = self.exposure.factor(seed, number, brightness)
             details["exposure"] = factor
         if self.iso is not None:
-            # With more light than the wanted speed allows, the noise is that of a higher one.
-            details["iso"] = self.iso.base * max(ratio, factor)
-        details["clipped"] = exposed(factor, white_level, image)
-        return Varied(details, weights, end)
+            # A factor above the ISO ratio has the noise of a higher ISO speed.
+            details["iso"] = self.iso.base * max(iso_ratio, factor)
+        details["clipped"] = expose_with(factor, white_level, image)
+        return AppliedVariation(details, weights, far_end)
 
     def describe(self) -> dict[str, Any]:
-        """Return what is set as plain values for `dataset.json`: enough to make every byte again."""
-        parts = {"exposure": self.exposure, "gradient": self.gradient, "iso": self.iso, "noise": self.noise}
-        return {name: part.describe() for name, part in parts.items() if part is not None}
+        """Return the set options as plain values for `dataset.json`; they determine every byte of the images."""
+        options = {"exposure": self.exposure, "gradient": self.gradient, "iso": self.iso, "noise": self.noise}
+        return {name: option.describe() for name, option in options.items() if option is not None}
 
 
-def varied_by(
+def variation_of(
     lut: Lut, exposure: ExposureChoice | None = None, gradient: Gradient | None = None, iso: IsoSpeed | None = None
 ) -> Variation:
-    """Return the variation of images of a table, whose noise is measured; one of the three must be given."""
+    """Return the variation of images of a LUT and measure its noise; at least one option must be given."""
     return Variation(exposure, gradient, iso, noise=measured_noise(lut))

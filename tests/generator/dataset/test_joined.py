@@ -17,7 +17,7 @@ from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import LightChoice, RandomLights
 from generator.masks.making import parse_masks
 from generator.pictures.random_scenes import random_scenes
-from generator.variation.variation import parse_exposure, varied_by
+from generator.variation.variation import parse_exposure, variation_of
 from tests.generator.dataset.known import plain_text, table_in
 from tests.pinned import Pinned
 
@@ -38,7 +38,7 @@ def make_data_set(lut: Lut, out: Path, scenes: Any, lights: LightChoice | list[i
 def test_pinned_members(layout: str, lut: Lut, tmp_path: Path, pinned: Pinned) -> None:
     masks = SimultaneousLights(RandomLights(2, 5, 1), 2, parse_masks("spots", 2, 1))
     options: dict[str, Any] = {"layout": layout, "shard_images": 2, "split": (0.4, 0.3, 0.3)}
-    variation = varied_by(lut, parse_exposure("stops:low=-1,high=1"))
+    variation = variation_of(lut, parse_exposure("stops:low=-1,high=1"))
     make_data_set(
         lut, tmp_path / "out", random_scenes(5, 13, 11), masks, variation=variation, uncertainty=True, **options
     )

@@ -42,12 +42,12 @@ from generator.masks.maps import quantised_chromaticities
 from generator.options import LightOptions
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import Preparation, Source, find_pictures, read_picture
-from generator.rendering.black_points import BlackPoint, veil_of, without_veil
+from generator.rendering.black_points import BlackPoint, black_subtraction, subtract_black
 from generator.rendering.colorimetric import ColorimetricRendering
 from generator.rendering.matrices import ColourMatrix
 from generator.rendering.render import render
 from generator.variation.iso_speed import parse_iso
-from generator.variation.variation import Variation, parse_exposure, parse_gradient, varied_by
+from generator.variation.variation import Variation, parse_exposure, parse_gradient, variation_of
 from tests.generator.conftest import MakeLut, lut_in
 from tests.generator.dataset.contents import contents
 from tests.generator.groups import grouped
@@ -535,7 +535,7 @@ def test_image_has_random_share_of_black_subtracted(make_lut: MakeLut, pictures:
         light = single_mixture(int(entry.lights[0]))
         share = BY_COLOUR.black_point.share(5, number)
         assert row["cells"] == rendering.map.sha256[:16]
-        printed = rendering.printed(light, share)
+        printed = rendering.printed_light(light, share)
         image = draw_printed(lut.samples, sources[entry.source], [printed], rendering.cells, seed=5, image=number)
         np.testing.assert_array_equal(dataset.read_image(entry), np.minimum(image, lut.provenance.white_level))
         assert float(row["black_taken"]) == pytest.approx(share, abs=1e-8)
@@ -590,14 +590,14 @@ def test_image_under_several_lights(make_lut: MakeLut, pictures: Path, tmp_path:
     for number, (entry, source) in enumerate(zip(dataset.entries, sources, strict=True)):
         lighting = choice.lightings_of(number)[0]
         weights = dataset.read_weights(entry)
-        lights = [rendering.printed(mixture, 1.0) for mixture in lighting.mixtures]
+        lights = [rendering.printed_light(mixture, 1.0) for mixture in lighting.mixtures]
         shard_numbers = draw_printed(
             lut.samples,
             source.read().picture,
             lights,
             rendering.cells,
             shares=weights,
-            most=lut.provenance.white_level,
+            white_level=lut.provenance.white_level,
             seed=5,
             image=number,
         )
@@ -613,7 +613,7 @@ def test_subtracts_black_of_mixture(make_lut: MakeLut, pictures: Path, tmp_path:
     request = LightOptions(light=[mixture.label]).choose(lut, 5)
     dataset = generate_dataset(lut, tmp_path / "out", find_pictures(pictures), request, seed=5, options=options)
     picture = next(iter(find_pictures(pictures))).read().picture
-    samples = without_veil(mixture.samples(lut, 5), veil_of(lut, mixture, 1.0), lut.provenance.white_level)
+    samples = subtract_black(mixture.samples(lut, 5), black_subtraction(lut, mixture, 1.0), lut.provenance.white_level)
     image = dataset.read_image(dataset.entries[0])
     np.testing.assert_array_equal(image, draw_samples(samples, picture, seed=5, image=0))
 
@@ -673,7 +673,7 @@ def make_varied(lut: Lut, smooth_pictures: Path, tmp_path: Path) -> Make:
 
 
 def full_variation(lut: Lut) -> Variation:
-    return varied_by(
+    return variation_of(
         lut, parse_exposure("stops:low=-2,high=2"), parse_gradient("smooth:stops=1"), parse_iso("400/100:read=1")
     )
 
@@ -715,7 +715,7 @@ def test_variation_does_not_depend_on_workers_or_layout(lut: Lut, make_varied: M
 
 
 def test_clips_requested_share(lut: Lut, make_varied: Make) -> None:
-    dataset = make_varied("clipped", varied_by(lut, parse_exposure("clip:share=.05,most=50")))
+    dataset = make_varied("clipped", variation_of(lut, parse_exposure("clip:share=.05,most=50")))
     white = dataset.description.table.white_level
     for entry in dataset.entries:
         image = dataset.read_image(entry)
@@ -725,10 +725,10 @@ def test_clips_requested_share(lut: Lut, make_varied: Make) -> None:
         # The image has 6912 pixels; several may have the count at the limit.
         assert 0.05 <= clipped + 1 / 6912 < 0.06
     # Noise increases the brightest pixels, so it must be included when the factor is chosen.
-    noisy = make_varied("noisy", varied_by(lut, parse_exposure("clip:share=.05,most=50"), iso=parse_iso("6400/100")))
+    noisy = make_varied("noisy", variation_of(lut, parse_exposure("clip:share=.05,most=50"), iso=parse_iso("6400/100")))
     shares = [float(row["clipped"]) for row in noisy.details.values()]
     assert np.abs(np.array(shares) / 0.05 - 1).max() < 0.06
-    unclipped = make_varied("unclipped", varied_by(lut, parse_exposure("clip:share=0,most=50")))
+    unclipped = make_varied("unclipped", variation_of(lut, parse_exposure("clip:share=0,most=50")))
     assert all(float(row["clipped"]) == 0 for row in unclipped.details.values())
     assert all(unclipped.read_image(entry).max() >= white - 8 for entry in unclipped.entries)
 
@@ -767,7 +767,7 @@ def test_refuses_wrong_number_of_crops(lut: Lut, smooth_pictures: Path, tmp_path
 
 def test_tint_has_correct_maps(lut: Lut, make_varied: Make) -> None:
     gradient = parse_gradient("soft-edge:width=.9,stops=1,least=1,colour=.5")
-    dataset = make_varied("tint", varied_by(lut, gradient=gradient))
+    dataset = make_varied("tint", variation_of(lut, gradient=gradient))
     unvaried = make_varied("plain")
     scenes = open_generated(dataset.store.location).scenes
     for entry, flat, scene in zip(dataset.entries, unvaried.entries, scenes, strict=True):
@@ -791,7 +791,7 @@ def test_tint_has_correct_maps(lut: Lut, make_varied: Make) -> None:
 
 def test_falloff_weights_ground_truth(lut: Lut, make_varied: Make) -> None:
     choice = SimultaneousLights(RandomLights(2, len(lut.white), 5), 2, parse_masks("half-plane:angle=0", 2, 5))
-    gradient = varied_by(lut, gradient=parse_gradient("soft-edge:angle=0,width=.9,stops=3,least=3"))
+    gradient = variation_of(lut, gradient=parse_gradient("soft-edge:angle=0,width=.9,stops=3,least=3"))
     dataset = make_varied("several", gradient, lights=choice)
     unvaried = make_varied("plain", lights=choice)
     largest_difference = 0.0
@@ -810,7 +810,7 @@ def test_falloff_weights_ground_truth(lut: Lut, make_varied: Make) -> None:
 def test_refuses_tint_with_several_lights(lut: Lut, make_varied: Make) -> None:
     choice = SimultaneousLights(RandomLights(2, len(lut.white), 5), 2, parse_masks("smooth", 2, 5))
     with pytest.raises(InputError):
-        make_varied("both", varied_by(lut, gradient=parse_gradient("smooth:colour=.1")), lights=choice)
+        make_varied("both", variation_of(lut, gradient=parse_gradient("smooth:colour=.1")), lights=choice)
 
 
 def test_raw_files_have_equal_counts(lut: Lut, make_varied: Make, smooth_pictures: Path, tmp_path: Path) -> None:

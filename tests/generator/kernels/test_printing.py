@@ -1,4 +1,4 @@
-"""Rendering by colour against the rule at the head of the kernel, spelled out in numpy."""
+"""Rendering by colour compared with the rule in numpy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from foundation.colorimetry import decode_srgb
 from foundation.errors import InputError
 from generator.kernels.planar import scales_of
 from generator.kernels.printed_crops import draw_printed_crops
-from generator.kernels.printing import NODE_CODES, NODES, SIDE, PrintedLight, draw_printed, nearest_nodes
+from generator.kernels.printing import NODE_CODES, NODES, SIDE, PrintedLight, count_by_node, draw_printed
 from generator.kernels.rendering import draw_samples
 
 Array = npt.NDArray[np.float64]
@@ -24,7 +24,7 @@ CELL_OF = RNG.integers(0, CELLS, NODES).astype(np.uint32)
 
 
 def light(*numbers: int, weights: tuple[float, ...] = (1.0,)) -> PrintedLight:
-    """Return a light of numbers that have nothing to do with each other."""
+    """Return an illuminant with arbitrary numbers."""
     rng = np.random.default_rng(sum(numbers))
     means, cells = np.empty((NODES, 4), np.float32), np.zeros((len(numbers), NODES, 2, 4), np.float32)
     means[:, :3], means[:, 3] = rng.uniform(900, 5000, (NODES, 3)), rng.uniform(20, 30, NODES)
@@ -33,78 +33,79 @@ def light(*numbers: int, weights: tuple[float, ...] = (1.0,)) -> PrintedLight:
     return PrintedLight(means, cells, np.array(numbers), np.sqrt(weights).astype(np.float32))
 
 
-def nearest(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
-    """Return the node nearest to each pixel; of two the one of the higher code."""
+def nearest_node(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
+    """Return the node nearest to each pixel, the higher code if two are equally near."""
     distance = np.abs(picture[..., None].astype(np.int64) - np.array(NODE_CODES)[::-1])
     return (SIDE - 1 - distance.argmin(axis=-1)) @ np.array([SIDE * SIDE, SIDE, 1])
 
 
-def choices(picture: npt.NDArray[np.uint8], place: int, seed: int, image: int) -> npt.NDArray[np.int64]:
-    """Return which sample each pixel has of the light at a place; the rule of place 0 is `draw_samples`'."""
-    if place == 0:
-        numbered = np.arange(COUNT, dtype=np.uint16)[None, :, None] * np.ones((8, 1, 3), np.uint16)
-        return draw_samples(numbered, picture, seed=seed, image=image)[..., 0].astype(np.int64)
+def choices(picture: npt.NDArray[np.uint8], stream: int, seed: int, image: int) -> npt.NDArray[np.int64]:
+    """Return the sample number of each pixel in a stream; stream 0 is that of `draw_samples`."""
+    if stream == 0:
+        indices = np.arange(COUNT, dtype=np.uint16)[None, :, None] * np.ones((8, 1, 3), np.uint16)
+        return draw_samples(indices, picture, seed=seed, image=image)[..., 0].astype(np.int64)
     from generator.kernels.mixing import mix_samples
 
-    numbered = np.zeros((place + 1, 8, COUNT, 3), np.uint16)
-    numbered[place] = np.arange(COUNT)[None, :, None]
-    weights = np.zeros((*picture.shape[:2], place + 1), np.float32)
-    weights[..., place] = 1
-    return mix_samples(numbered, picture, weights, white_level=65535, seed=seed, image=image)[..., 0].astype(np.int64)
+    indices = np.zeros((stream + 1, 8, COUNT, 3), np.uint16)
+    indices[stream] = np.arange(COUNT)[None, :, None]
+    weights = np.zeros((*picture.shape[:2], stream + 1), np.float32)
+    weights[..., stream] = 1
+    return mix_samples(indices, picture, weights, white_level=65535, seed=seed, image=image)[..., 0].astype(np.int64)
 
 
-def spelled_out(
+def image_by_rule(
     picture: npt.NDArray[np.uint8], lights: list[PrintedLight], shares: Array, seed: int, image: int
 ) -> Array:
-    """Return the image before it is rounded and cut off at 0."""
+    """Return the image before rounding and clipping."""
     nodes, lin = np.array(NODE_CODES), decode_srgb(np.arange(256) / 255)
-    below = np.minimum(picture.astype(np.int64) // 16, SIDE - 2)
-    part = (lin[picture] - lin[nodes[below]]) / (lin[nodes[below + 1]] - lin[nodes[below]])
-    near = nearest(picture)
+    lower = np.minimum(picture.astype(np.int64) // 16, SIDE - 2)
+    fraction = (lin[picture] - lin[nodes[lower]]) / (lin[nodes[lower + 1]] - lin[nodes[lower]])
+    nearest_nodes = nearest_node(picture)
     out: Array = np.zeros(picture.shape)
-    place = 0
-    for number, one in enumerate(lights):
-        # Along the edges of a cube, the channel with the largest part first.
-        order = np.argsort(-part, axis=-1, kind="stable")
-        ends = np.concatenate([np.ones((*order.shape[:2], 1)), np.take_along_axis(part, order, -1)], axis=-1)
-        weights, corner = -np.diff(ends, axis=-1, append=0.0), below.copy()
-        seen = np.zeros((*picture.shape[:2], 4))
+    stream = 0
+    for number, light in enumerate(lights):
+        # Along the edges of a cube, the channel with the largest fraction first.
+        order = np.argsort(-fraction, axis=-1, kind="stable")
+        ends = np.concatenate([np.ones((*order.shape[:2], 1)), np.take_along_axis(fraction, order, -1)], axis=-1)
+        weights, corner = -np.diff(ends, axis=-1, append=0.0), lower.copy()
+        values = np.zeros((*picture.shape[:2], 4))
         for step in range(4):
-            seen += weights[..., step, None] * one.means[corner @ np.array([SIDE * SIDE, SIDE, 1])]
+            values += weights[..., step, None] * light.means[corner @ np.array([SIDE * SIDE, SIDE, 1])]
             if step < 3:
                 corner += order[..., step, None] == np.arange(3)
         share = shares[..., number, None]
-        out += share * seen[..., :3]
-        for table, root, cells in zip(one.lights, one.roots, one.bases, strict=True):
-            drawn = SAMPLES[table][CELL_OF[near], choices(picture, place, seed, image)]
-            out += np.sqrt(share) * root * seen[..., 3:] * cells[near, 1, :3] * (drawn - cells[near, 0, :3])
-            place += 1
+        out += share * values[..., :3]
+        for table, root, cells in zip(light.lights, light.roots, light.bases, strict=True):
+            drawn = SAMPLES[table][CELL_OF[nearest_nodes], choices(picture, stream, seed, image)]
+            scale = root * values[..., 3:] * cells[nearest_nodes, 1, :3]
+            out += np.sqrt(share) * scale * (drawn - cells[nearest_nodes, 0, :3])
+            stream += 1
     return out
 
 
 @pytest.mark.slow
 @settings(max_examples=25)
 @given(st.integers(1, 70), st.integers(1, 9), st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1))
-def test_an_image_is_what_the_rule_says(width: int, height: int, seed: int, image: int) -> None:
+def test_image_follows_the_rule(width: int, height: int, seed: int, image: int) -> None:
     picture = np.random.default_rng(width).integers(0, 256, (height, width, 3)).astype(np.uint8)
     picture[::2, :, 1] = picture[::2, :, 0]
     for lights in ([light(2)], [light(0, 3, weights=(0.25, 0.75))]):
-        wanted = spelled_out(picture, lights, np.ones((height, width, 1)), seed, image)
-        got = draw_printed(SAMPLES, picture, lights, CELL_OF, seed=seed, image=image)
-        np.testing.assert_allclose(got, np.maximum(wanted, 0), atol=0.51)
+        expected = image_by_rule(picture, lights, np.ones((height, width, 1)), seed, image)
+        image_drawn = draw_printed(SAMPLES, picture, lights, CELL_OF, seed=seed, image=image)
+        np.testing.assert_allclose(image_drawn, np.maximum(expected, 0), atol=0.51)
 
 
-def test_several_lights_have_samples_of_their_own_and_shares() -> None:
+def test_mixed_lights_have_independent_samples_and_shares() -> None:
     picture = RNG.integers(0, 256, (20, 45, 3)).astype(np.uint8)
     lights = [light(1), light(0, 2, weights=(0.5, 0.5)), light(3)]
     shares = RNG.dirichlet((1, 1, 1), (20, 45))
     shares[0, :, 1], shares[1] = 0, (0, 0, 1)
     shares /= shares.sum(axis=-1, keepdims=True)
-    got = draw_printed(SAMPLES, picture, lights, CELL_OF, shares=shares.astype(np.float32), seed=3, image=4)
-    np.testing.assert_allclose(got, np.maximum(spelled_out(picture, lights, shares, 3, 4), 0), atol=0.52)
+    image_drawn = draw_printed(SAMPLES, picture, lights, CELL_OF, shares=shares.astype(np.float32), seed=3, image=4)
+    np.testing.assert_allclose(image_drawn, np.maximum(image_by_rule(picture, lights, shares, 3, 4), 0), atol=0.52)
 
 
-def test_bands_threads_and_targets_change_no_byte() -> None:
+def test_result_is_independent_of_bands_threads_and_target() -> None:
     picture = RNG.integers(0, 256, (31, 77, 3)).astype(np.uint8)
     whole = draw_printed(SAMPLES, picture, [light(1)], CELL_OF, seed=5)
     np.testing.assert_array_equal(draw_printed(SAMPLES, picture, [light(1)], CELL_OF, seed=5, threads=3), whole)
@@ -113,7 +114,8 @@ def test_bands_threads_and_targets_change_no_byte() -> None:
     out = np.zeros((31, 80, 3), np.uint16)[:, :77]
     draw_printed(SAMPLES, picture, [light(1)], CELL_OF, seed=5, out=out)
     np.testing.assert_array_equal(out, whole)
-    assert (draw_printed(SAMPLES, picture, [light(1)], CELL_OF, seed=5, most=2000) == np.minimum(whole, 2000)).all()
+    clipped = draw_printed(SAMPLES, picture, [light(1)], CELL_OF, seed=5, white_level=2000)
+    assert (clipped == np.minimum(whole, 2000)).all()
     with pytest.raises(InputError):
         draw_printed(SAMPLES, picture[..., :2], [light(1)], CELL_OF)
 
@@ -121,10 +123,10 @@ def test_bands_threads_and_targets_change_no_byte() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("flip", [False, True])
 @pytest.mark.parametrize("window", [(0, 0, 77, 31), (5, 3, 40, 20), (63, 30, 1, 1), (33, 0, 30, 2)])
-def test_a_crop_is_a_window_of_the_image(flip: bool, window: tuple[int, int, int, int]) -> None:
+def test_crop_is_a_window_of_the_image(flip: bool, window: tuple[int, int, int, int]) -> None:
     picture = RNG.integers(0, 256, (31, 77, 3)).astype(np.uint8)
     x, y, width, height = window
-    taken, stretch = np.array([[30.0, 20.0, 10.0]] * 3), np.array([[1.1, 1.2, 1.3]] * 3)
+    black_counts, stretch = np.array([[30.0, 20.0, 10.0]] * 3), np.array([[1.1, 1.2, 1.3]] * 3)
     lights, flips = [light(2), light(0, 3, weights=(0.25, 0.75)), light(2)], np.array([flip, not flip, flip])
     out = np.empty((3, 3, height, width), np.float32)
     draw_printed_crops(
@@ -133,20 +135,20 @@ def test_a_crop_is_a_window_of_the_image(flip: bool, window: tuple[int, int, int
         [picture] * 3,
         np.array([window] * 3),
         CELL_OF,
-        scales=scales_of(np.array([0.7] * 3), 4000, taken, stretch),
+        scales=scales_of(np.array([0.7] * 3), 4000, black_counts, stretch),
         flips=flips,
         seeds=np.array([9, 10, 11], np.uint64),
         threads=2,
         out=out,
     )
-    for one, seed, mirrored, crop in zip(lights, (9, 10, 11), flips, out, strict=True):
-        whole = spelled_out(picture, [one], np.ones((31, 77, 1)), seed, 0)
-        wanted = np.minimum((whole[y : y + height, x : x + width] - taken[0]) * stretch[0] * 0.7 / 4000, 0.7)
-        shown = crop.transpose(1, 2, 0)
-        np.testing.assert_allclose(shown[:, ::-1] if mirrored else shown, wanted, atol=2e-5)
+    for crop_light, seed, mirrored, crop in zip(lights, (9, 10, 11), flips, out, strict=True):
+        whole = image_by_rule(picture, [crop_light], np.ones((31, 77, 1)), seed, 0)
+        expected = np.minimum((whole[y : y + height, x : x + width] - black_counts[0]) * stretch[0] * 0.7 / 4000, 0.7)
+        crop_pixels = crop.transpose(1, 2, 0)
+        np.testing.assert_allclose(crop_pixels[:, ::-1] if mirrored else crop_pixels, expected, atol=2e-5)
 
 
-def test_pixels_are_counted_by_the_nearest_node() -> None:
+def test_counts_pixels_by_nearest_node() -> None:
     picture = RNG.integers(0, 256, (9, 40, 3)).astype(np.uint8)
-    counts = np.bincount(nearest(picture).ravel(), minlength=NODES)
-    np.testing.assert_array_equal(nearest_nodes(picture), counts)
+    counts = np.bincount(nearest_node(picture).ravel(), minlength=NODES)
+    np.testing.assert_array_equal(count_by_node(picture), counts)

@@ -1,4 +1,4 @@
-"""The kernel against its rule in plain Python integers, and the statistics of its choices."""
+"""The kernel compared with its rule in Python integers, and the statistics of its choices."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from foundation.errors import InputError
 from generator.kernels import vector as streaming
-from generator.kernels.choice import bits_of, readable
+from generator.kernels.choice import channel_bits, readable
 from generator.kernels.mixing import mix_samples, mixed_table
 from generator.kernels.planar import draw_batch
 from generator.kernels.printing import draw_printed
@@ -26,40 +26,40 @@ from tests.generator.conftest import MakeLut
 Rule = Callable[..., npt.NDArray[np.int64]]
 
 
-def expected(
+def expected_image(
     rule: Rule, samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8], seed: int, image: int, **place: int
 ) -> npt.NDArray[np.uint16]:
-    """Return `draw_samples` by the rules at the heads of `rendering.py` and `choice.py`, in numpy."""
+    """Return `draw_samples` by the rules of `rendering.py` and `choice.py`, in numpy."""
     bits = {8: 1, 64: 2, 512: 3, 4096: 4, 32768: 5}[len(samples)]
     upper = (picture >> (8 - bits)).astype(np.int64)
     colour = (upper[..., 0] << (2 * bits)) | (upper[..., 1] << bits) | upper[..., 2]
     return samples[colour, rule(seed, image, *colour.shape, count=samples.shape[1], **place)]
 
 
-def test_the_paper_s_table_of_32_cubed_colours_by_hand(rule: Rule) -> None:
-    # The sample's own address as its value: any wrong colour, sample or channel shows.
+def test_table_of_the_paper_follows_the_rule(rule: Rule) -> None:
+    # Each sample has its address as value, so any wrong colour, sample or channel is detected.
     address = np.arange(32768 * 25).reshape(32768, 25)
     samples = np.stack([address >> 8, address & 0xFF, address % 65521], axis=-1).astype(np.uint16)
     picture = np.random.default_rng(3).integers(0, 256, (5, 1031, 3)).astype(np.uint8)
     seed, image = 0xFEDCBA9876543210, 0xDEADBEEF
-    got = draw_samples(samples, picture, seed=seed, image=image)
-    np.testing.assert_array_equal(got, expected(rule, samples, picture, seed, image))
+    drawn_image = draw_samples(samples, picture, seed=seed, image=image)
+    np.testing.assert_array_equal(drawn_image, expected_image(rule, samples, picture, seed, image))
 
 
-def test_first_choices_of_seed_0_are_fixed_for_ever() -> None:
-    # Philox's known answer for counter and key zero begins 6627e8d5 e169c58d bc57ac4c: the keys of row 0. The rest is
-    # worked out here in Python's integers.
+def test_first_choices_of_seed_0() -> None:
+    # The published output of Philox for counter and key 0 begins 6627e8d5 e169c58d bc57ac4c: the keys of row 0. The
+    # rest is computed here in Python integers.
     samples = np.zeros((8, 25, 3), np.uint16)
     samples[..., 0] = np.arange(25)
     row = draw_samples(samples, np.zeros((1, 12, 3), np.uint8))[0, :, 0].tolist()
-    by_hand: list[int] = []
+    expected_numbers: list[int] = []
     for x in (0, 1, 2, 3):
         h = (x ^ 0x6627E8D5) * 0x21F0AAAD % 2**32 ^ 0xE169C58D
         h = (h ^ h >> 16) * 0x735A2D97 % 2**32 ^ 0xBC57AC4C
         h = (h ^ h >> 15) * 0x31848BAB % 2**32
-        by_hand += [h * 25 >> 32, h * 25 % 2**32 * 25 >> 32]
-    assert row[:4] == by_hand[::2]
-    assert row[8:] == by_hand[1::2]
+        expected_numbers += [h * 25 >> 32, h * 25 % 2**32 * 25 >> 32]
+    assert row[:4] == expected_numbers[::2]
+    assert row[8:] == expected_numbers[1::2]
     assert row == [22, 24, 3, 14, 11, 8, 22, 6, 3, 7, 7, 19]
 
 
@@ -73,17 +73,17 @@ def test_first_choices_of_seed_0_are_fixed_for_ever() -> None:
     st.integers(0, 2**64 - 1),
     st.integers(0, 2**32 - 1),
 )
-def test_any_table_and_size_by_hand(
+def test_any_table_and_size_follows_the_rule(
     rule: Rule, bits: int, count: int, height: int, width: int, seed: int, image: int
 ) -> None:
     rng = np.random.default_rng(seed % 1000)
     samples = rng.integers(0, 65536, (8**bits, count, 3)).astype(np.uint16)
     picture = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
-    got = draw_samples(samples, picture, seed=seed, image=image)
-    np.testing.assert_array_equal(got, expected(rule, samples, picture, seed, image))
+    drawn_image = draw_samples(samples, picture, seed=seed, image=image)
+    np.testing.assert_array_equal(drawn_image, expected_image(rule, samples, picture, seed, image))
 
 
-def test_bands_threads_memory_order_and_a_given_target_change_nothing(
+def test_result_is_independent_of_bands_threads_memory_order_and_target(
     make_lut: MakeLut, picture: npt.NDArray[np.uint8]
 ) -> None:
     samples = make_lut().samples[1]
@@ -101,21 +101,21 @@ def test_bands_threads_memory_order_and_a_given_target_change_nothing(
 @pytest.mark.slow
 @settings(max_examples=60)
 @given(st.one_of(st.integers(1, 40), st.integers(480, 1100)), st.integers(1, 4), st.integers(0, 100), st.booleans())
-def test_an_image_too_large_for_the_caches_is_the_same_and_nothing_beside_it_is_written(
-    width: int, height: int, margin: int, odd: bool
+def test_streamed_image_is_the_same_and_stays_within_its_target(
+    width: int, height: int, margin: int, is_odd: bool
 ) -> None:
     rng = np.random.default_rng(width)
     samples = rng.integers(0, 65536, (512, 25, 3)).astype(np.uint16)
     picture = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
     memory = np.full(2 * height * 3 * (width + 2 * margin) + 1, 171, np.uint8)
-    whole = memory[odd : memory.size - (not odd)].view(np.uint16).reshape(height, width + 2 * margin, 3)
+    whole = memory[is_odd : memory.size - (not is_odd)].view(np.uint16).reshape(height, width + 2 * margin, 3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(streaming, "STREAMED_BYTES", 0)
         draw_samples(samples, picture, out=whole[:, margin : margin + width])
     np.testing.assert_array_equal(whole[:, margin : margin + width], draw_samples(samples, picture))
-    beside = np.concatenate([whole[:, :margin], whole[:, margin + width :]], axis=1)
-    np.testing.assert_array_equal(beside, np.full_like(beside, 171 << 8 | 171))
-    assert memory[-1 if not odd else 0] == 171
+    outside = np.concatenate([whole[:, :margin], whole[:, margin + width :]], axis=1)
+    np.testing.assert_array_equal(outside, np.full_like(outside, 171 << 8 | 171))
+    assert memory[-1 if not is_odd else 0] == 171
 
 
 def choices(seed: int, image: int, height: int, width: int) -> npt.NDArray[np.uint16]:
@@ -126,8 +126,8 @@ def choices(seed: int, image: int, height: int, width: int) -> npt.NDArray[np.ui
 
 
 def chi_square(pairs: npt.NDArray[np.int64], classes: int) -> float:
-    expected = pairs.size / classes
-    return float(((np.bincount(pairs.ravel(), minlength=classes) - expected) ** 2 / expected).sum())
+    expected_count = pairs.size / classes
+    return float(((np.bincount(pairs.ravel(), minlength=classes) - expected_count) ** 2 / expected_count).sum())
 
 
 # Chi-square limits for an error probability of 1e-6 (Wilson and Hilferty, z = 4.753): 24 degrees of freedom 77,
@@ -136,13 +136,13 @@ LIMIT_24, LIMIT_624 = 77.0, 812.0
 
 
 @pytest.mark.slow
-def test_every_sample_is_drawn_equally_often() -> None:
+def test_samples_are_drawn_uniformly() -> None:
     drawn = choices(2019, 7, 1500, 4000).astype(np.int64)
     assert drawn.size == 6_000_000
     assert chi_square(drawn, 25) < LIMIT_24
-    # Along rows, columns and each of the places that share words too.
-    for place in range(16):
-        assert chi_square(drawn[:, place::16], 25) < LIMIT_24
+    # Also for each phase of the pixels that share words.
+    for phase in range(16):
+        assert chi_square(drawn[:, phase::16], 25) < LIMIT_24
 
 
 @pytest.mark.slow
@@ -153,25 +153,25 @@ def test_neighbours_are_independent(down: int, right: int) -> None:
     pairs = drawn[: height - down, : width - right] * 25 + drawn[down:, right:]
     # Overlapping pairs share a member, which widens the statistic a little at right = 1; non-overlapping are taken.
     step = 2 * max(right, 1)
-    kept = pairs[:, ::step] if right in (1, 2, 4) else pairs[:: 2 * max(down, 1)] if down else pairs[:, :1024]
-    assert chi_square(kept, 625) < LIMIT_624
+    distinct_pairs = pairs[:, ::step] if right in (1, 2, 4) else pairs[:: 2 * max(down, 1)] if down else pairs[:, :1024]
+    assert chi_square(distinct_pairs, 625) < LIMIT_624
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("one", "other"),
+    ("first", "second"),
     [((0, 0), (1, 0)), ((0, 0), (1 << 32, 0)), ((0, 0), (0, 1)), ((1, 0), (0, 1)), ((6, 3), (7, 3)), ((2, 9), (3, 8))],
 )
-def test_seeds_and_images_are_independent(one: tuple[int, int], other: tuple[int, int]) -> None:
-    # One round of multiplying and shifting gives pictures that are each other's with neighbours swapped.
-    a, b = (choices(*which, 800, 1024).astype(np.int64) for which in (one, other))
+def test_seeds_and_images_are_independent(first: tuple[int, int], second: tuple[int, int]) -> None:
+    # With a single round, images would be equal after swapping neighbours.
+    a, b = (choices(*seed_and_image, 800, 1024).astype(np.int64) for seed_and_image in (first, second))
     assert chi_square(a * 25 + b, 625) < LIMIT_624
     for x_flip, y_flip in ((1, 0), (2, 0), (3, 0), (0, 1), (4, 0), (1, 1)):
         swapped = b[np.arange(800) ^ y_flip][:, np.arange(1024) ^ x_flip]
         assert chi_square(a * 25 + swapped, 625) < LIMIT_624
 
 
-def test_a_patch_measures_what_the_table_holds(make_lut: MakeLut) -> None:
+def test_flat_patch_has_mean_and_variance_of_the_table(make_lut: MakeLut) -> None:
     # 1600 pixels of one colour: each channel's mean is the table's within 5.5 standard errors; 64 colours x 3 channels
     # x 2 lights at a two-sided probability of 4e-8 each: one false alarm in 70 000 seeds, and the seed is fixed.
     lut = make_lut(bits=2)
@@ -185,11 +185,11 @@ def test_a_patch_measures_what_the_table_holds(make_lut: MakeLut) -> None:
         error = table.std(axis=1) / np.sqrt(1600)
         assert (np.abs(measured - table.mean(axis=1)) < 5.5 * error).all()
         # And the scatter is the table's: the variance of 1600 draws is within 6 of its standard errors (kurtosis < 4).
-        spread = image.reshape(8, 40, 8, 40, 3).var(axis=(1, 3)).reshape(64, 3)
-        assert (np.abs(spread / table.var(axis=1) - 1) < 6 * np.sqrt(3 / 1600)).all()
+        variance = image.reshape(8, 40, 8, 40, 3).var(axis=(1, 3)).reshape(64, 3)
+        assert (np.abs(variance / table.var(axis=1) - 1) < 6 * np.sqrt(3 / 1600)).all()
 
 
-def test_render_replaces_unfit_colours_by_the_nearest(make_lut: MakeLut) -> None:
+def test_render_replaces_unfit_colours(make_lut: MakeLut) -> None:
     lut = make_lut(bits=2, unfit=(0, 1))
     black = render(lut, np.zeros((4, 8, 3), np.uint8), 0, rendering="codes", seed=1)
     # Colour 0 is (0, 0, 0) and 1 (0, 0, 1), both unfit; at distance 1 of black remain 4 (0, 1, 0) and 16 (1, 0, 0).
@@ -197,24 +197,24 @@ def test_render_replaces_unfit_colours_by_the_nearest(make_lut: MakeLut) -> None
     np.testing.assert_array_equal(black, green)
 
 
-def test_a_picture_of_another_type_is_refused_before_anything_is_drawn(make_lut: MakeLut) -> None:
+def test_refuses_picture_of_another_type(make_lut: MakeLut) -> None:
     with pytest.raises(InputError):
         render(make_lut(unfit=(0,)), np.zeros((4, 4, 3)), 0)  # pyrefly: ignore[bad-argument-type]
 
 
-def test_a_light_that_is_not_there_is_named(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
+def test_refuses_unknown_light(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
     lut = make_lut()
     for light in (-1, 4):
-        with pytest.raises(InputError, match=rf"light {light}.*0 to 3"):
+        with pytest.raises(InputError, match=rf"illuminant {light};.*0 to 3"):
             render(lut, picture, light)
-    wrong: list[Any] = [1.5, None]
-    for light in wrong:
+    invalid: list[Any] = [1.5, None]
+    for light in invalid:
         with pytest.raises(InputError, match=rf"{light!r}"):
             render(lut, picture, light)
     np.testing.assert_array_equal(render(lut, picture, np.arange(4)[2]), render(lut, picture, 2))
 
 
-def test_wrong_shapes_and_numbers_are_named(picture: npt.NDArray[np.uint8]) -> None:
+def test_refuses_invalid_shapes_and_numbers(picture: npt.NDArray[np.uint8]) -> None:
     samples = np.zeros((8, 25, 3), np.uint16)
     with pytest.raises(InputError):
         draw_samples(samples, picture.astype(np.uint16))  # pyrefly: ignore[bad-argument-type]
@@ -233,27 +233,27 @@ def test_wrong_shapes_and_numbers_are_named(picture: npt.NDArray[np.uint8]) -> N
     with pytest.raises(InputError):
         draw_samples(samples, picture, seed=-1)
     with pytest.raises(InputError):
-        bits_of(9)
+        channel_bits(9)
 
 
 @pytest.mark.parametrize(
     "function",
     [draw_samples, draw_batch, draw_printed, mix_samples, mixed_table, render],
 )
-def test_what_is_not_said_is_image_0_of_seed_0(function: Callable[..., object]) -> None:
-    known = {"seed": 0, "seeds": 0, "image": 0, "images": 0, "first_row": 0, "threads": 1, "flip": False, "gain": 1}
-    said = {name: given.default for name, given in signature(function).parameters.items() if name in known}
-    assert said
-    assert said == {name: known[name] for name in said}
+def test_defaults_are_image_0_of_seed_0(function: Callable[..., object]) -> None:
+    usual = {"seed": 0, "seeds": 0, "image": 0, "images": 0, "first_row": 0, "threads": 1, "flip": False, "gain": 1}
+    defaults = {name: entry.default for name, entry in signature(function).parameters.items() if name in usual}
+    assert defaults
+    assert defaults == {name: usual[name] for name in defaults}
 
 
-@pytest.mark.parametrize("left", [0, 2, 1000])
-def test_two_bytes_behind_samples_can_be_read(left: int) -> None:
+@pytest.mark.parametrize("bytes_left", [0, 2, 1000])
+def test_two_bytes_after_samples_are_readable(bytes_left: int) -> None:
     page = mmap.PAGESIZE
     memory = np.frombuffer(mmap.mmap(-1, 2 * page), np.uint8)
     size = 8 * 4 * 3
-    end = page - left  # Where the samples end: at the end of a page, or within one.
+    end = page - bytes_left  # Where the samples end: at the end of a page, or within one.
     samples = memory[end - 2 * size : end].view(np.uint16).reshape(8, 4, 3)
-    found = readable(samples)
-    assert (found is samples) is (left >= 2)
-    np.testing.assert_array_equal(found, samples)
+    readable_samples = readable(samples)
+    assert (readable_samples is samples) is (bytes_left >= 2)
+    np.testing.assert_array_equal(readable_samples, samples)

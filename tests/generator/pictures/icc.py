@@ -1,4 +1,4 @@
-"""Colour profiles made by hand, after ICC.1:2001-04 (version 2.4): matrix and gamma, or grey and gamma."""
+"""Minimal colour profiles of ICC.1:2001-04 (version 2.4): matrix and gamma, or grey and gamma."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.03
 
 @dataclass(frozen=True)
 class Space:
-    """Chromaticities x, y of red, green and blue, and of white."""
+    """Chromaticities x, y of red, green, blue and white."""
 
     primaries: tuple[tuple[float, float], ...]
     white: tuple[float, float]

@@ -1,4 +1,4 @@
-"""Pictures of any kind, written by OpenImageIO."""
+"""Write pictures with OpenImageIO."""
 
 from __future__ import annotations
 

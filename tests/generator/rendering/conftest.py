@@ -1,4 +1,4 @@
-"""Small tables of prints with known faults."""
+"""Small look-up tables of prints with known faults."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MakeTable = Callable[..., Lut]
 
 @pytest.fixture
 def make_table(tmp_path: Path) -> MakeTable:
-    """Return a maker of tables of a print, samples with a noise of Poisson, in folders of their own."""
+    """Return a function that writes a LUT of a print, with Poisson noise, to a new folder."""
 
     def make(
         bits: int = 3,
@@ -36,21 +36,21 @@ def make_table(tmp_path: Path) -> MakeTable:
         folder.mkdir()
         writer = LutWriter(folder, lights, 1 << 3 * bits, 25)
         rng = np.random.default_rng(20191127)
-        plan: list[Illumination] = []
+        illuminations: list[Illumination] = []
         for light, kelvin in zip(range(lights), (2000.0, 5600.0, 10000.0), strict=False):
-            seen = printed(bits, tint)
+            camera_colours = printed(bits, tint)
             if light == 0:
-                # A warm light has no blue: what the blue channel sees of it is mostly green.
-                seen[:, 2] += blue_of_green * (seen[:, 1] - seen[:, 2])
-            means = seen * WHITES[light]
-            drawn = np.asarray(rng.poisson(np.repeat(means[:, None], 25, axis=1)), np.int64)
-            samples: npt.NDArray[np.uint16] = np.minimum(drawn, white_level).astype(np.uint16)
+                # A warm illuminant has no blue: the blue channel records mostly green.
+                camera_colours[:, 2] += blue_of_green * (camera_colours[:, 1] - camera_colours[:, 2])
+            means = camera_colours * WHITES[light]
+            counts = np.asarray(rng.poisson(np.repeat(means[:, None], 25, axis=1)), np.int64)
+            samples: npt.NDArray[np.uint16] = np.minimum(counts, white_level).astype(np.uint16)
             if change is not None:
                 change(samples)
             writer.put(light, samples)
-            plan.append(Illumination(light, "blackbody", kelvin, Colour(255, 255 - light, light)))
+            illuminations.append(Illumination(light, "blackbody", kelvin, Colour(255, 255 - light, light)))
         writer.finish(
-            plan,
+            illuminations,
             WHITES[:lights],
             Provenance(
                 camera=camera,

@@ -1,4 +1,4 @@
-"""Training crops: each item is a window of the image that its numbers give, whatever the batch and the threads."""
+"""Training crops: each item depends only on its number, not on batches or threads."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from generator.lights.lighting import Mixture
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import Picture
 from generator.rendering import Rendering
-from generator.rendering.black_points import BlackPoint, veil_of
+from generator.rendering.black_points import BlackPoint, black_subtraction
 from generator.rendering.colorimetric import ColorimetricRendering
 from generator.rendering.matrices import ColourMatrix
-from generator.training.crops import KEPT, Crops, Recycled
+from generator.training.crops import KEPT_BLOCKS, Crops, RecycledMemory
 from generator.training.gallery import Gallery, gallery_of, open_gallery, save_gallery
 from generator.variation.iso_speed import parse_iso
 from generator.variation.sensor_noise import SensorNoise
@@ -38,63 +38,63 @@ pytestmark = pytest.mark.slow
 SHAPE = (4, 3, 32, 32)
 
 
-def place(array: npt.NDArray[np.float32]) -> int:
+def address_of(array: npt.NDArray[np.float32]) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-def test_memory_of_which_nothing_is_left_is_used_again() -> None:
-    recycled = Recycled()
+def test_reuses_released_memory() -> None:
+    recycled = RecycledMemory()
     first = recycled.array(SHAPE)
     assert first.shape == SHAPE
     assert first.dtype == np.float32
     assert first.flags.c_contiguous
     assert first.flags.writeable
-    at = place(first)
+    address = address_of(first)
     del first
-    assert place(recycled.array(SHAPE)) == at
+    assert address_of(recycled.array(SHAPE)) == address
 
 
-def test_what_is_still_seen_is_left_alone() -> None:
-    recycled = Recycled()
+def test_keeps_memory_with_views() -> None:
+    recycled = RecycledMemory()
     whole = recycled.array(SHAPE)
     whole[...] = 7
     views = [whole[1:, 0], whole.reshape(-1)[::5], whole[2].T]
     buffer = memoryview(whole[3])
-    at = place(whole)
+    address = address_of(whole)
     del whole
-    for _ in range(2 * KEPT):
-        other = recycled.array(SHAPE)
-        assert place(other) != at
-        other[...] = 1
+    for _ in range(2 * KEPT_BLOCKS):
+        array = recycled.array(SHAPE)
+        assert address_of(array) != address
+        array[...] = 1
     assert all((view == 7).all() for view in views)
     assert np.asarray(buffer).min() == 7
 
 
-def test_sizes_do_not_mix() -> None:
-    recycled = Recycled()
+def test_reuses_memory_of_equal_size_only() -> None:
+    recycled = RecycledMemory()
     for shape in ((1, 3, 8, 8), (7, 3, 32, 32), SHAPE):
-        made = recycled.array(shape)
-        made[...] = 3
-        assert made.shape == shape
+        array = recycled.array(shape)
+        array[...] = 3
+        assert array.shape == shape
 
 
-def test_threads_never_share_memory() -> None:
-    recycled = Recycled()
-    wrong: list[int] = []
+def test_threads_do_not_share_memory() -> None:
+    recycled = RecycledMemory()
+    failed_threads: list[int] = []
 
     def work(number: int) -> None:
         for _ in range(200):
-            mine = recycled.array(SHAPE)
-            mine[...] = number
-            if not (mine == number).all():
-                wrong.append(number)
+            array = recycled.array(SHAPE)
+            array[...] = number
+            if not (array == number).all():
+                failed_threads.append(number)
 
     threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert not wrong
+    assert not failed_threads
 
 
 BITS = 2
@@ -103,7 +103,7 @@ MATRIX = ColourMatrix("mine", np.array([[0.6, 0.3, 0.1], [0.1, 0.7, 0.2], [0.05,
 
 
 def ramp(height: int, width: int) -> Picture:
-    """Return a picture that has every colour of a table of 2 bits a channel, many times."""
+    """Return a picture with every colour of a LUT of 2 bits per channel, many times."""
     rows, columns = np.mgrid[:height, :width]
     return (np.stack([columns, rows, rows + columns], axis=-1) % 4 * 64).astype(np.uint8)
 
@@ -113,7 +113,7 @@ def gallery() -> Gallery:
     return gallery_of([ramp(40, 50), np.full((9, 8, 3), 200, np.uint8)], ["ramp", "plain"])
 
 
-def test_every_value_is_a_sample_of_its_colour_under_its_light(make_lut: MakeLut, gallery: Gallery) -> None:
+def test_values_are_samples_of_their_colour_and_light(make_lut: MakeLut, gallery: Gallery) -> None:
     lut = make_lut(bits=BITS)
     batch = Crops(lut, gallery, (7, 8), flip=False, length=300, rendering="codes").batch(np.arange(300))
     assert batch.images.shape == (300, 3, 7, 8)
@@ -124,28 +124,28 @@ def test_every_value_is_a_sample_of_its_colour_under_its_light(make_lut: MakeLut
         if picture == 1:
             code = 200 >> 6
             colour = code << 4 | code << 2 | code
-            wanted = lut.samples[light, colour].astype(np.float32) * np.float32(1 / lut.provenance.white_level)
-            assert (image.reshape(3, -1).T[:, None] == wanted[None]).all(axis=2).any(axis=1).all()
+            expected = lut.samples[light, colour].astype(np.float32) * np.float32(1 / lut.provenance.white_level)
+            assert (image.reshape(3, -1).T[:, None] == expected[None]).all(axis=2).any(axis=1).all()
     np.testing.assert_allclose(batch.illuminants, lut.ground_truth[batch.lights], rtol=1e-6)
 
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(order=st.permutations(list(range(24))), cut=st.integers(1, 23))
-def test_items_do_not_depend_on_who_asks_when(
-    made: tuple[Crops, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], order: list[int], cut: int
+def test_items_are_independent_of_batches(
+    sample: tuple[Crops, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], order: list[int], cut: int
 ) -> None:
-    crops, images = made
-    for part in (order[:cut], order[cut:]):
-        np.testing.assert_array_equal(crops.batch(part).images, images[part])
+    crops, images = sample
+    for items in (order[:cut], order[cut:]):
+        np.testing.assert_array_equal(crops.batch(items).images, images[items])
 
 
 @pytest.fixture
-def made(make_lut: MakeLut, gallery: Gallery) -> tuple[Crops, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
+def sample(make_lut: MakeLut, gallery: Gallery) -> tuple[Crops, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
     crops = Crops(make_lut(bits=BITS), gallery, (5, 6), length=24, exposure=(0.5, 2.0), seed=11)
     return crops, crops.batch(np.arange(24)).images
 
 
-def test_a_pickled_copy_gives_the_same_and_carries_no_table(make_lut: MakeLut, gallery: Gallery) -> None:
+def test_pickled_copy_is_equal_and_small(make_lut: MakeLut, gallery: Gallery) -> None:
     crops = Crops(make_lut(bits=3), gallery, (5, 6), lights=[1, Mixture((0, 2), (0.5, 0.5))], length=50, seed=3)
     stored = pickle.dumps(crops)
     assert len(stored) < gallery.codes.size + 4000
@@ -153,7 +153,7 @@ def test_a_pickled_copy_gives_the_same_and_carries_no_table(make_lut: MakeLut, g
     np.testing.assert_array_equal(again.batch(np.arange(50)).images, crops.batch(np.arange(50)).images)
 
 
-def test_seeds_and_epochs_differ_and_threads_do_not(make_lut: MakeLut, gallery: Gallery) -> None:
+def test_seeds_and_epochs_differ(make_lut: MakeLut, gallery: Gallery) -> None:
     lut = make_lut(bits=BITS)
     first = Crops(lut, gallery, (6, 6), length=40).batch(np.arange(40))
     same = Crops(lut, gallery, (6, 6), length=40, threads=3).batch(np.arange(40))
@@ -168,7 +168,7 @@ def test_seeds_and_epochs_differ_and_threads_do_not(make_lut: MakeLut, gallery: 
 
 
 @pytest.mark.parametrize("rendering", get_args(Rendering))
-def test_a_batch_fills_the_memory_it_is_given(make_lut: MakeLut, gallery: Gallery, rendering: Rendering) -> None:
+def test_fills_given_memory(make_lut: MakeLut, gallery: Gallery, rendering: Rendering) -> None:
     crops = Crops(make_lut(bits=BITS), gallery, (5, 6), length=40, threads=2, rendering=rendering)
     memory = np.full((12, 3, 5, 6), np.nan, np.float32)
     batch = crops.batch(np.arange(9, 20), out=memory[1:])
@@ -179,7 +179,7 @@ def test_a_batch_fills_the_memory_it_is_given(make_lut: MakeLut, gallery: Galler
         crops.batch(np.arange(9, 20), out=memory)
 
 
-def test_choices_are_even(make_lut: MakeLut) -> None:
+def test_choices_are_uniform(make_lut: MakeLut) -> None:
     gallery = gallery_of([ramp(12, 13)] * 5)
     count = 3000
     crops = Crops(make_lut(bits=BITS), gallery, (4, 4), length=count, exposure=(0.25, 1.0), seed=7)
@@ -188,7 +188,7 @@ def test_choices_are_even(make_lut: MakeLut) -> None:
         expected = count / kinds
         # Chi-square with 4 degrees of freedom at most: above 28 by chance once in 80 000.
         assert ((np.bincount(drawn, minlength=kinds) - expected) ** 2 / expected).sum() < 28
-    # The gain is even in stops over two stops, mean 1 stop: its error is 2 / sqrt(12 · 3000) = .0105 stops.
+    # The gain is uniform over two stops, mean 1 stop: its error is 2 / sqrt(12 · 3000) = 0.0105 stops.
     means = np.log2(batch.images.mean(axis=(1, 2, 3)))
     bright = np.log2(Crops(make_lut(bits=BITS, name="again"), gallery, (4, 4), length=count, seed=7)
                      .batch(np.arange(count)).images.mean(axis=(1, 2, 3)))  # fmt: skip
@@ -196,7 +196,7 @@ def test_choices_are_even(make_lut: MakeLut) -> None:
     assert np.ptp(means - bright) == pytest.approx(2.0, abs=0.02)
 
 
-def test_mirrored_items_are_the_others_mirrored(make_lut: MakeLut) -> None:
+def test_mirrors_half_of_the_items(make_lut: MakeLut) -> None:
     lut = make_lut(bits=BITS)
     gallery = gallery_of([ramp(6, 6)])
     plain = Crops(lut, gallery, (6, 6), length=200, flip=False).batch(np.arange(200)).images
@@ -208,14 +208,14 @@ def test_mirrored_items_are_the_others_mirrored(make_lut: MakeLut) -> None:
     assert 50 < mirrored.sum() < 150
 
 
-def test_items_that_are_not_there(make_lut: MakeLut, gallery: Gallery) -> None:
+def test_refuses_unknown_items(make_lut: MakeLut, gallery: Gallery) -> None:
     crops = Crops(make_lut(bits=BITS), gallery, (4, 4), length=3)
     assert crops[2][0].shape == (3, 4, 4)
     with pytest.raises(IndexError):
         crops[3]
 
 
-def test_a_gallery_on_disk_is_the_pictures(tmp_path: Path) -> None:
+def test_saved_gallery_holds_the_pictures(tmp_path: Path) -> None:
     sources = random_scenes(3, 9, 7)
     gallery = save_gallery(sources, tmp_path / "gallery")
     assert gallery.names == ("random-000000", "random-000001", "random-000002")
@@ -247,12 +247,15 @@ except ImportError as error:
 """
 
 
-def test_pytorch_that_is_missing_is_an_import_error_and_named() -> None:
-    done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == ("training batches for PyTorch need it: pip install torch\n", "")
+def test_reports_missing_pytorch() -> None:
+    process = subprocess.run([sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True, check=False)
+    assert (process.stdout, process.stderr) == (
+        "PyTorch is not installed, training batches need it; run pip install torch\n",
+        "",
+    )
 
 
-def test_crops_by_colour_are_windows_of_the_image_that_is_rendered_so(make_lut: MakeLut, gallery: Gallery) -> None:
+def test_colorimetric_crops_subtract_black_like_images(make_lut: MakeLut, gallery: Gallery) -> None:
     lut = make_lut(bits=BITS)
     black_point = BlackPoint("random")
     options: dict[str, Any] = {"lights": [1, 3], "length": 30, "seed": 8, "matrix": MATRIX}
@@ -266,19 +269,19 @@ def test_crops_by_colour_are_windows_of_the_image_that_is_rendered_so(make_lut: 
     assert not kept.black_taken.any()
     assert 0 < batch.black_taken.min() < batch.black_taken.max() < 0.97
     level = lut.provenance.white_level
-    for image, before, light, share in zip(batch.images, kept.images, batch.lights, batch.black_taken, strict=True):
+    for image, plain, light, share in zip(batch.images, kept.images, batch.lights, batch.black_taken, strict=True):
         mixture = crops.lights[int(light)]
         grey = ColorimetricRendering(lut, MATRIX).black(mixture)
-        veil = veil_of(lut, mixture, float(share), grey)
-        wanted = (before.astype(np.float64) * level - veil.taken[:, None, None]) * veil.stretch[:, None, None] / level
-        np.testing.assert_allclose(image, wanted, atol=2e-6)
+        black = black_subtraction(lut, mixture, float(share), grey)
+        expected = (plain.astype(float) * level - black.counts[:, None, None]) * black.stretch[:, None, None] / level
+        np.testing.assert_allclose(image, expected, atol=2e-6)
     again = pickle.loads(pickle.dumps(crops)).batch(np.arange(30))
     np.testing.assert_array_equal(again.images, batch.images)
-    for part in ([29, 3], [3]):
-        np.testing.assert_array_equal(crops.batch(part).images, batch.images[part])
+    for items in ([29, 3], [3]):
+        np.testing.assert_array_equal(crops.batch(items).images, batch.images[items])
 
 
-def test_renderings_that_cannot_be_are_named(make_lut: MakeLut, gallery: Gallery) -> None:
+def test_refuses_invalid_renderings(make_lut: MakeLut, gallery: Gallery) -> None:
     lut = make_lut(bits=BITS)
     with pytest.raises(InputError, match="'inks'"):
         Crops(lut, gallery, (5, 6), rendering="inks")  # pyrefly: ignore[bad-argument-type]
@@ -286,15 +289,15 @@ def test_renderings_that_cannot_be_are_named(make_lut: MakeLut, gallery: Gallery
         Crops(lut, gallery, (5, 6), rendering="codes", matrix=MATRIX)
 
 
-def test_what_a_spawned_worker_loads_reads_no_charts() -> None:
-    """Each worker of a loader imports it anew; what measures noise brings OpenCV and SciPy."""
+def test_workers_import_no_heavy_libraries() -> None:
+    """A spawned worker imports everything again, so OpenCV and SciPy must not be loaded."""
     program = "import sys, generator.training.crops, generator.rendering.colorimetric; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert "generator.training.crops" in loaded
     assert not {"cv2", "numba", "scipy", "experiment.framing.pictures"}.intersection(loaded)
 
 
-MINE = ColourMatrix("mine", PRINT_MATRIX, "a test")
+CAMERA = ColourMatrix("mine", PRINT_MATRIX, "a test")
 
 NOISE = SensorNoise(read=(6.0, 4.0, 3.5), shot=(0.5, 0.25, 0.75))
 
@@ -304,14 +307,14 @@ CASES: dict[str, dict[str, Any]] = {
     "codes": {"rendering": "codes", "exposure": (0.25, 2.0)},
     "codes of mixtures, black taken out": {"rendering": "codes", "lights": MIXED, "black_point": "random:.9"},
     "codes with noise": {"rendering": "codes", "exposure": (0.1, 8.0), "noise": NOISE, "flip": False, "threads": 3},
-    "colours": {"matrix": MINE, "lights": [4, 1]},
-    "colours without black": {"matrix": MINE, "black_point": "compensate", "lights": MIXED, "threads": 2},
-    "colours with speed": {"matrix": MINE, "noise": NOISE, "iso": parse_iso("1600/100"), "black_point": "random"},
+    "colours": {"matrix": CAMERA, "lights": [4, 1]},
+    "colours without black": {"matrix": CAMERA, "black_point": "compensate", "lights": MIXED, "threads": 2},
+    "colours with speed": {"matrix": CAMERA, "noise": NOISE, "iso": parse_iso("1600/100"), "black_point": "random"},
 }
 
 
 def pictures() -> list[npt.NDArray[np.uint8]]:
-    """Return pictures of unlike sizes, the last as large as a crop."""
+    """Return pictures of different sizes, the last as large as a crop."""
     return [scene.read().picture for scene in random_scenes(3, 41, 23, 5)] + [
         random_scenes(1, 9, 7, 6)[0].read().picture
     ]
@@ -320,14 +323,14 @@ def pictures() -> list[npt.NDArray[np.uint8]]:
 @pytest.mark.parametrize("name", CASES)
 def test_items(name: str, tmp_path: Path, pinned: Pinned) -> None:
     gallery = gallery_of(pictures(), ["a", "b", "c", "d"])
-    found: list[Any] = []
+    pins: list[Any] = []
     for size, seed, epoch in (((7, 9), 2**63 + 1, 0), ((1, 1), 3, 2**32 - 1), ((5, 8), 4, 7)):
         crops = Crops(
             table_in(tmp_path / f"lut{seed}"), gallery, size, length=1000, seed=seed, epoch=epoch, **CASES[name]
         )
         batch = crops.batch([0, 999, 500, 3, 3, 77])
-        found += [vars(batch), batch.images[0, :, 0, 0], len(crops)]
+        pins += [vars(batch), batch.images[0, :, 0, 0], len(crops)]
         crops.set_epoch(1)
         image, light = crops[12]
-        found.append([image, light])
-    pinned(f"training items, {name}", found)
+        pins.append([image, light])
+    pinned(f"training items, {name}", pins)

@@ -1,4 +1,4 @@
-"""Exposures, gradients and noise: what texts name, and the same variation for a seed."""
+"""Exposures, gradients and noise: parsing, distributions, and reproducible images."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from tests.generator.said import said
 from tests.pinned import Pinned
 
 
-def stops(text: str, count: int = 4000) -> list[float]:
+def drawn_stops(text: str, count: int = 4000) -> list[float]:
     exposure = parse_exposure(text)
     return [float(np.log2(exposure.factor(5, number, 0.5))) for number in range(count)]
 
 
 @pytest.mark.slow
-def test_drawn_evenly_in_stops() -> None:
-    drawn = np.sort(stops("stops:low=-2,high=1"))
-    # Kolmogorov and Smirnov: the largest distance of 4000 even numbers exceeds .031 once in a thousand.
+def test_draws_uniformly_in_stops() -> None:
+    drawn = np.sort(drawn_stops("stops:low=-2,high=1"))
+    # Kolmogorov-Smirnov: the largest distance of 4000 uniform numbers exceeds 0.031 once in a thousand.
     assert np.abs((drawn + 2) / 3 - np.arange(4000) / 4000).max() < 0.031
 
 
 @pytest.mark.slow
-def test_drawn_normally_in_stops() -> None:
-    drawn = stops("normal:mean=-1,sd=.5")
+def test_draws_normally_in_stops() -> None:
+    drawn = drawn_stops("normal:mean=-1,sd=.5")
     assert np.mean(drawn) == pytest.approx(-1, abs=0.03)
     assert np.std(drawn) == pytest.approx(0.5, abs=0.02)
     assert -2.5 <= min(drawn) < -2
@@ -49,13 +49,13 @@ def test_drawn_normally_in_stops() -> None:
 
 
 @pytest.mark.slow
-def test_quantiles_of_another_data_set() -> None:
+def test_draws_from_quantiles() -> None:
     drawn = [np.log2(DrawnExposure((-3.0, -1.0, 0.0)).factor(1, number, 0.0)) for number in range(2000)]
     assert np.mean(np.array(drawn) < -1) == pytest.approx(0.5, abs=0.05)
     assert np.mean(np.array(drawn) > -0.5) == pytest.approx(0.25, abs=0.05)
 
 
-def test_a_factor_and_automatic_exposure() -> None:
+def test_fixed_and_automatic_exposure() -> None:
     assert parse_exposure(".5").factor(0, 0, 0.1) == pytest.approx(0.5)
     assert parse_exposure("clip:share=.01").factor(0, 3, 0.25) == 4
     assert parse_exposure("clip:share=.01,most=3").factor(0, 3, 0.25) == 3
@@ -67,18 +67,18 @@ def test_a_factor_and_automatic_exposure() -> None:
     assert len({round(level, 9) for level in levels}) == 500
 
 
-def test_levels_that_fall_are_refused() -> None:
+def test_refuses_falling_levels() -> None:
     with pytest.raises(InputError):
         parse_exposure("level:share=.1,low=.9,high=.5")
     with pytest.raises(InputError):
         AutomaticExposure(0.1, (0.5, 0.2))
 
 
-def test_light_falls_off_within_the_stops_asked_for() -> None:
+def test_far_end_is_within_requested_stops() -> None:
     gradient = parse_gradient("soft-edge:width=.8,stops=2,least=1,colour=.1")
     ends = np.array([gradient.of_image(7, number).end for number in range(400)])
     assert ends.max() <= 0.5
-    # The brightest channel of the end is between 1 and 2 stops below the light.
+    # The brightest channel of the far end is 1 to 2 stops darker.
     level = np.log2(ends.max(axis=1))
     assert -2 <= level.min() < -1.97
     assert -1.03 < level.max() <= -1
@@ -89,17 +89,16 @@ def test_light_falls_off_within_the_stops_asked_for() -> None:
     assert plain[0] == plain[1] == plain[2]
 
 
-def test_the_far_end_is_what_the_words_of_the_image_say() -> None:
-    """To the last digits: images made again are to be the same."""
+def test_far_end_follows_random_words() -> None:
     gradient = parse_gradient("smooth:stops=3,least=.5,colour=.2")
     for number in (0, 7):
         level, red, blue = ((int(word) + 0.5) / 2**32 for word in philox.words(9, 0, 64, number, philox.GRADIENTS)[:3])
         tint = np.exp(0.2 * (2 * np.array([red, 0.5, blue]) - 1))
-        wanted = 2 ** -(0.5 + 2.5 * level) * tint / tint.max()
-        assert gradient.of_image(9, number).end == pytest.approx(wanted, rel=1e-13)
+        expected = 2 ** -(0.5 + 2.5 * level) * tint / tint.max()
+        assert gradient.of_image(9, number).end == pytest.approx(expected, rel=1e-13)
 
 
-def test_the_shape_is_not_that_of_masks_of_the_same_seed() -> None:
+def test_gradients_differ_from_masks_of_the_same_seed() -> None:
     gradient = parse_gradient("smooth").of_image(7, 1)
     weights = gradient.weights(40, 60)
     masks = parse_masks("smooth", 2, 7).maker(1).weights(40, 60, 2)
@@ -108,7 +107,7 @@ def test_the_shape_is_not_that_of_masks_of_the_same_seed() -> None:
     np.testing.assert_allclose(weights.sum(axis=2), 1, atol=1e-6)
 
 
-def test_a_folder_of_masks_is_no_gradient(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_folder_of_masks_as_gradient(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "masks").mkdir()
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=r"'masks'.*half-plane"):
@@ -136,7 +135,7 @@ def test_a_folder_of_masks_is_no_gradient(tmp_path: Path, monkeypatch: pytest.Mo
         (parse_shape, "window", "", {"columns": (1, 20), "rows": (1, 20), "softness": (0, 1)}),
     ],
 )
-def test_numbers_are_taken_from_bound_to_bound(
+def test_accepts_numbers_within_bounds(
     parse: Callable[[str], object], kind: str, others: str, bounds: dict[str, tuple[float, float]]
 ) -> None:
     for name, ends in bounds.items():
@@ -201,7 +200,7 @@ SPEEDS = (
 
 @pytest.mark.slow
 def test_texts_of_variations(pinned: Pinned) -> None:
-    found: dict[str, Any] = {}
+    pins: dict[str, Any] = {}
     choices: list[ExposureChoice] = [
         DrawnExposure((-2.0, -1.0, 1.5, 1.5)),
         AutomaticExposure(0.5, (0.1, 0.2, 0.9), 3.0),
@@ -209,26 +208,26 @@ def test_texts_of_variations(pinned: Pinned) -> None:
     for text in EXPOSURES:
         choice = said(parse_exposure, text)
         if isinstance(choice, dict):
-            found[text] = choice
+            pins[text] = choice
         else:
             choices.append(choice)
     for number, choice in enumerate(choices):
         factors = [choice.factor(2**33, image, light) for image in (0, 1, 2, 70000) for light in (0.0, 0.2, 1.3)]
-        found[f"exposure {number}"] = [choice.seen, choice.describe(), factors]
+        pins[f"exposure {number}"] = [choice.metered_share, choice.describe(), factors]
     for text in GRADIENTS:
         gradient = said(parse_gradient, text)
-        found[text] = gradient if isinstance(gradient, dict) else [
+        pins[text] = gradient if isinstance(gradient, dict) else [
             gradient.describe(),
-            [[made.end, made.weights(5, 8)] for made in (gradient.of_image(3, number) for number in range(3))],
+            [[falloff.end, falloff.weights(5, 8)] for falloff in (gradient.of_image(3, number) for number in range(3))],
         ]  # fmt: skip
     for text in SPEEDS:
         for base in (None, 200.0):
             speed = said(parse_iso, text, base)
-            found[f"{text} of {base}"] = speed if isinstance(speed, dict) else [
+            pins[f"{text} of {base}"] = speed if isinstance(speed, dict) else [
                 speed.describe(), speed.ratio, NOISE.at(speed.ratio, speed.sensor_electrons)
             ]  # fmt: skip
-    found["deviates"] = [normal_deviates(), normal_deviates()[[0, 1, 8191, 8192, -1]]]
-    pinned("texts of variations", found)
+    pins["deviates"] = [normal_deviates(), normal_deviates()[[0, 1, 8191, 8192, -1]]]
+    pinned("texts of variations", pins)
 
 
 @pytest.mark.slow
@@ -238,24 +237,25 @@ def test_images_exposed_anew(pinned: Pinned) -> None:
     image[0, 0], image[0, 1] = (0, 0, 0), (4600, 4599, 1)
     weights = np.stack([np.zeros((9, 13)), np.linspace(0, 1, 117).reshape(9, 13)], axis=-1).astype(np.float32)
     end = (0.25, 1.0, 0.5)
-    found: dict[str, Any] = {}
+    pins: dict[str, Any] = {}
     for factor in (0.1, 1.0, 3.0):
         for ratio in (1.0, 2.0):
-            for far in (None, weights):
+            for falloff in (None, weights):
                 out = np.empty_like(image)
                 share = expose(
-                    image, factor, NOISE, wanted=NOISE.at(ratio), ratio=ratio, weights=far, end=end if far is not None
-                    else (1.0, 1.0, 1.0), white_level=4600, seed=5, number=3, first_row=2, out=out,
+                    image, factor, NOISE, target_noise=NOISE.at(ratio), iso_ratio=ratio, weights=falloff,
+                    far_end=(1.0, 1.0, 1.0) if falloff is None else end, white_level=4600, seed=5, number=3,
+                    first_row=2, out=out,
                 )  # fmt: skip
-                found[f"{factor} {ratio} {far is not None}"] = [share, out.max(), out.tobytes()]
+                pins[f"{factor} {ratio} {falloff is not None}"] = [share, out.max(), out.tobytes()]
     shares = (0.0, 0.004, 0.0043, 0.01, 0.5, 1.0)
-    found["reached"] = [[brightness_reached(image, share, far, end) for share in shares] for far in (None, weights)]
-    for wanted, ratio, below in ((None, 1.0, False), (NOISE.at(4.0), 4.0, True), (NOISE.at(2.0), 2.0, False)):
+    pins["reached"] = [[brightness_reached(image, share, map_, end) for share in shares] for map_ in (None, weights)]
+    for target, ratio, below in ((None, 1.0, False), (NOISE.at(4.0), 4.0, True), (NOISE.at(2.0), 2.0, False)):
         items = rng.uniform(0, 1, (4, 3, 3, 5)).astype(np.float32) ** 4
         items[:, :, 0] = 0
         gains, seeds = np.array([0.25, 1.0, 2.0, 3.0]), np.array([1, 2, 2**63, 2**64 - 1], np.uint64)
-        add_noise(items, gains, NOISE, seeds, white_level=900, wanted=wanted, ratio=ratio, below_black=below)
-        found[f"items {ratio}"] = list(items)
+        add_noise(items, gains, NOISE, seeds, white_level=900, target_noise=target, iso_ratio=ratio, below_black=below)
+        pins[f"items {ratio}"] = list(items)
     for exposure in (
         None,
         parse_exposure(".5"),
@@ -265,8 +265,8 @@ def test_images_exposed_anew(pinned: Pinned) -> None:
         for gradient in (None, parse_gradient("smooth:colour=.3")):
             for iso in (None, parse_iso("800/200")):
                 if exposure or gradient or iso:
-                    made = image.copy()
-                    varied = Variation(exposure, gradient, iso, noise=NOISE).apply(made, 4600, 7, 2)
-                    name = f"varied {len(found)}"
-                    found[name] = [varied.details, varied.end, varied.intensity(), made.tobytes()]
-    pinned("images exposed anew", found)
+                    varied_image = image.copy()
+                    varied = Variation(exposure, gradient, iso, noise=NOISE).apply(varied_image, 4600, 7, 2)
+                    name = f"varied {len(pins)}"
+                    pins[name] = [varied.details, varied.end, varied.intensity(), varied_image.tobytes()]
+    pinned("images exposed anew", pins)
