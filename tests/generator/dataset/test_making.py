@@ -194,7 +194,7 @@ def test_skips_pictures_too_small_for_format(make_lut: MakeLut, tmp_path: Path) 
 def test_failed_data_set_leaves_no_files(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     sources = find_pictures([pictures])
-    before, threads = contents(tmp_path), threading.active_count()
+    original, threads = contents(tmp_path), threading.active_count()
     with pytest.raises(InputError, match="there is no illuminant 9"):
         generate_dataset(lut, tmp_path / "out", sources, [0, 9], workers=2)
     with pytest.raises(FormatError, match="0 of 1 pictures"):
