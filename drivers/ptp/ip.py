@@ -528,7 +528,9 @@ class IpTransport(CableTransport):
             except LinkTimeout as error:
                 remaining -= wait
                 if remaining <= 0:
-                    raise LinkTimeout(f"{self.label} has not answered within {timeout:g} s; check its power") from error
+                    raise LinkTimeout(
+                        f"{self.label} has not answered within {timeout:g} s; check its network, or restart it"
+                    ) from error
                 self._read_event_channel()
 
     def _read_event_channel(self) -> None:
