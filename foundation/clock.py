@@ -45,7 +45,7 @@ SYSTEM_CLOCK: Final = SystemClock()  # Default clock
 
 
 def elapsed_s() -> float:
-    """Return seconds since an arbitrary origin, on Linux with the time during which the machine was suspended."""
+    """Return seconds since an arbitrary origin; on Linux, they include time while the machine is suspended."""
     # time.monotonic() stops while a Linux machine is suspended.
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
@@ -60,8 +60,9 @@ class SteadyClock:
     White frames are interpolated in time. If the system date were set back during a session, illuminants would be
     interpolated between the wrong white frames.
 
-    `clock` gives the date at the start, which is at least `not_before`, and waits. `elapsed` returns seconds since any
-    origin, which never decrease. `behind_s`: seconds by which `clock` was behind `not_before` at the start, or 0.
+    The start date is the date of `clock`, or `not_before` if that is later. `clock` is also used to wait. `elapsed`
+    returns seconds since any origin, which never decrease. `behind_s`: seconds by which `clock` was behind
+    `not_before`, or 0.
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class SteadyClock:
         return self._start + timedelta(seconds=self._elapsed() - self._origin)
 
     def monotonic(self) -> float:
-        """Return seconds of `clock`."""
+        """Return the seconds of `clock.monotonic`."""
         return self._clock.monotonic()
 
     def sleep(self, seconds: float) -> None:
@@ -113,7 +114,7 @@ class SimulatedClock:
         return self._start + self._elapsed
 
     def monotonic(self) -> float:
-        """Return simulated seconds since this clock was made."""
+        """Return simulated seconds since the start of this clock."""
         return self._elapsed.total_seconds()
 
     def sleep(self, seconds: float) -> None:

@@ -183,10 +183,10 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
 
         def gather(number: int, seconds: float) -> tuple[NDArray[np.float32], float]:
             print(f"exposure {number} begins, {seconds:g} s", flush=True)
-            thrown = beam.gather(seconds, lambda: print(f"exposure {number} half over", flush=True))
+            projected = beam.measure_exposure(seconds, lambda: print(f"exposure {number} half over", flush=True))
             dark = f"; no light: {beam.trouble}" if beam.trouble else ""
-            print(f"exposure {number} ends: {thrown}{dark}", flush=True)
-            return thrown.picture, thrown.lamp
+            print(f"exposure {number} ends: {projected}{dark}", flush=True)
+            return projected.picture, projected.lamp
 
         yield WatchedFilm(world, gather, serial, clock.now())
 

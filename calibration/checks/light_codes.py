@@ -1,7 +1,8 @@
 """Check that the white reference under each illuminant matches its codes: detects exchanged frames.
 
 Each white is compared with a prediction from its codes, all other illuminants of the session, and priors for any
-projector (`calibration.checks.projector_model`). The uncertainty of the prediction limits each result. The checks:
+projector (`calibration.checks.projector_model`). Deviations count only beyond the uncertainty of the prediction. The
+checks:
 
 - Does a white differ from its prediction by more than four standard uncertainties?
 - Would two illuminants fit better with exchanged names? `exchange_deg` is the largest angle between two illuminants
@@ -27,18 +28,18 @@ from foundation.colorimetry import angles_deg
 _Array = npt.NDArray[np.float64]
 
 # Standard uncertainties subtracted from an angle or a brightness, so that noise does not appear as a wrong name.
-CERTAIN = 4.0
+CERTAIN_SIGMAS = 4.0
 
 # Twice the logarithm of the odds above which two names are reported as exchanged. A session of 707 illuminants has
-# 250 000 pairs, which need 25; the rest are odds of ten to one.
-EXCHANGED = 30.0
+# 250 000 pairs, which need 25 of it; the other 5 are odds of ten to one.
+EXCHANGE_EVIDENCE = 30.0
 
-# An illuminant is verified if any exchange with an illuminant at a larger angle would be detected. LUTs with such
-# errors are refused.
-HELD_DEG = 8.0
+# An illuminant is verified if any exchange with an illuminant at a larger angle would be detected. Errors above this
+# angle cause a refusal of the LUT.
+VERIFIED_DEG = 8.0
 
 # Largest standard uncertainty, degrees, of the prediction of a verified illuminant; red and blue are 85° apart.
-_HELD_SD_DEG = 10.0
+_VERIFIED_SD_DEG = 10.0
 
 _FEW = 24  # Up to this number of illuminants each is left out in turn; with more, the majority decides
 
@@ -46,7 +47,7 @@ _SUSPECTS = 8  # Number of illuminants tested for exchanges: those whose omissio
 
 # An exchange is accepted up to this misfit above the omission of one illuminant, which removes three values with a
 # mean of 1 each.
-_AS_GOOD = 9.0
+_MISFIT_MARGIN = 9.0
 
 # Relative scatter of a channel against the others: typical of healthy lamps, and largest accepted for this session.
 # Larger values mean a cut colour-wheel period or wrong names, which must be reported.
@@ -57,21 +58,22 @@ _BRIGHTNESS_SD, _UNTIED_SD = 0.03, 0.06
 
 # Largest misfit of few illuminants with correct names: constant, and per illuminant. 360 random healthy rooms were
 # below 6 + 1.7 per illuminant; with an exchange over 6° or more, all were above 12 + 3.3.
-_HEALTHY, _HEALTHY_EACH = 8.0, 2.5
+_MAX_MISFIT, _MAX_MISFIT_EACH = 8.0, 2.5
 
-# Largest squared distance of two whites from the prediction for their exchanged codes. Six dimensions have a mean of
-# 6, and exceed this once in ten million cases.
-_FITS = 50.0
+# Largest squared distance of two whites from the prediction for their exchanged codes. With six dimensions the mean
+# is 6, and 50 is exceeded once in 200 million cases.
+_MAX_DISTANCE2 = 50.0
 
-_FREE = 10.0  # Relative standard deviation of brightness that makes it irrelevant: only the direction counts
+# Relative standard deviation of brightness that makes it irrelevant: only the direction counts.
+_FREE_BRIGHTNESS_SD = 10.0
 
-# Largest squared distance of two predictions, in units of `EXCHANGED`, for evaluating their exchange. Both illuminants
-# would deviate, so an exchange gives twice this distance.
-_FAR = 3.0
+# Largest squared distance of two predictions, in units of `EXCHANGE_EVIDENCE`, for evaluating their exchange. Both
+# illuminants would deviate, so an exchange gives twice this distance.
+_NEAR_PAIRS = 3.0
 
 _BLOCK_PAIRS = 20_000  # Pairs evaluated at a time: about 100 MB
 
-_Whole = npt.NDArray[np.int64]
+_Integers = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -92,10 +94,10 @@ class CodeAgreement:
     error_deg: _Array  # (L,) largest standard uncertainty of the prediction over all directions
     off_deg: _Array  # (L,) angle beyond four standard uncertainties, or 0
     brightness: _Array  # (L,) relative difference of brightness from the prediction; −0.5 is half as bright
-    off_brightness: _Array  # (L,) its size beyond four standard uncertainties, ≥ 0
-    seen_as: _Whole  # (L,) illuminant whose codes predict a deviating white; −1: none
+    off_brightness: _Array  # (L,) amount of `brightness` beyond four standard uncertainties, ≥ 0
+    seen_as: _Integers  # (L,) illuminant whose codes predict a deviating white; −1: none
     exchanges: tuple[ExchangedLights, ...]  # most likely first
-    held: npt.NDArray[np.bool_]  # (L,) whether the white is verified by its codes (`HELD_DEG`)
+    is_verified: npt.NDArray[np.bool_]  # (L,) whether the white is verified by its codes (`VERIFIED_DEG`)
     exchange_deg: float  # largest angle between two illuminants with an undetected exchange; 0: none
     misfit: float  # of few illuminants, relative to healthy rooms; 0 with many
 
@@ -115,11 +117,11 @@ def code_agreement(
     codes : (L, 3) int64
         0 … 255; codes may repeat.
     white : (L, 3) float64
-        Counts on paper at equal exposure, without lamp drift and black light.
+        Counts on paper at equal exposure, without lamp drift and dark light.
     error : (L, 3) float64
         Standard uncertainties of `white`.
     dark_known, drift_known : bool
-        Whether black light and lamp drift were measured.
+        Whether dark light and lamp drift were measured.
     """
     # The matrices are small: threads of the linear algebra library would mostly wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
@@ -127,12 +129,12 @@ def code_agreement(
     count = len(white)
     mean, cov = fit.predicted(np.arange(count)[:, None])
     angle, deviation, error_deg = _directions(mean, cov, white)
-    off_deg = angle * np.maximum(1 - CERTAIN / np.maximum(deviation, 1e-9), 0)
+    off_deg = angle * np.maximum(1 - CERTAIN_SIGMAS / np.maximum(deviation, 1e-9), 0)
     brightness, off_brightness = _brightness(mean, cov, white)
     pairs, evidence, expected, angles = _pairs(fit, mean, cov, off_deg > 0)
-    is_held, is_undetected = error_deg < _HELD_SD_DEG, expected < EXCHANGED
-    is_held[pairs[is_undetected & (angles > HELD_DEG)].ravel()] = False
-    detected = np.flatnonzero(evidence > EXCHANGED)
+    is_verified, is_undetected = error_deg < _VERIFIED_SD_DEG, expected < EXCHANGE_EVIDENCE
+    is_verified[pairs[is_undetected & (angles > VERIFIED_DEG)].ravel()] = False
+    detected = np.flatnonzero(evidence > EXCHANGE_EVIDENCE)
     exchanges = [
         ExchangedLights(int(pairs[k, 0]), int(pairs[k, 1]), float(angles[k]), float(evidence[k]))
         for k in detected[np.argsort(-evidence[detected], kind="stable")].tolist()
@@ -141,7 +143,8 @@ def code_agreement(
         # Detected by complete refits, which are valid beyond the linearisation of this fit.
         first, second = swap
         k = int(np.flatnonzero((pairs == swap).all(axis=1))[0])
-        exchanges = [ExchangedLights(first, second, float(angles[k]), max(float(evidence[k]), EXCHANGED)), *exchanges]
+        swap_evidence = max(float(evidence[k]), EXCHANGE_EVIDENCE)
+        exchanges = [ExchangedLights(first, second, float(angles[k]), swap_evidence), *exchanges]
     return CodeAgreement(
         angle_deg=angle,
         error_deg=error_deg,
@@ -150,7 +153,7 @@ def code_agreement(
         off_brightness=off_brightness,
         seen_as=_seen_as(mean, cov, white, off_deg),
         exchanges=_without_repeated_lights(exchanges),
-        held=is_held,
+        is_verified=is_verified,
         exchange_deg=float(angles[is_undetected].max(initial=0.0)),
         misfit=misfit,
     )
@@ -181,7 +184,7 @@ def _fit_codes(
         return fitted, None, 0.0
     all_used = np.ones(count, dtype=np.bool_)
     fitted = fit(codes, _CHROMA_SD, all_used)
-    misfit = fitted.misfit / _healthy(count)
+    misfit = fitted.misfit / _max_misfit(count)
     if misfit < 1 or count < 2:
         return fitted, None, misfit
     used = all_used
@@ -190,10 +193,10 @@ def _fit_codes(
         fits = {light: fit(codes, _CHROMA_SD, remaining) for light, remaining in without.items()}
         ranked = sorted(fits, key=lambda light: fits[light].misfit)
         best = fits[ranked[0]]
-        is_healthy = best.misfit < _healthy(int(used.sum()) - 1)
+        is_healthy = best.misfit < _max_misfit(int(used.sum()) - 1)
         if used.all():
-            exchange, misfit_left = _healing_exchange(fit, codes, fitted.misfit, ranked[:_SUSPECTS])
-            if exchange is not None and misfit_left < best.misfit + _AS_GOOD:
+            exchange, misfit_left = _best_exchange(fit, codes, fitted.misfit, ranked[:_SUSPECTS])
+            if exchange is not None and misfit_left < best.misfit + _MISFIT_MARGIN:
                 remaining = ~np.isin(np.arange(count), exchange)
                 return fit(codes, _CHROMA_SD, remaining), exchange, misfit
         used, fitted = without[ranked[0]], best
@@ -202,33 +205,33 @@ def _fit_codes(
     return fitted, None, misfit
 
 
-def _healthy(lights: int) -> float:
+def _max_misfit(lights: int) -> float:
     # Measured on random healthy rooms with 2 to 20 illuminants.
-    return _HEALTHY + _HEALTHY_EACH * lights
+    return _MAX_MISFIT + _MAX_MISFIT_EACH * lights
 
 
-def _healing_exchange(
+def _best_exchange(
     fit: Callable[[npt.NDArray[np.integer], float, npt.NDArray[np.bool_] | None], ProjectorFit],
     codes: npt.NDArray[np.integer],
     misfit: float,
     suspects: Sequence[int],
 ) -> tuple[tuple[int, int] | None, float]:
     """Return the two suspects whose exchange makes all illuminants agree, or None, and the remaining misfit."""
-    best, exchange = _healthy(len(codes)), None
+    best, exchange = _max_misfit(len(codes)), None
     for first, second in combinations(sorted(suspects), 2):
         exchanged = codes.copy()
         exchanged[[first, second]] = codes[[second, first]]
         misfit_left = fit(exchanged, _CHROMA_SD, np.ones(len(codes), dtype=np.bool_)).misfit
-        if misfit_left < best and misfit - misfit_left > EXCHANGED / 2:
+        if misfit_left < best and misfit - misfit_left > EXCHANGE_EVIDENCE / 2:
             best, exchange = misfit_left, (first, second)
     return exchange, best
 
 
 def _directions(mean: _Array, cov: _Array, white: _Array) -> tuple[_Array, _Array, _Array]:
-    """Return the angle (L,) degrees of each white from its prediction, in σ, and the largest σ in degrees."""
+    """Return angles (L,) of the whites from their predictions: degrees, in units of σ, and the largest σ, degrees."""
     # Brightness is ignored: a flickering lamp is no wrong name.
     direction = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
-    along = np.asarray(_FREE**2 * (white**2).sum(axis=1), dtype=np.float64)
+    along = np.asarray(_FREE_BRIGHTNESS_SD**2 * (white**2).sum(axis=1), dtype=np.float64)
     free: _Array = cov + along[:, None, None] * direction[:, :, None] * direction[:, None]
     # Scale the prediction to the brightness of the white: the difference is then perpendicular to it, like an angle.
     level = np.maximum((white * direction).sum(axis=1, keepdims=True), 0)
@@ -247,23 +250,24 @@ def _brightness(mean: _Array, cov: _Array, white: _Array) -> tuple[_Array, _Arra
     direction = mean / predicted[:, None]
     excess = (white * direction).sum(axis=1) / predicted - 1
     error = np.sqrt(np.einsum("lc,lcd,ld->l", direction, cov, direction)) / predicted
-    return excess, np.maximum(np.abs(excess) - CERTAIN * error, 0)
+    return excess, np.maximum(np.abs(excess) - CERTAIN_SIGMAS * error, 0)
 
 
 def _pairs(
     fit: ProjectorFit, mean: _Array, cov: _Array, is_off: npt.NDArray[np.bool_]
-) -> tuple[_Whole, _Array, _Array, _Array]:
+) -> tuple[_Integers, _Array, _Array, _Array]:
     """Return pairs (P, 2) of illuminants, evidence (P,) for an exchange, expected evidence (P,), and angles (P,).
 
     `mean` (L, 3) and `cov` (L, 3, 3) are predictions. `is_off` (L,): illuminants that deviate from their codes.
     """
     pairs = np.stack(np.triu_indices(len(fit.white), 1), axis=-1)
     if len(fit.white) > _FEW:
-        # With many illuminants, only near pairs and pairs with a deviating illuminant: others would deviate strongly.
+        # With many illuminants, only near pairs and pairs with a deviating illuminant are evaluated: an exchange of
+        # other pairs would cause strong deviations.
         first, second = pairs.T
         difference = mean[first] - mean[second]
         distance2 = np.einsum("pa,pab,pb->p", difference, np.linalg.inv(cov[first] + cov[second]), difference)
-        pairs = pairs[(distance2 < _FAR * EXCHANGED) | is_off[first] | is_off[second]]
+        pairs = pairs[(distance2 < _NEAR_PAIRS * EXCHANGE_EVIDENCE) | is_off[first] | is_off[second]]
     blocks = [pairs[start : start + _BLOCK_PAIRS] for start in range(0, len(pairs), _BLOCK_PAIRS)]
     results = [_evaluate_pairs(fit, block) for block in blocks]
     empty = (np.zeros(0),) * 3
@@ -271,7 +275,7 @@ def _pairs(
     return pairs, evidence, expected, angles
 
 
-def _evaluate_pairs(fit: ProjectorFit, pairs: _Whole) -> tuple[_Array, _Array, _Array]:
+def _evaluate_pairs(fit: ProjectorFit, pairs: _Integers) -> tuple[_Array, _Array, _Array]:
     mean, cov = fit.predicted(pairs)
     inverse = np.linalg.inv(cov)
 
@@ -283,11 +287,11 @@ def _evaluate_pairs(fit: ProjectorFit, pairs: _Whole) -> tuple[_Array, _Array, _
     expected = distance2(np.concatenate([difference, -difference], axis=1))
     exchanged2 = distance2(exchanged)
     # Exchanged names must fit well, not only better.
-    evidence = np.where(exchanged2 < _FITS, distance2(named) - exchanged2, 0.0)
+    evidence = np.where(exchanged2 < _MAX_DISTANCE2, distance2(named) - exchanged2, 0.0)
     return evidence, expected, angles_deg(mean[:, :3], mean[:, 3:])
 
 
-def _seen_as(mean: _Array, cov: _Array, white: _Array, off_deg: _Array) -> _Whole:
+def _seen_as(mean: _Array, cov: _Array, white: _Array, off_deg: _Array) -> _Integers:
     """Return for each deviating illuminant the one (L,) whose codes predict its white, or −1."""
     seen_as = np.full(len(white), -1, dtype=np.int64)
     for light in np.flatnonzero(off_deg > 0).tolist():
@@ -295,7 +299,7 @@ def _seen_as(mean: _Array, cov: _Array, white: _Array, off_deg: _Array) -> _Whol
         angle, deviation, _ = _directions(mean, cov, own_white)
         deviation[light] = np.inf
         nearest = int(np.argmin(deviation))
-        if deviation[nearest] < CERTAIN and angle[nearest] < off_deg[light]:
+        if deviation[nearest] < CERTAIN_SIGMAS and angle[nearest] < off_deg[light]:
             seen_as[light] = nearest
     return seen_as
 

@@ -454,7 +454,7 @@ EXCHANGE_DEG = Figure(
 
 def _checked_text(table: TableMeasurements, accepted: float) -> str:
     codes = table.lights.codes
-    return "" if codes is None else f"{int(codes.held.sum())} of {len(codes.held)}"
+    return "" if codes is None else f"{int(codes.is_verified.sum())} of {len(codes.is_verified)}"
 
 
 def _checked_row(table: TableMeasurements) -> SummaryRow | None:
@@ -472,7 +472,8 @@ CROSS_CHECKED_SHARE = Figure(
     why="a wrong name of the others would not be detected",
     source="angle at which a wrong name is refused, beyond the prediction error of so few illuminants",
     remedy="take white, red, green and blue in the session, and expose longer", before_session=False,
-    measure=_code_value(lambda codes: float(codes.held.mean())), where=_checked_text, lines=(Line(230, _checked_row),),
+    measure=_code_value(lambda codes: float(codes.is_verified.mean())), where=_checked_text,
+    lines=(Line(230, _checked_row),),
 )  # fmt: skip
 
 _WhiteValues = Callable[["CodeAgreement"], "npt.NDArray[np.float64]"]

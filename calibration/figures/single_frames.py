@@ -1,4 +1,4 @@
-"""Limits of quantities that no LUT shows: the rig before a session, and single frames during it."""
+"""Limits for the laboratory before a session and for single frames during it; no LUT contains these quantities."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ EVENNESS: Final = Limit(
 )  # fmt: skip
 
 TURN: Final = Limit(
-    "turn", "Angle between the rows of the chart and of the picture", "geometry", "°", "at most", 5.0, None,
-    why="sampling windows are aligned with the picture's rows, and their corners approach the neighbouring patches",
-    source="geometry: 5 px of samples in a patch of 10 px", remedy="turn the camera until the rows are level",
+    "turn", "Angle between the rows of the chart and of the frame", "geometry", "°", "at most", 5.0, None,
+    why="sampling windows are aligned with the rows of the frame, and their corners approach the neighbouring patches",
+    source="geometry: 5 px of samples in a patch of 10 px", remedy="turn the camera until the rows are parallel",
 )  # fmt: skip
 
 KEYSTONE: Final = Limit(
     "keystone", "Ratio of two opposite sides of the chart, minus 1", "geometry", "share", "at most", 0.1, None,
     why="patches on the far side are smaller and out of focus", source=JUDGEMENT,
-    remedy="align the camera perpendicular to the centre of the print, at the same distance from all four corners",
+    remedy="align the camera perpendicular to the print, at the same distance from all four corners",
 )  # fmt: skip
 
 NOISE_REDUCTION: Final = Limit(
@@ -60,24 +60,25 @@ EMPTY_PHOTOSITES: Final = Limit(
 )  # fmt: skip
 
 REPEATED: Final = Limit(
-    "repeated", "Noise of the difference from earlier frames, relative to independent frames", "devices", "",
+    "repeated", "Noise that is independent of earlier frames, relative to all noise", "devices", "",
     "at least", 0.3, 0.3,
     why="the camera delivered an earlier frame again",
-    source="a correlation of 0.9; an identical frame gives 0, an independent one 1",
+    source="a correlation of 0.95; an identical frame gives 0, an independent one 1",
     remedy="check the camera's cable and memory card",
 )  # fmt: skip
 
 UNIFORMITY: Final = Limit(
     "uniformity", "Deviation of the worst tile from the whole frame's light", "light", "share", "at most", 0.02, 0.02,
     why="an object stands in front of the chart, or only part of the projected image shows the planned illuminant",
-    source="an LCD's uniformity changes by as much between codes; a wandering arc shifts the field by less",
+    source="the uniformity of an LCD changes by 2 % between codes; a moving arc changes the illumination field by less",
     remedy="look at the chart and at the projected image",
 )  # fmt: skip
 
 ROWS: Final = Limit(
     "rows", "Strips of rows with unexpected content", "devices", "", "at most", 3, 3,
-    why="the file was damaged during transfer, or an object covers part of the picture", source="a fly covers as many",
-    remedy="check the cable and the memory card, and look at the picture",
+    why="the file was damaged during transfer, or an object covers part of the frame",
+    source="an insect in front of the chart covers as many",
+    remedy="check the cable and the memory card, and look at the frame",
 )  # fmt: skip
 
 # Measured by the live judge only, in addition to the limits in LAB.toml.

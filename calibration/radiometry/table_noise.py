@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from calibration.sampling import PhotonTransfer
     from calibration.table.lut import Lut
 
-_LIGHTS: Final = 6  # illuminants to measure: 200 000 patches of a full LUT give each parameter to 1 %
+_LIGHTS: Final = 6  # illuminants to measure: their 200 000 patches in a full LUT determine each parameter to 1 %
 
 # Largest relative RMS difference of variances from the curve: 0.006 in simulated LUTs of two cameras, 0.1 in LUTs with
 # only eight patches per level.
@@ -26,8 +26,8 @@ _FEWEST: Final = 32  # minimum number of patches for a curve of three parameters
 def noise_curve(lut: Lut) -> PhotonTransfer | None:
     """Return the photon-transfer curve of the samples of a LUT; None if they have no noise at all.
 
-    Uses up to six illuminants, those with the brightest darkest channel. Samples of 0 are clipped, so their noise is
-    too small: patches with such samples are excluded, and unfit patches as well. `calibration.sampling` fits the curve.
+    Uses the six illuminants whose darkest channel is brightest. Samples of 0 are clipped, so their noise is too small:
+    patches with such samples are excluded, and unfit patches as well. `calibration.sampling` fits the curve.
 
     Raises
     ------
@@ -48,8 +48,8 @@ def noise_curve(lut: Lut) -> PhotonTransfer | None:
     cells = sum(map(len, means))
     if cells < _FEWEST:
         raise InputError(
-            f"the noise of {lut.folder} cannot be measured: {cells} patches have several samples above 0, minimum "
-            f"{_FEWEST}; omit --iso, --exposure and --gradient, or use another LUT"
+            f"the noise of {lut.folder} cannot be measured: {cells} patches have only samples above 0, at "
+            f"least {_FEWEST} expected; omit --iso, --exposure and --gradient, or use another LUT"
         )
     curve = photon_transfer(np.concatenate(means), np.concatenate(variances), count)
     has_noise = np.concatenate(variances).max() > 0

@@ -3,8 +3,8 @@
 - `Lens`: homography and Brown's distortion (D. C. Brown, "Close-range camera calibration", 1971).
 - `Displacement`: penalised tensor-product B-splines over the print (P. H. C. Eilers and B. D. Marx, "Flexible smoothing
   with B-splines and penalties", Statistical Science 1996). If measurements are few, the sheet is modelled by heights
-  over its plane. Heights move points along lines through the foot of the camera's perpendicular, so an edge that is
-  measured across alone determines both directions. The sheet hardly stretches within its plane.
+  over its plane. Heights move points along lines through the foot of the camera's perpendicular. So a measurement
+  across an edge also determines the displacement along it. The sheet hardly stretches within its plane.
 - `LateralColour`: red and blue lie a ρ + b ρ³ further out than green; ρ is 1 at the frame corner. The linear term is
   the chromatic difference of magnification, the cubic term the chromatic difference of distortion (W. T. Welford,
   "Aberrations of Optical Systems", 1986, ch. 10).
@@ -32,11 +32,11 @@ from foundation.errors import RegistrationError
 _PAIRS_FOR_ALL, _PAIRS_FOR_ONE = 48, 16
 
 # Assumed focal length in half diagonals of the frame. With real lenses of 1.5 to 0.8 diagonals, a tilt of 2° moves the
-# foot of the camera's perpendicular by 5 to 3 % of the diagonal; this assumption gives 3 to 5 %.
+# foot of the camera's perpendicular by 5 to 3 % of the diagonal; with the assumed focal length, by 4 %.
 _FOCAL_RADII = 2.2
 
 # Height of the finite difference in `parallax`, relative to the camera distance.
-_STEP = 1e-3
+_HEIGHT_STEP = 1e-3
 
 _ON_ONE_LINE = (
     "the detected marks of the chart lie on one line; marks spread over the sheet are expected. Bring the whole chart "
@@ -44,14 +44,14 @@ _ON_ONE_LINE = (
 )
 
 # Usual second difference of the displacement between knots, px: waves with an amplitude of 2 px and a period of 20
-# knots, or 0.2 px and 6 knots. Patches can measure shorter waves, too.
+# knots, or 0.2 px and 6 knots. Shorter waves are followed if patches show them.
 ROUGHNESS_PX = 0.2
 
 # Second difference for waves of 6 mm with a period of 150 mm. Rougher sheets are refused.
-MOST_ROUGHNESS_PX = 2.0
+MAX_ROUGHNESS_PX = 2.0
 
-# Usual displacement within the plane at half a field from its centre: lens distortion beyond Brown's model, or paper
-# expanded by humidity (judgement).
+# Usual displacement within the plane, between centre and edge of the print: lens distortion beyond Brown's model, or
+# paper expanded by humidity (judgement).
 _IN_PLANE_PX = 2.0
 
 # Added to the diagonal, px⁻²: makes the system solvable at knots without measurements; negligible at all others.
@@ -64,7 +64,7 @@ _Array = npt.NDArray[np.float64]
 
 # Prior standard deviation of each term at the frame corner; lenses have 0 to 1 px. It matters only if an illuminant
 # leaves a channel dark.
-_USUAL_PX = 2.0
+_PRIOR_PX = 2.0
 
 # Systematic standard uncertainty of each term: errors of the colour model are alike over the frame. Simulated frames
 # without aberration give 0.003 to 0.009 px at the corner, and 0.02 px under a dim illuminant.
@@ -75,8 +75,8 @@ _ROUNDS = 4
 
 _HUBER = 2.0  # Misfit, in standard deviations, above which the weight of a block decreases
 
-# Ratio of eigenvalues of an information matrix below which the smaller is rounding error, and taken for zero.
-_ONE_DIRECTION = 1e-9
+# Ratio of eigenvalues of an information matrix below which the smaller one is a rounding error, and set to zero.
+_MIN_EIGENVALUE_RATIO = 1e-9
 
 _MEDIAN_CHI2 = 3.357  # Median of χ² with 4 degrees of freedom: two colours, two directions
 
@@ -110,22 +110,22 @@ class Lens:
     def parallax(self, points_mm: npt.ArrayLike) -> _Array:
         """Return the apparent movement (N, 2) float64 of points (N, 2) mm per unit of height above the plane.
 
-        Its length is 1 at half the frame diagonal from the foot of the camera's perpendicular, and 0 at the foot:
-        plane and parallax (R. Hartley and A. Zisserman, "Multiple View Geometry", 2nd edition, section 13.3).
+        Its length is 1 at half the frame diagonal from the foot of the camera's perpendicular, and 0 at the foot.
+        Source: plane and parallax (R. Hartley and A. Zisserman, "Multiple View Geometry", 2nd edition, section 13.3).
         """
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
         x, y = self.centre_px
         to_camera = np.array([[1, 0, -x], [0, 1, -y], [0, 0, _FOCAL_RADII * self.radius_px]])
         plane = to_camera @ self.homography
         normal = np.cross(plane[:, 0], plane[:, 1])
-        # All points of the plane have the same distance from the camera along its normal.
-        step = _STEP * (normal @ plane[:, 2]) / (normal @ normal) * normal
+        # All points of the plane have the same distance from the camera along the normal of the plane.
+        step = _HEIGHT_STEP * (normal @ plane[:, 2]) / (normal @ normal) * normal
         plane_points = np.column_stack([points, np.ones(len(points))]) @ plane.T
         raised_px, lowered_px = (
             self._distort(_FOCAL_RADII * moved_points[:, :2] / moved_points[:, 2:])
             for moved_points in (plane_points + step, plane_points - step)
         )
-        return (lowered_px - raised_px) / (2 * _STEP * self.radius_px)
+        return (lowered_px - raised_px) / (2 * _HEIGHT_STEP * self.radius_px)
 
 
 def fit_lens(
@@ -135,7 +135,7 @@ def fit_lens(
 
     Parameters
     ----------
-    points_mm, places_px : (N, 2) float64
+    points_mm, positions_px : (N, 2) float64
         Pairs in mm and half-size px, N ≥ 8.
     frame_size : (int, int)
         Width and height in half-size px.
@@ -187,7 +187,7 @@ class Displacement:
     knot_mm: _Array  # (2,) distance of knots in x and y
     coefficients: _Array  # (rows, columns, 2) half-size px (dx, dy)
     lens: Lens | None = None  # maps heights to the frame; None: displacements without heights
-    # (rows, columns) movement by a height at the frame corner, half-size px; None without `lens`
+    # (rows, columns) heights, as their movement of a point at the frame corner, half-size px; None without `lens`
     heights: _Array | None = None
 
     @classmethod
@@ -202,7 +202,7 @@ class Displacement:
         return cls(low_mm, (high_mm - low_mm) / spans, np.zeros((*shape, 2)), lens, heights)
 
     def basis(self, points_mm: npt.ArrayLike) -> sparse.csr_array:
-        """Return the splines (N, K) float64 at points (N, 2) mm; outside, the cubic of the border continues."""
+        """Return the splines (N, K) float64 at points (N, 2) mm; outside, the border polynomial continues."""
         rows, columns = self.coefficients.shape[:2]
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
         knot_position = (points - self.origin_mm) / self.knot_mm
@@ -244,8 +244,8 @@ class Displacement:
 
     def errors_px(self, points_mm: _Array, information: _Array, at_mm: _Array) -> _Array:
         """Return the standard uncertainty (M,) float64, px, of the displacement at points `at_mm` (M, 2)."""
-        curved = self._curved.reshape(*self.coefficients.shape[:2], -1)
-        bends = [np.diff(curved, 2, axis=axis) for axis in (0, 1)]
+        penalised = self._penalised.reshape(*self.coefficients.shape[:2], -1)
+        bends = [np.diff(penalised, 2, axis=axis) for axis in (0, 1)]
         # Parts without measurements are taken to be as rough as the measured parts.
         roughness = max(ROUGHNESS_PX, *(float(np.sqrt((bend**2).mean())) for bend in bends))
         # Each draw is a fit to data and roughness with simulated scatter; the covariance is the inverse of the normal
@@ -260,20 +260,20 @@ class Displacement:
     def likely_roughness_px(self, points_mm: _Array, information: _Array, roughness_px: float) -> float:
         """Return the most likely second difference between knots, px, at least `ROUGHNESS_PX`.
 
-        The sum of squared bends over the number of determined bends is one step of a fixed-point iteration (D. J. C.
-        MacKay, "Bayesian interpolation", Neural Computation 1992).
+        The sum of squared bends, divided by the number of determined bends, is one step of a fixed-point iteration
+        (D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992).
         """
         bending = _differences(*self.coefficients.shape[:2])
-        curved = self._curved
-        drawn = self._drawn(points_mm, information, roughness_px)[-curved.size :]
-        groups = np.split(drawn, curved.shape[1])
+        penalised = self._penalised
+        drawn = self._drawn(points_mm, information, roughness_px)[-penalised.size :]
+        groups = np.split(drawn, penalised.shape[1])
         undetermined_px2 = sum(float((np.asarray(bending @ draws) ** 2).sum()) for draws in groups) / _DRAWS
-        fitted_px2 = float((np.asarray(bending @ curved) ** 2).sum())
-        determined = max(curved.shape[1] * bending.shape[0] - undetermined_px2 / roughness_px**2, 1.0)
-        return float(np.clip(np.sqrt(fitted_px2 / determined), ROUGHNESS_PX, MOST_ROUGHNESS_PX))
+        fitted_px2 = float((np.asarray(bending @ penalised) ** 2).sum())
+        determined = max(penalised.shape[1] * bending.shape[0] - undetermined_px2 / roughness_px**2, 1.0)
+        return float(np.clip(np.sqrt(fitted_px2 / determined), ROUGHNESS_PX, MAX_ROUGHNESS_PX))
 
     @property
-    def _curved(self) -> _Array:
+    def _penalised(self) -> _Array:
         """Coefficients with a roughness penalty: (K, 1) heights, or without a lens (K, 2) displacements, px."""
         return self.coefficients.reshape(-1, 2) if self.heights is None else self.heights.reshape(-1, 1)
 
@@ -333,7 +333,7 @@ def _cubic_weights(t: _Array) -> _Array:
     return np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3], axis=-1) / 6
 
 
-# All second differences on the grid: yy, xx, then √2 times xy. One registration needs them dozens of times, hence the
+# All second differences on the grid: xx, yy, then √2 times xy. One registration needs them dozens of times, hence the
 # cache; do not modify the result.
 @lru_cache(maxsize=4)
 def _differences(rows: int, columns: int) -> sparse.csr_array:
@@ -362,7 +362,7 @@ class LateralColour:
     def unmeasured(cls, frame_size: tuple[int, int]) -> LateralColour:
         """Return zero shifts with the prior uncertainty of a lens; `frame_size` is width and height."""
         size = np.array(frame_size, dtype=np.float64)
-        return cls((size - 1) / 2, float(np.hypot(*size)) / 2, np.zeros((2, 2)), np.eye(4) * _USUAL_PX**2)
+        return cls((size - 1) / 2, float(np.hypot(*size)) / 2, np.zeros((2, 2)), np.eye(4) * _PRIOR_PX**2)
 
     def shift_px(self, positions_px: _Array, channel: Channel) -> _Array:
         """Return the outward shift (N, 2) float64 px of a channel at positions (N, 2) px of green."""
@@ -394,7 +394,7 @@ class LateralColour:
         covariance of the displacement measured by red, green and blue; 0 without a measurement. `pull`: (3, B, 2)
         float64 px⁻¹, information times displacement from the present shifts.
         """
-        # Displacements common to all channels belong to the map: they are eliminated block by block.
+        # Displacements common to all channels are no lateral colour: they are eliminated block by block.
         total: _Array = information.sum(axis=0)
         # A shift between channels needs at least two of them.
         used = (np.trace(information, axis1=2, axis2=3) > 0).sum(axis=0) > 1
@@ -402,11 +402,11 @@ class LateralColour:
             return self
         positions, precisions, pulls = positions_px[used], information[:, used], pull[:, used]
         # Edge points are measured only across the edge: the matrix may be singular.
-        inverse = np.asarray(np.linalg.pinv(total[used], rcond=_ONE_DIRECTION, hermitian=True), dtype=np.float64)
+        inverse = np.asarray(np.linalg.pinv(total[used], rcond=_MIN_EIGENVALUE_RATIO, hermitian=True), dtype=np.float64)
         offset = (positions - self.centre_px) / self.radius_px
         design = np.stack([offset, offset * (offset**2).sum(axis=1, keepdims=True)], axis=-1)
         colours = [CHANNELS.index("R"), CHANNELS.index("B")]
-        # Information of red and blue after elimination of the map: a Schur complement.
+        # Information of red and blue after this elimination: a Schur complement.
         reduced = np.empty((len(positions), 2, 2, 2, 2))
         for i, row in enumerate(colours):
             for j, column in enumerate(colours):
@@ -424,7 +424,7 @@ class LateralColour:
         for _ in range(_ROUNDS):
             normal: _Array = np.einsum("n,nip,nabij,njq->apbq", weight, design, reduced, design).reshape(4, 4) / scale
             gradient: _Array = np.einsum("n,nip,nai->ap", weight, design, reduced_pull).ravel() / scale
-            prior = np.eye(4) / _USUAL_PX**2
+            prior = np.eye(4) / _PRIOR_PX**2
             covariance = np.linalg.inv(normal + prior)
             step = covariance @ (gradient - prior @ start)
             terms = start + step

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from calibration.registration.colours import ColourModel, displaced_areas, fit_colours
 from calibration.registration.geometry import (
-    MOST_ROUGHNESS_PX,
+    MAX_ROUGHNESS_PX,
     ROUGHNESS_PX,
     Displacement,
     LateralColour,
@@ -427,7 +427,7 @@ class Matcher:
             information = located.information(shift, self._cell * block, self.cell_px)
             total = self.displacement.at(centre) + shift
             self.displacement = self.displacement.fitted(
-                centre, information, np.einsum("nij,nj->ni", information, total), MOST_ROUGHNESS_PX
+                centre, information, np.einsum("nij,nj->ni", information, total), MAX_ROUGHNESS_PX
             )
             self.colours = self._fit_colours()
         if best_score < _LEAST_BLOCK_SCORE:

@@ -155,7 +155,7 @@ def _codes_json(codes: CodeAgreement) -> dict[str, Any]:
         "off_brightness": _rounded_values(codes.off_brightness),
         "seen_as": {str(light): int(codes.seen_as[light]) for light in np.flatnonzero(codes.seen_as >= 0).tolist()},
         "exchanges": [asdict(pair) for pair in codes.exchanges],
-        "held": int(codes.held.sum()),
+        "held": int(codes.is_verified.sum()),
         "exchange_deg": _rounded(codes.exchange_deg),
         "misfit": _rounded(codes.misfit),
     }

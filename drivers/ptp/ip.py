@@ -1,10 +1,10 @@
 """PTP over a network: transactions on one TCP connection, events on a second one.
 
-A packet is its length with header (32 bits), its type (32 bits), then the fields of the type. The initiator opens the
-command channel with `InitCommandRequest`; `InitCommandAck` returns a connection number. The initiator sends this number
-on the event channel in `InitEventRequest`; the reply is `InitEventAck`. `InitFail` may replace both replies.
-Transactions use the command channel; events, `Ping` and `Pong` the event channel. There is no thread: while it waits, a
-caller answers the pings of the device at least once a second.
+A packet has a header with its length, including the header, and its type (32 bits each), and the fields of the type.
+The initiator opens the command channel with `InitCommandRequest`; `InitCommandAck` returns a connection number. The
+initiator sends this number on the event channel in `InitEventRequest`; the reply is `InitEventAck`. `InitFail` may
+replace either reply. Transactions use the command channel; events, `Ping` and `Pong` use the event channel. There is no
+thread: a waiting call answers the pings of the device at least once a second.
 
 Source: CIPA DC-005-2005, PTP-IP, clauses 2.2 (connections) and 2.3 (packets).
 """
@@ -181,7 +181,7 @@ class OperationRequest(PtpDataset):
 
 @dataclass(frozen=True)
 class StartData(PtpDataset):
-    """Start of a data phase of `total` bytes; None if the sender does not know the length."""
+    """Start of a data phase of `total` bytes; None if the length is unknown."""
 
     transaction: U32
     total: Total
@@ -197,7 +197,7 @@ class Data(PtpDataset):
 
 @dataclass(frozen=True)
 class EndData(PtpDataset):
-    """The last bytes of a data phase; may be all or none of it."""
+    """The last bytes of a data phase; may be empty, or the whole data phase."""
 
     transaction: U32
     data: Rest = b""
@@ -260,7 +260,7 @@ def encode_data(transaction: int, data: bytes | memoryview, *, last: bool) -> by
 class PacketCutter:
     """Splits the stream of one channel into packets, for pieces of any size.
 
-    Data are passed on as `Data` at once, and only the last bytes of a packet as `EndData`; both mean the same. After a
+    Data bytes are returned at once as `Data`, and only the last bytes of an END_DATA packet as `EndData`. After a
     `ProtocolError` the position in the stream is lost, and every further `feed` raises too.
     """
 
@@ -386,7 +386,7 @@ class Channel:
         while not self._packets:
             piece = self._link.read(READ, timeout)
             if not piece:
-                raise LinkTimeout("no packet arrived in time")
+                raise LinkTimeout(f"no packet arrived within {timeout:g} s; check that the camera is on")
             self._packets.extend(self._cutter.feed(piece))
         return self._packets.popleft()
 
@@ -395,7 +395,7 @@ class Channel:
         self._link.close()
 
 
-MAX_EVENTS: Final = 4096  # Events kept for a caller who never reads them
+MAX_EVENTS: Final = 4096  # Events kept if the caller never reads them
 
 # Timeout of each connection and greeting, seconds; a camera wakes its network in a few seconds.
 CONNECT_S: Final = 10.0
@@ -419,8 +419,8 @@ _CANCEL_S: Final = 2.0  # Timeout for the end of a cancelled transaction, second
 class IpTransport(CableTransport):
     """A `drivers.ptp.protocol.Transport` over two links.
 
-    - `open_command`, `open_event` open them, again after `reset`. If the second raises `LinkClosed`, it is repeated for
-      2 s.
+    - `open_command`, `open_event` open the links, also after `reset`. If `open_event` raises `LinkClosed`, it is
+      repeated for 2 s.
     - `guid`: 16 bytes that identify this computer to a paired camera.
     - `name`: name of this computer on the camera's display.
     """
@@ -486,7 +486,7 @@ class IpTransport(CableTransport):
                 case Pong():
                     pass
                 case packet:
-                    raise ProtocolError(f"{self.label} sent {type(packet).__name__} during a transaction; reset it")
+                    raise ProtocolError(f"{self.label} sent {type(packet).__name__} instead of a response; reset it")
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events received since the last call, and answer pings; never waits."""
@@ -525,10 +525,12 @@ class IpTransport(CableTransport):
             wait = min(remaining, _PING_EVERY_S)
             try:
                 return self._command.next(wait)
-            except LinkTimeout:
+            except LinkTimeout as error:
                 remaining -= wait
                 if remaining <= 0:
-                    raise
+                    raise LinkTimeout(
+                        f"{self.label} has not answered within {timeout:g} s; check its network, or restart it"
+                    ) from error
                 self._read_event_channel()
 
     def _read_event_channel(self) -> None:

@@ -16,11 +16,11 @@ HELP = f"""Choose parameters of a method without ground truths, by the green sta
 
 Reads DATA in any layout of evaluate run: images of one camera under many illuminants. Illuminants differ much in red
 and blue chromaticity and little in green; the chosen parameters give estimates with the smallest spread in green
-(Banić, Lončarić 2018; reconstructed). FAMILY is {FAMILIES_HELP}. FAMILY@PIXELS reduces images to that size first:
-gray-edge-2@360.
+(Banić, Lončarić 2018; reconstructed from the publication). FAMILY is {FAMILIES_HELP}.
+FAMILY@PIXELS first reduces the longer side of images to this size, for example gray-edge-2@360.
 
 Ground truths do not influence the choice; --errors prints errors for comparison. Prints every setting, the chosen one
-first; evaluate run DATA --method SETTING evaluates one. Writes no files.
+first. To evaluate a setting, use evaluate run DATA --method SETTING. Writes no files.
 
 {EXIT_CODES}
 """
@@ -54,7 +54,7 @@ def tune(
     print(f"chosen: {best.text}, with the smallest spread of estimates in green chromaticity ({best.spread:.5f})")
     print(
         "ground truths: not used for the choice"
-        + (", printed for comparison" if errors else "")
+        + (", only for the printed errors" if errors else "")
         + "; to evaluate the setting on other images, use --method "
         + best.text
     )

@@ -1,8 +1,8 @@
-"""Files of a results folder for other programs, and files of estimates: `errors.csv`, `run.json`.
+"""Write and read files of a results folder (`errors.csv`, `run.json`), and read estimates of other programs.
 
 A line of `errors.csv` has the columns `image`, `method`, the estimate, the ground truth (`truth_r`, `truth_g`,
-`truth_b`), `recovery` and `reproduction` in degrees, `guessed`, and `group` if images are grouped. Columns are
-identified by name; additional columns are ignored.
+`truth_b`), `recovery` and `reproduction` in degrees, `guessed`, `cause`, and `group` if images are grouped. Columns
+are identified by name; additional columns are ignored.
 
 A file of estimates from another program has the columns `image,r,g,b` and one line for each image of the data set.
 Separators are commas, semicolons or tabs. The file extension of an image may be omitted.
@@ -43,7 +43,7 @@ class MethodErrors:
     - `method`: name of the method.
     - `images`: names of the N images, each once.
     - `truths`: (N, 3) float64, linear camera RGB of any length.
-    - `errors`: kind of error to (N,) float64, degrees.
+    - `errors`: (N,) float64, degrees, by kind of error.
     - `guessed`: (N,) bool, True if no pixel was usable and the estimate is therefore grey.
     - `groups`: for each image, the group of related images; None if a line has no group.
     """
@@ -67,8 +67,8 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
     missing = [name for name in ("image", "method", *_NUMBER_COLUMNS, "guessed") if name not in columns]
     if missing:
         raise FormatError(
-            f"{path} has the columns {', '.join(columns) or 'of an empty file'}, expected {', '.join(missing)} too, as "
-            "evaluate run writes them; run the methods again"
+            f"{path} has the columns {', '.join(columns) or '(none)'}, expected also {', '.join(missing)}; run "
+            "evaluate run again"
         )
     if len(set(columns)) < len(columns):
         raise FormatError(f"{path} has the columns {', '.join(columns)}, expected each once; remove the others")
@@ -76,7 +76,9 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
     for row in rows:
         line_name = f"{path}, line {rows.line_num}"
         if rows.restkey in row:
-            raise FormatError(f"{line_name} has more than {len(columns)} fields, expected one a column; correct it")
+            raise FormatError(
+                f"{line_name} has more than {len(columns)} fields, expected one for each column; correct it"
+            )
         numbers = [_finite_number(row[name], name, line_name) for name in _NUMBER_COLUMNS]
         if min(numbers) < 0 or not any(numbers[2:]):
             raise FormatError(
@@ -87,7 +89,7 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
             raise FormatError(f"{line_name}: guessed is {row['guessed']!r}, expected 0 or 1; correct it")
         images = lines_by_method.setdefault(row["method"] or "", {})
         if row["image"] in images:
-            raise FormatError(f"{line_name} has {row['method']} on {row['image']} again, expected once; remove it")
+            raise FormatError(f"{line_name} has {row['method']} on {row['image']} twice, expected once; delete one")
         images[row["image"]] = numbers, row["guessed"] == "1", row.get("group") or ""
     if not lines_by_method:
         raise FormatError(f"{path} has no errors, expected a line for each image and method; run the methods again")
@@ -133,18 +135,18 @@ def errors_csv(
 
     The columns are image, method, r, g, b, truth_r, truth_g, truth_b, recovery, reproduction, guessed, cause, and group
     if images are grouped. Illuminants have the sum 1; errors are degrees. `guessed` is 1 if the method returned no
-    illuminant and grey replaces it; `cause` is the reason.
+    illuminant, so that grey is recorded; `cause` is the reason.
 
-    `truths`: (N, 3) float64, camera RGB of any length. `groups`: group of each image; None if every image is its own.
+    `truths`: (N, 3) float64, camera RGB of any length. `groups`: group of each image; None if images are not grouped.
     """
-    shares = truths / truths.sum(axis=1, keepdims=True)
+    chromaticities = truths / truths.sum(axis=1, keepdims=True)
     estimated = [result.estimates / result.estimates.sum(axis=1, keepdims=True) for result in results]
     group_head = [] if groups is None else ["group"]
     head = ("image", "method", *_ESTIMATE_KEYS, *_TRUTH_KEYS, *_ERROR_KINDS, "guessed", "cause", *group_head)
     rows: list[tuple[object, ...]] = [head]
     for index, image in enumerate(images):
         for result, estimates in zip(results, estimated, strict=True):
-            numbers = (*estimates[index], *shares[index])
+            numbers = (*estimates[index], *chromaticities[index])
             errors = (result.errors[metric][index] for metric in _ERROR_KINDS)
             cause = (result.causes or {}).get(index, "")
             rows.append(
@@ -198,7 +200,7 @@ class GivenEstimates:
     name: str  # Name in the tables
     file: str  # Name of the file
     sha256: str  # Hash of its bytes
-    # Name of the image to its estimate (3,) float64 as in the file; values are not checked
+    # Estimate (3,) float64 of each image, by its name, as in the file; values are not checked
     lights: Mapping[str, npt.NDArray[np.float64]]
 
     def estimate_scene(self, scene: Scene) -> npt.NDArray[np.float64]:

@@ -25,14 +25,14 @@ from drivers.projector import Power
 from foundation.clock import Clock
 from foundation.errors import DeviceError, InputError
 
-# Interval of screenshots during an exposure, s. About one frame period, so that a window that matters is seen.
+# Interval of screenshots during an exposure, s. About one frame period, so that no relevant window is missed.
 SAMPLE_S: Final = 0.02
 
 POLL_S: Final = 0.1  # Interval of queries of the projector, s.
 
 FINEST_PX: Final = 480  # Maximum width of an averaged picture, px: 2.6 mm on an A0 chart, less than a patch.
 
-# Relative light of a lamp during warm-up. Its control port does not report the progress (chosen).
+# Relative light of a lamp during warm-up, a chosen value: the control port does not report the progress.
 WARMING_SHARE: Final = 0.5
 
 _INSTANT_S: Final = 1e-4  # Shorter times than this, s, are treated as 0: clocks count in microseconds.
@@ -96,10 +96,10 @@ class LampState:
     share: float  # Relative light output
     frozen: bool = False  # Whether the picture is frozen
     source: str | None = None  # Input; None if not reported
-    trouble: str = ""  # Reason why it did not answer, and so gives no light; empty if it answered
+    trouble: str = ""  # Reason why the projector did not answer; its light is then 0. Empty if it answered
 
 
-def ask(projector: PjLinkProjector) -> LampState:
+def lamp_state(projector: PjLinkProjector) -> LampState:
     """Return the state of a projector; without an answer, its light is 0."""
     try:
         power = projector.power()
@@ -119,7 +119,7 @@ def ask(projector: PjLinkProjector) -> LampState:
 
 
 @dataclass(frozen=True, eq=False)
-class ThrownLight:
+class ProjectedLight:
     """Light on the chart during an exposure."""
 
     picture: NDArray[np.float32]  # (h, w, 3) float32, mean light of each primary, 0 to 1; (1, 1, 3) if always uniform
@@ -156,7 +156,7 @@ class Beam:
         self._screen_input: str | None = None
         self._frozen_picture: NDArray[np.float32] | None = None
         self._last_picture: NDArray[np.float32] = _BLACK
-        self._thread = threading.Thread(target=self._poll, name="asking the projector", daemon=True)
+        self._thread = threading.Thread(target=self._poll, name="projector queries", daemon=True)
 
     def __enter__(self) -> Beam:
         if self._projector is not None:
@@ -179,14 +179,14 @@ class Beam:
         with self._lock:
             return self._state.trouble
 
-    def gather(self, seconds: float, halfway: Callable[[], None] = lambda: None) -> ThrownLight:
+    def measure_exposure(self, seconds: float, halfway: Callable[[], None] = lambda: None) -> ProjectedLight:
         """Wait for the exposure time, and return the light on the chart during it; call `halfway` in the middle."""
         at = self._clock.monotonic()
         ends, half = at + seconds, at + seconds / 2
         total: NDArray[np.float64] = np.zeros((1, 1, 3))
         lit = 0.0
         while ends - at > _INSTANT_S:
-            share, picture = self._thrown()
+            share, picture = self._current_light()
             self._clock.sleep(min(SAMPLE_S, max(ends - self._clock.monotonic(), 0.0)))
             # A picture represents the time until the next one.
             end = min(self._clock.monotonic(), ends)
@@ -195,20 +195,20 @@ class Beam:
             if at < half <= end:
                 halfway()
             at = end
-        # Without light, there is no picture.
+        # Without light the mean is undefined; the picture is then black.
         mean = total / lit if lit else total
-        return ThrownLight(mean.astype(np.float32), lit / seconds)
+        return ProjectedLight(mean.astype(np.float32), lit / seconds)
 
-    def _thrown(self) -> tuple[float, NDArray[np.float32]]:
+    def _current_light(self) -> tuple[float, NDArray[np.float32]]:
         with self._lock:
             state = self._state
             if self._frozen_picture is not None:
                 return state.share, self._frozen_picture
             if state.source is not None and self._screen_input is not None and state.source != self._screen_input:
                 return state.share, _BLACK
-            return state.share, self._look()
+            return state.share, self._read_screen()
 
-    def _look(self) -> NDArray[np.float32]:
+    def _read_screen(self) -> NDArray[np.float32]:
         try:
             self._last_picture = picture_light(self._pictures.take(), self._light)
         except DeviceError:
@@ -221,17 +221,17 @@ class Beam:
             self._poll_once(self._projector)
 
     def _poll_once(self, projector: PjLinkProjector) -> None:
-        state = ask(projector)
+        state = lamp_state(projector)
         with self._lock:
             self._state = state
             if self._screen_input is None:
-                # The screen is assumed at the input that is selected when the lamp is first seen on.
+                # The screen is assumed at the input that is selected when the lamp is on for the first time.
                 self._screen_input = state.source
             if state.frozen:
                 self._frozen_picture = self._last_picture if self._frozen_picture is None else self._frozen_picture
             else:
                 self._frozen_picture = None
-                self._look()
+                self._read_screen()
 
 
 _BLACK: Final[NDArray[np.float32]] = np.zeros((1, 1, 3), dtype=np.float32)

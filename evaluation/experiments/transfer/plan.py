@@ -1,6 +1,6 @@
 """Plan a transfer: open and compare data sets, and select the images that may be used for training.
 
-A method must not have seen a test image or its scene. Images are compared by their sources:
+A method must not be trained on a test image or on its scene. Images are compared by their sources:
 
 - two generated sets: by the hash of the source picture;
 - a generated and a real set: by name, because a generated image of a test photograph shows the same scene;
@@ -9,10 +9,10 @@ A method must not have seen a test image or its scene. Images are compared by th
 Names are compared without folder and extension; upper and lower case are equal.
 
 The naive baseline is a counterpart of each generated image: the same picture under the same illuminant, equally bright
-and equally quantised, but without print, camera and noise. Its codes become linear light by the sRGB curve, optionally
-camera RGB by a colour matrix, and each channel is multiplied by the illuminant. The advantage of training on generated
-images over training on their counterparts is the benefit of the look-up table (LUT). Masks of several illuminants are
-those of the generated image. `generate --exposure` and `--iso` are not applied to counterparts.
+and equally quantised, but without print, camera and noise. Its codes are converted to linear light by the sRGB curve,
+and optionally to camera RGB by a colour matrix. Each channel is multiplied by the illuminant. The advantage of training
+on generated images over training on their counterparts is the benefit of the look-up table (LUT). Masks of several
+illuminants are taken from the generated image. `generate --exposure` and `--iso` are not applied to counterparts.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from generator.rendering.matrices import ColourMatrix, camera_matrix
 
 @dataclass(frozen=True)
 class SharedImage:
-    """A training image that shows the same as a test image."""
+    """A training image with the same picture or scene as a test image."""
 
     position: int  # Index in the training set, from 0
-    name: str  # Its name, or that of its source picture
+    name: str  # Name of the training image, or of its source picture
     test: str  # Name of the test image, or of its source picture
     by: str  # Identified by "name" or by "content"
 
@@ -79,7 +79,7 @@ def trainable_images(
 ) -> tuple[tuple[Scene, ...], str]:
     """Return the images of a set that may be used for training, and a note on images shared with the test ("" if none).
 
-    `leave_out`: excludes images that show a picture of the test; otherwise copies of test images are refused.
+    `leave_out`: True excludes shared images; False keeps them, but refuses copies of test images.
     """
     common = shared_images(training, test)
     if not common:
@@ -131,7 +131,7 @@ class FoundPicture:
     preparation: Preparation
 
     def codes(self, crop: int = 0) -> npt.NDArray[np.uint8]:
-        """Return the sRGB codes (H, W, 3) uint8 from which images of the data set, or one of its crops, were made."""
+        """Return the sRGB codes (H, W, 3) uint8 of the prepared picture, or of its crop number `crop`."""
         if self.path is None:
             number = int(self.name.rpartition("-")[2])
             return RandomScene(number, self.width, self.height, self.preparation.seed).read().picture
@@ -148,8 +148,8 @@ class FoundPicture:
 def find_source_pictures(dataset: Dataset, folder: Path | str) -> tuple[Mapping[str, FoundPicture], tuple[str, ...]]:
     """Return the source pictures of a data set in a folder, by name, and the names of missing ones.
 
-    A file is the right one if its hash is the recorded one; the file with the recorded name is tried first. Pictures of
-    random colours need no file.
+    A file is identified by the recorded hash; the file with the recorded name is tried first. Pictures of random
+    colours need no file.
     """
     preparation = preparation_of(dataset.description)
     if "://" in str(folder):
@@ -163,7 +163,9 @@ def find_source_pictures(dataset: Dataset, folder: Path | str) -> tuple[Mapping[
             return file_sha256(files[name])
         except OSError as error:
             reason = os.strerror(error.errno or 0)
-            raise InputError(f"cannot read {files[name]}: {reason}; name another folder") from error
+            raise InputError(
+                f"cannot read {files[name]}: {reason}, a readable file expected; change its permissions, or use a copy"
+            ) from error
 
     @cache
     def by_hash() -> Mapping[str, Path]:
@@ -300,7 +302,7 @@ class RelitScene:
 
     scene: Scene
     truth: npt.NDArray[np.float64]  # (3,) float64, ground truth of the generated image, linear camera RGB
-    name: str  # Its own name, because a scene may be used several times
+    name: str  # Name of the relit image; a scene may be used several times
     saturation: None = None  # None; clipped pixels are masked, because channels are scaled differently
 
     def read(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_] | None]:
@@ -328,7 +330,7 @@ def relit_scenes(scenes: Sequence[Scene], lights: Sequence[npt.NDArray[np.float6
 class TransferPlan:
     """Training sets of a transfer, and the notes on their preparation."""
 
-    # Each set and, if it was generated and pictures are given, its naive counterparts, without excluded images
+    # Without excluded images; each generated set is followed by its naive and relit counterparts, if requested
     training: tuple[TrainingSet, ...]
     sets: tuple[SceneSet, ...]  # The data sets as opened
     notes: tuple[str, ...]  # Excluded images, colour matrices and cautions, as sentences
@@ -362,7 +364,7 @@ def plan_transfer(
         generated = tuple(scene for scene in scenes if isinstance(scene, GeneratedScene))
         if not generated:
             training.append(TrainingSet(scene_set.name, "other", scenes))
-            notes.append(f"{scene_set.name} was not made by generate: its rows are no results of generated images")
+            notes.append(f"{scene_set.name} was not made by generate: its rows are not results of generated images")
         elif pictures is None:
             training.append(TrainingSet(scene_set.name, "generated", generated))
         else:
@@ -392,7 +394,10 @@ def _trainable(scene_set: SceneSet, test: SceneSet, notes: list[str]) -> tuple[S
         held_out_ids = {id(scene) for scene in held_out}
         trainable = tuple(scene for scene in trainable if id(scene) not in held_out_ids)
     if not trainable:
-        raise InputError(f"0 images of {scene_set.name} are outside its test parts and the test set; use another set")
+        raise InputError(
+            f"{scene_set.name} has 0 images outside its test parts and the test set, at least 1 "
+            "expected; use another set"
+        )
     return trainable
 
 
@@ -406,7 +411,7 @@ def _with_naive(name: str, images: Sequence[GeneratedScene], folder: Path | str,
     with_picture = tuple(scene for scene in images if scene.entry.source in found_pictures)
     if not with_picture:
         raise InputError(
-            f"0 of {len(missing)} pictures of {name} are in {folder}, by name and hash (missing: "
+            f"0 of {len(missing)} pictures of {name} are in {folder}, by hash (missing: "
             f"{first_few(missing, 3)}), expected the folder that the data set was made from; use that folder"
         )
     if missing:
@@ -421,7 +426,7 @@ def _with_naive(name: str, images: Sequence[GeneratedScene], folder: Path | str,
     camera = dataset.description.table.camera
     matrix = camera_matrix(camera)
     if matrix is None:
-        notes.append(f"{name}: no colour matrix of {camera} is available, so there is no row with a matrix")
+        notes.append(f"{name}: no colour matrix of {camera} is available, so the rows with a matrix are omitted")
         return sets
     rows = "; ".join(" ".join(f"{value:.3f}" for value in row) for row in matrix.rows)
     notes.append(f"{name}: colour matrix of {matrix.name}, {matrix.source}, rows of sum 1: {rows}")

@@ -151,14 +151,14 @@ def test_reports_one_wrong_illuminant_of_eight() -> None:
 def test_single_illuminant_is_not_verified() -> None:
     result = agreement([(255, 120, 60)], *random_session([(255, 120, 60)], 1))
     assert not result.off_deg.any()
-    assert not result.held.any()
+    assert not result.is_verified.any()
 
 
 @pytest.mark.parametrize("room", ROOMS.values(), ids=ROOMS)
 def test_predicts_whites_of_healthy_rooms(room: Room) -> None:
     result = agreement_of_plan(room_whites(room))
     assert result.off_deg.max() < LIMIT.accept / 8
-    assert result.held.all()
+    assert result.is_verified.all()
     assert result.exchange_deg < 2
 
 
@@ -206,7 +206,7 @@ def test_does_not_judge_uncertain_whites() -> None:
     white = room_whites(Room(), noise=0.05)
     assert agreement_of_plan(white, error=0.05).off_deg.max() < LIMIT.accept
     # Such illuminants are not verified either.
-    assert agreement_of_plan(white, error=0.3).held.mean() < 0.5
+    assert agreement_of_plan(white, error=0.3).is_verified.mean() < 0.5
 
 
 def test_detects_half_brightness() -> None:

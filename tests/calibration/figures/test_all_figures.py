@@ -126,7 +126,7 @@ def codes(**more: object) -> Any:
         "off_brightness": np.array([0.2, 0.0, 0.4]),
         "brightness": np.array([0.25, 0.01, -0.5]),
         "exchanges": (),
-        "held": np.array([True, True, False]),
+        "is_verified": np.array([True, True, False]),
         "exchange_deg": 1.5,
         "misfit": 0.75,
     }

@@ -1152,7 +1152,7 @@ def test_a_session_with_nothing_wrong_has_no_remark(small_lab: Lab, tmp_path: Pa
     assert remarks(result) == set()
     codes = result.figures.lights.codes
     assert codes is not None
-    assert codes.held.all()
+    assert codes.is_verified.all()
     assert codes.exchange_deg < 1
     assert codes.off_deg.max() == 0
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.registration.geometry import (
-    MOST_ROUGHNESS_PX,
+    MAX_ROUGHNESS_PX,
     ROUGHNESS_PX,
     Displacement,
     LateralColour,
@@ -178,7 +178,7 @@ def test_estimates_roughness_from_outline() -> None:
     # Second differences of a sine with 6 knots are (2 sin(π/6))² = 1 times its amplitude, RMS 1/√2.
     assert fitted_roughness(2.0) == pytest.approx(np.sqrt(2), rel=0.6)
     assert fitted_roughness(0.02) == ROUGHNESS_PX
-    assert fitted_roughness(50.0) == MOST_ROUGHNESS_PX
+    assert fitted_roughness(50.0) == MAX_ROUGHNESS_PX
 
 
 SIZE = (400, 300)

@@ -39,7 +39,7 @@ def test_reads_columns_by_name(tmp_path: Path) -> None:
         ("a,Mine,1,1,1,1,1,1,-1,2,0", "line 2: a has .*no value below 0"),
         ("a,Mine,1,1,1,0,0,0,1,2,0", "line 2: a has"),
         ("a,Mine,1,1,1,1,1,1,1,2,maybe", "guessed is 'maybe'"),
-        ("a,Mine,1,1,1,1,1,1,1,2,0\na,Mine,1,1,1,1,1,1,1,2,0", "line 3 has Mine on a again"),
+        ("a,Mine,1,1,1,1,1,1,1,2,0\na,Mine,1,1,1,1,1,1,1,2,0", "line 3 has Mine on a twice"),
         ("", "has no errors"),
     ],
 )

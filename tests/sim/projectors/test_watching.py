@@ -26,7 +26,7 @@ from sim.projectors.watching import (
     LampState,
     ScreenPlace,
     Screenshots,
-    ask,
+    lamp_state,
     picture_light,
 )
 from sim.world.world import Room
@@ -63,7 +63,7 @@ def plain(code: int) -> NDArray[np.uint32]:
 def thrown(pixels: Callable[[float], NDArray[np.uint32]], seconds: float = 0.5) -> tuple[NDArray[np.float32], float]:
     clock = SimulatedClock()
     with Beam(Shown(clock, pixels), None, light_of, clock) as beam:
-        light = beam.gather(seconds)
+        light = beam.measure_exposure(seconds)
     return light.picture, light.lamp
 
 
@@ -90,7 +90,7 @@ def test_averages_light_not_codes() -> None:
     clock = SimulatedClock()
     screen = Shown(clock, lambda at: plain(WHITE if at < 0.5 else 0))
     with Beam(screen, None, Room().light_of, clock) as beam:
-        picture = beam.gather(1.0).picture
+        picture = beam.measure_exposure(1.0).picture
     np.testing.assert_allclose(picture, 0.5, atol=SAMPLE_S)
 
 
@@ -99,7 +99,7 @@ def test_ends_in_time_and_reports_the_middle_once() -> None:
     screen = Shown(clock, lambda at: plain(WHITE))
     halves: list[float] = []
     with Beam(screen, None, light_of, clock) as beam:
-        beam.gather(0.5, lambda: halves.append(clock.monotonic()))
+        beam.measure_exposure(0.5, lambda: halves.append(clock.monotonic()))
     assert clock.monotonic() == pytest.approx(0.5)
     assert halves == [pytest.approx(0.25, abs=SAMPLE_S)]
     assert screen.looks[-1] == -1.0, "the screen is released"
@@ -190,7 +190,7 @@ class Answers(PjLinkProjector):
     ],
 )
 def test_light_follows_the_reported_state(answers: Answers, state: LampState) -> None:
-    assert ask(answers) == state
+    assert lamp_state(answers) == state
 
 
 @pytest.mark.parametrize("pjlink_class", [1, 2])
@@ -198,11 +198,11 @@ def test_queries_projectors_of_both_classes(pjlink_class: int) -> None:
     device = SimulatedProjector(SimulatedClock(), Power.ON, ProjectorTraits(pjlink_class=pjlink_class))
     peer = PjLinkPeer(device)
     projector = PjLinkProjector(lambda: PeerLink(peer))
-    assert ask(projector) == LampState(1.0, False, "31")
+    assert lamp_state(projector) == LampState(1.0, False, "31")
     device.set_frozen(True)
-    assert ask(projector).frozen == (pjlink_class == 2)
+    assert lamp_state(projector).frozen == (pjlink_class == 2)
     device.set_muted(True)
-    assert ask(projector).share == 0
+    assert lamp_state(projector).share == 0
 
 
 @pytest.mark.slow
@@ -213,7 +213,7 @@ def test_frozen_picture_stays_and_other_input_is_black() -> None:
 
         def seen() -> list[float]:
             answers.await_questions()
-            return beam.gather(0.1).picture[0, 0].tolist()
+            return beam.measure_exposure(0.1).picture[0, 0].tolist()
 
         assert seen() == [1.0, 0.0, 0.0]
         answers.is_frozen = True
