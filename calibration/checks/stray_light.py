@@ -21,8 +21,8 @@ import numpy.typing as npt
 CERTAIN = 4.0  # Standard uncertainties subtracted from each amount, so that noise does not appear as light
 
 # Tolerance for mixtures of two primaries, relative to the white boost (judgement). A projector that boosts white also
-# boosts mixtures. It adds mostly light of the two primaries, but a part may appear as the third. Faults in the frames of
-# primaries also look like a boost; with this factor they make the check less sensitive, but cannot disable it.
+# boosts mixtures. It adds mostly light of the two primaries, but a part may appear as the third. Faulty primary frames
+# also look like a boost; with this factor they make the check less sensitive, but cannot disable it.
 BOOST_ELSEWHERE = 0.25
 
 # Largest amount that is reported as room light (judgement). A larger amount means a wrong illuminant or exposure, which

@@ -51,7 +51,7 @@ class Check:
 
     @property
     def is_beyond(self) -> bool:
-        """Whether the value is outside its limits. The check may have passed, if the change is allowed for this frame."""
+        """Whether the value is outside its limits. The check may pass all the same, if the change is allowed."""
         if self.value is None:
             return False
         return (self.low is not None and self.value < self.low) or (self.high is not None and self.value > self.high)
