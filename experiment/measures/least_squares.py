@@ -16,7 +16,7 @@ import numpy.typing as npt
 from foundation.compiled import compiled
 from foundation.robust import MAD_TO_SIGMA
 
-# Highest order of flat fields. Only this basis is cached, because a basis of lower order is the beginning of it.
+# Highest order of flat fields. All orders up to it share one cached basis, because lower ones are its beginning.
 _CACHED_ORDER: Final = 8
 
 

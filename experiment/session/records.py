@@ -37,7 +37,7 @@ RECENT = 50
 class Check:
     """One check of a frame."""
 
-    name: str  # "movement", "file", "screen" …; a figure of the look-up table (LUT) has the same name
+    name: str  # name of the corresponding figure of the look-up table (LUT); without one, "movement", "file" …
     value: float | None = None  # result in `unit`; None if it is not a number
     low: float | None = None  # lower limit of `value`; None without limit
     high: float | None = None  # upper limit of `value`; None without limit
@@ -112,7 +112,7 @@ class HandlesPauses(Protocol):
     def after_pause(self) -> None:
         """Prepare for the first frames after a pause for a lasting cause, which link the run to its earlier frames.
 
-        It is called after all earlier frames are judged, and before the next frame is taken.
+        It is called after all earlier frames are judged, and before the next frame is judged.
         """
         ...
 
