@@ -608,7 +608,9 @@ def outcome_of(
     says = tuple(remark(row, result.figures) for row in verdict.remarks)
     truth = compare(result, open_lut(folder), world, chart, session, changes, every)
     names = tuple(row.figure.name for row in verdict.remarks)
-    return Outcome(verdict.outcome, names, says, truth, result.figures.lens.left if LENS_LEFT in names else 0.0)
+    return Outcome(
+        verdict.outcome, names, says, truth, result.figures.lens.remaining_rms if LENS_LEFT in names else 0.0
+    )
 
 
 def try_case(case: NamedCase, *, small: bool, seed: int = 1, body: str = "EOS 550D") -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Compiled inner loops of calibration: light spread by the lens, comparison with neighbours, moments.
 
-Sums must not be reordered, so that a LUT has the same bytes on every processor. Only the compiler is imported, because
-any other change of imports would recompile all kernels.
+Sums must not be reordered, so that a LUT has the same bytes on every processor. The module imports nothing of CroP
+except the compiler, because a change in any imported module would recompile all kernels.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ _Count = npt.NDArray[np.uint16]
 _Index = npt.NDArray[np.int64]
 _Slot = npt.NDArray[np.int32]
 
-PARTS = 5  # Parts along a slot; a tag's module has two, so that every printed edge is between two parts
+PARTS = 5  # Parts along a slot; a module of a tag is two parts long, so that no printed edge is inside of a part
 
-# Slots on each side of a patch that are evaluated individually, at least 25 px: light from further away does not depend
-# on the sampling position within the slot.
+# Number of slots on each side of a patch with weights of their own. They cover at least 25 px; light from further away
+# does not depend on the sampling position within the slot.
 REACH = 2
 
 ACROSS = 2 * REACH + 1  # Slots along the neighbourhood of a patch
@@ -30,10 +30,11 @@ ACROSS = 2 * REACH + 1  # Slots along the neighbourhood of a patch
 
 @compiled
 def window_shares(scale: float, pitches: _Array, offsets: _Array, window: int, shares: _Array) -> None:
-    """Fill `shares` (pitches, offsets, 25): fractions of a kernel's light in a window from each part of five slots.
+    """Fill `shares` (pitches, offsets, 25) with the fractions of a window's light from each part of five slots.
 
-    One axis, Gaussian of σ `scale` px, mean over `window` pixels centred `offsets` px from the central slot's centre.
-    Slots are `pitches` px long. Light from further away is added to the outermost parts.
+    The kernel is a Gaussian of σ `scale` px along one axis. The window has `window` pixels, and its centre is `offsets`
+    px from the centre of the central slot. Slots are `pitches` px long. Light from further away is added to the
+    outermost parts.
     """
     parts = shares.shape[2]
     root = scale * math.sqrt(2.0)
@@ -72,13 +73,13 @@ def weights_around(
     row: _Index, column: _Index, neighbours: _Slot, parts: _Slot, offset: _Array, pitch: _Array, shares: _Array,
     grid: _Array, amount: _Array, weights: _Float, background: _Float,
 ) -> None:  # fmt: skip
-    """Fill `weights` (N, 25, 3) and `background` (N, 3 kinds, 3) with the light from the slots around patches.
+    """Fill `weights` (N, 25, 3) and `background` (N, 3 kinds, 3) with the fractions of light from the slots around.
 
-    `row`, `column`, `neighbours`, `parts`: (N,), (N,) int64, (N, 25) and (5 R, 5 K) int32, as in `PrintedGrid`.
+    `row`, `column`, `neighbours`, `parts`: (N,), (N,) int64, (N, 25) and (5 R, 5 C) int32, as in `PrintedGrid`.
     `offset`: (N, 3, 2) px along the print's axes, from the patch centre to the window centre of each channel. `pitch`:
-    (N, 2) px, width and height of a slot at each patch. `shares`: (K, pitches, offsets, 25) from `window_shares`.
-    `grid`: (4,) first pitch, its step, first offset, its step. `amount`: (N, 3, K), amount of each kernel by channel
-    and patch.
+    (N, 2) px, width and height of a slot at each patch. `shares`: of K kernels, (K, pitches, offsets, 25), by
+    `window_shares`.
+    `grid`: (4,) first pitch and step, first offset and step. `amount`: (N, 3, K), amount of each kernel.
     """
     kernels, patch_count = shares.shape[0], len(row)
     x, y = np.empty(ACROSS * PARTS), np.empty(ACROSS * PARTS)
@@ -120,7 +121,7 @@ def light_around(
     background behind the print, has its own light.
     """
     for n in range(len(neighbours)):
-        # Interleaved channels, because each is a chain of sums.
+        # The three channels together: each sum waits for its previous addition, so one alone would be slower.
         red, green, blue = 0.0, 0.0, 0.0
         for slot in range(neighbours.shape[1]):
             source = neighbours[n, slot]
@@ -139,14 +140,14 @@ def light_around(
 
 @compiled
 def blur_rows(image: _Float, taps: _Float, out: _Float) -> None:
-    """Fill `out` (R, N) with a finite `image` (R, N) blurred down its rows by odd `taps`; borders are repeated."""
+    """Fill `out` (R, N) with a finite `image` (R, N) blurred along axis 0; `taps`: odd number; edges are repeated."""
     rows, reach = image.shape[0], len(taps) // 2
     padded = np.zeros(len(taps) + 3, dtype=np.float32)
     padded[: len(taps)] = taps
     for row in range(rows):
         out[row] = 0
         sums = out[row]
-        # Four rows at once, added in their order, to load and store each sum less often.
+        # Four rows at once, added in their order, so that each sum is loaded and stored less often.
         for tap in range(0, len(taps), 4):
             first = row + tap - reach
             row1, row2 = image[min(max(first, 0), rows - 1)], image[min(max(first + 1, 0), rows - 1)]
@@ -158,7 +159,7 @@ def blur_rows(image: _Float, taps: _Float, out: _Float) -> None:
 
 @compiled
 def print_slots(shares: _Float, light: _Array, inks: _Array, image: _Float) -> None:
-    """Fill `image` (N, 3) with slots whose `shares` (N, 3 kinds) show `inks` (3 kinds, 3) in the local `light` (N, 3).
+    """Fill `image` (N, 3) with slots: `shares` (N, 3 kinds) of `inks` (3 kinds, 3) in the local `light` (N, 3).
 
     The last kind, the background behind the print, has its own light.
     """
@@ -222,7 +223,7 @@ def clipped_to_neighbours(values: _Array, around: _Index, out: _Array) -> None:
             value = values[neighbour]
             is_known = value == value
             below, above = value if is_known else np.inf, value if is_known else -np.inf
-            # Without branches, which would be unpredictable.
+            # Without branches, because the processor could not predict them.
             low = min(low, max(lowest, below))
             lowest = min(lowest, below)
             high = max(high, min(highest, above))

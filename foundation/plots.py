@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-# Colours of text, of axes and notes, of grid lines, and of the background. In an SVG, a dark screen replaces them.
+# Colours of text, of axes and notes, of grid lines, and of the background. In an SVG, a dark page replaces them.
 INK, FAINT, GRID, PAPER = "#22262b", "#5b636d", "#e3e6ea", "#fdfdfe"
 
 # Colour of marks in a picture.
@@ -25,7 +25,7 @@ MARK = "#e8502a"
 CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
 
 # Colours of series: M. Okabe, K. Ito, "Color universal design", 2008, distinguishable for colour-blind people. Black is
-# replaced by grey and yellow omitted, since they are invisible on a dark and a light screen.
+# replaced by grey, and yellow is omitted: they are invisible on a dark or a light page.
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f8790")
 
 DASHES = ("-", "--", ":", "-.")  # Line styles: the first one for the first seven series, and so on
@@ -35,10 +35,10 @@ _CSS_VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
 
 _PNG_DPI = 110  # A picture of 10 inches fills the page width of 1100 pixels
 
-# Level 4 gives photographs of the same size as Matplotlib's level 6 in a third of the time.
+# With level 4, PNG files of photographs are as small as with Matplotlib's level 6, in a third of the time.
 _PNG_SETTINGS: Final = (cv2.IMWRITE_PNG_COMPRESSION, 4)
 
-# Resolution of raster parts of an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
+# Resolution of the images in an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
 _RASTER_DPI = 180
 
 _STYLE = {
@@ -53,7 +53,7 @@ _STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.titlesize": 10,
-    # Names of methods, images and data sets may contain "$", which is not mathematics there.
+    # Names of methods, images and data sets may contain "$", which must not start a formula.
     "text.parse_math": False,
 }
 
@@ -83,7 +83,7 @@ def series_style(number: int) -> dict[str, str]:
 
 
 def legend_label(name: str) -> str:
-    """Return a name for a legend of Matplotlib, which omits names with a leading underscore.
+    """Return a name with a space before a leading underscore: Matplotlib omits names with underscore from legends.
 
     Examples
     --------
@@ -99,7 +99,7 @@ def draw_png(draw: Callable[..., None], *arguments: Any) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    # `Any`, since the types of Matplotlib do not describe keyword arguments.
+    # `Any`, because the types of Matplotlib do not describe keyword arguments.
     library: Any = matplotlib
     with library.rc_context(_STYLE):
         figure: Any = Figure(layout="constrained", dpi=_PNG_DPI)
@@ -140,7 +140,7 @@ def standalone_svg(svg: bytes) -> bytes:
 
     Examples
     --------
-    >>> b"--paper" in standalone(b"<svg><path/></svg>")
+    >>> b"--paper" in standalone_svg(b"<svg><path/></svg>")
     True
     """
     colours = (resources.files("foundation") / "templates" / "colours.css").read_text(encoding="utf-8")
@@ -169,7 +169,7 @@ def draw_squares(
 
 
 def _write_plain_numbers(figure: Any) -> None:
-    # Matplotlib labels logarithmic axes with mathematics, which `text.parse_math` switches off.
+    # Matplotlib labels logarithmic axes with formulas, which do not work without `text.parse_math`.
     from matplotlib.ticker import LogFormatter
 
     class PlainLogFormatter(LogFormatter):

@@ -3,27 +3,28 @@
 **Point spread.** A share 1 − s of the light is in the core, a Gaussian of standard deviation σ that includes the
 aperture of the photosite. A share s is in the shoulders: the core convolved with
 
-    w(r) = exp(−r / a) / (2π a²),
+    w(r) = exp(−r / a) / (2π a²).
 
-whose standard deviation along each axis is √3 a, the scale of the shoulders. Its transfer function is (1 + (2π a
-f)²)^(−3/2). At f cycles per half-size pixel, the lens has
+The standard deviation of w along each axis is √3 a; `shoulder_px` is this value. At f cycles per half-size pixel, the
+lens has the modulation transfer function
 
     MTF(f) = exp(−2π² σ² f²) · (1 − s + s · (1 + (2π a f)²)^(−3/2)).
 
-Measured wings of photographic lenses, of spherical aberration and of scattered light are straight lines on a
-logarithmic plot over some decades; therefore an exponential. It is no sum of Gaussians, so that software which fits
-Gaussians is tested fairly. `MILD_SHOULDERS` and `STRONG_SHOULDERS` are two such lenses.
+The shoulders are exponential, because measured wings of photographic lenses, of spherical aberration and of scattered
+light are straight lines on a logarithmic plot over some decades. They are not a sum of Gaussians, so that software that
+fits Gaussians has no advantage. `MILD_SHOULDERS` and `STRONG_SHOULDERS` are two such lenses.
 
-**Veiling glare** (ISO 9358:1994, ISO 18844:2017): a share v of the light of the whole frame, including the backdrop, is
-uniform on it: (1 − v) · light + v · mean light, for each camera channel. A uniform field keeps its light.
+**Veiling glare** (ISO 9358:1994, ISO 18844:2017): a share v of the light is distributed uniformly over the frame, which
+includes the background: (1 − v) · light + v · mean light, for each camera channel. A uniform frame does not change.
 
 **Lateral chromatic aberration**: red and blue are magnified differently from green. At the fraction ρ of the distance
-from axis to corner, a channel is shifted outwards by d · ρ · (1 + ρ²) / 2 relative to green, d in the corner. Half is
-the chromatic difference of magnification (linear), half the chromatic difference of distortion (cubic; W. T. Welford,
-"Aberrations of Optical Systems", 1986, ch. 10). The equal shares are chosen.
+from axis to corner, a channel is shifted outwards by d · ρ · (1 + ρ²) / 2 relative to green; d is the shift in the
+corner. Half of it is the chromatic difference of magnification (linear), half that of distortion (cubic; W. T. Welford,
+"Aberrations of Optical Systems", 1986, ch. 10). The equal parts are judgement.
 
-**Fall-off** of the lens over the frame is 1 / (1 + c r²)², which is cos⁴ of the angle to the axis. Fall-off of a
-primary of the projector over the page is g / (1 + c d²). `sim.world.rendering.light` uses these constants.
+**Fall-off** of the lens is 1 / (1 + c r²)² at the distance r from the axis, which is cos⁴ of the angle to the axis. The
+fall-off of a primary of the projector is g / (1 + c d²) at the distance d from its brightest point, with the gain g.
+`sim.world.rendering.light` uses these constants.
 
 Positions are half-size pixels, centres at integers, x right, y down.
 """
@@ -39,7 +40,7 @@ from numpy.typing import NDArray
 
 
 def lens_falloff(axis: tuple[float, float], size: tuple[int, int], lost: float) -> NDArray[np.float64]:
-    """Return x and y of the axis (photosites) and c of a lens that loses `lost` in the corner, (3,) float64."""
+    """Return x, y of the axis (photosites) and c, (3,) float64; `lost`: fraction of light lost in the corners."""
     corner2 = (size[0] ** 2 + size[1] ** 2) / 4
     return np.array([*axis, ((1 - lost) ** -0.5 - 1) / corner2])
 
@@ -47,7 +48,7 @@ def lens_falloff(axis: tuple[float, float], size: tuple[int, int], lost: float) 
 def projector_falloff(
     page_mm: tuple[float, float], lost: float, difference: float, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return (3, 4) float64: x and y of the brightest point (mm), c and a gain of 1 for each primary."""
+    """Return (3, 4) float64: x, y of the brightest point (mm), c and a gain of 1 for each primary."""
     page = np.array(page_mm)
     half_diagonal = float(np.hypot(*page)) / 2
     losses = lost * (1 + difference * np.array([-1.0, 0.0, 1.0]))
@@ -66,9 +67,10 @@ STRONG_SHOULDERS: Final = {"blur_px": 0.535, "shoulder_share": 0.0452, "shoulder
 # Radius of the kernel, in lengths a. The 0.12 % of the light outside is restored by the normalisation.
 _REACH: Final = 9.0
 
-_FINER: Final = 7  # Points per pixel over which the kernel is averaged, because its peak is narrower than a pixel.
+# Points per pixel and axis over which the kernel is averaged, because its peak is narrower than a pixel.
+_POINTS_PER_PX: Final = 7
 
-# Steps to invert a shift. Each reduces the error by the slope of the shift, below 0.01 for shifts of some pixels.
+# Iterations to invert a shift. Each multiplies the error by the slope of the shift, below 0.01 for shifts of some px.
 _STEPS: Final = 6
 
 APERTURE_VARIANCE: Final = 1 / 12  # Variance of the uniform aperture of a photosite, photosites².
@@ -97,8 +99,8 @@ class PhotographicLens:
         return math.hypot(*self.half_size) / 2
 
     @property
-    def splits_colours(self) -> bool:
-        """Whether red or blue are shifted relative to green."""
+    def has_lateral_colour(self) -> bool:
+        """Whether red or blue is shifted relative to green."""
         return bool(self.lateral_red_px or self.lateral_blue_px)
 
     def shifted(self, green_px: NDArray[np.float64], channel: str) -> NDArray[np.float64]:
@@ -150,12 +152,12 @@ class PhotographicLens:
         """Return the shoulder kernel on half-size pixels, (n, n) float32 with odd n and sum 1."""
         length = self.shoulder_px / math.sqrt(3)
         reach = max(math.ceil(_REACH * length), 1)
-        distance = (np.arange((2 * reach + 1) * _FINER) - (_FINER - 1) / 2) / _FINER - reach
+        distance = (np.arange((2 * reach + 1) * _POINTS_PER_PX) - (_POINTS_PER_PX - 1) / 2) / _POINTS_PER_PX - reach
         fine = np.exp(-np.hypot(distance[:, None], distance) / length)
-        pixels = fine.reshape(2 * reach + 1, _FINER, 2 * reach + 1, _FINER).sum(axis=(1, 3))
+        pixels = fine.reshape(2 * reach + 1, _POINTS_PER_PX, 2 * reach + 1, _POINTS_PER_PX).sum(axis=(1, 3))
         return (pixels / pixels.sum()).astype(np.float32)
 
-    def veiled(self, light: NDArray[np.float32], pattern: str) -> NDArray[np.float32]:
+    def add_veil(self, light: NDArray[np.float32], pattern: str) -> NDArray[np.float32]:
         """Add veiling glare to the light of a mosaic (primaries, rows, columns) float32, in place.
 
         Returns the added light (primaries, 2, 2) float32, by parity of row and column.

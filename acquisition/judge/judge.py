@@ -111,7 +111,7 @@ class LiveJudge:
         self._state = self._state.updated(step, ExaminedFrame(frame, light, accepted))
 
     def after_pause(self) -> None:
-        """Allow for changes of lamp and chart; see `experiment.session.records.OutlastsPauses`."""
+        """Allow for changes of lamp and chart; see `experiment.session.records.HandlesPauses`."""
         self._state = self._base = self._state.paused()
         self._fresh = False
 

@@ -42,8 +42,8 @@ from experiment.session.records import (
     Check,
     FrameJudge,
     FrameKind,
+    HandlesPauses,
     Judgement,
-    OutlastsPauses,
     SessionStep,
     duration_text,
     link_steps,
@@ -625,7 +625,7 @@ class LastingCause:
             self._to_show.update(numbers)
         self.last_before = attempts[-1].id
         # All files have been judged before the wait.
-        if isinstance(job.judge, OutlastsPauses):
+        if isinstance(job.judge, HandlesPauses):
             job.judge.after_pause()
 
 

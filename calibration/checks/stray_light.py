@@ -1,14 +1,13 @@
-"""Detect light in single frames that no dark frame shows, such as an open door, a lamp or daylight.
+"""Detect room light that is in some frames and not in the dark frames, for example through an open door.
 
-Two sums are more precise than the prediction of a white from its codes:
+The counts of the white paper under an illuminant are a sum of its counts under red, green and blue at full code. Three
+equations, one for each camera channel, give the amounts of the primaries. Two checks use them:
 
-- *Codes of 0.* A white has no light of a primary with code 0. A positive amount is room light in its own frame; a
-  negative amount was in the frame of a primary that it contains.
-- *White.* The sum of the red, green and blue frames is white. An excess that is equal for all primaries, with a steady
-  lamp, is additional light in their frames. A projector that reduces full white looks the same; a projector that boosts
-  white hides the excess.
-
-The amounts of the primaries in the whites on paper are the solution of three equations.
+- *Codes of 0.* The amount of a primary with code 0 must be 0. If it is positive, room light is in the frame of this
+  illuminant. If it is negative, room light is in the frame of a primary that the illuminant contains.
+- *White.* The amounts in white frames must be 1. If all three are less by the same value, and the lamp is steady, room
+  light is in the frames of the primaries. A projector that reduces full white has the same effect; a projector that
+  boosts white hides the room light.
 """
 
 from __future__ import annotations
@@ -21,17 +20,18 @@ import numpy.typing as npt
 
 CERTAIN = 4.0  # Standard uncertainties subtracted from each amount, so that noise does not appear as light
 
-# Tolerance for mixtures of two primaries: this fraction of the white boost may appear as the third primary, because
-# overlaps add mostly light of the two. Faults in the primary frames also look like a boost. They make the check less
-# sensitive, but cannot disable it (judgement).
+# Tolerance for mixtures of two primaries, relative to the white boost (judgement). A projector that boosts white also
+# boosts mixtures. It adds mostly light of the two primaries, but a part may appear as the third. Faulty primary frames
+# also look like a boost; with this factor they make the check less sensitive, but cannot disable it.
 BOOST_ELSEWHERE = 0.25
 
-# Largest amount of room light; more is a wrong illuminant or exposure, which other figures detect (judgement).
-_LARGEST = 0.1
+# Largest amount that is reported as room light (judgement). A larger amount means a wrong illuminant or exposure, which
+# other figures detect.
+_MAX_ROOM_LIGHT = 0.1
 
-# Minimum ratio of the smallest and the largest singular value of the primaries' whites (judgement): cameras have 0.1 or
-# more.
-_LEAST_SHARE = 0.02
+# Minimum ratio of the smallest to the largest singular value of the counts under the primaries (judgement). Cameras
+# have 0.1 or more; below the minimum, the camera cannot separate the primaries.
+_MIN_SINGULAR_RATIO = 0.02
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -39,17 +39,17 @@ _Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class StrayLight:
-    """Light in some frames of L illuminants that is not in the dark frames."""
+    """Room light in some frames of L illuminants that is not in the dark frames."""
 
-    at_zero: _Array  # (L,) worst amount of a primary with code 0, relative to that primary; NaN: not checked
-    certain: _Array  # (L,) its size beyond four standard uncertainties; 0: not checked
-    of_primaries: float  # excess of the sum of primaries over white beyond uncertainty: least excess of the three
+    at_zero: _Array  # (L,) amount of a primary with code 0 (full code: 1) that is furthest from 0; NaN: not checked
+    certain: _Array  # (L,) excess of its size over four standard uncertainties; 0: none, or not checked
+    of_primaries: float  # certain room light in the frames of the primaries, relative to white; 0: none, or not checked
     primaries: tuple[int, int, int]  # indices of red, green and blue
-    lights_of: _Mask  # (L, 3) primaries with a code above 0
+    has_primary: _Mask  # (L, 3) whether the code of a primary is above 0
 
     @property
     def share(self) -> float:
-        """Largest amount of all, 0 … 1 of white."""
+        """Largest amount of room light, 0 … 1 of white."""
         return max(float(self.certain.max(initial=0.0)), self.of_primaries)
 
     @property
@@ -58,7 +58,7 @@ class StrayLight:
         return np.isfinite(self.at_zero)
 
     def lights_beyond(self, accepted: float) -> list[int]:
-        """Return the illuminants with affected frames, worst first: a primary if its own frame has the light."""
+        """Return the illuminants with more room light than `accepted` in their frames, worst first; primaries last."""
         worst = [int(light) for light in np.argsort(-self.certain, kind="stable") if self.certain[light] > accepted]
         positive = [light for light in worst if self.at_zero[light] > 0]
         negative = [light for light in worst if self.at_zero[light] < 0]
@@ -66,7 +66,7 @@ class StrayLight:
         affected_primaries = [
             light
             for primary, light in enumerate(self.primaries)
-            if exceeds_white or any(self.lights_of[mixture, primary] for mixture in negative)
+            if exceeds_white or any(self.has_primary[mixture, primary] for mixture in negative)
         ]
         return positive + [light for light in affected_primaries if light not in positive]
 
@@ -89,96 +89,98 @@ def stray_light(
     full_white: _Array,
     primaries: tuple[int, int, int] | None,
 ) -> StrayLight | None:
-    """Measure light in frames that the dark frames do not show.
+    """Measure room light that is not in the dark frames.
 
     Parameters
     ----------
     codes : (L, 3) int64
         0 … 255.
     white, error : (L, 3) float64
-        Counts on paper, without dark light, drift and exposure differences, and their standard uncertainties.
+        Counts of paper, corrected for dark frames, drift and exposure, and their standard uncertainties.
     full_white : (W, 3) float64
-        Counts of all white frames, corrected in the same way; their scatter is the scatter of the lamp.
+        Counts of paper in all white frames, corrected for dark frames and exposure; they scatter with the lamp.
     primaries : (int, int, int) or None
         Indices of pure red, green and blue.
 
     Returns
     -------
     StrayLight or None
-        None without the three primaries, if the camera cannot separate them, or if a white is unknown.
+        None if a primary is missing, if the camera cannot separate the primaries, or if counts are unknown.
     """
     if primaries is None or not (np.isfinite(white).all() and np.isfinite(error).all()):
         return None
     primary_whites = white[list(primaries)]
     singular_values = np.linalg.svd(primary_whites, compute_uv=False)
-    if not singular_values[-1] > _LEAST_SHARE * singular_values[0]:
+    if not singular_values[-1] > _MIN_SINGULAR_RATIO * singular_values[0]:
         return None
     inverse = np.linalg.inv(primary_whites)
     amounts = white @ inverse
-    # Errors of a primary's white count in proportion to the amount of that primary.
+    # An error in the counts of a primary has the weight of its amount.
     variance = error**2 + amounts**2 @ error[list(primaries)] ** 2
     spread = np.sqrt(variance @ inverse**2)
-    lights_of = codes > 0
+    has_primary = codes > 0
     full = full_white @ inverse
     is_checked = np.ones(len(codes), dtype=np.bool_)
     is_checked[list(primaries)] = False
     boost = max(float(full.max()) - 1, 0.0) if len(full) else 0.0
-    tolerance = CERTAIN * spread + np.where(lights_of.sum(axis=1) > 1, BOOST_ELSEWHERE * boost, 0.0)[:, None]
-    beyond = np.where(~lights_of & is_checked[:, None], np.maximum(np.abs(amounts) - tolerance, 0), 0.0)
-    # With a wrong name or exposure all amounts deviate, and much more.
-    beyond[(beyond > _LARGEST).any(axis=1)] = 0
-    zero_amounts = np.where(~lights_of & is_checked[:, None], np.abs(amounts), -1.0)
+    tolerance = CERTAIN * spread + np.where(has_primary.sum(axis=1) > 1, BOOST_ELSEWHERE * boost, 0.0)[:, None]
+    beyond = np.where(~has_primary & is_checked[:, None], np.maximum(np.abs(amounts) - tolerance, 0), 0.0)
+    # A wrong illuminant or exposure changes all amounts, and by more than room light.
+    beyond[(beyond > _MAX_ROOM_LIGHT).any(axis=1)] = 0
+    zero_amounts = np.where(~has_primary & is_checked[:, None], np.abs(amounts), -1.0)
     worst = np.argmax(np.where(beyond.any(axis=1, keepdims=True), beyond, zero_amounts), axis=1)
     at_zero = amounts[np.arange(len(codes)), worst]
-    has_zero = is_checked & ~lights_of.all(axis=1)
+    has_zero = is_checked & ~has_primary.all(axis=1)
     of_primaries = _primary_excess(codes[list(primaries)], full, spread[list(primaries)])
-    is_mixture = has_zero & (lights_of.sum(axis=1) > 1)
-    if of_primaries and _are_pure(amounts[is_mixture], lights_of[is_mixture], spread[is_mixture], of_primaries):
+    is_mixture = has_zero & (has_primary.sum(axis=1) > 1)
+    if of_primaries and _are_pure(amounts[is_mixture], has_primary[is_mixture], spread[is_mixture], of_primaries):
         of_primaries = 0.0
     return StrayLight(
         at_zero=np.where(has_zero, at_zero, np.nan),
         certain=beyond.max(axis=1, initial=0.0),
         of_primaries=of_primaries,
         primaries=primaries,
-        lights_of=lights_of,
+        has_primary=has_primary,
     )
 
 
 def _primary_excess(codes: npt.NDArray[np.int64], full: _Array, spread: _Array) -> float:
-    """Return the excess of the primaries over white from their amounts (W, 3) in white frames; 0 if unknown."""
-    # Unknown if primaries are not at full code as white is, or without two white frames for the stability of the lamp.
-    if len(full) < 2 or int(codes.max(axis=1).min()) < _FULL:
+    """Return the room light in the primaries' frames from the amounts (W, 3) in white frames; 0 if unknown."""
+    # The sum of the primaries is white only at full code. Two white frames show whether the lamp is steady.
+    if len(full) < 2 or int(codes.max(axis=1).min()) < _FULL_CODE:
         return 0.0
     excess = 1 - full.mean(axis=0)
     flicker = float(np.ptp(full.mean(axis=1)))
-    # Frames of primaries have the same flicker, and lasting changes between two white frames.
-    error = float(np.sqrt((spread**2).max() + (_FLICKERS * flicker) ** 2))
+    # The frames of the primaries have the same flicker and slow changes as the white frames.
+    error = float(np.sqrt((spread**2).max() + (_DEVIATION_PER_RANGE * flicker) ** 2))
     share = float(excess.min()) - CERTAIN * error
-    is_equal = float(np.ptp(excess)) <= _ALIKE * float(excess.mean())
-    return share if is_equal and 0 < share <= _LARGEST else 0.0
+    is_equal = float(np.ptp(excess)) <= _MAX_DIFFERENCE * float(excess.mean())
+    return share if is_equal and 0 < share <= _MAX_ROOM_LIGHT else 0.0
 
 
-def _are_pure(amounts: _Array, lights_of: _Mask, spread: _Array, share: float) -> bool:
-    """Return whether mixtures of two primaries show that the frames of primaries contain no other light."""
-    contains = np.where(lights_of, amounts, 0.0) >= _MUCH
-    if not (contains.sum(axis=0) >= _WITNESSES).all():
+def _are_pure(amounts: _Array, has_primary: _Mask, spread: _Array, share: float) -> bool:
+    """Return whether mixtures of two primaries prove that the frames of the primaries have no room light."""
+    contains = np.where(has_primary, amounts, 0.0) >= _MIN_AMOUNT
+    if not (contains.sum(axis=0) >= _MIN_MIXTURES).all():
         return False
-    missing = np.where(lights_of, 0.0, np.abs(amounts) + CERTAIN * spread).max(axis=1)
-    return bool(missing[contains.any(axis=1)].max() <= _LITTLE * share)
+    missing = np.where(has_primary, 0.0, np.abs(amounts) + CERTAIN * spread).max(axis=1)
+    return bool(missing[contains.any(axis=1)].max() <= _MAX_MISSING * share)
 
 
-_MUCH = 0.5  # Minimum amount of a primary in a mixture that misses half of the other light in the primary's frame
+# Minimum amount of a primary in a mixture. Room light in the frame of this primary then gives the primary with code 0 a
+# negative amount of at least half of the room light.
+_MIN_AMOUNT = 0.5
 
-_WITNESSES = 3  # Number of mixtures per primary that must agree (judgement: in one, errors may cancel)
+_MIN_MIXTURES = 3  # Number of mixtures per primary that must agree (judgement: in one, errors may cancel)
 
-# Largest missing light of a mixture, noise included, relative to the excess of the primaries.
-_LITTLE = 0.25
+# Largest amount of the primary with code 0 in a mixture, including noise, relative to the supposed room light.
+_MAX_MISSING = 0.25
 
-_FULL = 255  # Largest code
+_FULL_CODE = 255  # Largest code
 
-# Standard deviation of brightness relative to the range of two or three white frames; 0.6 for three.
-_FLICKERS = 0.5
+# Standard deviation of the lamp relative to the range of two or three white frames; 0.6 is expected for three.
+_DEVIATION_PER_RANGE = 0.5
 
-# Excesses are equal if their range relative to the mean is below this: daylight has less against the white of a lamp,
-# flicker in the frames of primaries has more (judgement).
-_ALIKE = 0.6
+# Largest range of the three excesses relative to their mean (judgement). Daylight has less, although its colour differs
+# from the lamp; flicker in the frames of the primaries has more.
+_MAX_DIFFERENCE = 0.6

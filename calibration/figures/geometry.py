@@ -104,14 +104,14 @@ BLEED = Figure(
 
 def _uncorrected_lens_light(table: TableMeasurements) -> float | None:
     # Few patches cannot show the lens's spread; it is then part of the uncertainty, and no remedy exists.
-    is_detectable = len(table.registration.mismatched_cells) >= _MIN_CELLS_FOR_GLARE or table.lens.is_left_in
-    return table.lens.left if table.lens.measured and is_detectable else None
+    is_detectable = len(table.registration.mismatched_cells) >= _MIN_CELLS_FOR_GLARE or table.lens.is_uncorrected
+    return table.lens.remaining_rms if table.lens.measured and is_detectable else None
 
 
 def _uncorrected_in_worst_cell(table: TableMeasurements) -> float | None:
     # A remark on all patches includes the worst one; report only one of the two.
     residual = _uncorrected_lens_light(table)
-    return None if residual is None or residual > CORRECTION_RESIDUAL.accept else table.lens.left_worst
+    return None if residual is None or residual > CORRECTION_RESIDUAL.accept else table.lens.remaining_worst
 
 
 def _glare_text(table: TableMeasurements, accepted: float) -> str:
@@ -119,7 +119,7 @@ def _glare_text(table: TableMeasurements, accepted: float) -> str:
     glare = f"{100 * lens.veil:.2f} ± {100 * lens.veil_error:.2f} % of the mean light"
     return (
         f"measured veiling glare: {glare}; up to {100 * lens.veil_at_most:.2g} % is not excluded; the error of "
-        f"patches with {100 * lens.worst_level:.2g} % of paper white may reach {100 * lens.left_worst:.2g} %"
+        f"patches with {100 * lens.worst_level:.2g} % of paper white may reach {100 * lens.remaining_worst:.2g} %"
     )
 
 
@@ -128,8 +128,8 @@ def _lens_row(table: TableMeasurements) -> SummaryRow:
     if not lens.measured:
         return SummaryRow(name, "not measured", lens.why_not)
     glare = f"veiling glare of {100 * lens.veil:.2f} ± {100 * lens.veil_error:.2f} % of the mean light"
-    darkest = f"{100 * lens.left_worst:.2g} % in patches of {100 * lens.worst_level:.2g} % of paper white"
-    residual = f"{100 * lens.left:.2g} % RMS, {darkest},"
+    darkest = f"{100 * lens.remaining_worst:.2g} % in patches of {100 * lens.worst_level:.2g} % of paper white"
+    residual = f"{100 * lens.remaining_rms:.2g} % RMS, {darkest},"
     if not lens.corrected and not lens.beyond_cell:
         note = f"{lens.why_not}; most likely {glare}; patch means may contain {residual[:-1]}"
         return SummaryRow(name, "none", note)

@@ -104,7 +104,7 @@ def _baseline_of_first(
     spread = cells.var(axis=1, ddof=1)
     if registered.lens is not None:
         means = np.concatenate([cells.mean(axis=1), references.mean(axis=1, dtype=np.float64)])
-        added = registered.lens.added(FrameLevels(means, beyond_print(first, registered.lens.beyond)))
+        added = registered.lens.added(FrameLevels(means, beyond_print(first, registered.lens.background)))
         cells -= added[: len(cells), None]
         references = references - added[len(cells) :, None].astype(np.float32)
     level = cells.mean(axis=1)
@@ -210,7 +210,7 @@ def _spread_frame(baseline: Baseline, frames: _Frames, view: PrintView, is_mixed
         means, highest = baseline.patches(decoded.mosaic, decoded.black)
         usable &= np.isfinite(means).all(axis=1) & (highest < CLIPPING_SHARE * decoded.saturation)
         total += np.nan_to_num(means)
-        beyond += beyond_print(decoded, view.beyond)
+        beyond += beyond_print(decoded, view.background)
         count, file = count + 1, file or decoded.record.file
     if not count:
         return None

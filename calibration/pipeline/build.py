@@ -1,9 +1,9 @@
-"""Build a LUT from a session, in a straight line of stages; each takes a value and returns the next one.
+"""Build a look-up table (LUT) from a session in stages; the result of each stage is the input of the next.
 
-The stages, their functions and their values::
+Stage, function and result::
 
     frames         frames.select_frames          SelectedFrames
-    shared by all  baseline.baseline_of          Baseline, made once before the first frame
+    all frames     baseline.baseline_of          Baseline, measured once before the first frame
     decoded        measuring.decode_frame        DecodedFrame
     located        measuring.locate              LocatedFrame
     sampled        measuring.sample              SampledFrame
@@ -13,12 +13,12 @@ The stages, their functions and their values::
     verdict        calibration.verdict.judge     Verdict
     LUT            _write_table                  the folder
 
-Threads decode and measure frames in advance with the current `Accumulator`. A result is discarded and measured again if
-the chart was registered again in between. The memory holds a few frames at a time.
+Threads decode and measure the next frames in advance with the current `Accumulator`. If the chart is registered again
+in the meantime, they are measured again. Only a few frames are in memory at a time.
 
-The LUT appears complete or not at all. Until then it is a hidden folder next to its final path, and an interrupted
-build resumes from its last checkpoint (`checkpoint`) with an identical result. A checkpoint is used only if its inputs
-and options are unchanged and the samples on disk have the recorded hashes.
+The LUT appears completely or not at all. Until it is complete, it is a hidden folder next to its final path. An
+interrupted build resumes from its last checkpoint (`checkpoint`) with an identical result. A checkpoint is used only if
+its inputs and options are unchanged and the samples on disk have the recorded hashes.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ from foundation.folders import clear_folder
 from foundation.records import to_plain
 from foundation.version import software
 
-CHECKPOINT_EVERY = 16  # Frames between checkpoints: the largest number that a killed build repeats
+CHECKPOINT_EVERY = 16  # Frames between checkpoints; after a kill, at most these are measured again
 
 # Version of the method: increased if samples, ground truth or unfit patches change, so that no LUT mixes methods.
 METHOD = 17
@@ -105,7 +105,7 @@ WriteReport = Callable[[BuildResult, Session, Path], None]
 
 @dataclass(frozen=True)
 class TableProgress:
-    """Progress of a LUT that still lacks frames."""
+    """Progress of a LUT of a session that is not complete."""
 
     lights: int
     lights_planned: int
@@ -127,13 +127,15 @@ def build(
     Parameters
     ----------
     session : Session
+        Complete session.
     out : Path
         Folder of the LUT; it must not exist.
     progress : ReportProgress, optional
-        Called with the number of finished frames, of all frames, and the current step.
+        Called with the number of finished frames, the number of all frames, and the current step.
     report : WriteReport, optional
         Writes a report into the folder before it gets its final name.
     options : BuildOptions
+        Samples and corrections, by default as in the paper.
     linearity : Path, optional
         Folder with a series of exposures, to measure the sensor's linearity.
     judged_by : Sequence[Figure]
@@ -164,7 +166,7 @@ def build(
         figures = table_figures(accumulator, series)
         result = BuildResult(figures, judge(judged_values(figures), judged_by), out)
         if figures.lights.drift is not None and not result.verdict.refused:
-            # A build killed here finds samples that differ from its checkpoint, and starts again.
+            # If the build is killed here, the samples differ from the checkpoint, and the next build starts again.
             for light, gain in enumerate(figures.lights.drift.gains):
                 writer.put(light, corrected(writer.get(light), gain))
         # The LUT lists the hashes of its report, so the report is written first.
@@ -187,13 +189,13 @@ def append(
     linearity: Path | None = None,
     judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult | TableProgress:
-    """Add the frames available so far of a session in progress.
+    """Add the available frames of a session in progress.
 
     The LUT is built under a hidden name. It appears after the last frame, with the same bytes as from one `build`.
-    Parameters and errors are those of `build`, but illuminants may be missing.
+    Parameters and errors as for `build`, except that illuminants may be missing.
     """
     selected = select_frames(session)
-    # An imported session may have an empty plan; its illuminants are the plan then.
+    # An imported session may have an empty plan; then only its illuminants must be complete.
     if not selected.lights_without and {step.number for step in session.steps} <= session.done_steps():
         return build(session, out, progress, report, options, linearity, judged_by)
     _require_dark_frames(session, options)
@@ -215,7 +217,7 @@ def check(
     picture: Path | None = None,
     judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
-    """Register the chart in a session's best frame and judge this frame; writes only the picture.
+    """Register the chart in a session's best frame and judge this frame; only the picture is written.
 
     `picture`: PNG path for the frame with the detected or expected chart; None for no picture.
     """
@@ -245,7 +247,7 @@ def check(
 def judge_trial(
     session: Session, saturation: int, options: BuildOptions = PAPER_OPTIONS, linearity: Path | None = None
 ) -> BuildResult:
-    """Judge a few trial frames like a whole session; writes nothing.
+    """Judge a few trial frames like a complete session; nothing is written.
 
     The lens, and the figures that depend on it, are not measured, because that takes a minute.
 
@@ -333,7 +335,7 @@ def _new_accumulator(session: Session, selected: SelectedFrames, options: BuildO
     primaries = [decode_frame(session, record) for record in selected.primaries]
     more_whites = _readable_frames(session, selected.more_whites)
     baseline = baseline_of(session.chart, first, options, primaries, more_whites)
-    # These frames are read again in their turn, to save memory.
+    # These frames are decoded again later, because keeping them would need too much memory.
     dark = selected.first_dark if options.subtract_dark else None
     measured_dark = None if dark is None else measure_dark(baseline, decode_frame(session, dark), baseline.first)
     return Accumulator.empty(session, selected, baseline, first.saturation, measured_dark)
@@ -341,7 +343,7 @@ def _new_accumulator(session: Session, selected: SelectedFrames, options: BuildO
 
 def _readable_frames(session: Session, records: Sequence[FrameRecord]) -> Iterator[DecodedFrame]:
     for record in records:
-        # A fault of a frame is reported in its turn.
+        # A fault of a frame is reported later, when the frame is measured.
         with contextlib.suppress(CropError):
             yield decode_frame(session, record)
 

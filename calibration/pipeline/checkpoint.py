@@ -40,7 +40,7 @@ class Checkpoint:
 class UnfinishedTable:
     """The hidden folder of an unfinished LUT; opened by `unfinished_table`.
 
-    `keep`: True if a later program may resume; False if it would be refused again.
+    `keep`: whether a later program may resume; False for a refused LUT, which would be refused again.
     """
 
     def __init__(self, folder: Path, out: Path) -> None:
@@ -51,7 +51,7 @@ class UnfinishedTable:
     def load(self, identity: dict[str, Any], frames: list[str]) -> Checkpoint | None:
         """Return the checkpoint of an earlier program; None if there is none, or if its inputs differ.
 
-        A build resumes from a checkpoint with the same identity and the first of its `frames`.
+        Its identity must be equal, and its frames must be the first ones of `frames`, in the same order.
         """
         record = self.folder / RECORD
         if not record.is_file() or not (self.folder / SAMPLES).is_file():
@@ -103,7 +103,7 @@ def _hash_of(identity: dict[str, Any], frames: list[str]) -> str:
 
 @contextmanager
 def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
-    """Open or create the hidden folder of the LUT `out`; it is kept afterwards only with a checkpoint."""
+    """Open or create the hidden folder of the LUT `out`; at the end it is removed if it has no checkpoint."""
     require_free(out, "the LUT")
     folder = partial_path(out)
     busy = f"{out} is being built by another program; wait until it has finished, or give another folder"

@@ -484,7 +484,7 @@ def _to_subtract(
     means = np.concatenate([cells, references.mean(axis=1, dtype=np.float64)])
     if dark is not None:
         means -= dark.patches
-    added = moved.lens.added(FrameLevels(means, beyond_print(decoded, moved.lens.beyond))).astype(np.float32)
+    added = moved.lens.added(FrameLevels(means, beyond_print(decoded, moved.lens.background))).astype(np.float32)
     return added if dark is None else added + dark.patches
 
 

@@ -1,10 +1,10 @@
-"""Correct the light that the lens brings from the surroundings to each patch, and report the result.
+"""Correct the light that the lens scatters from the surroundings into each patch, and report the result.
 
 The correction subtracts one number per patch and channel from the samples: the light that the lens added, minus the
-light that it removed. The noise of samples is unchanged. Levels are taken from the uncorrected frame, as in the fit of
-the shares, so light that was scattered twice is included.
+light that it removed. The noise of samples is unchanged. The light is calculated from the levels of the uncorrected
+frame, as in the fit of the point spread, so it includes light that is scattered twice.
 
-P patches as in `PrintedGrid`; counts above black level; half-size pixels.
+Conventions: P patches as in `PrintedGrid`; counts above black level; half-size pixels.
 """
 
 from __future__ import annotations
@@ -51,12 +51,13 @@ from experiment.measures.paper import FlatField
 
 _MARGIN_PX = 12.0  # minimum distance of background samples from the edge of the sheet
 
-_LATTICE_PX = 24  # distance of background samples
+_LATTICE_PX = 24  # distance between neighbouring background samples
 
 # Minimum number of references of one colour per term of the smooth component over the page.
 _LEAST_REFERENCES = 3
 
-_FIELD_ORDER = 6  # highest order of a smooth change of white references, which changes the field
+# Highest order over the page of a smooth change of the white references, to which the flat field is fitted.
+_FIELD_ORDER = 6
 
 _LEAST_LEVEL = 1e-3  # lower bound of levels in relative errors
 
@@ -72,7 +73,7 @@ class PrintView:
     photosites_px: _Array  # (3, 2) offset of the photosites of each channel from the centre of a block
     frame_px: tuple[int, int]  # rows and columns of the half-size frame
     light: UsualLight
-    beyond: Sites  # positions of the background; empty if the print fills the frame
+    background: Sites  # positions of background samples; empty if the print fills the frame
 
     @staticmethod
     def of(
@@ -87,8 +88,8 @@ class PrintView:
         """Return the view of a session; `photosites_px` (3, 2): offset of photosites from the centre of a block."""
         low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
         light = UsualLight.of(grid, field.at(grid.points_mm), field.at(np.clip(grid.slots_mm, low, high)))
-        beyond = _background_sites(grid, registration, shape, window)
-        return PrintView(grid, whites, photosites_px, shape, light, beyond)
+        background = _background_sites(grid, registration, shape, window)
+        return PrintView(grid, whites, photosites_px, shape, light, background)
 
     def around(self, registration: Registration, cells: Sites, references: Sites) -> Surroundings:
         """Return the surroundings of the patches of a frame from their sampling positions."""
@@ -124,14 +125,14 @@ class FrameCorrection:
     near: NearLight
     far: _Array  # (3, F) shares of far kernels by channel
     veil: _Array  # (3,) shares of veiling glare by channel
-    beyond: Sites
+    background: Sites
 
     @staticmethod
     def of(spread: PointSpread, view: PrintView, around: Surroundings) -> FrameCorrection:
         """Return the correction for a point spread and the surroundings of a frame's patches."""
         amounts, near = spread.amounts(), len(NEAR_PX)
         far, veil = amounts[0, :, near:-1], amounts[0, :, -1]
-        return FrameCorrection(around, around.near(amounts[:, :, :near]), far, veil, view.beyond)
+        return FrameCorrection(around, around.near(amounts[:, :, :near]), far, veil, view.background)
 
     def added(self, levels: FrameLevels) -> _Array:
         """Return the light that the lens added to each patch, (P, 3) float64 counts; negative if it removed more."""
@@ -171,15 +172,15 @@ class LensFigures:
     worst: float  # largest change
     # RMS error of patch means after correction: uncertainty of the shares and uncorrected veiling glare
     residual: float
-    residual_worst: float  # of the worst patch
+    residual_worst: float  # the same for the worst patch
     worst_level: float  # level of the worst patch relative to paper
     veil: float  # most likely veiling glare relative to the mean light of the frame, worst channel
     veil_error: float  # its standard uncertainty
-    beyond_cell: float  # largest share of light from beyond the patch in the worst sample
-    left_in_worst: float  # part of it that exceeds the window mean, and is not corrected
-    # (3, 3) relative error of the white (ground truth); assumes usual veiling glare if not measured
+    beyond_cell: float  # largest share of light from outside of the patch, in the worst sample
+    left_in_worst: float  # excess of this share over the mean of the window; it is not corrected
+    # (3, 3) covariance of the relative errors of white (ground truth), with usual veiling glare if not measured
     white_covariance: _Array
-    # (C, 3) relative standard uncertainty of patch means against white, brightest frame of each channel
+    # (C, 3) standard uncertainty of patch means relative to white, in the brightest frame of each channel
     cells_error: _Array
     measured: bool = True  # whether the lens could be measured
     corrected: bool = True  # whether samples and ground truth are corrected
@@ -206,22 +207,22 @@ class LensFigures:
 
     @property
     def uncorrected_in_worst(self) -> float:
-        """Uncorrected share of light from beyond the patch in the worst sample, without the sharp core."""
+        """Uncorrected share of light from outside of the patch, in the worst sample, without the sharp core."""
         return max(self.left_in_worst, 0.0) if self.corrected else self.beyond_cell
 
     @property
-    def is_left_in(self) -> bool:
+    def is_uncorrected(self) -> bool:
         """Whether measured spread is not corrected."""
         return self.measured and not self.corrected and self.beyond_cell > 0
 
     @property
-    def left(self) -> float:
-        """RMS error of patch means by the lens, relative to paper."""
+    def remaining_rms(self) -> float:
+        """RMS error of patch means that the lens still causes, relative to paper."""
         return self._remaining(self.rms, self.residual)
 
     @property
-    def left_worst(self) -> float:
-        """The same of the worst patch."""
+    def remaining_worst(self) -> float:
+        """The same for the worst patch."""
         return self._remaining(self.worst, self.residual_worst)
 
     def _remaining(self, size: float, residual: float) -> float:
@@ -233,9 +234,9 @@ class LensFigures:
         return self.veil + 2 * self.veil_error
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of `lut.json` and `report.json`."""
-        shares = [field.name for field in fields(self) if isinstance(getattr(self, field.name), float)]
-        values: dict[str, Any] = {name: float(f"{getattr(self, name):.4g}") for name in shares}
+        """Return the figures in the form of `lut.json` and `report.json`."""
+        names = [field.name for field in fields(self) if isinstance(getattr(self, field.name), float)]
+        values: dict[str, Any] = {name: float(f"{getattr(self, name):.4g}") for name in names}
         values |= {
             "white_covariance": [[float(f"{value:.4g}") for value in row] for row in self.white_covariance.tolist()],
             "assumed": not self.measured,
@@ -290,7 +291,7 @@ def measure_spread(
     scales: list[_Array] = []
     paper_changes: dict[int, _Array] = {}
     references: list[ReferenceData] = []
-    # share 1 of each near kernel in turn, constant over the frame
+    # for each near kernel: its share is 1 in the whole frame, and the others are 0
     unit_shares = np.zeros((len(NEAR_PX), PLACES, 3, len(NEAR_PX)))
     unit_shares[:, 0] = np.eye(len(NEAR_PX))[:, None]
     near = [around.near(amounts) for amounts in unit_shares]
@@ -353,10 +354,10 @@ def _changes(
     bits: int,
     channel: int,
 ) -> tuple[_Array, _Array, _Array]:
-    """Return changes of a channel per share of each unknown.
+    """Return the changes of a channel if the share of an unknown is 1, for each of T unknowns.
 
-    1. (T, P), change of levels: added light minus the change of white references, because the field is fitted to them.
-    2. (T,), mean of the latter, by which all levels change.
+    1. (T, P), change of levels: added light minus the change of the white references, to which the field is fitted.
+    2. (T,), mean change of the white references, by which all levels change.
     3. (T,), relative change of white: this mean minus the light that a patch loses.
     """
     count, points = 8**bits, around.grid.points_mm
@@ -374,8 +375,8 @@ def _changes(
     added, deviation = np.empty((2, len(terms), len(points)))
     loss = np.empty(len(terms))
     for term, (kernel, place) in enumerate(terms):
-        brought, own = (values[:, channel] for values in light[kernel])
-        np.divide(brought - own * levels, relative, out=added[term])
+        incoming, own = (values[:, channel] for values in light[kernel])
+        np.divide(incoming - own * levels, relative, out=added[term])
         np.subtract(own, own[:count].mean(), out=deviation[term])
         loss[term] = 1 - own[:count].mean()
         if place is not None:
@@ -393,7 +394,7 @@ def _changes(
 
 
 def _kernel_light(frame: SpreadFrame, around: Surroundings, near: list[NearLight]) -> list[tuple[_Array, _Array]]:
-    """Return for each kernel its light (P, 3), counts, and the share (P, 3) of a patch's own light in it."""
+    """Return for each kernel the light at the patches (P, 3), counts, and the share (P, 3) of a patch's own light."""
     levels = frame.levels
     inks = around.inks(levels)
     image = around.image(levels, inks)
@@ -423,7 +424,7 @@ def _figures(
     for item, scale in zip(data, scales, strict=True):
         expected = LevelModel.of(item.level, item.usable, bits).predicted
         is_bright = item.usable & (item.level * scale[-1] > least_counts)
-        # The full change includes the mean of white, because levels are relative to paper.
+        # Levels are relative to paper, so the mean change of white is a part of each change.
         change = (item.changes[is_bright] - np.outer(expected[is_bright], scale[:-1])) / item.level[is_bright, None]
         terms = channel_terms(item.channel)
         corrected.append(change @ spread.shares[terms])
@@ -440,7 +441,7 @@ def _figures(
     veils = far_groups()[-1]
     veil, veil_error = spread.likeliest[veils], np.sqrt(np.diag(spread.covariance)[veils])
     worst_channel = int(np.argmax(veil + 2 * veil_error))
-    # A channel too dark for a measurement gets the values of the brightest channel.
+    # A channel that is too dark for a measurement gets the values of the brightest channel.
     best = data[int(np.argmax([scale[-1] for scale in scales]))].channel
     return LensFigures(
         rms=0.0 if is_empty else float(np.sqrt((correction**2).mean())),
@@ -464,12 +465,12 @@ def _white_covariance(shares_error: _Array, paper_changes: list[_Array]) -> _Arr
     change = np.zeros((3, TERMS))
     for channel in range(3):
         change[channel, channel_terms(channel)] = paper_changes[channel]
-    # Light that leaves the frame is no error: it dims all patches of a channel alike, like glass.
+    # Light that leaves the frame is no error: it makes all patches of a channel darker by the same factor.
     return change @ shares_error @ change.T
 
 
 def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:
-    """Return the share (N,) of each near kernel from beyond a patch, in the worst sample and in the window mean."""
+    """Return the share (N,) of each near kernel from outside of a patch: in the worst sample, and window mean."""
     cell, reach = float(around.pitch_px.min()), around.window // 2
     worst, mean = np.empty(len(NEAR_PX)), np.empty(len(NEAR_PX))
     # The worst sample is a corner pixel, with 0.5 px of rounding towards the corner.
@@ -484,7 +485,7 @@ def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:
 def _background_sites(grid: PrintedGrid, registration: Registration, shape: tuple[int, int], window: int) -> Sites:
     rows, columns = shape
     width, height = grid.pitch_mm
-    # The sheet: outermost patches, extended straight to its edge and a margin.
+    # Area of the sheet: from the outermost patches, straight lines to its edge, and a margin.
     low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
     sheet = grid.slots_mm[grid.blank_shares[..., 2].ravel() < 0.5]
     low, high = np.minimum(low, sheet.min(axis=0)), np.maximum(high, sheet.max(axis=0))

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from foundation.compiled import compiled
 from foundation.robust import MAD_TO_SIGMA
 
-# Highest order of flat fields. A basis of lower order is the beginning of this one.
+# Highest order of flat fields. All orders up to it share one cached basis, because lower ones are its beginning.
 _CACHED_ORDER: Final = 8
 
 
@@ -55,7 +55,8 @@ def linear_combinations(basis: _Array, factors: _Array) -> _Array:
 def least_squares(design: _Array, values: _Array, weights: _Array) -> _Array:
     """Return the x (K,) float64 that minimises Σ w (values − design x)².
 
-    The normal equations square the condition of the design, so its columns should be nearly orthogonal and of order 1.
+    The normal equations square the condition number of the design. Its columns should be nearly orthogonal, with values
+    of about 1.
 
     `design`: (N, K) float64. `values`: (N,) float64. `weights`: (N,) float64, ≥ 0.
     """
@@ -65,8 +66,8 @@ def least_squares(design: _Array, values: _Array, weights: _Array) -> _Array:
 def robust_least_squares(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Array, _Array]:
     """Fit by least squares with low weights for outliers.
 
-    Iteratively reweighted with Tukey's biweight, which ends at six robust standard deviations (P. J. Huber, E. M.
-    Ronchetti, *Robust Statistics*, 2nd edition, chapter 7); otherwise like `least_squares`.
+    The fit is repeated with weights by Tukey's biweight of the residuals, which is 0 beyond six robust standard
+    deviations (P. J. Huber, E. M. Ronchetti, *Robust Statistics*, 2nd edition, chapter 7).
 
     Parameters
     ----------
@@ -106,9 +107,9 @@ def held_out_squares(design: _Array, values: _Array, weights: _Array, counts: tu
     design, values
         (N, K) and (N,) float64.
     weights
-        (N,) float64, ≥ 0. Points of weight 0 count neither for the fits nor for their errors.
+        (N,) float64, ≥ 0. Points of weight 0 are not used, neither in the fits nor in the errors.
     counts
-        Numbers of columns, rising, K at most.
+        Numbers of columns, in ascending order, at most K.
 
     Returns
     -------
@@ -124,7 +125,7 @@ def _contiguous(array: _Array) -> _Array:
 
 
 def page_powers(order: int) -> list[tuple[int, int]]:
-    """Return the degrees (i, j) in x and y of the terms of total order up to `order`, in rising order.
+    """Return the degrees (i, j) in x and y of all terms up to the total order `order`, in ascending order.
 
     >>> page_powers(2)
     [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
@@ -142,12 +143,12 @@ def order_of(count: int) -> int:
 
 
 def page_polynomial(points_mm: npt.ArrayLike, page_mm: tuple[float, float], order: int) -> _Array:
-    """Return the basis P_i(x) P_j(y) of Legendre polynomials at points of the page, x, y −1 … 1 on the page.
+    """Return the values of the Legendre polynomials P_i(x) P_j(y) at points of the page; x and y are scaled to −1 … 1.
 
-    `points_mm`: (N, 2) float, mm on the print. Returns (N, terms) float64, read-only, terms as in `page_powers`.
+    `points_mm`: (N, 2) float, mm on the page. Returns (N, terms) float64, read-only, terms as in `page_powers`.
     """
     points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 2)
-    # Terms are in rising order, so a basis of lower order is the beginning of a higher one.
+    # Terms are in ascending order, so a basis of lower order is the beginning of a higher one.
     return _page_basis(points.tobytes(), page_mm, max(order, _CACHED_ORDER))[:, : len(page_powers(order))]
 
 
@@ -164,20 +165,21 @@ def _page_basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Arr
 def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tuple[_Array, tuple[int, ...]]:
     """Return polynomials over the page that describe the fall-off of light, simplest shapes first.
 
-    The fall-off of a lens is a sum of even powers of the distance from its axis: cos⁴ of the angle, and less if the
-    mount shades the rim. The fall-off of a projector is smooth about another point.
+    The fall-off of a lens is a sum of even powers of the distance from its axis: cos⁴ of the angle, and the shadow of
+    the mount. The fall-off of a projector is a smooth function of the distance from another point.
 
     Parameters
     ----------
     page_mm
         Width and height of the page.
     outside_only
-        Whether references surround the patches and are not between them; then up to third order only.
+        Whether all references are around the patches and none between them; the order is then at most 3.
 
     Returns
     -------
-        Terms (legendre, T) float64: each column is a polynomial in the terms of `page_powers`, orthogonal to the
-        columns before it, with mean square 1 over the page. And the numbers of terms after which a fit may end.
+        Terms (legendre, T) float64: each column has the coefficients of a polynomial in the terms of `page_powers`, is
+        orthogonal to the columns before it, and has the mean square 1 over the page. The second value has the numbers
+        of terms that a fit may use.
     """
     half = float(np.hypot(*page_mm)) / 2
     node, _ = np.polynomial.legendre.leggauss(_CACHED_ORDER + 2)
@@ -191,9 +193,10 @@ def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tup
     def radial(half_power: int) -> list[_Array]:
         return [x * r2 ** (half_power - 1), y * r2 ** (half_power - 1), r2**half_power]
 
-    # After slope and bend come the powers r⁴ and r⁶ of the distance from a centre, then the other terms of third and
-    # fourth order; r⁸ comes before the terms of fifth and sixth order. x r² and y r² move the centre to first order.
-    # They replace two of the terms of third order, r⁴ one of fourth, and so on.
+    # Order of the groups: constant, slope and curvature; r⁴ and r⁶, with r the distance from a centre; the other terms
+    # of third and fourth order; r⁸; the other terms of fifth and sixth order. x r² and y r² are in the group of r⁴,
+    # because they are its change if the centre moves; r⁶ and r⁸ have such terms too. Up to the sixth order, each term
+    # replaces one of the other terms of its order.
     groups = (
         [power(0), power(1), power(2), power(3)]
         if outside_only
@@ -225,7 +228,7 @@ def code_powers(degree: int) -> list[tuple[int, int, int]]:
 
 
 def code_polynomial(rgb: npt.ArrayLike, degree: int) -> _Array:
-    """Return the basis of printed codes: products of three Legendre polynomials of codes scaled to −1 … 1.
+    """Return the values of products of three Legendre polynomials at printed codes, which are scaled to −1 … 1.
 
     `rgb`: (C, 3) int, printed codes 0 … 255. Returns (C, terms) float64, terms as in `code_powers`.
     """
@@ -279,7 +282,7 @@ def _robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _A
 def _held_out_squares(design: _Array, values: _Array, weights: _Array, counts: npt.NDArray[np.int64]) -> _Array:
     # The error of a held-out point is its residual / (1 − leverage), so no fit is repeated (R. D. Cook, S. Weisberg,
     # *Residuals and Influence in Regression*, section 2.2). In coordinates in which the normal matrix of the largest
-    # fit is 1, the leverages of nested fits are sums over one row of the design.
+    # fit is the identity, the leverages of nested fits are sums over one row of the design.
     points, unknowns = design.shape
     gram, right = _normal_equations(design, values, weights)
     _factorise(gram)

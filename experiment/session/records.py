@@ -1,7 +1,7 @@
 """Values of a session: its plan, and attempts, frames, events and verdicts in its journal.
 
-A `FrameJudge` decides about measurements and limits. The journal keeps every judgement completely, so that each
-refusal can be read again with its numbers, and a resumed run has the measurements of earlier frames.
+A `FrameJudge` measures frames and applies the limits. The journal contains every judgement with its values, so that
+each refusal can be read later, and a resumed run has the measurements of earlier frames.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ RECENT = 50
 class Check:
     """One check of a frame."""
 
-    name: str  # "movement", "file", "screen" …; that of the figure if the look-up table (LUT) has such a figure
+    name: str  # name of the corresponding figure of the look-up table (LUT); without one, "movement", "file" …
     value: float | None = None  # result in `unit`; None if it is not a number
     low: float | None = None  # lower limit of `value`; None without limit
     high: float | None = None  # upper limit of `value`; None without limit
@@ -51,7 +51,7 @@ class Check:
 
     @property
     def is_beyond(self) -> bool:
-        """Whether the value is outside its limits. Another check may report the cause, or the change is followed."""
+        """Whether the value is outside its limits. The check may pass all the same, if the change is allowed."""
         if self.value is None:
             return False
         return (self.low is not None and self.value < self.low) or (self.high is not None and self.value > self.high)
@@ -65,10 +65,10 @@ class Judgement:
     seen: tuple[float, float, float] | None = None  # camera RGB of the paper above black, counts; None if not measured
     measurement: bytes = b""  # data of the judge for later frames, opaque to all others
     preview: bytes = b""  # JPEG of the frame; empty if there is none
-    # Earlier frames cannot be trusted. For a refused reference: all since the last good one. For another refused frame:
-    # all since the start of the run, or since its last pause for a lasting cause.
+    # Whether earlier frames must not be used. If this frame is a reference: all frames after the last good reference.
+    # If it is another frame: all frames of the run, or all after its last pause for a lasting cause.
     voids: bool = False
-    lasting: bool = False  # repeating the frame does not help until somebody has removed the cause
+    lasting: bool = False  # whether a repetition is useless until somebody has removed the cause
 
     @classmethod
     def of_reason(cls, name: str, reason: str | None) -> Judgement:
@@ -99,20 +99,20 @@ class FrameJudge(Protocol):
     def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
         """Restore a frame of an earlier run from the `measurement` of its judgement.
 
-        It is called for all earlier frames before the first frame is judged. `accepted`: whether the frame still
-        counts.
+        It is called for all earlier frames before the first frame is judged. `accepted`: whether the frame is still
+        accepted.
         """
         ...
 
 
 @runtime_checkable
-class OutlastsPauses(Protocol):
-    """A judge that takes pauses of a run into account."""
+class HandlesPauses(Protocol):
+    """A judge that allows for changes during a pause of the run."""
 
     def after_pause(self) -> None:
-        """Handle a pause of the run for a lasting cause; the next frames reconnect it to the earlier ones.
+        """Prepare for the first frames after a pause for a lasting cause, which link the run to its earlier frames.
 
-        It is called when all earlier frames are judged, and while no frame is being judged.
+        It is called after all earlier frames are judged, and before the next frame is judged.
         """
         ...
 
@@ -121,8 +121,8 @@ class OutlastsPauses(Protocol):
 class Attempt:
     """One attempt at a step, as in the journal.
 
-    Times are of the clock of the laboratory, None before they are reached. The verdict is None for an attempt that is
-    not finished or was interrupted.
+    Times are those of the laboratory's clock, and None for a stage that was not reached. The verdict is None if the
+    attempt is in progress or was interrupted.
     """
 
     id: int
@@ -138,7 +138,7 @@ class Attempt:
 
     @property
     def has_frame(self) -> bool:
-        """Whether it has a raw file. A failed attempt may have the file name of the next one."""
+        """Whether there is a raw file. The field `file` of a failed attempt may name the file of the next attempt."""
         return self.taken_at is not None
 
 
@@ -187,8 +187,8 @@ class SessionEvent:
     """An event that is not a frame: start, stop, warm-up, failure of a device."""
 
     at: datetime
-    what: str
-    detail: str
+    what: str  # name of the event, as in the journal
+    detail: str  # sentence
     number: int
 
 
@@ -205,7 +205,7 @@ def last_frame_time(attempts: Iterable[Attempt]) -> datetime | None:
 
 def preview_path(folder: Path, file: str) -> Path:
     """Return the path of the preview of a raw file in the folder of a session, whether it exists or not."""
-    # Only the name of `file` counts, so that no row of a journal leads out of `previews/`.
+    # Only the last part of `file` is used, so that no row of a journal leads to a file outside of `previews/`.
     return folder / "previews" / f"{Path(file).stem}.jpg"
 
 
@@ -214,24 +214,24 @@ class TimedAttempt:
     """Duration and success of an attempt."""
 
     seconds: float | None  # interval since the previous attempt; None after a pause
-    gained: bool  # the attempt gave an accepted frame
+    is_accepted: bool  # whether the attempt gave an accepted frame
 
 
 def time_left(attempts: Iterable[TimedAttempt], remaining_frames: int) -> float | None:
     """Estimate the time for the remaining frames, s; None if it is unknown.
 
-    It is the recent number of attempts for each frame, with repetitions and references, times the median interval.
+    It is the product of the attempts per accepted frame, the median interval, and the number of remaining frames.
 
     Parameters
     ----------
     attempts
-        Judged attempts, oldest first; the newest `RECENT` count.
+        Judged attempts, oldest first; only the last `RECENT` are used.
     remaining_frames
         Number of frames that are not taken yet.
 
     Examples
     --------
-    >>> night = [TimedAttempt(seconds, gained=seconds != 7) for seconds in (None, 5, 300, 5, 7, 7)]
+    >>> night = [TimedAttempt(seconds, is_accepted=seconds != 7) for seconds in (None, 5, 300, 5, 7, 7)]
     >>> time_left(night, remaining_frames=10)
     105.0
     """
@@ -239,11 +239,11 @@ def time_left(attempts: Iterable[TimedAttempt], remaining_frames: int) -> float 
         return 0.0
     recent = deque(attempts, RECENT)
     intervals = [attempt.seconds for attempt in recent if attempt.seconds is not None]
-    gained = sum(attempt.gained for attempt in recent)
-    if not intervals or not gained:
+    accepted_count = sum(attempt.is_accepted for attempt in recent)
+    if not intervals or not accepted_count:
         return None
-    # The median, so that a pause does not count for ever.
-    return statistics.median(intervals) * len(recent) / gained * remaining_frames
+    # The median, so that a pause does not change the estimate until the end.
+    return statistics.median(intervals) * len(recent) / accepted_count * remaining_frames
 
 
 def duration_text(seconds: float | None) -> str:
@@ -257,16 +257,16 @@ def duration_text(seconds: float | None) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
-# Kind of a frame: a planned illuminant, full white, black of the picture, or a colour for the response of the
-# projector. Response frames are judged while a session is taken, and are not part of a LUT.
+# Kind of a frame: a planned illuminant, full white, a black picture, or a colour that shows the response of the
+# projector. Response frames are judged during the session, and are not used for a LUT.
 FrameKind = Literal["light", "white", "dark", "response"]
 
 KINDS: tuple[FrameKind, ...] = get_args(FrameKind)  # All kinds, as in the journal
 
 REFERENCES: tuple[FrameKind, ...] = ("white", "dark")  # Kinds of frames with which frames of illuminants are compared
 
-# Highest code of a response frame; 255 is left to white and to illuminants, so that no response frame is mistaken for
-# one.
+# Highest code of a response frame. It is below 255, so that no response frame has the codes of a white frame or of an
+# illuminant with full code.
 TOP = 250
 
 # Red, green and blue of the projector, each alone
@@ -275,8 +275,8 @@ PRIMARIES = (Colour(TOP, 0, 0), Colour(0, TOP, 0), Colour(0, 0, TOP))
 MIDDLE = 136  # Code of a quarter of the light, at which the curve of each primary is compared with that of grey
 
 # First frames of a session, from which the light of any codes is predicted: primaries; greys for the curve from codes
-# to light; pairs of primaries for light that is added if both are on; and primaries at half code for their own curves.
-# Steps are chosen: equal in code, and closer where the curve is relatively steep.
+# to light; pairs of primaries for the light added by overlaps; and primaries at half code for the curve of each.
+# Steps of the greys (judgement): equal, and smaller for dark codes, because the curve is relatively steep there.
 RESPONSE = (
     *PRIMARIES,
     *(Colour(code, code, code) for code in (TOP, 232, 208, 184, 160, 136, 112, 88, 64, 48, 32, 16)),
@@ -308,10 +308,10 @@ def plan_steps(
     seed: int | None = None,
     response: Sequence[Colour] = (),
 ) -> tuple[SessionStep, ...]:
-    """Return the plan of a session: a white and a dark frame first, every `reference_every` illuminants, and last.
+    """Return the plan: a white and a dark frame at the start, every `reference_every` illuminants, and at the end.
 
-    `seed`: seed of the shuffled order (numpy's PCG64), so that neither time nor repeated frames correlate with colour;
-    None keeps the order. `response`: colours of the response frames, after the first pair.
+    `seed`: seed of the shuffled order (numpy's PCG64), so that neither time nor an unchanged picture correlates with
+    colour; None keeps the order. `response`: colours of the response frames, after the first pair.
     """
     steps: list[SessionStep] = []
 
@@ -334,8 +334,8 @@ def plan_steps(
 def link_steps(first_number: int) -> tuple[SessionStep, ...]:
     """Return the first frames of a resumed run, which link it to the earlier frames.
 
-    A grey and the primaries show the response of the projector again. A white and a dark frame give the illuminants a
-    reference with the same lamp.
+    A grey and the primaries measure the response of the projector again. The next illuminants are compared with the
+    white and the dark frame, because the lamp may have changed during the pause.
     """
     colours = (Colour(TOP, TOP, TOP), *PRIMARIES)
     frames: list[tuple[FrameKind, Colour]] = [*(("response", colour) for colour in colours), ("white", WHITE)]

@@ -39,9 +39,10 @@ if TYPE_CHECKING:
 # Default number of images in a shard. A kill loses at most this number for each shard in progress.
 SHARD_IMAGES: Final = 256
 
-# Version of colorimetric rendering, raised when its rules change the pixels for equal options. 1 subtracted the grey of
-# the black patch of the print, 2 the grey to which black is mapped. 3 tries more patches for greys with errors of 0.2
-# degrees or more in 2. 4 uses one map of the chart, interpolated between patches, instead of one for each illuminant.
+# Version of colorimetric rendering, increased when equal options give other pixels. In version 1 the black of the print
+# was the grey of the black patch; since version 2 it is the grey to which black is mapped. Version 3 tries more patches
+# for greys with an error of 0.2° or more. Version 4 has one map of the chart, interpolated between patches; before,
+# each illuminant had one.
 RENDERING_VERSION: Final = 4
 
 
@@ -66,12 +67,12 @@ class DatasetOptions:
     crops
         Number of crops of each picture, 1 or more; the sources must be prepared with the same number.
     reading
-        Preparation of the sources as plain values; it is only recorded.
+        Preparation of the sources as plain values. It is recorded in `dataset.json` and has no effect.
     rendering
         ``"colorimetric"``: the print reproduces the colours of the picture; ``"codes"``: the codes of the picture are
         the codes of the print, as in the paper.
     matrix
-        Matrix from linear sRGB to camera RGB for colorimetric rendering; None for that of the camera of the LUT.
+        Matrix from linear sRGB to camera RGB for colorimetric rendering; None: matrix of the camera of the LUT.
     black_point
         Treatment of the black of the print.
     uncertainty
@@ -111,16 +112,16 @@ class DatasetOptions:
 
     @cached_property
     def tints(self) -> bool:
-        """Whether the illuminant changes its colour over an image, so that images have maps of it."""
+        """Whether the colour of the illuminant changes over an image, so that images have maps of it."""
         return self.variation is not None and self.variation.tints
 
     @property
     def is_rendered(self) -> bool:
-        """Whether rendering changes pixels: it is not by codes with the black of the print kept."""
+        """Whether the options differ from rendering by codes that keeps the black of the print."""
         return self.rendering != "codes" or self.black_point.kind != "keep"
 
     def describe_rendering(self, lut: Lut) -> dict[str, Any]:
-        """Return the rendering as plain values; empty for codes with the black of the print kept."""
+        """Return the rendering as plain values; empty for rendering by codes that keeps the black of the print."""
         described: dict[str, Any] = {}
         if self.rendering == "colorimetric":
             used = self.matrix or matrix_for(lut)
@@ -171,8 +172,8 @@ def parse_split(text: str) -> tuple[float, float, float]:
     is_whole = total >= 1 and all(share == int(share) for share in shares)
     if not (is_whole or abs(total - 1) < _ROUNDED or abs(total - 100) < 100 * _ROUNDED):
         raise InputError(
-            f"the split {text} has the sum {total:.10g}, expected 1 as in 0.8,0.1,0.1; use a sum of 1, or integers as "
-            "in 8,1,1"
+            f"the split {text} has the sum {total:.10g}, expected 1; give shares such as 0.8,0.1,0.1, or integers such "
+            "as 8,1,1"
         )
     return shares[0] / total, shares[1] / total, shares[2] / total
 
@@ -186,12 +187,12 @@ class ShardJob:
     shard: int
     first: int  # first image number
     stop: int  # last image number + 1
-    position: int  # of the first of `sources` in the list of the plan
-    sources: tuple[Source, ...]  # of the images in this shard
+    position: int  # position of the first source of this shard in the plan
+    sources: tuple[Source, ...]  # sources of the images in this shard
     choice: LightChoice
     seed: int
     options: DatasetOptions
-    versions: dict[str, str]  # of the libraries that change bytes; a worker must have the same
+    versions: dict[str, str]  # versions of libraries that may change bytes; the worker must have the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,14 +209,15 @@ class Plan:
         key_of(self.seed)
         if not self.sources or not self.choice.lights_each:
             raise InputError(
-                f"the plan has {len(self.sources)} pictures and {self.choice.lights_each} illuminants; add some of both"
+                f"the plan has {len(self.sources)} pictures and {self.choice.lights_each} illuminants for each, "
+                "expected at least 1 of both; add pictures or illuminants"
             )
         if self.total > 1 << 32:
             raise InputError(f"the plan has {self.total} images, expected at most 2^32; make several data sets")
         if self.options.tints and any(lighting.masks for lighting in self.choice.lightings_of(0)):
             raise InputError(
-                "a gradient with colour and several illuminants in an image both need masks, expected one of them; "
-                "omit colour, or use one illuminant"
+                "the images have a gradient with colour and several illuminants, expected at most one of both, because "
+                "both need the masks; omit the colour of the gradient, or use one illuminant"
             )
         require_library(self.options.layout)
 
@@ -259,7 +261,7 @@ class Plan:
         )
 
     def identity(self) -> dict[str, Any]:
-        """Return plain values that are equal for two plans exactly if they make the same bytes."""
+        """Return plain values; they are equal for two plans if and only if both plans make the same bytes."""
         return {
             "format": "crop.plan",
             "version": 1,
@@ -299,7 +301,7 @@ class Plan:
 
 
 def sources_sha256(sources: Sequence[Source]) -> str:
-    """Return a hash over name and preparation of all sources."""
+    """Return a hash of the names and preparations of all sources."""
     # Folders and contents are not included: the hash is equal on every machine, and files are hashed when they are
     # read.
     digest = hashlib.sha256()

@@ -544,7 +544,7 @@ class World:
             frame_light[:, first:last] = patch_light * weights.transpose(2, 0, 1)
 
         _run_in_blocks(self.body.visible.height, block)
-        self.lens.veiled(frame_light, self.body.pattern)
+        self.lens.add_veil(frame_light, self.body.pattern)
         return frame_light, np.ones(3, dtype=np.float32)
 
     def _mirrored(self, points: NDArray[np.float64], situation: Situation, first: int) -> NDArray[np.float32]:
@@ -710,7 +710,7 @@ class World:
         table = self._signals(reflectance).astype(np.float32)
         nodes = self._nodes(situation)
         views = [nodes]
-        if self.lens.splits_colours:
+        if self.lens.has_lateral_colour:
             views = [self._nodes(situation, channel) for channel in _CHANNELS]
         sigma = ((2 * room.blur_px) ** 2 + (2 * situation.defocus_px) ** 2 + APERTURE_VARIANCE) ** 0.5
         out = np.empty((3, visible.height, visible.width), dtype=np.float32)
@@ -735,7 +735,7 @@ class World:
         if spread:
             self.lens.spread(out)
             _run_in_blocks(visible.height, respond)
-        return out, self.lens.veiled(out, self.body.pattern)
+        return out, self.lens.add_veil(out, self.body.pattern)
 
     def _response(self, first: int, last: int) -> NDArray[np.float32]:
         # Response (rows, columns) float32 of the photosites of a block of rows.

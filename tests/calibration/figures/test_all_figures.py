@@ -85,7 +85,7 @@ def test_lens_residual_needs_enough_cells(cells: int, measured: bool, left_in: b
     table: Any = SimpleNamespace(
         is_of_one_frame=False,
         registration=SimpleNamespace(mismatched_cells=np.zeros(cells)),
-        lens=SimpleNamespace(measured=measured, is_left_in=left_in, left=0.003, left_worst=0.02),
+        lens=SimpleNamespace(measured=measured, is_uncorrected=left_in, remaining_rms=0.003, remaining_worst=0.02),
     )
     assert geometry.CORRECTION_RESIDUAL.measure(table) == (0.003 if told else None)
 
@@ -204,7 +204,7 @@ def lens_before(cells: int, **more: bool) -> dict[str, Any]:
     """Return a lens with a residual of 0.003, and the number of cells."""
     return {
         "registration": SimpleNamespace(mismatched_cells=np.zeros(cells)),
-        "lens": SimpleNamespace(left=0.003, left_worst=0.02, **more),
+        "lens": SimpleNamespace(remaining_rms=0.003, remaining_worst=0.02, **more),
     }
 
 
@@ -286,10 +286,10 @@ AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.arra
         (geometry.BLEED, {}, 0.00449 + 0.01),
         (geometry.BLOCKS_GOOD, {}, 7 / 8),
         # What a lens leaves is told where cells are enough to tell it.
-        (geometry.CORRECTION_RESIDUAL, lens_before(4096, measured=True, is_left_in=False), 0.003),
-        (geometry.CORRECTION_RESIDUAL, lens_before(4095, measured=True, is_left_in=False), None),
-        (geometry.CORRECTION_RESIDUAL, lens_before(512, measured=True, is_left_in=True), 0.003),
-        (geometry.CORRECTION_RESIDUAL, lens_before(4096, measured=False, is_left_in=True), None),
+        (geometry.CORRECTION_RESIDUAL, lens_before(4096, measured=True, is_uncorrected=False), 0.003),
+        (geometry.CORRECTION_RESIDUAL, lens_before(4095, measured=True, is_uncorrected=False), None),
+        (geometry.CORRECTION_RESIDUAL, lens_before(512, measured=True, is_uncorrected=True), 0.003),
+        (geometry.CORRECTION_RESIDUAL, lens_before(4096, measured=False, is_uncorrected=True), None),
         (truth.NOISE_MISFIT, {}, 0.2),
         (truth.NOISY_SHARE, {}, 4 / 512),
         (truth.REFERENCES_USED, {}, 0.76),
@@ -340,7 +340,7 @@ def test_check_judges_bounded_figures_only_beyond_limit(figure: Any, beyond: dic
 
 
 def test_check_skips_figures_of_all_frames() -> None:
-    result = of_one_frame(**lens_before(4096, measured=True, is_left_in=False))
+    result = of_one_frame(**lens_before(4096, measured=True, is_uncorrected=False))
     for figure in (geometry.CORRECTION_RESIDUAL, light.LINEARITY_KNOWN, radiometry.WHITE_FRAMES, truth.TRUTH_WORST_DEG):
         assert figure.measure(result) is not None
         assert figure.judged_value(result) is None

@@ -43,12 +43,12 @@ def test_value_beyond_its_limits(value: float | None, low: float | None, high: f
 
 
 def test_remaining_time_uses_the_last_fifty_attempts() -> None:
-    night = [*[TimedAttempt(1000, gained=False)] * 30, *[TimedAttempt(6, gained=True)] * 25]
+    night = [*[TimedAttempt(1000, is_accepted=False)] * 30, *[TimedAttempt(6, is_accepted=True)] * 25]
     # Half of the fifty gave a frame; the median interval is that of both halves.
     assert time_left(night, 10) == (1000 + 6) / 2 * 2 * 10
     assert time_left(night, 0) == 0
     assert time_left(night[:30], 10) is None
-    assert time_left([TimedAttempt(None, gained=True)], 10) is None
+    assert time_left([TimedAttempt(None, is_accepted=True)], 10) is None
 
 
 def test_attempts_with_frames_and_doubts() -> None:
