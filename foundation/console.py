@@ -681,7 +681,7 @@ def json_value(value: Any) -> Any:
     Examples
     --------
     >>> from pathlib import Path
-    >>> plain({"place": Path("lut"), "angles": (0.5, float("nan"))})
+    >>> json_value({"place": Path("lut"), "angles": (0.5, float("nan"))})
     {'place': 'lut', 'angles': [0.5, None]}
     """
     if value is None or isinstance(value, str | bool | int):

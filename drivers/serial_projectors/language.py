@@ -378,7 +378,7 @@ def load_language(named: str) -> Language:
                 f"or the path of a file that ends with {FILE_ENDING}"
             )
         path = FOLDER / f"{named.lower()}{FILE_ENDING}"
-    text = read_text(path, "write one as described in docs/devices.md", "language file")
+    text = read_text(path, "write one as described in docs/reference/language-files.md", "language file")
     return parse_language(text, str(path))
 
 
