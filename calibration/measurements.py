@@ -1,6 +1,6 @@
 """Measurements of a build or a check, in named groups of frozen values. Verdict, report and LUT are based on them.
 
-L illuminants, C colours, G printed greys, S samples per patch. Counts are above black unless called raw.
+L illuminants, C colours, G printed greys, S samples per patch. Counts are above the black level unless called raw.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _Levels = Annotated[FloatArray, AfterValidator(lambda values: values.reshape(-1,
 
 @dataclass(frozen=True, eq=False)
 class FrameMeasurements:
-    """Measurements of one light or white frame."""
+    """Measurements of one frame of an illuminant or of white."""
 
     record: FrameRecord
     black: FloatArray  # (2, 2) float64 counts, black level of each position of the Bayer block
@@ -57,7 +57,7 @@ class FrameMeasurements:
     dark: FloatArray  # (3,) float64 counts, dark light on bare paper that was subtracted; 0 without subtraction
     share_at_zero: float  # Fraction of the frame's samples in the LUT that are 0
     blur_px: float  # σ of the frame's blur, half-size px: of the frame registered last, plus the change since then
-    exposure: float  # Shutter time × ISO speed / f-number² by the raw file, s; 0 if unknown
+    exposure: float  # Shutter time × ISO speed / f-number² from the raw file, s; 0 if unknown
     origin: FrameOrigin
 
 
@@ -120,13 +120,13 @@ class LightMeasurements:
     # (L,) float64, fraction of each illuminant's samples in the LUT that are 0; (0,) after a check
     share_at_zero: _Array
     additivity: Additivity | None  # White against the sum of the primaries; None if a frame is missing
-    # Agreement with the codes; None after a check. Indices from L on in `exchanges` and `seen_as` are white frames
+    # Agreement with the codes; None after a check. In `exchanges` and `seen_as`, indices ≥ L are white frames
     codes: CodeAgreement | None
-    # The same for white frames: only the first if the others differ by lamp drift, else all. None without any
+    # Agreement of the white frames with the codes, only of the first if the lamp drifted; None without white frames
     white_frames: CodeAgreement | None
     # Drift correction in the LUT; None if not requested. All other values are as measured
     drift: DriftCorrection | None = None
-    # Light missing in the dark frames; None without frames of the three primaries alone or without a dark frame
+    # Light that dark frames do not contain; None if the frame of a primary alone or a dark frame is missing
     stray: StrayLight | None = None
 
     @property
@@ -137,9 +137,9 @@ class LightMeasurements:
 
     @property
     def off_codes_deg(self) -> _Array | None:
-        """(L,) float64 degrees, significant angle between each white and its prediction; None after a check.
+        """(L,) float64 degrees, significant angle between each ground truth and its prediction; None after a check.
 
-        For exchanged illuminants, the angle between the two.
+        For two exchanged illuminants, the angle between them.
         """
         if self.codes is None:
             return None
@@ -150,7 +150,7 @@ class LightMeasurements:
         return angle_deg
 
     def lights_off_codes(self, accepted_deg: float) -> list[int]:
-        """Return the illuminants beyond `accepted_deg` from the prediction, the furthest first."""
+        """Return the illuminants that deviate by more than `accepted_deg`, the largest deviation first."""
         deg = self.off_codes_deg
         return [] if deg is None else [int(light) for light in np.argsort(-deg) if deg[light] > accepted_deg]
 
@@ -164,7 +164,9 @@ class GreyMeasurements:
     errors: _Array  # (L, G, 3) float64 counts, standard errors of `values`
 
     def tints_deg(self, white: _Array) -> _Array:
-        """Return the angles (G,), degrees, of greys to white under the illuminant with the highest weakest channel.
+        """Return the angles (G,) between greys and white, degrees.
+
+        The illuminant with the most counts in its weakest channel is used, because its noise is lowest.
 
         `white`: (L, 3) float64 counts, the ground truth.
         """
@@ -184,7 +186,7 @@ class SensorMeasurements:
     noise: _Array  # (3,) float64, median standard deviation of one sample under white, relative to paper white
     transfer: PhotonTransfer  # Photon-transfer curve of the frame registered first
     linearity: LinearityMeasurements | None
-    superposition: Superposition  # Nonlinearity by comparing several primaries together and alone
+    superposition: Superposition  # Nonlinearity: several primaries together, compared with each alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,9 +195,9 @@ class CellMeasurements:
 
     window: int  # Side of the sampling window, px; S = window²
     unfit: tuple[Unfit, ...]
-    stains: Stains  # Patches with other colours than their codes', in the order of colour indices
+    stains: Stains  # Patches whose colour does not match their code, in the order of colour indices
     levels: _Array  # (C, 3) float64, each patch in the frame registered first, relative to bare paper
-    added: AddedLight  # Light added to some patches, independent of their colour
+    added: AddedLight  # Light added to some patches, whatever their colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,13 +206,13 @@ class TableMeasurements:
 
     session: SessionMeasurements
     registration: Registration
-    frames: tuple[FrameMeasurements, ...]  # Every light and white frame, in the order taken
+    frames: tuple[FrameMeasurements, ...]  # Frames of illuminants and of white, in the order taken
     lights: LightMeasurements
     greys: GreyMeasurements
     sensor: SensorMeasurements
     dark_frames: DarkSummary  # Dark frames; only the first one in a check
     cells: CellMeasurements
-    origins: OriginFigures  # Frames of another camera, lens or exposure than most
+    origins: OriginFigures  # Frames with another camera, lens or exposure than most frames
     # Primaries alone, for the flat field of coloured patches; None if a frame is missing or too dim
     primaries: Primaries | None
     lens: LensFigures  # Light that the lens spreads, and its correction
@@ -220,7 +222,7 @@ class TableMeasurements:
 
     @property
     def is_of_one_frame(self) -> bool:
-        """True for a check, which reads one light or white frame and one dark frame."""
+        """True for a check, which reads one frame of an illuminant or of white, and one dark frame."""
         return self.lights.codes is None
 
     @property
@@ -237,7 +239,7 @@ class TableMeasurements:
 
     @property
     def registered_frame(self) -> FrameMeasurements:
-        """The frame registered first; the first measured frame if that one was not measured."""
+        """The frame registered first; if it was not measured, the first measured frame."""
         candidates = (frame for frame in self.frames if frame.record.file == self.session.registered_file)
         return next(candidates, self.frames[0])
 
@@ -259,7 +261,7 @@ class TableMeasurements:
 
     @property
     def white_drift(self) -> float:
-        """Largest relative change of paper white between white frames, over the channels."""
+        """Largest relative difference of paper white between white frames, in the worst channel."""
         whites = np.array([frame.paper.white for frame in self.white_frames])
         return float((np.ptp(whites, axis=0) / whites.mean(axis=0)).max()) if len(whites) > 1 else 0.0
 
@@ -274,13 +276,13 @@ class TableMeasurements:
 
     @property
     def dark_share(self) -> float:
-        """Light on bare paper while the projector shows black, of white, worst channel; NaN if not measured."""
+        """Light on bare paper while the projector shows black, relative to white, worst channel; NaN if unknown."""
         share = np.abs(self.dark_frames.light / self._full_white).max()
         return float(share) if np.isfinite(self.dark_frames.light).all() else float("nan")
 
     @property
     def dark_change(self) -> float:
-        """Change of this light between dark frames, relative to white; NaN with one dark frame."""
+        """Change of the light in dark frames during the session, relative to white; NaN with one dark frame."""
         lights = self.dark_frames.lights
         return float((np.ptp(lights, axis=0) / self._full_white).max()) if len(lights) > 1 else float("nan")
 

@@ -25,14 +25,14 @@ from foundation.files import atomic_file, csv_text, read_csv, write_atomic
 Kind = Literal["uniform", "blackbody", "spectrum"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")  # Columns of `illuminations.csv` (docs/formats.md)
 
-NAME = "name"  # Additional column with names of illuminants, in computed tables with other spectra
+NAME = "name"  # Additional column with names of illuminants, for computed LUTs with other spectra
 
 # Steps along an edge of the chromaticity triangle: 666 points; with 41 black bodies these are the 707 of the paper.
 GRID = 35
 
 CCTS_K = tuple(range(2000, 10001, 200))  # Black bodies of the plan, K: from candle light to blue sky
 
-MOST_CCTS = 10_000  # Largest number of temperatures in a text: more come from a mistake in the step
+MOST_CCTS = 10_000  # Largest number of temperatures in a text; a larger number comes from a wrong step
 
 
 FORMATS = ("png", "pdf", "svg")  # File extensions of plots, and Matplotlib's names of the formats
@@ -48,7 +48,7 @@ class Illumination:
     index: int
     kind: Kind  # "spectrum" for a computed illuminant with its own spectrum
     cct_k: float | None  # temperature of a black body, K
-    colour: Colour  # codes that the projector shows, or that would show the colour of a computed illuminant
+    colour: Colour  # codes that the projector shows; for a computed illuminant, codes of the nearest colour
     name: str | None = None  # name of a computed illuminant, such as "D65"
 
 
@@ -102,7 +102,10 @@ def save_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
 
 
 def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illumination, ...]:
-    """Read `illuminations.csv`; additional columns are ignored. `computed`: allow names and other spectra."""
+    """Read `illuminations.csv`; additional columns are ignored.
+
+    `computed`: whether the file belongs to a computed LUT, with names and other spectra.
+    """
     rows = read_csv(path, "make one with: acquire illuminations", "illuminations")[1]
     if not rows or any(column not in rows[0] for column in COLUMNS):
         raise FormatError(f"{path}: illuminants in the columns {','.join(COLUMNS)} expected; run acquire illuminations")
@@ -112,7 +115,7 @@ def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illuminat
         cct_k: float | None = None
         try:
             if kind not in ("uniform", "blackbody", "spectrum") or (kind == "spectrum" and not computed):
-                raise ValueError(f"kind is {kind!r}, uniform or blackbody expected")
+                raise ValueError(f"kind is {kind!r}, uniform{', spectrum' if computed else ''} or blackbody expected")
             for column in ("index", "red", "green", "blue"):
                 if not row[column].strip().removeprefix("-").isdecimal():
                     raise ValueError(f"{column} is {row[column] or 'missing'}, a whole number expected")
@@ -148,8 +151,8 @@ def parse_ccts(text: str) -> tuple[float, ...]:
         steps = (last - first) / step if step else math.nan
         if not 0 <= steps < MOST_CCTS:
             raise InputError(
-                f"{description}: steps of {step:g} K do not go from {first:g} to {last:g} K in at most {MOST_CCTS} "
-                "temperatures; use a step below 0 for a falling range"
+                f"{description}: a range from {first:g} to {last:g} K in steps of {step:g} K; at most {MOST_CCTS} "
+                "temperatures expected, and a step below 0 for a falling range; change the step"
             )
         return tuple(first + step * number for number in range(int(steps + 1e-9) + 1))
     _require_kelvin(ccts, description)
@@ -165,15 +168,15 @@ def _require_kelvin(ccts: Sequence[float], description: str) -> None:
 def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:
     """Plot the rb-chromaticities of illuminants (paper, section 3.1), each point in its colour.
 
-    Chromaticities r = R / (R + G + B) and b = B / (R + G + B) are computed from the decoded codes, that is from linear
-    light with the sRGB transfer function. An illuminant without light is omitted.
+    Chromaticities r = R / (R + G + B) and b = B / (R + G + B) are computed from the codes, decoded to linear light
+    with the sRGB transfer function. An illuminant with the codes 0, 0, 0 is omitted.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     ending = path.suffix.lower().removeprefix(".")
     if ending not in FORMATS:
-        raise InputError(f"the plot {path.name} has no known format; end its name with .{', .'.join(FORMATS)}")
+        raise InputError(f"the plot {path.name} has no known format; choose a name that ends in .{', .'.join(FORMATS)}")
     lit_lights = [light for light in illuminations if any(light.colour)]
     codes = np.array([light.colour for light in lit_lights]).reshape(-1, 3) / 255
     linear = decode_srgb(codes)
@@ -224,7 +227,7 @@ def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
     axes.set_ylim(-0.03, 1.03)
     axes.set_aspect("equal")
     axes.legend(loc="upper right", frameon=False)
-    axes.set_title(f"rb-chromaticities of {len(lit_lights)} illuminations")
+    axes.set_title(f"rb-chromaticities of {len(lit_lights)} illuminants")
     # The date is not written, so that the same illuminants give the same PNG.
     metadata = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}[ending]
     with atomic_file(path) as stream:

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from generator.dataset.making import Workers
     from generator.dataset.plan import Plan
     from generator.dataset.reader import Dataset
-    from generator.dataset.records import Description
     from generator.rendering.matrices import ColourMatrix
 
 
@@ -61,8 +60,8 @@ of a store supported by fsspec. OUT appears when it is complete: images/ (linear
 
 Each image shows a print of the picture under an illuminant, as the camera would record it. A pixel is the response to
 its colour, interpolated between patches, plus the noise of one sample; with --rendering codes it is one sample of its
-patch. Equal seed, pictures and LUT give equal bytes, with any workers. A picture that cannot be read is skipped and
-listed. To resume an interrupted run, repeat the same command.
+patch. Equal seed, pictures and LUT give equal bytes with any number of workers. A picture that cannot be read is
+skipped and listed. To resume an interrupted run, repeat the same command.
 
 Examples: a first data set from a computed LUT; training crops under illuminants of any chromaticity; test images with
 two illuminants each, rendered as in the paper.
@@ -118,7 +117,7 @@ def generate(
         plan = _plan(paths.lut, paths.out, pictures, light, rendering, variation, images, work)
         existing = completed_dataset(plan, paths.out)
         if existing is not None:
-            _print_summary(existing, paths.out, output, was_there=True)
+            _print_summary(existing, paths.out, output, is_existing=True)
             _draw_sheet(existing, paths.out, sheet)
         elif work.shard is not None:
             _make_share(plan, paths.out, work.shard, workers, output)
@@ -129,7 +128,7 @@ def generate(
 
 @_explore_app.command(epilog=EXIT_CODES)
 def explore(
-    lut: Annotated[Path, typer.Argument(metavar="LUT", help="Folder of the LUT; demo: for a small computed LUT.")],
+    lut: Annotated[Path, typer.Argument(metavar="LUT", help="Folder of the LUT, or demo: for a small example.")],
     sources: Annotated[
         list[str] | None,
         typer.Option(
@@ -225,11 +224,11 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers, output: Json
         done_count, shard_count = make_share(plan, out, share, workers, callbacks)
     output.add(dataset=masked(out), shard=shard, shards_done=done_count, shards=shard_count)
     finish = "run the same command without --shard to complete the data set"
-    next_step = finish if done_count == shard_count else "run the command for the other shares"
+    next_step = finish if done_count == shard_count else "run the command for the other shares first"
     print(masked(f"{done_count} of {shard_count} shards of {out} are done; {next_step}"))
 
 
-def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bool = False) -> None:
+def _print_summary(dataset: Dataset, out: str, output: JsonOutput, is_existing: bool = False) -> None:
     record = dataset.description
     lights = len(dataset.light_labels)
     # A picture drawn several times is a source each time; a computed picture has no hash.
@@ -243,7 +242,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
         choice = choice["lights"]
     output.add(
         dataset=masked(out),
-        made=not was_there,
+        made=not is_existing,
         images=record.images,
         planned=record.planned,
         pictures=record.sources,
@@ -257,7 +256,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
         replaced_pixels=record.replaced_pixels,
         rendering=None if record.rendering is None else record.rendering.model_dump(mode="json"),
     )
-    note = "; it was already complete" if was_there else ""
+    note = "; it was already complete" if is_existing else ""
     print(f"{masked(out)}: {counted(record.images, 'image')} of {pictures} under {counted(lights, 'illuminant')}{note}")
     if record.splits:
         split_text = ", ".join(f"{images} for {split}" for split, images in record.splits.items())
@@ -274,24 +273,13 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
         share = 100 * record.replaced_pixels / record.pixels
         print(
             f"{record.replaced_pixels} source pixels ({share:.2g} %) have colours that the LUT lists as unfit; "
-            "they were replaced by the nearest fit colour"
+            "they were replaced by the nearest usable colour"
         )
     if record.rendering is not None and record.rendering.outside:
         print(
             f"{100 * record.rendering.outside:.2g} % of the pixels have colours that the print cannot show; the "
-            f"mean colour error is {record.rendering.distance or 0:.2g} degrees. The ground truth is not "
-            f"affected{_wider_print(record)}"
+            f"mean colour error is {record.rendering.distance or 0:.2g} degrees. The ground truth is not affected"
         )
-
-
-def _wider_print(record: Description) -> str:
-    computed = record.table.computed or {}
-    unmanaged = computed.get("room", {}).get("profile") == "unmanaged"
-    return (
-        '; the command sim table with profile = "managed" in its settings makes a LUT with a wider gamut'
-        if unmanaged
-        else ""
-    )
 
 
 def _verify(out: str, workers: int | None, output: JsonOutput) -> Dataset:
@@ -299,8 +287,8 @@ def _verify(out: str, workers: int | None, output: JsonOutput) -> Dataset:
     from generator.dataset.reader import file_faults, open_dataset
     from generator.stores import is_remote
 
-    by_default = max(processor_count(), _STORE_READERS if is_remote(out) else 1)
-    reader_count = Workers(count=by_default if workers is None else workers).count
+    default_count = max(processor_count(), _STORE_READERS if is_remote(out) else 1)
+    reader_count = Workers(count=default_count if workers is None else workers).count
     faults: list[str] = []
     with progress("files") as update_progress:
         for fault in file_faults(out, update_progress, workers=reader_count):

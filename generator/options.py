@@ -38,11 +38,11 @@ _work_option = partial(option, panel="Work")
 
 @dataclass(frozen=True)
 class PathArguments:
-    """The arguments; None if they are not given, as with --verify."""
+    """The arguments; None if they are missing, as with --verify."""
 
     lut: Annotated[
         Path | None,
-        typer.Argument(metavar="LUT", help="Folder of the LUT; demo: for a small computed LUT.", show_default=False),
+        typer.Argument(metavar="LUT", help="Folder of the LUT, or demo: for a small example.", show_default=False),
     ] = None
     out: Annotated[
         str | None,
@@ -127,7 +127,7 @@ class PictureOptions:
 
 @dataclass(frozen=True)
 class LightOptions:
-    """Illuminants of each image, and their masks."""
+    """Illuminants of each image, and masks that distribute them."""
 
     light: Annotated[
         list[str] | None,
@@ -197,20 +197,20 @@ class LightOptions:
         from generator.lights.choices import SimultaneousLights
         from generator.masks.making import parse_masks
 
-        together = self.lights_per_image or (1 if self.masks is None else 2)
+        per_image = self.lights_per_image or (1 if self.masks is None else 2)
         if self.lights_per_image is not None and self.lights_per_image < 1:
             raise InputError(f"--lights-per-image is {self.lights_per_image}, expected 1 or more")
-        if self.masks is not None and together == 1:
+        if self.masks is not None and per_image == 1:
             raise InputError(
                 f"--masks {self.masks} needs several illuminants in an image, but there is 1; use --lights-per-image 2 "
                 "or more"
             )
-        choice = self._lights(lut, seed, together)
-        if together == 1:
+        choice = self._lights(lut, seed, per_image)
+        if per_image == 1:
             return choice
-        return SimultaneousLights(choice, together, parse_masks(self.masks or "smooth", together, seed))
+        return SimultaneousLights(choice, per_image, parse_masks(self.masks or "smooth", per_image, seed))
 
-    def _lights(self, lut: Lut, seed: int, together: int) -> LightChoice:
+    def _lights(self, lut: Lut, seed: int, per_image: int) -> LightChoice:
         from generator.lights import choices
         from generator.lights.distributions import ground_truths_by_line, load_ground_truths, parse_distribution
         from generator.lights.gamut import Gamut
@@ -229,13 +229,13 @@ class LightOptions:
                 f"{' and '.join(given_options)} exclude each other; give only one (--random may be used with "
                 "--distribution)"
             )
-        count = together * (1 if self.random is None else self.random)
+        count = per_image * (1 if self.random is None else self.random)
         if self.light:
             return choices.parse_lights(self.light, lut)
         if self.nearest is not None:
-            return choices.nearest_lights(lut, load_ground_truths(self.nearest), self.nearest.name, together)
+            return choices.nearest_lights(lut, load_ground_truths(self.nearest), self.nearest.name, per_image)
         if self.match is not None:
-            return choices.matched_lights(Gamut.of(lut), ground_truths_by_line(self.match), self.match.name, together)
+            return choices.matched_lights(Gamut.of(lut), ground_truths_by_line(self.match), self.match.name, per_image)
         if self.distribution is not None:
             return choices.DrawnLights(Gamut.of(lut), parse_distribution(self.distribution), count, seed)
         return RandomLights(count, len(lut.white), seed)
@@ -326,8 +326,8 @@ class RenderingOptions:
         str,
         _image_option(
             "WHAT",
-            "Black of the print: keep it, compensate (subtract it), or subtract a random share in each image, random "
-            "or random:MAX. The ground truth does not change.",
+            "Black of the print: keep leaves it, compensate subtracts it, random or random:MAX subtracts a random "
+            "share of it in each image. The ground truth does not change.",
         ),
     ] = "keep"
 
@@ -353,8 +353,8 @@ class VariationOptions:
         _variation_option(
             "KIND",
             "Change the exposure: a factor such as 0.5; stops:low=-2,high=1 or normal:mean=-1,sd=0.5, drawn for each "
-            "image; clip:share=0.01 saturates that share of the pixels; level:share=0.01,low=0.3,high=0.9 brings it to "
-            "a level relative to saturation (most=8 limits the factor). Noise follows the light; counts are clipped.",
+            "image; clip:share=0.01 saturates that share of the pixels; level:share=0.01,low=0.3,high=0.9 exposes "
+            "this share to a random level relative to saturation (most=8 limits the factor). Noise is adapted to it.",
         ),
     ] = None
     gradient: Annotated[
@@ -406,14 +406,14 @@ class WorkOptions:
     shard_images: Annotated[
         int,
         _work_option(
-            "N", "Images in one shard: all that a kill can lose of tar and Parquet files, or in a store.", min=1
+            "N", "Images in one shard. In tar and Parquet files and in stores, an unfinished shard is repeated.", min=1
         ),
     ] = 256
     shard: Annotated[
         str | None,
         _work_option(
             "I/N",
-            "Make only share I of N, with I from 0, in parallel to other programs. Then run the command without it.",
+            "Make only share I of N, with I from 0 to N - 1. After all shares, run the command without this option.",
         ),
     ] = None
     verify: Annotated[
@@ -425,7 +425,7 @@ class WorkOptions:
     ] = None
 
     def to_workers(self) -> Workers:
-        """Return the workers; their default number is that of the processors."""
+        """Return the workers; by default as many as processors."""
         from generator.dataset.making import Workers
 
         return Workers(self.engine, processor_count() if self.workers is None else self.workers)
@@ -446,7 +446,7 @@ class DatasetInputs:
     choice: LightChoice
     reading: Mapping[str, Any]  # preparation of the pictures, as plain values
     lines: tuple[str, ...]  # printed for the user
-    crops: int  # of each picture
+    crops: int  # number for each picture
 
 
 def dataset_inputs(lut: Lut, pictures: PictureOptions, light: LightOptions, seed: int) -> DatasetInputs:
@@ -473,7 +473,7 @@ def _inputs_of_dataset(lut: Lut, location: str, pictures: PictureOptions, light:
     sources = scenes_of(dataset, candidates)
     reading = {**preparation.describe(), "lights_of": {"pictures_seed": preparation.seed}}
     lines = tuple(
-        f"{location} was made with {name.replace('_', ' ')}, which is not copied; set the option if you need it"
+        f"the option {name.replace('_', ' ')} of {location} is not copied; set it if you need it"
         for name in ("variation", "rendering", "black_point")
         if name in dataset.description.options
     )

@@ -11,16 +11,17 @@ measured light sources.
 **Models** cover 380 to 780 nm in steps of 5 nm. They are parametric; only sensitivities are measured. Spectra are
 relative; `sim.world.world` sets the exposure. Functions have no state.
 
-Projector ``uhp``: a mercury arc lamp (200 bar) behind the dichroic red, green and blue segments of a colour wheel. A
-continuum, and the lines 405, 436, 546 and 577/579 nm broadened by pressure (Derra et al., "UHP lamp systems for
-projection applications", J. Phys. D 38 (2005) 2995, figure 4). Projector ``led``: three asymmetric Gaussians with peaks
-at 633, 515 and 451 nm and full widths of 19, 34 and 22 nm. A measured LED projector has peaks at 632, 516 and 452 nm
-and widths of 19, 34 and 21 nm.
+Projector ``uhp``: a mercury arc lamp (200 bar) behind the dichroic red, green and blue segments of a colour wheel. Its
+spectrum is a continuum with the lines 405, 436, 546 and 577/579 nm, broadened by pressure (Derra et al., "UHP lamp
+systems for projection applications", J. Phys. D 38 (2005) 2995, figure 4). Projector ``led``: three asymmetric
+Gaussians with peaks at 633, 515 and 451 nm and full widths of 19, 34 and 22 nm. A measured LED projector has peaks at
+632, 516 and 452 nm and widths of 19, 34 and 21 nm.
 
-Print: Yule-Nielsen spectral Neugebauer model (Yule and Nielsen 1951; Viggiano 1985). The sixteen overprints of cyan,
-magenta, yellow and black are mixed by Demichel's weights in the power 1/n. Solid inks are density bands that follow
-measured ramps on photo paper within about 0.1: yellow 1.25 below 480 nm, half at 490 nm; magenta 1.17 at 540 nm, 0.2 at
-450 nm; cyan 1.0 at three quarters at 600 nm, half at 700 nm. The reflection of the surface is added.
+Print: Yule-Nielsen spectral Neugebauer model (Yule and Nielsen 1951; Viggiano 1985). The reflectances of the sixteen
+overprints of cyan, magenta, yellow and black, to the power 1/n, are averaged with Demichel's weights. Solid inks are
+density bands within about 0.1 of ramps measured on photo paper. Yellow has 1.25 below 480 nm and half of it at 490 nm,
+magenta 1.17 at 540 nm and 0.2 at 450 nm. Cyan at a coverage of 0.75 has 1.0 at 600 nm and half of it at 700 nm. The
+reflection of the surface is added.
 
 Papers ``matt`` and ``glossy`` follow prints of an Epson XP-960 without colour management, measured with a ColorMunki
 (olemagnp/print_profiles on GitHub; no data are copied). Solid inks and overprints on PermaJet Matt Plus 240 and Ilford
@@ -35,10 +36,10 @@ like measured pigment blacks (P800, Canon Pro-300).
 inks. ``managed``: like an ICC profile of a print shop. sRGB (IEC 61966-2-1) → CIE XYZ under D50 (Bradford, ICC.1:2022
 annex E) → relative colorimetric with black point compensation (ISO 18619) → ink codes of the paper. White is bare
 paper, black is the darkest neutral print, and relative luminance between them is linear. Colours out of gamut go to the
-nearest printable colour in CIELAB relative to paper; differences of hue count twice, because profiles preserve hue
-before chroma (chosen). The table has 33 nodes per channel like an ICC profile, made by inversion of the print model
-(Levenberg-Marquardt from the nearest node of a coarse grid). It is interpolated in tetrahedra, so grey codes depend on
-grey nodes only (Kasson and others, J. Electronic Imaging 4 (1995) 226).
+nearest printable colour in CIELAB relative to paper. Differences of hue count twice, because profiles preserve hue
+rather than chroma (chosen). The conversion table has 33 nodes per channel like an ICC profile, made by inversion of the
+print model (Levenberg-Marquardt from the nearest node of a coarse grid). It is interpolated in tetrahedra, so grey
+codes depend on grey nodes only (Kasson and others, J. Electronic Imaging 4 (1995) 226).
 """
 
 from __future__ import annotations
@@ -84,11 +85,11 @@ def require_grid(wavelengths_nm: _Array, where: str) -> None:
     steps = np.diff(wavelengths_nm)
     if steps.min() <= 0:
         raise FormatError(f"{where}: {wavelengths_nm[int(steps.argmin())]:g} nm occurs twice; delete one")
-    inside = (wavelengths_nm[:-1] < high) & (wavelengths_nm[1:] > low)
-    if steps[inside].max() > WIDEST_STEP_NM:
-        at = int(np.flatnonzero(inside)[steps[inside].argmax()])
+    is_visible = (wavelengths_nm[:-1] < high) & (wavelengths_nm[1:] > low)
+    if steps[is_visible].max() > WIDEST_STEP_NM:
+        widest = int(np.flatnonzero(is_visible)[steps[is_visible].argmax()])
         raise FormatError(
-            f"{where}: a gap from {wavelengths_nm[at]:g} to {wavelengths_nm[at + 1]:g} nm, "
+            f"{where}: a gap from {wavelengths_nm[widest]:g} to {wavelengths_nm[widest + 1]:g} nm, "
             f"{WIDEST_STEP_NM:g} nm at most expected; measure the wavelengths between"
         )
 
@@ -115,7 +116,7 @@ def resampled(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array
             values[:, number] = np.interp(onto_nm, wavelengths_nm, curves[:, number], left=0, right=0)
         return values
     if float(np.diff(wavelengths_nm).max()) > 0.999 * step:
-        # Otherwise a wavelength would also represent nodes in the wide step after it.
+        # Without this, the last wavelength before a wide step would also represent grid points inside the step.
         wavelengths_nm, curves = _densified(wavelengths_nm, curves, step)
     # Each wavelength represents half the distance to its neighbours.
     edges = np.concatenate([wavelengths_nm[:1], (wavelengths_nm[1:] + wavelengths_nm[:-1]) / 2, wavelengths_nm[-1:]])
@@ -267,7 +268,7 @@ def _reading_problem(error: OSError) -> str:
 
 
 def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:
-    """Return the sensitivities of a file from its bytes; messages name it `where`."""
+    """Return the sensitivities of a file from its bytes; `where` is its name in messages."""
     try:
         document = _Document.model_validate(json.loads(data, object_pairs_hook=_unique_keys))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
@@ -338,13 +339,13 @@ def _require_camera(wavelengths: _Array, curves: _Array, where: str) -> None:
         )
     peak = curves.max(axis=0)
     if peak.min() <= 0:
-        raise FormatError(f"{where}: {_CHANNELS[int(peak.argmin())]} is 0 at all wavelengths; correct it")
+        raise FormatError(f"{where}: {_CHANNELS[int(peak.argmin())]} is always 0, values above 0 expected; correct it")
     for edge in (0, -1):
         edge_share = curves[edge] / peak
         if edge_share.max() > EDGE_SHARE:
             raise FormatError(
-                f"{where}: {_CHANNELS[int(edge_share.argmax())]} has {edge_share.max():.0%} of its peak at its last "
-                f"wavelength, {wavelengths[edge]:g} nm, {EDGE_SHARE:.0%} at most expected; add the missing wavelengths"
+                f"{where}: {_CHANNELS[int(edge_share.argmax())]} has {edge_share.max():.0%} of its peak at the end of "
+                f"its range, {wavelengths[edge]:g} nm, {EDGE_SHARE:.0%} at most expected; add the missing wavelengths"
             )
 
 
@@ -362,11 +363,11 @@ PaperName = Literal["poster", "matt", "glossy"]  # Papers of the simulated print
 
 SURFACE_REFLECTANCE = 0.03  # Relative light that the surface of plain matt paper reflects.
 
-MATT_SURFACE = 0.0165  # The same for coated matt photo paper, whose black measures 0.016 to 0.026 from 400 to 660 nm.
+MATT_SURFACE = 0.0165  # The same for coated matt photo paper; its black has 0.016 to 0.026 from 400 to 660 nm.
 
-GLOSSY_SURFACE = 0.0035  # The same for glossy paper outside of the mirror angle; its black measures 0.0038 at least.
+GLOSSY_SURFACE = 0.0035  # The same for glossy paper outside of the mirror angle; its black has at least 0.0038.
 
-MATT_BLACK = 1.8  # Density of solid matt black below the surface; the total density is then as measured.
+MATT_BLACK = 1.8  # Density of solid matt black below the surface; the total density then equals the measured one.
 
 GLOSSY_BLACK = 2.0  # Density of solid photo black below the surface, for the same reason.
 
@@ -394,7 +395,7 @@ def _rise(centre_nm: float, width_nm: float) -> NDArray[np.float64]:
 
 
 def projector_primaries(lamp: LampSpectrum = "uhp") -> NDArray[np.float64]:
-    """Return the light (3, 81) float64 of the primaries red, green, blue at full brightness, relative power per nm.
+    """Return the spectra (3, 81) float64 of red, green and blue at full brightness, relative power per nm.
 
     White is near D65: CIE 1931 x, y within 0.02.
     """
@@ -405,7 +406,7 @@ def projector_primaries(lamp: LampSpectrum = "uhp") -> NDArray[np.float64]:
         continuum = 0.55 * _gauss(560, 130) + 0.35 * _gauss(640, 90)
         lines = 0.6 * _gauss(405, 4) + 1.9 * _gauss(437, 5, 8) + 2.1 * _gauss(547, 5, 8) + 1.9 * _gauss(579, 6, 8)
         arc = (continuum + lines) * _rise(412, 4) * (1 - _rise(700, 6))
-        # The notch removes the yellow line from green and red, as in real wheels, for purer primaries.
+        # A notch removes the yellow line from green and red, as in real colour wheels, for purer primaries.
         power = arc * np.stack([_rise(600, 3), _rise(505, 4) * (1 - _rise(568, 3)), 1 - _rise(493, 4)])
         balance = (1.29, 1.0, 1.12)
     return power * np.array(balance)[:, None]
@@ -439,9 +440,9 @@ class InkedPaper:
 
 
 def paper_white() -> NDArray[np.float64]:
-    """Return the reflectance (81,) float64 of bare paper, slightly blue by its brightener.
+    """Return the reflectance (81,) float64 of bare paper, slightly blue because of its brightener.
 
-    Measured photo paper rises from 0.64 at 400 nm to 0.93 at 450 nm and falls to 0.85 at 600 nm, as this one does.
+    Measured photo paper rises from 0.64 at 400 nm to 0.93 at 450 nm and falls to 0.85 at 600 nm, like this curve.
     """
     return (0.45 + 0.405 * _rise(402, 9)) + 0.075 * _gauss(452, 22, 50) + 0.03 * _rise(680, 15)
 
@@ -456,8 +457,8 @@ def _poster_inks() -> NDArray[np.float64]:
 
 
 def _photo_inks(black: float) -> NDArray[np.float64]:
-    # Least squares over inks and overprints, 400 to 730 nm, on a glossy and a matt paper. Black is constant, like
-    # pigments.
+    # Least squares over inks and overprints, 400 to 730 nm, on a glossy and a matt paper. Black is constant over
+    # wavelength, like pigments.
     cyan = 1.85 * (_gauss(596, 37, 81) + 0.14 * _gauss(380, 75))
     magenta = 1.77 * (_gauss(548, 59, 29) + 0.10 * _gauss(397, 20))
     yellow = 1.84 * (1 - _rise(492, 11))
@@ -480,8 +481,8 @@ def paper(name: PaperName) -> InkedPaper:
 def ink_coverage(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
     """Return the nominal coverage (..., 4) float64, 0 to 1, of cyan, magenta, yellow and black for ink codes (..., 3).
 
-    The complement of the code with grey component replacement. Black is proportional to the square of the smallest of
-    the three inks, which are reduced by a share of it.
+    Coverage is the complement of the code, with grey component replacement. Black is proportional to the square of the
+    smallest of the three inks. All three are reduced by a share of black.
     """
     inked = paper(on)
     cmy = 1 - np.asarray(rgb, dtype=np.float64) / 255
@@ -540,16 +541,18 @@ def ink_codes(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
     table = _table(on)
     nodes = np.clip(np.asarray(rgb, dtype=np.float64), 0, 255) / 255 * (NODES - 1)
     corner = np.minimum(nodes.astype(np.int64), NODES - 2)
-    share = nodes - corner
-    # A tetrahedron: from the corner to its opposite, one channel after the other, largest share first.
-    order = np.argsort(-share, axis=1, kind="stable")
-    sorted_share = np.take_along_axis(share, order, axis=1)
+    fractions = nodes - corner
+    # The four nodes lie on the way from the corner to the opposite corner, along one channel after another, the channel
+    # with the largest fraction first.
+    order = np.argsort(-fractions, axis=1, kind="stable")
+    sorted_share = np.take_along_axis(fractions, order, axis=1)
     weights = -np.diff(np.concatenate([np.ones((len(nodes), 1)), sorted_share, np.zeros((len(nodes), 1))], axis=1))
-    at = corner.copy()
-    codes = weights[:, :1] * table[at[:, 0], at[:, 1], at[:, 2]]
+    node = corner.copy()
+    codes = weights[:, :1] * table[node[:, 0], node[:, 1], node[:, 2]]
     for step in range(3):
-        np.put_along_axis(at, order[:, step, None], np.take_along_axis(at, order[:, step, None], axis=1) + 1, axis=1)
-        codes = codes + weights[:, step + 1, None] * table[at[:, 0], at[:, 1], at[:, 2]]
+        channel = order[:, step, None]
+        np.put_along_axis(node, channel, np.take_along_axis(node, channel, axis=1) + 1, axis=1)
+        codes = codes + weights[:, step + 1, None] * table[node[:, 0], node[:, 1], node[:, 2]]
     return codes
 
 
@@ -569,9 +572,9 @@ def _lab(xyz: _Array) -> _Array:
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
 
 
-def _target_xyz(share: _Array, black: float) -> _Array:
+def _target_xyz(codes: _Array, black: float) -> _Array:
     # XYZ relative to white for sRGB codes 0 to 1, with black point compensation.
-    linear = decode_srgb(share)
+    linear = decode_srgb(codes)
     return black + (1 - black) * (linear @ _SRGB_TO_D50.T) / _SRGB_TO_D50.sum(axis=1)
 
 
@@ -590,9 +593,9 @@ class _Inks:
         forms = np.einsum("il,lc,jl->cij", roots, observer, roots) * (1 - inked.surface)
         self._forms = forms / white[:, None, None]
 
-    def xyz(self, share: _Array) -> _Array:
+    def xyz(self, codes: _Array) -> _Array:
         """Return XYZ (N, 3) relative to paper of ink codes (N, 3), 0 to 1."""
-        weights = self._paper.shares(ink_coverage(share * 255, self._on))
+        weights = self._paper.shares(ink_coverage(codes * 255, self._on))
         return self._floor + np.stack([((weights @ form) * weights).sum(axis=1) for form in self._forms], axis=1)
 
     def codes_of_lab(self, lab: _Array) -> _Array:
@@ -602,49 +605,49 @@ class _Inks:
         axis = np.linspace(0, 1, 9)
         grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         grid_lab = _lab(self.xyz(grid))
-        share = grid[cKDTree(grid_lab).query(lab)[1]]
+        codes = grid[cKDTree(grid_lab).query(lab)[1]]
         chroma = np.hypot(lab[:, 1], lab[:, 2])
-        along = np.where(chroma[:, None] > 1e-6, lab[:, 1:] / np.maximum(chroma, 1e-6)[:, None], [1.0, 0.0])
-        turn = np.zeros((len(lab), 3, 3))
-        turn[:, 0, 0] = 1
-        turn[:, 1, 1:] = along
-        turn[:, 2, 1:] = _HUE_WEIGHT * along[:, ::-1] * [-1, 1]
+        chroma_axis = np.where(chroma[:, None] > 1e-6, lab[:, 1:] / np.maximum(chroma, 1e-6)[:, None], [1.0, 0.0])
+        axes = np.zeros((len(lab), 3, 3))
+        axes[:, 0, 0] = 1
+        axes[:, 1, 1:] = chroma_axis
+        axes[:, 2, 1:] = _HUE_WEIGHT * chroma_axis[:, ::-1] * [-1, 1]
         damping = np.full(len(lab), 1e-2)
-        error = self._difference(share, lab, turn)
+        differences = self._difference(codes, lab, axes)
         active = np.arange(len(lab))
         for _ in range(_STEPS):
-            codes, difference, matrix = share[active], error[active], turn[active]
+            active_codes, difference, matrix = codes[active], differences[active], axes[active]
             slope = np.empty((len(active), 3, 3))
             for channel in range(3):
                 # Away from the nearer bound, so that codes stay in 0 to 1.
-                nudge = np.where(codes[:, channel] < 0.5, 1e-5, -1e-5)
-                moved = codes.copy()
-                moved[:, channel] += nudge
-                slope[:, :, channel] = (self._difference(moved, lab[active], matrix) - difference) / nudge[:, None]
+                nudge = np.where(active_codes[:, channel] < 0.5, 1e-5, -1e-5)
+                shifted = active_codes.copy()
+                shifted[:, channel] += nudge
+                slope[:, :, channel] = (self._difference(shifted, lab[active], matrix) - difference) / nudge[:, None]
             downhill = (difference[:, None] @ slope)[:, 0]
             # A code at its bound stays there if the descent leads outside.
-            fixed = ((codes <= 0) & (downhill > 0)) | ((codes >= 1) & (downhill < 0))
+            fixed = ((active_codes <= 0) & (downhill > 0)) | ((active_codes >= 1) & (downhill < 0))
             slope = np.where(fixed[:, None], 0, slope)
             curvature = slope.swapaxes(1, 2) @ slope
             scale = damping[active] * (1 + np.trace(curvature, axis1=1, axis2=2))
             curvature += scale[:, None, None] * np.eye(3)
             gradient = np.where(fixed, 0, downhill)[..., None]
             step: _Array = np.asarray(-np.linalg.solve(curvature, gradient)[..., 0], dtype=np.float64)
-            candidates: _Array = np.clip(codes + step, 0, 1)
+            candidates: _Array = np.clip(active_codes + step, 0, 1)
             new_difference = self._difference(candidates, lab[active], matrix)
             gain = (difference**2).sum(axis=1) - (new_difference**2).sum(axis=1)
             is_better = gain > 0
-            share[active[is_better]], error[active[is_better]] = candidates[is_better], new_difference[is_better]
+            codes[active[is_better]], differences[active[is_better]] = candidates[is_better], new_difference[is_better]
             damping[active] *= np.where(is_better, 0.2, 8)
             is_done = ((new_difference**2).sum(axis=1) < 1e-6) | (is_better & (gain < 1e-7)) | (damping[active] > 1e6)
             active = active[~is_done]
             if len(active) == 0:
                 break
-        return share
+        return codes
 
-    def _difference(self, share: _Array, lab: _Array, turn: _Array) -> _Array:
+    def _difference(self, codes: _Array, lab: _Array, axes: _Array) -> _Array:
         # Differences (N, 3) in lightness, chroma and weighted hue.
-        return (turn @ (_lab(self.xyz(share)) - lab)[..., None])[..., 0]
+        return (axes @ (_lab(self.xyz(codes)) - lab)[..., None])[..., 0]
 
 
 @cache
@@ -662,8 +665,8 @@ def _table(on: PaperName) -> _Array:
     # (33, 33, 33, 3) ink codes 0 to 255 by sRGB codes.
     axis = np.linspace(0, 1, NODES)
     codes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    share = _Inks(on).codes_of_lab(_lab(_target_xyz(codes.reshape(-1, 3), _black(on))))
-    table = 255 * share.reshape(codes.shape)
+    ink = _Inks(on).codes_of_lab(_lab(_target_xyz(codes.reshape(-1, 3), _black(on))))
+    table = 255 * ink.reshape(codes.shape)
     table[-1, -1, -1] = 255
     table.setflags(write=False)
     return table

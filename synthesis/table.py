@@ -3,7 +3,7 @@
 The same camera, illuminants, settings and seed give the same bytes with any number of threads. Computed frames are
 evaluated like photographs in `calibration.pipeline.measuring`: the black level is subtracted, flat field and white are
 measured on the white references, samples are divided by the flat field of their colour. Therefore the ground truth has
-the error of a photographed one.
+the same kind of error as the ground truth of a photographed LUT.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class PatchMeasurement:
     """Measurement of the frames of all illuminants; made by `PatchMeasurement.of`."""
 
     points: ChartPoints  # Patches and references of the chart
-    sensor: PatchSensor  # Their photosites: patches, white references, grey references
+    sensor: PatchSensor  # Photosites of patches, white references and grey references, in this order
     lamp: ChartLamp
     iso: int
     reader: PaperReader  # Measures flat field and white; its base is the flat field of the white frame
@@ -93,11 +93,11 @@ class PatchMeasurement:
         means = usable_means(samples, highest, references, mosaic.saturation())
         whites, greys = np.split(means, [len(self.points.whites_mm)])
         _require_unclipped(whites, f"illuminant {light}")
-        paper, shape = self.reader.read(whites, f"illuminant {light}")
+        paper, cell_field = self.reader.read(whites, f"illuminant {light}")
         if self.primaries is not None:
-            shape = shape * self.primaries.field_ratio(paper.white)
+            cell_field = cell_field * self.primaries.field_ratio(paper.white)
         grey_values, grey_errors = self.points.levels.read(greys, paper.field.at(self.points.greys_mm))
-        values, highest = gather_values(mosaic, black, cells, shape)
+        values, highest = gather_values(mosaic, black, cells, cell_field)
         share_at_zero = 1 - int(np.count_nonzero(values)) / values.size
         return ComputedFrame(light, values, share_at_zero, highest, black, paper, grey_values, grey_errors)
 
@@ -106,8 +106,8 @@ class PatchMeasurement:
         _, references = self._sites()
         means = usable_means(*gather(mosaic, black, references), references, mosaic.saturation())
         whites = means[: len(self.points.whites_mm)]
-        _require_unclipped(whites, "the frame of white")
-        return self.reader.read(whites, "the frame of white")[0]
+        _require_unclipped(whites, "the white frame")
+        return self.reader.read(whites, "the white frame")[0]
 
     def _sites(self) -> tuple[Sites, Sites]:
         sites, count = self.sensor.sites, len(self.points.cells_mm)
@@ -122,8 +122,8 @@ def _require_unclipped(whites: _Array, frame_name: str) -> None:
     usable = int(np.isfinite(whites).all(axis=1).sum())
     if usable < MIN_REFERENCES:
         raise QualityError(
-            f"{frame_name}: {usable} of {len(whites)} references are unclipped, {MIN_REFERENCES} or more expected; "
-            "expose less: reduce room.white_level_share, or with the projector exposure.shutter_s, in the settings"
+            f"{frame_name}: {usable} of {len(whites)} white references are unclipped, {MIN_REFERENCES} expected; "
+            "expose less: reduce room.white_level_share in the settings, or exposure.shutter_s with the projector"
         )
 
 
@@ -173,7 +173,7 @@ def compute_table(task: TableTask, out: Path, threads: int, progress: ReportLigh
         writer = LutWriter(folder, lights, cells, task.window**2)
 
         def compute(light: int) -> ComputedFrame:
-            # The samples are written, and not kept in memory.
+            # The samples are on disk and need not stay in memory.
             frame = measurement.measure(light)
             writer.put(light, frame.values)
             return replace(frame, values=frame.values[:0].copy())
@@ -226,7 +226,7 @@ def _clipped_cells(frames: Sequence[ComputedFrame], saturation: int) -> list[Unf
     unfit: list[Unfit] = []
     for colour in np.flatnonzero(highest.max(axis=0) >= allowed).tolist():
         light = int(highest[:, colour].argmax())
-        cause = f"clipped: {int(highest[light, colour])} counts under light {light}, below {allowed:.0f} allowed"
+        cause = f"clipped: {int(highest[light, colour])} counts under illuminant {light}, below {allowed:.0f} allowed"
         unfit.append(Unfit(colour=colour, cause=cause))
     return unfit
 

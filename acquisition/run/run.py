@@ -1,7 +1,7 @@
-"""Take a session from LAB.toml: create or resume it, open the rig, take all open frames, and send notices.
+"""Take a session from LAB.toml: create or resume it, open the rig, take all missing frames, and send notices.
 
-Notices go to the terminal, a command, a URL, systemd and a dead man's switch (docs/how-to/night-run.md). A thread of
-its own delivers them, so that no frame waits. A notice that cannot be delivered is reported once.
+Notices go to the terminal, a command, a URL, systemd and a dead man's switch (docs/how-to/night-run.md). A separate
+thread delivers them, so that frames do not wait. A notice that cannot be delivered is reported once.
 """
 
 from __future__ import annotations
@@ -69,15 +69,15 @@ from foundation.errors import CropError, DeviceRefused, InputError, StorageError
 from foundation.secret_texts import is_webhook, target_label
 from foundation.version import software
 
-LIMIT_S: Final = 20.0  # Time for a receiver to accept a notice, s; a message to a telephone takes seconds
+LIMIT_S: Final = 20.0  # Longest time for a receiver to accept a notice, s; a message to a telephone takes seconds
 ENDING_S: Final = 2.0  # Additional time for the last notice, s, so that a slow receiver is reported by name
-# Interval between two notices of pauses with the same cause, s: more notices would not bring anybody sooner.
+# Shortest interval between two notices of pauses with the same cause, s: nobody needs more of them.
 QUIET_S: Final = 3600.0
 QUEUED: Final = 100  # Notices that can wait for a slow receiver; more are dropped
 
 
 class Notices:
-    """Sends events to a target; `close` waits up to `LIMIT_S` for the last.
+    """Sends events to a target; `close` waits for the delivery of the last one.
 
     `target`: a URL or a command line; empty for none.
     """
@@ -94,12 +94,12 @@ class Notices:
         if target:
             self._thread.start()
 
-    def tell(self, event: str, message: str, at: datetime) -> None:
-        """Send an event; returns at once."""
+    def send(self, event: str, message: str, at: datetime) -> None:
+        """Put an event into the queue of the sending thread."""
         if not self._target:
             return
         text = f"{self._session}: {event}: {message}"
-        # Slack, Mattermost and their likes show `text`, Discord `content`.
+        # Slack, Mattermost and similar services show `text`, Discord shows `content`.
         body = {
             "event": event,
             "message": message,
@@ -111,7 +111,7 @@ class Notices:
         }
         with suppress(queue.Full):
             self._waiting.put_nowait((event, message, json.dumps(body, ensure_ascii=False).encode()))
-        self.say_failures()
+        self.report_failures()
 
     def close(self) -> None:
         """Wait until all notices are delivered, at most for `LIMIT_S` and `ENDING_S`; a second call does nothing."""
@@ -121,15 +121,17 @@ class Notices:
                 self._waiting.put(None, timeout=LIMIT_S)
             self._thread.join(max(until - time.monotonic(), 0))
             if self._thread.is_alive():
-                self._failed.put(f"{target_label(self._target)} did not receive all notices before the end")
+                self._failed.put(
+                    f"{target_label(self._target)} did not receive all notices in time; check the receiver"
+                )
         self._closed = True
-        self.say_failures()
+        self.report_failures()
 
-    def say_failures(self) -> None:
+    def report_failures(self) -> None:
         """Report notices that could not be delivered; called by the thread of the run."""
         while not self._failed.empty():
             sentence = self._failed.get()
-            # A receiver that is out of reach usually stays so: each failure is reported once.
+            # A receiver that cannot be reached usually stays so, therefore each failure is reported once.
             if sentence not in self._reported:
                 self._reported.add(sentence)
                 self._warn(sentence)
@@ -139,7 +141,8 @@ class Notices:
             failure = self._posted(*notice) if is_webhook(self._target) else self._run(*notice)
             if failure:
                 # Only scheme and host, or the program, are named: the rest of the target may be a secret.
-                self._failed.put(f"{target_label(self._target)} did not receive a notice: {failure}; the run continues")
+                label = target_label(self._target)
+                self._failed.put(f"{label} did not receive a notice: {failure}; the run continues; check the receiver")
 
     def _run(self, event: str, message: str, body: bytes) -> str:
         variables = {"CROP_EVENT": event, "CROP_MESSAGE": message, "CROP_SESSION": self._session}
@@ -188,7 +191,7 @@ def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
     try:
         with urllib.request.build_opener(Unredirected).open(request, timeout=LIMIT_S):
             return ""
-    # Texts of library errors may contain the secret address: only their number or kind is reported.
+    # Texts of library errors may contain the secret address, so only the code or the kind of an error is reported.
     except urllib.error.HTTPError as error:
         error.close()
         return f"it answered {error.code}"
@@ -199,34 +202,34 @@ def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
 
 
 class PauseNotices:
-    """Sends notices of pauses: one per cause in `QUIET_S`, and the end of a reported pause.
+    """Sends notices of pauses, at most one per cause in `QUIET_S`, and of the end of a reported pause.
 
-    `tell`: receives an event and a sentence.
+    `send`: receives an event and a sentence.
     """
 
-    def __init__(self, tell: Callable[[str, str], object], clock: Clock) -> None:
-        self._tell, self._clock = tell, clock
-        self._told_at: dict[str, float] = {}
-        self._is_told = False
+    def __init__(self, send: Callable[[str, str], object], clock: Clock) -> None:
+        self._send, self._clock = send, clock
+        self._sent_at_s: dict[str, float] = {}
+        self._is_reported = False
 
     def paused(self, sentence: str) -> None:
-        """Note a pause at its start, and repeatedly during it: a notice held back by `QUIET_S` is sent later."""
-        if self._is_told:
+        """Report a pause; called at its start and repeatedly during it, so that a delayed notice is sent later."""
+        if self._is_reported:
             return
         cause, now_s = pause_cause(sentence), self._clock.monotonic()
-        if now_s - self._told_at.get(cause, -math.inf) >= QUIET_S:
-            self._told_at[cause] = now_s
-            self._is_told = True
-            self._tell("paused", sentence)
+        if now_s - self._sent_at_s.get(cause, -math.inf) >= QUIET_S:
+            self._sent_at_s[cause] = now_s
+            self._is_reported = True
+            self._send("paused", sentence)
 
     def resumed(self, sentence: str) -> None:
-        """Note the end of the pause."""
-        if self._is_told:
-            self._is_told = False
-            self._tell("resumed", sentence)
+        """Report the end of the pause."""
+        if self._is_reported:
+            self._is_reported = False
+            self._send("resumed", sentence)
 
 
-# Checks in the line about the last frame, if they have a value.
+# Names of the checks whose values are shown for the last frame, in this order.
 SHOWN = (
     OFF_CODES_DEG.name, "movement", "blur", WHITE_DRIFT.name,
     LEAK_SHARE.name, STRAY_SHARE.name, DARK_DRIFT.name, "exposure",
@@ -315,7 +318,7 @@ class Terminal:
         _print(sentence)
 
     def state(self, sentence: str) -> None:
-        """Show the reason of a wait until the next frame; this time does not count as a frame's time."""
+        """Show the reason of a wait; its time is not included in the time per frame."""
         self._since = None
         self._bar.update(self._task, status=sentence, remaining="")
         self._print_line(sentence)
@@ -334,7 +337,7 @@ def _print(line: str) -> None:
         print(line, file=sys.stderr)
 
 
-ALIVE_S: Final = 60.0  # Interval between two signs to a dead man's switch, s: such services count minutes
+ALIVE_S: Final = 60.0  # Interval between two signs to a dead man's switch, s: such services allow minutes
 
 # Share of the watchdog's time between two signs: sd_watchdog_enabled(3) recommends at most half.
 WATCHDOG_SHARE: Final = 0.25
@@ -358,28 +361,28 @@ class Life:
         self._clock = clock
         self._manager = environment.get("NOTIFY_SOCKET", "")
         self._watchdog_s = _watchdog_s(environment)
-        self._told = self._fed = -math.inf
+        self._signed_s = self._watchdog_fed_s = -math.inf
 
     def ready(self) -> None:
         """Report that devices and session are open."""
         self._to_manager("READY=1")
-        self.sign("at work")
+        self.sign("running")
 
-    def sign(self, doing: str) -> None:
-        """Report the current activity; may be called at any rate."""
+    def sign(self, activity: str) -> None:
+        """Report the current activity; may be called often, because signs are sent at intervals."""
         now_s = self._clock.monotonic()
-        if now_s - self._fed >= self._watchdog_s * WATCHDOG_SHARE:
-            self._fed = now_s
-            self._to_manager(f"WATCHDOG=1\nSTATUS={' '.join(doing.split())}")
-        if now_s - self._told >= ALIVE_S:
-            self._told = now_s
-            self._notices.tell("alive", doing, datetime.now(UTC))
-        self._notices.say_failures()
+        if now_s - self._watchdog_fed_s >= self._watchdog_s * WATCHDOG_SHARE:
+            self._watchdog_fed_s = now_s
+            self._to_manager(f"WATCHDOG=1\nSTATUS={' '.join(activity.split())}")
+        if now_s - self._signed_s >= ALIVE_S:
+            self._signed_s = now_s
+            self._notices.send("alive", activity, datetime.now(UTC))
+        self._notices.report_failures()
 
-    def end(self, how: str, sentence: str) -> None:
-        """Report how the run ended."""
-        self._to_manager(f"STOPPING=1\nSTATUS={how}: {' '.join(sentence.split())}")
-        self._notices.tell(how, sentence, datetime.now(UTC))
+    def end(self, event: str, sentence: str) -> None:
+        """Report the end of the run."""
+        self._to_manager(f"STOPPING=1\nSTATUS={event}: {' '.join(sentence.split())}")
+        self._notices.send(event, sentence, datetime.now(UTC))
 
     def close(self) -> None:
         """Wait for the delivery of notices."""
@@ -415,7 +418,7 @@ def run_session(
     announce: Callable[[str], object] = lambda sentence: None,
     retake: str | None = None,
     ending: EndRequest | None = None,
-    on_frame: Callable[[Taken], object] = lambda on_frame: None,
+    on_frame: Callable[[Taken], object] = lambda frame: None,
     state: Callable[[str], object] = lambda sentence: None,
 ) -> RunOutcome:
     """Take the session `folder`, new or interrupted, with the rig of the settings.
@@ -427,16 +430,16 @@ def run_session(
         session = opened.enter_context(_resumed(settings, folder, announce)) if session_exists(folder) else None
         if session is None and retake is not None:
             raise nothing_to_retake(folder)
-        alive = None if session is None else opened.enter_context(_signs_of(session))
+        alive = None if session is None else opened.enter_context(_signs_of_session(session))
         if session is not None and alive is not None:
             if retake is not None:
                 session.retake(retake)
 
-            def checking(checked: int, total: int) -> None:
+            def report_check(checked: int, total: int) -> None:
                 state(f"checking frame {checked} of {total}")
-                alive(f"{BEGINS}; frame {checked} of {total}")
+                alive(f"{STARTING}; frame {checked} of {total}")
 
-            if session.journal.accepted_files() and (damaged := session.verify(checking)):
+            if session.journal.accepted_files() and (damaged := session.verify(report_check)):
                 announce(f"voided: {first_few(damaged, 5)}")
             total = len(session.steps)
             if len(session.done_steps()) == total:
@@ -454,15 +457,15 @@ def run_session(
         first = link_runs(session, devices.clock.now())
         total = len(session.steps)
         observe(len(session.done_steps()), total)
-        # Written after the screen is dark and the journal is closed.
+        # The report is written after the screen is dark and the journal is closed.
         at_last.callback(_report, session, announce)
-        sign = alive or opened.enter_context(_signs_of(session))
+        sign = alive or opened.enter_context(_signs_of_session(session))
         sign("")
 
         def count(frame: Taken) -> None:
             sign("")
             on_frame(frame)
-            # A reference may have been put behind the plan.
+            # A white or dark frame may have been added at the end of the plan.
             total = len(session.steps)
             observe(total - frame.remaining, total)
 
@@ -471,18 +474,18 @@ def run_session(
 
 
 @contextmanager
-def _signs_of(session: Session) -> Generator[SignOfLife]:
-    """Send signs of life of this run; first note that the previous one was killed, if it was."""
+def _signs_of_session(session: Session) -> Generator[SignOfLife]:
+    """Send signs of life of this run. If the previous run was killed, first record this in the journal."""
     journal = session.journal
     if note := killed_note(session):
-        # The clock of the lab, which may differ from the computer's, is not open yet.
+        # The clock of the lab, which may differ from the clock of the computer, is not open yet.
         journal.note(last_frame_time(journal.attempts()) or datetime.now(UTC), "killed", note)
     with signs_of_life(journal.beat, journal.run_state, TRY_S) as alive:
         yield alive
 
 
 def _report(session: Session, announce: Callable[[str], object]) -> None:
-    # A disk error must not change the end of the run: the report can be derived again.
+    # A disk error must not change the result of the run, because the report can be written again.
     try:
         write_session_report(session.folder)
     except CropError as error:
@@ -512,7 +515,7 @@ def _created(settings: LabSettings, folder: Path) -> Session:
 
 
 def require_same_devices(session: Session, devices: Devices, settings: LabSettings) -> None:
-    """Require the camera and the projector of the session's start; record them if the session is new."""
+    """Raise an error unless camera and projector are those recorded in the session; record them if it is new."""
     # A LUT of two sensors, even of the same model, is worthless, and the frames would not show it.
     recorded = session.journal.records()
     body = devices.camera.identity()
@@ -530,7 +533,7 @@ def require_same_devices(session: Session, devices: Devices, settings: LabSettin
             raise DeviceRefused(
                 f"the {device} is {name}, but {session.folder} was started with {expected}; frames of both cannot be "
                 "combined",
-                remedy=f"connect the first {device}, or start a new session",
+                remedy=f"connect the {device} of the session, or start a new session",
                 value=name,
                 expected=expected,
             )
@@ -561,11 +564,11 @@ def killed_note(session: Session) -> str:
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended.
+    """Result of a run.
 
-    - `total`, `left`: number of planned steps, and of steps without an accepted frame.
-    - `refused`: for each of these steps, why it was left for the next run.
-    - `doubts`: warnings of this run and earlier ones that stopped nothing.
+    - `total`, `remaining`: number of planned steps, and of steps without an accepted frame.
+    - `refused`: for each step that was given up, the reason.
+    - `doubts`: warnings of this run and of earlier runs of the session.
     """
 
     total: int
@@ -584,7 +587,7 @@ def take_session(
     devices: Devices,
     settings: LabSettings,
     judge: FrameJudge | None = None,
-    observe: Callable[[Taken], object] = lambda on_frame: None,
+    observe: Callable[[Taken], object] = lambda frame: None,
     announce: Callable[[str], object] = lambda sentence: None,
     state: Callable[[str], object] = lambda sentence: None,
     ending: EndRequest | None = None,
@@ -605,7 +608,7 @@ def take_session(
     retry = RetryPolicy(
         devices.clock,
         sequence.patience_s,
-        reports.tell,
+        reports.report,
         lambda: keep_awake(devices.camera),
         reports.sign_of_life,
         end_request.at_once,
@@ -618,7 +621,7 @@ def take_session(
     reports.ready()
     try:
         for stray in session.set_aside_strays():
-            reports.tell("stray", f"{stray.name}: a complete file, but not in the journal; it is not used")
+            reports.report("stray", f"{stray.name}: a complete file, but not in the journal; it is not used")
         with RunWatch(reports.late) as watch:
             queue = _open_steps(session, settings, first)
             job = Job(session, devices, settings, queue, judge or ExposureJudge(settings), retry, watch)
@@ -631,10 +634,10 @@ def take_session(
         outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up, doubts)
         if end_request.is_requested and not outcome.complete:
             raise KeyboardInterrupt
-        leave_lab(devices, RunEnd.COMPLETE if outcome.complete else RunEnd.UNFINISHED, sequence, reports.tell)
+        leave_lab(devices, RunEnd.COMPLETE if outcome.complete else RunEnd.UNFINISHED, sequence, reports.report)
     except BaseException as error:
         interrupted = isinstance(error, KeyboardInterrupt)
-        leave_lab(devices, RunEnd.INTERRUPTED if interrupted else RunEnd.UNFINISHED, sequence, reports.tell)
+        leave_lab(devices, RunEnd.INTERRUPTED if interrupted else RunEnd.UNFINISHED, sequence, reports.report)
         # frames.csv is written again at the next opening: its errors must not hide this one.
         with suppress(StorageError):
             session.write_frames_csv()
@@ -680,10 +683,10 @@ def _make_ready(job: Job) -> None:
         make_ready(devices.projector, settings.sequence, job.retry)
 
 
-BEGINS = "a run begins: it looks at its frames and opens its devices"  # Sign of life of a run before its first frame
+STARTING = "a run starts: it checks its frames and opens its devices"  # Sign of life of a run before its first frame
 
 
-# Reports that a run is alive, and what it waits for; "" while it takes frames.
+# Reports that a run is alive; its argument is the reason of a wait, or "" if frames are taken.
 SignOfLife = Callable[[str], None]
 
 
@@ -691,14 +694,14 @@ SignOfLife = Callable[[str], None]
 def signs_of_life(
     beat: Callable[[RunState, str, datetime], None], newest: Callable[[], RunState | None], within_s: float
 ) -> Generator[SignOfLife]:
-    """Send signs of life while the block runs, and in the end why it ended."""
+    """Send signs of life while the block runs, and finally the reason of its end."""
     last_s, reported_state = -math.inf, ""
 
-    def say(state: RunState, sentence: str) -> None:
+    def send(state: RunState, sentence: str) -> None:
         with suppress(CropError):
             beat(state, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
 
-    def changes(state: RunState) -> bool:
+    def is_new(state: RunState) -> bool:
         with suppress(CropError):
             return newest() not in (None, state)
         return False
@@ -706,13 +709,13 @@ def signs_of_life(
     def alive(waits_for: str) -> None:
         nonlocal last_s, reported_state
         state: RunState = "waiting" if waits_for else "running"
-        if time.monotonic() - last_s >= BEAT_S or state != reported_state or changes(state):
+        if time.monotonic() - last_s >= BEAT_S or state != reported_state or is_new(state):
             last_s, reported_state = time.monotonic(), state
-            say(state, waits_for or "frames are taken")
+            send(state, waits_for or "frames are taken")
 
     cause = f"ended by an error in the program; {AGAIN}"
     try:
-        alive(BEGINS)
+        alive(STARTING)
         yield alive
         cause = ""
     except KeyboardInterrupt:
@@ -722,7 +725,7 @@ def signs_of_life(
         cause = str(error)
         raise
     finally:
-        say("ended", cause)
+        send("ended", cause)
 
 
 class _Reports:
@@ -749,18 +752,18 @@ class _Reports:
         """Report that devices and session are open."""
         self._life.ready()
 
-    def working(self, doing: str) -> None:
-        """Report the current activity, and notices that could not be delivered."""
-        self._life.sign(doing)
-        self._notices.say_failures()
+    def working(self, activity: str) -> None:
+        """Send a sign of life with the current activity, and report notices that could not be delivered."""
+        self._life.sign(activity)
+        self._notices.report_failures()
 
     def doubt(self, sentence: str) -> None:
-        """Report a warning for the morning; errors of the disk are reported elsewhere."""
+        """Report a warning that does not stop the run; errors of the disk are reported elsewhere."""
         self._announce(f"{DOUBT}: {sentence}")
         with suppress(StorageError):
             self._journal.note(self._clock.now(), DOUBT, sentence)
 
-    def tell(self, event: str, sentence: str, /) -> None:
+    def report(self, event: str, sentence: str, /) -> None:
         """Report an event."""
         self._announce(f"{event}: {sentence}")
         if event == "paused":
@@ -771,27 +774,27 @@ class _Reports:
             self._journal.note(self._clock.now(), event, sentence)
 
     def sign_of_life(self, state: str, sentence: str, within_s: float, /) -> None:
-        """Report that the run waits, and for what."""
-        doing: RunState = "paused" if state == "paused" else "waiting"
-        if doing == "paused":
+        """Report that the run waits, with the reason."""
+        run_state: RunState = "paused" if state == "paused" else "waiting"
+        if run_state == "paused":
             self._pauses.paused(sentence)
         self._state(sentence)
-        self.working(f"{doing}: {sentence}")
-        self._journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
+        self.working(f"{run_state}: {sentence}")
+        self._journal.beat(run_state, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
 
     def late(self, sentence: str, started: datetime) -> None:
         """Report a late step from another thread, while the thread of the run waits for it."""
         thread_beat(self._journal.path, "late", sentence, started + timedelta(seconds=TRY_S))
 
-    def end(self, how: str, sentence: str) -> None:
-        """Note why the run ended; errors of the disk are reported elsewhere."""
-        self._notify(how, sentence)
-        self._life.end(how, sentence)
+    def end(self, event: str, sentence: str) -> None:
+        """Report the reason of the end; errors of the disk are reported elsewhere."""
+        self._notify(event, sentence)
+        self._life.end(event, sentence)
         with suppress(StorageError):
-            self._journal.note(self._clock.now(), how, sentence)
+            self._journal.note(self._clock.now(), event, sentence)
 
     def _notify(self, event: str, sentence: str) -> None:
-        self._notices.tell(event, sentence, datetime.now(UTC))
+        self._notices.send(event, sentence, datetime.now(UTC))
 
     def close(self) -> None:
         """Wait for the delivery of notices."""

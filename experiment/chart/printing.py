@@ -2,8 +2,9 @@
 
 - A file has true size: print it at 100 %, never with "fit to page". In the TIFF, all patches and tag modules are the
   same whole number of pixels, because unequal modules move the corners that detectors measure.
-- The codes name inks, not colours; the colours are measured later. They are untagged on the page of the PDF and in the
-  TIFF. The output intent of the PDF (required by PDF/X) and the tagged TIFF declare sRGB for colour-managed printing.
+- The codes are amounts of ink, not colours; the colours are measured later. They are untagged on the page of the PDF
+  and in the TIFF. The output intent of the PDF (required by PDF/X) and the tagged TIFF declare sRGB for printing with
+  colour management.
 - An A0 sheet at 600 dpi has 1.7 GB of pixels, so it is never in memory: equal rows are drawn once and compressed strip
   by strip.
 """
@@ -35,8 +36,8 @@ _BANDS = 64  # Bands of equal rows that are painted at a time, which limits memo
 
 _SUPERSAMPLING = 8  # Fine pixels along each side of a preview pixel: edges are then accurate to 1/8 of it
 
-# Overlap of a patch of the PDF with the next patches, so that no hairline of paper shows between them. And reduction of
-# each rectangle, so that rounding does not paint the next pixel.
+# Overlap of a patch of the PDF with the next patches, so that no line of paper is visible between them; and reduction
+# of each rectangle on all sides, so that rounding does not paint the next pixel.
 _LAP_PX, _INSET_PX = 0.2, 0.01
 
 
@@ -115,12 +116,12 @@ def tag_modules(tag: Tag) -> npt.NDArray[np.bool_]:
     import cv2
 
     if tag.family != TAG_FAMILY:
-        raise InputError(f"tag {tag.id} has family {tag.family}, {TAG_FAMILY} expected; use a chart by acquire chart")
+        raise InputError(f"tag {tag.id} has family {tag.family}, {TAG_FAMILY} expected; run acquire chart again")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     if not 0 <= tag.id < len(dictionary.bytesList):
         raise InputError(
             f"tag id {tag.id} does not exist, 0 to {len(dictionary.bytesList) - 1} expected for family {TAG_FAMILY}; "
-            "use a chart by acquire chart"
+            "run acquire chart again"
         )
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, tag.id, TAG_MODULES)) > 127
 
@@ -130,7 +131,7 @@ def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.u
     right, bottom = tag.corners_mm[2]
     upright = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
     if not (right > left and bottom > top and np.allclose(tag.corners_mm, upright, atol=1e-3)):
-        raise InputError(f"tag {tag.id} is rotated, but only upright tags can be printed; use a chart by acquire chart")
+        raise InputError(f"tag {tag.id} is rotated, but only upright tags can be printed; run acquire chart again")
     size = np.array([right - left, bottom - top]) / TAG_MODULES
     rim = np.array([left, top, right, bottom]) + np.concatenate([-size, size])
     rows, columns = np.nonzero(tag_modules(tag))
@@ -212,8 +213,8 @@ def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI, tagged: bool = Fa
     Parameters
     ----------
     dpi
-        Resolution at which patches and tag modules are whole pixels: 600, 360, or another multiple of 24 for charts of
-        `experiment.chart.layout`. An A0 sheet at 600 dpi has 28 087 × 19 866 pixels.
+        Resolution at which patches and tag modules are whole pixels: 600 or 1200 for every page of
+        `experiment.chart.layout`, any multiple of 24 for A0. An A0 sheet at 600 dpi has 28 087 × 19 866 pixels.
     tagged
         Whether the codes are tagged as sRGB, for a shop that prints through the profile of its printer.
     """
@@ -252,10 +253,10 @@ def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, operators
     """Write any drawing as a PDF/X-4 with one page of its size. `operators`: operators added to the page."""
     width, height = (side * POINTS_PER_MM for side in sheet.page_mm)
     corners = sheet.rectangles_mm * POINTS_PER_MM
-    # Renderers paint every pixel that a rectangle touches, so each is slightly smaller, and rounding leaves the next
-    # pixel alone.
-    hair, lap = _INSET_PX * PX_MM * POINTS_PER_MM, _LAP_PX * PX_MM * POINTS_PER_MM
-    corners += np.array([hair, hair, -hair, -hair])
+    # Renderers paint every pixel that a rectangle touches. Slightly smaller rectangles do not touch the next pixel,
+    # even after rounding.
+    inset, lap = _INSET_PX * PX_MM * POINTS_PER_MM, _LAP_PX * PX_MM * POINTS_PER_MM
+    corners += np.array([inset, inset, -inset, -inset])
     corners[len(corners) - sheet.tiles :, 2:] += lap
     left, top, right, bottom = corners.T
     boxes = np.stack([left, height - bottom, right - left, bottom - top], axis=1)
@@ -275,10 +276,10 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     from scipy import sparse
 
     if width_px < 1:
-        raise InputError(f"a preview of {width_px} pixels is requested; give a width of 1 or more")
+        raise InputError(f"the preview has a width of {width_px} pixels, 1 or more expected; enlarge it")
     height_px = max(1, round(width_px * chart.page_mm[1] / chart.page_mm[0]))
-    fine = (width_px * _SUPERSAMPLING, height_px * _SUPERSAMPLING)
-    bands = list(_bands(drawing(chart), fine[0] / chart.page_mm[0], fine))
+    fine_size = (width_px * _SUPERSAMPLING, height_px * _SUPERSAMPLING)
+    bands = list(_bands(drawing(chart), fine_size[0] / chart.page_mm[0], fine_size))
     # Means over whole pixels, for which OpenCV is much faster than numpy.
     means = np.stack(
         [

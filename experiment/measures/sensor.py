@@ -4,7 +4,8 @@ EMVA 1288 (release 4.0, linearity error) plots the mean of a sensor against expo
 straight line between 5 and 95 % of saturation. Here every patch of the chart is such a curve. Patches have all levels,
 so the exposure of a frame need not be known: between two frames, the counts of all patches must rise by the same
 factor. A factor that depends on the level is nonlinearity. Only a power law of the light cannot be detected in this
-way. For it the exposure times are used together, because cameras round them (0.3 s for 0.315 s).
+way. Its exponent is measured from the exposure times of all frames together, because cameras round the time of each
+frame (0.3 s for 0.315 s).
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _Array = npt.NDArray[np.float64]
 
 
 def black_drift(blacks: Sequence[_Array]) -> float:
-    """Return the largest range of the black level over frames, of any position of the block, counts.
+    """Return the largest range of the black level over the frames, at the worst position of the Bayer block, counts.
 
     `blacks`: black level (2, 2) float64 of each frame, counts.
     """
@@ -54,7 +55,7 @@ def deviations(levels: _Array, exposure_s: _Array) -> tuple[_Array, _Array]:
     levels
         (K, P, 3) float64, mean counts of patches in K frames, relative to saturation; NaN if not usable.
     exposure_s
-        (K,) float64, exposure times by the camera, rising, s.
+        (K,) float64, exposure times as recorded by the camera, ascending, s.
 
     Returns
     -------
@@ -66,8 +67,8 @@ def deviations(levels: _Array, exposure_s: _Array) -> tuple[_Array, _Array]:
     for channel in range(3):
         both_times = (exposure_s, _exact_times(exposure_s))
         fits = [_deviation(levels[..., channel], np.log(times), nodes) for times in both_times]
-        # Cameras write 0.3 s for a third of a stop, and some really expose for 0.3 s: the times that fit the frames
-        # better are used.
+        # Cameras record 0.3 s for 0.315 s, a step of a third of a stop; some really expose for 0.3 s. The times with
+        # the better fit are used.
         deviation[channel] = min(fits, key=lambda fit: fit[1])[0]
     return nodes, deviation
 
@@ -78,7 +79,7 @@ def _exact_times(exposure_s: _Array) -> _Array:
 
 
 def _deviation(levels: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array, float]:
-    """Return the relative deviation (B,) at nodes, and the RMS distance of the frames' factors from their times.
+    """Return the relative deviation (B,) at nodes, and the RMS residual of the log factors against the log times.
 
     `levels`: (K, P), one channel, relative to saturation. The deviation is NaN at nodes with too few patches.
     """
@@ -105,8 +106,9 @@ def _deviation(levels: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array
     is_measured = patch_counts >= _LEAST_PATCHES
     if not rows or is_measured.sum() < 2:
         return np.full(len(nodes), np.nan), np.inf
-    # A power of the light appears as a slope, and noise in both frames looks like one. A pattern that repeats with the
-    # steps of the frames cannot be measured. So the slope is set to 0, and the other deviations are drawn to 0.
+    # A power of the light appears as a slope of the deviation over the logarithmic level. Noise in both frames has the
+    # same effect, so the slope is set to 0. A pattern that repeats with the steps of the frames cannot be measured, so
+    # the other deviations get a weak constraint towards 0.
     centred_log_nodes = np.where(is_measured, np.log(nodes) - np.log(nodes)[is_measured].mean(), 0)
     constraints = np.zeros((2 + len(nodes), frames - 1 + len(nodes)))
     constraints[0, frames - 1 :], constraints[1, frames - 1 :] = _HARD * is_measured, _HARD * centred_log_nodes

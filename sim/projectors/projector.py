@@ -1,6 +1,6 @@
 """The simulated projector with its lamp, and the screen, which has one uniform colour.
 
-The state advances with the clock, only at calls. Protocols are in other modules.
+Each call of a method first updates the state to the current time. Protocols are in other modules.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ class SimulatedProjector:
         self.traits = traits or ProjectorTraits()
         self._lock = threading.RLock()
         self._power = power
-        self._since = clock.monotonic()
-        self._lit_s = self.traits.lamp_hours * 3600.0
+        self._state_since_s = clock.monotonic()
+        self._burnt_s = self.traits.lamp_hours * 3600.0
         self._muted = False
         self._faults: dict[str, Severity] = {}
         self._input = "31"
@@ -92,17 +92,17 @@ class SimulatedProjector:
             return self._power
 
     def switch_on(self) -> None:
-        """Switch the lamp on; refused during cooling."""
+        """Switch the lamp on; refused during warm-up and cooling."""
         with self._lock:
-            self._start(Power.WARMING, Power.ON, "cooling down")
+            self._start(Power.WARMING, Power.ON)
 
     def switch_off(self) -> None:
-        """Switch the lamp off; refused during warm-up."""
+        """Switch the lamp off; refused during warm-up and cooling."""
         with self._lock:
-            self._start(Power.COOLING, Power.STANDBY, "warming up")
+            self._start(Power.COOLING, Power.STANDBY)
 
     def muted(self) -> bool:
-        """Return whether the picture is blanked; refused unless the projector is on."""
+        """Return whether the picture is black (muted); refused unless the projector is on."""
         with self._require_on():
             return self._muted
 
@@ -120,11 +120,11 @@ class SimulatedProjector:
         """Select one of `INPUTS`; refused unless the projector is on."""
         with self._require_on():
             if code not in INPUTS:
-                raise ValueError(code)
+                raise ValueError(f"the input is {code!r}, expected one of {', '.join(INPUTS)}")
             self._input = code
 
     def input_resolution(self) -> Resolution | NoResolution:
-        """Return the resolution of the input signal, or why there is none; refused unless the projector is on."""
+        """Return the resolution of the input signal, or the reason for its absence; refused unless on."""
         with self._require_on():
             return self.signal
 
@@ -147,8 +147,8 @@ class SimulatedProjector:
         """Return the state of its only lamp."""
         with self._lock:
             self._update()
-            burning = self.clock.monotonic() - self._since if self._lit() else 0.0
-            return (Lamp(int((self._lit_s + burning) / 3600.0), self._lit()),)
+            burning_s = self.clock.monotonic() - self._state_since_s if self._lit() else 0.0
+            return (Lamp(int((self._burnt_s + burning_s) / 3600.0), self._lit()),)
 
     def close(self) -> None:
         """Do nothing: it has no connection."""
@@ -163,7 +163,7 @@ class SimulatedProjector:
             if self._muted or not self._lit():
                 return 0.0
             if self._power is Power.WARMING:
-                return (self.clock.monotonic() - self._since) / self.traits.warm_up_s
+                return (self.clock.monotonic() - self._state_since_s) / self.traits.warm_up_s
             return 1.0
 
     def break_part(self, part: str, severity: Severity) -> None:
@@ -181,42 +181,40 @@ class SimulatedProjector:
         with self._lock:
             self._faults.clear()
 
-    def _start(self, change: Power, settled: Power, busy: str) -> None:
+    def _start(self, transition: Power, target: Power) -> None:
         self._update()
-        if self._power is settled:
+        if self._power is target:
             return
         if self._power in (Power.WARMING, Power.COOLING):
-            if self._power is change:
-                busy = self._power.value
-            raise DeviceRefused(f"the simulated projector is {busy}; wait until it has finished")
-        if change is Power.WARMING and self._faults.get("lamp") is Severity.ERROR:
+            raise DeviceRefused(f"the simulated projector is in {self._power.value}; wait until it has finished")
+        if transition is Power.WARMING and self._faults.get("lamp") is Severity.ERROR:
             raise DeviceFault("the lamp of the simulated projector is broken; repair it")
-        self._enter(change, self.clock.monotonic())
+        self._enter(transition, self.clock.monotonic())
 
     @contextmanager
     def _require_on(self) -> Generator[None]:
-        """Hold the state for the block; refuse it unless the projector is on."""
+        """Lock the state during the block; raise an error unless the projector is on."""
         with self._lock:
             self._update()
             if self._power is not Power.ON:
-                raise DeviceRefused(f"the simulated projector is in {self._power.value}; wait until it is on")
+                raise DeviceRefused(f"the simulated projector is in {self._power.value}; switch it on and wait")
             yield
 
     def _lit(self) -> bool:
         return self._power in (Power.ON, Power.WARMING)
 
     def _update(self) -> None:
-        passed = self.clock.monotonic() - self._since
-        if self._power is Power.WARMING and passed >= self.traits.warm_up_s:
-            self._enter(Power.ON, self._since + self.traits.warm_up_s)
-        elif self._power is Power.COOLING and passed >= self.traits.cool_down_s:
-            self._enter(Power.STANDBY, self._since + self.traits.cool_down_s)
+        elapsed_s = self.clock.monotonic() - self._state_since_s
+        if self._power is Power.WARMING and elapsed_s >= self.traits.warm_up_s:
+            self._enter(Power.ON, self._state_since_s + self.traits.warm_up_s)
+        elif self._power is Power.COOLING and elapsed_s >= self.traits.cool_down_s:
+            self._enter(Power.STANDBY, self._state_since_s + self.traits.cool_down_s)
 
     def _enter(self, power: Power, at: float) -> None:
         if self._lit():
-            self._lit_s += at - self._since
+            self._burnt_s += at - self._state_since_s
         self._power = power
-        self._since = at
+        self._state_since_s = at
         if power is Power.STANDBY:
             self._muted = False
             self._frozen = False

@@ -108,7 +108,7 @@ def test_makes_data_set_with_contact_sheet(generate: Generate, capsys: pytest.Ca
     printed = capsys.readouterr()
     assert "out: 6 images of 2 pictures under 3 illuminants" in printed.out
     assert "1 of 3 pictures was skipped" in printed.out
-    assert "lists as unfit; they were replaced by the nearest fit colour" in printed.out
+    assert "lists as unfit; they were replaced by the nearest usable colour" in printed.out
     assert "skipped bad.png" in printed.err
     assert "6/6" in printed.err
     assert cv2.imread("sheet.png") is not None

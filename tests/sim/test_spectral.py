@@ -147,8 +147,8 @@ def altered(key: str, value: Any) -> dict[str, Any]:
         (altered("500.0", [0.1, 0.2, 0.3]), "500 nm occurs twice"),
         (document(low=420), "its wavelengths are 420 to 720, expected at least 400 to 700 nm"),
         (document(low=0.39, high=0.72, step=0.01), "convert them to nanometres"),
-        (altered("390", [0, 0, 0.3]), "B has 30% of its peak at its last wavelength, 390 nm"),
-        (altered("720", [0.051, 0, 0]), "R has 5% of its peak at its last wavelength, 720 nm"),
+        (altered("390", [0, 0, 0.3]), "B has 30% of its peak at the end of its range, 390 nm"),
+        (altered("720", [0.051, 0, 0]), "R has 5% of its peak at the end of its range, 720 nm"),
     ],
 )
 def test_refuses_bad_sensitivities(content: Any, message: str) -> None:

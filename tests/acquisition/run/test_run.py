@@ -32,9 +32,9 @@ from acquisition.run.pipeline import Taken, link_runs
 from acquisition.run.rig.lab import session_clock
 from acquisition.run.run import (
     ALIVE_S,
-    BEGINS,
     PLAIN_S,
     QUIET_S,
+    STARTING,
     Life,
     Notices,
     PauseNotices,
@@ -143,7 +143,7 @@ def test_resumed_run_reports_before_opening_devices(folder: Path, monkeypatch: p
     monkeypatch.setattr(run, "require_same", same)
     with pytest.raises(DeviceError):
         run_session(SETTINGS, folder, lambda done, total: None)
-    assert seen == [BEGINS]
+    assert seen == [STARTING]
     view = read_session(folder)
     assert view.head(datetime.now(UTC)).sentence == "no camera on USB; plug it in"
     assert [event.what for event in view.events].count("killed") == 1
@@ -470,7 +470,7 @@ def notices(target: str, *events: str) -> list[str]:
     warnings: list[str] = []
     told_by = Notices(target, "night", warnings.append)
     for event in events or ("paused",):
-        told_by.tell(event, "the screen is covered – 3 °C", AT)
+        told_by.send(event, "the screen is covered – 3 °C", AT)
     told_by.close()
     told_by.close()
     return warnings
@@ -514,7 +514,8 @@ class TestWebhook:
     def test_reports_refusal_once_without_secret(self, receiver: Receiver, why: str) -> None:
         with served(receiver):
             warnings = notices(f"http://u:s3cret@127.0.0.1:{receiver.port}/s3cret?s3cret", "paused", "resumed")
-        assert warnings == [f"http://127.0.0.1:{receiver.port}/… did not receive a notice: {why}; the run continues"]
+        failure = f"did not receive a notice: {why}; the run continues; check the receiver"
+        assert warnings == [f"http://127.0.0.1:{receiver.port}/… {failure}"]
         assert len(receiver.got) == 2
 
     def test_reports_missing_server(self) -> None:
@@ -557,7 +558,7 @@ class TestCommand:
         ],
     )
     def test_reports_failed_command(self, target: str, label: str, why: str) -> None:
-        expected = [f"{label} did not receive a notice: {why}; the run continues"] if why else []
+        expected = [f"{label} did not receive a notice: {why}; the run continues; check the receiver"] if why else []
         assert notices(target, "paused", "resumed") == expected
 
     @pytest.mark.slow
@@ -578,7 +579,7 @@ def test_notices_never_block() -> None:
     with served(Receiver(hangs=threading.Event())) as receiver:
         told_by = Notices(f"http://127.0.0.1:{receiver.port}/", "night")
         for number in range(3 * run.QUEUED):
-            told_by.tell(f"event {number}", "", AT)
+            told_by.send(f"event {number}", "", AT)
         assert len(receiver.got) <= 1
         assert receiver.hangs is not None
         receiver.hangs.set()
@@ -623,7 +624,7 @@ def test_feeds_watchdog_in_time(manager: Manager, address: str) -> None:
     clock = SimulatedClock()
     one = life(address, clock, WATCHDOG_USEC="60000000")
     one.ready()
-    assert manager.got() == ["READY=1", "WATCHDOG=1\nSTATUS=at work"]
+    assert manager.got() == ["READY=1", "WATCHDOG=1\nSTATUS=running"]
     fed: list[float] = [0.0]
     for _ in range(60):
         clock.sleep(5)
@@ -694,7 +695,7 @@ def last_words(block: Callable[[SignOfLife], None]) -> list[tuple[str, str]]:
 
 def test_complete_run_gives_no_cause() -> None:
     assert last_words(lambda alive: alive("")) == [
-        ("waiting", BEGINS),
+        ("waiting", STARTING),
         ("running", "frames are taken"),
         ("ended", ""),
     ]
