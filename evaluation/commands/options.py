@@ -69,10 +69,10 @@ Read = Annotated[
 def open_data(location: str, read: Sequence[str] | None = None) -> SceneSet:
     """Return the data set, read with the values of --read."""
     from evaluation.datasets import open_scenes
-    from evaluation.datasets.opening import with_black_judged
+    from evaluation.datasets.opening import check_black_level
 
     layout, options = reading_options(read or ())
-    return with_black_judged(open_scenes(location, layout, options), options.black)
+    return check_black_level(open_scenes(location, layout, options), options.black)
 
 
 def reading_options(texts: Sequence[str]) -> tuple[str | None, DataOptions]:
@@ -81,7 +81,7 @@ def reading_options(texts: Sequence[str]) -> tuple[str | None, DataOptions]:
     Examples
     --------
     >>> layout, options = reading_options(["layout=nus8", "black=128", "partial"])
-    >>> layout, options.given
+    >>> layout, options.set_options
     ('nus8', ('black', 'partial'))
     """
     from evaluation.datasets.options import DataOptions
