@@ -165,11 +165,11 @@ def choose_without_constant(texts: Sequence[str]) -> tuple[list[Learner], list[s
     The commands add the constant illuminant themselves.
     """
     from evaluation.learning.constant_light import ConstantLight
-    from evaluation.learning.feature_learner import what_is_missing
+    from evaluation.learning.feature_learner import missing_requirement
 
     explicit = {learner.name for learner in choose_learners(text for text in texts if text.lower() != "all")}
     learners = [learner for learner in choose_learners(texts) if learner.name != ConstantLight().name]
-    missing = {learner.name: what_is_missing(learner) for learner in learners if learner.name not in explicit}
+    missing = {learner.name: missing_requirement(learner) for learner in learners if learner.name not in explicit}
     left_out = [f"{name} is omitted: {reason}" for name, reason in missing.items() if reason]
     return [learner for learner in learners if not missing.get(learner.name)], left_out
 

@@ -32,7 +32,7 @@ class ThumbnailScene(PaintedScene):
 
 
 def is_ffcc(folder: Folder) -> bool:
-    """Return True if the folder or a direct child has a NAME.png with its NAME.txt."""
+    """Return True if the folder or a direct subfolder has a NAME.png with its NAME.txt."""
     for child in folder.within(1):
         names = child.files
         for name in islice((name for name in names if name.lower().endswith(".png")), _SAMPLED_NAMES):

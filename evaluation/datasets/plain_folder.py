@@ -88,7 +88,7 @@ def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folde
     for where, row in read_rows(path, COLUMNS):
         name = row["image"].strip()
         if not name or name in names:
-            problem = f"image {name!r} is listed twice, expected once" if name else "no image name, expected one"
+            problem = f"image {name!r} is open_folders twice, expected once" if name else "no image name, expected one"
             raise FormatError(f"{where}: {problem}; correct the line")
         names.add(name)
         image = _find_image(folder, name, where, indices)
@@ -98,12 +98,8 @@ def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folde
             first_refusal = first_refusal or _unusable_file(folder, name, where, indices)
             continue
         if (earlier_name := paths.setdefault(os.path.normpath(image), name)) != name:
-            raise FormatError(
-                f"{where}: {name} and {earlier_name} are one file, expected one row per image; remove one"
-            )
-        given_columns.update(
-            column for column in ("black", "saturation", "mask", "fold") if row.get(column, "").strip()
-        )
+            raise FormatError(f"{where}: {name} and {earlier_name} are one file, expected one row for it; remove one")
+        given_columns.update(name for name in ("black", "saturation", "mask", "fold") if row.get(name, "").strip())
         mask_path = _find_mask(name, image, indices)
         scenes.append(_scene(folder, name, image, mask_path, light, row, where, options))
         if scenes[-1].mask_path:
@@ -121,9 +117,7 @@ def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folde
     if "fold" in given_columns and min(folds) < 0:
         raise FormatError(f"{path}: some rows have a fold, expected one in all or none; complete the column")
     if mask_images := sorted(masks & paths.keys()):
-        raise FormatError(
-            f"{path} has a row for {first_few(mask_images)}, which is also a mask, expected images only; rename one"
-        )
+        raise FormatError(f"{path}: {first_few(mask_images)} is an image and a mask, expected one of these; rename it")
     exclusion_note = _unlisted_note(Path(location), path, indices, paths.keys(), masks, options.partial)
     return SceneSet(
         name=folder.resolve().name,
@@ -164,7 +158,7 @@ def _find_table(location: Path, scanned_folder: Folder | None) -> Path:
         raise FormatError(f"{location} has no table with the columns {','.join(COLUMNS)}; write one, a row per image")
     if len(tables) > 1:
         raise InputError(
-            f"{location} has {len(tables)} tables of ground truths ({first_few(tables)}), expected one; give one"
+            f"{location} has {len(tables)} tables of ground truths, expected one; give {first_few(tables)}"
         )
     return location / tables[0]
 
@@ -237,7 +231,7 @@ def _ending(file: str) -> str:
 
 
 def _find_image(folder: Path, name: str, where: str, indices: dict[str, _FolderIndex]) -> str | None:
-    """Return the path of a listed image, with or without ending in the table; None if it does not exist."""
+    """Return the path of a open_folders image, with or without ending in the table; None if it does not exist."""
     below, _, file = name.rpartition("/")
     if reason := _refusal_reason(file):
         raise FormatError(f"{where}: {name} is {reason}")
@@ -290,20 +284,16 @@ def _unlisted_note(
     """Return a note on excluded images without a row; an empty string if there are none."""
     folders = {file.rpartition(os.sep)[0] or "." for file in images}
     root = Folder(path.parent)
-    listed_folders = [index.folder for index in indices.values() if index.files]
+    open_folders = [index.folder for index in indices.values() if index.files]
     beside_images: list[str] = []
     elsewhere: list[str] = []
-    for folder in {
-        os.path.normpath(candidate.path): candidate for candidate in (*listed_folders, *root.within(1))
-    }.values():
-        folder_path = os.path.normpath(folder.path)
-        files = [
-            os.path.normpath(f"{folder_path}{os.sep}{file}") for file in folder.files if _ending(file) in IMAGE_ENDINGS
-        ]
+    for folder_path, folder in {os.path.normpath(item.path): item for item in (*open_folders, *root.within(1))}.items():
+        names = [name for name in folder.files if _ending(name) in IMAGE_ENDINGS]
+        files = [os.path.normpath(f"{folder_path}{os.sep}{name}") for name in names]
         (beside_images if folder_path in folders else elsewhere).extend(
             file for file in files if file not in images and file not in masks
         )
-    # Masks need no row of their own; they are listed only if there are no other images.
+    # Masks need no row of their own; they are open_folders only if there are no other images.
     beside_images = [file for file in beside_images if not Path(file).stem.endswith(_MASK)] or beside_images
     # If the user gave one of several tables, it is a selection of images. Otherwise an image without a row is an error.
     is_selection = location.is_file() and len(_tables(root)) > 1

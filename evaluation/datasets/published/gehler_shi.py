@@ -98,7 +98,7 @@ class MacbethScene(RawScene):
 
 
 def is_gehler_shi(folder: Folder) -> bool:
-    """Return True if the folder or a direct child has a ground truth or chart corners of the data set."""
+    """Return True if the folder or a direct subfolder has a ground truth or chart corners of the data set."""
     truth_files = {name for files, _ in _TRUTHS.values() for name in files}
     return any(
         truth_files.intersection(child.files)

@@ -122,7 +122,7 @@ class LsmiMixedScene(LsmiScene):
 
 
 def is_lsmi(folder: Folder) -> bool:
-    """Return True if a folder or a direct child has `meta.json` and `split.json`."""
+    """Return True if a folder or a direct subfolder has `meta.json` and `split.json`."""
     return bool(_cameras(folder))
 
 

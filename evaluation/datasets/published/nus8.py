@@ -63,8 +63,8 @@ def chart_boxes(
                 f"({first_few(missing)}), expected the chart of every image in one of them; download GROUNDTRUTH or "
                 "MASK from the data set's page"
             )
-        boxes = {index: read_mask(mask_files[names[index]]) for index in indices}
-        return boxes, f"{_MASK_FOLDER}/…_mask.txt, first line, as the .mat has no {_COORDS}"
+        source = f"{_MASK_FOLDER}/…_mask.txt, first line, as the .mat has no {_COORDS}"
+        return {index: read_mask(mask_files[names[index]]) for index in indices}, source
     rows = numeric_table(content, _COORDS, path, 4).astype(int)
     if len(rows) != len(names):
         raise FormatError(f"{path} has {len(names)} images and {len(rows)} {_COORDS}, expected as many; restore it")
@@ -179,7 +179,7 @@ class ChartScene(RawScene):
 
 
 def is_nus8(folder: Folder) -> bool:
-    """Return True if a folder or a direct child has a `CAMERA_gt.mat`."""
+    """Return True if a folder or a direct subfolder has a `CAMERA_gt.mat`."""
     return any(True for _ in _mat_files(folder))
 
 
@@ -220,8 +220,7 @@ def open_nus8(location: str, options: DataOptions, scanned_folder: Folder | None
             ),
             "mask": "the chart: "
             + "; ".join(
-                f"of {', '.join(published_note)} by {how}" if len(sources) > 1 else how
-                for how, published_note in sources.items()
+                f"of {', '.join(names)} by {text}" if len(sources) > 1 else text for text, names in sources.items()
             ),
             "ground truth": "groundtruth_illuminants of the .mat",
         },
