@@ -167,11 +167,11 @@ def match_images(
 Light = tuple[float, float, float]  # linear camera RGB of an illuminant, any length
 
 
-def check_light(values: Sequence[float], where: str, remedy: str = "restore the file") -> Light:
+def check_light(values: Sequence[float], origin: str, remedy: str = "restore the file") -> Light:
     """Return three values as an illuminant; raise FormatError if they are none."""
     if len(values) != 3 or not all(map(math.isfinite, values)) or min(values) < 0 or not any(values):
         raise FormatError(
-            f"{where}: the illuminant is {' '.join(f'{value:g}' for value in values) or 'empty'}, expected red, green "
+            f"{origin}: the illuminant is {' '.join(f'{value:g}' for value in values) or 'empty'}, expected red, green "
             f"and blue, each 0 or more and at least one above 0; {remedy}"
         )
     red, green, blue = values
@@ -183,7 +183,7 @@ def read_text(path: Path | str) -> str:
     return files.read_text(Path(path), "restore it from the data set's archive")
 
 
-def parse_numbers(text: str, where: str) -> list[float]:
+def parse_numbers(text: str, origin: str) -> list[float]:
     """Return the numbers in a text, separated by blanks, commas or line ends.
 
     Examples
@@ -194,7 +194,7 @@ def parse_numbers(text: str, where: str) -> list[float]:
     try:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError as error:
-        raise FormatError(f"{where}: {text.strip()!r} was read, expected numbers; restore the file") from error
+        raise FormatError(f"{origin}: {text.strip()!r} was read, expected numbers; restore the file") from error
 
 
 def read_lights(path: Path) -> list[Light]:
@@ -227,28 +227,28 @@ def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, Mapping
             if duplicates:
                 raise FormatError(f"{path} has two columns {duplicates[0]!r}, expected each once; remove one")
             for row in rows:
-                where = f"{path}, line {rows.line_num}"
+                origin = f"{path}, line {rows.line_num}"
                 if not row:
                     continue
                 if len(row) != len(header):
-                    raise FormatError(f"{where} has {len(row)} fields, expected {len(header)}; correct it")
-                yield where, dict(zip(header, row, strict=True))
+                    raise FormatError(f"{origin} has {len(row)} fields, expected {len(header)}; correct it")
+                yield origin, dict(zip(header, row, strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = (isinstance(error, OSError) and error.strerror) or str(error)
         raise FormatError(f"{path} cannot be read: {reason}; restore it") from error
 
 
-def parse_light(row: Mapping[str, str], columns: Sequence[str], where: str, remedy: str = "restore the file") -> Light:
+def parse_light(row: Mapping[str, str], columns: Sequence[str], origin: str, remedy: str = "restore the file") -> Light:
     """Return the illuminant in three columns of a row; `remedy` ends the message if the values are wrong."""
-    return check_light([parse_number(row[column], where, column) for column in columns], where, remedy)
+    return check_light([parse_number(row[column], origin, column) for column in columns], origin, remedy)
 
 
-def parse_number(text: str, where: str, column: str) -> float:
+def parse_number(text: str, origin: str, column: str) -> float:
     """Return the number in a field of a table."""
     try:
         return float(text)
     except ValueError as error:
-        raise FormatError(f"{where}: {column} is {text!r}, expected a number; correct it") from error
+        raise FormatError(f"{origin}: {column} is {text!r}, expected a number; correct it") from error
 
 
 Mask = npt.NDArray[np.bool_]  # (H, W), True for pixels that must not be used
@@ -342,7 +342,7 @@ class PaintedScene(RawScene):
     """Image whose charts or faces are painted over with zeros; pixels that are zero in every channel are masked."""
 
     def mask(self, image: Image) -> Mask:
-        """Return (H, W) bool, True where every channel of the image (H, W, 3) is zero."""
+        """Return (H, W) bool, True if all channels of the image (H, W, 3) are zero."""
         return np.asarray((image[..., 0] == 0) & (image[..., 1] == 0) & (image[..., 2] == 0))
 
 

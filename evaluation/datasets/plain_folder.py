@@ -85,27 +85,27 @@ def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folde
     given_columns: set[str] = set()
     paths: dict[str, str] = {}
     indices: dict[str, _FolderIndex] = {"": _FolderIndex(scanned_folder)} if scanned_folder else {}
-    for where, row in read_rows(path, COLUMNS):
+    for origin, row in read_rows(path, COLUMNS):
         name = row["image"].strip()
         if not name or name in names:
             problem = f"image {name!r} is open_folders twice, expected once" if name else "no image name, expected one"
-            raise FormatError(f"{where}: {problem}; correct the line")
+            raise FormatError(f"{origin}: {problem}; correct the line")
         names.add(name)
-        image = _find_image(folder, name, where, indices)
-        light = parse_light(row, COLUMNS[1:], where, "correct the line")
+        image = _find_image(folder, name, origin, indices)
+        light = parse_light(row, COLUMNS[1:], origin, "correct the line")
         if image is None:
             missing.append(name)
-            first_refusal = first_refusal or _unusable_file(folder, name, where, indices)
+            first_refusal = first_refusal or _unusable_file(folder, name, origin, indices)
             continue
         if (earlier_name := paths.setdefault(os.path.normpath(image), name)) != name:
-            raise FormatError(f"{where}: {name} and {earlier_name} are one file, expected one row for it; remove one")
+            raise FormatError(f"{origin}: {name} and {earlier_name} are one file, expected one row for it; remove one")
         given_columns.update(name for name in ("black", "saturation", "mask", "fold") if row.get(name, "").strip())
         mask_path = _find_mask(name, image, indices)
-        scenes.append(_scene(folder, name, image, mask_path, light, row, where, options))
+        scenes.append(_scene(folder, name, image, mask_path, light, row, origin, options))
         if scenes[-1].mask_path:
             masks.add(os.path.normpath(scenes[-1].mask_path))
         given_columns.update(("mask beside",) if mask_path and scenes[-1].mask_path == mask_path else ())
-        folds.append(_parse_fold(row, where))
+        folds.append(_parse_fold(row, origin))
     if not scenes or (missing and not options.partial):
         if first_refusal:
             raise FormatError(first_refusal)
@@ -230,11 +230,11 @@ def _ending(file: str) -> str:
     return f".{file.rpartition('.')[2].lower()}"
 
 
-def _find_image(folder: Path, name: str, where: str, indices: dict[str, _FolderIndex]) -> str | None:
+def _find_image(folder: Path, name: str, origin: str, indices: dict[str, _FolderIndex]) -> str | None:
     """Return the path of a open_folders image, with or without ending in the table; None if it does not exist."""
     below, _, file = name.rpartition("/")
     if reason := _refusal_reason(file):
-        raise FormatError(f"{where}: {name} is {reason}")
+        raise FormatError(f"{origin}: {name} is {reason}")
     if below not in indices:
         indices[below] = _FolderIndex(Folder(folder / below))
     index = indices[below]
@@ -259,12 +259,12 @@ def _refusal_reason(file: str) -> str:
     return ""
 
 
-def _unusable_file(folder: Path, name: str, where: str, indices: Mapping[str, _FolderIndex]) -> str | None:
+def _unusable_file(folder: Path, name: str, origin: str, indices: Mapping[str, _FolderIndex]) -> str | None:
     """Return why the unusable file that has the name of a missing image is refused; None if there is none."""
     below, _, file = name.rpartition("/")
     stem = Path(file).stem if _ending(file) in IMAGE_ENDINGS else file
     file_name = indices[below].unusable.get(stem)
-    return file_name and f"{where}: {name} exists only as {folder / below / file_name}: {_refusal_reason(file_name)}"
+    return file_name and f"{origin}: {name} exists only as {folder / below / file_name}: {_refusal_reason(file_name)}"
 
 
 def _find_mask(name: str, image: str, indices: Mapping[str, _FolderIndex]) -> str:
@@ -314,33 +314,33 @@ def _scene(
     mask_path: str,
     light: Light,
     row: Mapping[str, str],
-    where: str,
+    origin: str,
     options: DataOptions,
 ) -> OwnScene:
-    black = _parse_level(row, "black", where, options.black)
-    white = _parse_level(row, "saturation", where, options.saturation)
+    black = _parse_level(row, "black", origin, options.black)
+    white = _parse_level(row, "saturation", origin, options.saturation)
     if white is not None and white <= (black or 0):
-        raise FormatError(f"{where}: saturation {white:g}, expected above black {black or 0:g}; correct it")
+        raise FormatError(f"{origin}: saturation {white:g}, expected above black {black or 0:g}; correct it")
     mask = row.get("mask", "").strip()
     if mask and not (folder / mask).is_file():
-        raise FormatError(f"{where}: mask {folder / mask} does not exist; restore it, or leave the field empty")
+        raise FormatError(f"{origin}: mask {folder / mask} does not exist; restore it, or leave the field empty")
     if not mask and _ending(mask_path) in _PICTURES:
-        raise FormatError(f"{where}: mask {mask_path}, expected {' or '.join(_MASK_ENDINGS)}; make it again as PNG")
+        raise FormatError(f"{origin}: mask {mask_path}, expected {' or '.join(_MASK_ENDINGS)}; make it again as PNG")
     return OwnScene(name, image, light, black or 0.0, white, str(folder / mask) if mask else mask_path)
 
 
-def _parse_level(row: Mapping[str, str], column: str, where: str, otherwise: float | None) -> float | None:
+def _parse_level(row: Mapping[str, str], column: str, origin: str, otherwise: float | None) -> float | None:
     text = row.get(column, "").strip()
     if not text:
         return otherwise
-    level = parse_number(text, where, column)
+    level = parse_number(text, origin, column)
     if not (np.isfinite(level) and level >= 0):
-        raise FormatError(f"{where}: {column} is {text}, expected 0 or more, in the units of the file; correct it")
+        raise FormatError(f"{origin}: {column} is {text}, expected 0 or more, in the units of the file; correct it")
     return level
 
 
-def _parse_fold(row: Mapping[str, str], where: str) -> int:
+def _parse_fold(row: Mapping[str, str], origin: str) -> int:
     text = row.get("fold", "").strip()
     if text and not text.isdecimal():
-        raise FormatError(f"{where}: fold is {text!r}, expected a whole number from 0; correct it")
+        raise FormatError(f"{origin}: fold is {text!r}, expected a whole number from 0; correct it")
     return int(text) if text else -1  # -1: no fold

@@ -217,10 +217,10 @@ def open_cube_plus_plus(location: str, options: DataOptions, scanned_folder: Fol
     lights: dict[str, Light] = {}
     names: list[str] = []
     columns = [f"{truth}_{channel}" for channel in "rgb"]
-    for where, row in read_rows(folder.path / "gt.csv", ["image", *columns]):
+    for origin, row in read_rows(folder.path / "gt.csv", ["image", *columns]):
         names.append(row["image"])
         if not _is_blank(row, columns):
-            lights[row["image"]] = parse_light(row, columns, where)
+            lights[row["image"]] = parse_light(row, columns, origin)
     png_folders = [child for name, child in folder.folders.items() if name.upper().startswith("PNG")]
     images = gather_images(png_folders)
     indices, note = match_images(names, images, "gt.csv", folder.path / "PNG", options.partial)
@@ -274,8 +274,8 @@ def open_simple_cube(location: str, options: DataOptions, scanned_folder: Folder
         if subset not in (None, split.path.name):
             continue
         rows = [
-            (row["image"], parse_light(row, "rgb", where))
-            for where, row in read_rows(split.path / "gt.csv", ["image", "r", "g", "b"])
+            (row["image"], parse_light(row, "rgb", origin))
+            for origin, row in read_rows(split.path / "gt.csv", ["image", "r", "g", "b"])
         ]
         images = split.folders["PNG"].images()
         source = f"{split.path.name}/gt.csv"
@@ -322,12 +322,12 @@ def _is_blank(row: Mapping[str, str], columns: Sequence[str]) -> bool:
 
 def _white_levels(path: Path) -> dict[str, float]:
     levels: dict[str, float] = {}
-    for where, row in read_rows(path, ["image"]):
+    for origin, row in read_rows(path, ["image"]):
         text = row.get(_WHITE_COLUMN, "").strip()
         if text:
-            level = parse_number(text, where, _WHITE_COLUMN)
+            level = parse_number(text, origin, _WHITE_COLUMN)
             if not (math.isfinite(level) and level > BLACK):
-                raise FormatError(f"{where}: {_WHITE_COLUMN} is {text}, expected above black, {BLACK}; restore it")
+                raise FormatError(f"{origin}: {_WHITE_COLUMN} is {text}, expected above black, {BLACK}; restore it")
             levels[row["image"]] = level
     return levels
 

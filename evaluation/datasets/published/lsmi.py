@@ -300,11 +300,11 @@ class _Camera:
     def _scene(
         self, folder: Folder, place: str, image: str, lights: str, black: float, white: float | None
     ) -> LsmiScene:
-        where = f"{self.folder.path / 'meta.json'}, {place}"
-        illuminants = tuple(self._parse_light(place, number, where) for number in lights)
+        origin = f"{self.folder.path / 'meta.json'}, {place}"
+        illuminants = tuple(self._parse_light(place, number, origin) for number in lights)
         name, path = f"{self.name}/{image}", str(folder.path / image)
         mask_path = str(folder.path / f"{place}_mask.png") if self.is_preprocessed else ""
-        charts = () if self.is_preprocessed else self._chart_corners(place, where)
+        charts = () if self.is_preprocessed else self._chart_corners(place, origin)
         if len(illuminants) == 1:
             return LsmiScene(name, path, illuminants[0], black, white, charts, mask_path)
         shares = f"{path.rpartition('.')[0]}.npy"
@@ -312,16 +312,16 @@ class _Camera:
             raise FormatError(f"{shares} is missing, the illuminant fractions of {image}; run 1_make_mixture_map.py")
         return LsmiMixedScene(name, path, illuminants[0], black, white, charts, mask_path, illuminants, shares)
 
-    def _parse_light(self, place: str, number: str, where: str) -> Light:
+    def _parse_light(self, place: str, number: str, origin: str) -> Light:
         values = self._place_record(place).get(f"Light{number}")
         if not isinstance(values, list):
-            raise FormatError(f"{where} has no Light{number}, expected red, green, blue; run 1_make_mixture_map.py")
+            raise FormatError(f"{origin} has no Light{number}, expected red, green, blue; run 1_make_mixture_map.py")
         try:
-            return check_light([float(value) for value in cast("list[Any]", values)], f"{where}, Light{number}")
+            return check_light([float(value) for value in cast("list[Any]", values)], f"{origin}, Light{number}")
         except (TypeError, ValueError) as error:
-            raise FormatError(f"{where}: Light{number} is {values}, expected three numbers; restore it") from error
+            raise FormatError(f"{origin}: Light{number} is {values}, expected three numbers; restore it") from error
 
-    def _chart_corners(self, place: str, where: str) -> tuple[tuple[tuple[float, float], ...], ...]:
+    def _chart_corners(self, place: str, origin: str) -> tuple[tuple[tuple[float, float], ...], ...]:
         try:
             corners = [
                 np.asarray(self._place_record(place)["MCCCoord"][f"mcc{number}"], dtype=np.float64)
@@ -329,10 +329,10 @@ class _Camera:
             ]
         except (KeyError, TypeError, ValueError) as error:
             raise FormatError(
-                f"{where} has no MCCCoord with mcc1, mcc2, mcc3: the charts' corners; restore it"
+                f"{origin} has no MCCCoord with mcc1, mcc2, mcc3: the charts' corners; restore it"
             ) from error
         if any(chart.shape != (4, 2) or not np.isfinite(chart).all() for chart in corners):
-            raise FormatError(f"{where}: MCCCoord is wrong, expected four corners, x and y, of each chart; restore it")
+            raise FormatError(f"{origin}: MCCCoord is wrong, expected four corners, x and y, of each chart; restore it")
         return tuple(tuple((float(x) / _REDUCTION, float(y) / _REDUCTION) for x, y in chart) for chart in corners)
 
     def _place_record(self, place: str) -> Mapping[str, Any]:
