@@ -183,12 +183,12 @@ def read_text(path: Path | str) -> str:
     return files.read_text(Path(path), "restore it from the data set's archive")
 
 
-def parse_numbers(text: str, origin: str) -> list[float]:
+def to_numbers(text: str, origin: str) -> list[float]:
     """Return the numbers in a text, separated by blanks, commas or line ends.
 
     Examples
     --------
-    >>> parse_numbers("0.5, 0.75 1e-2", "gt.txt, line 1")
+    >>> to_numbers("0.5, 0.75 1e-2", "gt.txt, line 1")
     [0.5, 0.75, 0.01]
     """
     try:
@@ -201,14 +201,14 @@ def read_lights(path: Path) -> list[Light]:
     """Return the illuminants of a file with one per line (red, green, blue); empty lines at the end are ignored."""
     lines = read_text(path).rstrip().splitlines()
     return [
-        check_light(parse_numbers(line, f"{path}, line {number}"), f"{path}, line {number}")
+        check_light(to_numbers(line, f"{path}, line {number}"), f"{path}, line {number}")
         for number, line in enumerate(lines, 1)
     ]
 
 
 def read_light(path: Path | str) -> Light:
     """Return the illuminant of a file with one, on one line or three."""
-    return check_light(parse_numbers(read_text(path), str(path)), str(path))
+    return check_light(to_numbers(read_text(path), str(path)), str(path))
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, Mapping[str, str]]]:

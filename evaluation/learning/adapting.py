@@ -129,9 +129,7 @@ class BlendedModel:
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
         """Return the arrays of both models with the prefixes `elsewhere.` and `here.`, and the `share`."""
         models = {"elsewhere": self.pretrained, "here": self.local}
-        arrays = {
-            f"{prefix}.{name}": array for prefix, model in models.items() for name, array in model.arrays().items()
-        }
+        arrays = {f"{key}.{name}": array for key, model in models.items() for name, array in model.arrays().items()}
         return {"share": self.share, **arrays}
 
 

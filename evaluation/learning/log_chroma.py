@@ -155,15 +155,13 @@ def train(
 
     fft: Any = scipy.fft
     minimize: Any = scipy.optimize.minimize
-    fourier_scale = np.stack(
-        [_fourier_scale(*weights) for weights in zip(penalties.smoothness, penalties.size, strict=True)]
-    )
+    scale = np.stack([_fourier_scale(*weights) for weights in zip(penalties.smoothness, penalties.size, strict=True)])
     spectra: Any = fft.rfft2(histograms.astype(np.float32))
     targets = truth_bins.astype(np.float32)
     image_count, image_weights = float(repeats.sum()), repeats.astype(np.float32)
 
     def to_model(scaled: npt.NDArray[np.float64]) -> tuple[Any, Any]:
-        spectrum: Any = fourier_scale * fft.rfft2(scaled.reshape(3, *_SHAPE))
+        spectrum: Any = scale * fft.rfft2(scaled.reshape(3, *_SHAPE))
         return spectrum[:2], fft.irfft2(spectrum[2], s=_SHAPE)
 
     def loss(scaled: npt.NDArray[np.float64], entropy_weight: float, likelihood_weight: float) -> tuple[float, Any]:
@@ -188,7 +186,7 @@ def train(
             spectrum: Any = fft.rfft2(slopes * batch_weights[:, None, None])
             gradient[:2] += weight * (batch.conj() * spectrum[:, None]).sum(axis=0)
             gradient[2] += weight * spectrum.sum(axis=0)
-        scaled_gradient: Any = fft.irfft2(fourier_scale * gradient, s=_SHAPE)
+        scaled_gradient: Any = fft.irfft2(scale * gradient, s=_SHAPE)
         return total, scaled_gradient.ravel() + image_count * scaled
 
     scaled = np.zeros(3 * BINS * BINS)

@@ -146,9 +146,8 @@ def open_cube_plus(location: str, options: DataOptions, scanned_folder: Folder |
     png_folders = [child for name, child in folder.folders.items() if name.upper().startswith("PNG")]
     images = gather_images([folder, *png_folders])
     searched = f"{folder.path} (with folders PNG…: {', '.join(below.path.name for below in png_folders) or 'none'})"
-    indices, note = match_images(
-        [str(index) for index in range(1, len(lights) + 1)], images, file, searched, options.partial
-    )
+    names = [str(number) for number in range(1, len(lights) + 1)]
+    indices, note = match_images(names, images, file, searched, options.partial)
     black = BLACK if options.black is None else options.black
     peaks = Peaks()
     return SceneSet(

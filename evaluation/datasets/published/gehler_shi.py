@@ -36,8 +36,8 @@ from evaluation.datasets.files import (
     check_light,
     gather_images,
     match_images,
-    parse_numbers,
     read_text,
+    to_numbers,
 )
 from evaluation.datasets.options import DataOptions, choose_name, level_note
 from evaluation.datasets.published.matlab import numeric_table, read_mat
@@ -70,10 +70,7 @@ def _expand(ranges: str) -> Iterator[int]:
 
 
 # The 568 images in the order of the rows of both ground truths, from the file names of the recommended release.
-NAMES: Final = (
-    *(f"8D5U{number}" for number in _expand(_IDS_1D)),
-    *(f"IMG_{number:04d}" for number in _expand(_IDS_5D)),
-)
+NAMES: Final = (*(f"8D5U{id_:d}" for id_ in _expand(_IDS_1D)), *(f"IMG_{id_:04d}" for id_ in _expand(_IDS_5D)))
 _NAME_SET = frozenset(NAMES)
 
 
@@ -86,7 +83,7 @@ class MacbethScene(RawScene):
     def mask(self, image: Image) -> Mask:
         """Return (H, W) bool for an image (H, W, 3), True on the chart."""
         text = read_text(self.corners_path)
-        lines = [parse_numbers(line, self.corners_path) for line in text.strip().splitlines()[:5]]
+        lines = [to_numbers(line, self.corners_path) for line in text.strip().splitlines()[:5]]
         if len(lines) < 5 or any(len(line) != 2 for line in lines) or min(lines[0]) <= 0:
             raise FormatError(
                 f"{self.corners_path}, line 1: {text.strip().partition(chr(10))[0][:80] or 'empty'!r}; expected five "

@@ -201,7 +201,7 @@ def _subsets_by_place(folder: Folder, subset: str | None) -> dict[str, str]:
         name = key.rpartition("_")[2]
         if name not in _SUBSETS or not isinstance(places, list):
             raise FormatError(
-                f"{folder.path / 'split.json'} has the subset {key!r}, expected …_train, …_val or …_test; restore it"
+                f"{folder.path / 'split.json'} has {key!r}, expected …_train, …_val or …_test; restore it"
             )
         if subset in (None, name):
             subsets.update((str(place), name) for place in cast("list[Any]", places))
@@ -276,9 +276,8 @@ class _Camera:
         black, white, _ = self.levels()
         folders = self.folder.folders
         missing: list[str] = []
-        images_by_subset = {
-            name: _images_by_place(folders[name]) for name in _SUBSETS if name in folders and subset in (None, name)
-        }
+        selected = [name for name in _SUBSETS if name in folders and subset in (None, name)]
+        images_by_subset = {name: _images_by_place(folders[name]) for name in selected}
         for place, place_subset in places.items():
             if self.is_preprocessed:
                 folder, images = folders.get(place_subset), images_by_subset.get(place_subset, {}).get(place, [])
@@ -313,7 +312,7 @@ class _Camera:
         return LsmiMixedScene(name, path, illuminants[0], black, white, charts, mask_path, illuminants, shares)
 
     def _parse_light(self, place: str, number: str, origin: str) -> Light:
-        values = self._place_record(place).get(f"Light{number}")
+        values = self._record(place).get(f"Light{number}")
         if not isinstance(values, list):
             raise FormatError(f"{origin} has no Light{number}, expected red, green, blue; run 1_make_mixture_map.py")
         try:
@@ -324,8 +323,7 @@ class _Camera:
     def _chart_corners(self, place: str, origin: str) -> tuple[tuple[tuple[float, float], ...], ...]:
         try:
             corners = [
-                np.asarray(self._place_record(place)["MCCCoord"][f"mcc{number}"], dtype=np.float64)
-                for number in (1, 2, 3)
+                np.asarray(self._record(place)["MCCCoord"][f"mcc{number}"], dtype=np.float64) for number in (1, 2, 3)
             ]
         except (KeyError, TypeError, ValueError) as error:
             raise FormatError(
@@ -335,7 +333,7 @@ class _Camera:
             raise FormatError(f"{origin}: MCCCoord is wrong, expected four corners, x and y, of each chart; restore it")
         return tuple(tuple((float(x) / _REDUCTION, float(y) / _REDUCTION) for x, y in chart) for chart in corners)
 
-    def _place_record(self, place: str) -> Mapping[str, Any]:
+    def _record(self, place: str) -> Mapping[str, Any]:
         record = self.meta.get(place)
         if not isinstance(record, dict):
             raise FormatError(f"{self.folder.path / 'meta.json'} lacks {place} of split.json; restore both")

@@ -25,16 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from evaluation.datasets.files import (
-    Folder,
-    Mask,
-    RawScene,
-    box_mask,
-    check_light,
-    match_images,
-    parse_numbers,
-    read_text,
-)
+from evaluation.datasets.files import Folder, Mask, RawScene, box_mask, check_light, match_images, read_text, to_numbers
 from evaluation.datasets.options import DataOptions, choose_name, level_note
 from evaluation.datasets.published.matlab import names_or_none, numeric_table, read_mat, scalar
 from evaluation.scene import Image, SceneSet
@@ -95,7 +86,7 @@ def chart_boxes(
 def read_mask(path: Path) -> Box:
     """Return the chart box in a text file."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]
-    values = parse_numbers(lines[0], f"{path}, line 1") if lines else []
+    values = to_numbers(lines[0], f"{path}, line 1") if lines else []
     if len(values) != 4 or not math.isfinite(sum(map(abs, values))) or min(values[2:]) <= 0:
         raise FormatError(
             f"{path}, line 1: {lines[0].strip() if lines else 'nothing'!r}, expected x, y, width and height of the "
