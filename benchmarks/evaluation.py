@@ -92,7 +92,7 @@ def peer_call(
 
 
 def gray_edge(image: Image, used: npt.NDArray[np.uint8], method: GrayEdge) -> npt.NDArray[np.float64]:
-    border = method.left_out
+    border = method.border_width
     if border:
         inside = np.zeros_like(used)
         inside[border:-border, border:-border] = used[border:-border, border:-border]

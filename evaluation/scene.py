@@ -36,9 +36,14 @@ class Scene(Protocol):
         ...
 
     def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
-        """Return the image (H, W, 3), linear camera RGB without black level, and its mask.
+        """Read the image file; each call returns a new image, which the caller may change.
 
-        The mask is (H, W) bool, True for pixels that must not be used; None if all pixels may be used.
+        Returns
+        -------
+        image
+            (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, black level subtracted.
+        mask
+            (H, W) bool, True for pixels that must not be used; None if all pixels may be used.
         """
         ...
 
@@ -53,7 +58,7 @@ class MixedScene(Scene, Protocol):
         ...
 
     def read_weights(self) -> npt.NDArray[np.float32]:
-        """Return the fraction of each illuminant in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
+        """Return the fraction of each illuminant in each pixel: (H, W, K) float32, 0 … 1, sum 1; NaN if unknown."""
         ...
 
     def read_truth_map(self) -> npt.NDArray[np.float32]:
@@ -65,7 +70,7 @@ _Item = TypeVar("_Item")
 
 
 def report_progress(items: Iterable[_Item], on_scene: Callable[[], None] | None) -> Iterator[_Item]:
-    """Yield the items; `on_scene` is called after the consumer has used each."""
+    """Yield the items; `on_scene` is called after the consumer has used each item."""
     for item in items:
         yield item
         if on_scene:
@@ -76,15 +81,23 @@ def report_progress(items: Iterable[_Item], on_scene: Callable[[], None] | None)
 class SceneSet:
     """Images of a data set and their treatment before a method receives them.
 
-    - `name`: name of the data set as its authors write it, for headings: "Cube+".
-    - `layout`: name of the layout, by which its reader was chosen: "cube-plus".
-    - `location`: folder, file or URL as given.
-    - `scenes`: images in the data set's own order; at least one.
-    - `treatment`: printed with every result. "black level", "saturation", "mask" and "ground truth", each with the
-      applied value and its source; "reader" if the reader was never tested on a published copy.
-    - `folds`: fold of each scene, from 0, as the authors of the data set divide it; else None.
-    - `truth_uncertainty_deg`: largest uncertainty of a ground truth's direction, degrees, expanded (k = 2); None if the
-      data set does not report it.
+    Parameters
+    ----------
+    name
+        Name of the data set as its authors write it, for headings: "Cube+".
+    layout
+        Name of the layout of its files: "cube-plus".
+    location
+        Folder, file or URL as given.
+    scenes
+        Images in the order of the data set; at least one.
+    treatment
+        Printed with every result: "black level", "saturation", "mask" and "ground truth", each with the applied value
+        and its source; "reader" if the reader was never tested on a published copy.
+    folds
+        Fold of each scene, from 0, as the authors of the data set divide it; None if they do not.
+    truth_uncertainty_deg
+        Largest uncertainty of a ground truth, degrees, expanded (k = 2); None if the data set does not report it.
     """
 
     name: str

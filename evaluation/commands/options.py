@@ -69,10 +69,10 @@ Read = Annotated[
 def open_data(location: str, read: Sequence[str] | None = None) -> SceneSet:
     """Return the data set, read with the values of --read."""
     from evaluation.datasets import open_scenes
-    from evaluation.datasets.opening import with_black_judged
+    from evaluation.datasets.opening import check_black_level
 
     layout, options = reading_options(read or ())
-    return with_black_judged(open_scenes(location, layout, options), options.black)
+    return check_black_level(open_scenes(location, layout, options), options.black)
 
 
 def reading_options(texts: Sequence[str]) -> tuple[str | None, DataOptions]:
@@ -81,7 +81,7 @@ def reading_options(texts: Sequence[str]) -> tuple[str | None, DataOptions]:
     Examples
     --------
     >>> layout, options = reading_options(["layout=nus8", "black=128", "partial"])
-    >>> layout, options.given
+    >>> layout, options.set_options
     ('nus8', ('black', 'partial'))
     """
     from evaluation.datasets.options import DataOptions
@@ -165,11 +165,11 @@ def choose_without_constant(texts: Sequence[str]) -> tuple[list[Learner], list[s
     The commands add the constant illuminant themselves.
     """
     from evaluation.learning.constant_light import ConstantLight
-    from evaluation.learning.feature_learner import what_is_missing
+    from evaluation.learning.feature_learner import missing_requirement
 
     explicit = {learner.name for learner in choose_learners(text for text in texts if text.lower() != "all")}
     learners = [learner for learner in choose_learners(texts) if learner.name != ConstantLight().name]
-    missing = {learner.name: what_is_missing(learner) for learner in learners if learner.name not in explicit}
+    missing = {learner.name: missing_requirement(learner) for learner in learners if learner.name not in explicit}
     left_out = [f"{name} is omitted: {reason}" for name, reason in missing.items() if reason]
     return [learner for learner in learners if not missing.get(learner.name)], left_out
 

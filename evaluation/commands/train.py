@@ -76,7 +76,7 @@ def train(
         if base_model is None:
             fitted = fit_extracted(learner, features, truths, seed)
         else:
-            fitted = adapting.adapt(base_model, adapting.learn_alone(learner, features, truths, seed))
+            fitted = adapting.adapt(base_model, adapting.fit_local(learner, features, truths, seed))
         base_record = base_model.provenance if base_model else None
         record = provenance_of(data_set, seed, SystemClock(), adapted_from=base_record)
         save_model(out, fitted, record)
@@ -87,5 +87,5 @@ def train(
         share = float(fitted.model.share)
         output.add(adapted_from=adapt, share=share)
         notes.append(f"weights of the blend: {adapt} {share:.2f}, training on these images alone {1 - share:.2f}")
-    print(f"{out}: {learner.name}, {record.sentence()}")
+    print(f"{out}: {learner.name}, {record.description()}")
     show_notes(output, notes, data_set.treatment)

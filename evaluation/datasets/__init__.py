@@ -1,4 +1,4 @@
-"""Readers of data sets, one file a layout, behind one door: `open_scenes`."""
+"""Readers of data sets, one file per layout; `open_scenes` opens all of them."""
 
 from evaluation.datasets.opening import LAYOUTS, layout_of, open_scenes
 from evaluation.datasets.options import DataOptions

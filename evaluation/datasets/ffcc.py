@@ -1,10 +1,10 @@
-"""The folders that Fast Fourier Color Constancy (FFCC) trains on: a linear thumbnail and a text file for each image.
+"""Read training folders of Fast Fourier Color Constancy (FFCC): a linear thumbnail and a text file for each image.
 
-    FOLDER/…/000001.png      linear thumbnail, black removed; 8 or 16 bits
-    FOLDER/…/000001.txt      red, green, blue of the light, a line each
+    FOLDER/…/000001.png      linear thumbnail, black level subtracted; 8 or 16 bits
+    FOLDER/…/000001.txt      red, green and blue of the illuminant, one per line
 
-README.md of github.com/google/ffcc, "Preparation and folder structure"; folders below are searched as there. Its own
-preparation (internal/ReadImage.m) leaves out charts and clipped pixels before it averages, by making them zero.
+Source: README.md of github.com/google/ffcc, "Preparation and folder structure". Subfolders are searched too. FFCC's
+preparation (internal/ReadImage.m) sets charts and clipped pixels to zero before it averages.
 """
 
 from __future__ import annotations
@@ -14,69 +14,69 @@ from itertools import islice
 from pathlib import Path
 
 from evaluation.datasets.files import Folder, PaintedScene, decode_image
-from evaluation.datasets.options import DataOptions, stated
+from evaluation.datasets.options import DataOptions, level_note
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, first_few
 
-_DEPTH = 4  # Folders below the one given that are searched: more than the toolbox's own data sets have
-_SAMPLE = 100  # Names of a folder that are looked at to tell the layout
+_SEARCH_DEPTH = 4  # levels of subfolders that are searched: more than the toolbox's own data sets have
+_SAMPLED_NAMES = 100  # thumbnails of a folder that are checked to recognise the layout
 
 
 @dataclass(frozen=True, slots=True)
 class ThumbnailScene(PaintedScene):
     """A linear thumbnail; `white` is None unless the user gives it."""
 
-    def decoded(self) -> Image:
-        """Return the thumbnail (H, W, 3) as the file's numbers are, of 8 bits too."""
+    def decode(self) -> Image:
+        """Return the unchanged values of the file, (H, W, 3), 8 or 16 bits."""
         return decode_image(self.path, eight_bits=True)
 
 
 def is_ffcc(folder: Folder) -> bool:
-    """Return whether a folder looks like FFCC's: in it or below are a NAME.png and its NAME.txt."""
-    for place in folder.within(1):
-        files = place.files
-        for name in islice((name for name in files if name.lower().endswith(".png")), _SAMPLE):
-            if place.has(f"{name[:-4]}.txt"):
+    """Return True if the folder or a direct subfolder has a NAME.png with its NAME.txt."""
+    for child in folder.within(1):
+        names = child.files
+        for name in islice((name for name in names if name.lower().endswith(".png")), _SAMPLED_NAMES):
+            if child.has(f"{name[:-4]}.txt"):
                 return True
     return False
 
 
-def open_ffcc(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return the thumbnails of a folder and of those below it; thumbnails and lights are read when they are used."""
-    folder = listed or Folder(Path(place))
+def open_ffcc(location: str, options: DataOptions, scanned_folder: Folder | None = None) -> SceneSet:
+    """Return the thumbnails of a folder and its subfolders; images and ground truths are read on use."""
+    folder = scanned_folder or Folder(Path(location))
     black = 0.0 if options.black is None else options.black
     scenes: list[ThumbnailScene] = []
-    without: list[str] = []
-    alone: list[str] = []
-    for below in folder.within(_DEPTH):
-        images = below.images()
-        texts = {name[:-4] for name in below.files if name.lower().endswith(".txt")}
-        without.extend(images[name] for name in images if name not in texts)
+    lone_thumbnails: list[str] = []
+    lone_texts: list[str] = []
+    for child in folder.within(_SEARCH_DEPTH):
+        images = child.images()
+        texts = {name[:-4] for name in child.files if name.lower().endswith(".txt")}
+        lone_thumbnails.extend(images[name] for name in images if name not in texts)
         if images:
-            alone.extend(str(below.path / f"{name}.txt") for name in sorted(texts.difference(images)))
-        prefix = below.path.relative_to(folder.path).as_posix()
+            lone_texts.extend(str(child.path / f"{name}.txt") for name in sorted(texts.difference(images)))
+        prefix = child.path.relative_to(folder.path).as_posix()
         prefix = "" if prefix == "." else f"{prefix}/"
         scenes.extend(
             ThumbnailScene(f"{prefix}{name}.png", path, f"{path[:-4]}.txt", black, options.saturation)
             for name, path in images.items()
             if name in texts
         )
-    if without or (alone and not options.partial) or not scenes:
+    if lone_thumbnails or (lone_texts and not options.partial) or not scenes:
         raise FormatError(
-            f"{place} has {len(scenes)} thumbnails with a light, {len(without)} without "
-            f"({first_few(without) or 'none'}) and {len(alone)} text files without a thumbnail "
-            f"({first_few(alone) or 'none'}), expected NAME.png with NAME.txt; complete or remove them"
+            f"{location} has {len(scenes)} thumbnails with a ground truth, {len(lone_thumbnails)} without "
+            f"({first_few(lone_thumbnails) or 'none'}) and {len(lone_texts)} text files without a thumbnail "
+            f"({first_few(lone_texts) or 'none'}); expected NAME.png with NAME.txt; complete or remove them"
         )
     return SceneSet(
         name=folder.path.resolve().name,
         layout="ffcc",
-        location=place,
+        location=location,
         scenes=tuple(scenes),
         treatment={
             "images": str(len(scenes)),
-            "black level": stated(options.black, "0: removed when the thumbnails were made (README.md of FFCC)"),
-            "saturation": stated(options.saturation, "none: averaged pixels do not show what was clipped"),
+            "black level": level_note(options.black, "0: subtracted from the thumbnails (README.md of FFCC)"),
+            "saturation": level_note(options.saturation, "none: clipping cannot be detected in averaged pixels"),
             "mask": "pixels that are zero in every channel",
-            "ground truth": "the text file beside each thumbnail",
+            "ground truth": "the text file of each thumbnail",
         },
     )

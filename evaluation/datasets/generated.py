@@ -1,4 +1,4 @@
-"""Data sets made by `generate`, of every layout and in every store."""
+"""Read data sets made by `generate`, of every layout and in every store."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.options import choose
+from evaluation.datasets.options import choose_name
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
 from foundation.secret_texts import masked
@@ -18,95 +18,92 @@ from generator.dataset.records import SPLITS, Entry
 
 @dataclass(frozen=True)
 class GeneratedScene:
-    """An image of a dataset made by `generate`."""
+    """Image of a data set made by `generate`."""
 
     dataset: Dataset
     entry: Entry
 
     @property
     def name(self) -> str:
-        """The image's file name."""
+        """File name of the image."""
         return self.entry.image
 
     @property
     def group(self) -> str:
-        """Name of the picture that it was made from, which other images may share: they are kept in one fold."""
+        """Name of its source picture; all images of a source picture belong to one fold."""
         return self.entry.source
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, linear camera RGB, r + g + b = 1."""
+        """Ground truth (3,) float64, linear camera RGB, r + g + b = 1."""
         return np.array(self.entry.truth)
 
     @property
     def saturation(self) -> float:
-        """White level of the table that the image was made with, in the units of the image."""
+        """Saturation level of the LUT that the image was made with, in the units of the image."""
         return float(self.dataset.description.table.white_level)
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
-        """Return the image (H, W, 3) uint16, linear camera RGB, and no mask."""
+        """Return the image (H, W, 3) uint16, linear camera RGB, and None for the mask."""
         return self.dataset.read_image(self.entry), None
 
 
 @dataclass(frozen=True)
 class GeneratedMixedScene(GeneratedScene):
-    """An image of such a dataset that several lights fall on."""
+    """Generated image with several illuminants."""
 
     @property
     def lights(self) -> npt.NDArray[np.float64]:
-        """The lights (K, 3) float64, linear camera RGB, r + g + b = 1."""
+        """Illuminants (K, 3) float64, linear camera RGB, r + g + b = 1."""
         return np.array(self.entry.truths)
 
     def read_weights(self) -> npt.NDArray[np.float32]:
-        """Return the share of each light in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
+        """Return the fraction of each illuminant in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
         return self.dataset.read_weights(self.entry)
 
     def read_truth_map(self) -> npt.NDArray[np.float32]:
-        """Return the light of each pixel: (H, W, 3) float32, r + g + b = 1."""
+        """Return the illuminant of each pixel: (H, W, 3) float32, r + g + b = 1."""
         return self.dataset.read_ground_truth_map(self.entry)
 
 
-def open_generated(place: Path | str, subset: str | None = None) -> SceneSet:
-    """Return a dataset made by `generate`, or one part of it; images are read when they are evaluated.
-
-    `subset`: train, validation or test of `generate --split`; a picture is in one part with all its images.
-    """
-    dataset = open_dataset(place)
-    parts = [part for part in SPLITS if any(entry.split == part for entry in dataset.entries)]
-    if subset is not None and not parts:
+def open_generated(location: Path | str, subset: str | None = None) -> SceneSet:
+    """Return a generated data set, or its subset train, validation or test; images are read on use."""
+    dataset = open_dataset(location)
+    subsets = [split for split in SPLITS if any(entry.split == split for entry in dataset.entries)]
+    if subset is not None and not subsets:
         raise InputError(
-            f"the subset is {subset}, but {masked(str(place))} was not divided; generate --split 0.8,0.1,0.1 divides a "
-            "dataset by pictures, and evaluate cv keeps the images of a picture in one fold without that"
+            f"subset {subset} was requested, but {masked(str(location))} was not divided; generate it with --split "
+            "0.8,0.1,0.1, or use evaluate cv, which needs no subsets and keeps all images of a picture in one fold"
         )
-    part = choose(subset, parts, "subset", masked(str(place)))
+    split = choose_name(subset, subsets, "subset", masked(str(location)))
     table = dataset.description.table
     white = table.white_level
-    # Whoever reads results must see that no camera took a photograph of these colours.
+    # Readers of results must see that these colours were never photographed.
     computed = {} if table.computed is None else {"table": "computed from spectra and a model of the sensor"}
-    stated = [light.uncertainty_deg for light in dataset.description.lights]
-    known = max((one for one in stated if one is not None), default=None) if None not in stated else None
-    within = "" if known is None else f"; its direction is known to {known:.2g} degrees at worst (k = 2)"
+    uncertainties_deg = [light.uncertainty_deg for light in dataset.description.lights]
+    known_deg = [value for value in uncertainties_deg if value is not None]
+    uncertainty_deg = max(known_deg) if known_deg and len(known_deg) == len(uncertainties_deg) else None
+    uncertainty_note = "" if uncertainty_deg is None else f"; largest uncertainty {uncertainty_deg:.2g}° (k = 2)"
     return SceneSet(
-        name=_name_of(str(place)) + (f" {part}" if part else ""),
+        name=_dataset_name(str(location)) + (f" {split}" if split else ""),
         layout="generated",
-        location=masked(str(place)),
+        location=masked(str(location)),
         scenes=tuple(
             (GeneratedScene if len(entry.lights) == 1 else GeneratedMixedScene)(dataset, entry)
             for entry in dataset.entries
-            if part is None or entry.split == part
+            if split is None or entry.split == split
         ),
         treatment={
             **computed,
-            "black level": "subtracted when the table was made",
-            "saturation": f"from {white:g}, the white level of the table",
+            "black level": "subtracted when the LUT was made",
+            "saturation": f"from {white:g}, the saturation level of the LUT",
             "mask": "none",
-            "ground truth": "white of the light as the table has it; of several lights their mean over the image"
-            + within,
+            "ground truth": "white under the illuminant, from the LUT; mean over the image if there are several"
+            + uncertainty_note,
         },
-        truth_uncertainty_deg=known,
+        truth_uncertainty_deg=uncertainty_deg,
     )
 
 
-def _name_of(place: str) -> str:
-    """Return the name of a dataset: the last part of its URL, or of its folder's absolute path."""
-    return place.rstrip("/").rpartition("/")[2] if "://" in place else Path(place).resolve().name
+def _dataset_name(location: str) -> str:
+    return location.rstrip("/").rpartition("/")[2] if "://" in location else Path(location).resolve().name

@@ -1,9 +1,8 @@
-"""By what images are known without decoding them: whether they are copies of others.
+"""Recognise copies of images without decoding them.
 
-A model file keeps of what it was trained on each image's name and light, or the picture that it was generated from, so
-that a test on the same images is noticed. A name counts without folder and ending, capitals and case being one; a light
-as chromaticities to four digits, since copies of a data set hold it to different ones. What was renamed, or is held to
-another ground truth, is not known again.
+A model file stores hashes of its training images, so that a test on the same images is noticed. The hash of an image
+covers its name and ground truth, or its source picture if it was generated. Renamed images, and images with another
+ground truth, are not recognised.
 """
 
 from __future__ import annotations
@@ -26,80 +25,79 @@ from generator.dataset.reader import Dataset
 
 
 def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:
-    """Return by what scenes are known again: (N, 2) uint64, the first 64 bits of SHA-256.
+    """Return two hashes of each scene, (N, 2) uint64, each the first 64 bits of a SHA-256.
 
-    The first is of the image: name and light; of a generated one its source picture, whatever the light. The second is
-    of the name, by which a generated image and the photograph that it was made from find each other.
+    The first is of the image: its name and ground truth, or the source picture of a generated image. The second is of
+    the name; it links a generated image with the photograph that is its source.
     """
-    known: dict[int, Mapping[str, str]] = {}
+    cache: dict[int, Mapping[str, str]] = {}
     rows: list[tuple[int, int]] = []
     for scene in scenes:
         if isinstance(scene, GeneratedScene):
-            source, marks = scene.entry.source, source_marks(scene.dataset, known)
-            rows.append((_number("source", marks[source]), _number("generated", _stem(source))))
+            source, digests = scene.entry.source, source_digests(scene.dataset, cache)
+            rows.append((_hash("source", digests[source]), _hash("generated", _stem(source))))
         else:
             total = max(float(scene.truth.sum()), np.finfo(float).tiny)
-            light = " ".join(f"{part:.4f}" for part in scene.truth / total)
-            rows.append((_number("image", f"{_stem(scene.name)} {light}"), _number("real", _stem(scene.name))))
+            # Four digits, because copies of a data set have ground truths of different precision.
+            light = " ".join(f"{value:.4f}" for value in scene.truth / total)
+            rows.append((_hash("image", f"{_stem(scene.name)} {light}"), _hash("real", _stem(scene.name))))
     return np.array(rows, dtype=np.uint64).reshape(-1, 2)
 
 
-def known_again(scenes: Sequence[Scene], trained: npt.NDArray[np.uint64]) -> tuple[str, ...]:
-    """Return the names of the scenes that are among others, whose identities (N, 2) uint64 are given."""
-    images = {int(one) for one in trained[:, 0]}
-    names = {int(one) for one in trained[:, 1]}
-    found: list[str] = []
-    for scene, (own, _) in zip(scenes, identities(scenes).tolist(), strict=True):
+def find_training_images(scenes: Sequence[Scene], trained: npt.NDArray[np.uint64]) -> tuple[str, ...]:
+    """Return the names of the scenes that occur in `trained`, the `identities` (N, 2) uint64 of other scenes."""
+    images = {int(number) for number in trained[:, 0]}
+    names = {int(number) for number in trained[:, 1]}
+    names_found: list[str] = []
+    for scene, (image_number, _) in zip(scenes, identities(scenes).tolist(), strict=True):
         if isinstance(scene, GeneratedScene):
-            counterpart = _number("real", _stem(scene.entry.source))
+            counterpart = _hash("real", _stem(scene.entry.source))
         else:
-            counterpart = _number("generated", _stem(scene.name))
-        if own in images or counterpart in names:
-            found.append(scene.name)
-    return tuple(found)
+            counterpart = _hash("generated", _stem(scene.name))
+        if image_number in images or counterpart in names:
+            names_found.append(scene.name)
+    return tuple(names_found)
 
 
-def source_marks(dataset: Dataset, known: dict[int, Mapping[str, str]]) -> Mapping[str, str]:
-    """Return by what the source pictures of a generated set are known: the hash of the file, or how it was drawn.
-
-    `known` keeps those of each set, which many images ask for.
-    """
-    if id(dataset) not in known:
+def source_digests(dataset: Dataset, cache: dict[int, Mapping[str, str]]) -> Mapping[str, str]:
+    """Return the SHA-256 of each source picture by name, or its seed if it was drawn; `cache` is a cache."""
+    if id(dataset) not in cache:
         seed = dataset.description.seed
-        known[id(dataset)] = {one.name: one.sha256 or f"{one.name} of seed {seed}" for one in dataset.sources}
-    return known[id(dataset)]
+        cache[id(dataset)] = {item.name: item.sha256 or f"{item.name} of seed {seed}" for item in dataset.sources}
+    return cache[id(dataset)]
 
 
 def _stem(name: str) -> str:
     return PurePosixPath(name).stem.lower()
 
 
-def _number(kind: str, text: str) -> int:
-    return int(sha256_of(f"{kind}\t{text}".encode())[:16], 16)
+def _hash(role: str, text: str) -> int:
+    return int(sha256_of(f"{role}\t{text}".encode())[:16], 16)
 
 
-# Bytes of a file that are compared: a hundred thousand pixels and more, of which no two photographs agree in all.
-_PIECE: Final = 1 << 20
+# Bytes of a file that are compared: 100 000 pixels or more, whose noise differs between any two photographs.
+_COMPARED_BYTES: Final = 1 << 20
 
 
 def first_copies(scenes: Sequence[Scene]) -> list[int]:
-    """Return for each of N scenes the place of the first one with the same pixels: its own where there is none before.
+    """Return for each scene the index of the first scene with the same pixels, which is its own index if unique.
 
-    A copy in another fold is an image that a method was trained on. Of files are compared the lengths, and where these
-    are equal a piece from the middle, whose noise no second photograph has. Other scenes than files and thumbnails in
-    memory are no copies of each other.
+    Files of equal length are compared by a section from their middle. Scenes that are neither files nor thumbnails in
+    memory count as unique.
     """
-    lengths = Counter(_length(scene) for scene in scenes)
-    seen: dict[tuple[int, str], int] = {}
-    found: list[int] = []
-    for place, scene in enumerate(scenes):
-        length = _length(scene)
-        known = length is not None and lengths[length] > 1
-        found.append(seen.setdefault((length or 0, _piece(scene)), place) if known else place)
-    return found
+    # Copies matter because a method must not be tested on a copy of a training image in another fold.
+    counts = Counter(_byte_count(scene) for scene in scenes)
+    first_indices: dict[tuple[int, str], int] = {}
+    originals: list[int] = []
+    for index, scene in enumerate(scenes):
+        byte_count = _byte_count(scene)
+        has_twin = byte_count is not None and counts[byte_count] > 1
+        key = (byte_count or 0, _content_hash(scene) if has_twin else str(index))
+        originals.append(first_indices.setdefault(key, index))
+    return originals
 
 
-def _length(scene: Scene) -> int | None:
+def _byte_count(scene: Scene) -> int | None:
     if isinstance(scene, Thumbnail):
         return scene.image.nbytes
     with suppress(OSError):
@@ -108,13 +106,13 @@ def _length(scene: Scene) -> int | None:
     return None
 
 
-def _piece(scene: Scene) -> str:
+def _content_hash(scene: Scene) -> str:
     if isinstance(scene, Thumbnail):
         return sha256_of(np.ascontiguousarray(scene.image))
     assert isinstance(scene, RawScene)
     try:
         with Path(scene.path).open("rb") as stream:
-            stream.seek(max(0, (Path(scene.path).stat().st_size - _PIECE) // 2))
-            return sha256_of(stream.read(_PIECE))
+            stream.seek(max(0, (Path(scene.path).stat().st_size - _COMPARED_BYTES) // 2))
+            return sha256_of(stream.read(_COMPARED_BYTES))
     except OSError:
-        return scene.path  # What cannot be read is told when the image is.
+        return scene.path  # An unreadable image is reported when it is used.

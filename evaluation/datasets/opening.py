@@ -1,4 +1,4 @@
-"""The door to data sets: one function opens each layout that is known, by its name or by what it looks like."""
+"""Open data sets of every supported layout; the layout is given or recognised from the files."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from evaluation.datasets.ffcc import is_ffcc, open_ffcc
-from evaluation.datasets.files import IMAGE_ENDINGS, Folder, RawScene, pedestal_note, require_above_black
+from evaluation.datasets.files import IMAGE_ENDINGS, Folder, RawScene, black_level_warning, require_black_below_peak
 from evaluation.datasets.generated import open_generated
 from evaluation.datasets.options import DataOptions
-from evaluation.datasets.plain_folder import ASSUMED_BLACK, is_plain_folder, open_plain_folder, require_no_other_table
+from evaluation.datasets.plain_folder import ASSUMED_BLACK, is_plain_folder, open_plain_folder, refuse_unusable_table
 from evaluation.datasets.published.cube import (
     is_cube_plus,
     is_cube_plus_plus,
@@ -32,53 +32,57 @@ _LEVELS = ("black", "saturation")
 
 @dataclass(frozen=True)
 class Layout:
-    """A way in which data sets lie on the disk.
+    """File layout of data sets on a disk.
 
-    - `title`: what lies so, for help and messages: "a dataset made by generate".
-    - `signs`: what a place is told by: "cube+_gt.txt".
-    - `matches`: whether a folder looks like it; reads names, and the first lines of tables, at most.
-    - `open`: returns the data set at a path or URL; takes the names in its folder where they were read already.
-    - `options`: the fields of `DataOptions` that have a meaning for it.
-    - `general`: whether it is no particular data set's, and asked only where no other matches.
-    - `unverified`: whether it is others' and its reader was never tried on a copy that they published; results then say
-      so.
-    - `takes`: "folder" or "file", which a place must be; None if it may be either, or a URL.
+    - `title`: description for help and messages: "a dataset made by generate".
+    - `signature`: files by which the layout is recognised: "cube+_gt.txt".
+    - `matches`: returns True if a folder has the layout; reads only names and first lines of tables.
+    - `open`: returns the data set at a path or URL; the `Folder` is passed if its names were read already.
+    - `options`: fields of `DataOptions` that apply to the layout.
+    - `is_generic`: the layout belongs to no particular data set; it is tried only if no other layout matches.
+    - `is_unverified`: the reader was never tested on a published copy; results report this.
+    - `path_type`: "folder" or "file"; None if both, or a URL, are possible.
     """
 
     title: str
-    signs: str
+    signature: str
     matches: Callable[[Folder], bool]
     open: Callable[[str, DataOptions, Folder | None], SceneSet]
     options: tuple[str, ...] = ()
-    general: bool = False
-    unverified: bool = False
-    takes: str | None = "folder"
+    is_generic: bool = False
+    is_unverified: bool = False
+    path_type: str | None = "folder"
 
 
-# What is stated with results of a data set whose reader has met made-up copies only.
-_UNVERIFIED = "not verified against a published copy; compare one image with the authors' program"
+# Printed with results if the reader was only tested on synthetic copies.
+_UNVERIFIED_NOTE = "not verified against a published copy; compare one image with the authors' program"
 
 
-# By the names that the command takes.
+# Layouts by their names on the command line.
 LAYOUTS: Mapping[str, Layout] = {
     "generated": Layout(
         "a dataset made by generate",
         "dataset.json",
         lambda folder: folder.has("dataset.json"),
-        lambda place, options, _: open_generated(place, options.subset),
+        lambda location, options, _: open_generated(location, options.subset),
         ("subset",),
-        takes=None,
+        path_type=None,
     ),
     "thumbnails": Layout(
         "thumbnails in a NumPy archive",
         "a file .npz",
         lambda _: False,
-        lambda place, options, _: open_thumbnails(place, options.saturation),
+        lambda location, options, _: open_thumbnails(location, options.saturation),
         ("saturation",),
-        takes="file",
+        path_type="file",
     ),
     "cube-plus": Layout(
-        "Cube+, or Cube", "cube+_gt.txt", is_cube_plus, open_cube_plus, ("truth", *_LEVELS, "partial"), unverified=True
+        "Cube+, or Cube",
+        "cube+_gt.txt",
+        is_cube_plus,
+        open_cube_plus,
+        ("truth", *_LEVELS, "partial"),
+        is_unverified=True,
     ),
     "cube++": Layout(
         "Cube++",
@@ -86,7 +90,7 @@ LAYOUTS: Mapping[str, Layout] = {
         is_cube_plus_plus,
         open_cube_plus_plus,
         ("truth", *_LEVELS, "partial"),
-        unverified=True,
+        is_unverified=True,
     ),
     "simple-cube++": Layout(
         "SimpleCube++",
@@ -94,7 +98,7 @@ LAYOUTS: Mapping[str, Layout] = {
         is_simple_cube,
         open_simple_cube,
         ("subset", *_LEVELS, "partial"),
-        unverified=True,
+        is_unverified=True,
     ),
     "nus8": Layout(
         "NUS 8 cameras, or one of them",
@@ -102,7 +106,7 @@ LAYOUTS: Mapping[str, Layout] = {
         is_nus8,
         open_nus8,
         ("camera", *_LEVELS, "partial"),
-        unverified=True,
+        is_unverified=True,
     ),
     "gehler-shi": Layout(
         "Gehler's ColorChecker data set as Shi and Funt processed it",
@@ -110,7 +114,7 @@ LAYOUTS: Mapping[str, Layout] = {
         is_gehler_shi,
         open_gehler_shi,
         ("camera", "truth", *_LEVELS, "partial"),
-        unverified=True,
+        is_unverified=True,
     ),
     "intel-tau": Layout(
         "INTEL-TAU, processed to 1080p",
@@ -118,15 +122,15 @@ LAYOUTS: Mapping[str, Layout] = {
         is_intel_tau,
         open_intel_tau,
         ("camera", "subset", *_LEVELS, "partial"),
-        unverified=True,
+        is_unverified=True,
     ),
     "lsmi": Layout(
-        "LSMI, several lights",
+        "LSMI, several illuminants",
         "meta.json beside split.json",
         is_lsmi,
         open_lsmi,
         ("camera", "subset", *_LEVELS, "partial"),
-        unverified=True,
+        is_unverified=True,
     ),
     "ffcc": Layout(
         "FFCC's thumbnails",
@@ -134,8 +138,8 @@ LAYOUTS: Mapping[str, Layout] = {
         is_ffcc,
         open_ffcc,
         (*_LEVELS, "partial"),
-        general=True,
-        unverified=True,
+        is_generic=True,
+        is_unverified=True,
     ),
     "folder": Layout(
         "images of your own",
@@ -143,118 +147,129 @@ LAYOUTS: Mapping[str, Layout] = {
         is_plain_folder,
         open_plain_folder,
         (*_LEVELS, "partial"),
-        general=True,
-        takes=None,
+        is_generic=True,
+        path_type=None,
     ),
 }
 
 
-def open_scenes(place: Path | str, layout: str | None = None, options: DataOptions | None = None) -> SceneSet:
-    """Return the data set at a place; images are read when they are used.
+def open_scenes(location: Path | str, layout: str | None = None, options: DataOptions | None = None) -> SceneSet:
+    """Return the data set at a location; images are read on use.
 
-    `place`: folder, file or URL; URLs are those of datasets made by `generate`. `layout`: a name of `LAYOUTS`; by
-    default the one that the place looks like. `options`: what to take of it, and levels that replace those of the
-    layout.
+    Parameters
+    ----------
+    location
+        Folder or file of a data set, or URL of a data set made by `generate`.
+    layout
+        Name in `LAYOUTS`; None to recognise the layout from the files.
+    options
+        Selected part of the data set, and levels that replace those of the layout; None for `DataOptions()`.
 
-    Raises `InputError`: there is no layout of that name, the place looks like several, or an option has no meaning for
-    its layout; `FormatError`: the place looks like no layout; or the data set is not as its layout has it: the message
-    says what is missing.
+    Returns
+    -------
+    SceneSet
+        At least one image with its ground truth.
+
+    Raises
+    ------
+    InputError
+        The layout is unknown, several layouts match, or an option does not apply to the layout.
+    FormatError
+        No layout matches, or files are missing or damaged; the message names them.
     """
-    chosen = DataOptions() if options is None else options
-    text = str(place)
-    name, names = _recognise(text) if layout is None else (layout, None)
+    chosen_options = DataOptions() if options is None else options
+    address = str(location)
+    name, folder = _recognise_layout(address) if layout is None else (layout, None)
     if name not in LAYOUTS:
-        raise InputError(f"{name!r} is no layout; the layouts are {', '.join(LAYOUTS)}")
-    known = LAYOUTS[name]
-    if layout is not None and known.takes is not None:
-        _require_kind(text, name, known)
-    idle = [option for option in chosen.given if option not in known.options]
-    if idle:
-        able = [other for other, it in LAYOUTS.items() if idle[0] in it.options]
+        raise InputError(f"layout {name!r} is unknown, expected one of {', '.join(LAYOUTS)}; choose one of these")
+    entry = LAYOUTS[name]
+    if layout is not None and entry.path_type is not None:
+        _require_file_type(address, name, entry)
+    unused_options = [option for option in chosen_options.set_options if option not in entry.options]
+    if unused_options:
+        supporting = [key for key, other in LAYOUTS.items() if unused_options[0] in other.options]
         raise InputError(
-            f"--read {idle[0]} has no meaning for {text}, {known.title} ({name}); it has one for {', '.join(able)}"
+            f"--read {unused_options[0]} does not apply to {address}, {entry.title} ({name}), only to "
+            f"{', '.join(supporting)}; leave it out"
         )
-    data = known.open(text, chosen, names)
-    return replace(data, treatment={**data.treatment, "reader": _UNVERIFIED}) if known.unverified else data
+    data = entry.open(address, chosen_options, folder)
+    return replace(data, treatment={**data.treatment, "reader": _UNVERIFIED_NOTE}) if entry.is_unverified else data
 
 
-def with_black_judged(data: SceneSet, black: float | None) -> SceneSet:
-    """Return a data set, stated that a black level may be missing where images look so.
+def check_black_level(data: SceneSet, black: float | None) -> SceneSet:
+    """Return the data set, with a warning in its treatment if the black level may not be subtracted.
 
-    Reads images, mostly one: until one says that nothing is wrong.
-
-    `data`: what was opened. `black`: the level that the user gave.
-
-    Raises `InputError`: the level of the user, or of a table of theirs, is above every pixel of all images.
+    `black` is the level given by the user. Raises InputError if a given level is above all pixels of all images.
     """
+    # Images are read until one is plausible, which is usually the first.
     scenes = [scene for scene in data.scenes if isinstance(scene, RawScene)]
     if black is not None or data.layout == "folder":
-        require_above_black(scenes)
-    stated = data.treatment.get("black level", "")
-    note = pedestal_note(scenes) if stated == ASSUMED_BLACK else ""
-    return replace(data, treatment={**data.treatment, "black level": f"{stated}{note}"}) if note else data
+        require_black_below_peak(scenes)
+    source = data.treatment.get("black level", "")
+    note = black_level_warning(scenes) if source == ASSUMED_BLACK else ""
+    return replace(data, treatment={**data.treatment, "black level": f"{source}{note}"}) if note else data
 
 
-def layout_of(place: str) -> str:
-    """Return the name of the layout that a place looks like.
+def layout_of(location: str) -> str:
+    """Return the name of the layout of a location.
 
-    Raises `InputError`: it looks like several; `FormatError`: it looks like none, or is not there.
+    Raises InputError if several layouts match, and FormatError if none matches or the location does not exist.
     """
-    return _recognise(place)[0]
+    return _recognise_layout(location)[0]
 
 
-def _require_kind(place: str, name: str, known: Layout) -> None:
-    path = Path(place)
+def _require_file_type(location: str, name: str, entry: Layout) -> None:
+    path = Path(location)
     if not path.exists():
-        raise FormatError(f"{place} is not there, expected a {known.takes} of {known.title} ({name}); name that")
-    if path.is_dir() != (known.takes == "folder"):
+        raise FormatError(f"{location} does not exist, expected a {entry.path_type} with {entry.title} ({name})")
+    if path.is_dir() != (entry.path_type == "folder"):
         raise FormatError(
-            f"{place} is a {'folder' if path.is_dir() else 'file'}, expected a {known.takes} of {known.title} "
-            f"({name}); name that, or leave out --read layout to have the layout told by the place"
+            f"{location} is a {'folder' if path.is_dir() else 'file'}, expected a {entry.path_type} of {entry.title} "
+            f"({name}); correct it, or leave out --read layout to have the layout recognised"
         )
 
 
-def _refuse_results(folder: Path, place: str) -> None:
-    """Refuse a folder that holds results of `evaluate`, whose errors.csv has the columns of a table of images."""
+def _refuse_results(folder: Path, location: str) -> None:
+    # The errors.csv of results has the columns of a table of images, so it would be read as a data set.
     if (folder / "run.json").is_file() and any((folder / name).is_file() for name in ("errors.csv", "results.csv")):
         raise FormatError(
-            f"{place} is a results folder of evaluate, expected a data set; name the data that its run.json tells, or "
-            "compare results with evaluate compare"
+            f"{location} is a results folder of evaluate, expected a data set; give the data set in its run.json, or "
+            "use evaluate compare for results"
         )
 
 
-def _refuse_pictures(folder: Folder, place: str) -> None:
+def _refuse_pictures(folder: Folder, location: str) -> None:
     pictures = [name for name in folder.files if name.lower().endswith((*IMAGE_ENDINGS, ".jpg", ".jpeg"))]
     if pictures and not any(name.endswith((".csv", ".mat", ".txt", ".json")) for name in folder.files):
         raise FormatError(
-            f"{place} is no dataset: pictures ({first_few(pictures)}) without ground truths; name a published set's "
-            "whole folder, put a .csv with image,r,g,b beside images of 16 bits, or make a dataset of pictures: "
-            f"generate LUT OUT --sources {place}"
+            f"{location} has pictures ({first_few(pictures)}) without ground truths, expected a data set; give the "
+            "whole folder of a published set, add a .csv with image,r,g,b to images of 16 bits, or generate a data set "
+            f"from the pictures: generate LUT OUT --sources {location}"
         )
 
 
-def _recognise(place: str) -> tuple[str, Folder | None]:
-    if "://" in place:
+def _recognise_layout(location: str) -> tuple[str, Folder | None]:
+    if "://" in location:
         return "generated", None
-    path = Path(place)
+    path = Path(location)
     if path.is_file():
         by_ending = {".npz": "thumbnails", ".csv": "folder"}
         if path.name in ("errors.csv", "results.csv"):
-            _refuse_results(path.parent, place)
+            _refuse_results(path.parent, location)
         if path.suffix.lower() in by_ending:
             return by_ending[path.suffix.lower()], None
-        raise FormatError(f"{place} is a file, expected a folder, an archive .npz or a table .csv; name one of these")
+        raise FormatError(f"{location} is a file, expected an archive .npz or a table .csv; give one, or a folder")
     if not path.is_dir():
-        raise FormatError(f"{place} is no dataset: it does not exist; name its folder, file or URL")
-    _refuse_results(path, place)
+        raise FormatError(f"{location} does not exist, expected a data set; give its folder, file or URL")
+    _refuse_results(path, location)
     folder = Folder(path)
-    found = [name for name, known in LAYOUTS.items() if not known.general and known.matches(folder)]
-    found = found or [name for name, known in LAYOUTS.items() if known.general and known.matches(folder)]
-    if not found:
-        _refuse_pictures(folder, place)
-        require_no_other_table(folder)
-        signs = "; ".join(f"{known.signs} ({name})" for name, known in LAYOUTS.items())
-        raise FormatError(f"{place} is no dataset of a layout that is known. Looked for: {signs}. Name its folder")
-    if len(found) > 1:
-        raise InputError(f"{place} looks like {' and '.join(found)}; choose with --read layout=NAME")
-    return found[0], folder
+    matches = [name for name, entry in LAYOUTS.items() if not entry.is_generic and entry.matches(folder)]
+    matches = matches or [name for name, entry in LAYOUTS.items() if entry.is_generic and entry.matches(folder)]
+    if not matches:
+        _refuse_pictures(folder, location)
+        refuse_unusable_table(folder)
+        signatures = "; ".join(f"{entry.signature} ({name})" for name, entry in LAYOUTS.items())
+        raise FormatError(f"{location} has no supported layout, expected {signatures}; give a data set's folder")
+    if len(matches) > 1:
+        raise InputError(f"{location} matches {' and '.join(matches)}, expected one; choose with --read layout=NAME")
+    return matches[0], folder

@@ -1,4 +1,4 @@
-"""What a user may choose about a data set that its layout leaves open."""
+"""Options of a user for reading a data set."""
 
 from __future__ import annotations
 
@@ -11,21 +11,32 @@ from foundation.errors import InputError
 
 @dataclass(frozen=True)
 class DataOptions:
-    """What to take of a data set, and levels that replace those of its layout; None leaves the layout's own.
+    """Selected part of a data set, and levels that replace those of its layout.
 
-    - `camera`: one of the cameras of a data set of several, as its files name it: "Canon600D".
-    - `subset`: a part that the data set's authors name: "test", "lab_printouts".
-    - `truth`: which ground truth, where the authors give several for an image: "left", "recommended".
-    - `black`: black level in the units of the files, ≥ 0.
-    - `saturation`: value from which a pixel is clipped, in the units of the files, before black is subtracted, > 0.
-    - `partial`: whether images that the data set should have, but this copy has not, are left out and counted; else
-      they are an error.
+    Parameters
+    ----------
+    camera
+        Name of one camera as in the file names: "Canon600D"; None for all.
+    subset
+        Name of one subset as its authors write it: "test", "lab_printouts"; None for all.
+    truth
+        Name of the ground truth if there are several: "left", "recommended"; None for the layout's default.
+    black
+        Black level ≥ 0, in the units of the files; None for the level of the layout.
+    saturation
+        Value > 0 from which a pixel is clipped, in the units of the files, before black is subtracted; None for the
+        level of the layout.
+    partial
+        True to exclude and count missing images; False to raise an error for them.
 
-    Raises `InputError`: a level is none.
+    Raises
+    ------
+    InputError
+        A level is out of range, or the saturation is not above the black level.
 
     Examples
     --------
-    >>> DataOptions(camera="Canon600D", black=2048).given
+    >>> DataOptions(camera="Canon600D", black=2048).set_options
     ('camera', 'black')
     """
 
@@ -38,49 +49,46 @@ class DataOptions:
 
     def __post_init__(self) -> None:
         if self.black is not None and not (math.isfinite(self.black) and self.black >= 0):
-            raise InputError(f"black level {self.black:g}: expected a number from 0, in the units of the files")
+            raise InputError(f"black level {self.black:g}, expected 0 or more, in the units of the files; correct it")
         if self.saturation is not None and not (math.isfinite(self.saturation) and self.saturation > 0):
-            raise InputError(f"saturation {self.saturation:g}: expected a number above 0, in the units of the files")
+            raise InputError(f"saturation {self.saturation:g}, expected above 0, in the units of the files; correct it")
         if self.black is not None and self.saturation is not None and self.saturation <= self.black:
-            raise InputError(f"saturation {self.saturation:g} is not above the black level {self.black:g}; correct one")
+            raise InputError(f"saturation {self.saturation:g}, expected above black level {self.black:g}; correct it")
 
     @property
-    def given(self) -> tuple[str, ...]:
-        """The names of those that were given."""
+    def set_options(self) -> tuple[str, ...]:
+        """Names of the options that were given."""
         return tuple(field.name for field in fields(self) if getattr(self, field.name) not in (None, False))
 
 
-def choose(given: str | None, known: Collection[str], option: str, place: str) -> str | None:
-    """Return `given` as `known` spells it, or None if nothing was given.
+def choose_name(requested: str | None, available: Collection[str], option: str, location: str) -> str | None:
+    """Return the available name that equals `requested` except for case, "_" and "-"; None if none was requested.
 
-    `given`: what the user gave; upper and lower case, "_" and "-" are the same. `known`: what there is. `option`: the
-    option's name in the message: "camera". `place`: where it was looked for, for the message.
-
-    Raises `InputError`: there is none of that name.
+    `option` and `location` are for the message of the InputError that is raised if there is no such name.
 
     Examples
     --------
-    >>> choose("left-white", ["left", "left_white"], "truth", "Cube++")
+    >>> choose_name("left-white", ["left", "left_white"], "truth", "Cube++")
     'left_white'
     """
-    if given is None:
+    if requested is None:
         return None
-    found = [name for name in known if _plain(name) == _plain(given)]
-    if not found:
-        raise InputError(f"{place} has no {option} {given!r}; it has {', '.join(known) or 'none'}")
-    return found[0]
+    matches = [name for name in available if _normalised(name) == _normalised(requested)]
+    if not matches:
+        raise InputError(f"{location} has no {option} {requested!r}, expected one of {', '.join(available) or 'none'}")
+    return matches[0]
 
 
-def stated(given: float | None, otherwise: str) -> str:
-    """Return how a level is stated with results: that the user gave it, or else where the layout has it from.
+def level_note(level: float | None, otherwise: str) -> str:
+    """Return the level given by the user with this source, or else `otherwise`, the level and source of the layout.
 
     Examples
     --------
-    >>> stated(512.0, "2048 (the data set's page)")
-    '512, as the user gave it'
+    >>> level_note(512.0, "2048 (the data set's page)")
+    '512, given by the user'
     """
-    return otherwise if given is None else f"{given:g}, as the user gave it"
+    return otherwise if level is None else f"{level:g}, given by the user"
 
 
-def _plain(name: str) -> str:
+def _normalised(name: str) -> str:
     return name.lower().replace("-", "_")

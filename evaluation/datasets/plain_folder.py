@@ -1,17 +1,16 @@
-"""A user's own images: a folder with a table of their lights.
+"""Read a user's own images: a folder with a table of their ground truths.
 
-It lies so::
+Layout::
 
-    gt.csv              image,r,g,b: one row an image; its path from the table's folder, with or without the ending
+    gt.csv              image,r,g,b: one row per image; path relative to the table, with or without the ending
                         columns black, saturation: levels of the image, in the units of its file, optional
-                        column mask: a picture that is not 0 where a pixel must not be used, optional
+                        column mask: a picture that is not 0 for pixels that must not be used, optional
                         column fold: whole numbers from 0 for cross-validation, optional
     photo1.png …        linear camera RGB, red first: PNG or TIFF of 16 bits, TIFF of floats, or NumPy files
-    photo1_mask.png     the mask of photo1 where column mask names none, optional
+    photo1_mask.png     mask of photo1 if column mask is empty, optional
 
-The table is the folder's only .csv with those columns, or is named itself. An image beside them that has no row is
-refused, so that none is left out unseen. Pictures for the eye are refused: JPEG, and
-8 bits a channel, are sRGB, whose values are not proportional to light.
+The table is the only .csv of the folder with these columns, or is given itself. Images without a row are refused, so
+that no image is excluded by mistake. JPEG and 8-bit sRGB are refused: their values are not proportional to light.
 """
 
 from __future__ import annotations
@@ -24,34 +23,31 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.datasets.files import IMAGE_ENDINGS, Folder, Light, Mask, RawScene, light_of, number_of, read_rows
-from evaluation.datasets.options import DataOptions, stated
+from evaluation.datasets.files import IMAGE_ENDINGS, Folder, Light, Mask, RawScene, parse_light, parse_number, read_rows
+from evaluation.datasets.options import DataOptions, level_note
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError, first_few
 
-COLUMNS = ("image", "r", "g", "b")  # What the table must have
+COLUMNS = ("image", "r", "g", "b")  # required columns of the table
 
-# What is stated where nothing says what black is.
+# Source of the black level if neither the table nor the user gives one.
 ASSUMED_BLACK = "0: assumed, as neither a column black nor --read black gives it"
 
 _PICTURES = (".jpg", ".jpeg", ".webp", ".heic", ".gif", ".bmp")
 _RAWS = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef", ".srw", ".crw")
 _MASK = "_mask"
 _MASK_ENDINGS = (".png", ".tif", ".tiff")
-_MOST = 50  # Tables of a folder whose heads are read to find the one with the lights
+_INSPECTED_TABLES = 50  # tables of a folder whose headers are read to find the one with ground truths
 
 
 @dataclass(frozen=True, slots=True)
 class OwnScene(RawScene):
-    """An image of the user's.
-
-    `mask_path`: A picture that is not 0 where a pixel must not be used; "" for none.
-    """
+    """Image of the user; `mask_path` is a picture that is not 0 for pixels that must not be used, or empty."""
 
     mask_path: str = ""
 
     def mask(self, image: Image) -> Mask | None:
-        """Return (H, W) bool, True where the mask's picture is not 0, of an image (H, W, 3); None without one."""
+        """Return (H, W) bool for an image (H, W, 3), True if the mask picture is not 0; None without a mask."""
         if not self.mask_path:
             return None
         import cv2
@@ -62,143 +58,146 @@ class OwnScene(RawScene):
             raise FormatError(f"{self.mask_path} cannot be read: {error.strerror or error}; restore it") from error
         picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
         if picture is None:
-            raise FormatError(f"{self.mask_path} is no picture that can be read; make it again as PNG")
+            raise FormatError(f"{self.mask_path} cannot be decoded, expected a picture; make it again as PNG")
         if picture.shape != image.shape[:2]:
             raise FormatError(
-                f"{self.mask_path} is {picture.shape[1]} × {picture.shape[0]}, expected {image.shape[1]} × "
-                f"{image.shape[0]} as {self.path}; make it again"
+                f"{self.mask_path} has {picture.shape[1]} × {picture.shape[0]} px, expected {image.shape[1]} × "
+                f"{image.shape[0]} like {self.path}; make it again"
             )
         return np.asarray(picture != 0)
 
 
 def is_plain_folder(folder: Folder) -> bool:
-    """Return whether a folder has a table of images and lights."""
+    """Return True if a folder has a table of images and ground truths."""
     return bool(_tables(folder))
 
 
-def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return the images of a table; they are read when they are used."""
-    path = _table_of(Path(place), listed)
+def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folder | None = None) -> SceneSet:
+    """Return the images of a table; they are read on use."""
+    path = _find_table(Path(location), scanned_folder)
     folder = path.parent
     scenes: list[OwnScene] = []
     folds: list[int] = []
     missing: list[str] = []
-    refused: str | None = None
+    first_refusal: str | None = None
     masks: set[str] = set()
-    seen: set[str] = set()
-    given: set[str] = set()
+    names: set[str] = set()
+    given_columns: set[str] = set()
     paths: dict[str, str] = {}
-    listings: dict[str, _Listing] = {"": _Listing(listed)} if listed else {}
-    for where, row in read_rows(path, COLUMNS):
+    indices: dict[str, _FolderIndex] = {"": _FolderIndex(scanned_folder)} if scanned_folder else {}
+    for origin, row in read_rows(path, COLUMNS):
         name = row["image"].strip()
-        if not name or name in seen:
-            raise FormatError(f"{where}: the image {name!r} is {'named twice' if name else 'no name'}; correct it")
-        seen.add(name)
-        image = _find(folder, name, where, listings)
-        light = light_of(row, COLUMNS[1:], where, "correct the line")
+        if not name or name in names:
+            problem = f"image {name!r} is open_folders twice, expected once" if name else "no image name, expected one"
+            raise FormatError(f"{origin}: {problem}; correct the line")
+        names.add(name)
+        image = _find_image(folder, name, origin, indices)
+        light = parse_light(row, COLUMNS[1:], origin, "correct the line")
         if image is None:
             missing.append(name)
-            refused = refused or _unusable(folder, name, where, listings)
+            first_refusal = first_refusal or _unusable_file(folder, name, origin, indices)
             continue
-        if (before := paths.setdefault(os.path.normpath(image), name)) != name:
-            raise FormatError(f"{where}: {name} is the file of {before} too, expected each image once; take one away")
-        given.update(column for column in ("black", "saturation", "mask", "fold") if row.get(column, "").strip())
-        beside = _mask_beside(name, image, listings)
-        scenes.append(_scene(folder, name, image, beside, light, row, where, options))
+        if (earlier_name := paths.setdefault(os.path.normpath(image), name)) != name:
+            raise FormatError(f"{origin}: {name} and {earlier_name} are one file, expected one row for it; remove one")
+        given_columns.update(name for name in ("black", "saturation", "mask", "fold") if row.get(name, "").strip())
+        mask_path = _find_mask(name, image, indices)
+        scenes.append(_scene(folder, name, image, mask_path, light, row, origin, options))
         if scenes[-1].mask_path:
             masks.add(os.path.normpath(scenes[-1].mask_path))
-        given.update(("mask beside",) if beside and scenes[-1].mask_path == beside else ())
-        folds.append(_fold(row, where))
+        given_columns.update(("mask beside",) if mask_path and scenes[-1].mask_path == mask_path else ())
+        folds.append(_parse_fold(row, origin))
     if not scenes or (missing and not options.partial):
-        if refused:
-            raise FormatError(refused)
-        remedy = "complete the folder" + (", or take what is there with --read partial" if scenes else "")
+        if first_refusal:
+            raise FormatError(first_refusal)
+        remedy = "complete the folder" + (", or use the existing images with --read partial" if scenes else "")
         raise FormatError(
-            f"{folder} lacks {len(missing)} of the {len(seen)} images of {path.name} "
+            f"{folder} lacks {len(missing)} of the {len(names)} images of {path.name} "
             f"({first_few(missing) or 'it is empty'}); {remedy}"
         )
-    if "fold" in given and min(folds) < 0:
-        raise FormatError(f"{path}: some rows have a fold and others none, expected one in each; complete the column")
-    if both := sorted(masks & paths.keys()):
-        raise FormatError(f"{path} has a row for {first_few(both)}, which is a mask too; rename one of the two")
-    left_out = _without_row(Path(place), path, listings, paths.keys(), masks, options.partial)
+    if "fold" in given_columns and min(folds) < 0:
+        raise FormatError(f"{path}: some rows have a fold, expected one in all or none; complete the column")
+    if mask_images := sorted(masks & paths.keys()):
+        raise FormatError(f"{path}: {first_few(mask_images)} is an image and a mask, expected one of these; rename it")
+    exclusion_note = _unlisted_note(Path(location), path, indices, paths.keys(), masks, options.partial)
     return SceneSet(
         name=folder.resolve().name,
         layout="folder",
-        location=place,
+        location=location,
         scenes=tuple(scenes),
         treatment={
             "images": str(len(scenes))
-            + (f"; {len(missing)} more of {path.name} are not there" if missing else "")
-            + (f"; {left_out}" if left_out else ""),
-            "black level": _stated("black", given, path, options.black, ASSUMED_BLACK),
-            "saturation": _stated("saturation", given, path, options.saturation, "none: neither a column saturation "
-            "nor --read saturation gives it, so clipped pixels are used"),
-            "mask": _mask_stated(given, path, len(masks), len(scenes)),
+            + (f"; {len(missing)} of {path.name} are missing and excluded" if missing else "")
+            + (f"; {exclusion_note}" if exclusion_note else ""),
+            "black level": _level_note("black", given_columns, path, options.black, ASSUMED_BLACK),
+            "saturation": _level_note("saturation", given_columns, path, options.saturation, "none: neither a column "
+            "saturation nor --read saturation gives it, so clipped pixels are used"),
+            "mask": _mask_source(given_columns, path, len(masks), len(scenes)),
             "ground truth": f"r, g, b of {path.name}",
         },
-        folds=tuple(folds) if "fold" in given else None,
+        folds=tuple(folds) if "fold" in given_columns else None,
     )  # fmt: skip
 
 
-def _mask_stated(given: set[str], path: Path, masks: int, count: int) -> str:
-    of = ((f"column mask of {path.name}", "mask"), ("NAME_mask beside the image", "mask beside"))
-    sources = " or ".join(text for text, key in of if key in given)
-    return f"{sources}: where the picture is not 0; {masks} of {count} images have one" if sources else "none"
+def _mask_source(given_columns: set[str], path: Path, masks: int, count: int) -> str:
+    sources_by_key = ((f"column mask of {path.name}", "mask"), ("NAME_mask beside the image", "mask beside"))
+    sources = " or ".join(text for text, key in sources_by_key if key in given_columns)
+    return f"{sources}: pixels that are not 0; {masks} of {count} images have one" if sources else "none"
 
 
-def _stated(column: str, given: set[str], path: Path, option: float | None, otherwise: str) -> str:
-    if column in given:
-        return f"column {column} of {path.name}" + ("" if option is None else f", {option:g} where it is empty")
-    return stated(option, otherwise)
+def _level_note(column: str, given_columns: set[str], path: Path, option: float | None, otherwise: str) -> str:
+    if column in given_columns:
+        return f"column {column} of {path.name}" + ("" if option is None else f", {option:g} if empty")
+    return level_note(option, otherwise)
 
 
-def _table_of(place: Path, listed: Folder | None) -> Path:
-    if place.is_file():
-        return place
-    tables = _tables(listed or Folder(place))
+def _find_table(location: Path, scanned_folder: Folder | None) -> Path:
+    if location.is_file():
+        return location
+    tables = _tables(scanned_folder or Folder(location))
     if not tables:
-        raise FormatError(f"{place} has no table with the columns {','.join(COLUMNS)}; write one, a row an image")
+        raise FormatError(f"{location} has no table with the columns {','.join(COLUMNS)}; write one, a row per image")
     if len(tables) > 1:
-        raise InputError(f"{place} has several tables of lights ({first_few(tables)}); name the one that is meant")
-    return place / tables[0]
+        raise InputError(
+            f"{location} has {len(tables)} tables of ground truths, expected one; give {first_few(tables)}"
+        )
+    return location / tables[0]
 
 
-def require_no_other_table(folder: Folder) -> None:
-    """Refuse, by its columns, the one table of a folder beside images that is none of images and lights."""
-    heads = _heads(folder)
-    if len(heads) == 1 and folder.images(IMAGE_ENDINGS):
-        ((name, head),) = heads.items()
-        lacking = [column for column in COLUMNS if column not in _columns(head)]
+def refuse_unusable_table(folder: Folder) -> None:
+    """Raise FormatError if a folder with images has one table, which lacks required columns."""
+    headers = _headers(folder)
+    if len(headers) == 1 and folder.images(IMAGE_ENDINGS):
+        ((name, header),) = headers.items()
+        missing = [column for column in COLUMNS if column not in _columns(header)]
         raise FormatError(
-            f"{folder.path} is no dataset of a layout that is known: for images of your own {name} lacks the columns "
-            f"{','.join(lacking)} (found: {head.strip()[:80] or 'nothing'}), expected {','.join(COLUMNS)} between "
-            "commas in its first line; correct it, or name another folder"
+            f"{folder.path} has no supported layout: for images of your own, {name} lacks the columns "
+            f"{','.join(missing)} (its first line: {header.strip()[:80] or 'empty'}), expected {','.join(COLUMNS)}, "
+            "separated by commas; correct it, or give another folder"
         )
 
 
 def _tables(folder: Folder) -> list[str]:
-    return [name for name, head in _heads(folder).items() if all(column in _columns(head) for column in COLUMNS)]
+    return [name for name, header in _headers(folder).items() if all(column in _columns(header) for column in COLUMNS)]
 
 
-def _heads(folder: Folder) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for name in [name for name in folder.files if name.lower().endswith(".csv")][:_MOST]:
+def _headers(folder: Folder) -> dict[str, str]:
+    headers: dict[str, str] = {}
+    for name in [name for name in folder.files if name.lower().endswith(".csv")][:_INSPECTED_TABLES]:
         try:
             with (folder.path / name).open(encoding="utf-8-sig") as file:
-                found[name] = file.readline()
+                headers[name] = file.readline()
         except (OSError, UnicodeDecodeError):
             continue
-    return found
+    return headers
 
 
-def _columns(head: str) -> list[str]:
-    return [column.strip().strip('"') for column in head.split(",")]
+def _columns(header: str) -> list[str]:
+    return [column.strip().strip('"') for column in header.split(",")]
 
 
 @dataclass(frozen=True)
-class _Listing:
-    """The names in a folder, for quick questions."""
+class _FolderIndex:
+    """Names in a folder as sets and mappings, for quick look-up."""
 
     folder: Folder
 
@@ -212,18 +211,18 @@ class _Listing:
 
     @cached_property
     def masks(self) -> Mapping[str, str]:
-        """Files that are masks by their names, by the names of the images that they belong to, without ending."""
-        found: dict[str, str] = {}
-        for known in (_PICTURES, _MASK_ENDINGS):
+        """Mask files, by name of their image without ending."""
+        mask_files: dict[str, str] = {}
+        for endings in (_PICTURES, _MASK_ENDINGS):
             for file in sorted(self.files, reverse=True):
                 stem = file.rpartition(".")[0]
-                if stem.endswith(_MASK) and _ending(file) in known:
-                    found[stem[: -len(_MASK)]] = file
-        return found
+                if stem.endswith(_MASK) and _ending(file) in endings:
+                    mask_files[stem[: -len(_MASK)]] = file
+        return mask_files
 
     @cached_property
     def unusable(self) -> Mapping[str, str]:
-        """Pictures for the eye and raw files by their names without ending."""
+        """JPEG or other sRGB pictures and raw files, by name without ending."""
         return {Path(file).stem: file for file in self.files if _ending(file) in (*_PICTURES, *_RAWS)}
 
 
@@ -231,123 +230,117 @@ def _ending(file: str) -> str:
     return f".{file.rpartition('.')[2].lower()}"
 
 
-def _find(folder: Path, name: str, where: str, listings: dict[str, _Listing]) -> str | None:
-    """Return the path of an image that a table names with or without its ending; None if it is not there."""
+def _find_image(folder: Path, name: str, origin: str, indices: dict[str, _FolderIndex]) -> str | None:
+    """Return the path of a open_folders image, with or without ending in the table; None if it does not exist."""
     below, _, file = name.rpartition("/")
-    if why := _no_image(file):
-        raise FormatError(f"{where}: {name} is {why}")
-    if below not in listings:
-        listings[below] = _Listing(Folder(folder / below))
-    listing = listings[below]
+    if reason := _refusal_reason(file):
+        raise FormatError(f"{origin}: {name} is {reason}")
+    if below not in indices:
+        indices[below] = _FolderIndex(Folder(folder / below))
+    index = indices[below]
     if _ending(file) in IMAGE_ENDINGS:
-        return f"{listing.folder.path}{os.sep}{file}" if file in listing.files else None
-    return listing.images.get(file)
+        return f"{index.folder.path}{os.sep}{file}" if file in index.files else None
+    return index.images.get(file)
 
 
-def _no_image(file: str) -> str:
-    """Return why a file of that name holds no linear camera RGB; "" if it may."""
+def _refusal_reason(file: str) -> str:
+    """Return why a file with this ending cannot be linear camera RGB; an empty string if it can."""
     if _ending(file) in _PICTURES:
-        kind = "JPEG, " if _ending(file) in (".jpg", ".jpeg") else ""
+        file_type = "JPEG, " if _ending(file) in (".jpg", ".jpeg") else ""
         return (
-            f"{kind}a picture for the eye (sRGB), whose values are not proportional to light; expected linear camera "
-            f"RGB ({', '.join(IMAGE_ENDINGS)})"
+            f"{file_type}an sRGB picture, whose values are not proportional to light; expected linear camera RGB "
+            f"({', '.join(IMAGE_ENDINGS)})"
         )
     if _ending(file) in _RAWS:
         return (
-            "a raw file, whose mosaic has yet to be interpolated; make a linear 16-bit file of it, for instance with "
-            "dcraw -h -D -4 -T, and name that"
+            "a raw file with a colour mosaic, expected an image; make a linear 16-bit file of it, for instance with "
+            "dcraw -h -D -4 -T, and list that file"
         )
     return ""
 
 
-def _unusable(folder: Path, name: str, where: str, listings: Mapping[str, _Listing]) -> str | None:
-    """Return why a file that has the name of a missing image is refused; None if there is no such file."""
+def _unusable_file(folder: Path, name: str, origin: str, indices: Mapping[str, _FolderIndex]) -> str | None:
+    """Return why the unusable file that has the name of a missing image is refused; None if there is none."""
     below, _, file = name.rpartition("/")
     stem = Path(file).stem if _ending(file) in IMAGE_ENDINGS else file
-    found = listings[below].unusable.get(stem)
-    return found and f"{where}: of {name} there is only {folder / below / found}: {_no_image(found)}"
+    file_name = indices[below].unusable.get(stem)
+    return file_name and f"{origin}: {name} exists only as {folder / below / file_name}: {_refusal_reason(file_name)}"
 
 
-def _mask_beside(name: str, image: str, listings: Mapping[str, _Listing]) -> str:
-    """Return the path of the mask that belongs to an image by its name; "" if there is none."""
-    listing = listings[name.rpartition("/")[0]]
-    file = listing.masks.get(Path(image).stem)
-    return f"{listing.folder.path}{os.sep}{file}" if file else ""
+def _find_mask(name: str, image: str, indices: Mapping[str, _FolderIndex]) -> str:
+    index = indices[name.rpartition("/")[0]]
+    file = index.masks.get(Path(image).stem)
+    return f"{index.folder.path}{os.sep}{file}" if file else ""
 
 
-def _without_row(
-    place: Path,
+def _unlisted_note(
+    location: Path,
     path: Path,
-    listings: Mapping[str, _Listing],
+    indices: Mapping[str, _FolderIndex],
     images: Collection[str],
     masks: Collection[str],
     partial: bool,
 ) -> str:
-    """Return a sentence on the images that the table does not name; "" if there are none.
-
-    Where a table was named and has others beside it, it is a choice of the images; else one without a row is an error.
-    """
+    """Return a note on excluded images without a row; an empty string if there are none."""
     folders = {file.rpartition(os.sep)[0] or "." for file in images}
     root = Folder(path.parent)
-    looked_at = [listing.folder for listing in listings.values() if listing.files]
-    among: list[str] = []
+    open_folders = [index.folder for index in indices.values() if index.files]
+    beside_images: list[str] = []
     elsewhere: list[str] = []
-    for folder in {os.path.normpath(each.path): each for each in (*looked_at, *root.within(1))}.values():
-        at = os.path.normpath(folder.path)
-        files = [os.path.normpath(f"{at}{os.sep}{file}") for file in folder.files if _ending(file) in IMAGE_ENDINGS]
-        (among if at in folders else elsewhere).extend(
+    for folder_path, folder in {os.path.normpath(item.path): item for item in (*open_folders, *root.within(1))}.items():
+        names = [name for name in folder.files if _ending(name) in IMAGE_ENDINGS]
+        files = [os.path.normpath(f"{folder_path}{os.sep}{name}") for name in names]
+        (beside_images if folder_path in folders else elsewhere).extend(
             file for file in files if file not in images and file not in masks
         )
-    # A mask without a row is its image's affair, unless it lies there alone.
-    among = [file for file in among if not Path(file).stem.endswith(_MASK)] or among
-    chosen = place.is_file() and len(_tables(root)) > 1
-    if among and not (partial or chosen):
+    # Masks need no row of their own; they are open_folders only if there are no other images.
+    beside_images = [file for file in beside_images if not Path(file).stem.endswith(_MASK)] or beside_images
+    # If the user gave one of several tables, it is a selection of images. Otherwise an image without a row is an error.
+    is_selection = location.is_file() and len(_tables(root)) > 1
+    if beside_images and not (partial or is_selection):
         raise FormatError(
-            f"{path} has no row for {len(among)} of the images beside those that it names "
-            f"({first_few([os.path.relpath(file, root.path) for file in among])}), expected one for each; add what is "
-            "missing, take the files away, or leave them out with --read partial"
+            f"{path} has no row for {len(beside_images)} images in the folders of its images "
+            f"({first_few([os.path.relpath(file, root.path) for file in beside_images])}), expected one row each; add "
+            "rows, remove the files, or exclude them with --read partial"
         )
-    notes = ((among, "beside them"), (elsewhere, "in other folders there"))
-    return ", ".join(f"{len(files)} {what} without a row in {path.name} left out" for files, what in notes if files)
+    groups = ((beside_images, "beside them"), (elsewhere, "in other folders"))
+    return ", ".join(f"{len(files)} {note} without a row in {path.name} excluded" for files, note in groups if files)
 
 
 def _scene(
     folder: Path,
     name: str,
     image: str,
-    beside: str,
+    mask_path: str,
     light: Light,
     row: Mapping[str, str],
-    where: str,
+    origin: str,
     options: DataOptions,
 ) -> OwnScene:
-    black = _level(row, "black", where, options.black)
-    white = _level(row, "saturation", where, options.saturation)
+    black = _parse_level(row, "black", origin, options.black)
+    white = _parse_level(row, "saturation", origin, options.saturation)
     if white is not None and white <= (black or 0):
-        raise FormatError(f"{where}: saturation {white:g} is not above black {black or 0:g}; correct it")
+        raise FormatError(f"{origin}: saturation {white:g}, expected above black {black or 0:g}; correct it")
     mask = row.get("mask", "").strip()
     if mask and not (folder / mask).is_file():
-        raise FormatError(f"{where}: there is no mask {folder / mask}; restore it, or leave the field empty")
-    if not mask and _ending(beside) in _PICTURES:
-        raise FormatError(f"{where}: the mask {beside} is no {' or '.join(_MASK_ENDINGS)}; make it again as PNG")
-    return OwnScene(name, image, light, black or 0.0, white, str(folder / mask) if mask else beside)
+        raise FormatError(f"{origin}: mask {folder / mask} does not exist; restore it, or leave the field empty")
+    if not mask and _ending(mask_path) in _PICTURES:
+        raise FormatError(f"{origin}: mask {mask_path}, expected {' or '.join(_MASK_ENDINGS)}; make it again as PNG")
+    return OwnScene(name, image, light, black or 0.0, white, str(folder / mask) if mask else mask_path)
 
 
-def _level(row: Mapping[str, str], column: str, where: str, otherwise: float | None) -> float | None:
+def _parse_level(row: Mapping[str, str], column: str, origin: str, otherwise: float | None) -> float | None:
     text = row.get(column, "").strip()
     if not text:
         return otherwise
-    level = number_of(text, where, column)
+    level = parse_number(text, origin, column)
     if not (np.isfinite(level) and level >= 0):
-        raise FormatError(
-            f"{where}: {column} is {text}, expected a number from 0, in the units of the file; correct it"
-        )
+        raise FormatError(f"{origin}: {column} is {text}, expected 0 or more, in the units of the file; correct it")
     return level
 
 
-def _fold(row: Mapping[str, str], where: str) -> int:
-    """Return the fold of a row, -1 if it has none."""
+def _parse_fold(row: Mapping[str, str], origin: str) -> int:
     text = row.get("fold", "").strip()
     if text and not text.isdecimal():
-        raise FormatError(f"{where}: fold is {text!r}, expected a whole number from 0; correct it")
-    return int(text) if text else -1
+        raise FormatError(f"{origin}: fold is {text!r}, expected a whole number from 0; correct it")
+    return int(text) if text else -1  # -1: no fold

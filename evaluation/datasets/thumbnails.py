@@ -1,7 +1,7 @@
-"""Thumbnails of a real data set in one NumPy archive, as networks for colour constancy exchange them.
+"""Read thumbnails of a real data set in one NumPy archive, as used for training neural networks.
 
-The archive (`.npz`) holds `images` (N, H, W, 3), float32 or uint16, linear camera RGB with black subtracted; `gt`
-(N, 3), the lights; and `names` (N,). Pixels of masked calibration targets are exactly zero.
+The archive (`.npz`) contains `images` (N, H, W, 3), float32 or uint16, linear camera RGB minus black level; `gt`
+(N, 3), the ground truths; and `names` (N,). Pixels of masked calibration targets are exactly zero.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.files import check_light
-from evaluation.datasets.options import stated
+from evaluation.datasets.options import level_note
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError
 
@@ -23,12 +23,12 @@ _EXPECTED = "expected images (N, H, W, 3), gt (N, 3) and names (N,), as numpy.sa
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A thumbnail in memory.
+    """Thumbnail in memory.
 
-    - `name`: the image's name.
-    - `truth`: (3,) float64, linear camera RGB of the light, of any length.
-    - `image`: (H, W, 3) float32 or uint16, linear camera RGB, black at zero.
-    - `saturation`: value from which a pixel is clipped; None where nobody states it: averaged pixels do not show it.
+    - `name`: name of the image.
+    - `truth`: ground truth (3,) float64, linear camera RGB of any length.
+    - `image`: (H, W, 3) float32 or uint16, linear camera RGB minus black level.
+    - `saturation`: value from which a pixel is clipped; None if unknown, as averaged pixels do not show it.
     """
 
     name: str
@@ -37,20 +37,17 @@ class Thumbnail:
     saturation: float | None = None
 
     def read(self) -> tuple[npt.NDArray[np.float32] | npt.NDArray[np.uint16], npt.NDArray[np.bool_]]:
-        """Return a copy of the image and its mask, (H, W) bool: True where all channels are zero."""
+        """Return a copy of the image and its mask (H, W) bool, True if all channels are zero."""
         return self.image.copy(), (self.image == 0).all(axis=2)
 
 
 def open_thumbnails(path: Path | str, saturation: float | None = None) -> SceneSet:
-    """Return the thumbnails of an archive; they are held in memory.
-
-    `saturation`: value from which a pixel is clipped, in the units of the archive; None if it is not known.
-    """
+    """Return the thumbnails of an archive, in memory; `saturation` in the units of the archive, None if unknown."""
     try:
         with np.load(path) as content:
             images, truths, names = content["images"], content["gt"].astype(np.float64), content["names"]
-    except Exception as error:  # NumPy evaluates the heads of files, whose damage shows as any error.
-        raise FormatError(f"{path} is no archive of thumbnails: {error}; {_EXPECTED}") from error
+    except Exception as error:  # NumPy evaluates file headers; damaged ones may raise any error.
+        raise FormatError(f"{path} cannot be read as thumbnails: {error}; {_EXPECTED}") from error
     count = len(images)
     if images.ndim != 4 or images.shape[3] != 3 or truths.shape != (count, 3) or names.shape != (count,) or not count:
         raise FormatError(
@@ -60,35 +57,35 @@ def open_thumbnails(path: Path | str, saturation: float | None = None) -> SceneS
         raise FormatError(
             f"{path} has images of {images.dtype}, expected uint16, float32 or float64: linear camera RGB"
         )
-    titles = [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names.tolist()]
-    twice = next((name for name, times in Counter(titles).items() if times > 1), None)
-    unprintable = next((name for name in titles if not name.isprintable()), None)
-    if twice is not None or unprintable is not None:
+    printed_names = [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names.tolist()]
+    duplicate = next((name for name, times in Counter(printed_names).items() if times > 1), None)
+    unprintable = next((name for name in printed_names if not name.isprintable()), None)
+    if duplicate is not None or unprintable is not None:
         raise FormatError(
             f"{path} has "
-            + (f"two images named {twice!r}" if twice is not None else f"an image named {unprintable!r}")
-            + "; give each image a name of its own, on one line"
+            + (f"two images named {duplicate!r}" if duplicate is not None else f"an image named {unprintable!r}")
+            + ", expected unique printable names; rename it"
         )
-    below = 0
-    for name, truth, image in zip(titles, truths, images, strict=True):
+    negative_count = 0
+    for name, truth, image in zip(printed_names, truths, images, strict=True):
         check_light(truth.tolist(), f"{path}, gt of {name}")
         if not np.isfinite(image).all():
             raise FormatError(
-                f"{path}: {name} has pixels that are not finite; make them 0 in every channel, which masks them"
+                f"{path}: {name} has infinite or NaN pixels, expected finite values; set them to 0 to mask them"
             )
-        below += int((image < 0).sum())
+        negative_count += int((image < 0).sum())
     return SceneSet(
         name=Path(path).stem,
         layout="thumbnails",
         location=str(path),
         scenes=tuple(
-            Thumbnail(name, truth, np.maximum(image, 0) if below else image, saturation)
-            for name, truth, image in zip(titles, truths, images, strict=True)
+            Thumbnail(name, truth, np.maximum(image, 0) if negative_count else image, saturation)
+            for name, truth, image in zip(printed_names, truths, images, strict=True)
         ),
         treatment={
             "black level": "0: subtracted when the thumbnails were made"
-            + (f"; {below} values below it are taken as 0" if below else ""),
-            "saturation": stated(saturation, "none: averaged pixels do not show what was clipped"),
+            + (f"; {negative_count} negative values are set to 0" if negative_count else ""),
+            "saturation": level_note(saturation, "none: clipping cannot be detected in averaged pixels"),
             "mask": "pixels that are zero in every channel",
             "ground truth": "gt of the archive",
         },

@@ -259,7 +259,7 @@ def tune_family(
     tuned = tune(methods, scenes, on_scene, workers)
     errors: list[Summary | None] = [None] * len(methods)
     if metric is not None:
-        truths = require_truths(scenes, methods)[tuned.counted]
+        truths = require_truths(scenes, methods)[tuned.has_estimates]
         measure = recovery_error if metric == "recovery" else reproduction_error
         errors = [summarise(measure(tuned.lights[:, index], truths)) for index in range(len(methods))]
     settings = [

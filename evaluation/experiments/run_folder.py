@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.identity import known_again
+from evaluation.datasets.identity import find_training_images
 from evaluation.experiments.folds import folds_to_csv, groups_of
 from evaluation.experiments.running import SceneMethod, evaluate, require_truths
 from evaluation.experiments.suspicions import suspicions
@@ -96,7 +96,7 @@ def describe_run(
 def _training_note(name: str, record: TrainingRecord, data: SceneSet, sha256: str) -> str:
     if record.sha256 == sha256:
         return f"{name} was trained on these images: its errors are not valid for other images"
-    shared = known_again(data.scenes, record.images)
+    shared = find_training_images(data.scenes, record.images)
     if shared:
         return (
             f"{name}: {len(shared)} of {len(data.scenes)} images were used for training, by name and ground truth or "

@@ -1,1 +1,1 @@
-"""Methods that learn from scenes with known lights, one file a method."""
+"""Methods that learn from scenes with ground truth, one file per method."""

@@ -1,19 +1,10 @@
-"""What a method has learned elsewhere, adapted to N images of the camera at hand.
+"""Adapt a pretrained model to N images of another camera.
 
-Two models answer together. One was learned elsewhere, on generated images as a rule, and is tuned to the N as its
-method does that (`FeatureLearner.tune`). The other is what the same method learns of the N alone. The light is their
-mean in logarithms, the first with the weight w.
+Two models are blended. The pretrained model was usually fitted to generated images; its method may tune it to the N
+images (`FeatureLearner.tune`). The local model is fitted to the N images alone. The estimate is the mean of the
+logarithms of both estimates; the pretrained model has the weight w.
 
-What was learned elsewhere is taken to be worth as much as W images, `WORTH`, however many it was learned of. Methods
-that learn of both together let each of the N weigh by that; and w begins with stacking (L. Breiman, "Stacked
-regressions", Machine Learning 24, 1996) under a prior. The least sum of errors on the N, each estimated by models that
-have not seen it, would choose it, and on twenty images choose badly; so that much is added for a w other than expected
-as `STRENGTH` images would: expected is W / (W + N), and 1 where the first was tuned, and so knows the N as well. The
-models that are compared are both worse than what they stand for: the one is not yet tuned, the other has learned of
-fewer than N. What was learned elsewhere does not grow better with N: so w is multiplied by W⁴ / (W⁴ + N⁴), and from
-twice W on little is left of it whatever stacking says. No image that is tested on has a part in it.
-
-`WORTH`, `STRENGTH` and how each method tunes were chosen by docs/transfer.md#what-was-chosen-and-on-what.
+Test images are not used. docs/transfer.md#what-was-chosen-and-on-what explains the constants.
 """
 
 from __future__ import annotations
@@ -28,23 +19,22 @@ import numpy.typing as npt
 from evaluation.learning.feature_learner import FeatureLearner, Features, LearnedMethod, LightModel, fit_extracted
 from evaluation.metrics import recovery_error
 
-WORTH: Final = 200.0  # Images that what was learned elsewhere is taken to be worth before any is seen
-STRENGTH: Final = 25.0  # Images that this opinion weighs as much as
-_SHARES: Final = np.linspace(0, 1, 101)  # Weights to choose among
-# Parts of the N images, each estimated by a model that learned of the others; so few since each is a training.
-_PARTS: Final = 3
+PRETRAINED_WORTH: Final = 200.0  # W: number of local images to which a pretrained model is equivalent
+PRIOR_IMAGES: Final = 25.0  # weight of the expected w, as a number of images
+_SHARES: Final = np.linspace(0, 1, 101)  # candidates for w
+_FOLDS: Final = 3  # folds of the N images for cross-validation; few, because each requires a fit
 
 
 @dataclass(frozen=True, eq=False)
-class LearnedAlone:
-    """What N images teach a method that knows nothing else.
+class LocalFit:
+    """Method fitted to N local images.
 
-    - `method`: what it learned of all N.
-    - `features`: (N, ...), of those with a usable pixel.
+    - `method`: method fitted to all N images.
+    - `features`: (N, ...) features of the images with usable pixels.
     - `truths`: (N, 3) float64, r + g + b = 1.
-    - `held_out`: (N, 3) float64, the light of each by what was learned of the other parts; None of fewer images than
-      parts.
-    - `seed`: of the fits.
+    - `held_out`: (N, 3) float64, estimate of each image by a model fitted to the other folds; None for fewer images
+      than folds.
+    - `seed`: seed of the fits.
     """
 
     method: LearnedMethod
@@ -54,103 +44,104 @@ class LearnedAlone:
     seed: int
 
 
-def learn_alone(
+def fit_local(
     learner: FeatureLearner, features: Sequence[Features | None], truths: npt.NDArray[np.float64], seed: int = 0
-) -> LearnedAlone:
-    """Return what N images teach, of features, (...) of the learner's dtype or None, and truths (N, 3) float64."""
+) -> LocalFit:
+    """Fit a learner to the features (or None) and ground truths (N, 3) float64 of N local images."""
     method = fit_extracted(learner, features, truths, seed)
-    usable = [place for place, given in enumerate(features) if given is not None]
-    stacked: Any = np.stack([given for given in features if given is not None])
+    usable = [index for index, image_features in enumerate(features) if image_features is not None]
+    stacked: Any = np.stack([image_features for image_features in features if image_features is not None])
     lights = truths[usable] / truths[usable].sum(axis=1, keepdims=True)
     held_out = None
-    if len(usable) >= _PARTS:
+    if len(usable) >= _FOLDS:
         held_out = np.empty_like(lights)
-        parts = np.random.default_rng(seed).permutation(len(usable)) % _PARTS
-        for part in range(_PARTS):
-            held = parts == part
-            held_out[held] = learner.fit_features(stacked[~held], lights[~held], seed).lights(stacked[held])
-    return LearnedAlone(method, stacked, lights, held_out, seed)
+        fold_indices = np.random.default_rng(seed).permutation(len(usable)) % _FOLDS
+        for fold in range(_FOLDS):
+            tested = fold_indices == fold
+            held_out[tested] = learner.fit_features(stacked[~tested], lights[~tested], seed).lights(stacked[tested])
+    return LocalFit(method, stacked, lights, held_out, seed)
 
 
-def adapt(taught: LearnedMethod, alone: LearnedAlone, worth: float = WORTH) -> LearnedMethod:
-    """Return a method that was learned elsewhere, adapted to what N images teach alone.
-
-    `worth`: images that the former is taken to be worth, 0 for nothing: then the latter is returned.
-    """
-    if taught.learner != alone.method.learner:
-        raise ValueError(f"{taught.learner} was learned elsewhere, {alone.method.learner} here; expected the same")
+def adapt(pretrained: LearnedMethod, local_fit: LocalFit, worth: float = PRETRAINED_WORTH) -> LearnedMethod:
+    """Return a pretrained method adapted to a local fit; `worth` is W, and 0 returns the local method."""
+    if pretrained.learner != local_fit.method.learner:
+        raise ValueError(f"pretrained {pretrained.learner}, local {local_fit.method.learner}, expected equal learners")
     if not worth > 0:
-        return alone.method
-    elsewhere, count = taught.model, len(alone.features)
-    # What was adapted before has two models, each of another camera: it is taken as it is.
-    tuned = elsewhere
-    if not isinstance(elsewhere, BlendedModel):
-        tuned = taught.learner.tune(elsewhere, alone.features, alone.truths, worth, alone.seed)
-    share = worth / (worth + count) if tuned is elsewhere else 1.0
-    if alone.held_out is not None:
-        share = stacked_share(elsewhere.lights(alone.features), alone.held_out, alone.truths, share)
+        return local_fit.method
+    model, count = pretrained.model, len(local_fit.features)
+    # A model that was adapted before blends models of two cameras, so it is not tuned.
+    tuned = model
+    if not isinstance(model, BlendedModel):
+        tuned = pretrained.learner.tune(model, local_fit.features, local_fit.truths, worth, local_fit.seed)
+    # The expected w is W / (W + N), and 1 if the pretrained model was tuned, because it then knows the N images too.
+    share = worth / (worth + count) if tuned is model else 1.0
+    if local_fit.held_out is not None:
+        share = stacked_share(model.lights(local_fit.features), local_fit.held_out, local_fit.truths, share)
+    # A pretrained model does not improve with N: from N = 2 W on, it has little weight whatever stacking returns.
     share *= worth**4 / (worth**4 + count**4)
-    return replace(taught, model=BlendedModel(tuned, alone.method.model, np.array(share)))
+    return replace(pretrained, model=BlendedModel(tuned, local_fit.method.model, np.array(share)))
 
 
 def stacked_share(
-    one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], truths: npt.NDArray[np.float64], expected: float
+    first: npt.NDArray[np.float64], second: npt.NDArray[np.float64], truths: npt.NDArray[np.float64], expected: float
 ) -> float:
-    """Return the share, 0 … 1, of the first of two estimates (N, 3) float64 of true lights (N, 3) float64.
+    """Return the weight, 0 … 1, of the first of two estimates (N, 3) float64 of ground truths (N, 3) float64.
 
     Examples
     --------
-    Where the first is right and the second wrong, images outweigh an opinion against the first, enough of them wholly:
+    If only the first is correct, its weight increases with the number of images although the expected weight is 0:
 
     >>> truths, wrong = np.tile([0.3, 0.4, 0.3], (450, 1)), np.tile([0.2, 0.4, 0.4], (450, 1))
     >>> [round(stacked_share(truths[:n], wrong[:n], truths[:n], 0.0), 1) for n in (0, 25, 450)]
     [0.0, 0.5, 1.0]
     """
+    # Stacking (L. Breiman, "Stacked regressions", Machine Learning 24, 1996) with a prior, because the errors of twenty
+    # images alone select poorly: both compared models are worse than the final ones.
     if not len(truths):
         return expected
-    errors = np.array([recovery_error(_mean(one, other, share), truths).sum() for share in _SHARES])
-    opinion = STRENGTH * recovery_error(one, other).mean() * (_SHARES - expected) ** 2
-    return float(_SHARES[np.argmin(errors + opinion)]) if opinion.any() else expected
+    errors = np.array([recovery_error(_log_mean(first, second, share), truths).sum() for share in _SHARES])
+    prior_errors = PRIOR_IMAGES * recovery_error(first, second).mean() * (_SHARES - expected) ** 2
+    return float(_SHARES[np.argmin(errors + prior_errors)]) if prior_errors.any() else expected
 
 
-def _mean(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], share: float) -> npt.NDArray[np.float64]:
-    """Return the lights (N, 3) between lights (N, 3), r + g + b = 1: their mean in logarithms, with a share of one."""
-    lights = np.exp(share * np.log(one) + (1 - share) * np.log(other))
+def _log_mean(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64], share: float) -> npt.NDArray[np.float64]:
+    lights = np.exp(share * np.log(first) + (1 - share) * np.log(second))
     return lights / lights.sum(axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
 class BlendedModel:
-    """Two models that answer together.
+    """Two models whose estimates are averaged.
 
-    - `elsewhere`, `here`: what was learned elsewhere and then tuned, and what the N images taught alone.
-    - `share`: () float64, 0 … 1, the weight of the first in the mean of the logarithms of both lights.
+    - `pretrained`: the pretrained model, tuned if its method supports this.
+    - `local`: the model fitted to the N local images.
+    - `share`: () float64, 0 … 1, weight of the pretrained model in the mean of the logarithms.
     """
 
-    elsewhere: LightModel
-    here: LightModel
+    pretrained: LightModel
+    local: LightModel
     share: npt.NDArray[np.float64]
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
-        """Return the lights (N, 3) float64, r + g + b = 1, of features (N, ...) of the learner's dtype."""
-        return _mean(self.elsewhere.lights(features), self.here.lights(features), float(self.share))
+        """Return the estimates (N, 3) float64, r + g + b = 1, for features (N, ...) of the learner's dtype."""
+        return _log_mean(self.pretrained.lights(features), self.local.lights(features), float(self.share))
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
-        """Return the arrays of both, of any shape and dtype, under `elsewhere.` and `here.`, and the `share`."""
-        both = {"elsewhere": self.elsewhere, "here": self.here}
-        named = {f"{part}.{name}": array for part, model in both.items() for name, array in model.arrays().items()}
-        return {"share": self.share, **named}
+        """Return the arrays of both models with the prefixes `elsewhere.` and `here.`, and the `share`."""
+        models = {"elsewhere": self.pretrained, "here": self.local}
+        arrays = {f"{key}.{name}": array for key, model in models.items() for name, array in model.arrays().items()}
+        return {"share": self.share, **arrays}
 
 
 def restore(learner: FeatureLearner, arrays: Mapping[str, npt.NDArray[np.generic]]) -> LightModel:
-    """Return the model whose arrays (any shape and dtype) are given, adapted or not; see `FeatureLearner.restore`."""
+    """Return the model with these arrays, blended or not; see `FeatureLearner.restore`."""
     if "share" not in arrays:
         return learner.restore(arrays)
     share = np.asarray(arrays["share"], dtype=np.float64)
     if share.shape != () or not 0 <= share <= 1:
-        raise ValueError(f"a share of {share.tolist()}; expected a number from 0 to 1")
-    elsewhere, here = (
-        {name.removeprefix(part): array for name, array in arrays.items() if name.startswith(part)}
-        for part in ("elsewhere.", "here.")
+        raise ValueError(f"the share is {share.tolist()}, expected a number from 0 to 1")
+    pretrained, local = (
+        {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+        for prefix in ("elsewhere.", "here.")
     )
-    return BlendedModel(restore(learner, elsewhere), restore(learner, here), share)
+    return BlendedModel(restore(learner, pretrained), restore(learner, local), share)

@@ -1,13 +1,13 @@
-"""A small convolutional network that weighs local estimates by its confidence in them; needs PyTorch.
+"""Small convolutional network with local estimates weighted by confidence; requires PyTorch.
 
-After Y. Hu, B. Wang, S. Lin, "FC4: fully convolutional color constancy with confidence-weighted pooling", CVPR 2017: a
-fully convolutional network gives four channels, three of a local light and one of confidence; their product, summed
-over the image and scaled to length 1, is the light (equations 4 to 6), and the angular error is the loss (equation 7).
+After Y. Hu, B. Wang, S. Lin, "FC4: fully convolutional color constancy with confidence-weighted pooling", CVPR 2017. A
+fully convolutional network returns four channels: a local illuminant and its confidence. Their product, summed over the
+image and scaled to length 1, is the estimate (equations 4 to 6); the angular error is the loss (equation 7).
 
-*What is ours.* Three convolutions on thumbnails take the place of AlexNet or SqueezeNet pretrained on ImageNet, so that
-it trains on a processor in a minute; the network sees the square root of the image over its mean value, and a channel
-that tells usable pixels; a local light is the exponential of three channels. Each image is flipped and lit anew at
-random in every epoch, as in the paper's section 5.1, but by a tenth at most.
+*Differences to the paper.* Three convolutions on thumbnails replace AlexNet or SqueezeNet pretrained on ImageNet, so
+that training takes a minute on a processor. The input is the square root of the image divided by its mean, and a mask
+of usable pixels. Local illuminants are exponentials of three channels. Images are flipped and get random gains as in
+section 5.1, but gains of at most 10 %.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from evaluation.learning.working_size import reduce
 from evaluation.scene import Image
 from foundation.errors import InputError
 
-_KERNEL = 5  # Side of the first convolution, px; the others have 3
-_BATCH = 16  # Images a step of the optimiser, as in the paper
-# Range of the gain on each channel of an image that is lit anew. The paper's 0.6 to 1.4 hides which lights are
-# likely, which a few hundred images cannot do without.
-_GAINS = (0.9, 1.1)
-_TUNED = 4  # Tuning has this many times fewer epochs and smaller steps than training: not chosen by results
-_DECAY = 1e-4  # Decay of the weights, which are more than the images
+_FIRST_KERNEL = 5  # side of the first convolution, px; the others have 3
+_BATCH_SIZE = 16  # images per step of the optimiser, as in the paper
+# Range of the random gain of each channel. The range 0.6 to 1.4 of the paper hides the distribution of illuminants,
+# which is important with a few hundred images.
+_GAIN_RANGE = (0.9, 1.1)
+_TUNING_FACTOR = 4  # reduction of epochs and learning rate for tuning; not selected by results
+_DECAY = 1e-4  # weight decay, because the network has more weights than there are images
 
 
 @dataclass(frozen=True)
 class ConvNet(FeatureLearner):
-    """The method with its settings.
+    """Settings of the method.
 
-    - `working_size`: side of the square that an image is brought to, px.
+    - `working_size`: side of the square input, px.
     - `width`: channels of the first convolution; the others have twice as many.
-    - `epochs`: times that each image is seen.
-    - `rate`: learning rate of Adam, which falls to zero along a cosine.
+    - `epochs`: number of epochs.
+    - `rate`: learning rate of Adam, which decreases to zero along a cosine.
     """
 
     key: ClassVar[str] = "convnet"
@@ -56,10 +56,9 @@ class ConvNet(FeatureLearner):
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float16] | None:
-        """Return the image at working size, (64, 64, 4) float16: red, green, blue, and 1 where a pixel is usable.
+        """Return the image at working size, (64, 64, 4) float16: red, green, blue, and 1 for usable pixels.
 
-        What is wider or higher than the image is black and not usable. See `FeatureLearner.features`: the image is
-        (H, W, 3), the mask (H, W) bool.
+        Smaller images are padded with unusable black pixels. See `FeatureLearner.features`.
         """
         small, used = reduce(image, saturation, mask, self.working_size)
         if not small[used].any():
@@ -70,31 +69,28 @@ class ConvNet(FeatureLearner):
         return framed
 
     def fit_features(self, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> ConvNetModel:
-        """Return the network fitted to images (N, 64, 64, 4) float16 and lights (N, 3) float64."""
+        """Return the network fitted to images (N, 64, 64, 4) float16 and ground truths (N, 3) float64."""
         require_installed(self)
         torch = _torch()
         generator = torch.Generator().manual_seed(seed)
-        return self._trained(
-            _initial(torch, self.width, generator), features, truths, self.epochs, self.rate, generator
+        return self._train(
+            _initial_weights(torch, self.width, generator), features, truths, self.epochs, self.rate, generator
         )
 
     def tune(
         self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
     ) -> ConvNetModel:
-        """Return the network trained on, in smaller steps and fewer epochs, so that it stays near what it was.
-
-        `features`: images (N, 64, 64, 4) float16. `truths`: lights (N, 3) float64.
-        """
+        """Return the network after further training with smaller steps and fewer epochs."""
         del worth
         if not isinstance(model, ConvNetModel):
-            raise TypeError(f"{type(model).__name__} is no model of {self.key}")
+            raise TypeError(f"the model is {type(model).__name__}, expected ConvNetModel")
         require_installed(self)
         torch = _torch()
         weights = {name: torch.from_numpy(array.copy()).requires_grad_() for name, array in model.weights.items()}
-        epochs, rate = max(1, self.epochs // _TUNED), self.rate / _TUNED
-        return self._trained(weights, features, truths, epochs, rate, torch.Generator().manual_seed(seed))
+        epochs, rate = max(1, self.epochs // _TUNING_FACTOR), self.rate / _TUNING_FACTOR
+        return self._train(weights, features, truths, epochs, rate, torch.Generator().manual_seed(seed))
 
-    def _trained(
+    def _train(
         self,
         weights: dict[str, Any],
         features: Features,
@@ -105,7 +101,7 @@ class ConvNet(FeatureLearner):
     ) -> ConvNetModel:
         torch = _torch()
         threads = torch.get_num_threads()
-        # Sums of several threads depend on their number; the network is too small to gain by them.
+        # Sums depend on the number of threads, and the network is too small to benefit from several.
         torch.set_num_threads(1)
         try:
             images = torch.from_numpy(np.moveaxis(features, 3, 1).astype(np.float32))
@@ -113,9 +109,9 @@ class ConvNet(FeatureLearner):
             optimiser = torch.optim.Adam(list(weights.values()), lr=rate, weight_decay=_DECAY)
             schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(1, epochs))
             for _ in range(epochs):
-                for chosen in torch.randperm(len(images), generator=generator).split(_BATCH):
-                    shown, wanted = _lit_anew(torch, images[chosen], lights[chosen], generator)
-                    loss = _angle(torch, _forward(torch, weights, shown), wanted).mean()
+                for batch in torch.randperm(len(images), generator=generator).split(_BATCH_SIZE):
+                    batch_images, batch_lights = _augment(torch, images[batch], lights[batch], generator)
+                    loss = _angle(torch, _forward(torch, weights, batch_images), batch_lights).mean()
                     optimiser.zero_grad()
                     loss.backward()
                     optimiser.step()
@@ -125,36 +121,33 @@ class ConvNet(FeatureLearner):
         return ConvNetModel({name: weight.detach().numpy().copy() for name, weight in weights.items()})
 
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> ConvNetModel:
-        """Return the model whose arrays are given: weights (O, I, K, K) and biases (O,), float32."""
-        expected = _shapes(self.width)
-        found: dict[str, Any] = {name: arrays[name] for name in expected}
+        """Return the model with these weights and biases; see `FeatureLearner.restore`."""
+        expected = _weight_shapes(self.width)
+        loaded: dict[str, Any] = {name: arrays[name] for name in expected}
         for name, shape in expected.items():
-            if found[name].shape != shape or found[name].dtype != np.float32 or not np.isfinite(found[name]).all():
-                raise ValueError(f"{name} of the shape {found[name].shape}; expected {shape}, float32, all finite")
-        return ConvNetModel(found)
+            if loaded[name].shape != shape or loaded[name].dtype != np.float32 or not np.isfinite(loaded[name]).all():
+                raise ValueError(f"{name} has the shape {loaded[name].shape}, expected {shape}, finite float32")
+        return ConvNetModel(loaded)
 
 
 @dataclass(frozen=True, eq=False)
 class ConvNetModel:
-    """What was learned.
-
-    `weights`: weights (O, I, K, K) and biases (O,) of the convolutions, float32, by their names.
-    """
+    """Fitted network: weights (O, I, K, K) and biases (O,) of the convolutions, float32, by name."""
 
     weights: Mapping[str, npt.NDArray[np.float32]]
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
-        """Return the weights (O, I, K, K) and biases (O,), float32, by their names."""
+        """Return the weights and biases by name."""
         return dict(self.weights)
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
-        """Return the lights (N, 3) float64, r + g + b = 1, of images (N, 64, 64, 4) float16; needs PyTorch."""
+        """Return the estimates (N, 3) float64, r + g + b = 1, for images (N, 64, 64, 4) float16; requires PyTorch."""
         torch = _torch()
         weights = {name: torch.from_numpy(np.asarray(array)) for name, array in self.weights.items()}
         images = torch.from_numpy(np.moveaxis(features, 3, 1).astype(np.float32))
         with torch.no_grad():
-            found = np.concatenate([_forward(torch, weights, one[None]).numpy() for one in images])
-        lights = found.astype(np.float64)
+            estimates = np.concatenate([_forward(torch, weights, image[None]).numpy() for image in images])
+        lights = estimates.astype(np.float64)
         return lights / lights.sum(axis=1, keepdims=True)
 
 
@@ -162,13 +155,13 @@ def _torch() -> ModuleType:
     try:
         import torch
     except ImportError as error:
-        raise InputError("the method convnet needs PyTorch: pip install torch") from error
+        raise InputError("PyTorch is not installed, expected by the method convnet; pip install torch") from error
     return torch
 
 
-def _shapes(width: int) -> dict[str, tuple[int, ...]]:
+def _weight_shapes(width: int) -> dict[str, tuple[int, ...]]:
     return {
-        "weight1": (width, 4, _KERNEL, _KERNEL),
+        "weight1": (width, 4, _FIRST_KERNEL, _FIRST_KERNEL),
         "bias1": (width,),
         "weight2": (2 * width, width, 3, 3),
         "bias2": (2 * width,),
@@ -179,19 +172,19 @@ def _shapes(width: int) -> dict[str, tuple[int, ...]]:
     }
 
 
-def _initial(torch: Any, width: int, generator: Any) -> dict[str, Any]:
-    """Return weights as K. He et al. (ICCV 2015) draw them; those of the last layer begin at a tenth."""
+def _initial_weights(torch: Any, width: int, generator: Any) -> dict[str, Any]:
+    # Initialisation of K. He et al. (ICCV 2015); the last layer starts with a tenth of it.
     weights: dict[str, Any] = {}
-    for name, shape in _shapes(width).items():
+    for name, shape in _weight_shapes(width).items():
         inputs = int(np.prod(shape[1:]))
         drawn = torch.randn(shape, generator=generator) * (2 / inputs) ** 0.5
-        begin = 0.0 if name.startswith("bias") else drawn * (0.1 if name == "weight4" else 1.0)
-        weights[name] = (torch.zeros(shape) + begin).requires_grad_()
+        values = 0.0 if name.startswith("bias") else drawn * (0.1 if name == "weight4" else 1.0)
+        weights[name] = (torch.zeros(shape) + values).requires_grad_()
     return weights
 
 
-def _lit_anew(torch: Any, images: Any, lights: Any, generator: Any) -> tuple[Any, Any]:
-    low, high = _GAINS
+def _augment(torch: Any, images: Any, lights: Any, generator: Any) -> tuple[Any, Any]:
+    low, high = _GAIN_RANGE
     gains = low + (high - low) * torch.rand((len(images), 3), generator=generator)
     if torch.rand((), generator=generator) < 1 / 2:
         images = images.flip(3)
@@ -199,12 +192,12 @@ def _lit_anew(torch: Any, images: Any, lights: Any, generator: Any) -> tuple[Any
 
 
 def _forward(torch: Any, weights: Mapping[str, Any], images: Any) -> Any:
-    """Return lights (N, 3) of images (N, 4, H, W), each of length 1."""
+    # Estimates (N, 3) of length 1 for images (N, 4, H, W).
     convolve = torch.nn.functional.conv2d
     colours, used = images[:, :3], images[:, 3:]
     mean = colours.sum((1, 2, 3)) / (3 * used.sum((1, 2, 3)).clamp(min=1))
-    seen = torch.cat([(colours / mean.clamp(min=1e-6)[:, None, None, None]).sqrt(), used], 1)
-    layer = convolve(seen, weights["weight1"], weights["bias1"], stride=2, padding=_KERNEL // 2).relu()
+    inputs = torch.cat([(colours / mean.clamp(min=1e-6)[:, None, None, None]).sqrt(), used], 1)
+    layer = convolve(inputs, weights["weight1"], weights["bias1"], stride=2, padding=_FIRST_KERNEL // 2).relu()
     layer = convolve(layer, weights["weight2"], weights["bias2"], stride=2, padding=1).relu()
     layer = convolve(layer, weights["weight3"], weights["bias3"], padding=1).relu()
     local = convolve(layer, weights["weight4"], weights["bias4"])
@@ -214,7 +207,8 @@ def _forward(torch: Any, weights: Mapping[str, Any], images: Any) -> Any:
     return torch.nn.functional.normalize(lights.sum((2, 3)), dim=1)
 
 
-def _angle(torch: Any, found: Any, wanted: Any) -> Any:
-    """Return the angles (N,) radians between lights (N, 3); by the sine near zero, where the cosine has no slope."""
-    true = torch.nn.functional.normalize(wanted, dim=1)
-    return torch.atan2(torch.linalg.cross(found, true).norm(dim=1).clamp(min=1e-6), (found * true).sum(1))
+def _angle(torch: Any, estimates: Any, truths: Any) -> Any:
+    # Angles (N,) in radians, with the sine: the cosine has no gradient near zero.
+    directions = torch.nn.functional.normalize(truths, dim=1)
+    sine = torch.linalg.cross(estimates, directions).norm(dim=1).clamp(min=1e-6)
+    return torch.atan2(sine, (estimates * directions).sum(1))

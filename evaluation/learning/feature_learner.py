@@ -1,8 +1,8 @@
-"""The shape of a learned method that looks at an image once: features first, then a model of features.
+"""Contract of learned methods that extract features from an image and fit a model to the features.
 
-A `FeatureLearner` turns an image into features without knowing any light, so that cross-validation reads each image
-once however many folds there are; what it fits is a `LightModel`, arrays and nothing else, which a model file can hold.
-A class of a user's own need not have this shape: `methods.method.Learner` with its `fit(scenes, seed)` is enough.
+`FeatureLearner.features` does not depend on ground truths, so cross-validation reads each image only once. The fitted
+`LightModel` consists of arrays, which can be stored in a model file. Classes of users need only the contract
+`methods.method.Learner` with `fit(scenes, seed)`.
 """
 
 from __future__ import annotations
@@ -21,86 +21,121 @@ from evaluation.scene import Image, Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
-# Features of one image (...) of any dtype; each learner says which shape and dtype its own have.
+# Features of one image (...) of any dtype; shape and dtype depend on the learner.
 Features = npt.NDArray[Any]
 
 
 class LightModel(Protocol):
-    """What was learned: the light as a function of features."""
+    """Fitted model: the illuminant as a function of features."""
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
-        """Return the lights (N, 3) float64, camera RGB, r + g + b = 1, of the features (N, ...) of N images.
+        """Return the estimates for N images.
 
-        The light of an image does not depend on the images beside it.
+        Parameters
+        ----------
+        features
+            (N, ...) of the learner's dtype.
+
+        Returns
+        -------
+        numpy.ndarray
+            (N, 3) float64, linear camera RGB, r + g + b = 1; each estimate depends only on its own image.
         """
         ...
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
-        """Return what a model file holds: arrays of any shape and dtype but `object`, by their names."""
+        """Return the arrays for a model file by name, of any shape and dtype except `object`."""
         ...
 
 
 class FeatureLearner(ABC):
-    """A method yet to be fitted: a frozen dataclass whose fields, plain numbers and words, are its settings."""
+    """Method that must be fitted: a frozen dataclass; its fields are its settings, numbers or strings."""
 
-    key: ClassVar[str]  # Its name on the command line and in model files
+    key: ClassVar[str]  # name on the command line and in model files
 
-    title: ClassVar[str]  # Its name in tables, where that does not depend on its settings
+    title: ClassVar[str]  # name in tables, if it does not depend on the settings
 
     needs: ClassVar[tuple[str, str] | None] = None
-    """What training needs beside NumPy and SciPy: the module, and the command that installs it; None if nothing."""
+    # Additional module for training, and the command that installs it; None if none is required.
 
     @property
     def name(self) -> str:
-        """Its name in tables."""
+        """Name in tables."""
         return self.title
 
     @abstractmethod
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> Features | None:
-        """Return the features (...) of one image, its dtype the learner's own; None where no pixel is usable.
+        """Return the features of one image.
 
-        See `methods.method.Method.estimate` for what is given: image (H, W, 3), mask (H, W) bool.
+        Parameters
+        ----------
+        image
+            (H, W, 3), see `methods.method.Method.estimate`.
+        saturation
+            See `methods.method.Method.estimate`.
+        mask
+            (H, W) bool, see `methods.method.Method.estimate`.
+
+        Returns
+        -------
+        numpy.ndarray or None
+            Shape and dtype depend on the learner; None if no pixel is usable.
         """
 
     @abstractmethod
     def fit_features(self, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> LightModel:
-        """Return the model that was fitted to features and lights; the same for the same seed.
+        """Return the model fitted to features and ground truths.
 
-        `features`: (N, ...) of the learner's dtype, N ≥ 1. `truths`: (N, 3) float64, lights in linear camera RGB, r + g
-        + b = 1.
+        Parameters
+        ----------
+        features
+            (N, ...) of the learner's dtype, N ≥ 1.
+        truths
+            (N, 3) float64, linear camera RGB, r + g + b = 1.
+        seed
+            Seed of all random numbers; equal seeds must result in equal models.
         """
 
     def tune(
         self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
     ) -> LightModel:
-        """Return a model that `fit_features` made elsewhere, tuned to few images; most have nothing to tune.
+        """Return a pretrained model tuned to a few images; by default the model itself.
 
-        `features`: (N, ...) of the learner's dtype. `truths`: (N, 3) float64. `worth`: images of the few that what was
-        learned elsewhere is worth together.
+        Parameters
+        ----------
+        model
+            Model from `fit_features`, fitted to other images.
+        features
+            (N, ...) of the learner's dtype.
+        truths
+            (N, 3) float64, linear camera RGB, r + g + b = 1.
+        worth
+            Number of images to which the pretrained model is equivalent.
+        seed
+            Seed of all random numbers.
         """
         del features, truths, worth, seed
         return model
 
     @abstractmethod
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> LightModel:
-        """Return the model whose `arrays` (of any shape and dtype, see there) are given."""
+        """Return the model with these `LightModel.arrays`; raise ValueError or KeyError if they are not valid."""
 
     def fit(self, scenes: Sequence[Scene], seed: int = 0) -> LearnedMethod:
         """Return the method fitted to scenes; see `methods.method.Learner.fit`."""
-        (given,) = extract(scenes, [self])
-        return fit_extracted(self, given, truths_of(scenes), seed)
+        (features,) = extract(scenes, [self])
+        return fit_extracted(self, features, truths_of(scenes), seed)
 
 
 @dataclass(frozen=True, eq=False)
 class LearnedMethod:
-    """A learner with what it has learned: a method like any other.
+    """Fitted learner, which is a method.
 
-    - `learner`: what extracts the features.
-    - `model`: what estimates the light from them.
-    - `trained_on`: name of the data set, where it is to stand in the tables beside the method's name: a model from a
-      file.
+    - `learner`: extracts the features.
+    - `model`: estimates the illuminant from the features.
+    - `trained_on`: name of the training data for tables; None except for models from a file.
     """
 
     learner: FeatureLearner
@@ -109,16 +144,13 @@ class LearnedMethod:
 
     @property
     def name(self) -> str:
-        """The method's name in tables; of a model from a file also what it was trained on."""
+        """Name in tables, with the training data if known."""
         return self.learner.name + (f" (trained on {self.trained_on})" if self.trained_on else "")
 
     def estimate(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, camera RGB of length 1; see `methods.method.Method.estimate`.
-
-        The image is (H, W, 3), the mask (H, W) bool.
-        """
+        """Return the estimate (3,) float64, camera RGB of length 1; see `methods.method.Method.estimate`."""
         features = self.learner.features(image, saturation, mask)
         return GREY if features is None else unit(self.model.lights(features[None])[0])
 
@@ -129,67 +161,61 @@ def extract(
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[list[Features | None], ...]:
-    """Return the features of every scene for every learner; each image is read once.
+    """Return for each learner the features of each scene, or None; each image is read once."""
 
-    Returns for each learner, in their order, the features (...) of each scene, of the learner's dtype, or None.
-    """
-
-    def of_one(scene: Scene) -> list[Features | None]:
+    def extract_scene(scene: Scene) -> list[Features | None]:
         image, mask = scene.read()
         return [learner.features(image, scene.saturation, mask) for learner in learners]
 
-    rows = list(report_progress(ordered_map(of_one, scenes, workers), on_scene))
-    return tuple([row[place] for row in rows] for place in range(len(learners)))
+    rows = list(report_progress(ordered_map(extract_scene, scenes, workers), on_scene))
+    return tuple([row[learner_index] for row in rows] for learner_index in range(len(learners)))
 
 
 def fit_extracted(
     learner: FeatureLearner, features: Sequence[Features | None], truths: npt.NDArray[np.float64], seed: int = 0
 ) -> LearnedMethod:
-    """Return the method fitted to extracted features; images without a usable pixel are left out.
-
-    `features`: N entries, each (...) of the learner's dtype, or None. `truths`: (N, 3) float64, lights in linear camera
-    RGB of any length.
-    """
-    usable = [place for place, given in enumerate(features) if given is not None]
+    """Return the method fitted to the features and ground truths (N, 3) of N images; features of None are excluded."""
+    usable = [index for index, image_features in enumerate(features) if image_features is not None]
     if not usable:
         raise InputError(
-            f"{learner.name} cannot be trained: none of {len(features)} images has a usable pixel; give it images that "
-            "are not wholly clipped or masked"
+            f"{learner.name}: 0 of {len(features)} images have usable pixels, expected at least one; use images that "
+            "are not completely clipped or masked"
         )
-    stacked: Any = np.stack([given for given in features if given is not None])
-    chosen = truths[usable]
-    return LearnedMethod(learner, learner.fit_features(stacked, chosen / chosen.sum(axis=1, keepdims=True), seed))
+    stacked: Any = np.stack([image_features for image_features in features if image_features is not None])
+    usable_truths = truths[usable]
+    usable_truths /= usable_truths.sum(axis=1, keepdims=True)
+    return LearnedMethod(learner, learner.fit_features(stacked, usable_truths, seed))
 
 
 def require_installed(learner: object) -> None:
-    """Refuse a learner whose training needs a library that is not installed."""
-    reason = what_is_missing(learner)
+    """Raise InputError if a library for training is not installed."""
+    reason = missing_requirement(learner)
     if reason:
         raise InputError(reason)
 
 
-def what_is_missing(learner: object) -> str | None:
-    """Return why a learner cannot be trained here, with the remedy; None if it can, or is not one of the house's."""
+def missing_requirement(learner: object) -> str | None:
+    """Return a message with a remedy if a library for training is not installed; else None."""
     if not isinstance(learner, FeatureLearner) or learner.needs is None:
         return None
     module, remedy = learner.needs
     try:
         import_module(module)
     except ImportError:
-        return f"training {learner.key} needs {module}, which is not installed: {remedy}"
+        return f"training {learner.key} requires {module}, which is not installed: {remedy}"
     return None
 
 
 def truths_of(scenes: Sequence[Scene]) -> npt.NDArray[np.float64]:
-    """Return the ground truths (N, 3) float64, linear camera RGB, of N scenes."""
+    """Return the ground truths (N, 3) float64, linear camera RGB; raise InputError if one has a value of 0 or less."""
     if not scenes:
-        raise InputError("0 images: expected at least one to learn from")
+        raise InputError("0 training images, expected at least one; add some")
     truths = np.stack([np.asarray(scene.truth, dtype=np.float64) for scene in scenes])
-    bad = ~(np.isfinite(truths) & (truths > 0)).all(axis=1)
-    if bad.any():
-        place = int(np.argmax(bad))
+    is_invalid = ~(np.isfinite(truths) & (truths > 0)).all(axis=1)
+    if is_invalid.any():
+        index = int(np.argmax(is_invalid))
         raise InputError(
-            f"the ground truth of {scenes[place].name} is {' '.join(f'{part:g}' for part in truths[place])}, expected "
-            "red, green and blue of a light, each above 0, to learn from; correct it"
+            f"the ground truth of {scenes[index].name} is {' '.join(f'{value:g}' for value in truths[index])}, "
+            "expected red, green and blue above 0 for training; correct it"
         )
     return truths

@@ -1,8 +1,7 @@
-"""Model files: what a learned method has learned, as plain arrays with the story of their training.
+"""Model files: arrays of a fitted method with a record of their training.
 
-A model file is NumPy's `.npz` without pickled objects, so that opening one runs no code: the arrays of the model under
-their own names, and under `about` a JSON text with the method, its settings and the provenance. Reading checks all of
-it; a file that is foreign or damaged is refused in one sentence.
+A model file is a NumPy `.npz` without pickled objects, so opening it runs no code. It has the arrays of the model by
+name, and under `about` a JSON text with the method, its settings and the provenance. All parts are checked when read.
 """
 
 from __future__ import annotations
@@ -36,28 +35,27 @@ from foundation.version import software
 _FORMAT = "croplab model 1"
 _ABOUT = "about"
 _TRAINED = "trained_on"
-_REMEDY = "name a file that evaluate train has made"
+_REMEDY = "give a file made by evaluate train"
 
 
-# An array beside the text, which says all else.
+# Stored as an array, not in the JSON text.
 _Images = Annotated[npt.NDArray[np.uint64], PlainValidator(np.asarray), Field(exclude=True)]
 
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """What a model was trained on, by what and when.
+    """Record of the training of a model.
 
-    - `data_name`, `data_place`, `data_layout`: the data set; see `scene.SceneSet`.
-    - `treatment`: what was done to its images before the method saw them.
+    - `data_name`, `data_place`, `data_layout`: name, location and layout of the data set, see `scene.SceneSet`.
+    - `treatment`: treatment of its images, see `scene.SceneSet`.
     - `scenes`: number of images.
-    - `sha256`: of the images' names and ground truths, 64 hexadecimal digits; see `scenes_sha256`.
-    - `part`: the part of the data set: "all", or which folds.
-    - `seed`: of the fit.
-    - `software`: name and version of what trained it.
+    - `sha256`: hash of names and ground truths, see `scenes_sha256`.
+    - `part`: part of the data set: "all", or its folds.
+    - `seed`: seed of the fit.
+    - `software`: name and version of the program.
     - `date`: ISO 8601, UTC.
-    - `adapted_from`: of a model that was adapted: what the one that it was adapted from was trained on, in a sentence;
-      else empty.
-    - `images`: (N, 2) uint64, by what each image is known again, see `datasets.identity`.
+    - `adapted_from`: description of the training of the pretrained model; empty if the model was not adapted.
+    - `images`: (N, 2) uint64, identities of the images, see `datasets.identity`.
     """
 
     data_name: str
@@ -73,8 +71,8 @@ class TrainingRecord:
     adapted_from: str = ""
     images: _Images = field(default_factory=lambda: np.empty((0, 2), np.uint64), compare=False)
 
-    def sentence(self) -> str:
-        """Return in one line what the model was trained on."""
+    def description(self) -> str:
+        """Return the record as one line of text."""
         return (
             f"trained on {self.part} of {self.data_name} ({self.data_layout}, {self.scenes} images, seed {self.seed}) "
             f"by {self.software} on {self.date[:10]}"
@@ -84,10 +82,7 @@ class TrainingRecord:
 
 @dataclass(frozen=True, eq=False)
 class StoredMethod(LearnedMethod):
-    """A learned method from a model file.
-
-    - `provenance`: what it was trained on.
-    """
+    """Fitted method from a model file; `provenance` is the record of its training."""
 
     provenance: TrainingRecord | None = None
 
@@ -95,10 +90,7 @@ class StoredMethod(LearnedMethod):
 def provenance_of(
     data: SceneSet, seed: int, clock: Clock, adapted_from: TrainingRecord | None = None
 ) -> TrainingRecord:
-    """Return the provenance of a model that is trained on a data set now.
-
-    `adapted_from`: that of the model that is adapted; its images count among those that this one was trained on.
-    """
+    """Return the record of a training on a data set; images of the pretrained `adapted_from` are included."""
     images = identities(data.scenes)
     return TrainingRecord(
         data_name=data.name,
@@ -111,32 +103,32 @@ def provenance_of(
         seed=seed,
         software=software(),
         date=clock.now().isoformat(timespec="seconds"),
-        adapted_from=adapted_from.sentence() if adapted_from else "",
+        adapted_from=adapted_from.description() if adapted_from else "",
         images=np.concatenate([images, adapted_from.images]) if adapted_from else images,
     )
 
 
 def scenes_sha256(scenes: Sequence[Scene]) -> str:
-    """Return a hash of the names and ground truths of scenes, in their order: 64 hexadecimal digits.
+    """Return the SHA-256 of names and ground truths of scenes, 64 hexadecimal digits.
 
-    Truths count as chromaticities to nine digits, so that their length does not matter.
+    Ground truths are hashed as chromaticities with nine digits, so that their length does not matter.
     """
     truths = [np.asarray(scene.truth, dtype=np.float64) for scene in scenes]
-    shares = [" ".join(f"{part:.9f}" for part in truth / truth.sum()) for truth in truths]
+    shares = [" ".join(f"{value:.9f}" for value in truth / truth.sum()) for truth in truths]
     lines = [f"{scene.name}\t{share}" for scene, share in zip(scenes, shares, strict=True)]
     return sha256_of("\n".join(lines).encode())
 
 
 def save_model(path: Path, method: Method, provenance: TrainingRecord) -> None:
-    """Write a learned method to a new model file.
+    """Write a fitted method to a new model file.
 
-    Raises `InputError`: the method is not one of `standard_learners`, or something is at `path` already;
-    `StorageError`: the disk is full, read-only or gone.
+    Raises InputError if the method is not one of `standard_learners` or the path exists, and StorageError if the disk
+    cannot be written.
     """
     if not isinstance(method, LearnedMethod) or method.learner.key not in standard_learners():
         raise InputError(
-            f"{method.name} cannot be saved: model files hold {', '.join(standard_learners())}; a class of your own "
-            "keeps what it has learned by its own means, and is trained and evaluated by evaluate cv"
+            f"{method.name} cannot be saved, expected one of {', '.join(standard_learners())}; save the model of your "
+            "own class in your code, or train and evaluate it with evaluate cv"
         )
     require_free_file(path, "the model")
     about = {
@@ -155,54 +147,51 @@ def save_model(path: Path, method: Method, provenance: TrainingRecord) -> None:
 
 
 def load_model(path: Path) -> StoredMethod:
-    """Return the learned method of a model file.
-
-    Raises `FormatError`: the file is not there, is no model file, or is damaged; the message says which.
-    """
+    """Return the fitted method in a model file; raise FormatError if it does not exist or is not valid."""
     try:
         arrays = _read_arrays(path)
         about = json.loads(str(arrays.pop(_ABOUT)))
         if about["format"] != _FORMAT:
-            raise ValueError(f"it says {about['format']!r} where {_FORMAT!r} is expected")
-        known = standard_learners()
-        if about["method"] not in known:
-            raise ValueError(f"it holds {about['method']!r}; known are {', '.join(known)}")
-        learner = _with_settings(known[about["method"]], about["settings"])
+            raise ValueError(f"its format is {about['format']!r}, expected {_FORMAT!r}")
+        learners = standard_learners()
+        if about["method"] not in learners:
+            raise ValueError(f"its method is {about['method']!r}, expected {', '.join(learners)}")
+        learner = _apply_settings(learners[about["method"]], about["settings"])
         images = arrays.pop(_TRAINED)
         provenance = from_plain(TrainingRecord, about["provenance"] | {"images": images}, path, _REMEDY)
-        # Of an adapted model they are those of both trainings.
-        whole = len(images) == provenance.scenes or (provenance.adapted_from and len(images) > provenance.scenes)
-        if images.dtype != np.uint64 or images.shape[1:] != (2,) or not whole:
+        # Adapted models have the images of both trainings.
+        is_complete = len(images) == provenance.scenes or (provenance.adapted_from and len(images) > provenance.scenes)
+        if images.dtype != np.uint64 or images.shape[1:] != (2,) or not is_complete:
             raise ValueError(
                 f"its {_TRAINED} is {images.dtype} of the shape {images.shape}, expected uint64, (images, 2)"
             )
         model = restore(learner, arrays)
     except (FileNotFoundError, IsADirectoryError) as error:
-        what = "a folder" if path.is_dir() else "not there"
-        raise FormatError(f"{path} is {what}, expected a model file; {_REMEDY}") from error
+        problem = "is a folder" if path.is_dir() else "does not exist"
+        raise FormatError(f"{path} {problem}, expected a model file; {_REMEDY}") from error
     except KeyError as error:
-        raise _refused(path, f"it lacks {error}") from error
+        raise _damaged_file_error(path, f"it lacks {error}") from error
     except (
         *(OSError, ValueError, TypeError, AttributeError, EOFError, zlib.error, zipfile.BadZipFile),
-        *(RuntimeError, NotImplementedError),  # What is encrypted, or packed in a way that Python does not know.
+        *(RuntimeError, NotImplementedError),  # encrypted, or compressed with an unsupported method
     ) as error:
-        raise _refused(path, _reason(error)) from error
-    taught = f"{provenance.data_name}, adapted from another model" if provenance.adapted_from else provenance.data_name
-    return StoredMethod(learner, model, taught, provenance)
+        raise _damaged_file_error(path, _reason(error)) from error
+    trained_on = provenance.data_name + (", adapted from another model" if provenance.adapted_from else "")
+    return StoredMethod(learner, model, trained_on, provenance)
 
 
 def _reason(error: Exception) -> str:
-    told = (isinstance(error, OSError) and error.strerror) or str(error)
-    return told.splitlines()[0] if told else type(error).__name__
+    message = (isinstance(error, OSError) and error.strerror) or str(error)
+    return message.splitlines()[0] if message else type(error).__name__
 
 
-def _refused(path: Path, why: str) -> FormatError:
-    return FormatError(f"{path} is no whole model file: {why}; {_REMEDY}")
+def _damaged_file_error(path: Path, reason: str) -> FormatError:
+    return FormatError(f"{path} is not a valid model file: {reason}; {_REMEDY}")
 
 
 def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
-        # numpy.load would take a pickle for a file that is no archive; and its own check of sums comes with reading.
+        # numpy.load tries to unpickle other files, and checks sums only when it reads an array.
         if (damaged := archive.testzip()) is not None:
             raise ValueError(f"{damaged} is damaged")
     with np.load(path, allow_pickle=False) as content:
@@ -210,17 +199,17 @@ def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
 
 
 def settings_of(learner: FeatureLearner) -> dict[str, Any]:
-    """Return the settings of a learner as JSON has them, by their names."""
+    """Return the settings of a learner by name, as JSON values."""
     if not dataclasses.is_dataclass(learner):
-        raise TypeError(f"{learner.name} is no dataclass, whose fields would be its settings")
-    return {each.name: getattr(learner, each.name) for each in dataclasses.fields(learner)}
+        raise TypeError(f"{learner.name} is {type(learner).__name__}, expected a dataclass with settings as fields")
+    return {setting.name: getattr(learner, setting.name) for setting in dataclasses.fields(learner)}
 
 
-def _with_settings(learner: FeatureLearner, settings: Mapping[str, Any]) -> FeatureLearner:
+def _apply_settings(learner: FeatureLearner, settings: Mapping[str, Any]) -> FeatureLearner:
     expected = settings_of(learner)
     if set(settings) != set(expected):
-        raise ValueError(f"it has the settings {', '.join(sorted(settings))}; expected {', '.join(sorted(expected))}")
+        raise ValueError(f"its settings are {', '.join(sorted(settings))}, expected {', '.join(sorted(expected))}")
     for name, value in settings.items():
         if type(value) is not type(expected[name]):
-            raise ValueError(f"the setting {name} is {value!r}, expected one such as {expected[name]!r}")
+            raise ValueError(f"setting {name} is {value!r}, expected a value like {expected[name]!r}")
     return type(learner)(**settings)

@@ -1,4 +1,4 @@
-"""Images at the size that learned methods work on: averaged over blocks, without the pixels that must not be used."""
+"""Reduce images to the working size of learned methods, as block means of usable pixels."""
 
 from __future__ import annotations
 
@@ -8,24 +8,19 @@ import numpy.typing as npt
 from evaluation.methods.prepared import PreparedImage
 from evaluation.scene import Image
 
-# Share of a block's pixels that must be usable for its mean to be: with less, a masked chart's rim or a clipped sky
-# would come in through single pixels.
-_LEAST_SHARE = 0.5
+# Smallest fraction of usable pixels in a block. With less, single pixels at the edge of a masked chart or a clipped sky
+# would be used.
+_MIN_USABLE_SHARE = 0.5
 
 
 def reduce(
     image: Image, saturation: float | None, mask: npt.NDArray[np.bool_] | None, longest: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """Return an image reduced by a whole factor, and which of its pixels are usable.
+    """Return an image reduced by an integer factor, (h, w, 3) float32, 0 … 1, and its usable pixels, (h, w) bool.
 
-    Each pixel is the mean of the usable pixels of a block; blocks at the right and lower edge may be smaller. Pixels
-    are usable as `PreparedImage.usable` has them. The largest usable value becomes 1, so that no
-    feature depends on the exposure or on the unit of the image. Memory: a byte a pixel and some rows of the image.
-
-    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB. `saturation`: value from which a channel is
-    clipped; None if none is. `mask`: (H, W) bool, True where a pixel must not be used. `longest`: the most that height
-    and width may be, px; a smaller image keeps its size. Returns (h, w, 3) float32, 0 … 1; 0 where it is not usable.
-    Returns (h, w) bool, True where it is.
+    Each pixel is the mean of the usable pixels of a block, see `PreparedImage.usable`; unusable pixels are 0. `longest`
+    is the largest height and width in px; smaller images keep their size. The largest usable value becomes 1, so that
+    features do not depend on exposure and unit.
 
     Examples
     --------
@@ -36,38 +31,38 @@ def reduce(
     array([[0.833, 1.   ],
            [1.   , 1.   ]], dtype=float32)
     """
-    used = PreparedImage(image, saturation, mask).usable()
+    usable = PreparedImage(image, saturation, mask).usable()
     factor = -(-max(image.shape[:2]) // longest)
     if factor == 1:
-        small = np.where(used[..., None], image, 0).astype(np.float32)
+        small = np.where(usable[..., None], image, 0).astype(np.float32)
     else:
-        small, used = _block_means(image, used, factor)
+        small, usable = _block_means(image, usable, factor)
     peak = float(small.max(initial=0.0))
-    return (small / np.float32(peak) if peak > 0 else small), used
+    return (small / np.float32(peak) if peak > 0 else small), usable
 
 
 def _block_means(
-    image: Image, used: npt.NDArray[np.bool_], factor: int
+    image: Image, usable: npt.NDArray[np.bool_], factor: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    height, width = used.shape
+    height, width = usable.shape
     columns: npt.NDArray[np.int64] = np.arange(0, width, factor, dtype=np.int64)
     shape = (-(-height // factor), len(columns))
     sums, counts, sizes = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
-    across: npt.NDArray[np.int64] = np.minimum(width - columns, factor)
+    block_widths: npt.NDArray[np.int64] = np.minimum(width - columns, factor)
     for row, top in enumerate(range(0, height, factor)):
-        free = used[top : top + factor]
-        strip = np.where(free[..., None], image[top : top + factor], 0).sum(axis=0, dtype=np.float64)
+        rows = usable[top : top + factor]
+        strip = np.where(rows[..., None], image[top : top + factor], 0).sum(axis=0, dtype=np.float64)
         sums[row] = np.add.reduceat(strip, columns, axis=0)
-        counts[row] = np.add.reduceat(free.sum(axis=0), columns)
-        sizes[row] = across * len(free)
-    enough = counts >= _LEAST_SHARE * sizes
-    enough &= counts > 0
-    means = np.where(enough[..., None], sums / np.maximum(counts, 1)[..., None], 0)
-    return means.astype(np.float32), enough
+        counts[row] = np.add.reduceat(rows.sum(axis=0), columns)
+        sizes[row] = block_widths * len(rows)
+    is_usable = counts >= _MIN_USABLE_SHARE * sizes
+    is_usable &= counts > 0
+    means = np.where(is_usable[..., None], sums / np.maximum(counts, 1)[..., None], 0)
+    return means.astype(np.float32), is_usable
 
 
 def chromaticities(pixels: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """Return the chromaticities (r, g), (..., 2) float64, of colours (..., 3) of any float dtype; of black 1/3, 1/3.
+    """Return the chromaticities (r, g), (..., 2) float64, of colours (..., 3); 1/3, 1/3 for black.
 
     Examples
     --------
@@ -75,13 +70,15 @@ def chromaticities(pixels: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     array([[0.25 , 0.5  ],
            [0.333, 0.333]])
     """
-    given = pixels.astype(np.float64)
-    total = given.sum(axis=-1, keepdims=True)
-    return np.where(total > 0, given[..., :2] / np.where(total > 0, total, 1), 1 / 3)
+    values = pixels.astype(np.float64)
+    total = values.sum(axis=-1, keepdims=True)
+    return np.where(total > 0, values[..., :2] / np.where(total > 0, total, 1), 1 / 3)
 
 
 def lights_from_chromaticities(red_green: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the lights (N, 3) float64, r + g + b = 1, of chromaticities (r, g), (N, 2) float64; each channel ≥ 1e-6.
+    """Return illuminants (N, 3) float64, r + g + b = 1, from chromaticities (r, g), (N, 2) float64.
+
+    Channels are clipped to 1e-6 or more.
 
     Examples
     --------
@@ -89,9 +86,9 @@ def lights_from_chromaticities(red_green: npt.NDArray[np.float64]) -> npt.NDArra
     array([[0.25, 0.5 , 0.25]])
     """
     full = np.concatenate([red_green, 1 - red_green.sum(axis=1, keepdims=True)], axis=1)
-    bounded = np.maximum(full, _DARKEST)
-    return bounded / bounded.sum(axis=1, keepdims=True)
+    clipped = np.maximum(full, _MIN_CHROMATICITY)
+    return clipped / clipped.sum(axis=1, keepdims=True)
 
 
-# Least share of a channel in an estimated light: a model that extrapolates must not leave the colours that exist.
-_DARKEST = 1e-6
+# Smallest chromaticity of an estimate: extrapolating models may return impossible colours.
+_MIN_CHROMATICITY = 1e-6

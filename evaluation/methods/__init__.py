@@ -1,7 +1,6 @@
-"""Methods that estimate the light of an image from its statistics, one file a method.
+"""Methods that estimate the illuminant of an image from its statistics, one file per method.
 
-Every method is a value with a name and `estimate(image, saturation, mask)`, see `method.Method`; `standard_methods`
-lists them by their names on the command line.
+Contract: `method.Method`. `standard_methods` returns all methods by name on the command line.
 """
 
 from evaluation.methods.gray_edge import GrayEdge

@@ -1,18 +1,14 @@
-"""Gaussian derivatives of images of any size, in tiles, by separable filters.
+"""Compute Gaussian derivatives of images of any size, in tiles, with separable filters.
 
-Filters follow the program of the authors of the Gray-Edge framework (J. van de Weijer et al., 2007): Gaussian kernels
-cut at 3σ, normalised on the grid of pixels, edges continued by their last pixel, order 2 as √(f_xx² + 4 f_xy² + f_yy²).
+Filters follow the program of the authors of the Gray-Edge framework (J. van de Weijer et al., 2007). Gaussian kernels
+are cut at 3σ and normalised on the pixel grid; edges are continued by their last pixel; order 2 is
+√(f_xx² + 4 f_xy² + f_yy²).
 
-Rows filtered along x stand in columns of 16 numbers: (columns, rows, 16), one cache line a row, which is what the
-filter along y reads from top to bottom. An image is filtered in tiles whose columns fit a core's cache, from top to
-bottom; the rows that a tile shares with the one above are kept, and those beyond the image are copies.
+Rows filtered along x are stored in columns of 16 numbers: (columns, rows, 16), one cache line per row. The filter along
+y reads them from top to bottom. Tiles are filtered from top to bottom; rows shared with the tile above are reused.
 
-Vectors lie one after the other along the axis that is filtered, so that every load is aligned: rows are filtered in
-groups of 16 that are transposed first, which costs 4 shuffles a vector, where loads that begin between two cache lines
-would cost 2 cycles a tap. `OUTPUTS` neighbouring vectors are found at a time. From tap to tap the neighbours they need
-move on by one, so a tap loads two vectors, not two for each of them: what bounds the loop is additions and
-multiplications, not loads. Taps that lie symmetrically are combined before they are multiplied: a derivative of
-constant whole numbers is exactly zero. Short kernels of three orders at a time are the exception, see `beside_all`.
+Pixels that are neighbours along the filtered axis are in consecutive vectors, so all loads are aligned. Rows are
+therefore transposed in groups of 16 before they are filtered along x.
 """
 
 from __future__ import annotations
@@ -44,49 +40,46 @@ from generator.kernels.vector import (
     store,
 )
 
-# Vectors that are found at a time: as many sums as a multiplication takes cycles, so that none waits for another.
+# Vectors computed together: as many as a multiplication takes cycles, so that no sum waits for another.
 OUTPUTS: Final = 4
-_BYTES: Final = 4  # Of a float32
-CHUNK: Final = 16  # Interleaved pixels of a row that are three whole vectors
-_PIXEL: Final = 3 * LINE  # Bytes from pixel to pixel of 16 rows
+_FLOAT: Final = 4  # bytes of a float32
+INTERLEAVED_PIXELS: Final = 16  # interleaved pixels of a row that fill three vectors
+_PIXEL_BYTES: Final = 3 * LINE  # distance of two pixels in 16 transposed rows
 
-# Kinds of kernels: Σ w(k) (x(k) + x(-k)) + w(0) x(0); Σ w(k) (x(k) - x(-k)); Σ w(k) (x(k) + x(-k) - 2 x(0)). Those of
-# a Gaussian and of its first two derivatives.
-EVEN, ODD, BEND = 0, 1, 2
+# Symmetries of the kernels of a Gaussian and its first two derivatives:
+# Σ w(k) (x(k) + x(-k)) + w(0) x(0); Σ w(k) (x(k) - x(-k)); Σ w(k) (x(k) + x(-k) - 2 x(0)).
+EVEN, ODD, CENTRED = 0, 1, 2
 
 
-def _call(builder: Builder, name: str, *arguments: Any) -> Any:
-    """Return what an LLVM intrinsic on vectors of 16 float32 gives."""
-    whole = f"{name}.v{LANES}f32"
-    known = builder.module.globals.get(whole)
-    function = known or ir.Function(builder.module, ir.FunctionType(FLOATS, [FLOATS] * len(arguments)), whole)
+def _call_intrinsic(builder: Builder, name: str, *arguments: Any) -> Any:
+    full_name = f"{name}.v{LANES}f32"
+    existing = builder.module.globals.get(full_name)
+    function = existing or ir.Function(builder.module, ir.FunctionType(FLOATS, [FLOATS] * len(arguments)), full_name)
     return builder.call(function, arguments)
 
 
-def _fused(builder: Builder, first: Any, second: Any, third: Any) -> Any:
-    """Return first · second + third, rounded once."""
-    return _call(builder, "llvm.fma", first, second, third)
+def _fma(builder: Builder, first: Any, second: Any, third: Any) -> Any:
+    return _call_intrinsic(builder, "llvm.fma", first, second, third)
 
 
 def _root(builder: Builder, value: Any) -> Any:
-    return _call(builder, "llvm.sqrt", value)
+    return _call_intrinsic(builder, "llvm.sqrt", value)
 
 
-def _emit(
+def _emit_filter(
     builder: Builder,
     source: Any,
     stride: Any,
     weights: Sequence[Any],
-    reach: Any,
-    kinds: Sequence[int],
+    radius: Any,
+    symmetries: Sequence[int],
     *,
     side_by_side: bool = False,
 ) -> list[list[Any]]:
-    """Return the filtered vectors at `source` and after for each kind.
+    """Return the filtered vectors from `source` on, for each kernel.
 
-    Neighbours lie `stride` bytes apart; `weights` are addresses of reach + 1 float32 a kind. Read are `reach`
-    neighbours before the first and after the last vector. The vectors are `OUTPUTS` neighbours, or the three of `CHUNK`
-    interleaved pixels side by side, whose neighbours are loaded from wherever they begin.
+    `stride` is the distance of neighbouring vectors in bytes; `weights` are pointers of radius + 1 float32 per kernel.
+    The result has `OUTPUTS` vectors, or with `side_by_side` the three vectors of interleaved pixels.
     """
     from numba.core import cgutils
 
@@ -98,24 +91,27 @@ def _emit(
     def times(number: Any, count: int) -> Any:
         return builder.mul(number, ir.Constant(I64, count))
 
+    # From tap to tap the required neighbours move on by one vector. So each tap loads two new vectors, and the loop is
+    # limited by arithmetic, not by loads. Symmetric taps are combined before the multiplication, so that derivatives of
+    # constant whole numbers are exactly zero.
     outputs = range(3 if side_by_side else OUTPUTS)
-    apart = ir.Constant(I64, LINE) if side_by_side else stride
-    centre = [load(builder, builder.add(source, times(apart, at)), 0, FLOATS) for at in outputs]
+    spacing = ir.Constant(I64, LINE) if side_by_side else stride
+    centre = [load(builder, builder.add(source, times(spacing, i)), 0, FLOATS) for i in outputs]
     sums: list[list[Any]] = []
-    for kind, table in zip(kinds, weights, strict=True):
+    for symmetry, table in zip(symmetries, weights, strict=True):
         first = broadcast(builder, load(builder, table, 0, F32), FLOATS)
         zero = ir.Constant(FLOATS, [0.0] * LANES)
-        sums.append([slot_of(builder.fmul(one, first) if kind == EVEN else zero) for one in centre])
-    doubled = [builder.fadd(one, one) for one in centre] if BEND in kinds else []
-    lows, highs = [slot_of(one) for one in centre], [slot_of(one) for one in centre]
+        sums.append([slot_of(builder.fmul(vector, first) if symmetry == EVEN else zero) for vector in centre])
+    doubled = [builder.fadd(vector, vector) for vector in centre] if CENTRED in symmetries else []
+    lows, highs = [slot_of(vector) for vector in centre], [slot_of(vector) for vector in centre]
     last = builder.add(source, times(stride, OUTPUTS - 1))
-    with cgutils.for_range(builder, reach) as loop:
+    with cgutils.for_range(builder, radius) as loop:
         tap = builder.add(loop.index, ir.Constant(I64, 1))
         offset = builder.mul(tap, stride)
         below, above = builder.sub(source, offset), builder.add(last, offset)
         if side_by_side:
-            low = [load(builder, below, LINE * at, FLOATS) for at in outputs]
-            high = [load(builder, builder.add(source, offset), LINE * at, FLOATS) for at in outputs]
+            low = [load(builder, below, LINE * i, FLOATS) for i in outputs]
+            high = [load(builder, builder.add(source, offset), LINE * i, FLOATS) for i in outputs]
         else:
             low = [load(builder, below, 0, FLOATS), *[builder.load(slot) for slot in lows[:-1]]]
             high = [*[builder.load(slot) for slot in highs[1:]], load(builder, above, 0, FLOATS)]
@@ -123,128 +119,128 @@ def _emit(
                 for slot, value in zip(slots, values, strict=True):
                     builder.store(value, slot)
         factors = [
-            broadcast(builder, load(builder, builder.add(table, times(tap, _BYTES)), 0, F32), FLOATS)
+            broadcast(builder, load(builder, builder.add(table, times(tap, _FLOAT)), 0, F32), FLOATS)
             for table in weights
         ]
-        for at in outputs:
-            both = builder.fadd(low[at], high[at]) if EVEN in kinds or BEND in kinds else None
-            for kind, factor, slots in zip(kinds, factors, sums, strict=True):
-                if kind == EVEN:
-                    part = both
-                elif kind == ODD:
-                    part = builder.fsub(high[at], low[at])
+        for i in outputs:
+            pair_sum = builder.fadd(low[i], high[i]) if EVEN in symmetries or CENTRED in symmetries else None
+            for symmetry, factor, slots in zip(symmetries, factors, sums, strict=True):
+                if symmetry == EVEN:
+                    term = pair_sum
+                elif symmetry == ODD:
+                    term = builder.fsub(high[i], low[i])
                 else:
-                    part = builder.fsub(both, doubled[at])
-                builder.store(_fused(builder, part, factor, builder.load(slots[at])), slots[at])
+                    term = builder.fsub(pair_sum, doubled[i])
+                builder.store(_fma(builder, term, factor, builder.load(slots[i])), slots[i])
     return [[builder.load(slot) for slot in slots] for slots in sums]
 
 
 def _write(builder: Builder, values: Sequence[Any], target: Any, stride: Any) -> None:
-    for at, value in enumerate(values):
-        store(builder, value, builder.add(target, builder.mul(stride, ir.Constant(I64, at))), 0)
+    for i, value in enumerate(values):
+        store(builder, value, builder.add(target, builder.mul(stride, ir.Constant(I64, i))), 0)
 
 
-def _across(builder: Builder, kinds: Sequence[int], source: Value, reach: Value, places: Sequence[Value]) -> None:
-    """Filter `OUTPUTS` pixels of 16 rows by each of some kinds; `places` are those of the kernels, then the targets."""
-    apart = ir.Constant(I64, _PIXEL)
-    found = _emit(builder, source, apart, places[: len(kinds)], reach, kinds)
-    for values, target in zip(found, places[len(kinds) :], strict=True):
-        _write(builder, values, target, apart)
+def _filter_x(
+    builder: Builder, symmetries: Sequence[int], source: Value, radius: Value, pointers: Sequence[Value]
+) -> None:
+    # `pointers` are those of the kernels, then those of the targets.
+    spacing = ir.Constant(I64, _PIXEL_BYTES)
+    filtered = _emit_filter(builder, source, spacing, pointers[: len(symmetries)], radius, symmetries)
+    for values, target in zip(filtered, pointers[len(symmetries) :], strict=True):
+        _write(builder, values, target, spacing)
 
 
 @step(*[ADDRESS] * 4)
-def across_even(builder: Builder, source: Value, reach: Value, even: Value, target: Value) -> None:
-    """Write four pixels of 16 rows from `source` on, smoothed along x, to `target`."""
-    _across(builder, (EVEN,), source, reach, (even, target))
+def smooth_x(builder: Builder, source: Value, radius: Value, w0: Value, target: Value) -> None:
+    """Write four pixels of 16 rows, smoothed along x."""
+    _filter_x(builder, (EVEN,), source, radius, (w0, target))
 
 
 @step(*[ADDRESS] * 6)
-def across_even_odd(
-    builder: Builder, source: Value, reach: Value, even: Value, odd: Value, smooth: Value, slope: Value
-) -> None:
-    """Write four pixels of 16 rows, smoothed and derived once."""
-    _across(builder, (EVEN, ODD), source, reach, (even, odd, smooth, slope))
+def slope_x(builder: Builder, source: Value, radius: Value, w0: Value, w1: Value, smooth: Value, slope: Value) -> None:
+    """Write four pixels of 16 rows, smoothed and differentiated once along x."""
+    _filter_x(builder, (EVEN, ODD), source, radius, (w0, w1, smooth, slope))
 
 
 @step(*[ADDRESS] * 8)
-def across_all(
+def curve_x(
     builder: Builder,
     source: Value,
-    reach: Value,
-    even: Value,
-    odd: Value,
-    bend: Value,
+    radius: Value,
+    w0: Value,
+    w1: Value,
+    w2: Value,
     smooth: Value,
     slope: Value,
     curve: Value,
 ) -> None:
-    """Write four pixels of 16 rows, smoothed, derived once and derived twice."""
-    _across(builder, (EVEN, ODD, BEND), source, reach, (even, odd, bend, smooth, slope, curve))
+    """Write four pixels of 16 rows, smoothed and differentiated once and twice along x."""
+    _filter_x(builder, (EVEN, ODD, CENTRED), source, radius, (w0, w1, w2, smooth, slope, curve))
 
 
 @step(*[ADDRESS] * 9)
-def beside_all(
+def filter_interleaved_x(
     builder: Builder,
     source: Value,
-    reach: Value,
-    even: Value,
-    odd: Value,
-    bend: Value,
+    radius: Value,
+    w0: Value,
+    w1: Value,
+    w2: Value,
     smooth: Value,
     slope: Value,
     curve: Value,
     column: Value,
 ) -> None:
-    """Write 16 interleaved pixels of a row, smoothed, derived once and twice, as vectors `column` bytes apart."""
-    apart = ir.Constant(I64, 3 * _BYTES)
-    found = _emit(builder, source, apart, (even, odd, bend), reach, (EVEN, ODD, BEND), side_by_side=True)
-    for values, target in zip(found, (smooth, slope, curve), strict=True):
+    """Write 16 interleaved pixels of a row, filtered with all kernels, as vectors with a distance of `column` bytes."""
+    spacing = ir.Constant(I64, 3 * _FLOAT)
+    filtered = _emit_filter(builder, source, spacing, (w0, w1, w2), radius, (EVEN, ODD, CENTRED), side_by_side=True)
+    for values, target in zip(filtered, (smooth, slope, curve), strict=True):
         _write(builder, values, target, column)
 
 
 @step(*[ADDRESS] * 5)
-def down_even(builder: Builder, smooth: Value, reach: Value, even: Value, target: Value, pitch: Value) -> None:
-    """Write four rows of 16 numbers, smoothed along y, `pitch` bytes apart."""
-    (found,) = _emit(builder, smooth, ir.Constant(I64, LINE), (even,), reach, (EVEN,))
-    _write(builder, found, target, pitch)
+def smooth_y(builder: Builder, smooth: Value, radius: Value, w0: Value, target: Value, pitch: Value) -> None:
+    """Write four rows of 16 numbers, smoothed along y, with a distance of `pitch` bytes."""
+    (filtered,) = _emit_filter(builder, smooth, ir.Constant(I64, LINE), (w0,), radius, (EVEN,))
+    _write(builder, filtered, target, pitch)
 
 
 @step(*[ADDRESS] * 7)
-def down_gradient(
-    builder: Builder, smooth: Value, slope: Value, reach: Value, even: Value, odd: Value, target: Value, pitch: Value
+def gradient_y(
+    builder: Builder, smooth: Value, slope: Value, radius: Value, w0: Value, w1: Value, target: Value, pitch: Value
 ) -> None:
-    """Write the gradient's length from rows smoothed and derived along x."""
-    apart = ir.Constant(I64, LINE)
-    (along_x,) = _emit(builder, slope, apart, (even,), reach, (EVEN,))
-    (along_y,) = _emit(builder, smooth, apart, (odd,), reach, (ODD,))
-    lengths = [_root(builder, _fused(builder, x, x, builder.fmul(y, y))) for x, y in zip(along_x, along_y, strict=True)]
+    """Write the length of the gradient from rows smoothed and differentiated along x."""
+    spacing = ir.Constant(I64, LINE)
+    (along_x,) = _emit_filter(builder, slope, spacing, (w0,), radius, (EVEN,))
+    (along_y,) = _emit_filter(builder, smooth, spacing, (w1,), radius, (ODD,))
+    lengths = [_root(builder, _fma(builder, x, x, builder.fmul(y, y))) for x, y in zip(along_x, along_y, strict=True)]
     _write(builder, lengths, target, pitch)
 
 
 @step(*[ADDRESS] * 9)
-def down_curvature(
+def curvature_y(
     builder: Builder,
     smooth: Value,
     slope: Value,
     curve: Value,
-    reach: Value,
-    even: Value,
-    odd: Value,
-    bend: Value,
+    radius: Value,
+    w0: Value,
+    w1: Value,
+    w2: Value,
     target: Value,
     pitch: Value,
 ) -> None:
-    """Write √(f_xx² + 4 f_xy² + f_yy²) from rows smoothed, derived once, and derived twice along x."""
-    apart = ir.Constant(I64, LINE)
-    (xx,) = _emit(builder, curve, apart, (even,), reach, (EVEN,))
-    (xy,) = _emit(builder, slope, apart, (odd,), reach, (ODD,))
-    (yy,) = _emit(builder, smooth, apart, (bend,), reach, (BEND,))
-    sizes: list[Value] = []
+    """Write √(f_xx² + 4 f_xy² + f_yy²) from rows smoothed and differentiated once and twice along x."""
+    spacing = ir.Constant(I64, LINE)
+    (xx,) = _emit_filter(builder, curve, spacing, (w0,), radius, (EVEN,))
+    (xy,) = _emit_filter(builder, slope, spacing, (w1,), radius, (ODD,))
+    (yy,) = _emit_filter(builder, smooth, spacing, (w2,), radius, (CENTRED,))
+    magnitudes: list[Value] = []
     for a, b, c in zip(xx, xy, yy, strict=True):
         mixed = builder.fadd(b, b)
-        total = _fused(builder, a, a, _fused(builder, mixed, mixed, builder.fmul(c, c)))
-        sizes.append(_root(builder, total))
-    _write(builder, sizes, target, pitch)
+        total = _fma(builder, a, a, _fma(builder, mixed, mixed, builder.fmul(c, c)))
+        magnitudes.append(_root(builder, total))
+    _write(builder, magnitudes, target, pitch)
 
 
 @step(ADDRESS, ADDRESS)
@@ -255,31 +251,31 @@ def copy_line(builder: Builder, source: Value, target: Value) -> None:
 
 @step(*[ADDRESS] * 3)
 def transpose(builder: Builder, source: Value, pitch: Value, target: Value) -> None:
-    """Write the 16 x 16 numbers whose rows stand `pitch` bytes apart, transposed, to 16 cache lines at `target`."""
+    """Transpose 16 x 16 numbers with rows `pitch` bytes apart, and write 16 cache lines to `target`."""
     rows = [
         load(builder, builder.add(source, builder.mul(pitch, ir.Constant(I64, row))), 0, FLOATS) for row in range(LANES)
     ]
     size = LANES // 2
     while size:
-        # Squares of `size` numbers change places across the diagonal.
+        # Squares of `size` numbers are exchanged across the diagonal.
         upper = [lane if not lane & size else LANES + lane - size for lane in range(LANES)]
         lower = [lane + size if not lane & size else LANES + lane for lane in range(LANES)]
         for row in range(LANES):
             if not row & size:
                 pair = rows[row], rows[row + size]
-                for at, lanes in ((row, upper), (row + size, lower)):
-                    rows[at] = builder.shuffle_vector(*pair, constant(ir.VectorType(I32, LANES), lanes))
+                for i, lanes in ((row, upper), (row + size, lower)):
+                    rows[i] = builder.shuffle_vector(*pair, constant(ir.VectorType(I32, LANES), lanes))
         size //= 2
     for row, value in enumerate(rows):
         store(builder, value, target, LINE * row)
 
 
-GROUP: Final = LANES  # Rows that are filtered along x at a time: one a lane
-# Reach of kernels up to which rows are not transposed for order 2: its four transpositions a vector take longer than
-# loads that begin between two cache lines. Orders 0 and 1 have two and three, and are not faster so.
-NEAR: Final = 9
-# Numbers of a row that are converted before they are transposed: 16 rows of them take 12 KB of the nearest cache.
-STRETCH: Final = 4 * 3 * CHUNK
+ROW_GROUP: Final = LANES  # rows that are filtered together along x, one per lane
+# Largest kernel radius for which order 2 filters rows without transposing them. Its four transpositions per vector take
+# longer than unaligned loads (2 cycles per tap). Orders 0 and 1 need two and three, and are not faster that way.
+LARGEST_DIRECT_RADIUS: Final = 9
+# Numbers of a row that are converted before they are transposed: 16 rows take 12 KB of the first-level cache.
+ROW_BUFFER: Final = 4 * 3 * INTERLEAVED_PIXELS
 
 
 @inlined
@@ -288,7 +284,6 @@ def _convert(
     scale: float,
     line: npt.NDArray[np.float32],
 ) -> None:
-    """Write values (N,) times `scale` to `line` (N,) float32."""
     if scale == 1:
         for j in range(values.size):
             line[j] = np.float32(values[j])
@@ -298,35 +293,34 @@ def _convert(
 
 
 @compiled
-def _turn_rows(
+def _transpose_rows(
     image: npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64],
     scale: float,
     top: int,
     left: int,
     lines: npt.NDArray[np.float32],
-    turned: npt.NDArray[np.float32],
+    transposed: npt.NDArray[np.float32],
 ) -> None:
-    """Write 16 rows of an image (H, 3 W) from `top` on, times `scale`, transposed to `turned` (3 P + 16, 16) float32.
+    """Write 16 rows from `top` and P pixels from `left`, times `scale`, to `transposed` (3 P + 16, 16) float32.
 
-    Its P pixels begin with pixel `left`; beyond the image stand copies of its first and last pixels and of its last
-    row. `lines` (16, STRETCH) float32 is scratch.
+    Positions outside the image (H, 3 W) get copies of its edge. `lines` is a buffer (16, ROW_BUFFER) float32.
     """
     height, length = image.shape
     begin = max(0, 3 * left)
-    end = min(length, 3 * left + turned.shape[0] - LANES)
-    before = begin - 3 * left
-    for start in range(begin, end, STRETCH):
-        count = min(STRETCH, end - start)
-        for row in range(GROUP):
+    end = min(length, 3 * left + transposed.shape[0] - LANES)
+    padding = begin - 3 * left
+    for start in range(begin, end, ROW_BUFFER):
+        count = min(ROW_BUFFER, end - start)
+        for row in range(ROW_GROUP):
             values = image[min(top + row, height - 1), start : start + count]
             _convert(values, scale, lines[row, :count])
-        for at in range(0, count, LANES):
-            target = turned.ctypes.data + (start - 3 * left + at) * LINE
-            transpose(lines.ctypes.data + at * _BYTES, STRETCH * _BYTES, target)
-    for at in range(before):
-        turned[at] = turned[before + at % 3]
-    for at in range(end - 3 * left, turned.shape[0]):
-        turned[at] = turned[at - 3]
+        for i in range(0, count, LANES):
+            target = transposed.ctypes.data + (start - 3 * left + i) * LINE
+            transpose(lines.ctypes.data + i * _FLOAT, ROW_BUFFER * _FLOAT, target)
+    for i in range(padding):
+        transposed[i] = transposed[padding + i % 3]
+    for i in range(end - 3 * left, transposed.shape[0]):
+        transposed[i] = transposed[i - 3]
 
 
 @compiled
@@ -337,38 +331,35 @@ def _convert_row(
     left: int,
     line: npt.NDArray[np.float32],
 ) -> None:
-    """Write a row of an image (H, 3 W) times `scale`, from pixel `left` on, to `line` (3 P,) float32.
-
-    Beyond the image stand copies of its first and last pixels and of its last row.
-    """
+    # Positions outside the image get copies of its edge.
     height, length = image.shape
     begin = max(0, 3 * left)
     end = min(length, 3 * left + line.size)
     values = image[min(y, height - 1), begin:end]
-    before = begin - 3 * left
-    inside = line[before : before + end - begin]
+    padding = begin - 3 * left
+    inside = line[padding : padding + end - begin]
     _convert(values, scale, inside)
-    for at in range(before):
-        line[at] = inside[at % 3]
-    for at in range(before + inside.size, line.size):
-        line[at] = line[at - 3]
+    for i in range(padding):
+        line[i] = inside[i % 3]
+    for i in range(padding + inside.size, line.size):
+        line[i] = line[i - 3]
 
 
 @compiled
 def _filter_row(
     row: int, weights: npt.NDArray[np.float32], line: npt.NDArray[np.float32], columns: npt.NDArray[np.float32]
 ) -> None:
-    """Filter a row, as `_convert_row` wrote it from `reach` pixels before the tile on, to a row of three columns."""
-    reach = weights.shape[1] - 1
-    even = weights.ctypes.data
-    odd = even + weights.shape[1] * _BYTES
-    bend = odd + weights.shape[1] * _BYTES
+    # `line` starts `radius` pixels before the tile, see `_convert_row`.
+    radius = weights.shape[1] - 1
+    w0 = weights.ctypes.data
+    w1 = w0 + weights.shape[1] * _FLOAT
+    w2 = w1 + weights.shape[1] * _FLOAT
     column = columns.shape[2] * LINE
-    field = columns.shape[1] * column
-    for at in range(0, columns.shape[1], 3):
-        source = line.ctypes.data + 3 * reach * _BYTES + at * LINE
-        smooth = columns.ctypes.data + at * column + row * LINE
-        beside_all(source, reach, even, odd, bend, smooth, smooth + field, smooth + 2 * field, column)
+    plane = columns.shape[1] * column
+    for i in range(0, columns.shape[1], 3):
+        source = line.ctypes.data + 3 * radius * _FLOAT + i * LINE
+        smooth = columns.ctypes.data + i * column + row * LINE
+        filter_interleaved_x(source, radius, w0, w1, w2, smooth, smooth + plane, smooth + 2 * plane, column)
 
 
 @compiled
@@ -378,74 +369,73 @@ def filter_rows(
     top: int,
     left: int,
     rows: int,
-    done: int,
+    next_y: int,
     weights: npt.NDArray[np.float32],
     order: int,
     lines: npt.NDArray[np.float32],
-    turned: npt.NDArray[np.float32],
-    chunk: npt.NDArray[np.float32],
+    transposed: npt.NDArray[np.float32],
+    filtered: npt.NDArray[np.float32],
     columns: npt.NDArray[np.float32],
 ) -> int:
-    """Filter the rows of an image along x that a tile needs and the tile above it has not left.
+    """Filter rows of an image along x for one tile; rows in `columns` of the tile above are reused.
 
-    Returns the first row of the image that is not filtered, `done` of the tile below.
-
-    `image`: (H, 3 W) uint16, float32 or float64, rows of interleaved pixels. `scale`: factor for values that float32
-    does not hold. `weights`: (3, reach + 1) float32: the halves of the kernels of order 0, 1 and 2 from their centres
-    on. `lines`: (16, STRETCH) float32, scratch. `turned`: (Q + 6 reach + 16, 16) float32, scratch, its first number at
-    a cache line; Q, numbers of a row of the tile, is a multiple of 48. `chunk`: (order + 1, 48, 16) float32, scratch,
-    its first number at a cache line. `columns`: (order + 1, Q / 16, rows + 2 reach + 16, 16) float32: the filtered rows
-    in columns of 16 numbers, from row top - reach on; its first number at a cache line. What stands there of the tile
-    above is used.
+    `image`: (H, 3 W) uint16, float32 or float64, rows of interleaved pixels. `scale`: factor for values outside the
+    range of float32. `next_y`: first row that is not filtered yet; returned for the tile below. `weights`:
+    (3, radius + 1) float32, half kernels of order 0, 1 and 2 from their centre on. `columns`: (order + 1, Q / 16,
+    rows + 2 radius + 16, 16) float32, filtered rows from row top - radius on; Q, numbers per tile row, is a multiple of
+    48. Buffers: `lines` (16, ROW_BUFFER), `transposed` (Q + 6 radius + 16, 16) and `filtered` (order + 1, 48, 16)
+    float32. `columns`, `transposed` and `filtered` start at a cache line.
     """
-    reach = weights.shape[1] - 1
+    radius = weights.shape[1] - 1
     height = image.shape[0]
-    start = top - reach
-    even = weights.ctypes.data
-    odd = even + weights.shape[1] * _BYTES
-    bend = odd + weights.shape[1] * _BYTES
-    plane = chunk.shape[1] * LINE
-    kept = chunk.ctypes.data
+    start = top - radius
+    w0 = weights.ctypes.data
+    w1 = w0 + weights.shape[1] * _FLOAT
+    w2 = w1 + weights.shape[1] * _FLOAT
+    # Bytes of one order in `filtered`; of one column and of one order in `columns`.
+    block = filtered.shape[1] * LINE
+    blocks = filtered.ctypes.data
     column = columns.shape[2] * LINE
-    field = columns.shape[1] * column
+    plane = columns.shape[1] * column
     if top:
-        for at in range(columns.shape[1] * (order + 1)):
-            first = columns.ctypes.data + at * column
-            for row in range(done - start):
-                copy_line(first + (row + rows) * LINE, first + row * LINE)
-    line = turned.reshape(-1)[: columns.shape[1] * LANES + 6 * reach]
-    while done < min(height, top + rows + reach):
-        if order == 2 and reach <= NEAR:
-            for row in range(GROUP):
-                _convert_row(image, scale, done + row, left - reach, line)
-                _filter_row(done + row - start, weights, line, columns)
-            done += GROUP
+        for i in range(columns.shape[1] * (order + 1)):
+            column_start = columns.ctypes.data + i * column
+            for row in range(next_y - start):
+                copy_line(column_start + (row + rows) * LINE, column_start + row * LINE)
+    line = transposed.reshape(-1)[: columns.shape[1] * LANES + 6 * radius]
+    while next_y < min(height, top + rows + radius):
+        if order == 2 and radius <= LARGEST_DIRECT_RADIUS:
+            for row in range(ROW_GROUP):
+                _convert_row(image, scale, next_y + row, left - radius, line)
+                _filter_row(next_y + row - start, weights, line, columns)
+            next_y += ROW_GROUP
             continue
-        _turn_rows(image, scale, done, left - reach, lines, turned)
-        to = columns.ctypes.data + (done - start) * LINE
-        for at in range(0, columns.shape[1], 3):
+        _transpose_rows(image, scale, next_y, left - radius, lines, transposed)
+        target = columns.ctypes.data + (next_y - start) * LINE
+        for i in range(0, columns.shape[1], 3):
             for channel in range(3):
-                for pixel in range(0, CHUNK, OUTPUTS):
-                    source = turned.ctypes.data + (3 * reach + at * LANES + 3 * pixel + channel) * LINE
-                    smooth = kept + (3 * pixel + channel) * LINE
+                for pixel in range(0, INTERLEAVED_PIXELS, OUTPUTS):
+                    source = transposed.ctypes.data + (3 * radius + i * LANES + 3 * pixel + channel) * LINE
+                    smooth = blocks + (3 * pixel + channel) * LINE
                     if order == 0:
-                        across_even(source, reach, even, smooth)
+                        smooth_x(source, radius, w0, smooth)
                     elif order == 1:
-                        across_even_odd(source, reach, even, odd, smooth, smooth + plane)
+                        slope_x(source, radius, w0, w1, smooth, smooth + block)
                     else:
-                        across_all(source, reach, even, odd, bend, smooth, smooth + plane, smooth + 2 * plane)
-            for one in range(order + 1):
-                for part in range(3):
-                    transpose(kept + one * plane + part * LANES * LINE, LINE, to + one * field + (at + part) * column)
-        done += GROUP
-    for at in range(columns.shape[1] * (order + 1)):
-        first = columns.ctypes.data + at * column
+                        curve_x(source, radius, w0, w1, w2, smooth, smooth + block, smooth + 2 * block)
+            for n in range(order + 1):
+                for vector in range(3):
+                    source = blocks + n * block + vector * LANES * LINE
+                    transpose(source, LINE, target + n * plane + (i + vector) * column)
+        next_y += ROW_GROUP
+    for i in range(columns.shape[1] * (order + 1)):
+        column_start = columns.ctypes.data + i * column
         if not top:
-            for row in range(reach):
-                copy_line(first + reach * LINE, first + row * LINE)
-        for row in range(done - start, rows + 2 * reach):
-            copy_line(first + (row - 1) * LINE, first + row * LINE)
-    return done
+            for row in range(radius):
+                copy_line(column_start + radius * LINE, column_start + row * LINE)
+        for row in range(next_y - start, rows + 2 * radius):
+            copy_line(column_start + (row - 1) * LINE, column_start + row * LINE)
+    return next_y
 
 
 @compiled
@@ -458,103 +448,100 @@ def filter_columns(
 ) -> None:
     """Write the size of the Gaussian derivative of rows that are filtered along x to `out`.
 
-    `columns`: (order + 1, Q / 16, R, 16) float32, what `filter_rows` wrote: R ≥ rows + 2 reach, rows rounded up to
-    fours. `weights`: (3, reach + 1) float32: the halves of the kernels of order 0, 1 and 2 from their centres on.
-    `out`: (rows, Q) or longer float32, its first number at a cache line.
+    `columns`: (order + 1, Q / 16, R, 16) float32 from `filter_rows`, R ≥ rows + 2 radius, rows a multiple of 4.
+    `weights`: as in `filter_rows`. `out`: (rows, Q) or longer float32, starts at a cache line.
     """
-    reach = weights.shape[1] - 1
-    even = weights.ctypes.data
-    odd = even + weights.shape[1] * _BYTES
-    bend = odd + weights.shape[1] * _BYTES
+    radius = weights.shape[1] - 1
+    w0 = weights.ctypes.data
+    w1 = w0 + weights.shape[1] * _FLOAT
+    w2 = w1 + weights.shape[1] * _FLOAT
     column = columns.shape[2] * LINE
-    field = columns.shape[1] * column
-    pitch = out.shape[1] * _BYTES
-    for at in range(columns.shape[1]):
+    plane = columns.shape[1] * column
+    pitch = out.shape[1] * _FLOAT
+    for i in range(columns.shape[1]):
         for y in range(0, rows, OUTPUTS):
-            smooth = columns.ctypes.data + at * column + (y + reach) * LINE
-            target = out.ctypes.data + y * pitch + at * LINE
+            smooth = columns.ctypes.data + i * column + (y + radius) * LINE
+            target = out.ctypes.data + y * pitch + i * LINE
             if order == 0:
-                down_even(smooth, reach, even, target, pitch)
+                smooth_y(smooth, radius, w0, target, pitch)
             elif order == 1:
-                down_gradient(smooth, smooth + field, reach, even, odd, target, pitch)
+                gradient_y(smooth, smooth + plane, radius, w0, w1, target, pitch)
             else:
-                down_curvature(smooth, smooth + field, smooth + 2 * field, reach, even, odd, bend, target, pitch)
+                curvature_y(smooth, smooth + plane, smooth + 2 * plane, radius, w0, w1, w2, target, pitch)
 
 
-# Pixels of a tile's width at most, a multiple of 16: narrower, and more of a row is neighbours of the tile.
+# Largest width of a tile, px, a multiple of 16. Neighbours of narrower tiles are a larger part of each row.
 TILE_WIDTH = 256
-# Rows of a tile, a multiple of 16: with the widest standard kernels a tile's intermediate results take 0.8 MB at
-# most, which a core's cache holds.
+# Rows of a tile, a multiple of 16. With the widest standard kernels, intermediate results take up to 0.8 MB, which fit
+# into the cache of a core.
 TILE_ROWS = 64
 
-_ALIGNMENT = 64  # Bytes of a cache line: aligned buffers make a third of the difference between two loads and three
+_ALIGNMENT = 64  # bytes of a cache line; unaligned buffers are slower
 
 
 def gaussian_kernel(sigma: float, order: int) -> npt.NDArray[np.float64]:
-    """Return the kernel (N,) float64 of a Gaussian's derivative, to be correlated with; N = 2⌊3σ + ½⌋ + 1.
+    """Return the correlation kernel (N,) float64 of a Gaussian derivative; N = 2⌊3σ + ½⌋ + 1, σ > 0 in px.
 
-    Normalised on the grid of pixels: order 0 sums to 1; order 1 gives 1 for the ramp x; order 2 gives 1 for x²/2 and 0
-    for a constant.
-
-    `sigma`: standard deviation of the Gaussian, px, above 0.
+    Normalised on the pixel grid: order 0 has the sum 1; order 1 returns 1 for the ramp x; order 2 returns 1 for x²/2
+    and 0 for a constant.
 
     Examples
     --------
     >>> gaussian_kernel(0.5, 1).round(3)
     array([-0.002, -0.495,  0.   ,  0.495,  0.002])
     """
-    reach = math.floor(3 * sigma + 0.5)
-    x = np.arange(-reach, reach + 1, dtype=np.float64)
+    radius = math.floor(3 * sigma + 0.5)
+    x = np.arange(-radius, radius + 1, dtype=np.float64)
     bell = np.exp(-(x**2) / (2 * sigma**2))
     if order == 0:
         return bell / bell.sum()
     if order == 1:
         slope = x * bell
         return slope / (x * slope).sum()
-    bend = (x**2 / sigma**4 - 1 / sigma**2) * bell
-    bend -= bend.mean()
-    return bend / (0.5 * x**2 * bend).sum()
+    curve = (x**2 / sigma**4 - 1 / sigma**2) * bell
+    curve -= curve.mean()
+    return curve / (0.5 * x**2 * curve).sum()
 
 
-def put_tile(found: npt.NDArray[np.float32], top: int, left: int, tile: npt.NDArray[np.float32]) -> None:
-    """Write a tile of `differentiated_tiles`, (rows, Q) float32, to its place in an image (H, W, 3) float32."""
-    wide = min(tile.shape[1] // 3, found.shape[1] - left)
-    found[top : top + len(tile), left : left + wide] = tile[:, : 3 * wide].reshape(len(tile), wide, 3)
+def put_tile(image: npt.NDArray[np.float32], top: int, left: int, tile: npt.NDArray[np.float32]) -> None:
+    """Write a tile of `differentiated_tiles`, (rows, Q) float32, to an image (H, W, 3) float32."""
+    tile_width = min(tile.shape[1] // 3, image.shape[1] - left)
+    image[top : top + len(tile), left : left + tile_width] = tile[:, : 3 * tile_width].reshape(len(tile), tile_width, 3)
 
 
 def differentiated_tiles(
     image: Image, order: int, sigma: float, scale: float
 ) -> Iterator[tuple[int, int, npt.NDArray[np.float32]]]:
-    """Yield the Gaussian derivative of an image times `scale` in tiles, from top to bottom and then from left to right.
+    """Yield the Gaussian derivative of an image (H, W, 3) ≥ 0 in tiles, from top to bottom and then from left to right.
 
-    `image`: (H, W, 3) uint16, float32 or float64, not below 0. `order`, `sigma`: of the derivative, 0 to 2, and its
-    scale, px, above 0. `scale`: factor for values that float32 does not hold. Yields the tile's first row and pixel;
-    (rows, Q) float32, interleaved pixels, of which those within the image count. The array is written anew for the next
-    tile.
+    `order` is 0 to 2, `sigma` in px, above 0; `scale` is a factor for values outside the range of float32. Yields the
+    first row and pixel of a tile and (rows, Q) float32, interleaved pixels, which may extend beyond the image. The next
+    tile overwrites the array.
     """
     height, width = image.shape[:2]
     flat: Any = image.reshape(height, -1)
-    kernels = [gaussian_kernel(sigma, one) for one in range(3)]
-    reach = len(kernels[0]) // 2
-    weights = np.stack([kernel[reach:] for kernel in kernels]).astype(np.float32)
-    across = -(-width // TILE_WIDTH)  # tiles of equal width
-    wide = -(-width // (across * CHUNK)) * CHUNK
-    pitch = 3 * wide
-    most = min(TILE_ROWS, -(-height // GROUP) * GROUP)
-    lines, turned = np.zeros((GROUP, STRETCH), np.float32), _aligned((pitch + 6 * reach + LANES, LANES))
-    chunk = _aligned((order + 1, 3 * CHUNK, LANES))
-    columns = _aligned((order + 1, pitch // LANES, most + 2 * reach + GROUP, LANES))
-    out = _aligned((most, pitch))
-    for left in range(0, width, wide):
-        done = 0
-        for top in range(0, height, most):
-            done = filter_rows(flat, scale, top, left, most, done, weights, order, lines, turned, chunk, columns)
-            filter_columns(columns, weights, order, most, out)
+    kernels = [gaussian_kernel(sigma, kernel_order) for kernel_order in range(3)]
+    radius = len(kernels[0]) // 2
+    weights = np.stack([kernel[radius:] for kernel in kernels]).astype(np.float32)
+    tile_count = -(-width // TILE_WIDTH)  # tiles of equal width
+    tile_width = -(-width // (tile_count * INTERLEAVED_PIXELS)) * INTERLEAVED_PIXELS
+    pitch = 3 * tile_width
+    tile_rows = min(TILE_ROWS, -(-height // ROW_GROUP) * ROW_GROUP)
+    lines, transposed = np.zeros((ROW_GROUP, ROW_BUFFER), np.float32), _aligned((pitch + 6 * radius + LANES, LANES))
+    filtered = _aligned((order + 1, 3 * INTERLEAVED_PIXELS, LANES))
+    columns = _aligned((order + 1, pitch // LANES, tile_rows + 2 * radius + ROW_GROUP, LANES))
+    out = _aligned((tile_rows, pitch))
+    for left in range(0, width, tile_width):
+        next_y = 0
+        for top in range(0, height, tile_rows):
+            next_y = filter_rows(
+                flat, scale, top, left, tile_rows, next_y, weights, order, lines, transposed, filtered, columns
+            )
+            filter_columns(columns, weights, order, tile_rows, out)
             yield top, left, out[: height - top]
 
 
 def _aligned(shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
-    """Return an array of float32 that begins at a cache line."""
     spare = _ALIGNMENT // 4
     memory = np.empty(math.prod(shape) + spare, dtype=np.float32)
     start = -memory.ctypes.data // 4 % spare

@@ -1,11 +1,9 @@
-"""The Gray-Edge framework: the light is the Minkowski mean of an image or of its derivatives.
+"""The Gray-Edge framework: the estimate is the Minkowski mean of an image or of its derivatives.
 
 J. van de Weijer, T. Gevers, A. Gijsenij, "Edge-based color constancy", IEEE Transactions on Image Processing 16(9),
 2007, equation 13: ``e ∝ (∫ |∂ⁿ f_σ / ∂xⁿ|ᵖ dx)^(1/p)`` for each channel. With n = 0 and σ = 0 it is Gray-world (p = 1),
-White-Patch (p = ∞) and Shades-of-Gray; with n = 0 general Gray-world. Filters are those of the authors' program, see
-`gaussian.py`. What is left out is so too, pixels along the edges included, where there is a filter. Without one (σ = 0)
-nothing of a pixel comes from beyond the edge, so every pixel counts, and the estimate is what NumPy's mean, root mean
-square or maximum gives.
+White-Patch (p = ∞) and Shades-of-Gray; with n = 0 general Gray-world. Filters and excluded pixels follow the authors'
+program, see `gaussian.py`.
 """
 
 from __future__ import annotations
@@ -23,14 +21,23 @@ from evaluation.methods.prepared import PreparedImage, PreparedMethod, unit
 class GrayEdge(PreparedMethod):
     """One method of the framework.
 
-    - `name`: its name in tables.
-    - `order`: n, order of the derivative: 0, 1 or 2.
-    - `p`: Minkowski norm, ≥ 1; infinity takes the maximum.
-    - `sigma`: scale of the Gaussian, px; 0 for none, which only order 0 allows.
-    - `border`: pixels left out along every edge; by default 0 where σ is 0, else ⌊σ⌋ + 1 as in the authors' program,
-      which leaves out 1 px for σ = 0 too.
+    Parameters
+    ----------
+    name
+        Name in tables.
+    order
+        n, order of the derivative: 0, 1 or 2.
+    p
+        Minkowski norm, ≥ 1; infinity for the maximum.
+    sigma
+        Scale of the Gaussian, px; 0 for no filter, which is only possible with order 0.
+    border
+        Pixels excluded along every edge; None for 0 if σ is 0, else ⌊σ⌋ + 1.
 
-    Raises `ValueError`: order, norm and scale make no method of the framework.
+    Raises
+    ------
+    ValueError
+        The combination of order, norm and scale is not possible.
 
     Examples
     --------
@@ -50,17 +57,18 @@ class GrayEdge(PreparedMethod):
     def __post_init__(self) -> None:
         if self.order not in (0, 1, 2) or self.p < 1 or self.sigma < 0 or (self.order and not self.sigma):
             raise ValueError(
-                f"order {self.order}, p {self.p}, sigma {self.sigma} make no method of the framework; expected order 0 "
-                "to 2, p from 1, and sigma from 0, above 0 for a derivative"
+                f"order {self.order}, p {self.p}, sigma {self.sigma}; expected order 0 to 2, p of 1 or more, and sigma "
+                "of 0 or more, above 0 for a derivative; correct them"
             )
 
     @property
-    def left_out(self) -> int:
-        """Pixels left out along every edge."""
+    def border_width(self) -> int:
+        """Pixels excluded along every edge."""
         if self.border is not None:
             return self.border
+        # The authors' program excludes 1 px for σ = 0 too. Without a filter no pixel depends on values beyond the edge.
         return math.floor(self.sigma) + 1 if self.sigma else 0
 
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
-        return unit(prepared.norm(self.order, self.sigma, self.p, self.left_out))
+        """Return the estimate for a prepared image, (3,) float64, camera RGB of length 1."""
+        return unit(prepared.norm(self.order, self.sigma, self.p, self.border_width))

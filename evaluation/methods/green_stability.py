@@ -1,10 +1,9 @@
-"""Tune a method's parameters on images whose light nobody knows, by the green stability assumption.
+"""Tune parameters of a method on images without ground truth, by the green stability assumption.
 
 N. Banić, S. Lončarić, "Green stability assumption: unsupervised learning for statistics-based illumination estimation",
-Journal of Imaging 4(11), 2018 (arXiv 1802.00776): lights differ much in red and blue chromaticity and little in green,
-so of several sets of parameters the one whose estimates spread least in green chromaticity is taken to be the best.
-Here the spread is the standard deviation of g / (r + g + b) over the images; that is our reading of the paper, a
-reconstruction. Images for which any of the candidates gives no light are left out for all of them.
+Journal of Imaging 4(11), 2018 (arXiv 1802.00776). Illuminants differ much in red and blue chromaticity and little in
+green. The best parameters are those whose estimates vary least in green chromaticity. *Reconstruction*: the variation
+is the standard deviation of g / (r + g + b) over the images.
 """
 
 from __future__ import annotations
@@ -22,34 +21,34 @@ from evaluation.scene import Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
-_FEWEST_IMAGES = 2  # Images that a spread is found of
+_MIN_IMAGES = 2  # smallest number of images for a standard deviation
 
 
 @dataclass(frozen=True, eq=False)
-class Tuned:
-    """What tuning found.
+class TuningResult:
+    """Result of tuning.
 
-    - `best`: the candidate with the least spread, the first of equals.
-    - `candidates`: all of them.
-    - `spreads`: standard deviation of the green chromaticity of each one's estimates.
-    - `lights`: (M, C, 3) float64, camera RGB of length 1: the candidates' estimates for each image that counts.
-    - `counted`: (N,) bool, True for an image that counts.
+    - `best`: candidate with the smallest spread, the first of equals.
+    - `candidates`: C methods.
+    - `spreads`: standard deviation of the green chromaticity of the estimates, for each candidate.
+    - `lights`: (M, C, 3) float64, camera RGB of length 1: estimates for each of M images with estimates.
+    - `has_estimates`: (N,) bool, True for images with estimates of all candidates; others are excluded.
     """
 
     best: Method
     candidates: tuple[Method, ...]
     spreads: tuple[float, ...]
     lights: npt.NDArray[np.float64]
-    counted: npt.NDArray[np.bool_]
+    has_estimates: npt.NDArray[np.bool_]
 
 
 def tune(
-    candidates: Sequence[Method],
-    scenes: Sequence[Scene],
-    on_scene: Callable[[], None] | None = None,
-    workers: int = 1,
-) -> Tuned:
-    """Find the candidate whose estimates spread least in green chromaticity; ground truths are not looked at.
+    candidates: Sequence[Method], scenes: Sequence[Scene], on_scene: Callable[[], None] | None = None, workers: int = 1
+) -> TuningResult:
+    """Return the candidate whose estimates vary least in green chromaticity; ground truths are not used.
+
+    `on_scene` is called after each image; `workers` is the number of threads. Raises InputError if fewer than two
+    images have estimates of all candidates.
 
     Examples
     --------
@@ -68,31 +67,31 @@ def tune(
     >>> tune([find_method(text) for text in family_names("shades-of-gray")], walls).best.name
     'Shades-of-Gray (p=1)'
     """
-    if len(candidates) < 2 or len(scenes) < _FEWEST_IMAGES:
-        raise InputError(f"{len(candidates)} sets of parameters on {len(scenes)} images; expected 2 or more of each")
+    if len(candidates) < 2 or len(scenes) < _MIN_IMAGES:
+        raise InputError(f"{len(candidates)} candidates and {len(scenes)} images, expected 2 or more of each; add some")
 
     def estimates(scene: Scene) -> list[npt.NDArray[np.float64]]:
         image, mask = scene.read()
         lights = estimate_all(candidates, image, scene.saturation, mask)
         return [np.full(3, np.nan) if light is GREY else light for light in lights]
 
-    every = np.array(list(report_progress(ordered_map(estimates, scenes, workers), on_scene)))
-    counted = np.asarray(np.isfinite(every).all(axis=(1, 2)))
-    given = every[counted]
-    if len(given) < _FEWEST_IMAGES:
+    all_estimates = np.array(list(report_progress(ordered_map(estimates, scenes, workers), on_scene)))
+    is_complete = np.asarray(np.isfinite(all_estimates).all(axis=(1, 2)))
+    complete = all_estimates[is_complete]
+    if len(complete) < _MIN_IMAGES:
         raise InputError(
-            f"only {len(given)} of {len(scenes)} images give a light with every set of parameters; expected 2 or "
-            "more: use larger images or smaller scales"
+            f"{len(complete)} of {len(scenes)} images have estimates for all parameters, expected 2 or more; use "
+            "larger images or smaller scales"
         )
-    spreads = np.std(given[:, :, 1] / given.sum(axis=2), axis=0)
+    spreads = np.std(complete[:, :, 1] / complete.sum(axis=2), axis=0)
     best = candidates[int(spreads.argmin())]
-    return Tuned(best, tuple(candidates), tuple(map(float, spreads)), given, counted)
+    return TuningResult(best, tuple(candidates), tuple(map(float, spreads)), complete, is_complete)
 
 
 def family_names(name: str) -> tuple[str, ...]:
-    """Return what `naming.find_method` takes for each candidate of a family.
+    """Return the names of the candidates of a family, see `naming.find_method`.
 
-    Norms 1 to 15 without a scale; with scales of 1 to 9 px six norms up to 13.
+    Shades-of-Gray has the norms 1 to 15; other families have six norms up to 13, each with scales of 1 to 9 px.
 
     Examples
     --------
@@ -100,7 +99,7 @@ def family_names(name: str) -> tuple[str, ...]:
     (('shades-of-gray:p=1', 'shades-of-gray:p=2'), 'gray-edge-1:p=13:sigma=9')
     """
     if name not in FAMILIES:
-        raise InputError(f"{name!r} is no family of methods to tune; the families are {', '.join(FAMILIES)}")
+        raise InputError(f"family {name!r} cannot be tuned, expected {', '.join(FAMILIES)}; choose one of these")
     if name == "shades-of-gray":
         return tuple(f"{name}:p={p}" for p in range(1, 16))
     return tuple(f"{name}:p={p}:sigma={sigma}" for sigma in (1, 2, 4, 6, 9) for p in (1, 2, 4, 6, 9, 13))

@@ -1,7 +1,7 @@
-"""What every method of illumination estimation is to the code that runs it.
+"""Contracts of methods that estimate the illuminant of an image.
 
-A method is a value with a name and `estimate(image, saturation, mask)`. Two kinds can do more: a `LocalMethod` gives
-the light of every pixel, and a `Learner` is fitted to scenes first and gives the method that it has learned.
+A `Method` has a name and `estimate(image, saturation, mask)`. A `LocalMethod` also estimates the illuminant of every
+pixel. A `Learner` is fitted to scenes and returns a method.
 """
 
 from __future__ import annotations
@@ -18,58 +18,83 @@ __all__ = ["Image", "Learner", "LocalMethod", "Method"]
 
 
 class Method(Protocol):
-    """An illumination estimation method with its parameters fixed."""
+    """A method with fixed parameters that estimates the illuminant of an image."""
 
     @property
     def name(self) -> str:
-        """The method's name in tables."""
+        """Name of the method in tables."""
         ...
 
     def estimate(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float64]:
-        """Return the estimated light (3,) float64, camera RGB of length 1; `GREY` of `prepared` if no pixel is usable.
+        """Return the estimated illuminant of an image.
 
         Parameters
         ----------
         image
-            (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, black subtracted, any unit.
+            (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, black level subtracted, any unit.
         saturation
-            Value in that unit from which a pixel is clipped and not used; None if none is.
+            Value in the unit of the image from which a pixel is clipped and not used; None if no pixel is clipped.
         mask
-            (H, W) bool, True where a pixel must not be used.
+            (H, W) bool, True for pixels that must not be used; None if all may be used.
+
+        Returns
+        -------
+        numpy.ndarray
+            (3,) float64, linear camera RGB of length 1. If no pixel is usable, the object `prepared.GREY` itself.
         """
         ...
 
 
 @runtime_checkable
 class LocalMethod(Method, Protocol):
-    """A method that estimates the light of every pixel, for scenes under several lights."""
+    """A method that also estimates the illuminant of every pixel, for scenes under several illuminants."""
 
     def estimate_map(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float32]:
-        """Return the estimated light of each pixel: (H, W, 3) float32, r + g + b = 1; see `Method.estimate`."""
+        """Return the estimated illuminant of each pixel.
+
+        Parameters
+        ----------
+        image
+            (H, W, 3), see `Method.estimate`.
+        saturation
+            See `Method.estimate`.
+        mask
+            (H, W) bool, see `Method.estimate`.
+
+        Returns
+        -------
+        numpy.ndarray
+            (H, W, 3) float32, linear camera RGB, r + g + b = 1.
+        """
         ...
 
 
 @runtime_checkable
 class Learner(Protocol):
-    """A method that has yet to be fitted to scenes with known lights."""
+    """A method that must be fitted to scenes with ground truth before use."""
 
     @property
     def name(self) -> str:
-        """The method's name in tables."""
+        """Name of the method in tables."""
         ...
 
     def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Method:
-        """Return the method fitted to scenes; a class that keeps what it has learned in itself may return itself.
+        """Return the method fitted to scenes.
 
         Parameters
         ----------
         scenes
-            The training images with their ground truths, at least one.
+            Training images with their ground truths, at least one.
         seed
-            Of all that is random in the fit: the same seed and scenes give the same method.
+            Seed of all random numbers: equal seeds and scenes must result in equal methods.
+
+        Returns
+        -------
+        Method
+            The fitted method. A learner that stores its model in itself may return itself.
         """
         ...

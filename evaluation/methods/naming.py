@@ -1,17 +1,17 @@
-"""Find a method by what a user types: a name of this suite, a class of an installed module, or a class in a file.
+"""Return a method by its name: a method of this suite, a class of an installed module, or a class in a file.
 
     gray-edge-1            a method of `standard.standard_methods`
-    gray-edge-1:p=4:sigma=2, shades-of-gray:p=6      the same with other parameters, of the Gray-Edge framework
-    package.module:Class   a class or value of a module that Python finds, also beside the working folder
-    path/file.py:Class     a class or value of a file; what stands beside the file can be imported by it
+    gray-edge-1:p=4:sigma=2, shades-of-gray:p=6      a method of the Gray-Edge framework with other parameters
+    package.module:Class   a class or value of an installed module or of one in the working folder
+    path/file.py:Class     a class or value of a file, which can import modules of its folder
 
-and any of these with what is done around it:
+All of these can have a suffix:
 
-    gray-edge-2@360        on images shrunk to 360 px along their longer side (`resized.ResizedMethod`)
-    gray-world@patches     by 8 patches along the shorter side, for several lights (`patchwise.PatchwiseMethod`)
-    gray-world@patches=12  by 12
+    gray-edge-2@360        for images shrunk to 360 px along their longer side (`wrapped.ResizedMethod`)
+    gray-world@patches     for 8 patches along the shorter side, with several illuminants (`wrapped.PatchwiseMethod`)
+    gray-world@patches=12  for 12 patches
 
-A class is made without arguments; a value is taken as it is. A file of ten lines is enough::
+A class is called without arguments; a value is used unchanged. A file of ten lines is sufficient::
 
     import numpy as np
 
@@ -24,7 +24,7 @@ A class is made without arguments; a value is taken as it is. A file of ten line
             light = pixels[pixels.sum(axis=1).argmax()]
             return light / np.linalg.norm(light)
 
-Python of the file and the module is run: name only what you trust.
+The code of the file or module is run, so use only trusted ones.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ from foundation.version import PACKAGES, require_own_packages
 if TYPE_CHECKING:
     from evaluation.methods.method import Learner, Method
 
-FAMILIES = ("shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2")  # The methods that take parameters
+FAMILIES = ("shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2")  # methods with parameters
 
 _MODIFIERS = re.compile(r"(?P<size>[0-9]{1,6})|patches(=(?P<patches>[0-9]{1,6}))?")
 
-# Scale of a Gaussian that a text may ask for, px: no image has structure beyond, and the filter's width is bounded.
+# Largest scale of a Gaussian, px: no image has larger structures, and the width of the filter must be limited.
 LARGEST_SIGMA = 1000
 
 _FORMS = "a name of this suite, module:Class or path/file.py:Class"
 
 
 def find_method(text: str) -> Method | Learner:
-    """Return the method or learner that a text names.
+    """Return the method or learner with a name, see the module docstring; raise InputError if there is none.
 
     Examples
     --------
@@ -75,144 +75,144 @@ def find_method(text: str) -> Method | Learner:
     >>> find_method("gray-world@patches=4").name
     'Gray-world by patches'
     """
-    wanted = text.strip()
-    inner, at, around = wanted.rpartition("@")
-    changed = _MODIFIERS.fullmatch(around) if at else None
-    if changed is not None:
-        method = find_method(inner)
+    name = text.strip()
+    inner_name, separator, suffix = name.rpartition("@")
+    modifier = _MODIFIERS.fullmatch(suffix) if separator else None
+    if modifier is not None:
+        method = find_method(inner_name)
         if not callable(getattr(method, "estimate", None)):
-            raise InputError(f"{inner} is fitted first, so there is no {wanted}; train it, and give its model instead")
-        number = int(changed["size"] or changed["patches"] or PATCHES)
+            raise InputError(f"{name}: {inner_name} is not trained, expected a trained method; give its model instead")
+        number = int(modifier["size"] or modifier["patches"] or PATCHES)
         if not number:
-            raise InputError(f"{wanted}: expected a number above 0 after @")
-        if changed["size"]:
+            raise InputError(f"{name}: {number} after @, expected 1 or more; correct it")
+        if modifier["size"]:
             return ResizedMethod(cast("Method", method), number)
         return PatchwiseMethod(cast("Method", method), number)
-    family, colon, given = wanted.partition(":")
+    family, colon, parameters = name.partition(":")
     if colon and family in standard_methods():
-        return _with_parameters(family, given)
-    place, colon, name = wanted.rpartition(":")
+        return _parse_parameters(family, parameters)
+    location, colon, class_name = name.rpartition(":")
     if not colon:
-        known = {**standard_methods(), **local_methods()}
-        if wanted in known:
-            return known[wanted]
-        near = nearest_names(wanted, known) or f"the methods are {', '.join(known)}"
-        raise InputError(f"{wanted!r} is no method; {near}; module:Class or a file names one of your own")
-    if not place or not name:
-        raise InputError(f"{wanted!r} names no method; expected {_FORMS}")
-    is_file = place.endswith(".py")
-    module = _module_of_file(Path(place)) if is_file else _module_by_name(place)
-    found = getattr(module, name, None)
-    if found is None and place in PACKAGES and Path(f"{place}.py").is_file():
+        methods = {**standard_methods(), **local_methods()}
+        if name in methods:
+            return methods[name]
+        suggestion = nearest_names(name, methods) or f"the methods are {', '.join(methods)}"
+        raise InputError(f"method {name!r} is unknown; {suggestion}; give your own as module:Class or file.py:Class")
+    if not location or not class_name:
+        raise InputError(f"method {name!r} is incomplete, expected {_FORMS}; complete it")
+    is_file = location.endswith(".py")
+    module = _load_file(Path(location)) if is_file else _load_module(location)
+    candidate = getattr(module, class_name, None)
+    if candidate is None and location in PACKAGES and Path(f"{location}.py").is_file():
         raise InputError(
-            f"{wanted}: {place} is a package of this suite, which has no {name!r}; for the file of that name write "
-            f"{place}.py:{name}"
+            f"{name}: {location} is a package of this suite without {class_name!r}; for your file of that name, give "
+            f"{location}.py:{class_name}"
         )
-    if found is None:
-        others = ", ".join(sorted(one for one in vars(module) if _looks_like_method(module, one))) or "none"
-        raise InputError(f"{place} has no {name!r}; its classes with estimate or fit: {others}")
-    if isinstance(found, type):
+    if candidate is None:
+        alternatives = ", ".join(sorted(key for key in vars(module) if _looks_like_method(module, key))) or "none"
+        raise InputError(f"{location} has no {class_name!r}, expected a class with estimate or fit: {alternatives}")
+    if isinstance(candidate, type):
         try:
-            found = cast("object", found())
+            candidate = cast("object", candidate())
         except (Exception, SystemExit) as error:
             raise InputError(
-                f"{wanted} cannot be made without arguments: {_fault(error)}; give its parameters defaults, or name a "
-                "value of the file instead of the class"
+                f"{name} cannot be called without arguments: {_describe_failure(error)}; add defaults to its "
+                "parameters, or give a value of the file instead of the class"
             ) from error
-    return checked_method(found, wanted)
+    return check_method(candidate, name)
 
 
-def _with_parameters(family: str, given: str) -> Method:
-    """Return a method of the Gray-Edge framework with the parameters of a text: "p=4:sigma=2", in either order."""
+def _parse_parameters(family: str, parameters: str) -> Method:
+    # `parameters` is "p=4:sigma=2", in any order.
     standard = standard_methods()[family]
     if family not in FAMILIES or not isinstance(standard, GrayEdge):
-        raise InputError(f"{family} takes no parameters; those that do are {', '.join(FAMILIES)}")
-    known = ("p", "sigma") if standard.sigma else ("p",)
+        raise InputError(f"{family} has no parameters, expected one of {', '.join(FAMILIES)}; remove the parameters")
+    parameter_names = ("p", "sigma") if standard.sigma else ("p",)
     values: dict[str, float] = {}
-    for part in given.split(":"):
-        name, _, text = part.partition("=")
+    for assignment in parameters.split(":"):
+        name, _, text = assignment.partition("=")
         try:
             value = float(text)
         except ValueError:
             value = math.nan
-        if name not in known or name in values or math.isnan(value):
-            expected = " and ".join(f"{name}=NUMBER" for name in known)
-            raise InputError(f"{family}:{given}: {part!r} is no parameter, expected {expected}, once each, between :")
+        if name not in parameter_names or name in values or math.isnan(value):
+            expected = " and ".join(f"{name}=NUMBER" for name in parameter_names)
+            raise InputError(f"{family}:{parameters}: {assignment!r}, expected {expected}, once each, separated by :")
         values[name] = value
     p, sigma = values.get("p", standard.p), values.get("sigma", standard.sigma)
     if p < 1 or sigma > LARGEST_SIGMA or (standard.sigma and sigma <= 0):
         raise InputError(
-            f"{family}:{given}: p {p:g} and sigma {sigma:g} make no method, expected p from 1 and sigma above 0, up to "
-            f"{LARGEST_SIGMA} px"
+            f"{family}:{parameters}: p {p:g} and sigma {sigma:g}, expected p of 1 or more and sigma above 0, up to "
+            f"{LARGEST_SIGMA} px; correct them"
         )
     title = standard.name.partition(" (")[0]
     scale = f", σ={sigma:g}" if standard.sigma else ""
     return GrayEdge(f"{title} (p={p:g}{scale})", standard.order, p, sigma)
 
 
-def checked_method(found: object, place: str) -> Method | Learner:
-    """Return an object that is a method or a learner.
+def check_method(candidate: object, location: str) -> Method | Learner:
+    """Return a candidate that is a method or a learner; raise InputError if it is neither.
 
     Examples
     --------
     >>> class Nameless:
     ...     def estimate(self, image, saturation=None, mask=None):
     ...         return image.mean(axis=(0, 1))
-    >>> checked_method(Nameless(), "own.py:Nameless")
+    >>> check_method(Nameless(), "own.py:Nameless")
     Traceback (most recent call last):
         ...
-    foundation.errors.InputError: own.py:Nameless has no name; add name = "…", the text that stands in the tables
+    foundation.errors.InputError: own.py:Nameless has no name; add name = "…", the text for tables
     """
-    if not callable(getattr(found, "estimate", None)) and not callable(getattr(found, "fit", None)):
-        if callable(getattr(found, "estimate_map", None)):
+    if not callable(getattr(candidate, "estimate", None)) and not callable(getattr(candidate, "fit", None)):
+        if callable(getattr(candidate, "estimate_map", None)):
             raise InputError(
-                f"{place} has estimate_map alone; add estimate(image, saturation, mask) beside it, the light of the "
-                "whole image, by which it is measured on images under one light"
+                f"{location} has only estimate_map, expected also estimate(image, saturation, mask) for images under "
+                "one illuminant; add it"
             )
         raise InputError(
-            f"{place} is no method: it has neither estimate(image, saturation, mask) nor fit(scenes, seed); add the "
-            "one that it is to have, see docs/how-to/evaluate.md"
+            f"{location} has no method estimate(image, saturation, mask) or fit(scenes, seed), expected one of them; "
+            "add it, see docs/how-to/evaluate.md"
         )
     try:
-        name = getattr(found, "name", None)
+        name = getattr(candidate, "name", None)
     except Exception as error:
-        raise InputError(f"the name of {place} fails: {_fault(error)}; correct it") from error
+        raise InputError(f"{location}.name raises an error: {_describe_failure(error)}; correct it") from error
     if not isinstance(name, str) or not name:
-        raise InputError(f'{place} has no name; add name = "…", the text that stands in the tables')
-    return cast("Method | Learner", found)
+        raise InputError(f'{location} has no name; add name = "…", the text for tables')
+    return cast("Method | Learner", candidate)
 
 
 def _looks_like_method(module: ModuleType, name: str) -> bool:
-    one = getattr(module, name)
-    return not name.startswith("_") and (hasattr(one, "estimate") or hasattr(one, "fit"))
+    attribute = getattr(module, name)
+    return not name.startswith("_") and (hasattr(attribute, "estimate") or hasattr(attribute, "fit"))
 
 
-def _module_of_file(path: Path) -> ModuleType:
-    """Return the module of a Python file, run once a process: a second method of the file finds the same module."""
+def _load_file(path: Path) -> ModuleType:
+    # The file is run once per process, so that all methods of the file share one module.
     if not path.is_file():
-        raise InputError(f"{path} is not there; expected a Python file with the class of a method")
-    whole = path.resolve()
-    name = f"_method_file_{sha256(str(whole).encode()).hexdigest()[:16]}"
+        raise InputError(f"{path} does not exist, expected a Python file with the class of a method; correct the path")
+    resolved = path.resolve()
+    name = f"_method_file_{sha256(str(resolved).encode()).hexdigest()[:16]}"
     if name in sys.modules:
         return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, whole)
+    spec = importlib.util.spec_from_file_location(name, resolved)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # Data classes and pickles look their module up by its name.
+    # Data classes and pickles require their module in sys.modules.
     sys.modules[name] = module
     require_own_packages()
-    if str(whole.parent) not in sys.path:
-        sys.path.append(str(whole.parent))
+    if str(resolved.parent) not in sys.path:
+        sys.path.append(str(resolved.parent))
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         del sys.modules[name]
-        raise InputError(f"{path} fails while it is loaded: {_fault(error, whole)}; correct it") from error
+        raise InputError(f"{path} fails when loaded: {_describe_failure(error, resolved)}; correct it") from error
     return module
 
 
-def _module_by_name(name: str) -> ModuleType:
+def _load_module(name: str) -> ModuleType:
     require_own_packages()
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
@@ -222,22 +222,20 @@ def _module_by_name(name: str) -> ModuleType:
         missing = str(error.name)
         if name == missing or name.startswith(f"{missing}."):
             raise InputError(
-                f"there is no module {name!r}; install it, or give the path of a file that ends in .py"
+                f"module {name!r} does not exist; install it, or give the path of a file that ends in .py"
             ) from error
-        raise InputError(f"module {name} needs {missing!r}, which is not installed; install it") from error
+        raise InputError(f"module {name} requires {missing!r}, which is not installed; install it") from error
     except (Exception, SystemExit) as error:
-        raise InputError(f"module {name} fails while it is loaded: {_fault(error)}; correct it") from error
+        raise InputError(f"module {name} fails when loaded: {_describe_failure(error)}; correct it") from error
 
 
-def _fault(error: BaseException, file: Path | None = None) -> str:
-    """Return what went wrong, with the last line of `file` that it went through, or the last file and line at all.
-
-    The lines of this file, which called what failed, are of no use to who wrote it: without others there is none.
-    """
+def _describe_failure(error: BaseException, file: Path | None = None) -> str:
+    """Return the error with the last line in `file`, or without `file` the last file and line of its traceback."""
+    # Lines of this module are omitted, because they do not help the author of the method.
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if frame.filename == str(file) or (file is None and frame.filename != __file__)]
-    whose = f"{Path(own[-1].filename).name}, " if own and file is None else ""
-    place = f"{whose}line {own[-1].lineno}: " if own else ""
-    return f"{place}{type(error).__name__}: {error}"
+    file_name = f"{Path(own[-1].filename).name}, " if own and file is None else ""
+    position = f"{file_name}line {own[-1].lineno}: " if own else ""
+    return f"{position}{type(error).__name__}: {error}"

@@ -1,12 +1,8 @@
-"""Compiled loops over the pixels of an image, in its own dtype: nothing of an image's size is made.
+"""Compiled loops over the pixels of an image in its own dtype, without arrays of the size of the image.
 
-Sums are float64, or whole numbers where the image is: they do not depend on the dtype. An image is (H, W, 3) uint16,
-float32 or float64; `free` is (H, W) bool, True where a pixel may be used, or (0, 0) where every one may be; `border`
-leaves out pixels along every edge.
-
-Projections are counted in `BINS` equal bins from 0 to the greatest possible one. What is sought is first bracketed by
-bins, then summed and collected in one pass, in which a chunk of projections is found before any of them is judged: both
-loops then have no branch, the first is made of vectors, and only the few pixels at either end are looked at one by one.
+Sums are float64, or whole numbers for uint16, and do not depend on the dtype. An image is (H, W, 3) uint16, float32 or
+float64. `usable` is (H, W) bool, True for pixels that may be used, or (0, 0) if all may be used. `border` is the number
+of excluded pixels along every edge.
 """
 
 from __future__ import annotations
@@ -38,32 +34,34 @@ if TYPE_CHECKING:
     from evaluation.scene import Image
 
 
-SPAN = 64  # Pixels of a row that are added at a time where none is left out: a few vectors in each of three channels
-SPANS_OF_A_SUM = 60_000  # Values of uint16 that a sum of uint32 holds, less those of one more row of 350 000 px
-CHUNK = 256  # Pixels whose powers are found at a time, in the nearest cache
-BLOCK = 16  # Pixels of float32 whose whole powers are found at a time: three vectors, which become six of float64
-MOST_PRODUCTS = 64  # Powers up to which products are used
+SPAN = 64  # pixels of a row that are added together if all are usable: a few vectors per channel
+# Spans after which 32-bit sums are emptied: 65 537 values of uint16 fit, minus one more row of 350 000 px.
+LARGEST_SPAN_COUNT = 60_000
+CHUNK = 256  # pixels whose powers are computed together, in the first-level cache
+BLOCK = 16  # pixels of float32 whose whole powers are computed together: three vectors, six of float64
+LARGEST_PRODUCT_POWER = 64  # largest power that is computed by multiplications
 
 
-_BYTES = 4  # Of a float32
+_FLOAT_BYTES = 4  # size of a float32
 _DOUBLES = ir.VectorType(ir.DoubleType(), 8)
 
 
 @compiled
 def mark_clipped(image: Image, saturation: Any, clipped: npt.NDArray[np.uint8]) -> int:
-    """Set `clipped` (H, W) uint8 to 1 where a channel of `image` (H, W, 3) reaches `saturation`, and count them.
+    """Set `clipped` (H, W) uint8 to 1 if a channel of a pixel reaches `saturation`, and return the number of pixels.
 
-    `saturation` has the dtype of the image. Whole rows are compared first, which is done by vectors.
+    `saturation` has the dtype of the image.
     """
+    # Whole rows are compared first, because LLVM uses vectors for that loop.
     count = 0
     flat = image.reshape(-1)
     length = 3 * image.shape[1]
     for y in range(image.shape[0]):
         row = flat[y * length : (y + 1) * length]
-        over = 0
-        for at in range(row.size):
-            over |= row[at] >= saturation
-        if not over:
+        is_clipped = 0
+        for i in range(row.size):
+            is_clipped |= row[i] >= saturation
+        if not is_clipped:
             continue
         for x in range(image.shape[1]):
             if image[y, x, 0] >= saturation or image[y, x, 1] >= saturation or image[y, x, 2] >= saturation:
@@ -79,7 +77,7 @@ def _add_span(
     squares: npt.NDArray[np.uint64],
     highs: npt.NDArray[np.uint16],
 ) -> None:
-    """Add the values of a span to sums a place; the loops are such as LLVM makes vectors of."""
+    # LLVM uses vectors for loops of this form.
     for j in range(3 * SPAN):
         value = span[j]
         sums[j] += uint32(value)
@@ -90,73 +88,71 @@ def _add_span(
 
 
 @compiled
-def _count(free: npt.NDArray[np.bool_]) -> int:
-    usable = 0
-    for x in range(free.size):
-        usable += free[x]
-    return usable
+def _count_usable(usable: npt.NDArray[np.bool_]) -> int:
+    usable_count = 0
+    for x in range(usable.size):
+        usable_count += usable[x]
+    return usable_count
 
 
 @compiled
-def whole_moments(
-    image: npt.NDArray[np.uint16], free: npt.NDArray[np.bool_], border: int
+def integer_moments(
+    image: npt.NDArray[np.uint16], usable: npt.NDArray[np.bool_], border: int
 ) -> tuple[npt.NDArray[np.uint64], int]:
-    """Return (3, 3) uint64, of red, green and blue of an image (H, W, 3): sum, sum of squares, maximum; and the count.
+    """Return sum, sum of squares and maximum of each channel, (3, 3) uint64, and the number of usable pixels.
 
     Exact for images of fewer than 2³² pixels.
     """
-    found = np.zeros((3, 3), np.uint64)
+    moments = np.zeros((3, 3), np.uint64)
     height, width = image.shape[:2]
     flat = image.reshape(-1)
     sums = np.zeros(3 * SPAN, np.uint32)
     squares = np.zeros(3 * SPAN, np.uint64)
     highs = np.zeros(3 * SPAN, np.uint16)
-    count, since = 0, 0
+    count, span_count = 0, 0
     for y in range(border, height - border):
         for left in range(border, width - border, SPAN):
             right = min(width - border, left + SPAN)
-            usable = right - left
-            if free.size:
-                usable = _count(free[y, left:right])
-            count += usable
-            if usable == SPAN:
+            usable_count = right - left
+            if usable.size:
+                usable_count = _count_usable(usable[y, left:right])
+            count += usable_count
+            if usable_count == SPAN:
                 begin = 3 * (y * width + left)
                 _add_span(flat[begin : begin + 3 * SPAN], sums, squares, highs)
-                since += 1
+                span_count += 1
                 continue
             for x in range(left, right):
-                if not free.size or free[y, x]:
+                if not usable.size or usable[y, x]:
                     for channel in range(3):
                         value = uint64(image[y, x, channel])
-                        found[0, channel] += value
-                        found[1, channel] += value * value
-                        found[2, channel] = max(found[2, channel], value)
-        if since >= SPANS_OF_A_SUM or y == height - border - 1:
+                        moments[0, channel] += value
+                        moments[1, channel] += value * value
+                        moments[2, channel] = max(moments[2, channel], value)
+        if span_count >= LARGEST_SPAN_COUNT or y == height - border - 1:
             for j in range(sums.size):
-                found[0, j % 3] += uint64(sums[j])
+                moments[0, j % 3] += uint64(sums[j])
                 sums[j] = 0
-            since = 0
+            span_count = 0
     for j in range(sums.size):
-        found[1, j % 3] += squares[j]
-        found[2, j % 3] = max(found[2, j % 3], uint64(highs[j]))
-    return found, count
+        moments[1, j % 3] += squares[j]
+        moments[2, j % 3] = max(moments[2, j % 3], uint64(highs[j]))
+    return moments, count
 
 
 @compiled
 def float_moments(
-    image: npt.NDArray[np.float32] | npt.NDArray[np.float64], free: npt.NDArray[np.bool_], border: int, scale: float
+    image: npt.NDArray[np.float32] | npt.NDArray[np.float64], usable: npt.NDArray[np.bool_], border: int, scale: float
 ) -> tuple[npt.NDArray[np.float64], int]:
-    """Return (3, 3) float64, of red, green and blue times `scale`: sum, sum of squares, maximum; and the count.
-
-    The image is (H, W, 3). Rows are summed apart, which keeps twelve digits in an image of any size.
-    """
-    found = np.zeros((3, 3), np.float64)
+    """Return sum, sum of squares and maximum of each channel times `scale`, (3, 3) float64, and the usable count."""
+    # Rows are summed separately, which preserves twelve digits in images of any size.
+    moments = np.zeros((3, 3), np.float64)
     height, width = image.shape[:2]
     count = 0
     for y in range(border, height - border):
         row = np.zeros((3, 3), np.float64)
         for x in range(border, width - border):
-            if free.size and not free[y, x]:
+            if usable.size and not usable[y, x]:
                 continue
             for channel in range(3):
                 value = image[y, x, channel] * scale
@@ -165,28 +161,28 @@ def float_moments(
                 row[2, channel] = max(row[2, channel], value)
             count += 1
         for channel in range(3):
-            found[0, channel] += row[0, channel]
-            found[1, channel] += row[1, channel]
-            found[2, channel] = max(found[2, channel], row[2, channel])
-    return found, count
+            moments[0, channel] += row[0, channel]
+            moments[1, channel] += row[1, channel]
+            moments[2, channel] = max(moments[2, channel], row[2, channel])
+    return moments, count
 
 
 @compiled
-def _raise(factors: npt.NDArray[np.float64], powers: npt.NDArray[np.float64], length: int, p: float) -> None:
-    """Write the powers p of the first numbers of `factors`, which are lost; whole powers by products of vectors."""
-    left = int(p) if p <= MOST_PRODUCTS else 0
-    if left != p:
+def _raise_to_power(factors: npt.NDArray[np.float64], powers: npt.NDArray[np.float64], length: int, p: float) -> None:
+    # Whole powers are products of vectors; `factors` is overwritten.
+    exponent = int(p) if p <= LARGEST_PRODUCT_POWER else 0
+    if exponent != p:
         for j in range(length):
             powers[j] = factors[j] ** p
         return
     for j in range(length):
         powers[j] = 1.0
-    while left:
-        if left & 1:
+    while exponent:
+        if exponent & 1:
             for j in range(length):
                 powers[j] *= factors[j]
-        left >>= 1
-        if left:
+        exponent >>= 1
+        if exponent:
             for j in range(length):
                 factors[j] *= factors[j]
 
@@ -195,13 +191,11 @@ def _raise(factors: npt.NDArray[np.float64], powers: npt.NDArray[np.float64], le
 def _add_powers(
     builder: Builder, source: Value, blocks: Value, scale: Value, p: Value, bits: Value, sums: Value
 ) -> None:
-    """Add to 48 float64 at `sums` the powers `p` of `blocks` times 48 float32 from `source` on, times `scale`.
-
-    `p` is whole and of `bits` bits. Factors, powers and sums stay in registers.
-    """
+    # Adds powers of scaled float32 values to 48 float64 at `sums`. `p` is a whole number with `bits` bits. Factors,
+    # powers and sums stay in registers.
     from numba.core import cgutils
 
-    one, places = ir.Constant(I64, 1), range(6)
+    one_bit, positions = ir.Constant(I64, 1), range(6)
     halves = [constant(ir.VectorType(I32, 8), range(first, first + 8)) for first in (0, 8)]
 
     def slot_of(value: Any) -> Any:
@@ -209,34 +203,34 @@ def _add_powers(
         builder.store(value, slot)
         return slot
 
-    def multiply(slots: list[Any], by: list[Any]) -> None:
-        for slot, other in zip(slots, by, strict=True):
-            builder.store(builder.fmul(builder.load(slot), builder.load(other)), slot)
+    def multiply(slots: list[Any], multipliers: list[Any]) -> None:
+        for slot, multiplier in zip(slots, multipliers, strict=True):
+            builder.store(builder.fmul(builder.load(slot), builder.load(multiplier)), slot)
 
-    totals = [slot_of(load(builder, sums, LINE * at, _DOUBLES)) for at in places]
+    totals = [slot_of(load(builder, sums, LINE * i, _DOUBLES)) for i in positions]
     factor = broadcast(builder, scale, _DOUBLES)
     with cgutils.for_range(builder, blocks) as loop:
         start = builder.add(source, builder.mul(loop.index, ir.Constant(I64, 3 * LINE)))
-        vectors = [load(builder, start, LINE * at, FLOATS) for at in range(3)]
-        parts = [builder.shuffle_vector(vectors[at // 2], vectors[at // 2], halves[at % 2]) for at in places]
-        factors = [slot_of(builder.fmul(builder.fpext(part, _DOUBLES), factor)) for part in parts]
-        powers = [slot_of(ir.Constant(_DOUBLES, [1.0] * 8)) for _ in places]
+        vectors = [load(builder, start, LINE * i, FLOATS) for i in range(3)]
+        half_vectors = [builder.shuffle_vector(vectors[i // 2], vectors[i // 2], halves[i % 2]) for i in positions]
+        factors = [slot_of(builder.fmul(builder.fpext(half_vector, _DOUBLES), factor)) for half_vector in half_vectors]
+        powers = [slot_of(ir.Constant(_DOUBLES, [1.0] * 8)) for _ in positions]
         with cgutils.for_range(builder, bits) as bit:
-            wanted = builder.and_(builder.lshr(p, bit.index), one)
-            with builder.if_then(builder.icmp_unsigned("!=", wanted, ir.Constant(I64, 0))):
+            is_set = builder.and_(builder.lshr(p, bit.index), one_bit)
+            with builder.if_then(builder.icmp_unsigned("!=", is_set, ir.Constant(I64, 0))):
                 multiply(powers, factors)
-            with builder.if_then(builder.icmp_unsigned("<", builder.add(bit.index, one), bits)):
+            with builder.if_then(builder.icmp_unsigned("<", builder.add(bit.index, one_bit), bits)):
                 multiply(factors, factors)
         for total, power in zip(totals, powers, strict=True):
             builder.store(builder.fadd(builder.load(total), builder.load(power)), total)
-    for at, total in enumerate(totals):
-        store(builder, builder.load(total), sums, LINE * at)
+    for i, total in enumerate(totals):
+        store(builder, builder.load(total), sums, LINE * i)
 
 
 @compiled
 def sum_powers(
     values: Image,
-    free: npt.NDArray[np.bool_],
+    usable: npt.NDArray[np.bool_],
     border: int,
     top: int,
     first: int,
@@ -246,18 +240,17 @@ def sum_powers(
     scale: float,
     sums: npt.NDArray[np.float64],
 ) -> None:
-    """Add to `sums` (3,) float64 the powers p of the values times `scale` of some rows of an image.
+    """Add the powers p of scaled values of some rows of an image to `sums` (3,) float64.
 
-    `values`: (rows, Q) uint16, float32 or float64, not below 0: rows of interleaved pixels, or parts of them. What lies
-    beyond the image does not count. `free`: (H, W) or (0, 0) bool, see above; that of the whole image. `height`,
-    `width`: of the image, px. `sums`: (3,) float64.
+    `values`: (rows, Q) uint16, float32 or float64 ≥ 0, rows of interleaved pixels or parts of them, from row `top` and
+    pixel `first` on. Values beyond the image are ignored. `height`, `width` and `usable` are those of the image.
     """
     factors = np.empty(3 * CHUNK, np.float64)
     powers = np.empty(3 * CHUNK, np.float64)
-    found = np.zeros(3 * CHUNK, np.float64)
-    whole = int(p) if 1 < p <= MOST_PRODUCTS and values.itemsize == _BYTES else 0
+    sums_by_position = np.zeros(3 * CHUNK, np.float64)
+    whole_power = int(p) if 1 < p <= LARGEST_PRODUCT_POWER and values.itemsize == _FLOAT_BYTES else 0
     bits = 0
-    while whole == p and whole >> bits:
+    while whole_power == p and whole_power >> bits:
         bits += 1
     right = min(width - border, first + values.shape[1] // 3)
     for row in range(values.shape[0]):
@@ -267,82 +260,84 @@ def sum_powers(
         for left in range(max(border, first), right, CHUNK):
             length = min(CHUNK, right - left)
             span = values[row, 3 * (left - first) : 3 * (left - first + length)]
-            usable = length
-            if free.size:
-                usable = _count(free[y, left : left + length])
-            if p == 1 and usable == length:
+            usable_count = length
+            if usable.size:
+                usable_count = _count_usable(usable[y, left : left + length])
+            if p == 1 and usable_count == length:
                 for j in range(span.size):
-                    found[j] += span[j] * scale
+                    sums_by_position[j] += span[j] * scale
                 continue
-            if bits and usable == length:
+            if bits and usable_count == length:
                 blocks = length // BLOCK
-                _add_powers(span.ctypes.data, blocks, scale, whole, bits, found.ctypes.data)
+                _add_powers(span.ctypes.data, blocks, scale, whole_power, bits, sums_by_position.ctypes.data)
                 span = span[3 * BLOCK * blocks :]
             for j in range(span.size):
                 factors[j] = span[j] * scale
-            if usable < length:
+            if usable_count < length:
                 for x in range(length):
-                    if not free[y, left + x]:
+                    if not usable[y, left + x]:
                         factors[3 * x : 3 * x + 3] = 0.0
             if np.isinf(p):
                 for j in range(span.size):
-                    found[j] = max(found[j], factors[j])
+                    sums_by_position[j] = max(sums_by_position[j], factors[j])
                 continue
-            _raise(factors, powers, span.size, p)
+            _raise_to_power(factors, powers, span.size, p)
             for j in range(span.size):
-                found[j] += powers[j]
-    for j in range(found.size):
+                sums_by_position[j] += powers[j]
+    for j in range(sums_by_position.size):
         if np.isinf(p):
-            sums[j % 3] = max(sums[j % 3], found[j])
+            sums[j % 3] = max(sums[j % 3], sums_by_position[j])
         else:
-            sums[j % 3] += found[j]
+            sums[j % 3] += sums_by_position[j]
 
 
-BINS = 4096  # Of the histogram of projections: one that holds a limit has some thousand pixels of 18 million
-# Pixels by which the counted ones move on from row to row: no column is preferred where every 16th pixel counts.
-_STRIDE = 5
+# Equal bins of projections from 0 to the largest possible one: of 18 million pixels some thousand are in the bin with a
+# limit.
+BINS = 4096
+# Offset between rows of the pixels that are counted, px: no column is preferred if every 16th pixel is counted.
+_ROW_SHIFT = 5
 
 
 @compiled
 def count_projections(
-    image: Image, free: npt.NDArray[np.bool_], direction: npt.NDArray[np.float64], step: float, every: int
+    image: Image, usable: npt.NDArray[np.bool_], direction: npt.NDArray[np.float64], step: float, interval: int
 ) -> npt.NDArray[np.int64]:
-    """Return (BINS,) int64, the histogram of the projections of every so manieth pixel on a direction (3,) float64.
+    """Return the histogram (BINS,) int64 of projections on a direction (3,) float64, for every `interval`-th pixel.
 
-    `step` is bins a unit of projection.
+    `step` is the number of bins per unit of projection.
     """
     counts = np.zeros(BINS, np.int64)
     for y in range(image.shape[0]):
-        for x in range(_STRIDE * y % every, image.shape[1], every):
-            if free.size and not free[y, x]:
+        for x in range(_ROW_SHIFT * y % interval, image.shape[1], interval):
+            if usable.size and not usable[y, x]:
                 continue
-            along = image[y, x, 0] * direction[0] + image[y, x, 1] * direction[1] + image[y, x, 2] * direction[2]
-            counts[min(BINS - 1, int(along * step))] += 1
+            projection = image[y, x, 0] * direction[0] + image[y, x, 1] * direction[1] + image[y, x, 2] * direction[2]
+            counts[min(BINS - 1, int(projection * step))] += 1
     return counts
 
 
 @compiled
 def sum_outer_bins(
     image: Image,
-    free: npt.NDArray[np.bool_],
+    usable: npt.NDArray[np.bool_],
     direction: npt.NDArray[np.float64],
     step: float,
     brackets: npt.NDArray[np.int64],
-    bordering: npt.NDArray[np.float64],
+    collected: npt.NDArray[np.float64],
 ) -> tuple[npt.NDArray[np.float64], int, int, int]:
-    """Sum and count the pixels of bins outside of two brackets, and collect those of bins within.
+    """Sum and count the pixels of bins outside two brackets, and collect the pixels inside.
 
-    `image`, `free`: (H, W, 3) uint16, float32 or float64; (H, W) or (0, 0) bool, see above. `direction`, `step`: (3,)
-    float64, and bins a unit of projection; as for `count_projections`. `brackets`: (4,) int64: the first and the last
-    bin of the lower bracket, then of the upper one; they may overlap. `bordering`: (N, 4) float64, written: red, green,
-    blue and the projection of pixels of the brackets, in reading order. Returns (3, 3) float64, the sum of x xᵀ over
-    the pixels below the lower bracket and above the upper one; how many these are below and above; how many lie within
-    the brackets, of which the first N are written.
+    `brackets`: (4,) int64, first and last bin of the lower bracket, then of the upper one; they may overlap.
+    `collected`: (N, 4) float64, receives red, green, blue and the projection of up to N pixels inside, in reading
+    order. Returns the sum of x xᵀ (3, 3) float64 over the pixels below the lower and above the upper bracket, and the
+    numbers of pixels below, above and inside.
     """
+    # Projections of a chunk are computed before they are compared, so that both loops have no branches and the first
+    # uses vectors. Only the few pixels at the ends are processed one by one.
     total = np.zeros((3, 3), np.float64)
-    bins, kept = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
+    bins, kept_positions = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
     first, low, high, last = brackets
-    below, above, inside = 0, 0, 0
+    below_count, above_count, inside_count = 0, 0, 0
     width = image.shape[1]
     flat = image.reshape(-1)
     for y in range(image.shape[0]):
@@ -351,24 +346,24 @@ def sum_outer_bins(
             length = min(CHUNK, width - left)
             row = flat[3 * (y * width + left) : 3 * (y * width + left + length)]
             for j in range(length):
-                along = row[3 * j] * direction[0] + row[3 * j + 1] * direction[1] + row[3 * j + 2] * direction[2]
-                bins[j] = min(BINS - 1, np.int32(along * step))
-            found = 0
+                projection = row[3 * j] * direction[0] + row[3 * j + 1] * direction[1] + row[3 * j + 2] * direction[2]
+                bins[j] = min(BINS - 1, np.int32(projection * step))
+            kept_count = 0
             for j in range(length):
-                kept[found] = j
-                found += (bins[j] <= low) | (bins[j] >= high)
-            for at in range(found):
-                j = kept[at]
-                if free.size and not free[y, left + j]:
+                kept_positions[kept_count] = j
+                kept_count += (bins[j] <= low) | (bins[j] >= high)
+            for i in range(kept_count):
+                j = kept_positions[i]
+                if usable.size and not usable[y, left + j]:
                     continue
                 red, green, blue = np.float64(row[3 * j]), np.float64(row[3 * j + 1]), np.float64(row[3 * j + 2])
                 if first <= bins[j] <= last:
-                    if inside < bordering.shape[0]:
-                        bordering[inside, 0] = red
-                        bordering[inside, 1] = green
-                        bordering[inside, 2] = blue
-                        bordering[inside, 3] = red * direction[0] + green * direction[1] + blue * direction[2]
-                    inside += 1
+                    if inside_count < collected.shape[0]:
+                        collected[inside_count, 0] = red
+                        collected[inside_count, 1] = green
+                        collected[inside_count, 2] = blue
+                        collected[inside_count, 3] = red * direction[0] + green * direction[1] + blue * direction[2]
+                    inside_count += 1
                     continue
                 a += red * red
                 b += green * green
@@ -377,8 +372,8 @@ def sum_outer_bins(
                 ac += red * blue
                 bc += green * blue
                 if bins[j] < first:
-                    below += 1
+                    below_count += 1
                 else:
-                    above += 1
+                    above_count += 1
         total += np.array([[a, ab, ac], [ab, b, bc], [ac, bc, c]])
-    return total, below, above, inside
+    return total, below_count, above_count, inside_count

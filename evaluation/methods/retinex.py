@@ -1,21 +1,20 @@
-"""Methods of the Retinex family: local maxima stand for white.
+"""Methods of the Retinex family: local maxima represent white.
 
 Color Sparrow
-    N. Banić, S. Lončarić, "Using the Random Sprays Retinex algorithm for global illumination estimation", CCVW 2013: at
-    a point, Random Sprays Retinex gives the pixel over the maximum of a spray of random pixels around it, dense in the
-    middle (E. Provenzi et al., 2009). The point's light is the smoothed pixel over the smoothed ratio; the lights of a
-    grid are averaged. Constants are those of the authors' program, version 0.1; its sprays are rounded to whole numbers
-    before they are scaled to the image, here they are not, as the paper has it.
+    N. Banić, S. Lončarić, "Using the Random Sprays Retinex algorithm for global illumination estimation", CCVW 2013. At
+    each point of a grid, Random Sprays Retinex divides the pixel by the maximum of a spray: random pixels around it,
+    dense in the middle (E. Provenzi et al., 2009). The illuminant of a point is the smoothed pixel divided by the
+    smoothed ratio; the estimate is their mean. Constants are from the authors' program, version 0.1. The program rounds
+    sprays before it scales them to the image; as in the paper, they are not rounded here.
 Improved White-Patch
-    N. Banić, S. Lončarić, "Improving the White Patch method by subsampling", ICIP 2014: a maximum over few pixels
-    seldom meets a highlight or a noisy pixel, and the mean of many such maxima is steady. The numbers of pixels and
-    samples are a reconstruction: the paper gives several, chosen by cross-validation.
+    N. Banić, S. Lončarić, "Improving the White Patch method by subsampling", ICIP 2014. Maxima of few pixels rarely
+    include a highlight or a noisy pixel, and the mean of many such maxima is stable. *Reconstruction*: the paper gives
+    several numbers of pixels and samples, selected by cross-validation.
 Local Surface Reflectance statistics
     S.-B. Gao, W. Han, K. Yang, C. Li, Y. Li, "Efficient color constancy with local surface reflectance statistics",
-    ECCV 2014: the sum of an image's true reflectances over that of its locally normalised ones is nearly achromatic, so
-    the light is the sum of the values over the sum of the locally normalised values, channel by channel. A
-    reconstruction from the paper's text: the number of patches is not the authors' tuned one, and there is no smoothing
-    before.
+    ECCV 2014. The sum of the reflectances divided by the sum of the locally normalised ones is nearly achromatic. The
+    estimate of a channel is the sum of its values divided by the sum of its locally normalised values.
+    *Reconstruction* from the text: the number of patches is not the authors' tuned one, and images are not smoothed.
 """
 
 from __future__ import annotations
@@ -36,25 +35,24 @@ from foundation.compiled import compiled
 @compiled
 def spray_maxima(
     image: Image,
-    free: npt.NDArray[np.bool_],
+    usable: npt.NDArray[np.bool_],
     step: int,
     offsets: npt.NDArray[np.int64],
-    chosen: npt.NDArray[np.int64],
+    spray_indices: npt.NDArray[np.int64],
 ) -> npt.NDArray[np.float64]:
     """Return the maxima of each channel over the spray around each point of a grid, (R, C, 3) float64.
 
-    `image`: (H, W, 3) uint16, float32 or float64. `free`: (H, W) bool, True where a pixel may be used, or (0, 0) where
-    every one may be. `offsets`: (sprays, N, 2) int64, rows and columns from the point; those that lead out of the image
-    are left out. `chosen`: (R, C) int64, the spray of each point.
+    `usable`: (H, W) bool, or (0, 0) if all pixels are usable. `offsets`: (sprays, N, 2) int64, rows and columns from
+    the point; those outside the image are ignored. `spray_indices`: (R, C) int64, spray of each point.
     """
     height, width = image.shape[:2]
-    maxima = np.zeros((chosen.shape[0], chosen.shape[1], 3), np.float64)
-    for row in range(chosen.shape[0]):
-        for column in range(chosen.shape[1]):
-            spray = chosen[row, column]
-            for at in range(offsets.shape[1]):
-                y, x = row * step + offsets[spray, at, 0], column * step + offsets[spray, at, 1]
-                if y < 0 or x < 0 or y >= height or x >= width or (free.size and not free[y, x]):
+    maxima = np.zeros((spray_indices.shape[0], spray_indices.shape[1], 3), np.float64)
+    for row in range(spray_indices.shape[0]):
+        for column in range(spray_indices.shape[1]):
+            spray = spray_indices[row, column]
+            for i in range(offsets.shape[1]):
+                y, x = row * step + offsets[spray, i, 0], column * step + offsets[spray, i, 1]
+                if y < 0 or x < 0 or y >= height or x >= width or (usable.size and not usable[y, x]):
                     continue
                 for channel in range(3):
                     maxima[row, column, channel] = max(maxima[row, column, channel], image[y, x, channel])
@@ -63,12 +61,12 @@ def spray_maxima(
 
 @compiled
 def patch_sums(
-    image: Image, free: npt.NDArray[np.bool_], rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]
+    image: Image, usable: npt.NDArray[np.bool_], rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return the sums and the maxima of each channel over the usable pixels of patches, (R, C, 3) float64 each.
+    """Return sums and maxima of each channel over the usable pixels of patches, (R, C, 3) float64 each.
 
-    `image`: (H, W, 3) uint16, float32 or float64. `free`: (H, W) bool, True where a pixel may be used, or (0, 0) where
-    every one may be. `rows`, `columns`: (R + 1,) and (C + 1,) int64, where the patches begin, and the end of the last.
+    `usable`: (H, W) bool, or (0, 0) if all pixels are usable. `rows`, `columns`: (R + 1,) and (C + 1,) int64, first
+    row and column of each patch, and the end of the last.
     """
     shape = (rows.size - 1, columns.size - 1, 3)
     sums, maxima = np.zeros(shape, np.float64), np.zeros(shape, np.float64)
@@ -76,7 +74,7 @@ def patch_sums(
         for y in range(rows[i], rows[i + 1]):
             for j in range(shape[1]):
                 for x in range(columns[j], columns[j + 1]):
-                    if free.size and not free[y, x]:
+                    if usable.size and not usable[y, x]:
                         continue
                     for channel in range(3):
                         value = float(image[y, x, channel])
@@ -85,18 +83,18 @@ def patch_sums(
     return sums, maxima
 
 
-SPRAYS = 1000  # Sprays that a point's is chosen from, as in the authors' program
+SPRAY_COUNT = 1000  # number of sprays from which each point gets one, as in the authors' program
 
 
 @dataclass(frozen=True)
 class ColorSparrow(PreparedMethod):
-    """Mean of local lights by random sprays.
+    """Mean of local estimates by random sprays.
 
-    - `name`: its name in tables.
-    - `spray`: n, pixels of a spray.
-    - `step`: r and c, px between points of the grid.
+    - `name`: name in tables.
+    - `spray`: n, pixels per spray.
+    - `step`: r and c, distance of grid points, px.
     - `kernel`: k, side of the mean filter over the grid, points.
-    - `seed`: of the sprays; the same image gives the same estimate.
+    - `seed`: seed of the sprays; estimates are reproducible.
 
     Examples
     --------
@@ -112,33 +110,33 @@ class ColorSparrow(PreparedMethod):
     seed: int = 0
 
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
+        """Return the estimate for a prepared image, (3,) float64, camera RGB of length 1."""
         import cv2
 
         rows, columns = np.arange(0, prepared.height, self.step), np.arange(0, prepared.width, self.step)
         radius = math.hypot(prepared.height, prepared.width)
-        offsets = (_sprays(self.seed, self.spray) * radius).astype(np.int64)
-        chosen = np.random.default_rng((self.seed, 1)).integers(0, SPRAYS, (len(rows), len(columns)))
+        offsets = (_draw_sprays(self.seed, self.spray) * radius).astype(np.int64)
+        spray_indices = np.random.default_rng((self.seed, 1)).integers(0, SPRAY_COUNT, (len(rows), len(columns)))
         image: Any = prepared.image
-        maxima = spray_maxima(image, prepared.free(), self.step, offsets, chosen)
+        maxima = spray_maxima(image, prepared.usable_or_empty(), self.step, offsets, spray_indices)
         points = prepared.image[:: self.step, :: self.step].astype(np.float64)
-        used = prepared.usable(0)[:: self.step, :: self.step] & (points > 0).all(axis=2) & (maxima > 0).all(axis=2)
-        if not used.any():
+        is_used = prepared.usable(0)[:: self.step, :: self.step] & (points > 0).all(axis=2) & (maxima > 0).all(axis=2)
+        if not is_used.any():
             return GREY
-        ratios = np.where(used[..., None], np.minimum(points / np.where(maxima > 0, maxima, 1), 1), 0)
+        ratios = np.where(is_used[..., None], np.minimum(points / np.where(maxima > 0, maxima, 1), 1), 0)
         size = (self.kernel, self.kernel)
-        # Both are means over the same points, so their number cancels.
-        above = cv2.blur(np.where(used[..., None], points, 0), size, borderType=cv2.BORDER_CONSTANT)
-        below = cv2.blur(ratios, size, borderType=cv2.BORDER_CONSTANT)
-        lights = np.asarray(above).reshape(points.shape)[used] / np.asarray(below).reshape(points.shape)[used]
+        # Both are sums over the same points, so their number cancels.
+        sums = cv2.blur(np.where(is_used[..., None], points, 0), size, borderType=cv2.BORDER_CONSTANT)
+        divisors = cv2.blur(ratios, size, borderType=cv2.BORDER_CONSTANT)
+        lights = np.asarray(sums).reshape(points.shape)[is_used] / np.asarray(divisors).reshape(points.shape)[is_used]
         return unit(lights.mean(axis=0))
 
 
 @cache
-def _sprays(seed: int, count: int) -> npt.NDArray[np.float64]:
-    """Return sprays (SPRAYS, count, 2): rows and columns from the middle, in parts of the radius."""
+def _draw_sprays(seed: int, count: int) -> npt.NDArray[np.float64]:
+    # Rows and columns from the middle, (SPRAY_COUNT, count, 2), as fractions of the radius.
     random = np.random.default_rng((seed, 0))
-    angle, distance = random.uniform(0, 2 * np.pi, (SPRAYS, count)), random.uniform(0, 1, (SPRAYS, count))
+    angle, distance = random.uniform(0, 2 * np.pi, (SPRAY_COUNT, count)), random.uniform(0, 1, (SPRAY_COUNT, count))
     sprays = distance[..., None] * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
     sprays.setflags(write=False)
     return sprays
@@ -148,10 +146,10 @@ def _sprays(seed: int, count: int) -> npt.NDArray[np.float64]:
 class ImprovedWhitePatch(PreparedMethod):
     """Mean of the maxima of each channel over random samples of pixels.
 
-    - `name`: its name in tables.
-    - `pixels`: N, pixels of a sample, drawn with repetition from the usable ones.
-    - `samples`: M, samples.
-    - `seed`: of the draws; the same image gives the same estimate.
+    - `name`: name in tables.
+    - `pixels`: N, pixels of a sample, drawn with repetition from the usable pixels.
+    - `samples`: M, number of samples.
+    - `seed`: seed of the samples; estimates are reproducible.
 
     Examples
     --------
@@ -166,15 +164,15 @@ class ImprovedWhitePatch(PreparedMethod):
     seed: int = 0
 
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
-        free = prepared.free()
+        """Return the estimate for a prepared image, (3,) float64, camera RGB of length 1."""
+        usable = prepared.usable_or_empty()
         flat = prepared.image.reshape(-1, 3)
-        places = np.flatnonzero(free) if free.size else None
-        count = len(flat) if places is None else len(places)
+        positions = np.flatnonzero(usable) if usable.size else None
+        count = len(flat) if positions is None else len(positions)
         if not count:
             return GREY
         drawn = np.random.default_rng(self.seed).integers(0, count, (self.samples, self.pixels))
-        values = flat[drawn if places is None else places[drawn]]
+        values = flat[drawn if positions is None else positions[drawn]]
         return unit(values.max(axis=1).mean(axis=0, dtype=np.float64))
 
 
@@ -182,12 +180,12 @@ class ImprovedWhitePatch(PreparedMethod):
 class SurfaceReflectance(PreparedMethod):
     """Ratio of the sum of values to the sum of locally normalised values.
 
-    - `name`: its name in tables.
-    - `patches`: patches along either side of the image; at least one pixel each.
+    - `name`: name in tables.
+    - `patches`: number of patches along either side of the image; at least one pixel each.
 
     Examples
     --------
-    A dark colourful half counts less than the grey half that it stands beside:
+    A dark coloured half has less weight than the grey half:
 
     >>> image = np.ones((20, 40, 3)) * np.linspace(0.2, 1, 20)[:, None, None]
     >>> image[:, 20:] *= [0.3, 0.1, 0.1]
@@ -199,13 +197,13 @@ class SurfaceReflectance(PreparedMethod):
     patches: int = 10
 
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
+        """Return the estimate for a prepared image, (3,) float64, camera RGB of length 1."""
         rows, columns = (
             np.arange(min(self.patches, size) + 1) * size // min(self.patches, size)
             for size in (prepared.height, prepared.width)
         )
         image: Any = prepared.image
-        sums, maxima = patch_sums(image, prepared.free(), rows, columns)
+        sums, maxima = patch_sums(image, prepared.usable_or_empty(), rows, columns)
         normalised = np.divide(sums, maxima, out=np.zeros_like(sums), where=maxima > 0).sum(axis=(0, 1))
         total = sums.sum(axis=(0, 1))
         if not total.any():

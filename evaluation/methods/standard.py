@@ -1,6 +1,6 @@
-"""The methods that the command offers, with the constants that are usual in the field.
+"""Statistics-based methods with the usual constants of the field.
 
-Where they come from::
+Sources::
 
     method              source                                                  n, p, σ of the Gray-Edge framework
     White-Patch         B. Funt, L. Shi, "The rehabilitation of MaxRGB", 2010   0, ∞, 0
@@ -13,12 +13,12 @@ Where they come from::
     Gray-Edge, order 2  the same                                                2, 1, 1
     PCA                 D. Cheng et al., 2014; see `pca.py`                     -
 
-and, with their sources and constants: improved White-Patch, Color Sparrow, Local Surface Reflectance (`retinex`),
-grayness index and mean-shifted gray pixel (`gray_pixels`), and what OpenCV offers (`OpenCvGrayWorld`).
+Further methods: improved White-Patch, Color Sparrow, Local Surface Reflectance (`retinex`), grayness index and
+mean-shifted gray pixel (`gray_pixels`), and Gray-world of OpenCV (`OpenCvGrayWorld`).
 
-The paper's tables have the first three, Shades-of-Gray with p = 2 as here. The other constants are those with which the
-methods stand in the tables of the NUS dataset. Every method of the framework is built from its equation alone, without
-the preprocessing that a source may add (for White-Patch: no median filter).
+The paper's tables have the first three, with p = 2 for Shades-of-Gray. Other constants are from the tables of the NUS
+data set. Methods of the framework follow its equation only, without additional preprocessing of a source (for
+White-Patch: no median filter).
 """
 
 from __future__ import annotations
@@ -38,21 +38,19 @@ from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, uni
 from evaluation.methods.retinex import ColorSparrow, ImprovedWhitePatch, SurfaceReflectance
 from evaluation.methods.wrapped import PatchwiseMethod
 
-_TOP = 16383  # Value that white gets: a quarter of uint16, so that a channel multiplied by up to 4 is not cut off
+_WHITE = 16383  # value of white: a quarter of uint16, so that a channel multiplied by up to 4 is not clipped
 
-_ROWS = 256  # Rows that are scaled at a time, so that no float64 copy of a large image is made
+_STRIP_ROWS = 256  # rows that are scaled together, so that no float64 copy of a large image is made
 
 
 @dataclass(frozen=True)
 class OpenCvGrayWorld(PreparedMethod):
-    """Gray-world of OpenCV's xphoto over the pixels that are not too colourful: what a program that uses OpenCV gets.
+    """Gray-world of OpenCV's xphoto, which ignores strongly coloured pixels.
 
-    `GrayworldWB` corrects an image; the light is what it divides by: for each channel the sum before over the sum
-    after. Masked and saturated pixels are given to it as black. Two others of xphoto are left out: `SimpleWB` stretches
-    each channel between percentiles, offset included, and so is no estimate of a light; `LearningBasedWB` (D. Cheng et
-    al., CVPR 2015) of OpenCV 5.0 gives one of several lights for the same image from call to call, degrees apart.
+    `GrayworldWB` corrects an image. The estimate of a channel is its sum before divided by its sum after correction.
+    Masked and saturated pixels are passed as black.
 
-    `name`: its name in tables.
+    - `name`: name in tables.
 
     Examples
     --------
@@ -64,7 +62,10 @@ class OpenCvGrayWorld(PreparedMethod):
     name: str = "Gray-world (OpenCV)"
 
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
-        """Return the light of a prepared image: (3,) float64, camera RGB of length 1."""
+        """Return the estimate for a prepared image, (3,) float64, camera RGB of length 1."""
+        # Other methods of xphoto are not offered. `SimpleWB` stretches channels between percentiles, with an offset, so
+        # it is not an estimate. `LearningBasedWB` (D. Cheng et al., CVPR 2015) of OpenCV 5.0 is not reproducible:
+        # estimates for the same image differ by degrees.
         import cv2
 
         xphoto: Any = cv2.xphoto
@@ -72,22 +73,23 @@ class OpenCvGrayWorld(PreparedMethod):
         peak = float(prepared.moments()[2].max())
         if not peak:
             return GREY
-        given = np.zeros(prepared.image.shape, dtype=np.uint16)
-        for top in range(0, prepared.height, _ROWS):
-            rows = np.s_[top : top + _ROWS]
-            part = np.where(usable[rows][..., None], prepared.image[rows], 0)[..., ::-1]
-            given[rows] = np.rint(part / peak * _TOP)
-        after = np.asarray(xphoto.createGrayworldWB().balanceWhite(given)).reshape(-1, 3).sum(axis=0, dtype=np.float64)
-        before = given.reshape(-1, 3).sum(axis=0, dtype=np.float64)
-        return unit(np.divide(before, after, out=np.zeros(3), where=after > 0)[::-1])
+        input_image = np.zeros(prepared.image.shape, dtype=np.uint16)
+        for top in range(0, prepared.height, _STRIP_ROWS):
+            rows = np.s_[top : top + _STRIP_ROWS]
+            strip = np.where(usable[rows][..., None], prepared.image[rows], 0)[..., ::-1]
+            input_image[rows] = np.rint(strip / peak * _WHITE)
+        corrected = np.asarray(xphoto.createGrayworldWB().balanceWhite(input_image))
+        sums_after = corrected.reshape(-1, 3).sum(axis=0, dtype=np.float64)
+        sums_before = input_image.reshape(-1, 3).sum(axis=0, dtype=np.float64)
+        return unit(np.divide(sums_before, sums_after, out=np.zeros(3), where=sums_after > 0)[::-1])
 
 
-# Names of the methods that stand in most tables of the field; the others may take seconds on a large image.
+# Methods in most tables of the field; the others may take seconds on a large image.
 STANDARD = ("white-patch", "gray-world", "shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2", "pca")
 
 
 def standard_methods() -> Mapping[str, Method]:
-    """Return the methods by their short names on the command line; the paper's three first.
+    """Return the methods by name on the command line; the three methods of the paper are first.
 
     Examples
     --------
@@ -118,7 +120,7 @@ def standard_methods() -> Mapping[str, Method]:
 
 
 def local_methods() -> Mapping[str, LocalMethod]:
-    """Return methods that give a map of lights by their short names; for images under several lights only.
+    """Return methods that estimate an illuminant map, by name on the command line.
 
     Examples
     --------

@@ -47,7 +47,7 @@ def test_counts_images_without_usable_pixel(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("lut",), "is no dataset"),
+        (("lut",), "has no supported layout"),
         (("made", "--out", "lut"), "lut already exists; name another place for the results"),
         (("made", "--method", "none.npz"), "none.npz"),
         (("made", "--method", "lut/illuminations.csv"), "expected image,r,g,b"),

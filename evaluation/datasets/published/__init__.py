@@ -1,4 +1,4 @@
-"""Readers of the published data sets, each file one layout: what lies where, and which levels and masks are applied.
+"""Readers of published data sets, one file per layout: its files, and the levels and masks that are applied.
 
-A value that no copy of the data was at hand to hold against is said to be "not verified against a real copy".
+"Not verified against a real copy" marks layouts and values that were never tested on the published files.
 """

@@ -1,21 +1,21 @@
-"""The ColorChecker data set of Gehler, in the linear 12-bit files of Shi and Funt: 568 images, two cameras.
+"""Read the ColorChecker data set of Gehler, in the linear 12-bit files of Shi and Funt: 568 images, two cameras.
 
     8D5U5524.png …           86 images of a Canon EOS-1Ds ("1D"), 16-bit files of 12 bits, linear, black not subtracted
     IMG_0281.png …           482 images of a Canon EOS 5D
-    coordinates/NAME_macbeth.txt   the size of the image that was annotated, then four corners of the chart: 1 2, 3 4
-    ColorCheckerData.mat     with REC_groundtruth (568, 3): the recommended truth; REC_groundtruth.mat is taken too
-    real_illum_568..mat      with real_rgb (568, 3): Shi's truth of 2010
+    coordinates/NAME_macbeth.txt   size of the annotated image, then four corners of the chart: 1 2, 3 4
+    ColorCheckerData.mat     REC_groundtruth (568, 3): recommended ground truth; REC_groundtruth.mat is read too
+    real_illum_568..mat      real_rgb (568, 3): Shi's ground truth of 2010
 
-Files are found down to three folders deep, so the archives may be unpacked as they are (png/, Canon1D/png/ …).
+Subfolders are searched to a depth of three, so that the archives may be unpacked unchanged (png/, Canon1D/png/ …).
 
 P. Gehler et al., "Bayesian color constancy revisited", CVPR 2008; L. Shi, B. Funt,
 www2.cs.sfu.ca/~colour/data/shi_gehler.
 G. Hemrit et al., "Rehabilitating the ColorChecker dataset for illuminant estimation" (CIC 26, 2018, arXiv:1805.12262)
-found that three sets of ground truths are in use, each with errors, and made the recommended one (data sets page of
-colorconstancy.com), after subtracting black; errors by Shi's truth are not comparable with it. Rows of both belong to
-the images in the order of their names. Black levels and saturation: internal/GehlerShiSensor.m of
-github.com/google/ffcc, which says that 3580 of older papers "does not appear to be correct"; some programs take black 1
-for the 1D. The chart's corners are used as in internal/ReadImage.m there. Not verified against a real copy.
+describe errors in the three earlier sets of ground truths, and recommend a new one (colorconstancy.com). Errors against
+Shi's ground truth are not comparable with it. Rows of both belong to the images in order of their names. Black levels
+and saturation: internal/GehlerShiSensor.m of github.com/google/ffcc. It calls the saturation 3580 of older papers not
+correct; some programs use black 1 for the 1D. Chart corners: internal/ReadImage.m there. Not verified against a real
+copy.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ from evaluation.datasets.files import (
     RawScene,
     chart_mask,
     check_light,
-    gather,
-    numbers_in,
-    present,
+    gather_images,
+    match_images,
     read_text,
+    to_numbers,
 )
-from evaluation.datasets.options import DataOptions, choose, stated
-from evaluation.datasets.published.matlab import read_mat, table
+from evaluation.datasets.options import DataOptions, choose_name, level_note
+from evaluation.datasets.published.matlab import numeric_table, read_mat
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError
 
-BLACK: Final = {"1D": 0, "5D": 129}  # Black levels of the two cameras' files (GehlerShiSensor.m of FFCC)
-WHITE = 3692  # Saturation of both cameras' files, black not subtracted (GehlerShiSensor.m of FFCC)
+BLACK: Final = {"1D": 0, "5D": 129}  # black levels of both cameras' files, counts (GehlerShiSensor.m of FFCC)
+WHITE = 3692  # saturation of both cameras' files, counts, black not subtracted (GehlerShiSensor.m of FFCC)
 
-# Folders below the one given in which files are looked for: Canon1D/png is two deep, an archive's own one more.
-_DEPTH = 3
-_SAMPLE = 1000  # Names of a folder that are looked at for corners of charts; the data set has 568
+# Levels of subfolders that are searched: two for Canon1D/png, one for the folder of an archive.
+_SEARCH_DEPTH = 3
+_SAMPLED_NAMES = 1000  # names of a folder that are searched for chart corners; the data set has 568
 _TRUTHS: Final = {
     "recommended": (("ColorCheckerData.mat", "REC_groundtruth.mat"), "REC_groundtruth"),
     "shi": (("real_illum_568..mat", "real_illum_568.mat"), "real_rgb"),
 }
-_1D = "5524-5541 5543-5545 5547-5550 5552-5558 5560-5589 5592-5594 5596-5604 5606-5608 5611-5615 5617-5620"
-_5D = (
+_IDS_1D = "5524-5541 5543-5545 5547-5550 5552-5558 5560-5589 5592-5594 5596-5604 5606-5608 5611-5615 5617-5620"
+_IDS_5D = (
     "281-287 289-293 295-298 300-303 305-307 310 313-321 323-325 327-329 332-337 339-345 350-355 361-372 374-390 "
     "392-414 416-453 455-474 477 479-531 533-534 538-540 542-547 549-556 558-568 570-572 574-578 580-581 583-589 "
     "592-638 661 666 670-688 743-747 749-750 753-763 765-768 770-780 782-826 828-847 849 851 853-855 857-867 869-870 "
@@ -63,35 +63,31 @@ _5D = (
 )
 
 
-def _numbers(runs: str) -> Iterator[int]:
-    for run in runs.split():
-        first, _, last = run.partition("-")
+def _expand(ranges: str) -> Iterator[int]:
+    for number_range in ranges.split():
+        first, _, last = number_range.partition("-")
         yield from range(int(first), int(last or first) + 1)
 
 
-# The 568 images in the order of the rows of both truths: those names that the files of the recommended release carry
-# behind the number of their row.
-NAMES: Final = tuple([f"8D5U{number}" for number in _numbers(_1D)] + [f"IMG_{number:04d}" for number in _numbers(_5D)])
-_KNOWN = frozenset(NAMES)
+# The 568 images in the order of the rows of both ground truths, from the file names of the recommended release.
+NAMES: Final = (*(f"8D5U{id_:d}" for id_ in _expand(_IDS_1D)), *(f"IMG_{id_:04d}" for id_ in _expand(_IDS_5D)))
+_NAME_SET = frozenset(NAMES)
 
 
 @dataclass(frozen=True, slots=True)
 class MacbethScene(RawScene):
-    """An image with its ColorChecker.
-
-    `corners_path`: the text file with the chart's corners.
-    """
+    """Image with a ColorChecker; `corners_path` is the text file with the corners of the chart."""
 
     corners_path: str = ""
 
     def mask(self, image: Image) -> Mask:
-        """Return (H, W) bool, True on the chart, of an image (H, W, 3)."""
+        """Return (H, W) bool for an image (H, W, 3), True on the chart."""
         text = read_text(self.corners_path)
-        lines = [numbers_in(line, self.corners_path) for line in text.strip().splitlines()[:5]]
+        lines = [to_numbers(line, self.corners_path) for line in text.strip().splitlines()[:5]]
         if len(lines) < 5 or any(len(line) != 2 for line in lines) or min(lines[0]) <= 0:
             raise FormatError(
-                f"{self.corners_path} holds something else, expected width and height and then the corners of the "
-                "chart, two numbers a line; restore it from the data set's archive"
+                f"{self.corners_path}, line 1: {text.strip().partition(chr(10))[0][:80] or 'empty'!r}; expected five "
+                "lines of two numbers, the image size and four chart corners; restore it from the data set's archive"
             )
         height, width = image.shape[:2]
         corners = np.array([lines[number] for number in (1, 2, 4, 3)]) * [width / lines[0][0], height / lines[0][1]]
@@ -99,41 +95,42 @@ class MacbethScene(RawScene):
 
 
 def is_gehler_shi(folder: Folder) -> bool:
-    """Return whether a folder looks like the data set: a truth of it, or corners of its charts, are in it or below."""
-    known = {name for files, _ in _TRUTHS.values() for name in files}
+    """Return True if the folder or a direct subfolder has a ground truth or chart corners of the data set."""
+    truth_files = {name for files, _ in _TRUTHS.values() for name in files}
     return any(
-        known.intersection(place.files) or any(name.endswith("_macbeth.txt") for name in place.files[:_SAMPLE])
-        for place in folder.within(1)
+        truth_files.intersection(child.files)
+        or any(name.endswith("_macbeth.txt") for name in child.files[:_SAMPLED_NAMES])
+        for child in folder.within(1)
     )
 
 
-def open_gehler_shi(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
-    """Return the data set, or one camera of it; images are read when they are used."""
-    folder = listed or Folder(Path(place))
-    places = list(folder.within(_DEPTH))
-    truth = choose(options.truth, _TRUTHS, "truth", place) or "recommended"
-    path, lights = _read_truth(places, truth, place)
-    camera = choose(options.camera, BLACK, "camera", place)
-    # Pictures of a mask or a preview lie in folders without any image of the data set.
-    found = gather(
-        each
-        for each in places
-        if any(name.lower().endswith(".png") and Path(name).stem in _KNOWN for name in each.files)
+def open_gehler_shi(location: str, options: DataOptions, scanned_folder: Folder | None = None) -> SceneSet:
+    """Return the data set, or one camera of it; images are read on use."""
+    folder = scanned_folder or Folder(Path(location))
+    folders = list(folder.within(_SEARCH_DEPTH))
+    truth = choose_name(options.truth, _TRUTHS, "truth", location) or "recommended"
+    path, lights = _read_truth(folders, truth, location)
+    camera = choose_name(options.camera, BLACK, "camera", location)
+    # Folders without any image of the data set may contain masks or previews.
+    all_images = gather_images(
+        candidate
+        for candidate in folders
+        if any(name.lower().endswith(".png") and Path(name).stem in _NAME_SET for name in candidate.files)
     )
-    wanted = [name for name in NAMES if camera in (None, camera_of(name))]
-    others = set(NAMES).difference(wanted)
-    images = {name: file for name, file in found.items() if name not in others}
-    kept, note = present(wanted, images, "the data set", folder.path, options.partial)
+    selected_names = [name for name in NAMES if camera in (None, camera_of(name))]
+    other_names = set(NAMES).difference(selected_names)
+    images = {name: file for name, file in all_images.items() if name not in other_names}
+    indices, note = match_images(selected_names, images, "the data set", folder.path, options.partial)
     corners = {
-        name: str(where.path / name) for where in places for name in where.files if name.endswith("_macbeth.txt")
+        name: str(child.path / name) for child in folders for name in child.files if name.endswith("_macbeth.txt")
     }
-    lacking = [wanted[number] for number in kept if f"{wanted[number]}_macbeth.txt" not in corners]
-    if lacking:
+    missing = [selected_names[index] for index in indices if f"{selected_names[index]}_macbeth.txt" not in corners]
+    if missing:
         raise FormatError(
-            f"{place} lacks {len(lacking)} files of corners of charts, coordinates/{lacking[0]}_macbeth.txt the first; "
-            "without them the charts cannot be masked: unpack the archive of measured illumination there"
+            f"{location} lacks {len(missing)} files of chart corners, first coordinates/{missing[0]}_macbeth.txt; "
+            "they are required to mask the charts: unpack the archive of measured illumination there"
         )
-    rows = {name: number for number, name in enumerate(NAMES)}
+    rows = {name: index for index, name in enumerate(NAMES)}
     scenes = tuple(
         MacbethScene(
             f"{name}.png",
@@ -143,27 +140,27 @@ def open_gehler_shi(place: str, options: DataOptions, listed: Folder | None = No
             WHITE if options.saturation is None else options.saturation,
             corners[f"{name}_macbeth.txt"],
         )
-        for name in (wanted[number] for number in kept)
+        for name in (selected_names[index] for index in indices)
     )
     return SceneSet(
         name="Gehler-Shi" + (f" {camera}" if camera else ""),
         layout="gehler-shi",
-        location=place,
+        location=location,
         scenes=scenes,
         treatment={
             "images": note,
-            "black level": stated(
+            "black level": level_note(
                 options.black,
-                ", ".join(f"{level} of the {name}" for name, level in BLACK.items())
+                ", ".join(f"{level} for the {name}" for name, level in BLACK.items())
                 + ", subtracted (GehlerShiSensor.m of github.com/google/ffcc)",
             ),
-            "saturation": stated(options.saturation, f"from {WHITE}, black not subtracted (GehlerShiSensor.m)"),
+            "saturation": level_note(options.saturation, f"from {WHITE}, black not subtracted (GehlerShiSensor.m)"),
             "mask": "the ColorChecker, by the corners in coordinates/*_macbeth.txt",
             "ground truth": f"{_TRUTHS[truth][1]} of {path.name}: "
             + (
                 "recommended by Hemrit et al., 2018"
                 if truth == "recommended"
-                else "Shi's of 2010, which Hemrit et al. replaced in 2018; not comparable with results by theirs"
+                else "Shi's of 2010, replaced by Hemrit et al. in 2018; results with the two are not comparable"
             ),
         },
     )
@@ -180,23 +177,23 @@ def camera_of(name: str) -> str:
     return "5D" if name.startswith("IMG_") else "1D"
 
 
-def _read_truth(places: list[Folder], truth: str, place: str) -> tuple[Path, npt.NDArray[np.float64]]:
+def _read_truth(folders: list[Folder], truth: str, location: str) -> tuple[Path, npt.NDArray[np.float64]]:
     files, variable = _TRUTHS[truth]
-    found = [folder.path / name for name in files for folder in places if folder.has(name)]
-    if not found:
-        others = [
-            other
-            for other, (names, _) in _TRUTHS.items()
-            if other != truth and any(folder.has(name) for name in names for folder in places)
+    paths = [folder.path / name for name in files for folder in folders if folder.has(name)]
+    if not paths:
+        alternatives = [
+            other_truth
+            for other_truth, (names, _) in _TRUTHS.items()
+            if other_truth != truth and any(folder.has(name) for name in names for folder in folders)
         ]
-        remedy = f", or take the one that is there with --read truth={others[0]}" if others else ""
+        remedy = f", or use --read truth={alternatives[0]}" if alternatives else ""
         source = (
             "colorconstancy.com, data sets, ColorChecker RECommended"
             if truth == "recommended"
             else "www2.cs.sfu.ca/~colour/data/shi_gehler"
         )
-        raise InputError(f"{place} has no {' or '.join(files)}, the {truth} ground truth; fetch it ({source}){remedy}")
-    lights = table(read_mat(found[0]), variable, found[0], 3)
+        raise InputError(f"{location} has no {' or '.join(files)}, the {truth} ground truth; get it ({source}){remedy}")
+    lights = numeric_table(read_mat(paths[0]), variable, paths[0], 3)
     if len(lights) != len(NAMES):
-        raise FormatError(f"{found[0]}: {variable} has {len(lights)} rows, expected {len(NAMES)}; restore the file")
-    return found[0], lights
+        raise FormatError(f"{paths[0]}: {variable} has {len(lights)} rows, expected {len(NAMES)}; restore the file")
+    return paths[0], lights

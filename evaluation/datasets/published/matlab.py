@@ -1,4 +1,4 @@
-"""Values out of MATLAB files, checked: the data sets' ground truths come in them."""
+"""Read and check variables of MATLAB files, in which data sets store their ground truths."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ def read_mat(path: Path) -> Mapping[str, Any]:
     try:
         return loadmat(path)
     except NotImplementedError as error:
-        raise FormatError(f"{path} is of MATLAB's version 7.3, expected 7 at most; save it with -v7") from error
+        raise FormatError(f"{path} has MATLAB version 7.3, expected 7 or older; save it with -v7") from error
     except Exception as error:
         reason = (isinstance(error, OSError) and error.strerror) or str(error)
         raise FormatError(f"{path} cannot be read: {reason}; restore it from the data set's archive") from error
 
 
-def table(content: Mapping[str, Any], name: str, path: Path, columns: int) -> npt.NDArray[np.float64]:
-    """Return a variable as an array (N, columns) float64."""
+def numeric_table(content: Mapping[str, Any], name: str, path: Path, columns: int) -> npt.NDArray[np.float64]:
+    """Return a variable as a finite array (N, columns) float64."""
     try:
-        values = np.asarray(_get(content, name, path), dtype=np.float64)
+        values = np.asarray(_variable(content, name, path), dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise FormatError(f"{path}: {name} is not made of numbers; restore the file") from error
+        raise FormatError(f"{path}: {name} is not numeric, expected numbers; restore the file") from error
     if values.ndim != 2 or values.shape[1] != columns or not np.isfinite(values).all():
         raise FormatError(
             f"{path}: {name} is {values.shape}, expected (images, {columns}) finite numbers; restore the file"
@@ -39,30 +39,30 @@ def table(content: Mapping[str, Any], name: str, path: Path, columns: int) -> np
 
 
 def scalar(content: Mapping[str, Any], name: str, path: Path) -> float:
-    """Return a variable that is one number."""
-    values = np.asarray(_get(content, name, path))
+    """Return a variable that is one number ≥ 0."""
+    values = np.asarray(_variable(content, name, path))
     if values.size != 1 or values.dtype.kind not in "iuf" or not np.isfinite(values).all() or values.min() < 0:
-        raise FormatError(f"{path}: {name} is {values.tolist()}, expected one number from 0; restore the file")
+        raise FormatError(f"{path}: {name} is {values.tolist()}, expected one number of 0 or more; restore the file")
     return float(values.reshape(-1)[0])
 
 
-def strings(content: Mapping[str, Any], name: str, path: Path) -> list[str] | None:
-    """Return a variable that is a cell array of names, or None if there is none."""
+def names_or_none(content: Mapping[str, Any], name: str, path: Path) -> list[str] | None:
+    """Return a cell array of names, or None if the variable does not exist."""
     if name not in content:
         return None
-    found: list[str] = []
+    names: list[str] = []
     for cell in np.asarray(content[name], dtype=object).reshape(-1):
         value: Any = cell
         while isinstance(value, np.ndarray) and value.size == 1:
             value = value.reshape(-1)[0]
         if not isinstance(value, str):
-            raise FormatError(f"{path}: {name} holds {value!r}, expected names of images; restore the file")
-        found.append(value.strip())
-    return found
+            raise FormatError(f"{path}: {name} contains {value!r}, expected names of images; restore the file")
+        names.append(value.strip())
+    return names
 
 
-def _get(content: Mapping[str, Any], name: str, path: Path) -> Any:
+def _variable(content: Mapping[str, Any], name: str, path: Path) -> Any:
     if name not in content:
-        have = ", ".join(key for key in content if not key.startswith("__"))
-        raise FormatError(f"{path} has {have or 'nothing'}, expected {name} among them; restore the file")
+        existing = ", ".join(key for key in content if not key.startswith("__"))
+        raise FormatError(f"{path} has the variables {existing or 'none'}, expected also {name}; restore the file")
     return content[name]

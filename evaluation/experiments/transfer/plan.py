@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.generated import GeneratedScene
-from evaluation.datasets.identity import source_marks
+from evaluation.datasets.identity import source_digests
 from evaluation.experiments.transfer.rows import TrainingSet
 from evaluation.scene import Scene, SceneSet
 from foundation.colorimetry import decode_srgb
@@ -105,7 +105,7 @@ def _image_keys(scenes: SceneSet, with_names: bool, with_pixels: bool) -> list[t
     for scene in scenes.scenes:
         if isinstance(scene, GeneratedScene):
             name = scene.entry.source
-            keys: list[_Key] = [("content", source_marks(scene.dataset, digests)[name])]
+            keys: list[_Key] = [("content", source_digests(scene.dataset, digests)[name])]
         else:
             name = scene.name
             keys = [("content", sha256_of(np.ascontiguousarray(scene.read()[0], np.float32)))] if with_pixels else []

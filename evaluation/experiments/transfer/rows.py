@@ -27,7 +27,7 @@ from evaluation.experiments.cross_validation import (
 )
 from evaluation.experiments.folds import require_groups_together
 from evaluation.experiments.running import evaluate
-from evaluation.learning.adapting import LearnedAlone, adapt, learn_alone
+from evaluation.learning.adapting import LocalFit, adapt, fit_local
 from evaluation.learning.constant_light import ConstantLight
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod
 from evaluation.methods.method import Method
@@ -218,7 +218,7 @@ class _RealSubsets:
 
     tests: Material
     folds: Sequence[npt.NDArray[np.int64]]
-    learned: dict[tuple[int, int, bytes], LearnedAlone] = field(default_factory=dict)
+    learned: dict[tuple[int, int, bytes], LocalFit] = field(default_factory=dict)
 
     @property
     def min_images(self) -> int:
@@ -256,12 +256,12 @@ class _RealSubsets:
             raise TypeError(f"{learner.name} cannot be adapted, because it has no features")
         return adapt(method, self._learned(learner, number, indices, seed))
 
-    def _learned(self, learner: FeatureLearner, number: int, indices: Indices, seed: int) -> LearnedAlone:
+    def _learned(self, learner: FeatureLearner, number: int, indices: Indices, seed: int) -> LocalFit:
         key = number, seed, indices.tobytes()
         if key not in self.learned:
             features = self.tests.features[number]
             drawn_features = [] if features is None else [features[int(index)] for index in indices]
-            self.learned[key] = learn_alone(learner, drawn_features, self.tests.truths[indices], seed)
+            self.learned[key] = fit_local(learner, drawn_features, self.tests.truths[indices], seed)
         return self.learned[key]
 
 

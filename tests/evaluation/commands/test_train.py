@@ -91,7 +91,7 @@ def test_all_omits_learners_that_are_not_installed(
     assert main(["cv", "all", str(data), "--folds", "2"]) == 0
     printed = capsys.readouterr().out
     assert "Log-chroma" in printed
-    assert "Convolutional network is omitted: training convnet needs torch" in printed
+    assert "Convolutional network is omitted: training convnet requires torch" in printed
     assert "pip install scikit-learn" in printed
     assert main(["cv", "convnet", str(data)]) == 2
     assert "pip install torch" in capsys.readouterr().err

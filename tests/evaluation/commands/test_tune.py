@@ -10,4 +10,4 @@ from evaluation.cli import main
 def test_refuses_unknown_family_before_opening_data(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tune", "pca", "no/such/data"]) == 2
     error = capsys.readouterr().err
-    assert "'pca' is no family of methods to tune; the families are shades-of-gray, general-gray-world" in error
+    assert "'pca' cannot be tuned, expected shades-of-gray, general-gray-world" in error

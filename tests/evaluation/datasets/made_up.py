@@ -1,4 +1,4 @@
-"""Made-up copies of the data sets' layouts, with values whose results can be computed by hand."""
+"""Synthetic copies of all layouts; their results can be computed by hand."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from evaluation.datasets.published.gehler_shi import NAMES
 
 Image = npt.NDArray[np.uint16] | npt.NDArray[np.uint8]
 
+# Red, green and blue of an image, in counts; different, so that exchanged channels are noticed.
 COLOUR = (3000, 5000, 4000)
-"""Red, green and blue of a made-up image as its file has them, unlike each other so that a swap shows."""
 
 
 def image_of(height: int, width: int, colour: Sequence[int] = COLOUR) -> npt.NDArray[np.uint16]:
@@ -30,13 +30,13 @@ def image_of(height: int, width: int, colour: Sequence[int] = COLOUR) -> npt.NDA
 
 
 def write_png(path: Path, image: Image) -> None:
-    """Write an image (H, W, 3) uint16 or uint8, red first, by another library than reads it."""
+    """Write an image (H, W, 3) uint16 or uint8, red first; the reader uses another library."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(_png(image))
 
 
 def write_large_png(path: Path, height: int, width: int) -> None:
-    """Write what `image_of` makes; copies of a data set have the same large images in every test."""
+    """Write the image of `image_of`; the encoded file is cached."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(_large_png(height, width))
 
@@ -47,8 +47,8 @@ def _large_png(height: int, width: int) -> bytes:
 
 
 def _png(image: Image) -> bytes:
-    done, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    assert done
+    is_encoded, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    assert is_encoded
     return data.tobytes()
 
 
@@ -67,37 +67,37 @@ def write_mat(path: Path, variables: Mapping[str, Any]) -> None:
 
 def cells(names: Sequence[str]) -> npt.NDArray[Any]:
     """Return names (N, 1) as MATLAB's cell array of strings."""
-    made = np.empty((len(names), 1), dtype=object)
-    made[:, 0] = names
-    return made
+    array = np.empty((len(names), 1), dtype=object)
+    array[:, 0] = names
+    return array
 
 
 def cube_plus(folder: Path) -> None:
-    """Write three images of 1060 × 2060 px in which 10 × 10 px lie in the rectangle of the cube."""
+    """Write three images of 1060 × 2060 px; the rectangle of the cube has 10 × 10 px."""
     for name in ("1.PNG", "2.PNG", "PNG_3_9/3.PNG"):
         write_large_png(folder / name, 1060, 2060)
     (folder / "cube+_gt.txt").write_text("0.1 0.5 0.4\n0.2 0.5 0.3\n0.3 0.5 0.2\n")
     (folder / "cube+_left_gt.txt").write_text("0.25 0.5 0.25\n" * 3)
 
 
-CUBE_PLUS_PLUS_HEAD = "image," + ",".join(
+CUBE_PLUS_PLUS_HEADER = "image," + ",".join(
     f"{face}_{channel}" for face in ("mean", "left", "right", "left_white", "right_white") for channel in "rgb"
 )
 
 
 def cube_plus_plus(folder: Path) -> None:
-    """Write two images, the second without a mean light; the first with a white level of its own."""
+    """Write two images, the first with a white level, the second without a mean ground truth."""
     for name in ("00_0001", "00_0002"):
         write_large_png(folder / "PNG" / f"{name}.png", 1728, 2592)
     rest = "0.1,0.5,0.4,0.2,0.5,0.3,0.11,0.5,0.39,0.21,0.5,0.29"
-    (folder / "gt.csv").write_text(f"{CUBE_PLUS_PLUS_HEAD}\n00_0001,0.15,0.5,0.35,{rest}\n00_0002,,,,{rest}\n")
+    (folder / "gt.csv").write_text(f"{CUBE_PLUS_PLUS_HEADER}\n00_0001,0.15,0.5,0.35,{rest}\n00_0002,,,,{rest}\n")
     (folder / "properties.csv").write_text(
         "image,estimation,MakerNotes:NormalWhiteLevel\n00_0001,full,8000\n00_0002,partial,\n"
     )
 
 
 def simple_cube(folder: Path) -> None:
-    """Write one image of 648 × 432 px in each part, the rectangle of the cube painted over."""
+    """Write one image of 648 × 432 px in each subset, the rectangle of the cube painted over."""
     image = image_of(432, 648)
     image[182:, 473:] = 0
     for part, name, light in (("train", "00_0003", "0.15,0.5,0.35"), ("test", "01_0004", "0.2,0.5,0.3")):
@@ -124,8 +124,8 @@ def nus8(folder: Path) -> None:
         )
 
 
+# Corners of a chart, annotated on an image of 16 × 20 px: columns 2 to 6, rows 2 to 4 at half the size.
 MACBETH = "20 16\n4 4\n11.98 4\n4 8\n12 8\n"
-"""Corners of a chart annotated on an image twice as large as 8 × 10 px: columns 2 to 6, rows 2 to 4."""
 
 
 def gehler_shi(folder: Path) -> None:
@@ -141,7 +141,7 @@ def gehler_shi(folder: Path) -> None:
 
 
 def intel_tau(folder: Path) -> None:
-    """Write two cameras with one and two parts, 8 × 10 px, two pixels painted over."""
+    """Write two cameras with one and two subsets, 8 × 10 px, two pixels painted over."""
     image = image_of(8, 10)
     image[3, 4:6] = 0
     for path, light in (
@@ -150,18 +150,18 @@ def intel_tau(folder: Path) -> None:
         ("Nikon_D810/field_1_cameras/N_D810_field_7", "0.2\n0.5\n0.3"),
     ):
         write_tiff(folder / f"{path}.tiff", image)
-        head, _, number = path.rpartition("_")
-        (folder / f"{head}_{number.zfill(3)}.wp").write_text(light)
+        stem, _, number = path.rpartition("_")
+        (folder / f"{stem}_{number.zfill(3)}.wp").write_text(light)
 
 
+# Corners in px of the raw file: columns 2 to 4 and rows 2 to 4 of the half-size image.
 CHARTS = {f"mcc{number}": [[4, 4], [8, 4], [8, 8], [4, 8]] for number in (1, 2, 3)}
-"""Corners in px of the raw file: columns 2 to 4 and rows 2 to 4 of the half-size image."""
 
 LIGHTS = {"Light1": [0.5, 1, 0.5], "Light2": [2.0, 1, 1.0], "Light3": [1.0, 1, 3.0]}
 
 
 def lsmi(folder: Path) -> None:
-    """Write one place of Sony's under one and two lights and one under three, 8 × 10 px."""
+    """Write a place under one and two illuminants and one under three, with a Sony camera, 8 × 10 px."""
     camera = folder / "sony"
     two = np.full((8, 10, 2), (0.25, 0.75))
     two[7, 9] = -1
@@ -185,8 +185,8 @@ def lsmi(folder: Path) -> None:
     )
 
 
-def lsmi_prepared(folder: Path) -> None:
-    """Write what the authors' 2_preprocess_data.py makes of it: by part, black subtracted, masks as pictures."""
+def lsmi_preprocessed(folder: Path) -> None:
+    """Write output of 2_preprocess_data.py: folders by subset, black subtracted, masks as pictures."""
     camera = folder / "sony_512"
     mask = np.ones((8, 10), np.uint8)
     mask[2:5, 2:5] = 0
@@ -214,7 +214,7 @@ def ffcc(folder: Path) -> None:
 
 
 def plain_folder(folder: Path) -> None:
-    """Write a PNG, a TIFF of floats and a NumPy file, one with a mask, with levels of their own."""
+    """Write a PNG with a mask, a TIFF of floats and a NumPy file, with individual levels."""
     write_png(folder / "a.png", image_of(8, 10))
     write_tiff(folder / "more" / "b.tiff", image_of(8, 10).astype(np.float32) / 2)
     np.save(folder / "c.npy", image_of(8, 10))
@@ -238,26 +238,21 @@ def thumbnails(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class MadeUp:
-    """A made-up copy of a layout.
+    """Synthetic copy of a layout.
 
-    Attributes
-    ----------
-    layout
-        Its name.
-    make
-        Writes it into an empty folder.
-    at
-        Where the data set is in that folder.
-    partial
-        Whether images of the published data set are missing in it.
+    - `layout`: name of the layout.
+    - `make`: writes the copy into an empty folder.
+    - `subfolder`: path of the data set in that folder.
+    - `partial`: images of the published data set are missing.
     """
 
     layout: str
     make: Callable[[Path], None]
-    at: str = "."
+    subfolder: str = "."
     partial: bool = False
 
 
+# One copy of each layout, for each path that a user may give.
 COPIES = {
     "cube-plus": MadeUp("cube-plus", cube_plus),
     "cube++": MadeUp("cube++", cube_plus_plus),
@@ -270,10 +265,9 @@ COPIES = {
     "intel-tau camera": MadeUp("intel-tau", intel_tau, "Canon_5DSR"),
     "lsmi": MadeUp("lsmi", lsmi),
     "lsmi camera": MadeUp("lsmi", lsmi, "sony"),
-    "lsmi prepared": MadeUp("lsmi", lsmi_prepared, "sony_512"),
+    "lsmi prepared": MadeUp("lsmi", lsmi_preprocessed, "sony_512"),
     "ffcc": MadeUp("ffcc", ffcc),
     "folder": MadeUp("folder", plain_folder),
     "folder table": MadeUp("folder", plain_folder, "gt.csv"),
     "thumbnails": MadeUp("thumbnails", thumbnails, "thumbs.npz"),
 }
-"""One of each layout and of each place that a user may name of it."""

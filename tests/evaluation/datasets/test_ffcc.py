@@ -1,4 +1,4 @@
-"""FFCC's folders: values computed by hand on a made-up copy."""
+"""Values of FFCC folders, computed by hand for a synthetic copy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def copy(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_values(copy: Path) -> None:
+def test_reads_thumbnails_of_8_and_16_bits(copy: Path) -> None:
     data = open_scenes(copy)
     assert [scene.name for scene in data.scenes] == ["folder_1/000001.png", "folder_2/000001.png"]
     assert [scene.truth.tolist() for scene in data.scenes] == [[0.500249, 0.819743, 0.278876], [0.1, 0.2, 0.3]]
@@ -33,7 +33,7 @@ def test_values(copy: Path) -> None:
     assert deep.saturation is None
 
 
-def test_what_has_no_partner(copy: Path) -> None:
+def test_refuses_files_without_partner(copy: Path) -> None:
     write_png(copy / "folder_1" / "2.png", image_of(2, 2))
     with pytest.raises(FormatError, match=r"2.*1.*2\.png.*0"):
         open_scenes(copy)
@@ -44,7 +44,7 @@ def test_what_has_no_partner(copy: Path) -> None:
     assert len(open_scenes(copy, options=DataOptions(partial=True)).scenes) == 2
 
 
-def test_a_light_that_is_none_is_named_when_it_is_used(copy: Path) -> None:
+def test_reports_invalid_ground_truth_on_use(copy: Path) -> None:
     (copy / "folder_1" / "000001.txt").write_text("0.5\n0.8\nblue\n")
     with pytest.raises(FormatError, match=r"000001\.txt"):
         _ = open_scenes(copy).scenes[0].truth

@@ -1,4 +1,4 @@
-"""A made-up world whose lights are known: scenes of random surfaces under lights of a line."""
+"""Synthetic scenes: random surfaces under known illuminants on a line."""
 
 from __future__ import annotations
 
@@ -16,37 +16,36 @@ from evaluation.learning.regression_trees import RegressionTrees
 from evaluation.learning.standard import standard_learners
 from tests.evaluation.made_scenes import Made
 
-SIZE = 32
-"""Width and height of scenes, px."""
+SIZE = 32  # width and height of scenes, px
 
+# All methods, three with less training, and the network with the size of the scenes.
 LEARNERS: dict[str, FeatureLearner] = {
     **standard_learners(),
     "convnet": ConvNet(working_size=SIZE, epochs=40),
     "log-chroma": LogChroma(pretraining=8, training=24),
     "regression-trees": RegressionTrees(windows=3),
 }
-"""All methods; three train for less long, and the network's square is no larger than the scenes."""
 
+# All methods with so little training that estimates are reproducible but not accurate.
 QUICK: dict[str, FeatureLearner] = {
     **LEARNERS,
     "color-beaver": ColorBeaver(population=12, generations=6),
     "convnet": ConvNet(working_size=SIZE, epochs=6),
     "log-chroma": LogChroma(pretraining=2, training=6),
 }
-"""All methods, trained for so little that what they answer is the same again, but need not be right."""
 
 
 def lights_on_a_line(count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
-    """Return lights (N, 3) float64 from tungsten to shade: g fixed, r falls as b rises."""
+    """Return illuminants (N, 3) float64 from tungsten to shade: g is constant, r decreases with b."""
     red = rng.uniform(0.18, 0.42, count)
     return np.stack([red, np.full(count, 0.42), 0.58 - red], axis=1)
 
 
 def world(count: int, seed: int = 0, size: int = SIZE, cast: float = 0.25) -> list[Made]:
-    """Return scenes of 4 px tiles whose surfaces are near grey, each scene with a cast of its own.
+    """Return scenes of 4 px tiles with nearly grey surfaces.
 
-    The cast is what keeps Gray-world from being right: log-normal with a standard deviation of `cast` in the red and
-    blue of each surface, and a tenth of it common to the scene.
+    Surfaces have a log-normal cast with the standard deviation `cast` in red and blue, and a tenth of it common to the
+    scene, so that Gray-world is not accurate.
     """
     rng = np.random.default_rng(seed)
     scenes: list[Made] = []
@@ -60,7 +59,7 @@ def world(count: int, seed: int = 0, size: int = SIZE, cast: float = 0.25) -> li
 
 
 def save_world(path: Path, count: int, seed: int = 0, size: int = SIZE) -> None:
-    """Save scenes as thumbnails, named after the file."""
+    """Save scenes as thumbnails with the name of the file."""
     scenes = world(count, seed, size)
     np.savez(
         path,
@@ -71,5 +70,5 @@ def save_world(path: Path, count: int, seed: int = 0, size: int = SIZE) -> None:
 
 
 def constant_light(scenes: Sequence[Made]) -> npt.NDArray[np.float64]:
-    """Return the median light (3,) float64 of scenes, which a method must beat to have learned anything."""
+    """Return the median illuminant (3,) float64 of scenes, the baseline of learned methods."""
     return np.median([scene.truth for scene in scenes], axis=0)

@@ -1,4 +1,4 @@
-"""The provenance of models in tests."""
+"""Training records for tests."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from evaluation.scene import Scene, SceneSet
 
 
 class Noon:
-    """A clock that stands still."""
+    """A clock that always returns the same time."""
 
     def now(self) -> datetime:
         return datetime(2026, 11, 22, 12, tzinfo=UTC)
@@ -23,6 +23,5 @@ class Noon:
 
 
 def story(scenes: Sequence[Scene], name: str = "made up") -> TrainingRecord:
-    """Return the provenance of a model that was trained on scenes."""
     data = SceneSet(name, "memory", "nowhere", tuple(scenes), {"mask": "none"})
     return provenance_of(data, seed=3, clock=Noon())

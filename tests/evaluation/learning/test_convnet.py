@@ -1,4 +1,4 @@
-"""The network against a few lines of NumPy: what it sees, how it weighs, how it is lit anew, where it begins."""
+"""Convolutional network, compared with a NumPy implementation."""
 
 from __future__ import annotations
 
@@ -17,27 +17,29 @@ pytestmark = pytest.mark.slow
 torch: Any = pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
 
 
-def convolved(
+def convolve(
     layer: npt.NDArray[np.float64], weights: npt.NDArray[Any], bias: npt.NDArray[Any], step: int
 ) -> npt.NDArray[np.float64]:
-    """Return the sums (O, h, w) of an image (I, H, W) correlated with (O, I, K, K), zeros around it."""
-    reach = weights.shape[2] // 2
-    padded = np.pad(layer, ((0, 0), (reach, reach), (reach, reach)))
-    found: Any = [correlate(padded, kernel, mode="valid")[0, ::step, ::step] for kernel in weights.astype(np.float64)]
-    return np.asarray(found + bias[:, None, None].astype(np.float64))
+    """Return the correlation (O, h, w) of an image (I, H, W), padded with zeros, with weights (O, I, K, K)."""
+    radius = weights.shape[2] // 2
+    padded = np.pad(layer, ((0, 0), (radius, radius), (radius, radius)))
+    estimates: Any = [
+        correlate(padded, kernel, mode="valid")[0, ::step, ::step] for kernel in weights.astype(np.float64)
+    ]
+    return np.asarray(estimates + bias[:, None, None].astype(np.float64))
 
 
-def light_by_numpy(weights: dict[str, npt.NDArray[Any]], image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the light of an image (H, W, 4): R, G, B, usable; H and W multiples of four."""
+def numpy_estimate(weights: dict[str, npt.NDArray[Any]], image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the estimate for an image (H, W, 4): R, G, B, usable; H and W are multiples of four."""
     colours, used = np.moveaxis(image[..., :3], 2, 0), image[..., 3]
     mean = colours.sum() / (3 * used.sum())
     layer = np.concatenate([np.sqrt(colours / mean), used[None]])
     for number, step in ((1, 2), (2, 2), (3, 1)):
-        layer = np.maximum(convolved(layer, weights[f"weight{number}"], weights[f"bias{number}"], step), 0)
-    local = convolved(layer, weights["weight4"], weights["bias4"], 1)
+        layer = np.maximum(convolve(layer, weights[f"weight{number}"], weights[f"bias{number}"], step), 0)
+    local = convolve(layer, weights["weight4"], weights["bias4"], 1)
     height, width = used.shape
     share = used.reshape(height // 4, 4, width // 4, 4).mean(axis=(1, 3))
-    # FC4, equations 4 to 6: local lights times confidence, summed. Confidence is above 0, a light e^-3 to e^3.
+    # FC4, equations 4 to 6: sum of local illuminants times confidence; confidence > 0, illuminants e^-3 to e^3.
     confidence = np.logaddexp(0, local[3]) * share
     light = (np.exp(np.clip(local[:3], -3, 3)) * confidence).sum(axis=(1, 2))
     return light / light.sum()
@@ -45,25 +47,25 @@ def light_by_numpy(weights: dict[str, npt.NDArray[Any]], image: npt.NDArray[np.f
 
 def random_weights(size: float) -> dict[str, npt.NDArray[np.float32]]:
     random = np.random.default_rng(3)
-    shapes = convnet._shapes(3)
+    shapes = convnet._weight_shapes(3)
     return {name: random.normal(0, size, shape).astype(np.float32) for name, shape in shapes.items()}
 
 
 @pytest.mark.parametrize("size", [0.15, 0.4])
-def test_local_lights_are_weighed_by_confidence(size: float) -> None:
+def test_weights_local_estimates_by_confidence(size: float) -> None:
     weights = random_weights(size)
     image = np.random.default_rng(4).uniform(0.05, 1, (16, 12, 4)).astype(np.float16)
     image[..., 3] = 1
     image[3:9, 5:] = 0
-    (found,) = ConvNetModel(weights).lights(image[None])
-    np.testing.assert_allclose(found, light_by_numpy(dict(weights), image.astype(np.float64)), rtol=1e-4)
+    (estimates,) = ConvNetModel(weights).lights(image[None])
+    np.testing.assert_allclose(estimates, numpy_estimate(dict(weights), image.astype(np.float64)), rtol=1e-4)
     assert ConvNet(width=3).restore(dict(weights)).arrays().keys() == weights.keys()
     for damage in (weights["bias4"][:3], weights["bias4"].astype(np.float64), np.full(4, np.nan, np.float32)):
         with pytest.raises(ValueError, match="bias4"):
             ConvNet(width=3).restore({**weights, "bias4": damage})
 
 
-def test_what_is_smaller_than_the_square_is_framed_by_what_is_not_usable() -> None:
+def test_pads_small_images_with_unusable_pixels() -> None:
     image = np.full((20, 40, 3), 0.5, np.float32)
     framed = ConvNet(working_size=64).features(image)
     assert framed is not None
@@ -73,8 +75,8 @@ def test_what_is_smaller_than_the_square_is_framed_by_what_is_not_usable() -> No
     assert not framed[:, 40:].any()
 
 
-def test_the_loss_is_the_angle() -> None:
-    found = torch.tensor([[1.0, 0, 0], [2**-0.5, 2**-0.5, 0], [0, 0, 1]])
-    wanted = torch.tensor([[0, 3.0, 0], [5, 0, 0], [0, 0, 2]])
-    angles = convnet._angle(torch, found, wanted).numpy()
+def test_loss_is_angle() -> None:
+    estimates = torch.tensor([[1.0, 0, 0], [2**-0.5, 2**-0.5, 0], [0, 0, 1]])
+    truths = torch.tensor([[0, 3.0, 0], [5, 0, 0], [0, 0, 2]])
+    angles = convnet._angle(torch, estimates, truths).numpy()
     np.testing.assert_allclose(angles, [np.pi / 2, np.pi / 4, 0], atol=1e-5)

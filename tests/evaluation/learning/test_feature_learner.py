@@ -1,4 +1,4 @@
-"""The contract of every learned method that the commands offer."""
+"""Contract of all learned methods of the commands."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from tests.evaluation.learning.stories import story
 pytestmark = pytest.mark.slow
 
 TRAIN, TEST = world(60), world(30, seed=1)
-LOOKING = {key: learner for key, learner in LEARNERS.items() if key != "constant-light"}
-"""All that look at images; the constant light has tests of its own."""
+# Methods that use the image; the constant estimate has separate tests.
+IMAGE_LEARNERS = {key: learner for key, learner in LEARNERS.items() if key != "constant-light"}
 
 
-@pytest.fixture(scope="module", params=LOOKING)
+@pytest.fixture(scope="module", params=IMAGE_LEARNERS)
 def learner(request: pytest.FixtureRequest) -> FeatureLearner:
     if request.param == "convnet":
         pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
-    return LOOKING[request.param]
+    return IMAGE_LEARNERS[request.param]
 
 
 @pytest.fixture
 def quick(learner: FeatureLearner) -> FeatureLearner:
-    """Return the same method, trained for less."""
-    return next(QUICK[key] for key, one in LOOKING.items() if one is learner)
+    """Return the same method with less training."""
+    return next(QUICK[key] for key, candidate in IMAGE_LEARNERS.items() if candidate is learner)
 
 
 @pytest.fixture(scope="module")
@@ -48,22 +48,22 @@ def errors(method: LearnedMethod) -> np.ndarray:
     return recovery_error(estimates, np.stack([scene.truth for scene in TEST]))
 
 
-def test_it_learns_what_a_constant_light_does_not(fitted: LearnedMethod) -> None:
+def test_is_better_than_constant_estimate(fitted: LearnedMethod) -> None:
     truths = np.stack([scene.truth for scene in TEST])
     constant = recovery_error(np.tile(constant_light(TRAIN), (len(TEST), 1)), truths)
-    found = errors(fitted)
-    # The lights reach 15 degrees from end to end; surfaces give them away to about a degree.
-    assert np.median(found) < 0.4 * np.median(constant)
-    assert np.median(found) < 2.5
+    # Illuminants span 15°, and surfaces determine them within about 1°.
+    median = np.median(errors(fitted))
+    assert median < 0.4 * np.median(constant)
+    assert median < 2.5
 
 
-def test_the_seed_alone_decides(quick: FeatureLearner) -> None:
-    once, again = (quick.fit(TRAIN, seed=3) for _ in range(2))
-    for name, array in once.model.arrays().items():
-        np.testing.assert_array_equal(array, again.model.arrays()[name], err_msg=name)
+def test_is_reproducible_with_seed(quick: FeatureLearner) -> None:
+    first, second = (quick.fit(TRAIN, seed=3) for _ in range(2))
+    for name, array in first.model.arrays().items():
+        np.testing.assert_array_equal(array, second.model.arrays()[name], err_msg=name)
 
 
-def test_a_saved_model_gives_the_same_bits(fitted: LearnedMethod, tmp_path: Path) -> None:
+def test_saved_model_returns_identical_estimates(fitted: LearnedMethod, tmp_path: Path) -> None:
     save_model(tmp_path / "model.npz", fitted, story(TRAIN))
     loaded = load_model(tmp_path / "model.npz")
     assert loaded.learner == fitted.learner
@@ -71,13 +71,13 @@ def test_a_saved_model_gives_the_same_bits(fitted: LearnedMethod, tmp_path: Path
         np.testing.assert_array_equal(loaded.estimate(scene.image), fitted.estimate(scene.image))
 
 
-def test_neither_exposure_nor_unit_matters(fitted: LearnedMethod) -> None:
+def test_estimate_does_not_depend_on_exposure(fitted: LearnedMethod) -> None:
     for scene in TEST[:5]:
         plain = fitted.estimate(scene.image)
         np.testing.assert_allclose(fitted.estimate(scene.image * np.float32(4096)), plain, atol=1e-6)
 
 
-def test_masked_and_clipped_pixels_do_not_count(fitted: LearnedMethod) -> None:
+def test_ignores_masked_and_clipped_pixels(fitted: LearnedMethod) -> None:
     scene = TEST[0]
     spoilt, mask = scene.image.copy(), np.zeros(scene.image.shape[:2], dtype=bool)
     spoilt[8:16, 4:20], mask[8:16, 4:20] = [0.9, 0.01, 0.3], True
@@ -92,7 +92,7 @@ def test_masked_and_clipped_pixels_do_not_count(fitted: LearnedMethod) -> None:
     np.testing.assert_array_equal(fitted.estimate(clipped, 50), fitted.estimate(blank, None, ring))
 
 
-def test_an_image_without_a_usable_pixel_is_marked_and_not_learned_from(quick: FeatureLearner) -> None:
+def test_image_without_usable_pixel_is_grey_and_excluded_from_training(quick: FeatureLearner) -> None:
     black = replace(TRAIN[0], image=np.zeros_like(TRAIN[0].image))
     method = quick.fit([*TRAIN[:12], black])
     plain = quick.fit(TRAIN[:12])
@@ -103,7 +103,7 @@ def test_an_image_without_a_usable_pixel_is_marked_and_not_learned_from(quick: F
         quick.fit([black])
 
 
-def test_large_images_are_reduced(fitted: LearnedMethod) -> None:
+def test_reduces_large_images(fitted: LearnedMethod) -> None:
     rng = np.random.default_rng(0)
     small: list[npt.NDArray[np.float64]] = []
     large: list[npt.NDArray[np.float64]] = []
@@ -115,6 +115,6 @@ def test_large_images_are_reduced(fitted: LearnedMethod) -> None:
     assert np.mean(large) < np.mean(small) + 1.5
 
 
-def test_one_scene_is_enough_to_fit(learner: FeatureLearner) -> None:
+def test_fits_one_scene(learner: FeatureLearner) -> None:
     light = learner.fit(TRAIN[:1]).estimate(TRAIN[0].image)
     assert recovery_error(light, TRAIN[0].truth) < 3

@@ -1,4 +1,4 @@
-"""Log-chroma: a light shifts the histogram, the torus is cut where no light lies, gradients are derivatives."""
+"""Log-chroma: histograms, torus, losses and gradients."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ pytestmark = pytest.mark.slow
 LEARNER = LogChroma(pretraining=8, training=32)
 
 
-def extracted(image: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
-    found = LEARNER.features(image)
-    assert found is not None
-    return found
+def extract(image: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
+    features = LEARNER.features(image)
+    assert features is not None
+    return features
 
 
-def taught_by(scenes: list[Made]) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float64]]:
+def training_data(scenes: list[Made]) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float64]]:
     lights = np.stack([scene.truth for scene in scenes])
-    return np.stack([extracted(scene.image) for scene in scenes]), lights / lights.sum(axis=1, keepdims=True)
+    return np.stack([extract(scene.image) for scene in scenes]), lights / lights.sum(axis=1, keepdims=True)
 
 
-def test_a_light_shifts_both_histograms() -> None:
-    # Powers of two and whole bins: no pixel comes to lie on the other side of a bin's edge, none below the least value.
+def test_illuminant_shifts_both_histograms() -> None:
+    # Powers of two and whole bins: no pixel crosses the edge of a bin or the smallest value.
     (scene,) = world(1)
     image = scene.image / scene.image.max() * 0.5 + 0.25
     image[0, 0] = 4
-    plain = extracted(image)
-    lit = extracted((image * np.exp([-3 / 32, 0, 5 / 32])).astype(np.float32))
+    plain = extract(image)
+    lit = extract((image * np.exp([-3 / 32, 0, 5 / 32])).astype(np.float32))
     shifted = np.roll(plain, (3, -5), axis=(1, 2))
     for channel, allowed in ((0, 0.02), (1, 0.05)):
-        differ = np.abs(lit[channel].astype(int) - shifted[channel]).sum() / 2
-        assert differ <= allowed * plain[channel].sum()
+        difference = np.abs(lit[channel].astype(int) - shifted[channel]).sum() / 2
+        assert difference <= allowed * plain[channel].sum()
         assert np.abs(lit[channel].astype(int) - plain[channel]).sum() / 2 > 0.5 * plain[channel].sum()
 
 
-def test_chromas_are_counted_in_bins_of_a_32nd_on_a_torus_of_four() -> None:
-    # u = ln(g / r) and v = ln(g / b), in 32nds: (3, -2), and (65, -64), which lies a torus of 128 from (65, 64).
+def test_counts_chromas_in_bins_of_one_32nd() -> None:
+    # u = ln(g / r) and v = ln(g / b), in 32nds: (3, -2), and (65, -64), which is (65, 64) on a torus of 128.
     steps = np.array([[-3, 0, 2], [-65, 0, 64], [0, 0, 0], [0, 0, 0]], dtype=np.float64) / 32
     pixels = (np.exp(steps) * [[0.5], [0.5], [2**-8], [0.9]]).astype(np.float32)
     pixels[3, 1] = 2**-8.001
@@ -57,25 +57,27 @@ def test_chromas_are_counted_in_bins_of_a_32nd_on_a_torus_of_four() -> None:
     assert counts.dtype == np.uint16
 
 
-def test_deviations_are_from_the_usable_of_eight_neighbours() -> None:
+def test_deviations_use_eight_usable_neighbours() -> None:
     random = np.random.default_rng(0)
     image, used = random.random((5, 6, 3)).astype(np.float32), random.random((5, 6)) < 0.6
     used[:2, :3] = False
-    found = log_chroma._deviations(image, used)
+    deviations = log_chroma._deviations(image, used)
     for row, column in np.ndindex(5, 6):
-        near = [
+        differences = [
             np.abs(image[y, x] - image[row, column])
             for y in range(max(row - 1, 0), min(row + 2, 5))
             for x in range(max(column - 1, 0), min(column + 2, 6))
             if used[y, x] and (y, x) != (row, column)
         ]
-        np.testing.assert_allclose(found[row, column], np.mean(near, axis=0) if near else 0, rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(
+            deviations[row, column], np.mean(differences, axis=0) if differences else 0, rtol=1e-5, atol=1e-7
+        )
 
 
-def test_the_penalty_of_what_is_scaled_is_its_squared_length() -> None:
+def test_penalty_is_squared_length_of_scaled_parameters() -> None:
     scaled = np.random.default_rng(1).normal(0, 1, (BINS, BINS))
-    spectrum = np.fft.rfft2(scaled) * log_chroma._scale(0.3, 0.002)
-    # The authors' penalty of a filter: its squares, and an eighth of its squared differences, of all coefficients.
+    spectrum = np.fft.rfft2(scaled) * log_chroma._fourier_scale(0.3, 0.002)
+    # Authors' penalty of a filter: squares and an eighth of the squared differences, for all coefficients.
     full = np.fft.fft2(np.fft.irfft2(spectrum, s=(BINS, BINS)))
     turn = np.abs(1 - np.exp(2j * np.pi * np.arange(BINS) / BINS)) ** 2
     penalty = (np.abs(full) ** 2 * (0.3 * (turn[:, None] + turn) / 8 + 0.002)).sum()
@@ -83,29 +85,29 @@ def test_the_penalty_of_what_is_scaled_is_its_squared_length() -> None:
     assert abs(full[0, 0]) < 1e-9
 
 
-def relit(count: int, reds: npt.NDArray[np.float64], seed: int = 0) -> list[Any]:
-    """Return the scenes of the world under lights whose red over green and blue over green are given, (N, 2)."""
+def relit(count: int, ratios: npt.NDArray[np.float64], seed: int = 0) -> list[Any]:
+    """Return scenes under illuminants with red over green and blue over green, (N, 2)."""
     scenes = world(count, seed)
-    lights = np.stack([reds[:, 0], np.ones(count), reds[:, 1]], axis=1)
+    lights = np.stack([ratios[:, 0], np.ones(count), ratios[:, 1]], axis=1)
     return [
         replace(scene, truth=light, image=(scene.image / scene.truth * light).astype(np.float32))
         for scene, light in zip(scenes, lights, strict=True)
     ]
 
 
-def test_rare_lights_at_the_end_of_the_range_are_not_wrapped() -> None:
-    # As with the 1Ds Mark III: many lights at one end, few at the other, and more than half a torus in between.
+def test_rare_illuminants_are_not_wrapped() -> None:
+    # As for the 1Ds Mark III: many illuminants at one end, few at the other, more than half a torus apart.
     rng = np.random.default_rng(2)
     logs = np.concatenate([rng.uniform(-0.05, 0.05, 48), rng.uniform(1.2, 1.3, 12)])
     scenes = relit(60, np.exp(np.stack([logs / 3, -logs], axis=1)))
     method = LEARNER.fit(scenes[::2])
-    found = np.stack([method.estimate(scene.image) for scene in scenes[1::2]])
-    errors = recovery_error(found, np.stack([scene.truth for scene in scenes[1::2]]))
+    estimates = np.stack([method.estimate(scene.image) for scene in scenes[1::2]])
+    errors = recovery_error(estimates, np.stack([scene.truth for scene in scenes[1::2]]))
     assert errors.max() < 12
     assert np.median(errors) < 3
 
 
-def test_lights_that_span_more_than_the_torus_get_wider_bins() -> None:
+def test_widely_spread_illuminants_get_wider_bins() -> None:
     rng = np.random.default_rng(3)
     logs = rng.uniform(-1.3, 1.3, 60)
     scenes = relit(60, np.exp(np.stack([logs, -logs], axis=1)))
@@ -113,48 +115,48 @@ def test_lights_that_span_more_than_the_torus_get_wider_bins() -> None:
     errors = [float(recovery_error(method.estimate(scene.image), scene.truth)) for scene in scenes[48:]]
     assert np.median(errors) < 3
     arrays = method.model.arrays()
-    again = replace(method, model=LEARNER.restore(arrays))
-    assert again.estimate(scenes[50].image) == pytest.approx(method.estimate(scenes[50].image))
-    with pytest.raises(ValueError, match="bins of"):
+    restored = replace(method, model=LEARNER.restore(arrays))
+    assert restored.estimate(scenes[50].image) == pytest.approx(method.estimate(scenes[50].image))
+    with pytest.raises(ValueError, match="the grid is"):
         LEARNER.restore({**arrays, "grid": np.array([0.5, 0.1])})
-    with pytest.raises(InputError, match=r"3\.\d\d natural.*tells 3"):
+    with pytest.raises(InputError, match=r"3\.\d\d natural.*at most 3"):
         LEARNER.fit(relit(60, np.exp(np.stack([logs * 1.5, -logs], axis=1))))
 
 
 def hat(mean: tuple[float, float], covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return a normal distribution (1, 64, 64), wrapped by its nearest turn."""
+    """Return a normal distribution (1, 64, 64) on the torus."""
     bins = np.stack(np.meshgrid(np.arange(BINS), np.arange(BINS), indexing="ij"), axis=-1) - np.array(mean)
-    away = (bins + BINS / 2) % BINS - BINS / 2
-    likely = np.exp(-0.5 * np.einsum("...i,ij,...j", away, np.linalg.inv(covariance), away))
-    return (likely / likely.sum())[None]
+    offsets = (bins + BINS / 2) % BINS - BINS / 2
+    probabilities = np.exp(-0.5 * np.einsum("...i,ij,...j", offsets, np.linalg.inv(covariance), offsets))
+    return (probabilities / probabilities.sum())[None]
 
 
 @pytest.mark.parametrize("mean", [(30.3, 20.0), (0.4, 63.7)])
-def test_moments_of_a_normal_distribution_anywhere_on_the_torus(mean: tuple[float, float]) -> None:
+def test_moments_of_normal_distribution_on_torus(mean: tuple[float, float]) -> None:
     covariance = np.array([[6.0, 2.0], [2.0, 3.0]])
-    found = moments(hat(mean, covariance))
-    apart = (found.mean[0] - mean + BINS / 2) % BINS - BINS / 2
-    np.testing.assert_allclose(apart, 0, atol=1e-6)
-    np.testing.assert_allclose(found.covariance[0], [6, 3, 2], rtol=1e-3)
+    fit = moments(hat(mean, covariance))
+    difference = (fit.mean[0] - mean + BINS / 2) % BINS - BINS / 2
+    np.testing.assert_allclose(difference, 0, atol=1e-6)
+    np.testing.assert_allclose(fit.covariance[0], [6, 3, 2], rtol=1e-3)
 
 
 def softmax(response: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    likely = np.exp(response - response.max())
-    return likely / likely.sum()
+    probabilities = np.exp(response - response.max())
+    return probabilities / probabilities.sum()
 
 
 @pytest.mark.parametrize("loss", ["likelihood", "cross-entropy"])
-def test_derivatives_are_what_finite_differences_say(loss: str) -> None:
+def test_gradients_agree_with_finite_differences(loss: str) -> None:
     rng = np.random.default_rng(0)
     response = np.log(hat((62.8, 5.2), np.array([[9.0, 2.0], [2.0, 5.0]])) + 1e-4) + rng.normal(0, 0.3, (1, BINS, BINS))
-    place = np.array([[66.0, 3.0]])
+    truth_bins = np.array([[66.0, 3.0]])
 
-    def value(given: npt.NDArray[np.float64]) -> tuple[float, npt.NDArray[np.float64]]:
-        likely = softmax(given)
+    def value(logits: npt.NDArray[np.float64]) -> tuple[float, npt.NDArray[np.float64]]:
+        probabilities = softmax(logits)
         if loss == "cross-entropy":
-            losses, slopes = crossentropy(np.log(likely), likely, place)
+            losses, slopes = crossentropy(np.log(probabilities), probabilities, truth_bins)
         else:
-            losses, slopes = likelihood(likely, moments(likely), place, 1.0)
+            losses, slopes = likelihood(probabilities, moments(probabilities), truth_bins, 1.0)
         return float(losses.sum()), slopes
 
     _, slope = value(response)
@@ -164,19 +166,19 @@ def test_derivatives_are_what_finite_differences_say(loss: str) -> None:
         assert float((slope * step).sum()) == pytest.approx(expected, rel=1e-4)
 
 
-def test_the_likelihood_is_least_at_the_truth() -> None:
-    likely = hat((20.0, 30.0), np.eye(2) * 1e-3)
-    (hit,), _ = likelihood(likely, moments(likely), np.array([[20.0, 30.0 + BINS]]), 1.0)
-    (miss,), _ = likelihood(likely, moments(likely), np.array([[24.0, 30.0]]), 1.0)
+def test_likelihood_loss_is_smallest_at_ground_truth() -> None:
+    probabilities = hat((20.0, 30.0), np.eye(2) * 1e-3)
+    (hit,), _ = likelihood(probabilities, moments(probabilities), np.array([[20.0, 30.0 + BINS]]), 1.0)
+    (miss,), _ = likelihood(probabilities, moments(probabilities), np.array([[24.0, 30.0]]), 1.0)
     assert hit == pytest.approx(0, abs=1e-3)
     assert miss == pytest.approx(8, rel=1e-2)
 
 
-def test_an_image_that_stands_for_three_is_as_three() -> None:
-    known, lights = taught_by(world(12))
-    few, their_lights = taught_by(world(2, seed=5))
-    # Of 12 images worth 4, each of the two stands for three.
+def test_weight_three_equals_three_copies() -> None:
+    old, old_lights = training_data(world(12))
+    new, new_lights = training_data(world(2, seed=5))
+    # 12 images with worth 4 give each new image the weight 3.
     learner = replace(LEARNER, pretraining=2, training=8)
-    tuned = learner.tune(learner.fit_features(known, lights), few, their_lights, worth=4)
-    both = learner.fit_features(np.concatenate([known, *[few] * 3]), np.concatenate([lights, *[their_lights] * 3]))
-    assert recovery_error(tuned.lights(known), both.lights(known)).max() < 0.1
+    tuned = learner.tune(learner.fit_features(old, old_lights), new, new_lights, worth=4)
+    fitted = learner.fit_features(np.concatenate([old, *[new] * 3]), np.concatenate([old_lights, *[new_lights] * 3]))
+    assert recovery_error(tuned.lights(old), fitted.lights(old)).max() < 0.1

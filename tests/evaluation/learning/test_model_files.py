@@ -1,4 +1,4 @@
-"""Model files: whole, plain, with their story; foreign and damaged ones are refused in one sentence."""
+"""Model files: contents, and refusal of foreign and damaged files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def saved(fitted: LearnedMethod, tmp_path: Path) -> Path:
     return tmp_path / "model.npz"
 
 
-def test_the_hash_knows_names_lights_and_order() -> None:
+def test_hash_depends_on_names_ground_truths_and_order() -> None:
     hashes = {
         scenes_sha256(SCENES),
         scenes_sha256(SCENES[::-1]),
@@ -42,23 +42,23 @@ def test_the_hash_knows_names_lights_and_order() -> None:
     assert scenes_sha256(world(12)) == scenes_sha256(SCENES)
 
 
-def test_only_learned_methods_are_saved(tmp_path: Path) -> None:
+def test_saves_only_learned_methods(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="Gray-world cannot be saved"):
         save_model(tmp_path / "model.npz", standard_methods()["gray-world"], story(SCENES))
     assert not list(tmp_path.iterdir())
 
 
 class Payload:
-    """What a hostile file would run when it is unpickled."""
+    """Fails the test if it is unpickled."""
 
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         return (pytest.fail, ("a pickle was loaded",))
 
 
-@pytest.mark.parametrize("kind", ["text", "empty", "pickle", "pickled array", "thumbnails"])
-def test_foreign_files_are_refused(tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize("content", ["text", "empty", "pickle", "pickled array", "thumbnails"])
+def test_refuses_foreign_files(tmp_path: Path, content: str) -> None:
     path = tmp_path / "model.npz"
-    match kind:
+    match content:
         case "text":
             path.write_text("no model")
         case "empty":
@@ -75,31 +75,31 @@ def test_foreign_files_are_refused(tmp_path: Path, kind: str) -> None:
         load_model(path)
 
 
-def test_any_damage_is_found(saved: Path) -> None:
-    whole = saved.read_bytes()
+def test_detects_damage(saved: Path) -> None:
+    content = saved.read_bytes()
     expected = load_model(saved).estimate(SCENES[0].image)
     rng = np.random.default_rng(0)
-    for size in rng.integers(0, len(whole), 10):
-        saved.write_bytes(whole[:size])
+    for size in rng.integers(0, len(content), 10):
+        saved.write_bytes(content[:size])
         with pytest.raises(FormatError):
             load_model(saved)
-    refused = 0
-    for place in rng.integers(0, len(whole), 40):
-        flipped = bytearray(whole)
-        flipped[place] ^= 0xFF
+    refused_count = 0
+    for position in rng.integers(0, len(content), 40):
+        flipped = bytearray(content)
+        flipped[position] ^= 0xFF
         saved.write_bytes(flipped)
         try:
             loaded = load_model(saved)
         except FormatError:
-            refused += 1
-        else:  # Dates and other fields of the archive's own are not part of the model.
+            refused_count += 1
+        else:  # Dates and other fields of the archive do not belong to the model.
             np.testing.assert_array_equal(loaded.estimate(SCENES[0].image), expected)
-    assert refused > 20
+    assert refused_count > 20
 
 
-def test_what_python_cannot_unpack_is_refused(saved: Path) -> None:
+def test_refuses_unsupported_compression(saved: Path) -> None:
     content = bytearray(saved.read_bytes())
-    # Bit 5 of the flags of the first file, in its head and in the directory: compressed patched data.
+    # Bit 5 of the flags of the first file, in its header and in the directory: compressed patched data.
     content[content.index(b"PK\x03\x04") + 6] |= 1 << 5
     content[content.index(b"PK\x01\x02") + 8] |= 1 << 5
     saved.write_bytes(content)

@@ -1,4 +1,4 @@
-"""What every learner makes of a few small scenes, to the last digits: no change of the code may move it unseen."""
+"""Pinned features, models and estimates of all learners for a few small scenes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.learning.adapting import adapt, learn_alone
+from evaluation.learning.adapting import adapt, fit_local
 from evaluation.learning.color_beaver import ColorBeaver
 from evaluation.learning.constant_light import ConstantLight
 from evaluation.learning.convnet import ConvNet
@@ -23,10 +23,11 @@ from tests.evaluation.learning.made_up_world import world
 from tests.evaluation.made_scenes import Made
 from tests.pinned import Pinned
 
-# Parts of a method are pinned as well, since its estimate may not show them.
+# Intermediate results are pinned too, because estimates may not depend on all of them.
 
 pytestmark = pytest.mark.slow
 
+# Default and other settings, with little training.
 LEARNERS: dict[str, FeatureLearner] = {
     "constant light": ConstantLight(),
     "trees": RegressionTrees(windows=2),
@@ -44,29 +45,28 @@ LEARNERS: dict[str, FeatureLearner] = {
     "net": ConvNet(working_size=24, width=3, epochs=2),
     "net of one epoch": ConvNet(working_size=16, width=2, epochs=1, rate=0.01),
 }
-"""Each at its defaults and at others, trained for little: what is to be known again need not be learned well."""
 
+# Relative tolerances of training in single precision.
 TOLERANCES = {"log-chroma": 1e-3, "log-chroma without pretraining": 1e-3, "net": 1e-3, "net of one epoch": 1e-3}
-"""Training in single precision."""
 
 
 def scenes(count: int, seed: int) -> list[Made]:
-    """Return scenes of 24 px; of some a part is masked, clipped, or a row and a column is cut off."""
-    made = world(count, seed, size=24)
+    """Return scenes of 24 px; some are partly masked, clipped or cropped."""
+    cases = world(count, seed, size=24)
     mask = np.zeros((24, 24), bool)
     mask[4:9, 3:20] = True
-    cut = made[0].image[:23, :21]
-    made[0] = replace(made[0], image=np.ascontiguousarray(cut))
-    made[1] = replace(made[1], mask=mask, image=np.where(mask[..., None], 9, made[1].image).astype(np.float32))
-    made[2] = replace(made[2], saturation=float(np.sort(made[2].image.ravel())[-30]))
-    return made
+    cut = cases[0].image[:23, :21]
+    cases[0] = replace(cases[0], image=np.ascontiguousarray(cut))
+    cases[1] = replace(cases[1], mask=mask, image=np.where(mask[..., None], 9, cases[1].image).astype(np.float32))
+    cases[2] = replace(cases[2], saturation=float(np.sort(cases[2].image.ravel())[-30]))
+    return cases
 
 
-TRAIN, TEST, HERE = scenes(23, 0), scenes(5, 1), scenes(9, 2)
+TRAIN, TEST, LOCAL = scenes(23, 0), scenes(5, 1), scenes(9, 2)
 
 
 def real(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
-    """Return arrays with complex ones in their two parts."""
+    """Return arrays with complex ones as real and imaginary parts."""
     return {
         name: [np.real(array), np.imag(array)] if np.iscomplexobj(array) else array
         for name, array in sorted(arrays.items())
@@ -74,31 +74,31 @@ def real(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("key", LEARNERS)
-def test_what_is_learned(key: str, pinned: Pinned) -> None:
+def test_fitted_and_adapted_models(key: str, pinned: Pinned) -> None:
     learner = LEARNERS[key]
     if isinstance(learner, ConvNet):
         pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
-    same = TOLERANCES.get(key, 1e-6)
-    (given,) = extract(TRAIN, [learner])
-    (here,) = extract(HERE, [learner])
-    method = fit_extracted(learner, given, truths_of(TRAIN), 3)
-    alone = learn_alone(learner, here, truths_of(HERE), 4)
-    adapted = [adapt(method, alone, worth) for worth in (200.0, 5.0)]
-    few = adapt(method, learn_alone(learner, here[:2], truths_of(HERE[:2]), 4))
+    tolerance = TOLERANCES.get(key, 1e-6)
+    (features,) = extract(TRAIN, [learner])
+    (local_features,) = extract(LOCAL, [learner])
+    method = fit_extracted(learner, features, truths_of(TRAIN), 3)
+    local_fit = fit_local(learner, local_features, truths_of(LOCAL), 4)
+    adapted = [adapt(method, local_fit, worth) for worth in (200.0, 5.0)]
+    adapted_to_two = adapt(method, fit_local(learner, local_features[:2], truths_of(LOCAL[:2]), 4))
     tests = extract(TEST, [learner])[0]
     pinned(
         f"what is learned, {key}",
         {
-            "features": [np.asarray(one, float) for one in tests if one is not None],
+            "features": [np.asarray(image, float) for image in tests if image is not None],
             "arrays": real(method.model.arrays()),
             "lights": [method.estimate(scene.image, scene.saturation, scene.mask) for scene in TEST],
-            "held out": alone.held_out,
+            "held out": local_fit.held_out,
             "adapted": [
-                [np.asarray(one.model.arrays()["share"]), one.estimate(scene.image, scene.saturation, scene.mask)]
-                for one in (*adapted, few)
+                [np.asarray(model.model.arrays()["share"]), model.estimate(scene.image, scene.saturation, scene.mask)]
+                for model in (*adapted, adapted_to_two)
                 for scene in TEST[:3]
             ],
         },
-        same=same,
-        nothing=1e-6 if same > 1e-6 else 1e-8,
+        same=tolerance,
+        nothing=1e-6 if tolerance > 1e-6 else 1e-8,
     )

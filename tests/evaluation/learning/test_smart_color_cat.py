@@ -1,11 +1,11 @@
-"""Smart Color Cat where its answer is known."""
+"""Smart Color Cat with known results."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from evaluation.learning.smart_color_cat import CHOICES, FINE, SmartColorCat
+from evaluation.learning.smart_color_cat import BIN_CHOICES, FINE_BINS, SmartColorCat
 from evaluation.metrics import recovery_error
 from tests.evaluation.learning.made_up_world import lights_on_a_line, world
 
@@ -14,19 +14,19 @@ pytestmark = pytest.mark.slow
 RED, GREEN = (0.8, 0.1, 0.1), (0.1, 0.3, 0.1)
 
 
-def test_smart_color_cat_is_exact_where_its_assumption_holds() -> None:
-    # The histogram tells the place on the line linearly: a share of red pixels that grows with it.
+def test_is_exact_if_assumption_holds() -> None:
+    # The fraction of red pixels is a linear function of the position on the line.
     rng = np.random.default_rng(0)
     truths = lights_on_a_line(60, rng)
-    features = np.zeros((60, FINE), np.float32)
+    features = np.zeros((60, FINE_BINS), np.float32)
     features[:, 100], features[:, 400] = 1 - truths[:, 0], truths[:, 0]
     model = SmartColorCat().fit_features(features[:40], truths[:40])
-    assert len(model.weights) in CHOICES
-    assert [*CHOICES] == sorted(bins for bins in CHOICES if FINE % bins == 0 and 3 <= bins <= 60)
+    assert len(model.weights) in BIN_CHOICES
+    assert [*BIN_CHOICES] == sorted(bins for bins in BIN_CHOICES if FINE_BINS % bins == 0 and 3 <= bins <= 60)
     assert recovery_error(model.lights(features[40:]), truths[40:]).max() < 0.3
 
 
-def test_smart_color_cat_stays_between_the_lights_it_knows() -> None:
+def test_clips_to_range_of_training_illuminants() -> None:
     scenes = world(40)
     method = SmartColorCat().fit(scenes)
     truths = np.stack([scene.truth / scene.truth.sum() for scene in scenes])

@@ -1,4 +1,4 @@
-"""The Gray-Edge framework by hand and against formulations of others: means, derivatives, kernels, borders, strips."""
+"""Gray-Edge framework, compared with manual calculation, NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ def derivative(image: npt.NDArray[Any], order: int, sigma: float) -> npt.NDArray
     return np.asarray(prepared.derivative(order, sigma) / np.float32(prepared.scale))
 
 
-def test_minkowski_means_by_hand() -> None:
+def test_minkowski_means_of_two_pixels() -> None:
     image = np.array([[[3, 4, 0], [4, 3, 1]]], dtype=np.float64)
     assert recovery_error(GrayEdge("", 0, 1, 0, 0).estimate(image), [7, 7, 1]) < 1e-5
     assert recovery_error(GrayEdge("", 0, 2, 0, 0).estimate(image), [5, 5, 1]) < 1e-5
     assert recovery_error(GrayEdge("", 0, np.inf, 0, 0).estimate(image), [4, 4, 1]) < 1e-5
 
 
-def test_derivatives_of_polynomials() -> None:
+def test_derivatives_of_polynomials_are_exact() -> None:
     y, x = np.mgrid[0:60, 0:60].astype(np.float32)
     inside = (slice(25, 35), slice(25, 35))
     ramp = np.stack([3 * x + 4 * y, x, 0 * x + 7], axis=-1).astype(np.float32)
     np.testing.assert_allclose(derivative(ramp, 1, 2.0)[inside][0, 0], [5, 1, 0], atol=1e-3)
     np.testing.assert_allclose(derivative(ramp, 0, 2.0)[inside][0, 0], ramp[25, 25], rtol=1e-5)
-    bend = np.stack([x * x / 2, x * y, ramp[..., 0]], axis=-1).astype(np.float32)
-    np.testing.assert_allclose(derivative(bend, 2, 2.0)[inside][0, 0], [1, 2, 0], atol=2e-2)
+    curve = np.stack([x * x / 2, x * y, ramp[..., 0]], axis=-1).astype(np.float32)
+    np.testing.assert_allclose(derivative(curve, 2, 2.0)[inside][0, 0], [1, 2, 0], atol=2e-2)
 
 
 @pytest.mark.parametrize("sigma", [1.0, 2.5, 6.0, 9.0])
-def test_kernels_have_the_authors_size_and_norms(sigma: float) -> None:
+def test_kernels_have_authors_size_and_norms(sigma: float) -> None:
     x = np.arange(-int(3 * sigma + 0.5), int(3 * sigma + 0.5) + 1)
     kernels = [gaussian_kernel(sigma, order) for order in range(3)]
     assert {len(kernel) for kernel in kernels} == {len(x)}
@@ -53,7 +53,7 @@ def photograph(height: int, width: int) -> npt.NDArray[np.uint16]:
     """Return smooth colours, edges and noise (height, width, 3) uint16, none saturated below 16000."""
     random = np.random.default_rng(height + width)
     y, x = np.mgrid[:height, :width]
-    waves = [2 + np.sin(x / (17 + 5 * one)) + np.cos(y / (23 - 4 * one)) for one in range(3)]
+    waves = [2 + np.sin(x / (17 + 5 * channel)) + np.cos(y / (23 - 4 * channel)) for channel in range(3)]
     edges = 1 + 2.0 * ((x // 61 + y // 47) % 3 == 0)
     image = np.stack(waves, axis=-1) * edges[..., None] * np.array([400.0, 1000.0, 600.0])
     noise = np.asarray(np.clip(random.normal(0, 12, (height, width, 3)), -50, 50), dtype=np.float64)
@@ -61,16 +61,16 @@ def photograph(height: int, width: int) -> npt.NDArray[np.uint16]:
 
 
 def numpy_norm(values: npt.NDArray[Any], p: float) -> npt.NDArray[np.float64]:
-    """Return the unit light of the p-norms of the channels of (..., 3), as one writes it in NumPy."""
+    """Return the p-norms of the channels of (..., 3), of length 1."""
     flat = values.reshape(-1, 3).astype(np.float64)
     light = flat.max(axis=0) if np.isinf(p) else ((flat / flat.max()) ** p).mean(axis=0) ** (1 / p)
     return light / np.linalg.norm(light)
 
 
 @pytest.mark.parametrize("p", [1, 2, 4, 6.5, 20, np.inf])
-@pytest.mark.parametrize("kind", [np.uint16, np.float32, np.float64])
-def test_without_a_filter_the_estimate_is_that_of_a_line_of_numpy(p: float, kind: Any) -> None:
-    image = (photograph(301, 419) * (1 if kind is np.uint16 else 1.37e-5)).astype(kind)
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.float64])
+def test_agrees_with_numpy_without_filter(p: float, dtype: Any) -> None:
+    image = (photograph(301, 419) * (1 if dtype is np.uint16 else 1.37e-5)).astype(dtype)
     np.testing.assert_allclose(GrayEdge("", 0, p, 0).estimate(image), numpy_norm(image, p), rtol=1e-9)
     mask = np.random.default_rng(1).uniform(size=image.shape[:2]) < 0.02
     np.testing.assert_allclose(GrayEdge("", 0, p, 0).estimate(image, mask=mask), numpy_norm(image[~mask], p), rtol=1e-9)
@@ -86,12 +86,12 @@ def test_sums_of_the_largest_values_do_not_overflow() -> None:
 
 
 def scipy_kernel(order: int, sigma: float) -> npt.NDArray[np.float64]:
-    """Return scipy's kernel cut at 3σ, to be correlated with, with the gains of the authors' kernels."""
-    reach = int(3 * sigma + 0.5)
-    impulse = np.zeros(2 * reach + 1)
-    impulse[reach] = 1
-    kernel = ndimage.gaussian_filter1d(impulse, sigma, order=order, mode="constant", radius=reach)[::-1]
-    x = np.arange(-reach, reach + 1)
+    """Return the correlation kernel of scipy, cut at 3σ, with the gain of the authors' kernel."""
+    radius = int(3 * sigma + 0.5)
+    impulse = np.zeros(2 * radius + 1)
+    impulse[radius] = 1
+    kernel = ndimage.gaussian_filter1d(impulse, sigma, order=order, mode="constant", radius=radius)[::-1]
+    x = np.arange(-radius, radius + 1)
     if order == 2:
         kernel = kernel - kernel.mean()
     return kernel / (kernel.sum(), (x * kernel).sum(), (x**2 / 2 * kernel).sum())[order]
@@ -115,7 +115,7 @@ CASES = [(0, 9, 9), (1, 1, 6), (1, 5, 2), (2, 1, 1), (2, 3, 4), (1, np.inf, 1.3)
 
 
 @pytest.mark.parametrize(("order", "p", "sigma"), CASES)
-def test_derivatives_of_scipy_give_the_same_light(order: int, p: float, sigma: float) -> None:
+def test_agrees_with_derivatives_of_scipy(order: int, p: float, sigma: float) -> None:
     image = photograph(310, 420)
     border = int(sigma) + 1
     expected = numpy_norm(scipy_derivative(image, order, sigma)[border:-border, border:-border], p)
@@ -124,7 +124,7 @@ def test_derivatives_of_scipy_give_the_same_light(order: int, p: float, sigma: f
 
 @pytest.mark.parametrize(("order", "sigma"), [(0, 9.0), (1, 6.0), (2, 1.0), (1, 0.4)])
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (400, 2), (37, 41), (600, 131)])
-def test_derivatives_of_images_of_any_shape(order: int, sigma: float, shape: tuple[int, int]) -> None:
+def test_differentiates_images_of_any_shape(order: int, sigma: float, shape: tuple[int, int]) -> None:
     image = photograph(*shape)
     np.testing.assert_allclose(
         derivative(image, order, sigma), scipy_derivative(image, order, sigma), rtol=2e-5, atol=2e-3
@@ -132,24 +132,24 @@ def test_derivatives_of_images_of_any_shape(order: int, sigma: float, shape: tup
 
 
 @pytest.mark.parametrize("order", [0, 1, 2])
-def test_tiles_of_a_large_image_make_the_whole(order: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_derivative_does_not_depend_on_tiles(order: int, monkeypatch: pytest.MonkeyPatch) -> None:
     image = photograph(500, 300)
     monkeypatch.setattr(gaussian, "TILE_WIDTH", 304)
     monkeypatch.setattr(gaussian, "TILE_ROWS", 512)
     assert len(list(gaussian.differentiated_tiles(image, order, 3.0, 1.0))) == 1
-    whole = derivative(image, order, 3.0)
+    expected = derivative(image, order, 3.0)
     monkeypatch.setattr(gaussian, "TILE_WIDTH", 64)
     monkeypatch.setattr(gaussian, "TILE_ROWS", 16)
     assert len(list(gaussian.differentiated_tiles(image, order, 3.0, 1.0))) == 32 * 5
-    np.testing.assert_array_equal(derivative(image, order, 3.0), whole)
+    np.testing.assert_array_equal(derivative(image, order, 3.0), expected)
 
 
 @pytest.mark.parametrize("p", [1, 3, 6.5, 20, np.inf])
-def test_what_is_left_out_of_tiles_is_what_is_left_out_of_the_whole(p: float) -> None:
+def test_excludes_mask_and_border_across_tiles(p: float) -> None:
     image = photograph(150, 600)
     mask = np.random.default_rng(2).uniform(size=image.shape[:2]) < 0.001
     mask[40:80, 250:262] = True  # across the edges of tiles
-    image[60, 255] = 65535  # masked, but seen by the filter beside it
+    image[60, 255] = 65535  # masked, but used by the filter next to it
     for border in (0, 5, 70):
         inner = np.s_[border : 150 - border, border : 600 - border]
         expected = numpy_norm(scipy_derivative(image, 1, 2.0)[inner][~mask[inner]], p)

@@ -1,4 +1,4 @@
-"""Methods by name, of modules and of a user's file, and what is said where one cannot be had."""
+"""Methods by name, from modules and from a user's file, and messages about missing ones."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Brightest:
 
 
 @pytest.mark.parametrize("name", standard_methods())
-def test_names_of_the_suite(name: str) -> None:
+def test_returns_methods_of_suite(name: str) -> None:
     assert find_method(f" {name} ") == standard_methods()[name]
 
 
-def test_a_file_of_ten_lines(tmp_path: Path) -> None:
+def test_loads_class_from_file(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(TEN_LINES)
     method = find_method(f"{tmp_path}/own.py:Brightest")
     assert method.name == "Brightest pixel"
@@ -42,7 +42,7 @@ def test_a_file_of_ten_lines(tmp_path: Path) -> None:
     np.testing.assert_allclose(method.estimate(image), [0.6, 0.8, 0])
 
 
-def test_a_value_a_learner_and_a_neighbour_of_the_file(tmp_path: Path) -> None:
+def test_loads_learner_value_that_imports_module_of_folder(tmp_path: Path) -> None:
     (tmp_path / "beside_own.py").write_text("LABEL = 'from beside'\n")
     (tmp_path / "own.py").write_text(
         "from __future__ import annotations\nfrom dataclasses import dataclass\nfrom beside_own import LABEL\n"
@@ -50,27 +50,27 @@ def test_a_value_a_learner_and_a_neighbour_of_the_file(tmp_path: Path) -> None:
         "    def fit(self, scenes, seed=0):\n        return self\n"
         "five = Own(5)\n"
     )
-    found = find_method(f"{tmp_path}/own.py:five")
-    assert isinstance(found, Learner)
-    assert found.name == "from beside"
-    assert type(find_method(f"{tmp_path}/own.py:five")) is type(found)
+    method = find_method(f"{tmp_path}/own.py:five")
+    assert isinstance(method, Learner)
+    assert method.name == "from beside"
+    assert type(find_method(f"{tmp_path}/own.py:five")) is type(method)
     with pytest.raises(InputError, match="'p'"):
         find_method(f"{tmp_path}/own.py:Own")
 
 
-def test_a_class_of_a_module() -> None:
+def test_loads_class_from_module() -> None:
     assert find_method("evaluation.methods.pca:BrightDark").name == "PCA bright and dark"
 
 
-def test_what_is_done_around_a_method(tmp_path: Path) -> None:
+def test_applies_suffixes(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(TEN_LINES)
     assert find_method("gray-edge-2@360") == ResizedMethod(standard_methods()["gray-edge-2"], 360)
     assert find_method("gray-world@patches=5") == PatchwiseMethod(standard_methods()["gray-world"], 5)
     assert find_method(f"{tmp_path}/own.py:Brightest@90@patches").name == "Brightest pixel at 90 px by patches"
-    odd = tmp_path / "a@b"
-    odd.mkdir()
-    (odd / "own.py").write_text(TEN_LINES)
-    assert find_method(f"{odd}/own.py:Brightest").name == "Brightest pixel"
+    folder = tmp_path / "a@b"
+    folder.mkdir()
+    (folder / "own.py").write_text(TEN_LINES)
+    assert find_method(f"{folder}/own.py:Brightest").name == "Brightest pixel"
 
 
 @pytest.mark.parametrize(
@@ -78,12 +78,12 @@ def test_what_is_done_around_a_method(tmp_path: Path) -> None:
     [
         ("gray-edge-1:p=4,sigma=2", "'p=4,sigma=2'"),
         ("gray-edge-1:sigma=inf", "1000"),
-        ("", "is no method"),
+        ("", "method '' is unknown"),
         ("nowhere/own.py:Own", r"nowhere/own\.py"),
         ("evaluation.no_such:Own", r"'evaluation\.no_such'"),
     ],
 )
-def test_what_is_not_there(text: str, message: str) -> None:
+def test_refuses_unknown_method(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         find_method(text)
 
@@ -91,14 +91,14 @@ def test_what_is_not_there(text: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("class Own:\n    name = 'own'\n", "is no method: it has neither estimate"),
+        ("class Own:\n    name = 'own'\n", "has no method estimate"),
         (
             "class Own:\n    name = 'own'\n    def estimate_map(self, image): ...\n",
             "estimate_map",
         ),
         ("class Own:\n    def __init__(self, p): ...\n", "TypeError.*'p'"),
         ("class Own:\n    def estimate(self, image, saturation=None, mask=None): ...\n", 'has no name; add name = "…"'),
-        ("def f(:\n", "fails while it is loaded: line 1: "),
+        ("def f(:\n", "fails when loaded: line 1: "),
         ("x = 1\nimport no_such_thing\n", "2.*ModuleNotFoundError.*no_such_thing"),
         ("x = 1\n\n1 / 0\n", "line 3: ZeroDivisionError"),
         ("import sys\n\nsys.exit(0)\n", "3.*SystemExit.*0"),
@@ -112,13 +112,13 @@ def test_what_is_not_there(text: str, message: str) -> None:
         ),
     ],
 )
-def test_what_is_wrong_with_a_file(tmp_path: Path, source: str, message: str) -> None:
+def test_reports_errors_of_file(tmp_path: Path, source: str, message: str) -> None:
     (tmp_path / "own.py").write_text(source)
     with pytest.raises(InputError, match=message):
         find_method(f"{tmp_path}/own.py:Own")
 
 
-def test_a_file_that_was_corrected_loads(tmp_path: Path) -> None:
+def test_loads_corrected_file(tmp_path: Path) -> None:
     file = tmp_path / "own.py"
     file.write_text("1 / 0\n")
     with pytest.raises(InputError):
@@ -127,7 +127,7 @@ def test_a_file_that_was_corrected_loads(tmp_path: Path) -> None:
     assert find_method(f"{file}:Brightest").name == "Brightest pixel"
 
 
-def test_a_file_named_as_a_package_is_named_with_its_ending(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_suggests_file_ending_if_name_is_a_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("evaluation.py").write_text("class Mine:\n    pass\n")
     with pytest.raises(InputError, match=r"this suite.*evaluation\.py:Mine"):

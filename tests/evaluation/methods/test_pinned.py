@@ -1,4 +1,4 @@
-"""What every method gives of a few small images, to the last digits: no change of the code may move them unseen."""
+"""Pinned estimates of all methods for a few small images."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from evaluation.methods.standard import local_methods, standard_methods
 from evaluation.methods.wrapped import PatchwiseMethod, ResizedMethod, fill_unknown
 from tests.pinned import Pinned
 
-# Parts of a method are pinned as well, since its estimate may not show them.
+# Intermediate results are pinned too, because estimates may not depend on all of them.
 
 pytestmark = pytest.mark.slow
 
 Image = npt.NDArray[Any]
-Given = tuple[Image, float | None, npt.NDArray[np.bool_] | None]
+Case = tuple[Image, float | None, npt.NDArray[np.bool_] | None]
 
 
 def tiles(height: int, width: int, seed: int) -> npt.NDArray[np.float64]:
@@ -34,8 +34,8 @@ def tiles(height: int, width: int, seed: int) -> npt.NDArray[np.float64]:
     return image
 
 
-def cases() -> dict[str, Given]:
-    """Return images of odd sizes in each dtype, some masked, some with clipped pixels that lie at the limit."""
+def cases() -> dict[str, Case]:
+    """Return images of unusual sizes in each dtype, some masked, some with values at the saturation."""
     limit = tiles(37, 53, 2).astype(np.float32)
     limit[5, 7], limit[5, 8], limit[36, 52], limit[20, 30] = 2500, (2499, 90, 90), (9000, 1, 1), (10, 2500, 0)
     masked = tiles(40, 131, 3)
@@ -55,8 +55,8 @@ def cases() -> dict[str, Given]:
     }
 
 
-def many(seed: int = 8) -> Image:
-    """Return so many pixels (300, 311, 3) uint16 that limits are found of some of them, in large groups of equals."""
+def large_image(seed: int = 8) -> Image:
+    """Return an image (300, 311, 3) uint16 that is large enough for sampling, with large groups of equal pixels."""
     image = tiles(300, 311, seed)
     image[:20] = image[0, 0]
     image[140:200] = np.rint(image[140:200] / 500) * 500
@@ -65,7 +65,7 @@ def many(seed: int = 8) -> Image:
 
 CASES = cases()
 
-OTHERS: dict[str, Method] = {
+VARIANTS: dict[str, Method] = {
     "p 1.5": GrayEdge("", 0, 1.5, 0),
     "p 16": GrayEdge("", 0, 16, 0),
     "p 17": GrayEdge("", 0, 17, 0),
@@ -90,7 +90,7 @@ OTHERS: dict[str, Method] = {
 @pytest.mark.parametrize("case", CASES)
 def test_estimates(case: str, pinned: Pinned) -> None:
     image, saturation, mask = CASES[case]
-    methods = {**standard_methods(), **OTHERS}
+    methods = {**standard_methods(), **VARIANTS}
     pinned(
         f"estimates of an image, {case}",
         {name: method.estimate(image, saturation, mask) for name, method in methods.items()},
@@ -100,7 +100,7 @@ def test_estimates(case: str, pinned: Pinned) -> None:
 
 
 def test_estimates_of_many_pixels(pinned: Pinned) -> None:
-    image = many()
+    image = large_image()
     mask = np.zeros(image.shape[:2], bool)
     mask[::3, 50:120] = True
     methods = {
@@ -109,8 +109,8 @@ def test_estimates_of_many_pixels(pinned: Pinned) -> None:
         "mean shift": MeanShiftedGrayPixel(share=0.03),
         "local": LocalGraynessIndex(),
     }
-    found = {name: [m.estimate(image), m.estimate(image, 2900.0, mask)] for name, m in methods.items()}
-    pinned("estimates of many pixels", found, same=1e-5, nothing=1e-7)
+    estimates = {name: [m.estimate(image), m.estimate(image, 2900.0, mask)] for name, m in methods.items()}
+    pinned("estimates of many pixels", estimates, same=1e-5, nothing=1e-7)
 
 
 def test_maps_of_lights(pinned: Pinned) -> None:
@@ -121,11 +121,11 @@ def test_maps_of_lights(pinned: Pinned) -> None:
         "3 lights": LocalGraynessIndex(share=0.3, lights=3),
         "5 lights": LocalGraynessIndex(share=0.02, lights=5),
     }
-    found = {
-        case: {name: np.asarray(method.estimate_map(*given)) for name, method in methods.items()}
-        for case, given in CASES.items()
+    estimates = {
+        case: {name: np.asarray(method.estimate_map(*arguments)) for name, method in methods.items()}
+        for case, arguments in CASES.items()
     }
-    pinned("maps of lights by every local method", found, same=1e-5, nothing=1e-6)
+    pinned("maps of lights by every local method", estimates, same=1e-5, nothing=1e-6)
     unknown = tiles(5, 4, 9)
     unknown[0, 1:3] = unknown[2, 2] = unknown[4] = np.nan
     pinned(

@@ -1,4 +1,4 @@
-"""Which pixels of an image methods use, and methods on smaller images."""
+"""Usable pixels of an image, and methods on smaller images."""
 
 from __future__ import annotations
 
@@ -12,38 +12,40 @@ from evaluation.methods.wrapped import ResizedMethod
 from evaluation.metrics import recovery_error
 
 
-def test_which_pixels_are_used() -> None:
+def test_excludes_masked_saturated_and_border_pixels() -> None:
     image = np.ones((7, 9, 3))
     image[3, 4, 1] = 10
     mask = np.zeros((7, 9), dtype=bool)
     mask[1, 1] = True
-    used = usable(image, 10, mask, 1)
+    is_usable = usable(image, 10, mask, 1)
     expected = np.zeros((7, 9), dtype=bool)
     expected[1:6, 1:8] = True
     expected[2:5, 3:6] = False
     expected[1, 1] = False
-    np.testing.assert_array_equal(used, expected)
+    np.testing.assert_array_equal(is_usable, expected)
 
 
-def test_a_smaller_image_is_the_mean_of_usable_pixels() -> None:
+def test_shrinks_to_means_of_usable_pixels() -> None:
     image = np.arange(4 * 6 * 3, dtype=np.uint16).reshape(4, 6, 3)
     usable = np.ones((4, 6), dtype=bool)
     usable[0, 0] = usable[:2, 2:4] = False
     usable[2, 4] = usable[3, 5] = False
-    found, masked = shrink(image, usable, 3)
-    np.testing.assert_allclose(found[0, 0], image[[0, 1, 1], [1, 0, 1]].mean(axis=0), rtol=1e-6)
-    np.testing.assert_allclose(found[1, 1], image[2:4, 2:4].mean(axis=(0, 1)), rtol=1e-6)
+    small, masked = shrink(image, usable, 3)
+    np.testing.assert_allclose(small[0, 0], image[[0, 1, 1], [1, 0, 1]].mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(small[1, 1], image[2:4, 2:4].mean(axis=(0, 1)), rtol=1e-6)
     np.testing.assert_array_equal(masked, [[False, True, False], [False, False, True]])
 
 
 @pytest.mark.slow
-def test_independent_noise_misleads_second_derivatives_until_it_is_averaged_away() -> None:
-    # Grey things under a warm light, and noise that knows nothing of the light: half of what is bright in blue.
+def test_shrinking_removes_effect_of_noise_on_second_derivatives() -> None:
+    # Grey surfaces under a warm illuminant, with noise that does not depend on the illuminant.
     light, random = np.array([1.0, 0.8, 0.3]), np.random.default_rng(0)
     tiles = random.uniform(500, 3000, (12, 16, 1)).repeat(40, axis=0).repeat(40, axis=1)
     image = np.maximum(tiles * light + random.normal(0, 60, (480, 640, 3)), 0)
     method = standard_methods()["gray-edge-2"]
-    at_full_size, at_80 = (recovery_error(one.estimate(image), light) for one in (method, ResizedMethod(method, 80)))
+    at_full_size, at_80 = (
+        recovery_error(candidate.estimate(image), light) for candidate in (method, ResizedMethod(method, 80))
+    )
     assert at_full_size > 8
     assert at_80 < 1
     assert recovery_error(GrayEdge("", 2, 1, 6).estimate(image), light) < 2

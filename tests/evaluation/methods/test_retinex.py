@@ -1,4 +1,4 @@
-"""Methods of the Retinex family against the same sums and maxima, pixel by pixel."""
+"""Methods of the Retinex family, compared with loops over pixels."""
 
 from __future__ import annotations
 
@@ -24,56 +24,56 @@ def of_length_one(light: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("patches", [1, 4, 40])
-def test_values_over_locally_normalised_values(patches: int) -> None:
+def test_surface_reflectance_matches_loop(patches: int) -> None:
     total, normalised = np.zeros(3), np.zeros(3)
     down, across = min(patches, 33), min(patches, 47)
     for row, column in np.ndindex(down, across):
-        place = (
+        patch = (
             slice(row * 33 // down, (row + 1) * 33 // down),
             slice(column * 47 // across, (column + 1) * 47 // across),
         )
-        pixels = IMAGE[place][~MASK[place]]
+        pixels = IMAGE[patch][~MASK[patch]]
         if len(pixels):
             total += pixels.sum(axis=0)
             normalised += (pixels / pixels.max(axis=0)).sum(axis=0)
-    found = SurfaceReflectance(patches=patches).estimate(IMAGE, mask=MASK)
-    np.testing.assert_allclose(found, of_length_one(total / normalised), rtol=1e-6)
+    estimate = SurfaceReflectance(patches=patches).estimate(IMAGE, mask=MASK)
+    np.testing.assert_allclose(estimate, of_length_one(total / normalised), rtol=1e-6)
 
 
-def test_the_mean_of_maxima_is_that_of_samples_with_repetition() -> None:
+def test_white_patch_matches_expectation() -> None:
     pixels = np.sort(IMAGE[~MASK], axis=0)
     # A maximum of five is at most the k-th of N values with a probability of (k / N) ** 5.
-    likely = np.diff((np.arange(len(pixels) + 1) / len(pixels)) ** 5)
-    found = ImprovedWhitePatch(pixels=5, samples=20_000).estimate(IMAGE, mask=MASK)
-    np.testing.assert_allclose(found, of_length_one(likely @ pixels), rtol=0.01)
+    probabilities = np.diff((np.arange(len(pixels) + 1) / len(pixels)) ** 5)
+    estimate = ImprovedWhitePatch(pixels=5, samples=20_000).estimate(IMAGE, mask=MASK)
+    np.testing.assert_allclose(estimate, of_length_one(probabilities @ pixels), rtol=0.01)
 
 
-def test_the_light_of_each_point_is_the_smoothed_pixel_over_the_smoothed_ratio() -> None:
+def test_color_sparrow_matches_loop() -> None:
     step, count = 4, 6
     radius = math.hypot(33, 47)
-    offsets = (retinex._sprays(2, count) * radius).astype(int)
-    chosen = np.random.default_rng((2, 1)).integers(0, retinex.SPRAYS, (9, 12))
+    offsets = (retinex._draw_sprays(2, count) * radius).astype(int)
+    spray_indices = np.random.default_rng((2, 1)).integers(0, retinex.SPRAY_COUNT, (9, 12))
     points, ratios = np.zeros((2, 9 + 2, 12 + 2, 3))
-    used = np.zeros((9, 12), bool)
+    is_used = np.zeros((9, 12), bool)
     for row, column in np.ndindex(9, 12):
         y, x = row * step, column * step
-        around = [(y + down, x + across) for down, across in offsets[chosen[row, column]].tolist()]
-        seen = [IMAGE[place] for place in around if 0 <= place[0] < 33 and 0 <= place[1] < 47 and not MASK[place]]
-        if seen and not MASK[y, x]:
-            used[row, column] = True
+        around = [(y + down, x + across) for down, across in offsets[spray_indices[row, column]].tolist()]
+        values = [IMAGE[patch] for patch in around if 0 <= patch[0] < 33 and 0 <= patch[1] < 47 and not MASK[patch]]
+        if values and not MASK[y, x]:
+            is_used[row, column] = True
             points[row + 1, column + 1] = IMAGE[y, x]
-            ratios[row + 1, column + 1] = np.minimum(IMAGE[y, x] / np.max(seen, axis=0), 1)
+            ratios[row + 1, column + 1] = np.minimum(IMAGE[y, x] / np.max(values, axis=0), 1)
     lights = [
         points[row : row + 3, column : column + 3].sum(axis=(0, 1))
         / ratios[row : row + 3, column : column + 3].sum(axis=(0, 1))
-        for row, column in np.argwhere(used)
+        for row, column in np.argwhere(is_used)
     ]
-    found = ColorSparrow(spray=count, step=step, kernel=3, seed=2).estimate(IMAGE, mask=MASK)
+    estimate = ColorSparrow(spray=count, step=step, kernel=3, seed=2).estimate(IMAGE, mask=MASK)
     assert 20 < len(lights) < 9 * 12
-    np.testing.assert_allclose(found, of_length_one(np.mean(lights, axis=0)), rtol=1e-6)
+    np.testing.assert_allclose(estimate, of_length_one(np.mean(lights, axis=0)), rtol=1e-6)
 
 
 def test_sprays_are_dense_in_the_middle() -> None:
-    distances = np.linalg.norm(retinex._sprays(0, 50), axis=2)
-    # Uniform along the radius: half of the pixels lie in a quarter of the area.
+    distances = np.linalg.norm(retinex._draw_sprays(0, 50), axis=2)
+    # Uniform along the radius: half of the pixels are in a quarter of the area.
     np.testing.assert_allclose(np.percentile(distances, [25, 50, 75, 100]), [0.25, 0.5, 0.75, 1], atol=0.01)

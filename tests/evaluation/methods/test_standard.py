@@ -1,4 +1,4 @@
-"""Every method of the command against images whose answer is known."""
+"""All methods of the command, on images with known illuminant."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ LIGHT = np.array([0.5, 1.0, 0.7])
 
 
 def grey_scene(seed: int = 0) -> npt.NDArray[np.float64]:
-    """Return a grey noise image (64, 80, 3) under LIGHT: every method must find it."""
+    """Return a grey noise image (64, 80, 3) under LIGHT."""
     grey = np.random.default_rng(seed).uniform(100, 3000, (64, 80, 1))
     return grey * LIGHT
 
 
+# Degrees: OpenCV uses 14 bits; all other methods are exact within float32.
 TOLERANCES = {"opencv-grayworld": 0.01}
-"""Degrees; OpenCV's sees 14 bits. All others are exact but for float32."""
-LOOKS_AROUND = ("general-gray-world", "gray-edge-1", "gray-edge-2", "grayness-index", "mean-shifted-gray-pixel")
-"""Methods whose filters also see what is left out, as their authors' programs do."""
-APART = (
+# Methods whose filters also use excluded pixels, as in their authors' programs.
+USES_NEIGHBOURS = ("general-gray-world", "gray-edge-1", "gray-edge-2", "grayness-index", "mean-shifted-gray-pixel")
+# Methods that process channels separately: a gain of a channel is a gain of the estimate.
+SEPARATE_CHANNELS = (
     "white-patch",
     "gray-world",
     "shades-of-gray",
@@ -36,8 +37,6 @@ APART = (
     "color-sparrow",
     "local-surface-reflectance",
 )
-"""Methods that treat channels apart, so that a gain of one is a gain of the estimate; others choose pixels by all."""
-
 
 every_method = pytest.mark.parametrize("name", standard_methods())
 
@@ -51,7 +50,7 @@ def colourful_scene(seed: int = 1) -> npt.NDArray[np.float64]:
 
 @pytest.mark.slow
 @every_method
-def test_every_method_finds_the_light_on_grey_things(name: str) -> None:
+def test_estimates_illuminant_of_grey_surfaces(name: str) -> None:
     estimate = standard_methods()[name].estimate(grey_scene())
     assert recovery_error(estimate, LIGHT) < TOLERANCES.get(name, 1e-3)
     assert np.linalg.norm(estimate) == pytest.approx(1)
@@ -59,33 +58,33 @@ def test_every_method_finds_the_light_on_grey_things(name: str) -> None:
 
 @pytest.mark.slow
 @every_method
-def test_masked_and_saturated_pixels_do_not_matter(name: str) -> None:
+def test_ignores_masked_and_saturated_pixels(name: str) -> None:
     image = grey_scene()
     image[20:30, 30:50] = (9000, 100, 100)
     mask = np.zeros(image.shape[:2], dtype=bool)
     mask[20:30, 30:50] = True
     method = standard_methods()[name]
     assert np.isfinite(method.estimate(image)).all()
-    if name not in LOOKS_AROUND:
+    if name not in USES_NEIGHBOURS:
         limit = TOLERANCES.get(name, 1e-3)
         assert recovery_error(method.estimate(image, mask=mask), LIGHT) < limit
         assert recovery_error(method.estimate(image, saturation=8000), LIGHT) < limit
 
 
 @every_method
-def test_what_is_masked_may_be_anything(name: str) -> None:
+def test_estimate_does_not_depend_on_masked_pixels(name: str) -> None:
     image = colourful_scene()
     mask = np.zeros(image.shape[:2], dtype=bool)
     mask[:, 60:] = True
     method = standard_methods()[name]
-    before = method.estimate(image, 4000.0, mask)
-    # Filters of σ = 9 reach 27 px, so what they see of the masked part stays as it is.
+    expected = method.estimate(image, 4000.0, mask)
+    # Filters of σ = 9 use 27 px, so the masked pixels that they use are not changed.
     image[:, 88:] = np.random.default_rng(5).uniform(0, 3000, (72, 2, 3))
-    np.testing.assert_allclose(method.estimate(image, 4000.0, mask), before, rtol=1e-12)
+    np.testing.assert_allclose(method.estimate(image, 4000.0, mask), expected, rtol=1e-12)
 
 
 @every_method
-def test_a_mask_changes_what_is_seen(name: str) -> None:
+def test_mask_changes_estimate(name: str) -> None:
     image = np.concatenate([colourful_scene(1), colourful_scene(2)[..., ::-1]], axis=1)
     mask = np.zeros(image.shape[:2], dtype=bool)
     mask[:, 90:] = True
@@ -95,7 +94,7 @@ def test_a_mask_changes_what_is_seen(name: str) -> None:
 
 @pytest.mark.slow
 @every_method
-def test_an_image_without_a_usable_pixel_is_grey(name: str) -> None:
+def test_returns_grey_without_usable_pixel(name: str) -> None:
     method = standard_methods()[name]
     assert method.estimate(np.full((40, 40, 3), 500, np.uint16), saturation=500) is GREY
     assert method.estimate(np.zeros((40, 40, 3), np.uint16)) is GREY
@@ -106,16 +105,16 @@ def test_an_image_without_a_usable_pixel_is_grey(name: str) -> None:
 
 @every_method
 @pytest.mark.parametrize("factor", [2.0**-40, 0.37, 2.0**60])
-def test_the_unit_of_an_image_does_not_matter(name: str, factor: float) -> None:
+def test_estimate_does_not_depend_on_unit(name: str, factor: float) -> None:
     image, method = colourful_scene(), standard_methods()[name]
     expected = method.estimate(image, 3000.0)
-    # A comparison with a limit may turn by the last digit of a product that is not exact.
+    # Comparisons with limits may depend on the rounding of products.
     limit = 1e-6 if np.log2(factor).is_integer() else 0.05
     assert recovery_error(method.estimate(image * factor, 3000.0 * factor), expected) < limit
 
 
-@pytest.mark.parametrize("name", APART)
-def test_a_gain_of_a_channel_is_a_gain_of_the_estimate(name: str) -> None:
+@pytest.mark.parametrize("name", SEPARATE_CHANNELS)
+def test_gain_of_channel_is_gain_of_estimate(name: str) -> None:
     image, gains = colourful_scene(), np.array([0.5, 1.0, 2.0])
     method = standard_methods()[name]
     assert recovery_error(method.estimate(image * gains), method.estimate(image) * gains) < 1e-5
@@ -123,28 +122,28 @@ def test_a_gain_of_a_channel_is_a_gain_of_the_estimate(name: str) -> None:
 
 @pytest.mark.slow
 @every_method
-def test_the_dtype_of_an_image_does_not_matter(name: str) -> None:
+def test_estimate_does_not_depend_on_dtype(name: str) -> None:
     image, method = colourful_scene().astype(np.uint16), standard_methods()[name]
     expected = method.estimate(image, 3000.0)
-    for kind in (np.float32, np.float64, np.dtype(">u2")):
-        other: Any = image.astype(kind)
+    for dtype in (np.float32, np.float64, np.dtype(">u2")):
+        other: Any = image.astype(dtype)
         np.testing.assert_allclose(method.estimate(other, 3000.0), expected, rtol=1e-6)
 
 
 @every_method
-def test_an_image_of_any_layout_gives_the_same_twice_and_is_left_as_it_is(name: str) -> None:
+def test_is_reproducible_and_does_not_change_image(name: str) -> None:
     image, method = colourful_scene(), standard_methods()[name]
-    kept = image.copy()
+    original = image.copy()
     expected = method.estimate(image)
     assert np.array_equal(method.estimate(image), expected)
     assert np.array_equal(method.estimate(np.asfortranarray(image)), expected)
     assert np.array_equal(method.estimate(np.concatenate([image, image], axis=1)[:, :90]), expected)
-    assert np.array_equal(image, kept)
+    assert np.array_equal(image, original)
 
 
 @pytest.mark.slow
 @every_method
-def test_shared_parts_change_no_estimate(name: str) -> None:
+def test_sharing_prepared_image_does_not_change_estimates(name: str) -> None:
     image, methods = colourful_scene().astype(np.uint16), standard_methods()
     mask = np.random.default_rng(3).uniform(size=image.shape[:2]) < 0.1
     shared = estimate_all(list(methods.values()), image, 3000.0, mask)

@@ -1,4 +1,4 @@
-"""Cube+, Cube++ and SimpleCube++: values computed by hand on made-up copies."""
+"""Cube+, Cube++ and SimpleCube++: values computed by hand for synthetic copies."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def copy(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_levels_mask_and_truth(copy: Path) -> None:
+def test_cube_plus_applies_levels_mask_and_ground_truth(copy: Path) -> None:
     data = open_scenes(copy)
     assert [scene.name for scene in data.scenes] == ["1.PNG", "2.PNG", "3.PNG"]
     np.testing.assert_array_equal(
@@ -35,20 +35,20 @@ def test_levels_mask_and_truth(copy: Path) -> None:
     assert mask[1050:, 2050:].all()
     # The largest value is 9000, and the authors discard pixels from m - 2.
     assert data.scenes[2].saturation == 9000 - 2 - 2048
-    assert data.scenes[0].saturation == 6950  # Asked before the image is read.
+    assert data.scenes[0].saturation == 6950  # requested before the image is read
     assert "the published Cube+ has 1707" in data.treatment["images"]
 
 
-def test_cube_is_told_from_cube_plus(copy: Path) -> None:
+def test_distinguishes_cube_from_cube_plus(copy: Path) -> None:
     (copy / "cube+_gt.txt").rename(copy / "cube_gt.txt")
     data = open_scenes(copy)
     assert data.name == "Cube"
     assert "the published Cube has 1365" in data.treatment["images"]
 
 
-def test_superfluous_images(copy: Path) -> None:
+def test_refuses_unlisted_and_duplicate_images(copy: Path) -> None:
     write_png(copy / "4.png", image_of(4, 4))
-    with pytest.raises(FormatError, match=r"1 images.*cube\+_gt.txt.*know \(4\)"):
+    with pytest.raises(FormatError, match=r"1 images.*cube\+_gt.txt \(4\)"):
         open_scenes(copy)
     (copy / "4.png").unlink()
     write_png(copy / "PNG" / "1.PNG", image_of(4, 4))
@@ -56,14 +56,14 @@ def test_superfluous_images(copy: Path) -> None:
         open_scenes(copy)
 
 
-def test_a_reduced_copy_is_refused_since_its_cube_would_not_be_masked(copy: Path) -> None:
+def test_refuses_reduced_copy(copy: Path) -> None:
     write_png(copy / "1.PNG", image_of(866, 1300))
     with pytest.raises(FormatError, match=r"1\.PNG.*1300.*866.*2601.*1732"):
         open_scenes(copy).scenes[0].read()
 
 
 @pytest.fixture
-def whole(tmp_path: Path) -> Path:
+def plus_plus(tmp_path: Path) -> Path:
     cube_plus_plus(tmp_path)
     return tmp_path
 
@@ -74,46 +74,46 @@ def simple(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_mean_is_taken_where_there_is_one(whole: Path) -> None:
-    data = open_scenes(whole)
+def test_excludes_images_without_mean_ground_truth(plus_plus: Path) -> None:
+    data = open_scenes(plus_plus)
     assert [scene.name for scene in data.scenes] == ["00_0001.png"]
     assert data.scenes[0].truth.tolist() == [0.15, 0.5, 0.35]
-    assert "1 of these have no mean and are left out" in data.treatment["images"]
+    assert "1 of these have no mean and are excluded" in data.treatment["images"]
     assert "the published Cube++ has 4890" in data.treatment["images"]
 
 
-def test_levels_and_mask(whole: Path) -> None:
-    own, other = open_scenes(whole, options=DataOptions(truth="left")).scenes
-    image, mask = own.read()
+def test_cube_plus_plus_applies_levels_and_mask(plus_plus: Path) -> None:
+    with_level, without_level = open_scenes(plus_plus, options=DataOptions(truth="left")).scenes
+    image, mask = with_level.read()
     assert image[0, 0].tolist() == [6952, 0, 4952]
     assert image[1, 1].tolist() == [952, 2952, 1952]
     assert mask is not None
     assert mask.sum() == 1000 * 700
     assert mask[728:, 1892:].all()
-    assert own.saturation == 8000 - 2048  # MakerNotes:NormalWhiteLevel of its row.
-    assert other.saturation == 9000 - 2 - 2048  # Its row has none: the largest value less 2.
+    assert with_level.saturation == 8000 - 2048  # MakerNotes:NormalWhiteLevel
+    assert without_level.saturation == 9000 - 2 - 2048  # largest value minus 2
 
 
-def test_a_white_level_below_black_is_refused(whole: Path) -> None:
-    (whole / "properties.csv").write_text("image,MakerNotes:NormalWhiteLevel\n00_0001,1000\n")
+def test_refuses_white_level_below_black(plus_plus: Path) -> None:
+    (plus_plus / "properties.csv").write_text("image,MakerNotes:NormalWhiteLevel\n00_0001,1000\n")
     with pytest.raises(FormatError, match=r"properties\.csv.*2.*1000"):
-        open_scenes(whole)
+        open_scenes(plus_plus)
 
 
-def test_missing_columns_and_truths(whole: Path) -> None:
-    table = (whole / "gt.csv").read_text()
-    (whole / "gt.csv").write_text(table.replace("mean_b", "mean_blue"))
+def test_refuses_missing_columns_and_ground_truths(plus_plus: Path) -> None:
+    table = (plus_plus / "gt.csv").read_text()
+    (plus_plus / "gt.csv").write_text(table.replace("mean_b", "mean_blue"))
     with pytest.raises(FormatError, match=r"gt\.csv.*mean_b"):
-        open_scenes(whole)
-    (whole / "gt.csv").write_text(table.replace("0.15,0.5,0.35", "nan,nan,nan"))
+        open_scenes(plus_plus)
+    (plus_plus / "gt.csv").write_text(table.replace("0.15,0.5,0.35", "nan,nan,nan"))
     with pytest.raises(InputError, match="'mean'"):
-        open_scenes(whole)
-    (whole / "gt.csv").write_text(table.replace("0.15,0.5,0.35", "0.15,,0.35"))
+        open_scenes(plus_plus)
+    (plus_plus / "gt.csv").write_text(table.replace("0.15,0.5,0.35", "0.15,,0.35"))
     with pytest.raises(FormatError, match=r"gt\.csv.*2.*mean_g"):
-        open_scenes(whole)
+        open_scenes(plus_plus)
 
 
-def test_simple_cube(simple: Path) -> None:
+def test_simple_cube_applies_levels_mask_and_ground_truth(simple: Path) -> None:
     data = open_scenes(simple)
     assert [(scene.name, scene.truth.tolist()) for scene in data.scenes] == [
         ("00_0003.png", [0.15, 0.5, 0.35]),

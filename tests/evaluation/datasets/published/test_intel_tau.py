@@ -1,4 +1,4 @@
-"""INTEL-TAU: values computed by hand on a made-up copy."""
+"""INTEL-TAU: values computed by hand for a synthetic copy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def copy(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_levels_mask_and_truth(copy: Path) -> None:
+def test_applies_levels_mask_and_ground_truth(copy: Path) -> None:
     data = open_scenes(copy)
     assert [scene.name for scene in data.scenes] == NAMES
     assert [scene.truth.tolist() for scene in data.scenes] == [[0.3, 0.5, 0.2], [0.25, 0.5, 0.25], [0.2, 0.5, 0.3]]
@@ -37,7 +37,7 @@ def test_levels_mask_and_truth(copy: Path) -> None:
     assert data.folds is None
 
 
-def test_a_camera_and_a_part(copy: Path) -> None:
+def test_selects_camera_and_subset(copy: Path) -> None:
     assert [scene.name for scene in open_scenes(copy, options=DataOptions(subset="lab-printouts")).scenes] == NAMES[1:2]
     data = open_scenes(copy, options=DataOptions(camera="nikon_d810", subset="field_1_cameras"))
     assert data.name == "INTEL-TAU Nikon_D810 field_1_cameras"
@@ -49,7 +49,7 @@ def test_a_camera_and_a_part(copy: Path) -> None:
     assert [scene.name for scene in open_scenes(copy / "Canon_5DSR").scenes] == NAMES[:2]
 
 
-def test_the_authors_folds(copy: Path) -> None:
+def test_reads_authors_folds(copy: Path) -> None:
     lists = copy / "splits"
     lists.mkdir()
     rows: list[list[str]] = [[] for _ in range(10)]
@@ -63,14 +63,14 @@ def test_the_authors_folds(copy: Path) -> None:
     assert open_scenes(copy).folds is None
 
 
-def test_an_image_without_its_light_is_no_part_either(copy: Path) -> None:
+def test_refuses_image_without_ground_truth_even_if_partial(copy: Path) -> None:
     (copy / "Canon_5DSR/field_1_cameras/C_5DSR_field_002.wp").unlink()
     for partial in (False, True):
         with pytest.raises(FormatError, match=r"1.*C_5DSR_field_2"):
             open_scenes(copy, options=DataOptions(partial=partial))
 
 
-def test_a_light_that_is_none_is_named_when_it_is_used(copy: Path) -> None:
+def test_reports_invalid_ground_truth_on_use(copy: Path) -> None:
     (copy / "Canon_5DSR/field_1_cameras/C_5DSR_field_002.wp").write_text("0.3 0.5")
     scene = open_scenes(copy).scenes[0]
     with pytest.raises(FormatError, match=r"C_5DSR_field_002\.wp.*0\.3.*0\.5"):

@@ -1,4 +1,4 @@
-"""LSMI: values computed by hand on made-up copies of both of its forms."""
+"""LSMI: values computed by hand for synthetic copies of both forms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from evaluation.datasets.published import lsmi as reader
 from evaluation.scene import MixedScene
 from foundation.errors import FormatError, InputError
 from tests.data_files import shipped
-from tests.evaluation.datasets.made_up import lsmi, lsmi_prepared
+from tests.evaluation.datasets.made_up import lsmi, lsmi_preprocessed
 
 
 @pytest.fixture
@@ -24,12 +24,12 @@ def copy(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def prepared(tmp_path: Path) -> Path:
-    lsmi_prepared(tmp_path)
+def preprocessed(tmp_path: Path) -> Path:
+    lsmi_preprocessed(tmp_path)
     return tmp_path
 
 
-def test_levels_mask_and_lights(copy: Path) -> None:
+def test_applies_levels_mask_and_illuminants(copy: Path) -> None:
     data = open_scenes(copy)
     assert [scene.name for scene in data.scenes] == [
         *("sony/Place1_1.tiff", "sony/Place1_12.tiff", "sony/Place2_1.tiff", "sony/Place2_123.tiff"),
@@ -49,35 +49,35 @@ def test_levels_mask_and_lights(copy: Path) -> None:
     assert len(triple.lights) == 3
 
 
-def test_shares_and_lights_of_pixels(copy: Path) -> None:
+def test_reads_fractions_and_truth_map(copy: Path) -> None:
     scene = open_scenes(copy).scenes[1]
     assert isinstance(scene, MixedScene)
     weights, lit = scene.read_weights(), scene.read_truth_map()
     assert weights[0, 0].tolist() == [0.25, 0.75]
     assert np.isnan(weights[7, 9]).all()
     assert np.isnan(lit[7, 9]).all()
-    # .25 (.5, 1, .5) + .75 (2, 1, 1) = (1.625, 1, .875), of sum 3.5
+    # 0.25 (0.5, 1, 0.5) + 0.75 (2, 1, 1) = (1.625, 1, 0.875), sum 3.5
     np.testing.assert_allclose(lit[0, 0], np.array([1.625, 1, 0.875]) / 3.5, rtol=1e-6)
     np.testing.assert_allclose(scene.truth, np.array([1.625, 1, 0.875]) / 3.5, rtol=1e-6)
 
 
-def test_shares_that_do_not_sum_to_one_are_scaled(copy: Path) -> None:
+def test_normalises_fractions(copy: Path) -> None:
     scene = open_scenes(copy).scenes[3]
     assert isinstance(scene, MixedScene)
-    np.testing.assert_allclose(scene.read_weights()[3, 3], [0.25, 0.25, 0.5], rtol=1e-6)  # .2, .2, .4 in the file
+    np.testing.assert_allclose(scene.read_weights()[3, 3], [0.25, 0.25, 0.5], rtol=1e-6)  # 0.2, 0.2, 0.4 in the file
 
 
-def test_the_mean_is_over_pixels_of_unlike_lights(copy: Path) -> None:
+def test_ground_truth_is_mean_over_pixels(copy: Path) -> None:
     shares = np.zeros((8, 10, 2))
     shares[:, :5, 0] = shares[:, 5:, 1] = 1
     np.save(copy / "sony" / "Place1" / "Place1_12.npy", shares)
     scene = open_scenes(copy).scenes[1]
-    # Half of the pixels have (.5, 1, .5), half (2, 1, 1): the mean is (1.25, 1, .75).
+    # Half of the pixels have (0.5, 1, 0.5), half (2, 1, 1): the mean is (1.25, 1, 0.75).
     np.testing.assert_allclose(scene.truth, np.array([1.25, 1, 0.75]) / 3, rtol=1e-6)
 
 
-def test_the_prepared_form(prepared: Path) -> None:
-    data = open_scenes(prepared)
+def test_reads_preprocessed_form(preprocessed: Path) -> None:
+    data = open_scenes(preprocessed)
     assert [scene.name for scene in data.scenes] == ["sony_512/Place1_1.tiff", "sony_512/Place1_12.tiff"]
     scene = data.scenes[1]
     image, mask = scene.read()
@@ -86,22 +86,22 @@ def test_the_prepared_form(prepared: Path) -> None:
     assert mask.sum() == 9
     assert scene.saturation is None
     assert isinstance(scene, MixedScene)
-    assert np.isnan(scene.read_truth_map()[7, 9]).all()  # Its shares are 0, as the program leaves them.
+    assert np.isnan(scene.read_truth_map()[7, 9]).all()  # its fractions are 0
     assert "resized" in data.treatment["saturation"]
 
 
 @pytest.mark.slow
-def test_levels_of_another_camera_come_from_its_raw_file(copy: Path) -> None:
+def test_reads_levels_from_raw_file(copy: Path) -> None:
     (copy / "sony").rename(copy / "galaxy")
     with pytest.raises(InputError, match=r"--read black.*saturation"):
         open_scenes(copy)
-    given = open_scenes(copy, options=DataOptions(black=64, saturation=1023))
-    assert given.scenes[0].saturation == 1023 - 64
+    with_options = open_scenes(copy, options=DataOptions(black=64, saturation=1023))
+    assert with_options.scenes[0].saturation == 1023 - 64
     shutil.copy(shipped("raw/canon_eos_550d_colorchart.dng"), copy / "galaxy.dng")
     data = open_scenes(copy)
     # tests/data/README.md: "black 2056, white 15000".
     assert data.scenes[0].saturation == 15000 - 2056
-    assert data.treatment["black level"] == "2056 of galaxy, subtracted (galaxy.dng)"
+    assert data.treatment["black level"] == "galaxy 2056, subtracted (galaxy.dng)"
 
 
 @pytest.mark.parametrize(
@@ -111,10 +111,10 @@ def test_levels_of_another_camera_come_from_its_raw_file(copy: Path) -> None:
         ("Light2", [1, 1], "Light2.*1.*1"),
         ("Light2", ["a", 1, 1], "Light2"),
         ("MCCCoord", None, "MCCCoord.*mcc1.*mcc2.*mcc3"),
-        ("MCCCoord", {"mcc1": [], "mcc2": [], "mcc3": []}, "other than four corners"),
+        ("MCCCoord", {"mcc1": [], "mcc2": [], "mcc3": []}, "expected four corners"),
     ],
 )
-def test_what_is_wrong_in_the_metadata_is_named(copy: Path, key: str, value: object, message: str) -> None:
+def test_refuses_invalid_metadata(copy: Path, key: str, value: object, message: str) -> None:
     path = copy / "sony" / "meta.json"
     meta = json.loads(path.read_text())
     meta["Place1"][key] = value
@@ -123,7 +123,7 @@ def test_what_is_wrong_in_the_metadata_is_named(copy: Path, key: str, value: obj
         open_scenes(copy)
 
 
-def test_files_that_are_missing(copy: Path) -> None:
+def test_refuses_missing_files(copy: Path) -> None:
     camera = copy / "sony"
     (camera / "Place1" / "Place1_12.npy").unlink()
     with pytest.raises(FormatError, match=r"Place1_12\.npy.*1_make_mixture_map\.py"):
@@ -138,7 +138,7 @@ def test_files_that_are_missing(copy: Path) -> None:
 @pytest.mark.parametrize(
     "shares", [np.ones((8, 10)), np.ones((8, 10, 3)), np.ones((8, 10, 2), int), -np.ones((8, 10, 2))]
 )
-def test_maps_that_are_none_are_named(copy: Path, shares: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+def test_refuses_invalid_fractions(copy: Path, shares: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
     np.save(copy / "sony" / "Place1" / "Place1_12.npy", shares)
     scene = open_scenes(copy).scenes[1]
     assert isinstance(scene, reader.LsmiMixedScene)
