@@ -36,15 +36,15 @@ Corners = Annotated[
     tuple[str, str, str, str] | None,
     option(
         "X,Y X,Y X,Y X,Y",
-        "For a chart without tags: corners of its patches in the frame registered first, in pixels of the raw file, "
-        "clockwise from the printed top left.",
+        "For a chart without tags: corners of its patch area in the frame that is registered first, in pixels of the "
+        "raw file, clockwise from the top left corner of the print.",
     ),
 ]
 Linearity = Annotated[
     Path | None,
     option(
         "FOLDER",
-        "Measure the sensor's linearity with raw files of the chart at its position, under one illuminant, with "
+        "Measure the linearity of the sensor with raw files of the chart, not moved, under one illuminant, with "
         "exposure times from dim to almost saturated.",
     ),
 ]
@@ -54,7 +54,7 @@ NewTable = Annotated[Path, typer.Argument(metavar="LUT", help="New folder for th
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `build-lut` with the given arguments, or those of the process, and return its exit code."""
+    """Run `build-lut` with the given arguments, or the arguments of the process, and return its exit code."""
     return console.run(lambda: app(args=argv, prog_name="build-lut"))
 
 
@@ -90,8 +90,8 @@ def build_lut(
         bool,
         typer.Option(
             "--correct-drift",
-            help="Correct samples and ground truth for lamp drift between white frames. The recorded gains can undo "
-            "it. Refused if the white frames do not determine the drift.",
+            help="Correct samples and ground truth for lamp drift between white frames. The gains are recorded, so "
+            "that the correction can be undone. Refused if the white frames do not determine the drift.",
         ),
     ] = False,
     no_lens_correction: Annotated[
@@ -149,7 +149,7 @@ def check(
     session: SessionFolder,
     picture: Annotated[
         Path | None,
-        option("PNG", "Save the frame with the detected chart, or with the expected one if detection fails."),
+        option("PNG", "Save the frame with the detected chart, or with the expected chart if detection fails."),
     ] = None,
     corners: Corners = None,
     linearity: Linearity = None,
@@ -158,8 +158,8 @@ def check(
 ) -> None:
     """Register the chart in a session's best frame and judge the frame.
 
-    Reads the best light or white frame of SESSION and a dark one. Writes only the picture. Figures that need all frames
-    are judged by a build. Exit code 4 if a figure is refused.
+    Reads the best illuminant or white frame of SESSION and a dark frame. Writes only the picture. Figures that need all
+    frames are judged only by a build. Exit code 4 if a figure is refused.
     """
     from calibration.pipeline.build import check as check_session
     from calibration.pipeline.frames import BuildOptions
@@ -184,7 +184,7 @@ def check(
 @with_json("build-lut info")
 def info(
     lut: Table,
-    cite: Annotated[bool, typer.Option("--cite", help="Print only its BibTeX entry.")] = False,
+    cite: Annotated[bool, typer.Option("--cite", help="Print only the BibTeX entry of the LUT.")] = False,
     *,
     output: JsonOutput,
 ) -> None:
@@ -218,11 +218,11 @@ def info(
 @with_json("build-lut verify")
 def verify(
     lut: Table,
-    session: Annotated[Path | None, typer.Argument(help="Folder of its session, to check its frames, too.")] = None,
+    session: Annotated[Path | None, typer.Argument(help="Folder of the session, to check the frames, too.")] = None,
     *,
     output: JsonOutput,
 ) -> None:
-    """Check the hashes of all files of a LUT, and of its frames if SESSION is given, and list changes.
+    """Check the hashes of all files of a LUT, and of the frames if SESSION is given, and list changes.
 
     Reads LUT and SESSION; writes nothing. Exit code 2 if anything has changed.
     """
@@ -243,9 +243,9 @@ def verify(
         print(fault)
     if faults:
         raise FormatError(
-            f"{folder} has changed: {len(faults)} faults, expected 0; restore it from a copy, or build it again"
+            f"{folder} has changed: {counted(len(faults), 'fault')}, 0 expected; restore a copy or build it again"
         )
-    frames = "" if session is None else f" and of its {len(table.frames)} frames in {session}"
+    frames = "" if session is None else f" and of {len(table.frames)} frames in {session}"
     print(f"{folder}: the hashes of all files{frames} are correct")
 
 
@@ -276,10 +276,10 @@ def match(
 @with_json("build-lut compare")
 def compare(
     a_folder: Annotated[Path, typer.Argument(metavar="A", help="Folder of a LUT or a session.")],
-    b_folder: Annotated[Path, typer.Argument(metavar="B", help="Folder of another one, of the same chart.")],
+    b_folder: Annotated[Path, typer.Argument(metavar="B", help="Folder of another LUT or session of the same chart.")],
     out: Annotated[
         Path | None,
-        option("FOLDER", "Write report.html with its plots, comparison.json, lights.csv and cells.csv there."),
+        option("FOLDER", "Write report.html with its plots, comparison.json, lights.csv and cells.csv to this folder."),
     ] = None,
     *,
     output: JsonOutput,
@@ -366,8 +366,8 @@ def _hash_text(lut: Lut, expect: str | None) -> str:
     if expect is not None:
         return "it is the expected LUT, and all hashes are correct"
     return (
-        f"all files match its own hashes. Compare its hash, {lut.sha256}, with the expected one, or give that with "
-        "--expect"
+        f"all files match the hashes in the LUT. Compare its hash, {lut.sha256}, with the expected hash, or repeat "
+        "the command with --expect"
     )
 
 

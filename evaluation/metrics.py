@@ -13,10 +13,10 @@ illumination", ICCV 2021, as computed by its authors' program (github.com/DY112/
 MAE_illum
     Recovery error of each pixel, averaged over the unmasked pixels of an image, then over images.
 MAE_rgb
-    Angle between the pixel corrected by the estimate and corrected by the ground truth, averaged in the same way.
+    Angle between a pixel after correction by the estimate, and by the ground truth, averaged in the same way.
 
-The error by region is defined here. The region of an illuminant contains the pixels of which it gives more than half
-of the light; its error is the mean over them. It shows illuminants that reach only a few pixels.
+The error by region is our own definition: the mean over the pixels that receive more than half of their light from one
+illuminant. It also shows errors for illuminants that reach only a few pixels.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDA
     Parameters
     ----------
     estimate, truth
-        (..., 3), linear camera RGB of any length > 0. A channel of the estimate at 0 gives the limit.
+        (..., 3), linear camera RGB of any length > 0. For a channel of 0 in the estimate, the result is the limit.
 
     Returns
     -------
@@ -73,7 +73,7 @@ def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDA
 
     Examples
     --------
-    Unlike the recovery error it does not change if estimate and ground truth are filtered:
+    Unlike the recovery error, it does not change if the same filter is applied to estimate and ground truth:
 
     >>> estimate, truth, glass = np.array([1, 1, 1]), np.array([2, 1, 1]), np.array([0.5, 1, 3])
     >>> round(float(reproduction_error(estimate, truth)), 3)
@@ -101,7 +101,7 @@ class RegionError:
     """Error of the region of one illuminant.
 
     - `light`: index of the illuminant, from 0.
-    - `share`: pixels of the region over judged pixels, > 0.
+    - `share`: number of pixels of the region relative to all judged pixels, > 0.
     - `recovery`, `reproduction`: mean angular error of the region's pixels against this illuminant, degrees.
     """
 
@@ -208,8 +208,8 @@ def _rgb_errors(pixels: _Array, estimated: _Array, actual: _Array, saturation: f
         np.minimum(pixels * _gains(light), np.inf if saturation is None else saturation)
         for light in (estimated, actual)
     ]
-    # A black pixel stays black under every correction: its error is 0, as in LSMI's program. The 1e-4 counts by which
-    # that program avoids division by 0 are omitted.
+    # A black pixel stays black under every correction: its error is 0, as in LSMI's program. That program adds 1e-4
+    # counts to avoid a division by 0; this is omitted here.
     lit = pixels.any(axis=1)
     errors = np.zeros(len(pixels))
     errors[lit] = recovery_error(corrected[0][lit], corrected[1][lit])
@@ -228,7 +228,7 @@ SMALL_DEG: Final = 3.0
 
 @dataclass(frozen=True)
 class Summary:
-    """Statistics of the errors of a method on a data set, degrees: the six of the paper first, in its order.
+    """Statistics of the errors of a method on a data set, degrees; the first six are in the order of the paper.
 
     - `mean`, `median`: of all errors.
     - `trimean`: (Q1 + 2 Q2 + Q3) / 4.
@@ -271,7 +271,7 @@ def summarise(errors: npt.ArrayLike) -> Summary:
     if not values.size or not np.isfinite(values).all():
         raise InputError(
             f"{values.size} errors, {int((~np.isfinite(values)).sum())} of them NaN or infinite, expected at least one "
-            "error, all finite; correct or remove the others"
+            "error, all finite; correct or remove the NaN and infinite errors"
         )
     q1, q2, q3, p95 = (float(level) for level in percentiles(values, (25, 50, 75, 95)))
     first_five = (

@@ -48,7 +48,7 @@ class _LazyFunction:
         return (self._compiled or self.compile())(*arguments)
 
     def __reduce__(self) -> str:
-        # Pickled by name, as functions are: objects that hold one are sent to other processes.
+        # Pickled by name, like any function: objects that contain compiled functions are sent to other processes.
         return self._function.__qualname__
 
     @property
@@ -91,11 +91,11 @@ def _dispatcher(function: FunctionType) -> Any:
 
 
 def _translated(function: FunctionType) -> FunctionType:
-    """Return a copy of a function that calls compiled functions and has its origin as a closure variable."""
+    """Return a copy of `function` that calls compiled functions, with its hash and settings as a closure variable."""
     # The key of numba's cache consists of the function's file and its closure variables.
     code = function.__code__
     if code.co_freevars:
-        raise ValueError(f"{function.__qualname__} closes over {code.co_freevars}; compile module functions only")
+        raise ValueError(f"{function.__qualname__} uses outer {code.co_freevars}, expected none; pass arguments")
     scope = function.__globals__
     callees = {name: scope[name].compile() for name in _names(code) if isinstance(scope.get(name), _LazyFunction)}
     origin = (_digest_of(Path(code.co_filename)), *_settings())
@@ -174,7 +174,7 @@ def _numba() -> Any:
 
 @cache
 def _checked_cache() -> Any:
-    """Return a class like numba's cache of a function, with one file per signature and its hash."""
+    """Return a subclass of numba's cache with one file for each signature, which starts with a hash of its code."""
     # numba's own cache raises an error if a file is damaged.
     from numba.core import caching, serialize
 
@@ -221,7 +221,7 @@ def processor_count() -> int:
 
 
 def ordered_map(function: Callable[[_In], _Out], items: Iterable[_In], workers: int) -> Iterator[_Out]:
-    """Yield `function(item)` in the order of the items, computed by `workers` threads; 1 is the calling thread.
+    """Yield `function(item)` in the order of the items, from `workers` threads; with 1, from the calling thread.
 
     Examples
     --------
@@ -236,7 +236,7 @@ def ordered_map(function: Callable[[_In], _Out], items: Iterable[_In], workers: 
     try:
         for item in items:
             futures.append(pool.submit(function, item))
-            # The queue is short, so that results do not fill the memory.
+            # A short queue limits the memory for results.
             if len(futures) >= 2 * workers:
                 yield futures.popleft().result()
         while futures:

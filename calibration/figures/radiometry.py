@@ -99,8 +99,8 @@ ADDED_LIGHT = Figure(
     "added_light", "Light added to a large part of the print, relative to paper white", "radiometry", "share",
     "at most", 0.004, 0.01,
     why="it is equal on dark and bright patches, and extends beyond the patches listed as unfit",
-    source=SIMULATED + ": 0 in healthy rooms; 1 % of paper white makes patches of 10 % of paper white 10 % brighter, "
-    "those of 3 % 30 %; a reflection of 3 % causes errors of 57 %",
+    source=SIMULATED + ": 0 in healthy rooms; added light of 1 % of paper white makes a patch with 10 % of paper white "
+    "10 % brighter; a reflection of 3 % causes errors of 57 %",
     remedy="turn the print or the projector until it shows no reflection, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
@@ -128,8 +128,8 @@ FRAME_BLUR = Figure(
     "frame_blur", "Light of neighbouring patches added in the most blurred frame", "geometry", "share", "at most",
     0.003, 0.012,
     why="a frame is out of focus or shaken; only white frames are checked patch by patch for such light",
-    source=SIMULATED + ": 0.9 px of blur in one frame of a session with 0.5 px gives 0.8 %, and errors of 1.2 % in "
-    "patches; 1.1 px gives 2 % and 4 %",
+    source=SIMULATED + ": a frame with 0.9 px of blur in a session with 0.5 px has 0.8 % of added light, and errors "
+    "of 1.2 % in patches; a frame with 1.1 px has 2 % and 4 %",
     remedy="switch off autofocus and stabilisation, and keep the camera free from vibration",
     measure=lambda table: table.added_bleed(_most_blurred(table)), of_one_frame="bounded",
     where=_most_blurred_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
@@ -161,7 +161,7 @@ FRAME_SCATTER = Figure(
 BLOCK_DEVIATION = Figure(
     "block_deviation", "Deviation of the worst block of patches, worst frame", "radiometry", "share", "at most",
     0.01, 0.03,
-    why="an object or light was on the print in that frame or in the one compared with, and is in its samples",
+    why="an object or a light was in front of the print in this or in the compared frame, and changed the samples",
     source=SIMULATED + ": up to 0.4 % beyond noise",
     remedy="keep people out of the space between lamp, print and camera",
     measure=_largest_of_frames(lambda table, frame: frame.consistency.block), of_one_frame="bounded",
@@ -179,11 +179,11 @@ def _disturbed_count(table: TableMeasurements) -> float | None:
 DISTURBED_CELLS = Figure(
     "disturbed_cells", "Adjacent patches with large deviations in an illuminant's frame", "radiometry", "", "at most",
     0, None,
-    why="their samples under that illuminant do not have their own colours; they are listed as unfit, other patches "
-    "are unaffected",
-    source=SIMULATED + ": none in healthy rooms; two adjacent patches, five standard deviations off, are sufficient, "
-    "unless the dark frames show that they are hot", remedy="keep the space between lamp, print and camera free",
-    measure=_disturbed_count, of_one_frame="bounded",
+    why="their samples under that illuminant do not have the colours of these patches; they are listed as unfit, and "
+    "other patches are not affected",
+    source=SIMULATED + ": none in healthy rooms; two adjacent patches that deviate by five standard deviations are "
+    "sufficient, unless the dark frames show hot photosites there",
+    remedy="keep the space between lamp, print and camera free", measure=_disturbed_count, of_one_frame="bounded",
     cause=Explanation("few cells", disturbed_evidence, follows=("block_deviation",)), drawing="errors",
 )  # fmt: skip
 
@@ -241,10 +241,10 @@ def _frames_of_other_exposure(table: TableMeasurements, limit: float) -> list[Fr
 
 
 OTHER_EXPOSURE = Figure(
-    "other_exposure", "Exposure of a frame relative to most frames, by the files", "radiometry", "share",
+    "other_exposure", "Exposure of a frame relative to most frames, according to the raw files", "radiometry", "share",
     "at most", 0.01, 0.1,
-    why="brightness would differ between illuminants that should be equally bright, and noise with the ISO speed",
-    source="shutter times are steps of 26 %, and are recorded rounded", remedy=_KEEP_EXPOSURE,
+    why="illuminants of equal brightness would differ in brightness, and the noise would change with the ISO speed",
+    source="shutter times have steps of 26 %, and files contain rounded times", remedy=_KEEP_EXPOSURE,
     foremost=True, measure=lambda table: table.origins.exposure_difference, of_one_frame="bounded",
     where=lambda table, accepted: _foreign_frames_text(table.origins.other_exposure), retake=_frames_of_other_exposure,
     cause=Explanation("brightness", light_evidence),
@@ -260,7 +260,7 @@ OTHER_ISO = Figure(
 
 WHITE_FRAMES = Figure(
     "white_frames", "White frames", "light", "", "at least", 1, None,
-    why="the drift of the lamp, stains on the print and the uniformity of patches cannot be measured",
+    why="without them, drift of the lamp, stains on the print and the uniformity of patches cannot be measured",
     source="by definition; drift needs two white frames",
     remedy="take white frames during the session (sequence.reference_every)",
     before_session=False, measure=lambda table: float(len(table.white_frames)), drawing="course",

@@ -88,7 +88,7 @@ def added_light(
         model = LevelModel.of(filled, usable, bits)
         residual = model.residual_of(filled)
         expected = model.predicted
-        rows = model.known & usable
+        rows = model.is_predicted & usable
         groups = max(min(20, int(rows.sum()) // 20), 1)
         scatter = sigma_by_level(residual[rows], expected[rows], groups)
         sigma = np.sqrt(scatter**2 + variance[rows, channel])

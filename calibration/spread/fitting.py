@@ -542,7 +542,7 @@ def _rows(
     even = shape * data.even[:, None]
     smooth = np.column_stack([factor * expected[:, None], ink * dense[:, None]])
     columns = np.column_stack([data.changes, even, nonlinearity_change(expected, data.field), smooth])
-    selected, folds = _by_fold(np.flatnonzero(model.known & data.usable), cells_mm, page_mm)
+    selected, folds = _by_fold(np.flatnonzero(model.is_predicted & data.usable), cells_mm, page_mm)
     common = TERMS + even.shape[1] + 3
     smooth_count = smooth.shape[1]
     shapes: npt.NDArray[np.int64] = np.arange(TERMS, common - 3, dtype=np.int64)

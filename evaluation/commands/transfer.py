@@ -37,19 +37,19 @@ if TYPE_CHECKING:
     from evaluation.experiments.transfer.plan import TransferPlan
     from evaluation.scene import Scene
 
-# Ratio of image sizes above which all images are reduced: learned methods reduce images by up to 2 themselves.
+# Ratio of sizes above which all images are reduced. Learned methods use sizes that differ by up to 2 (whole factors).
 _MAX_SIZE_RATIO = 2.0
-_MAX_MEASURED = 25  # Images of a set whose sizes are read, at most
+_MAX_MEASURED = 25  # Maximum number of images of a set from which the size is determined
 
 HELP = f"""Train learned methods on generated images and test them on real ones.
 
 Reads data sets in any layout of evaluate run. Trains each method on each TRAIN and tests it on TEST. For comparison:
-real cross-validation of the same method, the constant illuminant (median of the training illuminants), and methods
+cross-validation of the same method on TEST, the constant illuminant (median of the training illuminants), and methods
 without training. --naive adds training without a look-up table: linear sRGB of the same pictures times the same
-illuminants, with and without the camera's colour matrix. --real adds N real images of the other folds: training on them
-alone, and training on each set followed by adaptation to them. Prints mean, median, trimean, best and worst 25 %,
-bootstrap intervals, and ratios to real cross-validation, paired by image. Training images that share a picture with the
-test set, by name or content, are excluded. Writes files only with --out.
+illuminants, with and without the camera's colour matrix. --real adds two trainings with N real images of the other
+folds: on these images alone, and on each set with adaptation to these images. Prints mean, median, trimean, best and
+worst 25 %, bootstrap intervals, and ratios to the cross-validation, paired by image. Training images that share a
+picture with the test set, by name or content, are excluded. Writes files only with --out.
 
 {EXIT_CODES}
 """
@@ -149,7 +149,7 @@ def _learners(names: Sequence[str]) -> tuple[list[AnyLearner], list[str]]:
 
 
 def _parse_counts(real: str | None) -> tuple[int | None, ...]:
-    """Return the numbers of --real without 0, whose rows exist in any case; None stands for all."""
+    """Return the numbers of --real; None stands for all, and 0 is omitted, because its rows always exist."""
     words = [] if real is None else [word.strip().lower() for word in real.split(",")]
     if not all(word == "all" or (word.isascii() and word.isdigit()) for word in words):
         raise InputError(f"--real is {real!r}, expected numbers of real images, such as 0,20,100,all; correct it")
@@ -159,12 +159,12 @@ def _parse_counts(real: str | None) -> tuple[int | None, ...]:
 def _possible_counts(
     counts: Sequence[int | None], folds: Sequence[npt.NDArray[np.int64]]
 ) -> tuple[tuple[int | None, ...], list[str]]:
-    """Return the numbers of real images that every fold (N,) int64 leaves, and notes on the others."""
+    """Return the numbers of real images that are available outside every fold (N,) int64, and notes on the others."""
     import numpy as np
 
     max_count = min(len(fold_numbers) - int(np.bincount(fold_numbers).max()) for fold_numbers in folds)
     left_out = [count for count in counts if count is not None and count > max_count]
-    notes = [f"No rows with {count} real images: the other folds have only {max_count}" for count in left_out]
+    notes = [f"No rows with {n} real images: the other folds have only {max_count}; reduce --real" for n in left_out]
     return tuple(count for count in counts if count not in left_out), notes
 
 

@@ -19,13 +19,13 @@ _Points = npt.NDArray[np.float64]
 # the 25 samples of a patch of 10 px comes from its neighbours.
 MAX_BLUR_PX = 1.0
 
-# Tried σ in half-size px, 7 % apart: from less than one photosite alone causes to far beyond use.
+# Candidate σ, half-size px, in steps of 7 %: from below the blur of a single photosite to far above useful values.
 _BLURS = np.geomspace(0.15, 4, 48)
 
-# Points of the outline at which blur is measured: enough for a median that is not moved by marks in the margin.
-_OUTLINE_PLACES = 80
+# Points of the outline at which blur is measured: so many that marks in the margin do not change the median.
+_OUTLINE_POINTS = 80
 
-# Half-size px that are read around a point of the outline: one patch inwards, and no marks in the margin.
+# Half-size px read around a point of the outline: about one patch inwards; outwards less than the distance to marks.
 _INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0
 
 
@@ -77,7 +77,7 @@ def _edge_blurs(plane: Plane, tag: DetectedTag) -> npt.NDArray[np.float64]:
         along = (pixels - start) @ tangent / length
         # Corners run clockwise with y down, so this points out of the tag.
         across = (pixels - start) @ np.array([tangent[1], -tangent[0]])
-        # Away from the corners, where another edge is near.
+        # Pixels near the corners are omitted, because another edge is near.
         near = (along > 0.2) & (along < 0.8) & (np.abs(across) < module)
         counts, distances = values[near], across[near]
         blurs[edge] = _sigma(counts, distances, (-module, 0.0, module))
@@ -85,12 +85,12 @@ def _edge_blurs(plane: Plane, tag: DetectedTag) -> npt.NDArray[np.float64]:
 
 
 def _outline_blurs(plane: Plane, field: DetectedField) -> tuple[_Points, npt.NDArray[np.float64]]:
-    """Return points around the patch area, (N, 2) px, and the edge's σ there."""
+    """Return points on the outline of the patch area, (N, 2) px, and the σ of the edge at each point, (N,) px."""
     height, width = plane.values.shape
     reach = int(np.ceil(_INWARDS_PX + _ALONG_PX))
     blurs: list[float] = []
     points: list[_Points] = []
-    for index in range(0, len(field.outline_px), max(1, len(field.outline_px) // _OUTLINE_PLACES)):
+    for index in range(0, len(field.outline_px), max(1, len(field.outline_px) // _OUTLINE_POINTS)):
         point, normal = field.outline_px[index] - plane.offset_px, field.normals[index]
         left, top = np.floor(point).astype(int) - reach
         if left < 0 or top < 0 or left + 2 * reach + 2 > width or top + 2 * reach + 2 > height:
@@ -107,7 +107,7 @@ def _outline_blurs(plane: Plane, field: DetectedField) -> tuple[_Points, npt.NDA
 
 
 def _sigma(counts: _Points, distances: _Points, step_positions: Sequence[float]) -> float:
-    # Blurred steps of unknown height are fitted for each σ.
+    # For each candidate σ, blurred steps of unknown height are fitted.
     sigma = _BLURS[:, None]
     steps = [ndtr((distances - position) / sigma) for position in step_positions]
     # The derivative of the edge absorbs an error of its position.

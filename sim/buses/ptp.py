@@ -42,7 +42,7 @@ _TIMEOUT_S = 10.0
 
 
 def serve_ptpip(responder: Responder, port: int = PORT, *, name: str = NAME) -> TcpServer:
-    """Serve a device on a TCP port, 0 for a free one; use the result, with its `address`, in a ``with`` block."""
+    """Serve a device on a TCP port (0: a free port); use the returned server in a ``with`` block."""
     return TcpServer(PtpIpService(responder, name).handle, port)
 
 
@@ -93,7 +93,7 @@ class PtpIpService:
                     case Ping():
                         _send(channel, Pong())
                     case _:
-                        # Rest of a cancelled transaction.
+                        # Remaining packets of a cancelled transaction.
                         pass
         finally:
             initiator.hang_up()

@@ -1,10 +1,10 @@
 """Geometry of the print and rendering of the light on each photosite.
 
-**Geometry.** The print is a sheet whose point (x, y) mm has a `height` mm out of the plane, towards the camera. The
-sheet is rotated by roll, then tilt, then pan, and projected by a pinhole with Brown's lens distortion (D. C. Brown,
-"Close-range camera calibration", 1971; coordinates and coefficients as in OpenCV). Paper does not stretch, and heights
-are small against wavelengths, so points keep their x and y. A fold is a crease above the plane; its flanks
-are inclined to the light.
+**Geometry.** Point (x, y) mm of the print is `height` mm above the plane of the print, towards the camera. The sheet is
+rotated by roll, then tilt, then pan, and projected by a pinhole with Brown's lens distortion (D. C. Brown, "Close-range
+camera calibration", 1971; coordinates and coefficients as in OpenCV). Paper does not stretch, and heights are small
+compared with wavelengths, so points keep their x and y. A fold is a crease above the plane; its flanks are inclined to
+the light.
 
 **Rendering.** `light` is compiled by numba, single-threaded, without interpreter lock; `sim.world.world` calls it for
 blocks of rows from several threads. A row depends only on its arguments, so blocks and threads do not change the
@@ -48,7 +48,7 @@ class Waviness:
     ) -> Waviness:
         """Draw a surface with a given distance between its highest and lowest points.
 
-        `wave_mm`: wavelength, within 15 %, of one wave in a random direction with weak waves across; 0 for long waves.
+        `wave_mm`: wavelength, within 15 %, of one strong wave and weak waves in random directions; 0: long waves.
         """
         random = np.random.default_rng([seed, 0x77617679])
         longer = max(page_mm)
@@ -66,10 +66,10 @@ class Waviness:
 
     def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the height (...) mm towards the camera at points (..., 2) mm, also off the page."""
-        share = points_mm / np.array(self.page_mm)
+        scaled = points_mm / np.array(self.page_mm)
         total = np.zeros(points_mm.shape[:-1])
         for (along_x, along_y), phase, amplitude in zip(self.cycles, self.phases, self.amplitudes_mm, strict=True):
-            total += amplitude * np.sin(2 * np.pi * (along_x * share[..., 0] + along_y * share[..., 1]) + phase)
+            total += amplitude * np.sin(2 * np.pi * (along_x * scaled[..., 0] + along_y * scaled[..., 1]) + phase)
         return total
 
 
@@ -149,7 +149,7 @@ class View:
         turn_deg: tuple[float, float, float],
         distortion: tuple[float, float, float, float],
     ) -> View:
-        """Choose the distance at which the print, without rotation, fills a share of the frame.
+        """Return the view in which the print, without rotation, fills the share `fill` of the frame's width or height.
 
         `turn_deg`: tilt (about the horizontal axis), pan (vertical axis) and roll (optical axis), degrees.
         """
@@ -227,16 +227,16 @@ class Print:
                 f"rectangles {self.rectangles_mm.shape} and codes {self.rgb.shape}, expected (N, 4) and (N, 3)"
             )
         if np.any(self.rectangles_mm[:, 2:] < self.rectangles_mm[:, :2]):
-            raise ValueError("a rectangle has its right or bottom before its left or top")
+            raise ValueError("right < left or bottom < top in a rectangle, expected (left, top, right, bottom)")
 
 
 @dataclass(frozen=True, eq=False)
 class LabelMap:
-    """A print as a grid of uniform intervals."""
+    """A print divided by a grid into areas of uniform colour."""
 
     x_lines: NDArray[np.float64]  # (A,) float64, ascending, mm: positions of vertical edges
     y_lines: NDArray[np.float64]  # (B,) float64, ascending, mm: positions of horizontal edges
-    labels: NDArray[np.int32]  # (B + 1, A + 1) int32: row of `codes` in each interval; `len(codes)` off the page
+    labels: NDArray[np.int32]  # (B + 1, A + 1) int32: row of `codes` of each area; `len(codes)` off the page
     codes: NDArray[np.int64]  # (N, 3) int64, distinct codes of the print, ascending, including bare paper
 
 
@@ -257,7 +257,7 @@ def label_map(sheet: Print) -> LabelMap:
 def _lines(ends: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
     """Return the sorted distinct coordinates of (N, 2) ends, and the indices of starts and ends in them.
 
-    Coordinates within 1 µm are merged. If there are more than `_MAX_LINES`, closer ones are merged to their mean.
+    Coordinates within 1 µm are merged to their mean. The distance increases until at most `_MAX_LINES` remain.
     """
     resolution = _FINEST_MM
     while True:
@@ -356,28 +356,28 @@ def light(
 ) -> None:
     """Write the signal of each photosite of some rows under each primary.
 
-    Blur and aperture of the photosite are one Gaussian with the axes of the print. The drawing consists of
-    rectangles, so its integrals are products of differences of normal distributions: exact for any position of edges.
+    Blur and aperture of the photosite are one Gaussian with axes parallel to the edges of the print. The light of each
+    rectangle is a product of differences of normal distributions, exact for any position of its edges.
 
     Parameters
     ----------
     first_row
-        First of the rows.
+        Row of the first row of `out` in the visible frame.
     nodes
-        (1 or 3, ny, nx, 2) float64, point on the print, mm, of photosite (16 (i − 1), 16 (j − 1)) at [j, i], for
-        all channels or for each.
+        (1 or 3, ny, nx, 2) float64, mm: at [:, j, i] the point on the print of the photosite in column 16 (i − 1) and
+        row 16 (j − 1). One array for all channels, or one for each.
     sigma_px
-        Blur and aperture, photosites.
+        Standard deviation of blur and aperture, photosites.
     x_lines, y_lines, labels
-        See `LabelMap`; labels are rows of `signals`.
+        See `LabelMap`; a label is an index of `signals`.
     signals
         (n, 3, 3) float32, signal of a colour [label, camera channel, primary] in full light, DN.
     channels
         (2, 2) int64, camera channel by parity of row and column.
     vignetting
-        (3,) float64: x, y and c; the lens transmits 1 / (1 + c r²)² at r photosites from there.
+        (3,) float64: x, y and c; the lens transmits 1 / (1 + c r²)² at r photosites from (x, y).
     falloff
-        (3, 4) float64, x, y, c and g of each primary: the projector gives g / (1 + c d²) at d mm from there.
+        (3, 4) float64, x, y, c and g of each primary: the projector gives g / (1 + c d²) at d mm from (x, y).
     response
         (rows, columns) float32, response of each photosite, about 1.
     out
@@ -440,7 +440,7 @@ def light(
                     _shares(x_lines, u, u_sigma, i, i1, u_share)
                     _shares(y_lines, v, v_sigma, j, j1, v_share)
                     red, green, blue = np.float32(0), np.float32(0), np.float32(0)
-                    # Unsigned indices are faster: negative indices need not be checked at hundreds of shares.
+                    # Unsigned indices are faster, because numba does not check them for negative values.
                     for b in range(np.uintp(j), np.uintp(j1 + 1)):
                         row_share = v_share[b]
                         for a in range(np.uintp(i), np.uintp(i1 + 1)):
@@ -450,11 +450,11 @@ def light(
                             green += share * signals[entry, channel, 1]
                             blue += share * signals[entry, channel, 2]
                 off_x, off_y = x - vignetting[0], y - vignetting[1]
-                passed = 1 / (1 + vignetting[2] * (off_x * off_x + off_y * off_y))
-                passed *= passed * response[row, x]
+                transmission = 1 / (1 + vignetting[2] * (off_x * off_x + off_y * off_y))
+                transmission *= transmission * response[row, x]
                 du, dv = u - falloff[0, 0], v - falloff[0, 1]
-                out[0, row, x] = red * passed * falloff[0, 3] / (1 + falloff[0, 2] * (du * du + dv * dv))
+                out[0, row, x] = red * transmission * falloff[0, 3] / (1 + falloff[0, 2] * (du * du + dv * dv))
                 du, dv = u - falloff[1, 0], v - falloff[1, 1]
-                out[1, row, x] = green * passed * falloff[1, 3] / (1 + falloff[1, 2] * (du * du + dv * dv))
+                out[1, row, x] = green * transmission * falloff[1, 3] / (1 + falloff[1, 2] * (du * du + dv * dv))
                 du, dv = u - falloff[2, 0], v - falloff[2, 1]
-                out[2, row, x] = blue * passed * falloff[2, 3] / (1 + falloff[2, 2] * (du * du + dv * dv))
+                out[2, row, x] = blue * transmission * falloff[2, 3] / (1 + falloff[2, 2] * (du * du + dv * dv))

@@ -310,12 +310,13 @@ def test_levels_that_codes_predict(pinned: Pinned) -> None:
     models = [predicting.LevelModel.of(level, known, 3) for known in (ALL, usable)]
     large = predicting.LevelModel.of(np.linspace(0.1, 0.9, 4096), np.arange(4096) % 7 > 0, 4)
     result = [
-        [one.freedom, brief(one.predicted), brief(one.residual_of(level)), int(one.known.sum())] for one in models
+        [one.freedom, brief(one.predicted), brief(one.residual_of(level)), int(one.is_predicted.sum())]
+        for one in models
     ]
     columns = random.standard_normal((4096, 3))
     pinned(
         "levels that codes predict",
-        [result, large.freedom, brief(large.residual(columns)), int(large.known.sum()),
+        [result, large.freedom, brief(large.residual(columns)), int(large.is_predicted.sum()),
          *(brief(predicting.neighbour_residual(columns[: 8**bits], bits)) for bits in (2, 3, 4))],
         **LOOSE,
     )  # fmt: skip

@@ -24,7 +24,7 @@ def printed_levels(bend: float) -> _Array:
 def test_residuals_are_linear_and_zero_for_smooth_colours() -> None:
     smooth = (3 + CODES @ [1.0, 0.5, 0.25])[:, None] ** 2
     residual = neighbour_residual(smooth, 3)
-    is_predicted = LevelModel.of(np.zeros(4096), np.ones(4096, dtype=np.bool_), 4).known
+    is_predicted = LevelModel.of(np.zeros(4096), np.ones(4096, dtype=np.bool_), 4).is_predicted
     inner = np.any((CODES > 0) & (CODES < 7), axis=1)
     assert residual[inner] == pytest.approx(0, abs=1e-9)
     assert is_predicted.sum() == 16**3 - 8

@@ -206,8 +206,8 @@ def test_gradual_events_grow_linearly(limits: dict[str, Any], moments: dict[tupl
 
 
 def test_events_have_the_documented_defaults() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "reference" / "simulated-faults.md").read_text(encoding="utf-8")
-    table = page.partition("| `what` | keys with default values |")[2].partition("\n\n")[0]
+    page = (Path(__file__).parents[3] / "docs/reference/simulated-faults.md").read_text(encoding="utf-8")
+    table = page.partition("| `what` | keys with default values |\n")[2].partition("\n\n")[0]
     kinds = {kind.what: kind for kind in get_args(AnyDisturbance)}
     compared = 0
     for line in table.splitlines():
