@@ -168,18 +168,18 @@ def illuminations(
 
     Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb chromaticities next to it.
     """
-    from experiment.lights import parse_ccts, plan_illuminations, plot_illuminations, save_illuminations
+    from experiment.lights import parse_ccts, plan_illuminants, plot_illuminants, save_illuminants
 
     plot = out.with_suffix(".png")
     if plot == out:
         raise InputError(f"{out} is the name of the plot; name the file of illuminants {out.with_suffix('.csv')}")
     require_free(out, "the illuminants")
     require_free(plot, "the plot of the illuminants")
-    lights = plan_illuminations(grid, parse_ccts(blackbodies))
+    lights = plan_illuminants(grid, parse_ccts(blackbodies))
     if not lights:
         raise InputError("there are 0 illuminants, at least 1 is needed; set --grid or --blackbodies")
-    save_illuminations(lights, out)
-    plot_illuminations(lights, plot)
+    save_illuminants(lights, out)
+    plot_illuminants(lights, plot)
     output.add(file=out, plot=plot, lights=len(lights), kinds=Counter(light.kind for light in lights))
     print(f"{out}: {len(lights)} illuminants; plot in {plot}")
 

@@ -31,7 +31,7 @@ from drivers.camera import ExposureSettings
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, SequenceSettings, SimulatedSettings
-from experiment.lights import Illumination, plan_illuminations, save_illuminations
+from experiment.lights import Illuminant, plan_illuminants, save_illuminants
 from experiment.session.folder import Session
 from foundation.colorimetry import angles_deg
 from sim.world.sensors import BODIES, Body
@@ -143,9 +143,9 @@ def repeated_variance(
     return measured / (sample_variance(counts, body, iso) / field**2 + 1 / 12)
 
 
-def lights_with_repeats() -> tuple[Illumination, ...]:
+def lights_with_repeats() -> tuple[Illuminant, ...]:
     """Return twelve lights, the brightest mixture and a primary twice."""
-    lights = plan_illuminations(grid=2, ccts_k=(2500, 4000, 5500, 7500))
+    lights = plan_illuminants(grid=2, ccts_k=(2500, 4000, 5500, 7500))
     repeated = (*lights, lights[9], lights[0])
     return tuple(replace(light, index=index) for index, light in enumerate(repeated))
 
@@ -162,7 +162,7 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
     chart = design_chart(seed=20)
     chart.save(settings.chart)
     lights = lights_with_repeats()
-    save_illuminations(lights, settings.illuminations)
+    save_illuminants(lights, settings.illuminations)
     run_session(settings, folder / "session", lambda done, total: None)
     with Session.open(folder / "session") as session:
         result = build(session, folder / "lut")

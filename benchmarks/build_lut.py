@@ -46,7 +46,7 @@ from drivers.camera import CapturedFrame
 from drivers.raw.rawfile import frame_black, read_raw
 from experiment.chart.layout import design_chart
 from experiment.chart.printing import drawing
-from experiment.lights import plan_illuminations
+from experiment.lights import plan_illuminants
 from experiment.session.folder import Session
 from experiment.session.journal import ReceivedFile
 from experiment.session.records import Judgement, plan_steps
@@ -87,7 +87,7 @@ def take(folder: Path, body: str = "EOS 550D", cr2: bool = False, lights: int = 
     room = replace(Room(), **MILD_SHOULDERS, veil=0.005)
     world = World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), BODIES[body], room)
     ccts = np.linspace(2500, 10000, max(lights - 3, 1)).round().tolist()
-    planned = plan_illuminations(grid=1, ccts_k=ccts)[:lights]
+    planned = plan_illuminants(grid=1, ccts_k=ccts)[:lights]
     session = Session.create(folder, "", chart, planned)
     at = datetime(2024, 3, 1, tzinfo=UTC)
     for step in plan_steps(planned, 25):

@@ -45,7 +45,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.errors import CropError
@@ -92,7 +92,7 @@ class NamedCase:
     what: str
     right: str
     wrong: str
-    changes: Callable[[World, Chart, Sequence[Illumination]], Changes] = lambda world, chart, lights: as_planned
+    changes: Callable[[World, Chart, Sequence[Illuminant]], Changes] = lambda world, chart, lights: as_planned
     room: Mapping[str, Any] = field(default_factory=dict[str, Any])
     lights: Mapping[str, Colour] = field(default_factory=lambda: dict(EIGHT_LIGHTS))
     settings: str = "rig = 'simulated'\n"
@@ -100,25 +100,25 @@ class NamedCase:
     must_say: bool = False
 
 
-def _other_camera(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
+def _other_camera(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
     body = replace(world.body, model="Canon EOS 5D Mark II", sensitivities="Canon_EOS_5D_Mark_II")
     other = World(world.sheet, body, world.room)
     foreign = FrameChange(world=other, serial="000000000077")
     return lambda step: foreign if light_named(lights, step) in ("warm", "violet") else AS_PLANNED
 
 
-def _exchanged(one: str, two: str) -> Callable[[World, Chart, Sequence[Illumination]], Changes]:
+def _exchanged(one: str, two: str) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
     """Return that the files of two lights stand for each other."""
     first, second = EIGHT_LIGHTS[one], EIGHT_LIGHTS[two]
 
-    def changes(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
+    def changes(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
         shown = {one: FrameChange(colour=second), two: FrameChange(colour=first)}
         return lambda step: shown.get(light_named(lights, step) or "", AS_PLANNED)
 
     return changes
 
 
-def _exchanged_reference(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
+def _exchanged_reference(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
     """Return that the first white reference and the frame of the red primary stand for each other."""
 
     def changes(step: SessionStep) -> FrameChange:
@@ -129,35 +129,35 @@ def _exchanged_reference(world: World, chart: Chart, lights: Sequence[Illuminati
     return changes
 
 
-def _lights_alone(*names: str, **change: Any) -> Callable[[World, Chart, Sequence[Illumination]], Changes]:
+def _lights_alone(*names: str, **change: Any) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
     """Return a change of some lights' frames."""
     changed = FrameChange(**change)
 
-    def changes(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
+    def changes(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
         return lambda step: changed if light_named(lights, step) in names else AS_PLANNED
 
     return changes
 
 
-def _whites(**change: Any) -> Callable[[World, Chart, Sequence[Illumination]], Changes]:
+def _whites(**change: Any) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
     """Return a change of the white references' frames."""
     changed = FrameChange(**change)
     return lambda world, chart, lights: lambda step: changed if step.kind == "white" else AS_PLANNED
 
 
-def _later_white(**change: Any) -> Callable[[World, Chart, Sequence[Illumination]], Changes]:
+def _later_white(**change: Any) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
     """Return a change of all white references' frames but the first."""
     changed = FrameChange(**change)
     return lambda world, chart, lights: lambda step: changed if step.kind == "white" and step.number else AS_PLANNED
 
 
-def _all(**change: Any) -> Callable[[World, Chart, Sequence[Illumination]], Changes]:
+def _all(**change: Any) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
     """Return a change of every frame."""
     changed = FrameChange(**change)
     return lambda world, chart, lights: lambda step: changed
 
 
-def _later(**change: Any) -> Callable[[World, Chart, Sequence[Illumination]], Changes]:
+def _later(**change: Any) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
     """Return a change of every frame from the sixth on."""
     changed = FrameChange(**change)
     return lambda world, chart, lights: lambda step: changed if step.number >= _MIDWAY else AS_PLANNED
@@ -167,7 +167,7 @@ _MIDWAY: Final = 6
 """The step from which a lasting change of a short session is there: after half of its lights."""
 
 
-def _hot_photosite(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
+def _hot_photosite(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
     """Return that one photosite in the middle of the darkest cell stands 3000 counts too high, in dark frames too."""
     darkest = int(np.argmin(chart.rgb.astype(np.int64).sum(axis=1)))
     column, row = np.round(world.project(chart.centres_mm[darkest])).astype(np.int64).tolist()
@@ -176,7 +176,7 @@ def _hot_photosite(world: World, chart: Chart, lights: Sequence[Illumination]) -
     return lambda step: changed
 
 
-def _other_print(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
+def _other_print(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
     """Return that another print of as many colours hangs there midway, its tags where the first's were."""
     small = chart.colour_count < _FULL_COLOURS
     other = world_of(chart_of(small, seed=7), world.body, world.room)
@@ -196,10 +196,10 @@ class _Settling(World):
         return (1 - self._share) * super().decoded(colour) + self._share * super().decoded(self._other)
 
 
-def _mixed(light: str, other: str, share: float) -> Callable[[World, Chart, Sequence[Illumination]], Changes]:
+def _mixed(light: str, other: str, share: float) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
     """Return that a share of another light is in a light's frame."""
 
-    def changes(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
+    def changes(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
         mixed = FrameChange(world=_Settling(world, EIGHT_LIGHTS[other], share))
         return lambda step: mixed if light_named(lights, step) == light else AS_PLANNED
 
@@ -216,7 +216,7 @@ class _CutWorld(World):
         return counts
 
 
-def _cut(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
+def _cut(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
     cut = FrameChange(world=_CutWorld(world.sheet, world.body, world.room))
     return lambda step: cut if light_named(lights, step) == "warm" else AS_PLANNED
 
@@ -231,11 +231,11 @@ class _BandedWorld(World):
         return np.clip(np.rint(counts + rows), 0, self.body.saturation).astype(np.uint16)
 
 
-def _one_white(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
+def _one_white(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
     return lambda step: FrameChange(number=0) if step.kind == "white" else AS_PLANNED
 
 
-def _banded(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
+def _banded(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
     banded = FrameChange(world=_BandedWorld(world.sheet, world.body, world.room))
     return lambda step: banded
 

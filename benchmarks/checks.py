@@ -18,7 +18,7 @@ from acquisition.check.check import check_lab
 from acquisition.check.findings import CheckReport, not_checked
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
-from experiment.lights import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminants, save_illuminants
 
 SEEDS = range(30)
 """Of the good rooms."""
@@ -60,7 +60,7 @@ def check(folder: Path, bits: int, room: dict[str, Any], seed: int = 1) -> Check
     chart = folder / f"chart{bits}.json"
     if not chart.exists():
         design_chart(bits).save(chart)
-        save_illuminations(plan_illuminations(1, ()), folder / "illuminations.csv")
+        save_illuminants(plan_illuminants(1, ()), folder / "illuminations.csv")
     room = dict(room)
     shutter_s = room.pop("shutter_s", 0.5)
     if shutter_s != 0.5:

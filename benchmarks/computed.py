@@ -26,7 +26,7 @@ from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import require_match
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.config import LabSettings, SimulatedSettings
-from experiment.lights import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminants, save_illuminants
 from experiment.session.folder import Session
 from sim.world.sensors import find_body
 from synthesis.settings import TableSettings, table_room
@@ -88,9 +88,9 @@ def compare(computed: Lut, photographed: Lut, every: int) -> None:
 def small_tables(folder: Path) -> tuple[Lut, Lut]:
     """Return a computed and a photographed table of a small chart."""
     chart = design_chart(3, A_SERIES_MM["A5"], 1)
-    lights = plan_illuminations(3, (2500, 4500, 6500))
+    lights = plan_illuminants(3, (2500, 4500, 6500))
     chart.save(folder / "chart.json")
-    save_illuminations(lights, folder / "illuminations.csv")
+    save_illuminants(lights, folder / "illuminations.csv")
     settings = LabSettings(
         rig="simulated",
         chart=folder / "chart.json",

@@ -29,11 +29,11 @@ from benchmarks.false_alarms import false_alarms, odd_worlds
 from benchmarks.judged_labs import Lab, lab_of, rooms
 from benchmarks.troubled_runs import causes
 from experiment.chart.layout import design_chart
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from sim.world.world import Room
 
 
-def neighbours(model: ProjectorModel, plan: Sequence[Illumination]) -> tuple[int, int, list[str]]:
+def neighbours(model: ProjectorModel, plan: Sequence[Illuminant]) -> tuple[int, int, list[str]]:
     """Return how many lights have another, and how many the next of the list, that they cannot be told from; and which.
 
     A light that is seen instead is told if it would be on average: by `limits.STALE_SIGMAS` and `STALE_ADVANTAGE`.

@@ -83,7 +83,7 @@ def natural_picture(width: int, height: int) -> npt.NDArray[np.uint8]:
 
 def noisy_table(folder: Path, lights: int) -> Lut:
     """Return a table of 32768 colours with shot noise."""
-    from experiment.lights import Illumination
+    from experiment.lights import Illuminant
 
     index = np.arange(32768)
     code = np.stack([index >> 10, index >> 5 & 31, index & 31], axis=-1) / 31
@@ -96,7 +96,7 @@ def noisy_table(folder: Path, lights: int) -> Lut:
     known = Provenance(
         camera="Benchmark", bits=5, white_level=12000, session_sha256="0", chart_sha256="0", software="benchmark"
     )
-    plan = [Illumination(light, "uniform", None, Colour(255, 255, 255)) for light in range(lights)]
+    plan = [Illuminant(light, "uniform", None, Colour(255, 255, 255)) for light in range(lights)]
     writer.finish(plan, np.full((lights, 3), 4000.0), known)
     return open_lut(folder)
 

@@ -19,7 +19,7 @@ from drivers.presenter import BLACK, Colour
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, parse_lab
-from experiment.lights import Illumination, plan_illuminations
+from experiment.lights import Illuminant, plan_illuminants
 from experiment.session.records import RESPONSE, Judgement, SessionStep, plan_steps
 from sim.camera.film import write_dng
 from sim.world.disturbances import CALM, AnyDisturbance, Disturbances, Moment
@@ -39,7 +39,7 @@ class Lab:
 
     world: World
     chart: Chart
-    plan: tuple[Illumination, ...]
+    plan: tuple[Illuminant, ...]
     settings: LabSettings
     file: Path
     judge: LiveJudge
@@ -104,7 +104,7 @@ def lab_of(
     """Return a lab with a judge that has seen nothing."""
     settings = parse_lab(LAB.format(shutter_s), "LAB.toml")
     chart = chart or design_chart(3, "A7")
-    plan = plan_illuminations()
+    plan = plan_illuminants()
     judge = LiveJudge(settings, chart, plan)
     world = World(sheet(chart), BODIES[body], room)
     return Lab(world, chart, plan, settings, folder / "frame.dng", judge, **more)

@@ -43,7 +43,7 @@ def report(name: str, value: float, unit: str, against: str = "") -> None:
 
 def small_table(folder: Path) -> Lut:
     """Return a table of 64 colours and 8 lights."""
-    from experiment.lights import Illumination
+    from experiment.lights import Illuminant
 
     folder.mkdir()
     rng = np.random.default_rng(1)
@@ -53,7 +53,7 @@ def small_table(folder: Path) -> Lut:
     known = Provenance(
         camera="Benchmark", bits=2, white_level=8000, session_sha256="0", chart_sha256="0", software="benchmark"
     )
-    plan = [Illumination(light, "uniform", None, Colour(255, 255, 255 - light)) for light in range(8)]
+    plan = [Illuminant(light, "uniform", None, Colour(255, 255, 255 - light)) for light in range(8)]
     writer.finish(plan, 4000.0 + np.arange(24.0).reshape(8, 3), known)
     return open_lut(folder)
 

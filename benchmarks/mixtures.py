@@ -30,7 +30,7 @@ from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.config import LabSettings, SimulatedSettings
-from experiment.lights import Illumination, plan_illuminations, save_illuminations
+from experiment.lights import Illuminant, plan_illuminants, save_illuminants
 from experiment.session.folder import Session
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import InputError
@@ -75,7 +75,7 @@ def report(name: str, value: float, unit: str, against: str) -> None:
     print(json.dumps({"name": name, "value": float(f"{value:.3g}"), "unit": unit, "against": against}), flush=True)
 
 
-def drives(lights: Sequence[Illumination]) -> _Array:
+def drives(lights: Sequence[Illuminant]) -> _Array:
     """Return (L, 3) float64, the primaries' light as shares of full."""
     codes = [light.colour for light in lights]
     return decode_srgb(np.array(codes) / 255)
@@ -164,7 +164,7 @@ def small_table(folder: Path) -> Lut:
         simulated=SimulatedSettings(body="Test", seed=20, room={"waviness_mm": 0.5}),
     )
     design_chart(3, A_SERIES_MM["A5"], 20).save(settings.chart)
-    save_illuminations(plan_illuminations(), settings.illuminations)
+    save_illuminants(plan_illuminants(), settings.illuminations)
     run_session(settings, folder / "session", lambda done, total: None)
     with Session.open(folder / "session") as session:
         build(session, folder / "lut")

@@ -25,7 +25,7 @@ from typing import Any
 
 from acquisition.monitor.serving import open_monitor
 from drivers.camera import CapturedFrame
-from experiment.lights import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminants, save_illuminants
 from experiment.session.journal import JOURNAL_FILE, Journal, ReceivedFile
 from experiment.session.records import RESPONSE, Check, Judgement, SessionStep, plan_steps
 
@@ -48,10 +48,10 @@ class _Night:
     """A session whose journal grows."""
 
     def __init__(self, folder: Path) -> None:
-        lights = plan_illuminations()
+        lights = plan_illuminants()
         self.steps = plan_steps(lights, 25, seed=1, response=RESPONSE)
         self._taken = 0
-        save_illuminations(lights, folder / "illuminations.csv")
+        save_illuminants(lights, folder / "illuminations.csv")
         Journal.create(folder / JOURNAL_FILE, self.steps)
         self.journal = Journal.open_for_run(folder / JOURNAL_FILE)
 

@@ -20,7 +20,7 @@ from collections.abc import Generator
 from typing import Any
 
 from drivers.display.fullscreen import FullScreen, list_displays
-from experiment.lights import plan_illuminations
+from experiment.lights import plan_illuminants
 
 SIZE = "1920x1080"
 
@@ -80,7 +80,7 @@ def main() -> int:
             return 0
         display = list_displays()[0]
         size = f"{display.width}×{display.height}"
-        lights = plan_illuminations()
+        lights = plan_illuminants()
         screen = FullScreen(display.number)
         shows: list[float] = []
         busy: list[float] = []

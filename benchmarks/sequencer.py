@@ -49,7 +49,7 @@ from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings, SequenceSettings
-from experiment.lights import Illumination, plan_illuminations
+from experiment.lights import Illuminant, plan_illuminants
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
 from experiment.session.records import Judgement, SessionStep, plan_steps
@@ -59,7 +59,7 @@ from tests.drivers.raw.raw_files import write_cr2
 
 BODY = BODIES["EOS 550D"]
 EXPOSURE = ExposureSettings(100, 8.0, 0.5)
-LIGHTS = plan_illuminations(35, list(range(2000, 10001, 200)))
+LIGHTS = plan_illuminants(35, list(range(2000, 10001, 200)))
 REAL_LIGHTS = 36
 """Lights of the session in real time: some tens of frames, a minute."""
 SLICES = (2, 1728, 1888)
@@ -299,7 +299,7 @@ def measure(
     """
     screen = PacedScreen(clock, latencies)
     camera = PacedCamera(screen, clock, latencies, files)
-    chosen = [Illumination(n, "uniform", None, LIGHTS[n].colour) for n in range(lights)]
+    chosen = [Illuminant(n, "uniform", None, LIGHTS[n].colour) for n in range(lights)]
     settings = _settings(settle_s)
     steps = plan_steps(chosen, settings.sequence.reference_every)
     with tempfile.TemporaryDirectory() as scratch:

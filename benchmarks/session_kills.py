@@ -47,7 +47,7 @@ from drivers.presenter import BLACK, Colour
 from drivers.projector import Power
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session, rebuild_journal
 from experiment.session.journal import IncomingFile, Journal, ledger_path, settled_frames
 from experiment.session.records import ACCEPTED, VOIDED, Check, Judgement, SessionStep, plan_steps
@@ -64,7 +64,7 @@ KILLS_A_SESSION = 4
 TOLD_EVERY = 100
 """Sessions from one line about the kills so far to the next."""
 
-LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 20 * n, 255 - n)) for n in range(6))
+LIGHTS = tuple(Illuminant(n, "uniform", None, Colour(255, 20 * n, 255 - n)) for n in range(6))
 SETTINGS = LabSettings.model_validate(
     {
         "rig": "simulated",

@@ -34,7 +34,7 @@ from drivers.raw.rawfile import CHANNELS, read_raw
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 from experiment.framing.pictures import STILL_PX
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.journal import ReceivedFile
 from experiment.session.records import Judgement, SessionStep, plan_steps
@@ -66,10 +66,10 @@ _Mask = npt.NDArray[np.bool_]
 _Counts = npt.NDArray[np.uint16]
 
 
-def short_plan(lights: Mapping[str, Colour] = EIGHT_LIGHTS) -> tuple[Illumination, ...]:
+def short_plan(lights: Mapping[str, Colour] = EIGHT_LIGHTS) -> tuple[Illuminant, ...]:
     """Return named lights as a session's plan."""
     return tuple(
-        Illumination(index, "uniform", None, colour, name) for index, (name, colour) in enumerate(lights.items())
+        Illuminant(index, "uniform", None, colour, name) for index, (name, colour) in enumerate(lights.items())
     )
 
 
@@ -123,7 +123,7 @@ def as_planned(step: SessionStep) -> FrameChange:
     return AS_PLANNED
 
 
-def light_named(lights: Sequence[Illumination], step: SessionStep) -> str | None:
+def light_named(lights: Sequence[Illuminant], step: SessionStep) -> str | None:
     """Return the name of a step's light; None for references."""
     return None if step.illumination is None else lights[step.illumination].name
 
@@ -172,7 +172,7 @@ def frame_file(world: World, step: SessionStep, change: FrameChange = AS_PLANNED
 def record_session(
     folder: Path,
     chart: Chart,
-    lights: Sequence[Illumination],
+    lights: Sequence[Illuminant],
     frame: Callable[[SessionStep], bytes],
     *,
     every: int = 25,
@@ -205,7 +205,7 @@ def short_session(
     chart: Chart,
     world: World,
     changes: Changes = as_planned,
-    lights: Sequence[Illumination] | None = None,
+    lights: Sequence[Illuminant] | None = None,
     every: int = 25,
     settings: str = "rig = 'simulated'\n",
 ) -> Session:

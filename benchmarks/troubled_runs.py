@@ -45,7 +45,7 @@ from drivers.ptp.usb import UsbTransport
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, load_lab
-from experiment.lights import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminants, save_illuminants
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, REFUSED, VOIDED
 from foundation.clock import SIM_START, SimulatedClock, SteadyClock
@@ -280,7 +280,7 @@ def make_lab(folder: Path, grid: int, events: Sequence[str] = (), **changes: obj
     """Write LAB.toml, a chart of 64 colours and lights; return the path of the first."""
     folder.mkdir(exist_ok=True)
     design_chart(bits=2, seed=3).save(folder / "chart.json")
-    save_illuminations(plan_illuminations(grid, [3000, 6500]), folder / "illuminations.csv")
+    save_illuminants(plan_illuminants(grid, [3000, 6500]), folder / "illuminations.csv")
     sequence = "".join(f"{key} = {json.dumps(value)}\n" for key, value in {**SETTINGS, **changes}.items())
     path = folder / "LAB.toml"
     path.write_text(
@@ -522,7 +522,7 @@ class Night:
 
 def night(scratch: Path, grid: int, night_s: float = NIGHT_S) -> Night:
     """Take a session that lasts a night in which power dips twice and much else happens; nobody comes."""
-    lights = len(plan_illuminations(grid, [3000, 6500]))
+    lights = len(plan_illuminants(grid, [3000, 6500]))
     frames = 21 + lights + 2 * (lights // 10 + 2)
     path = make_lab(scratch, grid, settle_s=max(night_s / frames - 2, 0.5), patience_s=HOUR_S, warm_up_s=20 * MINUTE_S)
     folder = scratch / "session"

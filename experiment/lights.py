@@ -42,7 +42,7 @@ _NAMED_CCTS_K = (2000, 3000, 4000, 6000, 10000)
 
 
 @dataclass(frozen=True)
-class Illumination:
+class Illuminant:
     """One illuminant of the plan."""
 
     index: int
@@ -76,17 +76,17 @@ def blackbody_light(cct_k: float) -> npt.NDArray[np.float64]:
     return linear / linear.max()
 
 
-def plan_illuminations(grid: int = GRID, ccts_k: Sequence[float] = CCTS_K) -> tuple[Illumination, ...]:
+def plan_illuminants(grid: int = GRID, ccts_k: Sequence[float] = CCTS_K) -> tuple[Illuminant, ...]:
     """Return the illuminants of an experiment: the triangular grid first, then the black bodies."""
-    lights: list[Illumination] = []
+    lights: list[Illuminant] = []
     for linear in uniform_lights(grid) if grid else ():
-        lights.append(Illumination(len(lights), "uniform", None, shown_colour(linear)))
+        lights.append(Illuminant(len(lights), "uniform", None, shown_colour(linear)))
     for cct_k in ccts_k:
-        lights.append(Illumination(len(lights), "blackbody", float(cct_k), shown_colour(blackbody_light(cct_k))))
+        lights.append(Illuminant(len(lights), "blackbody", float(cct_k), shown_colour(blackbody_light(cct_k))))
     return tuple(lights)
 
 
-def illuminations_to_csv(illuminations: Sequence[Illumination]) -> str:
+def illuminants_to_csv(illuminations: Sequence[Illuminant]) -> str:
     """Return the text of `illuminations.csv`."""
     rows: list[Sequence[object]] = [COLUMNS]
     for light in illuminations:
@@ -96,12 +96,12 @@ def illuminations_to_csv(illuminations: Sequence[Illumination]) -> str:
     return csv_text(rows)
 
 
-def save_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:
+def save_illuminants(illuminations: Sequence[Illuminant], path: Path) -> None:
     """Write `illuminations.csv`."""
-    write_atomic(path, illuminations_to_csv(illuminations))
+    write_atomic(path, illuminants_to_csv(illuminations))
 
 
-def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illumination, ...]:
+def load_illuminants(path: Path, *, computed: bool = False) -> tuple[Illuminant, ...]:
     """Read `illuminations.csv`; additional columns are ignored.
 
     `computed`: whether the file belongs to a computed LUT, with names and other spectra.
@@ -109,7 +109,7 @@ def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illuminat
     rows = read_csv(path, "make one with: acquire illuminations", "illuminations")[1]
     if not rows or any(column not in rows[0] for column in COLUMNS):
         raise FormatError(f"{path}: illuminants in the columns {','.join(COLUMNS)} expected; run acquire illuminations")
-    lights: list[Illumination] = []
+    lights: list[Illuminant] = []
     for number, row in enumerate(rows):
         kind, kelvin = row["kind"], row["cct_k"]
         cct_k: float | None = None
@@ -132,7 +132,7 @@ def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illuminat
                     raise ValueError(f"{name} is {code}, a code 0 … 255 expected")
         except ValueError as error:
             raise FormatError(f"{path}, illuminant {number}: {error}; correct this row") from error
-        lights.append(Illumination(number, kind, cct_k, colour, (row.get(NAME) or None) if computed else None))
+        lights.append(Illuminant(number, kind, cct_k, colour, (row.get(NAME) or None) if computed else None))
     return tuple(lights)
 
 
@@ -165,7 +165,7 @@ def _require_kelvin(ccts: Sequence[float], description: str) -> None:
             raise InputError(f"{description}: {cct_k:g} K given, temperatures from 1000 to 100 000 K expected")
 
 
-def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:
+def plot_illuminants(illuminations: Sequence[Illuminant], path: Path) -> None:
     """Plot the rb-chromaticities of illuminants (paper, section 3.1), each point in its colour.
 
     Chromaticities r = R / (R + G + B) and b = B / (R + G + B) are computed from the codes, decoded to linear light

@@ -31,7 +31,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
 from drivers.raw.rawfile import Mosaic
 from drivers.raw.storage import Area
-from experiment.lights import Illumination, parse_ccts, shown_colour
+from experiment.lights import Illuminant, parse_ccts, shown_colour
 from foundation.colorimetry import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError, nearest_names
 from foundation.files import sha256_of
@@ -152,10 +152,10 @@ def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
     return tuple(_light(name, power, None, where) for name, power in zip(headings[1:], powers.T, strict=True))
 
 
-def table_illuminations(lights: Sequence[LightSpectrum]) -> tuple[Illumination, ...]:
+def table_illuminants(lights: Sequence[LightSpectrum]) -> tuple[Illuminant, ...]:
     """Return illuminants for the list of a LUT, with names, and sRGB codes that show their colours."""
     return tuple(
-        Illumination(
+        Illuminant(
             index,
             "spectrum" if light.cct_k is None else "blackbody",
             light.cct_k,
@@ -334,7 +334,7 @@ class ProjectorLamp:
 
     world: World  # Room, camera and page
     settings: ExposureSettings  # Exposure of all frames
-    illuminations: tuple[Illumination, ...]
+    illuminations: tuple[Illuminant, ...]
     light: _Float  # (3, rows, columns) float32, light on each photosite under each primary at full brightness
 
     def illuminate(self, light: int) -> tuple[_Float, _Array]:

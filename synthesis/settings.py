@@ -16,14 +16,14 @@ from calibration.citation import OriginRecord
 from calibration.sampling import WINDOW, WINDOWS
 from experiment.chart.layout import design_chart
 from experiment.config import CameraSettings, CitationSettings, Settings, validate_settings
-from experiment.lights import plan_illuminations
+from experiment.lights import plan_illuminants
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
 from foundation.records import from_settings, parse_toml
 from sim.spectral import describe_sensitivities, read_sensitivities
 from sim.world.sensors import find_body
 from sim.world.world import Room
-from synthesis.lamps import LightSpectra, table_illuminations
+from synthesis.lamps import LightSpectra, table_illuminants
 from synthesis.table import TableTask
 
 # Parameters of the simulated room without effect on a computed LUT, which has no neighbouring patches and no time.
@@ -129,7 +129,7 @@ def table_task(camera: str, settings: TableSettings, where: str, lights: LightSp
         "window": settings.window,
         "seed": settings.seed,
     }
-    illuminations = plan_illuminations() if lights is None else table_illuminations(lights.lights)
+    illuminations = plan_illuminants() if lights is None else table_illuminants(lights.lights)
     powers = None if lights is None else np.array([light.power for light in lights.lights])
     record["lights"] |= {"count": len(illuminations)}
     exposure, origin = settings.exposure.exposure, citation_record(settings, where)

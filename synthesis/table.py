@@ -27,7 +27,7 @@ from calibration.table.writing import LutWriter, references_csv
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.chart.model import Chart
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
 from foundation.compiled import ordered_map
 from foundation.errors import QualityError, StorageError
@@ -141,7 +141,7 @@ class TableTask:
     body: Body
     room: Room
     exposure: ExposureSettings
-    illuminations: tuple[Illumination, ...]
+    illuminations: tuple[Illuminant, ...]
     powers: _Array | None  # (L, 81) float64, spectra in relative power per nm; None for the simulated projector
     window: int  # Side of the window of a patch, in half-size pixels
     record: dict[str, Any]  # Written to lut.json under `computed`

@@ -55,7 +55,7 @@ from experiment.chart.model import Chart, load_chart
 from experiment.config import LabSettings
 from experiment.framing.field import Corners
 from experiment.framing.homography import project
-from experiment.lights import load_illuminations
+from experiment.lights import load_illuminants
 from experiment.measures.exposure import measure_exposure
 from experiment.measures.paper import falloff
 from experiment.measures.pose import keystone, off_level_deg
@@ -106,7 +106,7 @@ def check_lab(
     also take an exposure series that measures the linearity of the sensor.
     """
     chart = load_chart(settings.chart)
-    lights = load_illuminations(settings.illuminations)
+    lights = load_illuminants(settings.illuminations)
     frames = len(planned_steps(settings, lights))
     lines = [f"illuminants {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} in a session"]
     lab_folder = Path(settings.file).parent

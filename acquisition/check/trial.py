@@ -22,7 +22,7 @@ from calibration.verdict import Verdict
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Mosaic, frame_black, read_raw
 from experiment.framing.field import Corners
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.measures.frame import measure
 from experiment.session.folder import Session
 from experiment.session.records import MIDDLE, FrameKind, Judgement, SessionStep
@@ -65,7 +65,7 @@ class Trial:
         return tuple(figure.name for figure in FIGURES if figure.name not in measured)
 
 
-def trial_lights(plan: Sequence[Illumination], primaries: npt.NDArray[np.float64]) -> tuple[Illumination, ...]:
+def trial_lights(plan: Sequence[Illuminant], primaries: npt.NDArray[np.float64]) -> tuple[Illuminant, ...]:
     """Return the illuminants of a trial: white, the primaries, grey, and the darkest of the plan.
 
     `primaries`: (3, 3) counts of R, G and B under the red, green and blue of the projector, which predict the counts of
@@ -78,11 +78,11 @@ def trial_lights(plan: Sequence[Illumination], primaries: npt.NDArray[np.float64
         if darkest not in colours.values():
             colours["darkest"] = darkest
     return tuple(
-        Illumination(index, "uniform", None, colour, name) for index, (name, colour) in enumerate(colours.items())
+        Illuminant(index, "uniform", None, colour, name) for index, (name, colour) in enumerate(colours.items())
     )
 
 
-def trial_steps(lights: Sequence[Illumination]) -> tuple[SessionStep, ...]:
+def trial_steps(lights: Sequence[Illuminant]) -> tuple[SessionStep, ...]:
     """Return the plan of a trial: references, illuminants, references."""
     references: list[tuple[FrameKind, int | None, Colour]] = [("white", None, WHITE)] * WHITES
     references.append(("dark", None, BLACK))

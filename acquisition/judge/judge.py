@@ -57,7 +57,7 @@ from drivers.raw.rawfile import CHANNELS, Channel, Mosaic, filled_fault, frame_b
 from experiment.chart.model import Chart
 from experiment.config import JudgeSettings, LabSettings
 from experiment.framing.pictures import preview_jpeg
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.measures.exposure import Exposure
 from experiment.measures.frame import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured, measure
 from experiment.session.records import REFERENCES, Check, Judgement, SessionStep
@@ -87,7 +87,7 @@ class _FrameChecks:
 class LiveJudge:
     """Judge of the frames of a session: `experiment.session.records.FrameJudge`."""
 
-    def __init__(self, settings: LabSettings, chart: Chart, illuminations: Sequence[Illumination]) -> None:
+    def __init__(self, settings: LabSettings, chart: Chart, illuminations: Sequence[Illuminant]) -> None:
         self._settings = settings
         # A chart without tags needs corners given by hand, which a run does not have.
         self._chart = chart if settings.judge.chart and chart.tags else None

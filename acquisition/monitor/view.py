@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 
-from experiment.lights import Illumination, load_illuminations
+from experiment.lights import Illuminant, load_illuminants
 from experiment.session.heartbeat import AGAIN, BEAT_S, LATE_S, Heartbeat, Process, SessionPlace
 from experiment.session.journal import JOURNAL_FILE, Journal, ledger_path, lost_files, no_journal_text, open_journal
 from experiment.session.records import (
@@ -153,7 +153,7 @@ class SessionView:
     name: str
     path_text: str
     steps: tuple[SessionStep, ...]
-    lights: tuple[Illumination, ...]
+    lights: tuple[Illuminant, ...]
     records: Mapping[str, str]
     attempts: tuple[AttemptView, ...]
     events: tuple[SessionEvent, ...]
@@ -233,10 +233,10 @@ def _without_own_files(folder: Path) -> str:
     return f"{' and '.join(missing)}: missing; restore it from a copy of the session" if missing else ""
 
 
-def _lights_of(folder: Path) -> tuple[Illumination, ...]:
+def _lights_of(folder: Path) -> tuple[Illuminant, ...]:
     # Only kinds and temperatures are read from the file: the plan has the codes.
     try:
-        return load_illuminations(folder / "illuminations.csv")
+        return load_illuminants(folder / "illuminations.csv")
     except (CropError, OSError):
         return ()
 

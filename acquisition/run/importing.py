@@ -20,7 +20,7 @@ from drivers.presenter import BLACK, WHITE
 from drivers.raw.rawfile import LAYOUT_START, layout_is_known
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
-from experiment.lights import Illumination, load_illuminations
+from experiment.lights import Illuminant, load_illuminants
 from experiment.session.folder import FRAME_COLUMNS, Session
 from experiment.session.records import ACCEPTED, REFUSED, FrameKind, Judgement, SessionStep
 from foundation.errors import FormatError
@@ -55,7 +55,7 @@ class Imported:
     unchecked: tuple[str, ...]
 
 
-def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, ...]]:
+def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illuminant, ...]]:
     """Read a list of frames (columns as in `frames.csv`, paths relative to it) and the illuminants next to it.
 
     Only `kind`, `illumination` and `file` must be filled. Rows of the kind ``response`` are ignored: only a running
@@ -64,7 +64,7 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, 
     rows = read_csv(path, "name a CSV file in UTF-8", "the list of frames")[1]
     if not rows or any(column not in rows[0] for column in FRAME_COLUMNS[:3]):
         raise FormatError(f"no frames under the expected columns {','.join(FRAME_COLUMNS)}", about=path)
-    lights = load_illuminations(path.parent / "illuminations.csv")
+    lights = load_illuminants(path.parent / "illuminations.csv")
     frames = [
         _listed(row, f"{path}, line {number}", path.parent, len(lights))
         for number, row in enumerate(rows, 2)
@@ -163,7 +163,7 @@ def _missing_frames(session: Session) -> list[str]:
     ]
 
 
-def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> SessionStep:
+def _step(number: int, frame: ListedFrame, lights: tuple[Illuminant, ...]) -> SessionStep:
     colour = WHITE if frame.kind == "white" else BLACK
     if frame.illumination is not None:
         colour = lights[frame.illumination].colour

@@ -35,7 +35,7 @@ from drivers.presenter import BLACK, ReportsWarnings
 from drivers.projector import Power, Projector
 from experiment.chart.model import Chart, load_chart
 from experiment.config import LabSettings, parse_lab
-from experiment.lights import Illumination, load_illuminations
+from experiment.lights import Illuminant, load_illuminants
 from experiment.session.folder import Session, session_exists
 from experiment.session.records import KINDS, RESPONSE, SessionStep, duration_text, plan_steps
 from experiment.session.repair import require_frames_folder
@@ -79,7 +79,7 @@ class Work:
     done: frozenset[int]
     order: str
     chart: Chart
-    lights: tuple[Illumination, ...]
+    lights: tuple[Illuminant, ...]
     lights_sha256: str
     frame_bytes: int | None = None
     frame_s: float | None = None
@@ -90,7 +90,7 @@ class Work:
         return sum(step.number not in self.done for step in self.steps)
 
 
-def planned_steps(settings: LabSettings, lights: Sequence[Illumination]) -> tuple[SessionStep, ...]:
+def planned_steps(settings: LabSettings, lights: Sequence[Illuminant]) -> tuple[SessionStep, ...]:
     """Return the frames of a new session, in the order of the settings."""
     sequence = settings.sequence
     seed = sequence.seed if sequence.order == "shuffled" else None
@@ -105,7 +105,7 @@ def outline(settings: LabSettings, folder: Path, session: Session | None, retake
     if session is None:
         if retake is not None:
             raise nothing_to_retake(folder)
-        chart, lights = load_chart(settings.chart), load_illuminations(settings.illuminations)
+        chart, lights = load_chart(settings.chart), load_illuminants(settings.illuminations)
         steps, sha256 = planned_steps(settings, lights), file_sha256(settings.illuminations)
         return Work(folder, True, steps, frozenset(), order_of(steps, settings), chart, lights, sha256)
     require_same(session, settings)
@@ -152,7 +152,7 @@ def require_same(session: Session, settings: LabSettings) -> None:
             f"{session.folder} was started with another chart than {settings.chart}",
             remedy="name the first chart, or a new session folder",
         )
-    if load_illuminations(settings.illuminations) != session.illuminations:
+    if load_illuminants(settings.illuminations) != session.illuminations:
         raise ConfigurationError(
             f"{session.folder} was started with other illuminants than {settings.illuminations}",
             remedy="name the first file, or a new session folder",
@@ -171,7 +171,7 @@ def order_of(steps: Sequence[SessionStep], settings: LabSettings) -> str:
     indices = [step.illumination for step in steps if step.illumination is not None]
     sequence = settings.sequence
     # The order depends on the indices, not on the codes.
-    listed = [Illumination(index, "uniform", None, BLACK) for index in sorted(indices)]
+    listed = [Illuminant(index, "uniform", None, BLACK) for index in sorted(indices)]
     shuffled = [step.illumination for step in plan_steps(listed, 1, seed=sequence.seed) if step.kind == "light"]
     if indices == shuffled and sequence.order == "shuffled":
         return f"shuffled by seed {sequence.seed}"

@@ -44,7 +44,7 @@ from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
-from experiment.lights import load_illuminations
+from experiment.lights import load_illuminants
 from experiment.session.folder import Session, busy_message, session_exists
 from experiment.session.heartbeat import AGAIN, BEAT_S, RunState, SessionPlace
 from experiment.session.journal import thread_beat
@@ -504,7 +504,7 @@ def _resumed(settings: LabSettings, folder: Path, announce: Callable[[str], obje
 
 def _created(settings: LabSettings, folder: Path) -> Session:
     chart = load_chart(settings.chart)
-    lights = load_illuminations(settings.illuminations)
+    lights = load_illuminants(settings.illuminations)
     try:
         return Session.create(folder, settings.to_toml(), chart, lights, planned_steps(settings, lights))
     except InputError:

@@ -24,7 +24,7 @@ from calibration.pipeline.build import build, refused_folder
 from calibration.table.lut import REFERENCES, REPORT_JSON, Lut, open_lut
 from calibration.table.verification import chart_difference
 from experiment.chart.model import Chart, load_chart
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.measures.stains import STAINED
 from experiment.session.folder import Session
 from experiment.session.journal import JOURNAL_FILE
@@ -170,12 +170,12 @@ def chart_of(folders: Sequence[Path]) -> Chart | None:
     return next((load_chart(path) for path in charts if path.is_file()), None)
 
 
-def light_pairs(first: Sequence[Illumination], second: Sequence[Illumination]) -> list[tuple[int, int]]:
+def light_pairs(first: Sequence[Illuminant], second: Sequence[Illuminant]) -> list[tuple[int, int]]:
     """Return the index pairs of illuminants with the same kind, temperature, codes and name, in the order of the first.
 
     Repeated illuminants are paired in their order.
     """
-    waiting: dict[Illumination, list[int]] = {}
+    waiting: dict[Illuminant, list[int]] = {}
     for light in reversed(second):
         waiting.setdefault(replace(light, index=0), []).append(light.index)
     return [(light.index, indices.pop()) for light in first if (indices := waiting.get(replace(light, index=0)))]

@@ -43,7 +43,7 @@ from calibration.spread.fitting import LEAST_COUNTS
 from calibration.spread.surroundings import unsuitable
 from drivers.raw.rawfile import CLIPPING_SHARE, frame_black, read_raw, strongest_channel
 from experiment.framing.pictures import REREGISTER_PX, Shift
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.measures.sensor import HIGHEST, LOWEST, deviations
 from foundation.colorimetry import angles_deg
 from foundation.errors import FormatError, InputError
@@ -439,7 +439,7 @@ def _differ_by_drift(whites: Sequence[FrameMeasurements]) -> bool:
 
 
 def _code_agreement(
-    illuminations: Sequence[Illumination],
+    illuminations: Sequence[Illuminant],
     by_light: Sequence[FrameMeasurements],
     whites: Sequence[FrameMeasurements],
     dark: _Array,
@@ -470,7 +470,7 @@ def _to_one_exposure(frames: Sequence[FrameMeasurements]) -> _Array:
 
 
 def _stray_light(
-    illuminations: Sequence[Illumination],
+    illuminations: Sequence[Illuminant],
     by_light: Sequence[FrameMeasurements],
     whites: Sequence[FrameMeasurements],
     dark: _Array,

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from calibration.radiometry.superposition import Superposition
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.measures.least_squares import product
 from experiment.measures.paper import FlatField, Paper
 
@@ -39,7 +39,7 @@ class Additivity:
 
 
 def additivity(
-    lights: Sequence[Illumination],
+    lights: Sequence[Illuminant],
     white: _Array,
     full_white: _Array | None,
     dark: _Array,
@@ -55,7 +55,7 @@ def additivity(
 
     Parameters
     ----------
-    lights : sequence of Illumination
+    lights : sequence of Illuminant
         The L illuminants; the three full primaries are used, and full white if `full_white` is None.
     white : (L, 3) float64
         Ground truths.
@@ -98,7 +98,7 @@ def drift_gains(at_s: _Array, white_at_s: _Array, white: _Array) -> _Array:
     return gains
 
 
-def pure_lights(illuminations: Sequence[Illumination]) -> tuple[int, int, int] | None:
+def pure_lights(illuminations: Sequence[Illuminant]) -> tuple[int, int, int] | None:
     """Return the indices of the brightest red, green and blue alone; None if one is missing."""
     indices: list[int] = []
     for channel in range(3):

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from calibration.citation import OriginRecord
-from experiment.lights import Illumination, load_illuminations
+from experiment.lights import Illuminant, load_illuminants
 from foundation.errors import FormatError, InputError, value_text
 from foundation.files import file_sha256, partial_path, read_text, reading_error, require_plain_folder, sha256_of
 from foundation.records import Record, from_json
@@ -333,7 +333,7 @@ class Lut:
     folder : Path
     samples : (L, 8**bits, S, 3) uint16
         Linear camera RGB; `provenance.white_level` is saturation.
-    illuminations : tuple of Illumination
+    illuminations : tuple of Illuminant
         The L illuminants.
     white : (L, 3) float64
         Ground truth: linear camera RGB of the achromatic reference in the units of the samples.
@@ -343,7 +343,7 @@ class Lut:
 
     folder: Path
     samples: npt.NDArray[np.uint16]
-    illuminations: tuple[Illumination, ...]
+    illuminations: tuple[Illuminant, ...]
     white: npt.NDArray[np.float64]
     provenance: Provenance
 
@@ -445,7 +445,7 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
             f"{folder} is no LUT: cannot read {PROVENANCE} ({error.strerror}); make one with build-lut"
         ) from error
     provenance = parse_provenance(text, path)
-    lights = load_illuminations(folder / ILLUMINATIONS, computed=True)
+    lights = load_illuminants(folder / ILLUMINATIONS, computed=True)
     white = _load_white(folder / ILLUMINATIONS)
     if check:
         require_listed(folder, provenance, len(lights))

@@ -26,7 +26,7 @@ from calibration.table.lut import (
     samples_sha256,
     sums_text,
 )
-from experiment.lights import COLUMNS, NAME, Illumination
+from experiment.lights import COLUMNS, NAME, Illuminant
 from foundation.errors import StorageError
 from foundation.files import csv_text, sha256_of, storage_error, write_atomic
 
@@ -98,7 +98,7 @@ class LutWriter:
 
     def finish(
         self,
-        illuminations: Sequence[Illumination],
+        illuminations: Sequence[Illuminant],
         white: npt.NDArray[np.float64],
         provenance: Provenance,
         frames: Sequence[SourceFrame] = (),
@@ -136,7 +136,7 @@ class LutWriter:
         write_atomic(self._folder / PROVENANCE, description)
 
 
-def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[np.float64]) -> str:
+def _ground_truth_csv(illuminations: Sequence[Illuminant], white: npt.NDArray[np.float64]) -> str:
     has_names = any(light.name is not None for light in illuminations)
     rows = (
         [

@@ -44,7 +44,7 @@ from calibration.table.lut import (
     recorded_sums,
     require_listed,
 )
-from experiment.lights import load_illuminations
+from experiment.lights import load_illuminants
 from foundation.errors import CropError, FormatError, InputError, StorageError
 from foundation.files import file_sha256, parse_json_object, require_plain_tree, storage_error, write_atomic
 from foundation.folders import atomic_folder, require_free
@@ -256,7 +256,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
                 write_atomic(partial / name, files[name])
         provenance = parse_provenance(files[PROVENANCE].encode(), partial / PROVENANCE)
         require_expected(partial, expect, url)
-        lights = len(load_illuminations(partial / ILLUMINATIONS, computed=True))
+        lights = len(load_illuminants(partial / ILLUMINATIONS, computed=True))
         require_listed(partial, provenance, lights)
         shape = require_shape(metadata, (lights, 8**provenance.bits), url)
         head = samples_header(attributes, shape, url)

@@ -19,7 +19,7 @@ from typing import BinaryIO, Final, TypeVar
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.model import Chart, load_chart
-from experiment.lights import Illumination, load_illuminations, save_illuminations
+from experiment.lights import Illuminant, load_illuminants, save_illuminants
 from experiment.session.journal import (
     JOURNAL_FILE,
     PATIENCE_S,
@@ -85,8 +85,8 @@ class Session:
         self._hold = hold
         require_plain_folder(folder, MOST_BYTES, ("frames", "previews"))
         self.chart: Chart = _own_copy(load_chart, folder / "chart.json", "chart")
-        self.illuminations: tuple[Illumination, ...] = _own_copy(
-            load_illuminations, folder / "illuminations.csv", "illuminants"
+        self.illuminations: tuple[Illuminant, ...] = _own_copy(
+            load_illuminants, folder / "illuminations.csv", "illuminants"
         )
         self.steps: tuple[SessionStep, ...] = journal.steps()
         self._require_planned_lights()
@@ -111,7 +111,7 @@ class Session:
         folder: Path,
         settings: str,
         chart: Chart,
-        illuminations: Sequence[Illumination],
+        illuminations: Sequence[Illuminant],
         steps: Sequence[SessionStep] = (),
     ) -> Session:
         """Create a new session folder, completely or not at all, and open it for a run.
@@ -127,7 +127,7 @@ class Session:
             (new / "frames").mkdir()
             write_atomic(new / "session.toml", settings)
             chart.save(new / "chart.json")
-            save_illuminations(illuminations, new / "illuminations.csv")
+            save_illuminants(illuminations, new / "illuminations.csv")
             Journal.create(new / JOURNAL_FILE, steps)
         return cls.open_for_run(folder)
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal, Protocol, get_args, runtime_checkable
 
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 
 ACCEPTED = "accepted"  # Verdict of a frame that may be used
 
@@ -302,7 +302,7 @@ class SessionStep:
 
 
 def plan_steps(
-    illuminations: Sequence[Illumination],
+    illuminations: Sequence[Illuminant],
     reference_every: int,
     *,
     seed: int | None = None,
@@ -343,7 +343,7 @@ def link_steps(first_number: int) -> tuple[SessionStep, ...]:
     return tuple(SessionStep(number, kind, None, colour) for number, (kind, colour) in enumerate(frames, first_number))
 
 
-def _shuffled(illuminations: Sequence[Illumination], seed: int) -> list[Illumination]:
+def _shuffled(illuminations: Sequence[Illuminant], seed: int) -> list[Illuminant]:
     from numpy.random import PCG64, Generator
 
     return [illuminations[position] for position in Generator(PCG64(seed)).permutation(len(illuminations))]

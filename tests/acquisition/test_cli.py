@@ -15,7 +15,7 @@ from experiment.chart import layout
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart, load_chart
 from experiment.config import load_lab
-from experiment.lights import load_illuminations, plan_illuminations, save_illuminations
+from experiment.lights import load_illuminants, plan_illuminants, save_illuminants
 
 Run = Callable[..., int]
 
@@ -105,7 +105,7 @@ def begun(folder: Path) -> Path:
     """Return a folder with a small chart and few lights, which `acquire init` leaves alone."""
     (folder / "chart").mkdir(parents=True)
     design_chart(2, None, 1).save(folder / "chart" / "chart.json")
-    save_illuminations(plan_illuminations(1, [5000.0]), folder / "illuminations.csv")
+    save_illuminants(plan_illuminants(1, [5000.0]), folder / "illuminations.csv")
     return folder
 
 
@@ -144,6 +144,6 @@ def test_init_fills_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     lab = tmp_path / "new" / "lab"
     assert main(["init", str(lab), "--rig", "simulated"]) == 0
     assert asked == [(5, None)], "the chart of all colours, of which a small one is drawn here"
-    assert len(load_illuminations(lab / "illuminations.csv")) == 707
+    assert len(load_illuminants(lab / "illuminations.csv")) == 707
     names = {path.name for path in (lab / "chart").iterdir()}
     assert names == {"chart.json", "chart.pdf", "preview.png", "proof.pdf", "PRINTING.txt"}

@@ -28,7 +28,7 @@ from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 from experiment.framing.field import field_mm
-from experiment.lights import Illumination, plan_illuminations
+from experiment.lights import Illuminant, plan_illuminants
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, SessionStep
 from sim.camera.film import write_dng
@@ -139,7 +139,7 @@ QUARTER = replace(
 def take(
     lab: Lab,
     folder: Path,
-    lights: Sequence[Illumination],
+    lights: Sequence[Illuminant],
     every: int = 25,
     frame: Callable[[SessionStep], bytes] | None = None,
     verdict: Callable[[SessionStep], str] | None = None,
@@ -241,9 +241,9 @@ def rendered_once() -> Generator[None]:
         yield
 
 
-def renumbered(lights: Sequence[Illumination]) -> tuple[Illumination, ...]:
+def renumbered(lights: Sequence[Illuminant]) -> tuple[Illuminant, ...]:
     """Return lights numbered from 0."""
     return tuple(replace(light, index=index) for index, light in enumerate(lights))
 
 
-LIGHTS = plan_illuminations(3, (2500, 4500, 6500))
+LIGHTS = plan_illuminants(3, (2500, 4500, 6500))

@@ -13,16 +13,16 @@ import pytest
 from acquisition.cli import main
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
-from experiment.lights import Illumination, save_illuminations
+from experiment.lights import Illuminant, save_illuminants
 from tests.calibration.lab import rendered_once
 
 __all__ = ["frame_hashes", "lab", "rendered_once", "session", "undisturbed"]
 
 LIGHTS = (
-    Illumination(0, "uniform", None, Colour(255, 0, 0)),
-    Illumination(1, "uniform", None, Colour(120, 255, 180)),
-    Illumination(2, "blackbody", 2500.0, Colour(255, 159, 70)),
-    Illumination(3, "blackbody", 6500.0, Colour(255, 254, 250)),
+    Illuminant(0, "uniform", None, Colour(255, 0, 0)),
+    Illuminant(1, "uniform", None, Colour(120, 255, 180)),
+    Illuminant(2, "blackbody", 2500.0, Colour(255, 159, 70)),
+    Illuminant(3, "blackbody", 6500.0, Colour(255, 254, 250)),
 )
 
 LAB = """
@@ -43,7 +43,7 @@ seed = 7
 def make_lab(folder: Path) -> Path:
     """Write a LAB.toml with chart and lights beside it, and return its path."""
     design_chart(bits=2, seed=3).save(folder / "chart.json")
-    save_illuminations(LIGHTS, folder / "illuminations.csv")
+    save_illuminants(LIGHTS, folder / "illuminations.csv")
     path = folder / "LAB.toml"
     path.write_text(LAB)
     return path

@@ -15,7 +15,7 @@ from acquisition.run.run import run_session
 from drivers.presenter import BLACK
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
-from experiment.lights import Illumination, plan_illuminations, save_illuminations
+from experiment.lights import Illuminant, plan_illuminants, save_illuminants
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, VOIDED, Attempt
 from foundation.errors import InputError, QualityError
@@ -68,10 +68,10 @@ def run(folder: Path, *events: Mapping[str, object]) -> Run:
 def make_lab(folder: Path, *events: Mapping[str, object]) -> None:
     """Write LAB.toml, chart and lights."""
     design_chart(3, "A7").save(folder / "chart.json")
-    plan = plan_illuminations()
+    plan = plan_illuminants()
     order: list[int] = np.random.default_rng(3).permutation(len(plan)).tolist()
     some = [replace(plan[k], index=n) for n, k in enumerate(order[:LIGHTS])]
-    save_illuminations(some, folder / "illuminations.csv")
+    save_illuminants(some, folder / "illuminations.csv")
     listed = ", ".join(
         "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in event.items()) + "}" for event in events
     )
@@ -142,7 +142,7 @@ def test_a_lamp_that_fails_is_refused_alike_by_each_run_and_followed_when_it_rec
 
 def test_a_light_that_is_none_is_said_before_anything_moves(tmp_path: Path) -> None:
     make_lab(tmp_path)
-    save_illuminations([Illumination(0, "uniform", None, BLACK)], tmp_path / "illuminations.csv")
+    save_illuminants([Illuminant(0, "uniform", None, BLACK)], tmp_path / "illuminations.csv")
     with pytest.raises(InputError, match=r"illuminant 0 .*0, 0, 0.*delete it"):
         run_session(load_lab(tmp_path / "LAB.toml"), tmp_path / "another", lambda done, total: None)
     assert not (tmp_path / "another").exists()

@@ -18,7 +18,7 @@ from acquisition.monitor.view import LOOK_AGAIN_S, SessionWatch, read_session
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session, rebuild_journal, session_exists
 from experiment.session.journal import Journal, LostJournalError, Rows, ledger_path, read_ledger, rows_of, thread_beat
 from experiment.session.opening import open_to_read
@@ -29,7 +29,7 @@ from tests.acquisition.run.scripted import SETTINGS, Lab
 
 pytestmark = pytest.mark.slow
 
-LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 30 * n, 0)) for n in range(6))
+LIGHTS = tuple(Illuminant(n, "uniform", None, Colour(255, 30 * n, 0)) for n in range(6))
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
 from calibration.table.lut import Lut, open_lut
 from experiment.chart.model import load_chart
 from experiment.config import load_lab
-from experiment.lights import load_illuminations
+from experiment.lights import load_illuminants
 from experiment.session.folder import Session
 from foundation.errors import FormatError
 from sim.world.world import World
@@ -148,7 +148,7 @@ def test_a_table_of_another_version_is_named(built: Path, lut: Lut, tmp_path: Pa
 
 def test_a_session_without_frames_is_said(built: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     settings = load_lab(built / "LAB.toml")
-    lights = load_illuminations(settings.illuminations)
+    lights = load_illuminants(settings.illuminations)
     steps = planned_steps(settings, lights)
     Session.create(built / "bare", settings.to_toml(), load_chart(settings.chart), lights, steps).close()
     assert run("calibration.cli", built / "bare", built / "never") in (2, 4)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from calibration.table.lut import Lut, Provenance, open_lut
 from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 
 CODES = np.indices((8, 8, 8)).reshape(3, -1).T
 """The codes (512, 3) of 3 bits, 0 … 7, in the order of a table."""
@@ -31,9 +31,9 @@ def write_lut(
         camera=camera, bits=3, white_level=WHITE_LEVEL, session_sha256="0", chart_sha256="0", software="test"
     )
     plan = [
-        Illumination(number, "uniform", None, Colour(1, 2, 3))
+        Illuminant(number, "uniform", None, Colour(1, 2, 3))
         if number < 2
-        else Illumination(number, "blackbody", 3000.0 + number, Colour(1, 2, 3))
+        else Illuminant(number, "blackbody", 3000.0 + number, Colour(1, 2, 3))
         for number in range(len(lights))
     ]
     writer.finish(plan, lights, names)

@@ -6,13 +6,13 @@ import pytest
 
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart
-from experiment.lights import Illumination, plan_illuminations
+from experiment.lights import Illuminant, plan_illuminants
 
 
 @pytest.fixture(scope="session")
-def plan() -> tuple[Illumination, ...]:
+def plan() -> tuple[Illuminant, ...]:
     """Return the 707 illuminants, made once because colour-science takes seconds to import."""
-    return plan_illuminations()
+    return plan_illuminants()
 
 
 @pytest.fixture(scope="session")

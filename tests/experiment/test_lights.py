@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from acquisition.cli import main
 from drivers.presenter import Colour
 from experiment.lights import (
-    Illumination,
-    illuminations_to_csv,
-    load_illuminations,
+    Illuminant,
+    illuminants_to_csv,
+    load_illuminants,
     parse_ccts,
     uniform_lights,
 )
@@ -24,11 +24,11 @@ from foundation.errors import FormatError, InputError
 HEADER = "index,kind,cct_k,red,green,blue\n"
 
 
-def codes(lights: tuple[Illumination, ...]) -> list[tuple[int, int, int]]:
+def codes(lights: tuple[Illuminant, ...]) -> list[tuple[int, int, int]]:
     return [light.colour for light in lights]
 
 
-def test_plan_has_666_uniform_illuminants_and_41_black_bodies(plan: tuple[Illumination, ...]) -> None:
+def test_plan_has_666_uniform_illuminants_and_41_black_bodies(plan: tuple[Illuminant, ...]) -> None:
     assert len(plan) == 707
     assert [light.index for light in plan] == list(range(707))
     assert [light.kind for light in plan] == ["uniform"] * 666 + ["blackbody"] * 41
@@ -38,7 +38,7 @@ def test_plan_has_666_uniform_illuminants_and_41_black_bodies(plan: tuple[Illumi
     assert all(max(code) == 255 for code in codes(plan))
 
 
-def test_uniform_illuminants_are_on_the_grid(plan: tuple[Illumination, ...]) -> None:
+def test_uniform_illuminants_are_on_the_grid(plan: tuple[Illuminant, ...]) -> None:
     uniform_codes = set(codes(plan[:666]))
     assert {(255, 0, 0), (0, 255, 0), (0, 0, 255)} <= uniform_codes
     linear = np.array(uniform_lights())
@@ -94,12 +94,12 @@ def test_reads_any_illuminants_that_it_writes(
     tmp_path_factory: pytest.TempPathFactory, drawn: list[tuple[float | None, Colour]]
 ) -> None:
     illuminants = tuple(
-        Illumination(number, "uniform" if cct_k is None else "blackbody", cct_k, colour)
+        Illuminant(number, "uniform" if cct_k is None else "blackbody", cct_k, colour)
         for number, (cct_k, colour) in enumerate(drawn)
     )
     path = tmp_path_factory.mktemp("lights") / "illuminations.csv"
-    path.write_text(illuminations_to_csv(illuminants))
-    assert load_illuminations(path) == illuminants
+    path.write_text(illuminants_to_csv(illuminants))
+    assert load_illuminants(path) == illuminants
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_refuses_bad_file(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "illuminations.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(FormatError) as refused:
-        load_illuminations(path)
+        load_illuminants(path)
     assert message in str(refused.value)
     assert str(path) in str(refused.value)
     assert "\n" not in str(refused.value)
@@ -134,4 +134,4 @@ def test_refuses_missing_and_binary_files(tmp_path: Path) -> None:
     binary.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
     for path in (tmp_path / "none.csv", tmp_path, binary):
         with pytest.raises(FormatError, match="acquire illuminations"):
-            load_illuminations(path)
+            load_illuminants(path)

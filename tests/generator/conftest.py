@@ -13,7 +13,7 @@ import pytest
 from calibration.table.lut import Lut, Provenance, Unfit, open_lut
 from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from generator import philox
 
 SAMPLES = 25
@@ -33,14 +33,14 @@ def lut_in(folder: Path, bits: int = 2, lights: int = 4, unfit: tuple[int, ...] 
     folder.mkdir()
     rng = np.random.default_rng(20190601)
     writer = LutWriter(folder, lights, 8**bits, SAMPLES)
-    plan: list[Illumination] = []
+    plan: list[Illuminant] = []
     white: list[npt.NDArray[np.float64]] = []
     for light in range(lights):
         means = expected_means(bits, light)
         writer.put(light, rng.poisson(means[:, None, :].repeat(SAMPLES, axis=1)).astype(np.uint16))
         is_body = light % 2 == 1
         plan.append(
-            Illumination(
+            Illuminant(
                 light,
                 "blackbody" if is_body else "uniform",
                 3000.0 + light if is_body else None,

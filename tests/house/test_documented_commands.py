@@ -21,7 +21,7 @@ from typer.main import get_command
 from acquisition.run.plan import planned_steps
 from croplab import COMMANDS
 from experiment.config import load_lab
-from experiment.lights import plan_illuminations
+from experiment.lights import plan_illuminants
 
 ROOT = Path(__file__).parents[2]
 MADE = ("docs/reference/commands/",)
@@ -115,7 +115,7 @@ def test_the_tutorial_counts_the_frames_that_are_taken(tmp_path: Path) -> None:
     asked = re.search(r"--grid (\d+) --blackbodies (\d+):(\d+):(\d+)", text)
     assert asked is not None
     grid, first, last, step = map(int, asked.groups())
-    lights = plan_illuminations(grid, tuple(range(first, last + 1, step)))
+    lights = plan_illuminants(grid, tuple(range(first, last + 1, step)))
     steps = planned_steps(load_lab(tmp_path / "LAB.toml"), lights)
     kinds = Counter(step.kind for step in steps)
     assert f"these are {len(lights)}." in text

@@ -13,7 +13,7 @@ from foundation.errors import FormatError, InputError
 from sim.spectral import WAVELENGTHS_NM
 from sim.world.sensors import BODIES, Rectangle
 from sim.world.world import Room
-from synthesis.lamps import PatchSensor, parse_spectra, read_lights, table_illuminations
+from synthesis.lamps import PatchSensor, parse_spectra, read_lights, table_illuminants
 
 
 def table(step: int = 5, low: int = 380, high: int = 780, **lights: float) -> str:
@@ -61,7 +61,7 @@ def test_black_body_follows_planck_and_keeps_its_temperature() -> None:
     planck = [w**-5 / np.expm1(1.4387769e7 / (w * 6000)) for w in (450.0, 650.0)]
     at = np.searchsorted(WAVELENGTHS_NM, [450, 650])
     assert lights[1].power[at[0]] / lights[1].power[at[1]] == pytest.approx(planck[0] / planck[1], rel=2e-3)
-    illuminations = table_illuminations(lights)
+    illuminations = table_illuminants(lights)
     assert [light.kind for light in illuminations] == ["blackbody"] * 3
     # The projector's black body of the same temperature has the same codes, to rounding.
     for light, cct_k in zip(illuminations, (2000, 6000, 10_000), strict=True):

@@ -19,7 +19,7 @@ from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
 from evaluation.datasets.generated import open_generated
-from experiment.lights import load_illuminations
+from experiment.lights import load_illuminants
 from foundation.errors import FormatError, InputError, QualityError, StorageError
 from generator.cli import main as generate
 from sim.spectral import print_reflectance, printed_reflectance, sensitivities
@@ -232,7 +232,7 @@ def test_all_lights_have_equal_exposure(lut: Lut) -> None:
 @pytest.mark.slow
 def test_refuses_spectra_in_a_session_plan(lut: Lut) -> None:
     with pytest.raises(FormatError, match=r"'spectrum'.* blackbody"):
-        load_illuminations(lut.folder / "illuminations.csv")
+        load_illuminants(lut.folder / "illuminations.csv")
 
 
 @pytest.mark.slow

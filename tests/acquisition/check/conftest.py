@@ -14,7 +14,7 @@ from acquisition.check.findings import CheckReport
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
 from experiment.framing.field import Corners
-from experiment.lights import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminants, save_illuminants
 
 Check = Callable[..., CheckReport]
 
@@ -25,7 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("check")
     for bits in (1, 2, 3):
         design_chart(bits).save(folder / f"chart{bits}.json")
-    save_illuminations(plan_illuminations(1, ()), folder / "illuminations.csv")
+    save_illuminants(plan_illuminants(1, ()), folder / "illuminations.csv")
     return folder
 
 

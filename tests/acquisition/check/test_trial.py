@@ -19,13 +19,13 @@ from calibration.pipeline.build import build
 from calibration.verdict import judged_values
 from drivers.presenter import Colour
 from experiment.config import LabSettings
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.records import SessionStep
 from sim.world.world import Room
 from tests.calibration.lab import hang
 
-DIM = Illumination(0, "uniform", None, Colour(30, 20, 40))
-PLAN = (Illumination(1, "uniform", None, Colour(255, 0, 0)), DIM)
+DIM = Illuminant(0, "uniform", None, Colour(30, 20, 40))
+PLAN = (Illuminant(1, "uniform", None, Colour(255, 0, 0)), DIM)
 
 
 def test_trial_has_references_primaries_and_darkest_illuminant() -> None:

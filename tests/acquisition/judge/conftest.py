@@ -20,7 +20,7 @@ from drivers.presenter import BLACK, Colour
 from experiment.chart.layout import design_chart
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, parse_lab
-from experiment.lights import Illumination, plan_illuminations
+from experiment.lights import Illuminant, plan_illuminants
 from experiment.session.records import RESPONSE, Judgement, SessionStep, plan_steps
 from sim.camera.film import write_dng
 from sim.world.disturbances import AnyDisturbance, Disturbances, Moment
@@ -39,7 +39,7 @@ class Bench:
 
     world: World
     chart: Chart
-    lights: tuple[Illumination, ...]
+    lights: tuple[Illuminant, ...]
     steps: tuple[SessionStep, ...]
     settings: LabSettings
     folder: Path
@@ -84,7 +84,7 @@ class Bench:
 
 def bench(folder: Path, room: Room, count: int = 12, every: int = 6, lab: str = LAB, response: bool = True) -> Bench:
     chart = design_chart(3, "A7")
-    plan = plan_illuminations()
+    plan = plan_illuminants()
     order: list[int] = np.random.default_rng(room.seed).permutation(len(plan)).tolist()
     planned = tuple(replace(plan[k], index=n) for n, k in enumerate(order[:count]))
     settings = parse_lab(lab, "LAB.toml")

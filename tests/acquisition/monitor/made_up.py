@@ -15,7 +15,7 @@ import numpy.typing as npt
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import A_SERIES_MM, design_chart
-from experiment.lights import Illumination, plan_illuminations, save_illuminations
+from experiment.lights import Illuminant, plan_illuminants, save_illuminants
 from experiment.session.journal import JOURNAL_FILE, Journal, ReceivedFile
 from experiment.session.records import RESPONSE, Check, Judgement, SessionStep, plan_steps
 from foundation.colorimetry import decode_srgb
@@ -25,7 +25,7 @@ FRAME_S = 5.0
 # Camera RGB of the projector's primaries, in columns: each is visible in more than one channel.
 CROSSTALK = np.array([[0.80, 0.15, 0.02], [0.17, 0.75, 0.12], [0.03, 0.10, 0.86]])
 
-LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, 40 * number, 0)) for number in range(4))
+LIGHTS = tuple(Illuminant(number, "uniform", None, Colour(255, 40 * number, 0)) for number in range(4))
 
 
 def jpeg(colour: Sequence[int], text: str = "") -> bytes:
@@ -51,12 +51,12 @@ class MadeUpRun:
     previews: bool = True
 
     @classmethod
-    def begin(cls, folder: Path, lights: Sequence[Illumination] = LIGHTS, *, response: bool = False) -> MadeUpRun:
+    def begin(cls, folder: Path, lights: Sequence[Illuminant] = LIGHTS, *, response: bool = False) -> MadeUpRun:
         """Create the folder and the plan."""
         folder.mkdir()
         (folder / "previews").mkdir()
         design_chart(1, A_SERIES_MM["A5"]).save(folder / "chart.json")
-        save_illuminations(lights, folder / "illuminations.csv")
+        save_illuminants(lights, folder / "illuminations.csv")
         steps = plan_steps(lights, 25, seed=1, response=RESPONSE if response else ())
         Journal.create(folder / JOURNAL_FILE, steps)
         run = cls(folder, steps, Journal.open_for_run(folder / JOURNAL_FILE))
@@ -130,7 +130,7 @@ class MadeUpRun:
 
 def whole_night(folder: Path, share: float = 0.6, *, grid: int = 35, previews: bool = True) -> MadeUpRun:
     """Return an open run of the paper's illuminants, `share` of them taken, with the usual events of a night."""
-    run = MadeUpRun.begin(folder, plan_illuminations(grid, tuple(range(2000, 10001, 200))), response=True)
+    run = MadeUpRun.begin(folder, plan_illuminants(grid, tuple(range(2000, 10001, 200))), response=True)
     run.previews = previews
     last = int(share * len(run.steps))
     for step in run.steps[:last]:

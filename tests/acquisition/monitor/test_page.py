@@ -14,7 +14,7 @@ import pytest
 
 from acquisition.monitor.serving import MonitorServer, open_monitor
 from acquisition.monitor.view import write_session_report
-from experiment.lights import plan_illuminations
+from experiment.lights import plan_illuminants
 from tests.acquisition.monitor.browser import (
     NAMELESS,
     OUTSIDE,
@@ -62,7 +62,7 @@ def _no_errors(tab: Tab) -> Iterator[None]:
 def run(tmp_path: Path) -> Iterator[MadeUpRun]:
     """Return a run of 27 illuminants with a third of its frames, one refused, and one active."""
     name = f"night {HOSTILE}".replace("/", "|")
-    new_run = MadeUpRun.begin(tmp_path / name, plan_illuminations(5, (3000, 6500)), response=True)
+    new_run = MadeUpRun.begin(tmp_path / name, plan_illuminants(5, (3000, 6500)), response=True)
     new_run.journal.record(f"camera {HOSTILE}", HOSTILE)
     new_run.journal.note(new_run.clock, "warning", HOSTILE)
     for step in new_run.steps[:28]:

@@ -28,7 +28,7 @@ from drivers.ptp.protocol import Responder, Transport
 from drivers.ptp.usb import UsbTransport
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
 from experiment.session.records import Judgement, SessionStep, plan_steps
@@ -41,7 +41,7 @@ from tests import cable_faults as faults
 from tests.acquisition.run.scripted import Beamer
 from tests.cable_faults import Occasion
 
-LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 12 * n, 255 - n)) for n in range(20))
+LIGHTS = tuple(Illuminant(n, "uniform", None, Colour(255, 12 * n, 255 - n)) for n in range(20))
 SETTINGS = LabSettings.model_validate(
     {
         "rig": "simulated",

@@ -20,7 +20,7 @@ from drivers.presenter import BLACK, Colour
 from drivers.projector import Power
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.records import plan_steps
 from foundation.clock import SimulatedClock
@@ -33,8 +33,8 @@ from sim.world.sensors import BODIES
 BODY = BODIES["Test"]
 EXPOSURE = ExposureSettings(100, 8.0, 0.5)
 LIGHTS = (
-    Illumination(0, "uniform", None, Colour(255, 0, 0)),
-    Illumination(1, "uniform", None, Colour(0, 255, 0)),
+    Illuminant(0, "uniform", None, Colour(255, 0, 0)),
+    Illuminant(1, "uniform", None, Colour(0, 255, 0)),
 )
 SETTINGS = LabSettings(rig="simulated", chart=Path("chart.json"), illuminations=Path("lights.csv"))
 EXPOSE_S = 1.5
@@ -154,7 +154,7 @@ class Lab:
         self,
         folder: Path,
         script: dict[int, bytes | Exception] | None = None,
-        lights: Sequence[Illumination] = LIGHTS,
+        lights: Sequence[Illuminant] = LIGHTS,
         reference_every: int = 25,
     ) -> None:
         self.clock = SimulatedClock()

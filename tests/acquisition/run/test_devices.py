@@ -44,7 +44,7 @@ from drivers.projector import Power
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings, SequenceSettings
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.opening import BusyJournalError
 from experiment.session.records import plan_steps
@@ -496,7 +496,7 @@ def test_back_off_continues_across_pauses() -> None:
 def test_full_disk_keeps_frame_in_camera(tmp_path: Path) -> None:
     """The real driver, with a kernel that refuses larger files: the download is repeated when there is space again."""
     resource = pytest.importorskip("resource")
-    chart, light = design_chart(1), Illumination(0, "uniform", None, WHITE)
+    chart, light = design_chart(1), Illuminant(0, "uniform", None, WHITE)
     document = {"rig": "simulated", "chart": "c", "illuminations": "i", "simulated": {"body": "Test"}}
     settings = LabSettings.model_validate(document)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

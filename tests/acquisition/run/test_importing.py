@@ -14,14 +14,14 @@ from acquisition.cli import main
 from acquisition.run.importing import Imported, import_session
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
-from experiment.lights import Illumination, save_illuminations
+from experiment.lights import Illuminant, save_illuminants
 from experiment.session.folder import FRAME_COLUMNS, Session
 from foundation.errors import FormatError
 from tests.drivers.raw.maker_files import raf
 from tests.drivers.raw.raw_files import write_dng
 from tests.json_of import json_of
 
-LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(3))
+LIGHTS = tuple(Illuminant(number, "uniform", None, Colour(255, number, 0)) for number in range(3))
 Row = Mapping[str, object]
 
 
@@ -29,7 +29,7 @@ Row = Mapping[str, object]
 def folder(tmp_path: Path) -> Path:
     """Return a folder with a chart, lights, and a raw file for each."""
     design_chart(bits=1).save(tmp_path / "chart.json")
-    save_illuminations(LIGHTS, tmp_path / "illuminations.csv")
+    save_illuminants(LIGHTS, tmp_path / "illuminations.csv")
     for light in LIGHTS:
         counts = np.random.default_rng(light.index).integers(100, 3000, (32, 32)).astype(np.uint16)
         write_dng(tmp_path / f"{light.index}.cr2", counts)

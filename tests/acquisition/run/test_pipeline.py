@@ -14,7 +14,7 @@ from acquisition.run.pipeline import StepQueue, Taken, unclosed_kinds
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.journal import IncomingFile, Journal
 from experiment.session.records import Check, FrameKind, Judgement, SessionStep, link_steps, plan_steps
@@ -25,7 +25,7 @@ from tests.acquisition.run.scripted import DOWNLOAD_S, EXPOSE_S, GLARE, LIGHTS, 
 SETTLE_S = SETTINGS.sequence.settle_s
 # Each try in a pause costs rows on a disk; a minute has enough of them.
 PATIENT = SETTINGS.model_copy(update={"sequence": SETTINGS.sequence.model_copy(update={"patience_s": 60.0})})
-FOUR = tuple(Illumination(n, "uniform", None, Colour(255, 40 * n, 0)) for n in range(4))
+FOUR = tuple(Illuminant(n, "uniform", None, Colour(255, 40 * n, 0)) for n in range(4))
 
 
 @pytest.fixture
@@ -420,7 +420,7 @@ class TestEnding:
         assert lab.clock.monotonic() < 60
 
 
-STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(4)], 2)
+STEPS = plan_steps([Illuminant(n, "uniform", None, Colour(255, n, 0)) for n in range(4)], 2)
 """white 0, dark 1, light 2, 3, white 4, dark 5, light 6, 7, white 8, dark 9."""
 
 

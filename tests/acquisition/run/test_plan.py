@@ -33,7 +33,7 @@ from drivers.presenter import Colour
 from drivers.projector import Power
 from experiment.chart.layout import design_chart
 from experiment.config import LabRig, LabSettings, NotifySettings, ProjectorCable, load_lab, parse_lab
-from experiment.lights import Illumination, save_illuminations
+from experiment.lights import Illuminant, save_illuminants
 from experiment.session.folder import Session
 from experiment.session.records import plan_steps
 from foundation.clock import SimulatedClock
@@ -44,7 +44,7 @@ from tests.json_of import json_of
 pytestmark = pytest.mark.slow
 
 GB = 10**9
-LIGHTS = tuple(Illumination(index, "uniform", None, Colour(255, index, 0)) for index in range(100))
+LIGHTS = tuple(Illuminant(index, "uniform", None, Colour(255, index, 0)) for index in range(100))
 EOS = CameraIdentity("Canon Inc.", "Canon EOS 550D", "123")
 SPEEDS = (0.25, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 
@@ -168,7 +168,7 @@ class TestAsking:
 @pytest.fixture
 def lab(tmp_path: Path) -> Path:
     design_chart(1).save(tmp_path / "chart.json")
-    save_illuminations(LIGHTS[:4], tmp_path / "lights.csv")
+    save_illuminants(LIGHTS[:4], tmp_path / "lights.csv")
     path = tmp_path / "LAB.toml"
     path.write_text(
         'rig = "simulated"\nchart = "chart.json"\nilluminations = "lights.csv"\n[simulated]\nbody = "Test"\n'

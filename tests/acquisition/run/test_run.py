@@ -51,7 +51,7 @@ from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
 from drivers.projector import Power, ProjectorIdentity
 from experiment.config import LabSettings, NotifySettings
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
 from experiment.session.records import ACCEPTED, REFUSED, Check, Judgement, SessionStep, link_steps, plan_steps
@@ -189,7 +189,7 @@ def test_refuses_other_screen(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_closes_repeated_illuminants(folder: Path) -> None:
-    lab = Lab(folder, lights=(*LIGHTS, Illumination(2, "uniform", None, Colour(9, 255, 3))))
+    lab = Lab(folder, lights=(*LIGHTS, Illuminant(2, "uniform", None, Colour(9, 255, 3))))
     assert take_session(lab.session, lab.devices, SETTINGS).complete
     lab.session.retake("1")
     assert take_session(lab.session, lab.devices, SETTINGS).complete
@@ -274,7 +274,7 @@ def test_runs_without_lamp_control(folder: Path) -> None:
     assert take_session(lab.session, devices, SETTINGS).complete
 
 
-FORTY_LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 6 * n, 0)) for n in range(40))
+FORTY_LIGHTS = tuple(Illuminant(n, "uniform", None, Colour(255, 6 * n, 0)) for n in range(40))
 PATIENCE_S = 120.0
 
 

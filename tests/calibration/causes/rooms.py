@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from sim.world.world import UNDISTURBED, Blob, Situation
@@ -55,7 +55,7 @@ def taken(
     lab: Lab,
     folder: Path,
     which: Which = all_frames,
-    lights: tuple[Illumination, ...] = BRIGHT,
+    lights: tuple[Illuminant, ...] = BRIGHT,
     situation: Situation = UNDISTURBED,
     settings: ExposureSettings = SETTINGS,
     paint: Callable[[Counts, Colour], None] | None = None,

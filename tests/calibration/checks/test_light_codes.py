@@ -14,7 +14,7 @@ from calibration.checks.light_codes import CodeAgreement, code_agreement
 from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
 from calibration.verdict import judge
-from experiment.lights import plan_illuminations
+from experiment.lights import plan_illuminants
 from experiment.session.records import SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 _Array = npt.NDArray[np.float64]
 Codes = Sequence[tuple[int, int, int]]
 
-PLAN = plan_illuminations(13, (3000, 6500))
+PLAN = plan_illuminants(13, (3000, 6500))
 LIMIT = next(limit for limit in FIGURES if limit.name == "off_codes_deg")
 ROOMS = {
     "default": Room(),
@@ -39,14 +39,14 @@ SESSIONS: dict[str, Codes] = {
     "two": [(255, 255, 255), (255, 120, 60)],
     "red and white": [(255, 0, 0), (255, 255, 255)],
     "primaries": [(255, 0, 0), (0, 255, 0), (0, 0, 255)],
-    "two black bodies": [light.colour for light in plan_illuminations(0, (3000, 8000))],
-    "five black bodies": [light.colour for light in plan_illuminations(0, (2500, 3500, 4500, 6500, 9500))],
+    "two black bodies": [light.colour for light in plan_illuminants(0, (3000, 8000))],
+    "five black bodies": [light.colour for light in plan_illuminants(0, (2500, 3500, 4500, 6500, 9500))],
     "eight": [
         (255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 200, 120), (150, 190, 255), (255, 255, 0),
         (128, 128, 128),
     ],
-    "thirteen": [light.colour for light in plan_illuminations(3, (2500, 4500, 6500))],
-    "41 black bodies": [light.colour for light in plan_illuminations(0, tuple(range(2000, 10001, 200)))],
+    "thirteen": [light.colour for light in plan_illuminants(3, (2500, 4500, 6500))],
+    "41 black bodies": [light.colour for light in plan_illuminants(0, tuple(range(2000, 10001, 200)))],
 }  # fmt: skip
 _SCATTER = ([0, 0.003, 0.01, 0.03], [0.0003, 0.001, 0.002], [0.0002, 0.0005, 0.002])
 CAMERAS = ("Canon_EOS-1Ds_Mark_III", "Canon_EOS_200D", "Canon_EOS_5DS", "Canon_EOS_5D_Mark_II", "Canon_EOS_600D")

@@ -34,7 +34,7 @@ from calibration.pipeline.build import build
 from calibration.table.lut import Lut, Provenance, open_lut
 from calibration.table.writing import LutWriter, references_csv
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.errors import FormatError, QualityError
@@ -60,7 +60,7 @@ def written(
     gain: npt.ArrayLike = 1.0,
     cells: Callable[[_Array], _Array] = lambda means: means,
     samples: int = 25,
-    lights: Sequence[Illumination] = LIGHTS,
+    lights: Sequence[Illuminant] = LIGHTS,
     errors: bool = True,
     chart: str = CHART,
     camera: str = "Test",

@@ -51,7 +51,7 @@ from drivers.presenter import BLACK, WHITE, Colour
 from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
 from experiment.chart.model import Chart
 from experiment.framing.field import field_mm
-from experiment.lights import Illumination, plan_illuminations
+from experiment.lights import Illuminant, plan_illuminants
 from experiment.measures.least_squares import order_of, page_polynomial
 from experiment.measures.sensor import deviations
 from experiment.session.folder import Session
@@ -778,7 +778,7 @@ def test_registers_large_cells(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("pinned_builds")
 def test_a_small_chart_is_not_told_to_plan_lights_that_were_planned(tmp_path: Path) -> None:
     lab = hang_chart(design_chart(2), "Test", Room())
-    with take(lab, tmp_path / "session", plan_illuminations(1, ())) as session:
+    with take(lab, tmp_path / "session", plan_illuminants(1, ())) as session:
         result = build(session, tmp_path / "lut")
     unknown = next(row for row in result.verdict.remarks if row.figure.name == "linearity_known")
     message = remark(unknown, result.figures)
@@ -1107,7 +1107,7 @@ CODES = (
     Colour(110, 110, 110),
 )
 WHITE_LIGHT, RED, BLUE, WARM, COOL = 0, 1, 3, 4, 5
-EIGHT = tuple(Illumination(index, "uniform", None, colour) for index, colour in enumerate(CODES))
+EIGHT = tuple(Illuminant(index, "uniform", None, colour) for index, colour in enumerate(CODES))
 ABOUT_NAMES = {
     "off_codes_deg", "off_brightness", "exchanged_lights", "exchange_deg", "cross_checked_share", "white_frame_deg",
     "white_frame_brightness", "white_deficit", "additivity", "other_camera", "other_lens", "other_exposure",
@@ -1119,7 +1119,7 @@ Frame = Callable[[SessionStep], bytes]
 
 
 def built_of(
-    small_lab: Lab, tmp_path: Path, frame: Frame | None = None, lights: tuple[Illumination, ...] = EIGHT
+    small_lab: Lab, tmp_path: Path, frame: Frame | None = None, lights: tuple[Illuminant, ...] = EIGHT
 ) -> BuildResult:
     with take(small_lab, tmp_path / "session", lights, frame=frame) as session:
         return build(session, tmp_path / "lut", report=figures_alone)
@@ -1454,7 +1454,7 @@ def test_refuses_series_of_moved_chart(session: Session, tmp_path: Path) -> None
 
 SMALL = paper_chart("A6", 3)
 ROOM = Room(waviness_mm=0.5)
-RED_LIGHT = Illumination(0, "uniform", None, Colour(255, 0, 0))
+RED_LIGHT = Illuminant(0, "uniform", None, Colour(255, 0, 0))
 
 
 @pytest.fixture(scope="module")

@@ -22,13 +22,13 @@ from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.chart.layout import design_chart
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.journal import ReceivedFile
 from experiment.session.records import Judgement, plan_steps
 
 AT = datetime(2024, 3, 1, 23, 0, tzinfo=UTC)
-LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 20 * n, 255 - n)) for n in range(5))
+LIGHTS = tuple(Illuminant(n, "uniform", None, Colour(255, 20 * n, 255 - n)) for n in range(5))
 STEPS = plan_steps(LIGHTS, 2)
 
 

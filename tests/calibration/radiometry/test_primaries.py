@@ -14,7 +14,7 @@ from calibration.radiometry.primaries import Additivity, Primaries, additivity, 
 from calibration.radiometry.superposition import NODES, Superposition
 from calibration.table.lut import open_lut
 from drivers.presenter import Colour
-from experiment.lights import Illumination, plan_illuminations
+from experiment.lights import Illuminant, plan_illuminants
 from experiment.measures.paper import FlatField, Paper, PaperReader
 from sim.world.world import Room
 from tests.calibration.lab import SETTINGS, hang, renumbered, take
@@ -26,8 +26,8 @@ PRIMARIES = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
 _Array = npt.NDArray[np.float64]
 
 
-def lights(codes: tuple[tuple[int, int, int], ...]) -> list[Illumination]:
-    return [Illumination(number, "uniform", None, Colour(*code)) for number, code in enumerate(codes)]
+def lights(codes: tuple[tuple[int, int, int], ...]) -> list[Illuminant]:
+    return [Illuminant(number, "uniform", None, Colour(*code)) for number, code in enumerate(codes)]
 
 
 def test_light_adds_after_black_subtraction() -> None:
@@ -148,7 +148,7 @@ def test_clips_counts_below_black() -> None:
 
 
 def test_selects_brightest_pure_illuminants() -> None:
-    lights = plan_illuminations(3, (3000,))
+    lights = plan_illuminants(3, (3000,))
     indices = pure_lights(lights)
     assert indices is not None
     assert [lights[n].colour for n in indices] == [
@@ -159,7 +159,7 @@ def test_selects_brightest_pure_illuminants() -> None:
     assert pure_lights([light for light in lights if light.kind == "cct"]) is None
 
     def selected(*codes: tuple[int, int, int]) -> tuple[int, int, int] | None:
-        return pure_lights([Illumination(n, "uniform", None, Colour(*code)) for n, code in enumerate(codes)])
+        return pure_lights([Illuminant(n, "uniform", None, Colour(*code)) for n, code in enumerate(codes)])
 
     # The first of equal ones; black does not count.
     assert selected((200, 0, 0), (255, 0, 0), (255, 0, 0), (0, 9, 0), (0, 0, 9), (255, 9, 0)) == (1, 3, 4)
@@ -171,7 +171,7 @@ def test_selects_brightest_pure_illuminants() -> None:
 def test_corrects_session_with_different_primaries(tmp_path: Path) -> None:
     room = Room(waviness_mm=0.5, projector_falloff=0.3, primary_difference=0.4, response_spread=0.0)
     lab = hang(room=room)
-    lights = renumbered(plan_illuminations(2, (4500, 6500)))
+    lights = renumbered(plan_illuminants(2, (4500, 6500)))
     with take(lab, tmp_path / "session", lights) as session:
         result = build(session, tmp_path / "lut")
     lut = open_lut(tmp_path / "lut")

@@ -9,9 +9,9 @@ import numpy as np
 
 from calibration.table.lut import Lut, Provenance, SourceFrame, frames_sha256, open_lut
 from calibration.table.writing import LutWriter
-from experiment.lights import plan_illuminations
+from experiment.lights import plan_illuminants
 
-LIGHTS = plan_illuminations(1, (2500, 6500))
+LIGHTS = plan_illuminants(1, (2500, 6500))
 FRAMES = [SourceFrame("white", None, "frames/0000_white.dng", "00" * 32)] + [
     SourceFrame("light", light.index, f"frames/{light.index + 2:04d}_light.dng", f"{light.index:02x}" * 32)
     for light in LIGHTS

@@ -21,7 +21,7 @@ from calibration.table.lut import Lut, Provenance, SourceFrame, open_lut
 from calibration.table.writing import LutWriter
 from calibration.table.zarr_store import SHARD_LIGHTS, fetch, publish
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from foundation.errors import FormatError, InputError, StorageError
 
 pytestmark = pytest.mark.slow
@@ -38,7 +38,7 @@ def lut(tmp_path: Path) -> Lut:
     rng = np.random.default_rng(3)
     for light in range(LIGHTS):
         writer.put(light, rng.poisson(500 + light, (64, 25, 3)).astype(np.uint16))
-    lights = [Illumination(light, "uniform", None, Colour(9, 8, light)) for light in range(LIGHTS)]
+    lights = [Illuminant(light, "uniform", None, Colour(9, 8, light)) for light in range(LIGHTS)]
     white: npt.NDArray[np.float64] = 900.0 + np.arange(3.0 * LIGHTS).reshape(LIGHTS, 3)
     provenance = Provenance(
         camera="Šestica", bits=2, white_level=8000, session_sha256="1", chart_sha256="2", software="test 1"

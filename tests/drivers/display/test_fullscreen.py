@@ -29,7 +29,7 @@ from drivers.display.fullscreen import (
 )
 from drivers.display.x11 import XScreen, is_dark
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.lights import plan_illuminations
+from experiment.lights import plan_illuminants
 from foundation.clock import SimulatedClock
 from foundation.errors import ConfigurationError, DeviceError, DeviceRefused
 from tests.contracts.presenter import Bench, PresenterContract
@@ -345,7 +345,7 @@ def test_process_survives_the_end_of_the_server(tmp_path: Path) -> None:
 
 
 def test_shows_all_codes_in_every_pixel_without_a_cursor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lights = [light.colour for light in plan_illuminations()]
+    lights = [light.colour for light in plan_illuminants()]
     assert len(lights) == 707
     codes = [Colour(code, 255 - code, (code * 7) % 256) for code in range(256)]
     with virtual_screen(tmp_path, "160x100", cursor=True) as server:

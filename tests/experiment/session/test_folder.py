@@ -18,14 +18,14 @@ import pytest
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
-from experiment.lights import Illumination, save_illuminations
+from experiment.lights import Illuminant, save_illuminants
 from experiment.session.folder import Session, journal_path, session_exists
 from experiment.session.records import Judgement, plan_steps
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.folders import unmounted_folder
 from tests.failing_calls import DISK_FAULTS, FailingCalls, failing_calls, why_not
 
-LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
+LIGHTS = tuple(Illuminant(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
 # printf white | sha256sum, printf light | sha256sum
 WHITE_SHA = "018fa96a44715c90bf93be148069cb28dd45d398f2cc75aa1565311f6e55d174"
@@ -92,9 +92,9 @@ def test_never_creates_over_existing_files(tmp_path: Path, session: Session) -> 
         (LIGHTS[:4], "illuminant 4 .* 255 4 0"),
     ],
 )
-def test_refuses_edited_illuminants(session: Session, lights: tuple[Illumination, ...], message: str) -> None:
+def test_refuses_edited_illuminants(session: Session, lights: tuple[Illuminant, ...], message: str) -> None:
     session.close()
-    save_illuminations(lights, session.folder / "illuminations.csv")
+    save_illuminants(lights, session.folder / "illuminations.csv")
     with pytest.raises(FormatError, match=rf"illuminations\.csv .*{message}"):
         Session.open(session.folder)
 
@@ -178,7 +178,7 @@ def test_unreadable_journal_is_not_missing(session: Session, monkeypatch: pytest
 
 
 AT = datetime(2026, 1, 1, tzinfo=UTC)
-NIGHT_LIGHTS = (Illumination(0, "uniform", None, Colour(255, 0, 0)),)
+NIGHT_LIGHTS = (Illuminant(0, "uniform", None, Colour(255, 0, 0)),)
 FRAMES = [f"frame {number} ".encode() * 9000 for number in range(2)]
 
 

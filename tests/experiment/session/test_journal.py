@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session import opening
 from experiment.session.journal import Journal, ReceivedFile, time_text
 from experiment.session.opening import create_file, require_sound_rows
@@ -87,7 +87,7 @@ def test_refuses_wrong_hashes(journal: sqlite3.Connection, text: str) -> None:
         require_sound_rows(Path("journal.sqlite"), journal)
 
 
-LIGHTS = (Illumination(0, "uniform", None, Colour(255, 0, 0)),)
+LIGHTS = (Illuminant(0, "uniform", None, Colour(255, 0, 0)),)
 STEPS = plan_steps(LIGHTS, 2)
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
 
@@ -173,7 +173,7 @@ def test_names_an_unknown_kind_of_frame(tmp_path: Path) -> None:
                 read()
 
 
-MODEL_STEPS = plan_steps((Illumination(0, "uniform", None, Colour(255, 0, 0)),), 2)
+MODEL_STEPS = plan_steps((Illuminant(0, "uniform", None, Colour(255, 0, 0)),), 2)
 BEGUN = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
 NUMBER = st.floats(allow_nan=False, allow_infinity=False)
 LIMIT = NUMBER | st.none()

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session import opening
 from experiment.session.journal import Journal
 from experiment.session.records import plan_steps
@@ -26,7 +26,7 @@ from foundation.errors import FormatError, StorageError
 
 pytestmark = pytest.mark.slow
 
-STEPS = plan_steps((Illumination(0, "uniform", None, Colour(255, 0, 0)),), 2)
+STEPS = plan_steps((Illuminant(0, "uniform", None, Colour(255, 0, 0)),), 2)
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
 
 # Another program: executes statements on the journal and holds it until its input ends.

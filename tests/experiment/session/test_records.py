@@ -7,7 +7,7 @@ from datetime import datetime
 import pytest
 
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.records import (
     RESPONSE,
     Attempt,
@@ -67,7 +67,7 @@ def test_attempts_with_frames_and_doubts() -> None:
         assert FrameRecord("light", 0, "a.cr2", "", moments[0], 0.5, verdict).accepted is accepted
 
 
-LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
+LIGHTS = tuple(Illuminant(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
 
 
 def test_plan_has_regular_white_and_dark_frames() -> None:

@@ -15,13 +15,13 @@ import pytest
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.records import Judgement, plan_steps
 from experiment.session.repair import MOST_UNREADABLE, lights_text, parse_lights
 from foundation.errors import FormatError, InputError, StorageError
 
-LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
+LIGHTS = tuple(Illuminant(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
 
 

@@ -16,7 +16,7 @@ from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from experiment.session.folder import Session
 from experiment.session.records import Check, Judgement, plan_steps
 from generator.dataset.making import generate_dataset
@@ -29,7 +29,7 @@ from generator.pictures.random_scenes import random_scenes
 if TYPE_CHECKING:
     from typing import BinaryIO
 
-LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, 200, 9 * number)) for number in range(3))
+LIGHTS = tuple(Illuminant(number, "uniform", None, Colour(255, 200, 9 * number)) for number in range(3))
 FRAMES = [SourceFrame("light", light.index, f"frames/{light.index}.dng", f"{light.index}" * 64) for light in LIGHTS]
 
 Seed = dict[str, bytes]

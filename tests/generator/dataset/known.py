@@ -14,7 +14,7 @@ from calibration.citation import OriginRecord
 from calibration.table.lut import UNCERTAINTY, Lut, Provenance, Unfit, open_lut
 from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from generator.dataset.reader import Dataset, file_faults, open_dataset
 from generator.kernels.choice import channels_of
 
@@ -40,11 +40,11 @@ def table_in(folder: Path, bits: int = 2, samples: int = 25, order: tuple[int, .
         writer.put(number, np.clip(np.rint(drawn), 0, 4600).astype(np.uint16))
     kelvins = (2500.0, 3800.0, 5500.0, 9000.0, None)
     plan = [
-        Illumination(number, "blackbody" if kelvins[light] else "uniform", kelvins[light], Colour(9, 8, light))
+        Illuminant(number, "blackbody" if kelvins[light] else "uniform", kelvins[light], Colour(9, 8, light))
         for number, light in enumerate(order)
     ]
     if order == (0, 1, 2, 3, 4):
-        plan[4] = Illumination(4, "spectrum", None, Colour(9, 8, 4), "E")
+        plan[4] = Illuminant(4, "spectrum", None, Colour(9, 8, 4), "E")
     provenance = Provenance(
         camera="Known camera",
         bits=bits,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from calibration.table.lut import Lut, Provenance, open_lut
 from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 
 # Spectra in three bands, by the blue code of the projector.
 SPECTRA: dict[int, tuple[float, float, float]] = {0: (9, 5, 2), 1: (7, 6, 4), 2: (5, 6, 6), 3: (3, 5, 9), 4: (4, 9, 3)}
@@ -38,9 +38,9 @@ def make_table(folder: Path, camera: str, order: tuple[int, ...], names: tuple[s
         counts = camera_counts(camera, light)
         writer.put(number, np.rint(counts)[:, None, :].repeat(25, axis=1).astype(np.uint16))
         white.append(counts[-1])
-    plan = [Illumination(number, "uniform", None, Colour(9, 8, light)) for number, light in enumerate(order)]
+    plan = [Illuminant(number, "uniform", None, Colour(9, 8, light)) for number, light in enumerate(order)]
     if names:
-        plan = [Illumination(number, "spectrum", None, Colour(9, 8, 7), name) for number, name in enumerate(names)]
+        plan = [Illuminant(number, "spectrum", None, Colour(9, 8, 7), name) for number, name in enumerate(names)]
     writer.finish(
         plan,
         np.array(white),

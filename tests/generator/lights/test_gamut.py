@@ -12,7 +12,7 @@ from scipy.stats import f as f_distribution
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError
 from generator.lights.gamut import (
@@ -189,7 +189,7 @@ def lab() -> Lab:
 @pytest.fixture(scope="module")
 def table(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Lut:
     folder = tmp_path_factory.mktemp("realism")
-    lights = tuple(Illumination(index, "uniform", None, colour) for index, colour in enumerate(CODES))
+    lights = tuple(Illuminant(index, "uniform", None, colour) for index, colour in enumerate(CODES))
     with take(lab, folder / "session", lights, every=3) as session:
         result = build(session, folder / "lut")
     assert result.lut is not None

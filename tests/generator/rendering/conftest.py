@@ -12,7 +12,7 @@ import pytest
 from calibration.table.lut import Lut, Provenance, open_lut
 from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
-from experiment.lights import Illumination
+from experiment.lights import Illuminant
 from tests.generator.rendering.prints import WHITES, printed
 
 MakeTable = Callable[..., Lut]
@@ -36,7 +36,7 @@ def make_table(tmp_path: Path) -> MakeTable:
         folder.mkdir()
         writer = LutWriter(folder, lights, 1 << 3 * bits, 25)
         rng = np.random.default_rng(20191127)
-        illuminations: list[Illumination] = []
+        illuminations: list[Illuminant] = []
         for light, kelvin in zip(range(lights), (2000.0, 5600.0, 10000.0), strict=False):
             camera_colours = printed(bits, tint)
             if light == 0:
@@ -48,7 +48,7 @@ def make_table(tmp_path: Path) -> MakeTable:
             if change is not None:
                 change(samples)
             writer.put(light, samples)
-            illuminations.append(Illumination(light, "blackbody", kelvin, Colour(255, 255 - light, light)))
+            illuminations.append(Illuminant(light, "blackbody", kelvin, Colour(255, 255 - light, light)))
         writer.finish(
             illuminations,
             WHITES[:lights],

@@ -20,7 +20,7 @@ from drivers.presenter import WHITE
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
 from experiment.config import CameraSettings, LabSettings, SimulatedSettings, load_lab, parse_lab
-from experiment.lights import plan_illuminations, save_illuminations
+from experiment.lights import plan_illuminants, save_illuminants
 from experiment.session.folder import Session
 from foundation.clock import Clock
 from foundation.errors import ConfigurationError, DeviceRefused
@@ -82,7 +82,7 @@ def test_accepts_sensitivities_as_body() -> None:
 @pytest.mark.slow
 def test_records_such_body_in_session(tmp_path: Path) -> None:
     design_chart(1, (148, 105)).save(tmp_path / "chart.json")
-    save_illuminations(plan_illuminations(0, (3000, 6000)), tmp_path / "lights.csv")
+    save_illuminants(plan_illuminants(0, (3000, 6000)), tmp_path / "lights.csv")
     lab = LabSettings(
         rig="simulated",
         chart=tmp_path / "chart.json",
