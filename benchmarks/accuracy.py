@@ -39,8 +39,8 @@ from sim.world.world import World
 
 WELL_LIT_DN = 300
 BINS_DN = ((300, 1000), (1000, 3000), (3000, 20000))
+# Photosites in a sample of red, green and blue.
 PHOTOSITES = np.array([1, 2, 1])
-"""Photosites in a sample of red, green and blue."""
 
 Changes = Mapping[str, bool | int | float | str]
 UNEVEN: Changes = {"lamp_drift_per_hour": 3.8, "projector_falloff": 0.3}

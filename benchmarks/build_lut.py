@@ -60,8 +60,8 @@ from tests.drivers.raw.raw_files import write_cr2
 RUNS = 4
 ROUNDS = 3
 
+# Frames of a session of the paper's lights: a white and a dark one with every 25, and at the end.
 PAPER_FRAMES = 707 + 2 * 30
-"""Frames of a session of the paper's lights: a white and a dark one with every 25, and at the end."""
 
 
 def least(work: Callable[[], object], runs: int = RUNS) -> float:

@@ -53,11 +53,11 @@ from sim.optics import MILD_SHOULDERS, STRONG_SHOULDERS
 from sim.world.sensors import BODIES
 from sim.world.world import Blob, Glare, Room, Situation, World
 
+# Angle from which a light's ground truth is wrong; those of random rooms are within 0.02.
 WRONG_DEG: Final = 0.1
-"""Angle from which a light's ground truth is wrong; those of random rooms are within 0.02."""
 
+# Error from which a cell's mean is wrong: three standard deviations of its noise at 300 counts.
 WRONG_SHARE: Final = 0.03
-"""Error from which a cell's mean is wrong: three standard deviations of its noise at 300 counts."""
 
 HALF: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.25)
 FAST: Final = ExposureSettings(iso=200, aperture=8.0, shutter_s=0.25)
@@ -69,8 +69,8 @@ _GLARE: Final = r"reflection|glare|mirror"
 _SPREAD: Final = r"bleed|neighbouring (?:cells|patches)|neighbours'? (light|colour)|spread|veil|correction"
 
 
+# Causes that most cases are not.
 _NOT_SO: Final = rf"{_STAINED}|{_BRILLIANT}|{_HAND}|{_GLARE}"
-"""Causes that most cases are not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +163,8 @@ def _later(**change: Any) -> Callable[[World, Chart, Sequence[Illumination]], Ch
     return lambda world, chart, lights: lambda step: changed if step.number >= _MIDWAY else AS_PLANNED
 
 
+# The step from which a lasting change of a short session is there: after half of its lights.
 _MIDWAY: Final = 6
-"""The step from which a lasting change of a short session is there: after half of its lights."""
 
 
 def _hot_photosite(world: World, chart: Chart, lights: Sequence[Illumination]) -> Changes:
@@ -240,15 +240,16 @@ def _banded(world: World, chart: Chart, lights: Sequence[Illumination]) -> Chang
     return lambda step: banded
 
 
+# Of a chart of five bits.
 _FULL_COLOURS: Final = 32768
-"""Of a chart of five bits."""
 
+# A broad reflection: most of the upper half of the print.
 _SPOT: Final = (0.1, -0.2, 0.9, 0.8)
-"""A broad reflection: most of the upper half of the print."""
 
+# Hand and forearm before the print.
 _HAND_AT: Final = (0.55, 0.35, 0.68, 0.7)
-"""Hand and forearm before the print."""
 
+# The rows of the table, and what else the causes of a verdict are to tell apart.
 CASES: Final[tuple[NamedCase, ...]] = (
     NamedCase("nothing-wrong", "a good lens, a good lab", r"(?!)", r".", room={"veil": 0.002, "lateral_red_px": 0.3}),
     NamedCase(
@@ -515,10 +516,9 @@ CASES: Final[tuple[NamedCase, ...]] = (
         _all(situation=Situation(glares=(Glare(_SPOT, 0.02),))),
     ),
 )
-"""The rows of the table, and what else the causes of a verdict are to tell apart."""
 
+# What a verdict on a case must not be.
 FAILURES: Final = ("silent", "wrong_cause", "false_remark", "unsaid")
-"""What a verdict on a case must not be."""
 
 BY_NAME: Final[Mapping[str, NamedCase]] = {case.name: case for case in CASES}
 
@@ -529,11 +529,11 @@ def chart_of(small: bool, seed: int = 1) -> Chart:
     return design_chart(3, A_SERIES_MM["A5"], seed) if small else design_chart(5, A_SERIES_MM["A0"], seed)
 
 
+# The row of a verdict on what the lens leaves.
 LENS_LEFT: Final = "correction_residual"
-"""The row of a verdict on what the lens leaves."""
 
+# Standard errors within which the RMS error of a table must lie for the error that its report states to be true.
 _TRUE_WITHIN: Final = 2.0
-"""Standard errors within which the RMS error of a table must lie for the error that its report states to be true."""
 
 
 @dataclass(frozen=True, eq=False)

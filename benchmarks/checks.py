@@ -20,9 +20,11 @@ from experiment.chart.layout import design_chart
 from experiment.config import load_lab
 from experiment.lights import plan_illuminations, save_illuminations
 
+# Of the good rooms.
 SEEDS = range(30)
-"""Of the good rooms."""
 
+# The figure that is looked at, bits of the chart, and what differs from the default room (`shutter_s` of the camera,
+# with light to suit it).
 ROOMS: tuple[tuple[str, int, dict[str, Any]], ...] = (
     *(
         ("brightest_share", 2, {"white_level_share": share})
@@ -41,9 +43,8 @@ ROOMS: tuple[tuple[str, int, dict[str, Any]], ...] = (
     *(("white_drift_deg", 2, {"wheel_hz": 60.0, "shutter_s": time}) for time in (1 / 60, 0.1, 0.5)),
     *(("unfit_share", 2, {"hot_per_million": rate}) for rate in (20.0, 300.0)),
 )
-"""The figure that is looked at, bits of the chart, and what differs from the default room (`shutter_s` of the camera,
-with light to suit it)."""
 
+# The same for the full chart on A0.
 FULL: tuple[tuple[str, int, dict[str, Any]], ...] = (
     *(
         ("doubtful_share", 5, {"stain_mm": size, "stain_depth": depth})
@@ -52,7 +53,6 @@ FULL: tuple[tuple[str, int, dict[str, Any]], ...] = (
     ("doubtful_share", 5, {"fold_mm": 5.0}),
     ("evenness", 5, {"vignetting": 0.4}),
 )
-"""The same for the full chart on A0."""
 
 
 def check(folder: Path, bits: int, room: dict[str, Any], seed: int = 1) -> CheckReport:

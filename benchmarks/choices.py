@@ -19,8 +19,8 @@ from benchmarks.generator import SAMPLES, report
 from foundation.compiled import compiled
 from generator.kernels.rendering import draw_samples
 
+# Of 72 statistics, two-sided: 72 · 1.2·10⁻⁷ = 0.8·10⁻⁵.
 LIMIT = 5.3
-"""Of 72 statistics, two-sided: 72 · 1.2·10⁻⁷ = 0.8·10⁻⁵."""
 WIDTH, HEIGHT = 8192, 1024
 DISTANCES = tuple(
     sorted({n for power in range(13) for n in (2**power, 3 * 2**power // 2, 2**power + 1, 17 * 2**power // 16)})

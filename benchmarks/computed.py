@@ -32,8 +32,8 @@ from sim.world.sensors import find_body
 from synthesis.settings import TableSettings, table_room
 from synthesis.table import TableTask, compute_table
 
+# Mean of a channel over the cells below which values cut off at 0 are compared with values cut off at 0.
 LEAST_COUNTS = 30.0
-"""Mean of a channel over the cells below which values cut off at 0 are compared with values cut off at 0."""
 
 
 def report(name: str, value: float, unit: str, against: str) -> None:

@@ -101,6 +101,7 @@ TRIALS = (
 _ANOTHER_LIGHT = "still shows the previous|shows another illuminant|is not the ordered"
 _ELSEWHERE = "darken the room|other light than|other light falls on the chart|the room light has changed"
 
+# What of each disturbance a sentence names; what cannot be told apart by one frame is named with its alternatives.
 NAMED = {
     "frozen screen, from a frame on": _ANOTHER_LIGHT,
     "stale frame": _ANOTHER_LIGHT,
@@ -123,7 +124,6 @@ NAMED = {
     "another ISO speed": "ISO speed 200",
     "colours exchanged": _ANOTHER_LIGHT,
 }
-"""What of each disturbance a sentence names; what cannot be told apart by one frame is named with its alternatives."""
 
 
 @dataclass

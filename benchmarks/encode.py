@@ -25,8 +25,8 @@ from generator.files import FORMATS, ImageMetadata, encode_image
 from generator.kernels.rendering import draw_samples
 
 REPEATS = 3
+# Standard deviation of the grain, codes of 8 bits.
 GRAIN = 2.0
-"""Standard deviation of the grain, codes of 8 bits."""
 METADATA = ImageMetadata(12000, (4000.0, 4000.0, 4000.0), "Canon EOS 550D")
 
 

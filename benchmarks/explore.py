@@ -30,9 +30,10 @@ from generator.lights.gamut import Gamut
 from generator.pictures.sources import Preparation, find_pictures
 from tests.acquisition.monitor.browser import CHROMIUM, browser_tab
 
+# Lights that are asked for.
 PLACES = 40
-"""Lights that are asked for."""
 
+# A script that moves the light on the page from place to place, and comes to the time of each, ms.
 DRAGGED = """
 (async () => {
   const times = [];
@@ -47,10 +48,9 @@ DRAGGED = """
   return times;
 })()
 """
-"""A script that moves the light on the page from place to place, and comes to the time of each, ms."""
 
+# Of the picture, px.
 SIZE = MAX_SIDE, 750
-"""Of the picture, px."""
 
 
 def _picture() -> bytes:

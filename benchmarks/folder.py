@@ -43,8 +43,8 @@ from generator.pictures.sources import find_pictures
 from generator.rendering import Rendering
 from generator.stores import LocalStore
 
+# Pictures of 512 px: as many make what a data set takes once a small part.
 SMALL_PICTURES = 400
-"""Pictures of 512 px: as many make what a data set takes once a small part."""
 
 LARGE_REPEATS = 3
 SMALL_REPEATS = 5

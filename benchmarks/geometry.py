@@ -11,8 +11,8 @@ over the whole print and its lens's distortion:
 - `tagless-curl`: that chart with a curl of 25 mm, before a wide-angle lens.
 
 Cells that the registration itself lists as not known well enough, or covered, are not counted, but said. Returns 1 when
-a cell that is not listed is more than half a pixel off, or a channel's cells more than .04 px RMS. Without tags .07 px
-are allowed: what the model of a smooth order's colours misses draws all cells by up to .005 of their size. A frame that
+a cell that is not listed is more than half a pixel off, or a channel's cells more than 0.04 px RMS. Without tags 0.07 px
+are allowed: what the model of a smooth order's colours misses draws all cells by up to 0.005 of their size. A frame that
 is refused is no failure, and said. A room takes some 10 s of one core, one without tags 30.
 """
 
@@ -34,15 +34,16 @@ from experiment.chart.layout import design_chart, paper_chart
 from foundation.errors import CropError
 from sim.world.world import Room
 
+# RMS distance from the truth that cells may have in a channel (wanted of the suite).
 MOST_RMS_PX: Final = 0.04
-"""RMS distance from the truth that cells may have in a channel (wanted of the suite)."""
 
+# The same without tags, in simulated frames: up to 0.06 px at cells of 10 px, 0.045 at those of 8.
 MOST_PLAIN_RMS_PX: Final = 0.07
-"""The same without tags, in simulated frames: up to .06 px at cells of 10 px, .045 at those of 8."""
 
+# Distance that a cell may have which is not listed: as far as samples' windows allow for.
 MOST_PX: Final = 0.5
-"""Distance that a cell may have which is not listed: as far as samples' windows allow for."""
 
+# How each room differs from the default one.
 ROOMS: Final[Mapping[str, Mapping[str, Any]]] = {
     "lateral": {"lateral_red_px": 1.0, "lateral_blue_px": -1.0},
     "waves": {
@@ -56,7 +57,6 @@ ROOMS: Final[Mapping[str, Mapping[str, Any]]] = {
     "tagless": {"lateral_red_px": 1.0, "lateral_blue_px": -1.0},
     "tagless-curl": {"lateral_red_px": 1.0, "lateral_blue_px": -1.0, "curl_mm": 25.0, "focal_diagonals": 0.8},
 }
-"""How each room differs from the default one."""
 
 
 def listed(shot: PhotographedChart, registration: Registration) -> np.ndarray[Any, np.dtype[np.bool_]]:

@@ -26,11 +26,11 @@ from generator.rendering.colorimetric import rendering_with
 from generator.rendering.matrices import matrix_for
 
 REPEATS = 4096
+# Codes of the greys whose noise counts: noise of darker and brighter ones may be cut off.
 NOISE = slice(20, 231)
-"""Codes of the greys whose noise counts: noise of darker and brighter ones may be cut off."""
+# Code from which bends of a ramp are counted, since light rises evenly in light, not in codes; and from which greys
+# count where all black is taken out.
 BRIGHT_FROM = 64
-"""Code from which bends of a ramp are counted, since light rises evenly in light, not in codes; and from which greys
-count where all black is taken out."""
 
 
 def measure(lut: Lut, name: str, black_taken: float) -> None:

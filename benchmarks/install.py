@@ -23,22 +23,22 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
+# From so many megabytes on a package is listed; docs/decisions/ says why it is there.
 LARGE_MB = 20
-"""From so many megabytes on a package is listed; docs/decisions/ says why it is there."""
 
+# Times that an import is repeated; the fastest counts, since the first reads the disk.
 ROUNDS = 5
-"""Times that an import is repeated; the fastest counts, since the first reads the disk."""
 
+# What is imported, by the name under which it is printed.
 IMPORTS = {
     "nothing": "pass",
     "numpy and cv2": "import numpy, cv2",
     "generator": "import generator",
     "generator.training": "import generator.training",
 }
-"""What is imported, by the name under which it is printed."""
 
+# What `import generator` must not load: nothing of the laboratory's, and nothing that takes long.
 LAB = ("acquisition", "calibration.pipeline", "sim", "rawpy", "usb", "serial", "scipy", "matplotlib", "numba")
-"""What `import generator` must not load: nothing of the laboratory's, and nothing that takes long."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -29,8 +29,8 @@ from sim.world.world import Room, World
 LAB = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "illuminations.csv"\n[camera]\nshutter_s = {}\n'
 
 Counts = npt.NDArray[np.uint16]
+# The light of each primary (3,) that codes give, after those of the frame before.
 Projector = Callable[[Colour, Colour], npt.NDArray[np.float64]]
-"""The light of each primary (3,) that codes give, after those of the frame before."""
 
 
 @dataclass

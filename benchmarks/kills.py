@@ -33,8 +33,8 @@ from generator.pictures.random_scenes import random_scenes
 
 IMAGES = 10_000
 LIGHTS = 2
+# So many times as long as between two kills, on the average, the undisturbed run takes.
 KILLS = 8
-"""So many times as long as between two kills, on the average, the undisturbed run takes."""
 
 
 def report(name: str, value: float, unit: str, against: str = "") -> None:

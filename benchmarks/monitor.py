@@ -29,17 +29,17 @@ from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.journal import JOURNAL_FILE, Journal, ReceivedFile
 from experiment.session.records import RESPONSE, Check, Judgement, SessionStep, plan_steps
 
+# Attempts of a night: 707 lights, references, response frames, and some that were refused.
 ATTEMPTS = 800
-"""Attempts of a night: 707 lights, references, response frames, and some that were refused."""
 
+# Checks of a frame.
 CHECKS = 12
-"""Checks of a frame."""
 
+# Answers of each kind of which the fastest counts: other programs only make them slower.
 REPEATS = 15
-"""Answers of each kind of which the fastest counts: other programs only make them slower."""
 
+# Connections of the attack, viewers, and answers that each of them asks for.
 TRICKLING, SILENT, VIEWERS, ANSWERS = 64, 400, 4, 100
-"""Connections of the attack, viewers, and answers that each of them asks for."""
 
 BEGUN = datetime(2026, 1, 1, 22, 0, tzinfo=UTC)
 

@@ -19,8 +19,8 @@ from experiment.chart.layout import paper_chart
 from sim.world.sensors import BODIES
 from sim.world.world import Room
 
+# RMS and worst, px, for each waviness in mm.
 LIMITS_PX = {0.5: (0.05, 0.5), 3.0: (0.05, 0.5), 6.0: (0.1, 0.7)}
-"""RMS and worst, px, for each waviness in mm."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

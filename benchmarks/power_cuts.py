@@ -39,15 +39,15 @@ from experiment.session.folder import Session
 from experiment.session.journal import Journal, ReceivedFile
 from experiment.session.records import Judgement
 
+# Cuts that are made unless more are asked for: a few minutes on a quiet machine.
 CUTS = 200
-"""Cuts that are made unless more are asked for: a few minutes on a quiet machine."""
+# Cuts of the control at least: about every second one of them takes a file that was not flushed.
 LEAST_CONTROL = 10
-"""Cuts of the control at least: about every second one of them takes a file that was not flushed."""
 
 DISK_BYTES = 24 << 20
 SECTOR = 512
+# Of the one file that is served.
 NAME = "/disk"
-"""Of the one file that is served."""
 
 
 class CachedDisk:

@@ -23,8 +23,8 @@ from foundation.clock import SystemClock
 from sim.buses.ptp import serve_ptpip
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 
+# 30 MB, a raw file.
 OBJECT = bytes(range(256)) * 117_188
-"""30 MB, a raw file."""
 DOWNLOADS = 21
 TURNS = 5
 OPERATIONS = 2000

@@ -50,14 +50,14 @@ from sim.world.rendering import Print
 from sim.world.sensors import BODIES
 from sim.world.world import Room, World
 
+# A cell this far off lies beyond what its samples' window allows for, 0.25 px, by enough to hold another colour.
 SILENT_PX = 1.0
-"""A cell this far off lies beyond what its samples' window allows for, 0.25 px, by enough to hold another colour."""
 
+# Words of remarks that say why cells are off in a random room.
 OF_CELLS = r"bleed|spread|veil|glare|correct|neighbour|uncertain|focus|blur|window|fall-?off|hot"
-"""Words of remarks that say why cells are off in a random room."""
 
+# Words of remarks that say why a light is off there.
 OF_LIGHTS = r"ground truth|fall-?off|uneven"
-"""Words of remarks that say why a light is off there."""
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 TAKEN_AT = datetime(2024, 3, 1, 9, 0, tzinfo=UTC)

@@ -60,12 +60,12 @@ from tests.drivers.raw.raw_files import write_cr2
 BODY = BODIES["EOS 550D"]
 EXPOSURE = ExposureSettings(100, 8.0, 0.5)
 LIGHTS = plan_illuminations(35, list(range(2000, 10001, 200)))
+# Lights of the session in real time: some tens of frames, a minute.
 REAL_LIGHTS = 36
-"""Lights of the session in real time: some tens of frames, a minute."""
+# Of an EOS 550D's lossless JPEG: two of the first width, one of the last; together its 5344 columns.
 SLICES = (2, 1728, 1888)
-"""Of an EOS 550D's lossless JPEG: two of the first width, one of the last; together its 5344 columns."""
+# Files of the comparison with plain saving.
 SAVED = 12
-"""Files of the comparison with plain saving."""
 
 
 @dataclass(frozen=True)

@@ -58,11 +58,11 @@ from sim.projectors.projector import SimulatedProjector
 from tests.end_to_end.conftest import make_lab
 
 KILLS = 10_000
+# Kills, on the average, between the beginning and the end of a session.
 KILLS_A_SESSION = 4
-"""Kills, on the average, between the beginning and the end of a session."""
 
+# Sessions from one line about the kills so far to the next.
 TOLD_EVERY = 100
-"""Sessions from one line about the kills so far to the next."""
 
 LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 20 * n, 255 - n)) for n in range(6))
 SETTINGS = LabSettings.model_validate(
@@ -146,6 +146,7 @@ class LightJudge:
         """Remember nothing."""
 
 
+# Where a run is killed: before or after a call.
 OPERATIONS: tuple[tuple[Any, str], ...] = (
     *((os, name) for name in ("fsync", "replace", "unlink", "close")),
     *((Journal, name) for name in ("begin", "commit", "note", "beat", "add_steps")),
@@ -153,7 +154,6 @@ OPERATIONS: tuple[tuple[Any, str], ...] = (
     *((Session, name) for name in ("write_frames_csv", "set_aside_strays")),
     *((IncomingFile, "__init__"), (IncomingFile, "complete"), (LightJudge, "judge"), (StepQueue, "accept")),
 )
-"""Where a run is killed: before or after a call."""
 
 
 def take(folder: Path) -> None:
@@ -239,8 +239,8 @@ def contents(folder: Path) -> dict[str, object]:
     return {"rows": rows, "frames": frames, "listed": sorted(listed)}
 
 
+# What a run that is in trouble does where it is killed.
 PHASES = ("taking", "pause", "retake", "relighting", "rebuilding")
-"""What a run that is in trouble does where it is killed."""
 
 RESPONSES = (Colour(250, 0, 0), Colour(0, 250, 0), Colour(0, 0, 250))
 TROUBLED = SETTINGS.model_copy(

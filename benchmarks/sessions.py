@@ -49,6 +49,7 @@ TAKEN_AT = datetime(2024, 3, 1, 9, 0, tzinfo=UTC)
 SECONDS_A_FRAME = 4
 WELL_LIT_DN = 300.0
 
+# The lights of a short session by name: the primaries, white, a warm and a cool white, two mixtures.
 EIGHT_LIGHTS: Mapping[str, Colour] = {
     "red": Colour(255, 0, 0),
     "green": Colour(0, 255, 0),
@@ -59,7 +60,6 @@ EIGHT_LIGHTS: Mapping[str, Colour] = {
     "violet": Colour(180, 60, 255),
     "dim": Colour(110, 70, 20),
 }
-"""The lights of a short session by name: the primaries, white, a warm and a cool white, two mixtures."""
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -112,8 +112,8 @@ class FrameChange:
     number: int | None = None
 
 
+# Nothing is otherwise.
 AS_PLANNED = FrameChange()
-"""Nothing is otherwise."""
 
 Changes = Callable[[SessionStep], FrameChange]
 

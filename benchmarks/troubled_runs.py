@@ -496,6 +496,7 @@ def causes(only: str = "") -> bool:
     return as_said
 
 
+# What the journal, and so the report, is to tell of a night: by what happened, an event and words of its sentence.
 STORY: Mapping[str, tuple[str, str]] = {
     "router": ("paused", "projector.*(nothing listens|out of reach)"),
     "first power dip": ("relit", "standby"),
@@ -506,7 +507,6 @@ STORY: Mapping[str, tuple[str, str]] = {
     "second power dip": ("killed", "power was lost"),
     "lamp lit again": ("warming up", ""),
 }
-"""What the journal, and so the report, is to tell of a night: by what happened, an event and words of its sentence."""
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,8 @@ from sim.world.world import UNDISTURBED, Glare, Room, Situation, World
 
 _Array = npt.NDArray[np.float64]
 
+# Half-size pixels within which a tail does not rise further: the core is the room's own blur.
 _CORE_PX = 1.5
-"""Half-size pixels within which a tail does not rise further: the core is the room's own blur."""
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,14 @@ from generator.pictures.sources import Preparation, find_pictures
 from synthesis.cli import main as sim
 from tests.acquisition.monitor.browser import browser_tab
 
+# Of the browser, px: the light, the picture and the pixel.
 WINDOW = 1280, 790
-"""Of the browser, px: the light, the picture and the pixel."""
 
+# Few colours, so that the table takes seconds; what is rendered by colour does not show it.
 SETTINGS = 'room.profile = "managed"\nchart.bits = 4\n'
-"""Few colours, so that the table takes seconds; what is rendered by colour does not show it."""
 
+# All that is asked of the program is there.
 DRAWN = "panels.every((one) => one.drawn.endsWith(shown.light) && one.rows.textContent.includes('±'))"
-"""All that is asked of the program is there."""
 
 
 def main() -> None:

@@ -27,6 +27,7 @@ FONT = "font-family='Helvetica, Arial, sans-serif'"
 ROW, BOX_HEIGHT, GAP = 44, 26, 14
 BAND_WIDTH, DATA_LEFT, WIDTH = 740, 790, 1010
 
+# What each package makes, the way of the data upwards; `foundation` handles no data of its own.
 DATA = {
     "evaluation": ("errors of methods, tables",),
     "generator": ("dataset/: raw images, ground truth",),
@@ -35,10 +36,9 @@ DATA = {
     "sim": ("a room, a print, a sensor",),
     "drivers": ("camera, projector, display: bytes on cables, raw files",),
 }
-"""What each package makes, the way of the data upwards; `foundation` handles no data of its own."""
 
+# The package that stands in for hardware, beside the way of the data.
 SIMULATED = "sim"
-"""The package that stands in for hardware, beside the way of the data."""
 
 
 @dataclass(frozen=True)

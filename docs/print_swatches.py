@@ -18,10 +18,10 @@ from sim.spectral import WAVELENGTHS_NM, PaperName, ProfileName, printed_reflect
 
 PAPERS: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 PROFILES: tuple[ProfileName, ...] = ("unmanaged", "managed")
+# Pixels of a colour's side, so that six prints stand in 910 pixels.
 SQUARE = 7
-"""Pixels of a colour's side, so that six prints stand in 910 pixels."""
+# Pixels of white between prints.
 GAP = 14
-"""Pixels of white between prints."""
 
 
 def file_codes() -> NDArray[np.float64]:

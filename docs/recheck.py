@@ -50,6 +50,7 @@ from pydantic import BaseModel, ConfigDict
 
 ROOT = Path(__file__).resolve().parents[1]
 
+# Pages whose tables of decimals are measurements; tables of other pages state limits, formats and settings.
 MEASURED = (
     "README.md",
     "docs/paper.md",
@@ -58,18 +59,17 @@ MEASURED = (
     "docs/how-to/transfer.md",
     "docs/how-to/tune.md",
 )
-"""Pages whose tables of decimals are measurements; tables of other pages state limits, formats and settings."""
 
 NO_SOURCE = 'figures with neither a recheck comment nor, in their section, "taken with version X, YYYY-MM-DD"'
 NUMBER = re.compile(r"-?(?:\d+\.?\d*|\.\d+)")
 TAKEN = re.compile(r"taken\s+with\s+version\s+(\S+),\s+(\d{4}-\d\d-\d\d)", re.IGNORECASE)
 
 
+# What a cell begins with.
 PYTHON = "```python\n"
-"""What a cell begins with."""
 
+# A figure of a sentence: which of several, its column, its row.
 SLOT = re.compile(r"\{(?:(min|max) )?([^{}:]+)(?:: ([^{}]*))?\}")
-"""A figure of a sentence: which of several, its column, its row."""
 
 
 @dataclass(frozen=True)

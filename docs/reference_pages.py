@@ -47,8 +47,8 @@ _AGAIN = {
     "nothing": "nothing",
 }
 
+# What stands in the table for "more than none".
 _LEAST = 1e-9
-"""What stands in the table for "more than none"."""
 
 
 _TOLD = {"known": "yes", "bounded": "beyond", "unknown": "–"}

@@ -27,14 +27,14 @@ class StepState(Enum):
     VOIDED = "voided"
 
 
+# States of a step of which the journal shows nothing yet: another may still come before it.
 AHEAD = (StepState.PLANNED, StepState.LIT, StepState.SETTLED)
-"""States of a step of which the journal shows nothing yet: another may still come before it."""
 
+# States of an attempt without a verdict, in their order; the journal shows all of them as a row without one.
 UNDER_WAY = (StepState.BEGUN, StepState.EXPOSED, StepState.FETCHED, StepState.SAVED, StepState.JUDGED)
-"""States of an attempt without a verdict, in their order; the journal shows all of them as a row without one."""
 
+# How an attempt ends. Only an accepted frame is used; every frame whose file is complete is kept.
 ENDS = (StepState.ACCEPTED, StepState.REFUSED, StepState.FAILED, StepState.INTERRUPTED, StepState.VOIDED)
-"""How an attempt ends. Only an accepted frame is used; every frame whose file is complete is kept."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Transition:
     cause: str
 
 
+# Every transition that a step can make.
 TRANSITIONS = (
     Transition(StepState.PLANNED, StepState.LIT, "the presenter shows the codes"),
     Transition(StepState.LIT, StepState.SETTLED, "settle_s have passed"),
@@ -69,4 +70,3 @@ TRANSITIONS = (
     Transition(StepState.ACCEPTED, StepState.LIT, "its file is gone, or lights want a reference"),
     *(Transition(state, StepState.INTERRUPTED, "Ctrl-C twice, a crash, a power cut") for state in UNDER_WAY),
 )
-"""Every transition that a step can make."""

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+# Of the division: that of the figures in docs/transfer.md.
 SEED = 0
-"""Of the division: that of the figures in docs/transfer.md."""
 
 
 def main() -> None:

@@ -41,19 +41,19 @@ from sim.spectral import print_reflectance, projector_primaries, read_sensitivit
 
 Floats = npt.NDArray[Any]
 
+# Archive, sensitivities, colour matrix, and what the names of its images contain.
 CAMERAS = {
     "600D": ("nus_canon_600d_64x64.npz", "Canon_EOS_600D", "Canon EOS 600D", "Canon"),
     "1Ds Mark III": ("nus_canon_1ds_mk3_64x64.npz", "Canon_EOS-1Ds_Mark_III", "Canon EOS-1Ds Mark III", "Canon"),
     "5DSR": ("intel_tau_5dsr_64x64.npz", "Canon_EOS_5DS", "Canon EOS 5DS R", "field"),
 }
-"""Archive, sensitivities, colour matrix, and what the names of its images contain."""
 
 LINEAR = decode_srgb(np.arange(256) / 255)
 WIDTH = 32
 CODES = np.rint(np.arange(WIDTH) * 255 / (WIDTH - 1)).astype(np.int64)
 SIDE, SMALL = 128, 64
+# White point of the target over the paper's white, and the most of the print's black that is taken out.
 WHITE, VEIL = 0.97, 0.97
-"""White point of the target over the paper's white, and the most of the print's black that is taken out."""
 
 
 @dataclass(frozen=True, eq=False)

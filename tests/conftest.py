@@ -30,9 +30,9 @@ from tests.pinned import TESTS, Pinned  # noqa: E402 - it needs NumPy
 # Sessions and tables are written to the disk for good, step by step: a run of twenty lights waits for it half a second.
 # What is lost with the power is of no interest here, and in memory nobody waits.
 MEMORY = Path("/dev/shm")
+# Free space from which temporary folders lie in memory: what is there at a time of a whole run is below a gigabyte,
+# since the folders of tests that pass are removed at once.
 MEMORY_BYTES = 4 << 30
-"""Free space from which temporary folders lie in memory: what is there at a time of a whole run is below a gigabyte,
-since the folders of tests that pass are removed at once."""
 
 if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MEMORY_BYTES:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
@@ -82,12 +82,12 @@ def pytest_runtest_setup() -> None:
     np.set_printoptions(legacy=False)
 
 
+# What marks all tests of a file.
 SLOW_FILE = re.compile(r"^pytestmark = (\[\s*)?pytest\.mark\.slow\b", re.MULTILINE)
-"""What marks all tests of a file."""
 
+# Examples of each property in `make test`, others each time, and in `make quick`, whose properties took a third of a
+# minute at a hundred; tests that need more say so.
 WHOLE_EXAMPLES, QUICK_EXAMPLES = 30, 12
-"""Examples of each property in `make test`, others each time, and in `make quick`, whose properties took a third of a
-minute at a hundred; tests that need more say so."""
 
 # No test says how long an example may take: a machine that does other things as well takes ten times as long.
 settings.register_profile("whole", max_examples=WHOLE_EXAMPLES, deadline=None)

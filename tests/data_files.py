@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+# Data in the repository.
 SHIPPED = Path(__file__).parent / "data"
-"""Data in the repository."""
 
+# Folders outside the repository's history: one that git ignores, and one beside the checkout.
 LOCAL = (SHIPPED / "local", Path(__file__).parents[2] / "shared" / "data")
-"""Folders outside the repository's history: one that git ignores, and one beside the checkout."""
 
 
 def shipped(name: str) -> Path:

@@ -27,8 +27,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+# What a disk answers that breaks, is full, read-only, used up, pulled out, or on a server that was started anew.
 DISK_FAULTS = (errno.EIO, errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.ENODEV, errno.ESTALE)
-"""What a disk answers that breaks, is full, read-only, used up, pulled out, or on a server that was started anew."""
 
 # What asks a disk (lseek does not, nor the locks of fcntl that SQLite takes), by number on x86-64 and on ARM64, and by
 # what names the file: a file descriptor, a path, or a folder's descriptor with a path ("at").

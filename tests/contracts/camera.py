@@ -18,8 +18,8 @@ import pytest
 from drivers.camera import Camera, CameraIdentity, ExposureSettings, capture
 from foundation.errors import DeviceError, DeviceRefused, StorageError
 
+# What every camera under test offers.
 SETTINGS = ExposureSettings(iso=100, aperture=8, shutter_s=1 / 60)
-"""What every camera under test offers."""
 
 
 class SeededFilm:

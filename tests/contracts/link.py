@@ -7,11 +7,11 @@ import pytest
 from drivers.links.link import Link
 from foundation.errors import LinkClosed, LinkTimeout
 
+# The near end, which is under test, and the far one, which helps.
 Ends = tuple[Link, Link]
-"""The near end, which is under test, and the far one, which helps."""
 
+# For what must come; nothing waits this long unless it fails.
 PATIENCE_S = 10.0
-"""For what must come; nothing waits this long unless it fails."""
 
 
 def read_exactly(link: Link, size: int) -> bytes:

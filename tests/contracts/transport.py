@@ -15,28 +15,29 @@ from drivers.ptp.codes import ResponseCode
 from drivers.ptp.protocol import MAX_COLLECTED, Answer, NoAnswer, PtpEvent, PtpRequest, PtpResponse, Transport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
+# For what must come; nothing waits this long unless it fails.
 PATIENCE_S = 10.0
-"""For what must come; nothing waits this long unless it fails."""
+# For what never comes.
 GIVE_UP_S = 0.05
-"""For what never comes."""
 
+# Answers with the parameters it was given.
 ECHO = 0x9F01
-"""Answers with the parameters it was given."""
+# Gives as many bytes of data as its parameter says.
 GIVE = 0x9F02
-"""Gives as many bytes of data as its parameter says."""
+# Takes data, and answers with their length and CRC-32.
 TAKE = 0x9F03
-"""Takes data, and answers with their length and CRC-32."""
+# Answers busy, although asked for data.
 REFUSE = 0x9F04
-"""Answers busy, although asked for data."""
+# Gives data, then reports that they are incomplete.
 BREAK_OFF = 0x9F05
-"""Gives data, then reports that they are incomplete."""
+# Raises as many events as its parameter says.
 RAISE = 0x9F06
-"""Raises as many events as its parameter says."""
+# Never answers.
 HANG = 0x9F07
-"""Never answers."""
+# Answers in the name of another transaction.
 MIX_UP = 0x9F08
-"""Answers in the name of another transaction."""
 
+# Payloads at which packets, pieces or reads are just full; 500 and 12 bytes of header make a packet of 512.
 EDGES = (
     0,
     1,
@@ -57,7 +58,6 @@ EDGES = (
     524288,
     786432,
 )
-"""Payloads at which packets, pieces or reads are just full; 500 and 12 bytes of header make a packet of 512."""
 
 
 def payload(size: int) -> bytes:

@@ -25,10 +25,10 @@ from tests.drivers.eos_lab import Lab
 pytestmark = pytest.mark.slow
 
 FRAMES = 150
+# Tries at a frame; the sequencer's default is three, in a better lab.
 ATTEMPTS = 6
-"""Tries at a frame; the sequencer's default is three, in a better lab."""
+# Share of operations at which something happens.
 TROUBLE = 0.05
-"""Share of operations at which something happens."""
 KILLED_EVERY = 40
 
 

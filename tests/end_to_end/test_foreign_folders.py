@@ -11,8 +11,8 @@ from tests.fuzz.foreign.trial import READERS, Trials
 
 pytestmark = pytest.mark.slow
 
+# Mutated folders of each kind, a few seconds; what they found once stands in KNOWN.
 COUNT = 8
-"""Mutated folders of each kind, a few seconds; what they found once stands in KNOWN."""
 
 KNOWN = (
     ("dataset folder", 73),  # a list of hashes that names a file of a terabyte without a byte

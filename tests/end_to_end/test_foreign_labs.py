@@ -29,6 +29,7 @@ from sim.world.world import Blob, Glare, Room, Situation, World
 
 pytestmark = pytest.mark.slow
 
+# Cases whose session has a sharper test of its own, of the same size; `benchmarks.rooms --case all` tries all.
 TRIED_ELSEWHERE = {
     # tests/calibration/pipeline/test_held_against_itself.py
     "other-camera", "red-blue", "warm-cool", "white-red", "white-reference-red", "half-exposed", "half-exposed-whites",
@@ -49,7 +50,6 @@ TRIED_ELSEWHERE = {
     # Here, both at once, and in tests/calibration/spread/test_spread.py
     "mild-shoulders", "strong-shoulders", "veil",
 }  # fmt: skip
-"""Cases whose session has a sharper test of its own, of the same size; `benchmarks.rooms --case all` tries all."""
 
 
 @pytest.fixture(scope="module")

@@ -23,8 +23,8 @@ from tests.house.test_documented_commands import FOUND
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn", "unplotted")]
 
 HOW_TO = "docs/how-to/"
+# Pages whose commands have a test of their own.
 ELSEWHERE = {"rehearsal.md"}
-"""Pages whose commands have a test of their own."""
 
 LAB = 'rig = "simulated"\nchart = "chart/chart.json"\nilluminations = "illuminations.csv"\n[sequence]\nwarm_up_s = 0\n'
 SIMULATED = '[simulated]\nbody = "Test"\nseed = 11\n'

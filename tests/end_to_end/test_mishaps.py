@@ -12,8 +12,8 @@ import pytest
 
 from tests.acquisition.run.mishaps import MISHAPS, TroubledLab, take_all
 
+# Few in which every kind of mishap comes up.
 SEEDS = (27, 33, 129, 40, 220)
-"""Few in which every kind of mishap comes up."""
 
 
 @pytest.mark.slow

@@ -37,8 +37,8 @@ pytestmark = [
 
 HOW_TO = (Path(__file__).parents[2] / "docs" / "how-to" / "rehearsal.md").read_text(encoding="utf-8")
 SIZE = "320x240"
+# For what must come; nothing takes this long unless it fails.
 PATIENCE_S = 180.0
-"""For what must come; nothing takes this long unless it fails."""
 
 PROGRAMS = {"acquire": "acquisition.cli", "build-lut": "calibration.cli", "sim": "synthesis.cli"}
 
@@ -197,12 +197,12 @@ def refusals(session: Path) -> list[str]:
         return [attempt.reason for attempt in taken.journal.attempts() if attempt.reason]
 
 
+# A short exposure.
 QUICK = "\n[camera]\nshutter_s = 0.25\n"
-"""A short exposure."""
+# Without the frames that teach the judge the projector: 21 exposures fewer.
 UNTAUGHT = "\n[judge]\nresponse = false\n"
-"""Without the frames that teach the judge the projector: 21 exposures fewer."""
+# Of the room in which that exposure is a good one.
 QUICK_ROOM = " --room white_level_share=1.4"
-"""Of the room in which that exposure is a good one."""
 
 
 @pytest.mark.usefixtures("undrawn")

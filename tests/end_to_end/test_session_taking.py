@@ -34,8 +34,8 @@ pytestmark = pytest.mark.slow
 
 Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 
+# Programs beside this one, without waiting for their imports each time.
 FORKS = multiprocessing.get_context("forkserver")
-"""Programs beside this one, without waiting for their imports each time."""
 FORKS.set_forkserver_preload([__name__, "acquisition.run.run", "acquisition.run.run", "sim.camera.eos"])
 
 

@@ -31,8 +31,8 @@ from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 pytestmark = pytest.mark.slow
 
 FEW = renumbered([LIGHTS[4], LIGHTS[5], LIGHTS[0]])
+# RMS relative error, noise taken out, from which samples are wrong: neighbours' colours give 50 % and more.
 WRONG = 0.02
-"""RMS relative error, noise taken out, from which samples are wrong: neighbours' colours give 50 % and more."""
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from acquisition.monitor.view import Head, SessionWatch
 
 pytestmark = pytest.mark.slow
 
+# How long a frame of the simulated lab may take on a machine that does other things.
 LIMIT_S = 120.0
-"""How long a frame of the simulated lab may take on a machine that does other things."""
 
 
 def seen(watch: SessionWatch, frames: int) -> Head:

@@ -21,8 +21,8 @@ from pathlib import Path
 from tests.fuzz.foreign.seeds import Seed, make_seeds
 from tests.fuzz.foreign.trial import Trials
 
+# Bytes that a process may claim: a folder of kilobytes that asks for more fails for it.
 MEMORY = 8 << 30
-"""Bytes that a process may claim: a folder of kilobytes that asks for more fails for it."""
 
 
 def _work(task: tuple[dict[str, Seed], str, range]) -> list[str]:

@@ -22,8 +22,8 @@ from foundation.version import PACKAGES
 
 pytestmark = pytest.mark.slow
 
+# Escape sequences that choose a colour (ECMA-48, SGR).
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|10[0-7])(?:;\d+)*m")
-"""Escape sequences that choose a colour (ECMA-48, SGR)."""
 
 HEAVY = (
     *("numpy", "numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),

@@ -32,9 +32,9 @@ COPIED = (
     "examples",
 )
 
+# Half-written files of other processes go away. Kept machine code comes with the copy, whose times are those of the
+# sources: compiling anew took half a minute an example.
 IGNORED = ("*.pyc.*", "*.tmp.*")
-"""Half-written files of other processes go away. Kept machine code comes with the copy, whose times are those of the
-sources: compiling anew took half a minute an example."""
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ from experiment.config import load_lab
 from experiment.lights import plan_illuminations
 
 ROOT = Path(__file__).parents[2]
+# What a build of the site leaves there: help texts, not written by anybody.
 MADE = ("docs/reference/commands/",)
-"""What a build of the site leaves there: help texts, not written by anybody."""
 
 PAGES = sorted(
     page

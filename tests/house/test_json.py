@@ -21,6 +21,7 @@ from foundation.console import JsonOutput, json_output, json_value, with_json
 from foundation.errors import QualityError
 from tests.json_of import json_of
 
+# Commands that write or serve something and have no figure to tell.
 WITHOUT_FIGURES = {
     "acquire init",
     "acquire rebuild",
@@ -30,7 +31,6 @@ WITHOUT_FIGURES = {
     "sim projector",
     "sim camera",
 }
-"""Commands that write or serve something and have no figure to tell."""
 
 REFERENCE = Path(__file__).parents[2] / "docs/reference/json.md"
 

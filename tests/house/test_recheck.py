@@ -9,8 +9,8 @@ import pytest
 from docs.recheck import MEASURED, ROOT, checks_of, run, tables_of, without_a_source
 from tests.data_files import LOCAL
 
+# What a block of commands may take in the suite; the others are run before a release.
 FEW_SECONDS = 5.0
-"""What a block of commands may take in the suite; the others are run before a release."""
 
 PAGE = """
     mkdir FOLDER

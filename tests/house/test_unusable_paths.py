@@ -25,8 +25,8 @@ COMMANDS = (
     ("generator.cli", "--verify", "{}"),
 )
 CAPABILITIES_3 = 0x20080522
+# Linux's CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH.
 IGNORE_PERMISSIONS = 1 << 1 | 1 << 2
-"""Linux's CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
 
 
 @contextmanager

@@ -21,8 +21,8 @@ from typing import Any, cast
 
 from tests.fuzz.foreign.seeds import Seed
 
+# Name of the file outside that nobody may touch.
 CANARY = "canary.png"
-"""Name of the file outside that nobody may touch."""
 
 NUMBERS = [
     "-1",

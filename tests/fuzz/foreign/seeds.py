@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, 200, 9 * number)) for number in range(3))
 FRAMES = [SourceFrame("light", light.index, f"frames/{light.index}.dng", f"{light.index}" * 64) for light in LIGHTS]
 
+# The files of a folder by name.
 Seed = dict[str, bytes]
-"""The files of a folder by name."""
 
 
 def files_of(folder: Path) -> Seed:

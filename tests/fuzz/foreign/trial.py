@@ -30,8 +30,8 @@ from generator.dataset.reader import file_faults, open_dataset
 from tests.fuzz.foreign.mutations import CANARY, mutate
 from tests.fuzz.foreign.seeds import Seed
 
+# Nothing of a folder of some kilobytes takes as long, whatever else the machine does.
 LIMIT_S = 20
-"""Nothing of a folder of some kilobytes takes as long, whatever else the machine does."""
 
 
 class Hang(BaseException):
