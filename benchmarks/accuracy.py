@@ -219,9 +219,7 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
     gains = np.array(drift["per_light"])
     report(f"{case}: lamp drift over the session", 100 * float(np.ptp(gains, axis=0).max()), "%", "white frames")
     shape = world.field(cells)
-    report(
-        f"{case}: light on the darkest patch", 100 * float((shape / shape.max(axis=0)).min()), "%", "brightest patch"
-    )
+    report(f"{case}: light, darkest patch", 100 * float((shape / shape.max(axis=0)).min()), "%", "brightest patch")
     mean_field = shape.mean()
     level = np.array([lut.white[n] / gains[n] / truth[n] for n in range(len(lights))]) / mean_field
     lit = truth * mean_field > WELL_LIT_DN

@@ -46,59 +46,40 @@ def compare(computed: Lut, photographed: Lut, every: int) -> None:
     unfit = {cell.colour for lut in (computed, photographed) for cell in lut.provenance.unfit}
     fit = np.array([colour for colour in range(computed.samples.shape[1]) if colour not in unfit])
     scores: list[np.ndarray] = []
-    noise_ratios: list[np.ndarray] = []
-    offsets: list[np.ndarray] = []
+    ratios_by_light: list[np.ndarray] = []
+    offsets_by_light: list[np.ndarray] = []
     for light in range(0, len(computed.white), every):
         gain = float(computed.white[light, 1] / photographed.white[light, 1])
-        computed_samples, photographed_samples = (
+        computed_dn, photo_dn = (
             np.asarray(lut.samples[light], dtype=np.float64)[fit] / scale
             for lut, scale in ((computed, gain), (photographed, 1.0))
         )
-        lit = photographed_samples.mean(axis=(0, 1)) > LEAST_COUNTS
-        variances = computed_samples.var(axis=1, ddof=1), photographed_samples.var(axis=1, ddof=1)
-        differences = computed_samples.mean(axis=1) - photographed_samples.mean(axis=1)
-        scores.append(
-            (differences / np.sqrt((variances[0] + variances[1]) / computed_samples.shape[1]))[:, lit].ravel()
-        )
-        noise_ratios.append(np.sqrt(variances[0].mean(axis=0) / variances[1].mean(axis=0))[lit])
-        offsets.append((differences.mean(axis=0) / photographed_samples.mean(axis=(0, 1)))[lit])
-    all_scores = np.concatenate(scores)
+        lit = photo_dn.mean(axis=(0, 1)) > LEAST_COUNTS
+        variances = computed_dn.var(axis=1, ddof=1), photo_dn.var(axis=1, ddof=1)
+        diffs = computed_dn.mean(axis=1) - photo_dn.mean(axis=1)
+        scores.append((diffs / np.sqrt((variances[0] + variances[1]) / computed_dn.shape[1]))[:, lit].ravel())
+        ratios_by_light.append(np.sqrt(variances[0].mean(axis=0) / variances[1].mean(axis=0))[lit])
+        offsets_by_light.append((diffs.mean(axis=0) / photo_dn.mean(axis=(0, 1)))[lit])
+    z = np.concatenate(scores)
     student = "1.02: noise alone, Student's t of 48 degrees of freedom"
-    report("difference / standard error, standard deviation", float(all_scores.std()), "", student)
-    report("difference / standard error, mean", float(all_scores.mean()), "", "0")
-    report(
-        "difference / standard error, beyond 4",
-        float((np.abs(all_scores) > 4).mean()),
-        "share",
-        "0.00022 for Student's t",
-    )
+    report("difference / standard error, standard deviation", float(z.std()), "", student)
+    report("difference / standard error, mean", float(z.mean()), "", "0")
+    report("difference / standard error, beyond 4", float((np.abs(z) > 4).mean()), "share", "0.00022 for Student's t")
     report(
         "difference / standard error, largest",
-        float(np.abs(all_scores).max()),
+        float(np.abs(z).max()),
         "",
-        f"{all_scores.size} patches, illuminants and channels",
+        f"{z.size} patches, illuminants and channels",
     )
-    all_ratios = np.concatenate(noise_ratios)
+    ratios = np.concatenate(ratios_by_light)
+    report("standard deviation of samples, ratio, mean over illuminants", float(ratios.mean()), "", "1")
+    report("the same ratio, most extreme illuminant and channel", float(ratios[np.abs(ratios - 1).argmax()]), "", "1")
+    offsets = np.concatenate(offsets_by_light)
     report(
-        "standard deviation of the samples of a patch, ratio, mean over illuminants", float(all_ratios.mean()), "", "1"
-    )
-    report(
-        "the same ratio, most extreme illuminant and channel",
-        float(all_ratios[np.abs(all_ratios - 1).argmax()]),
-        "",
-        "1",
-    )
-    all_offsets = np.concatenate(offsets)
-    report(
-        "mean of all patches, largest relative difference under an illuminant",
-        float(np.abs(all_offsets).max()),
-        "",
-        "0",
+        "mean of all patches, largest relative difference under an illuminant", float(np.abs(offsets).max()), "", "0"
     )
     log_ratios = np.log(computed.ground_truth / photographed.ground_truth)
-    report(
-        "chromaticity of the ground truth, median relative difference", float(np.median(np.abs(log_ratios))), "", "0"
-    )
+    report("ground truth chromaticity, median relative difference", float(np.median(np.abs(log_ratios))), "", "0")
     dark = [
         np.asarray(lut.samples[light, 0], dtype=np.float64).mean() / lut.white[light].mean()
         for lut in (computed, photographed)

@@ -115,12 +115,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("\n| world | frames | rejected | causes | chromaticity limit at the end |\n|---|---|---|---|---|")
             for label, count, rejected, counts_by_cause, limit in unusual_worlds(folder, options.lights):
                 print(f"| {label} | {count} | {rejected} | {dict(counts_by_cause) or ''} | {limit} |")
-    is_as_documented = True
+    as_documented = True
     if not options.frames_only:
         print("\nIntermittent causes in whole runs:\n")
-        is_as_documented = causes()
+        as_documented = causes()
     print(f"\n{time.monotonic() - start_s:.0f} s")
-    return int(not is_as_documented)
+    return int(not as_documented)
 
 
 if __name__ == "__main__":

@@ -115,7 +115,7 @@ def encode_and_discard(image: npt.NDArray[np.uint16]) -> None:
 
 
 def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.uint8]], repeats: int) -> None:
-    sources, numpy_folder, crop_folder, encoded_folder, old_folder = (
+    sources, plain, ours, encoded_folder, old_folder = (
         scratch / folder for folder in ("sources", "usual", "ours", "written", "aside")
     )
     sources.mkdir()
@@ -127,7 +127,7 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
     table, paths = np.array(lut.samples[0]), sorted(sources.iterdir())
 
     def clear() -> None:
-        for folder in (numpy_folder, crop_folder, encoded_folder):
+        for folder in (plain, ours, encoded_folder):
             if folder.is_dir():
                 for path in folder.rglob("*"):
                     if path.is_file():
@@ -135,32 +135,29 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
                 folder.rename(tempfile.mkdtemp(dir=old_folder))
 
     def run_numpy() -> None:
-        numpy_folder.mkdir()
-        draw_with_numpy(table, paths, numpy_folder)
+        plain.mkdir()
+        draw_with_numpy(table, paths, plain)
 
     def run_numpy_processes(processes: ProcessPoolExecutor) -> None:
-        numpy_folder.mkdir()
+        plain.mkdir()
         futures = [
-            processes.submit(draw_in_process, lut.folder, paths[worker::workers], numpy_folder)
-            for worker in range(workers)
+            processes.submit(draw_in_process, lut.folder, paths[worker::workers], plain) for worker in range(workers)
         ]
         for future in futures:
             future.result()
 
     def run_crop(previews: bool = False, rendering: Rendering = "codes") -> None:
         options = DatasetOptions(previews=previews, rendering=rendering)
-        generate_dataset(lut, crop_folder, find_pictures([sources]), [0], options=options, workers=workers)
+        generate_dataset(lut, ours, find_pictures([sources]), [0], options=options, workers=workers)
 
     run_crop()
-    images = images_of(crop_folder)
+    images = images_of(ours)
     with (
         ThreadPoolExecutor(workers) as pool,
         ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as processes,
     ):
         run_numpy_processes(processes)
-        sizes = [
-            sum(path.stat().st_size for path in folder.iterdir()) for folder in (numpy_folder, crop_folder / "images")
-        ]
+        sizes = [sum(path.stat().st_size for path in folder.iterdir()) for folder in (plain, ours / "images")]
 
         def encode() -> None:
             call_in_threads(pool, [partial(encode_and_discard, image) for image in images])
@@ -203,11 +200,9 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
     report(label, len(pictures) / wall["ours"], "images/s")
     report(f"{label}, by colour", wall["ours"] / wall["colour"], "ratio", "by codes")
     report(label, wall["usual"] / wall["ours"], "ratio", against)
-    many_processes = "cv2.imread, numpy gather, cv2.imwrite, as many processes as workers"
-    report(label, wall["processes"] / wall["ours"], "ratio", many_processes)
-    report(
-        f"{label}, with previews", wall["processes"] / wall["previews"], "ratio", f"{many_processes}, without previews"
-    )
+    many = "cv2.imread, numpy gather, cv2.imwrite, as many processes as workers"
+    report(label, wall["processes"] / wall["ours"], "ratio", many)
+    report(f"{label}, with previews", wall["processes"] / wall["previews"], "ratio", f"{many}, without previews")
     report(f"folder to folder, {name}, processor time", processor["usual"] / processor["ours"], "ratio", against)
     report(f"folder to folder, {name}, size of the images", sizes[1] / sizes[0], "ratio", against)
     report(label, wall["files"] / wall["ours"], "ratio", f"{encoder_alone}, files written")

@@ -91,11 +91,11 @@ def noisy_table(folder: Path, lights: int) -> Lut:
     writer = LutWriter(folder, lights, 32768, SAMPLES)
     for light in range(lights):
         writer.put(light, rng.poisson(means[:, None].repeat(SAMPLES, axis=1)).astype(np.uint16))
-    provenance = Provenance(
+    origin = Provenance(
         camera="Benchmark", bits=5, white_level=12000, session_sha256="0", chart_sha256="0", software="benchmark"
     )
     plan = [Illumination(light, "uniform", None, Colour(255, 255, 255)) for light in range(lights)]
-    writer.finish(plan, np.full((lights, 3), 4000.0), provenance)
+    writer.finish(plan, np.full((lights, 3), 4000.0), origin)
     return open_lut(folder)
 
 
@@ -127,8 +127,8 @@ def _choose_all(
     for y in range(height):
         keys = row_keys(y, light, 0, np.uint64(0))
         for group in range(groups):
-            group_target = target + 4 * GROUP * (y * groups + group)
-            choose_group(picture + 3 * y * width, width, group, keys, count, bits, scratch, group_target)
+            address = target + 4 * GROUP * (y * groups + group)
+            choose_group(picture + 3 * y * width, width, group, keys, count, bits, scratch, address)
 
 
 @compiled
@@ -148,10 +148,8 @@ def fetching(tables: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> 
     positions = np.zeros((len(tables), height, width), np.uint32)
     scratch = np.empty(SCRATCH_BYTES, np.uint8)
     table_shape = np.uint32(SAMPLES), np.uint32(5)
-    for light, light_positions in enumerate(positions):
-        _choose_all(
-            picture.ctypes.data, width, height, light, *table_shape, light_positions.ctypes.data, scratch.ctypes.data
-        )
+    for light, target in enumerate(positions):
+        _choose_all(picture.ctypes.data, width, height, light, *table_shape, target.ctypes.data, scratch.ctypes.data)
     starts = np.array([table.ctypes.data for table in tables])
     return lambda: _fetch(
         starts,

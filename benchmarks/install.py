@@ -81,11 +81,7 @@ def _test_installation(python: str, folder: Path) -> bool:
         [str(binaries / "python"), "-c", f"import sys, generator; print([m for m in {LAB!r} if m in sys.modules])"],
         folder,
     )
-    print(
-        json.dumps(
-            {"python": version, "name": "laboratory modules loaded by import generator", "value": loaded.strip()}
-        )
-    )
+    print(json.dumps({"python": version, "name": "lab modules loaded by import generator", "value": loaded.strip()}))
     _one_picture(version, binaries, folder)
     return _tutorial(version, binaries, folder)
 
@@ -93,7 +89,7 @@ def _test_installation(python: str, folder: Path) -> bool:
 def _one_picture(version: str, binaries: Path, folder: Path) -> None:
     """Print the time of `generate` for one picture: first start, and warm (kernels compiled, files read)."""
     (picture,) = (ROOT / "docs" / "images").glob("prints.png")
-    environment = _environment_without_repository() | {"XDG_CACHE_HOME": str(folder / "cache")}
+    environment = _outside_environment() | {"XDG_CACHE_HOME": str(folder / "cache")}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     times: list[tuple[float, float]] = []
     for number in range(1 + ROUNDS):
@@ -101,13 +97,11 @@ def _one_picture(version: str, binaries: Path, folder: Path) -> None:
         words = [str(binaries / "generate"), "demo:", f"one-{number}", "--sources", str(picture)]
         subprocess.run(words, cwd=folder, env=environment, check=True, capture_output=True)
         usage_after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        processor_s = usage_after.ru_utime + usage_after.ru_stime - usage_before.ru_utime - usage_before.ru_stime
-        times.append((time.perf_counter() - start_s, processor_s))
+        busy_s = usage_after.ru_utime + usage_after.ru_stime - usage_before.ru_utime - usage_before.ru_stime
+        times.append((time.perf_counter() - start_s, busy_s))
     _report(version, "generate, one picture, first start", times[0][0], "s")
     _report(version, "generate, one picture, warm", min(wall for wall, _ in times[1:]), "s")
-    _report(
-        version, "generate, one picture, warm, processor time", min(processor_s for _, processor_s in times[1:]), "s"
-    )
+    _report(version, "generate, one picture, warm, processor time", min(busy_s for _, busy_s in times[1:]), "s")
 
 
 def _tutorial(version: str, binaries: Path, folder: Path) -> bool:
@@ -122,16 +116,12 @@ def _tutorial(version: str, binaries: Path, folder: Path) -> bool:
             continue
         program = shutil.which(words[0]) if words[0] == "cp" else str(binaries / words[0])
         start_s = time.perf_counter()
-        process = subprocess.run(
-            [str(program), *words[1:]], cwd=work, env=_environment_without_repository(), capture_output=True, text=True
+        run = subprocess.run(
+            [str(program), *words[1:]], cwd=work, env=_outside_environment(), capture_output=True, text=True
         )
         _report(version, line, time.perf_counter() - start_s, "s")
-        if process.returncode:
-            print(
-                json.dumps(
-                    {"python": version, "name": line, "failed": process.returncode, "says": process.stderr[-2000:]}
-                )
-            )
+        if run.returncode:
+            print(json.dumps({"python": version, "name": line, "failed": run.returncode, "says": run.stderr[-2000:]}))
             return False
     return True
 
@@ -157,11 +147,11 @@ def _seconds(binaries: Path, code: str, folder: Path) -> float:
 
 def _run(words: list[str], folder: Path) -> str:
     return subprocess.run(
-        words, cwd=folder, env=_environment_without_repository(), check=True, capture_output=True, text=True
+        words, cwd=folder, env=_outside_environment(), check=True, capture_output=True, text=True
     ).stdout
 
 
-def _environment_without_repository() -> dict[str, str]:
+def _outside_environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
 
 

@@ -255,15 +255,15 @@ def true_rows(case: Case, small: bool) -> set[str]:
     return {CELL_PX.name} if _cell_sides_px(world.project, chart).min() < CELL_PX.accept else set()
 
 
-def is_silent(outcome: Outcome) -> bool:
+def is_silent(result: Outcome) -> bool:
     """Return whether the LUT is wrong and no remark explains it."""
-    truth = outcome.truth
-    if truth is None or not outcome.is_wrong:
+    truth = result.truth
+    if truth is None or not result.is_wrong:
         return False
     # A reported lens error explains an error of this size; a smaller one does not.
-    if len(outcome.remarks_without_lens) < len(outcome.says) and truth.worst > WRONG_SHARE:
+    if len(result.remarks_without_lens) < len(result.says) and truth.worst > WRONG_SHARE:
         return False
-    return not replace(outcome, says=_without_lens(outcome)).mentions(
+    return not replace(result, says=_without_lens(result)).mentions(
         OF_LIGHTS if truth.worst <= WRONG_SHARE else OF_CELLS
     )
 
@@ -316,11 +316,9 @@ def census(outcomes: Sequence[tuple[Case, Outcome]], room_kind: str) -> int:
             continue
         offsets = np.array([truth.offset_rms_px() for truth in truths]).max(axis=0)
         channels = ("red", "green", "blue")
-        offset_figures = {
-            f"RMS in the worst room, {name}": value for name, value in zip(channels, offsets, strict=True)
-        }
-        offset_figures["worst of all fit patches"] = max(truth.worst_offset_px() for truth in truths)
-        for name, value in offset_figures.items():
+        offset_px = {f"worst room's RMS, {name}": value for name, value in zip(channels, offsets, strict=True)}
+        offset_px["worst of all fit patches"] = max(truth.worst_offset_px() for truth in truths)
+        for name, value in offset_px.items():
             figure = {"name": f"{room_kind}, {waves} waves, patch centres, {name}", "value": round(float(value), 4)}
             print(json.dumps(figure | {"unit": "px", "against": "World.project"}))
     return silent
@@ -333,9 +331,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--calm", type=int, default=10, help="number of calm rooms")
     parser.add_argument("--first", type=int, default=0, help="seed of the first room")
     parser.add_argument("--small", action="store_true", help="use small charts and frames")
-    parser.add_argument(
-        "--case", action="append", choices=["all", *BY_NAME], default=[], help="run a named case instead"
-    )
+    parser.add_argument("--case", action="append", choices=["all", *BY_NAME], default=[], help="a named case instead")
     options = parser.parse_args(arguments)
     if options.case:
         names = [case.name for case in CASES] if "all" in options.case else options.case
@@ -347,29 +343,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return int(any(failed))
     seeds = range(options.first, options.first + options.rooms), range(options.first, options.first + options.calm)
-    random_results = [(case, _run_room(case, "random", small=options.small)) for case in map(random_case, seeds[0])]
-    calm_results = [(case, _run_room(case, "calm", small=options.small)) for case in map(calm_case, seeds[1])]
+    wild = [(case, _run_room(case, "random", small=options.small)) for case in map(random_case, seeds[0])]
+    calm = [(case, _run_room(case, "calm", small=options.small)) for case in map(calm_case, seeds[1])]
     silent = sum(
-        census(outcomes, label)
-        for outcomes, label in ((random_results, "random rooms"), (calm_results, "calm rooms"))
-        if outcomes
+        census(outcomes, kind) for outcomes, kind in ((wild, "random rooms"), (calm, "calm rooms")) if outcomes
     )
-    false_remarks = sum(
-        bool(set(outcome.rows) - true_rows(case, options.small)) and not outcome.is_wrong
-        for case, outcome in calm_results
+    false = sum(
+        bool(set(result.rows) - true_rows(case, options.small)) and not result.is_wrong for case, result in calm
     )
-    false_remarks += sum(outcome.verdict == "refuse" for _, outcome in calm_results)
-    print(
-        json.dumps(
-            {
-                "name": "calm rooms, false remarks",
-                "value": false_remarks,
-                "unit": "rooms",
-                "against": f"{len(calm_results)}",
-            }
-        )
-    )
-    return int(silent > 0 or false_remarks > 0)
+    false += sum(result.verdict == "refuse" for _, result in calm)
+    print(json.dumps({"name": "calm rooms, false remarks", "value": false, "unit": "rooms", "against": f"{len(calm)}"}))
+    return int(silent > 0 or false > 0)
 
 
 def _case_failed(name: str, *, small: bool, seed: int) -> bool:

@@ -269,12 +269,10 @@ class TroubledLab:
     def most_notices_an_hour(self) -> int:
         """Return the largest number of pause notices for one cause within an hour."""
         times: dict[str, list[float]] = {}
-        for at_s, event, message in self.notices:
+        for time_s, event, message in self.notices:
             if event == "paused":
-                times.setdefault(pause_cause(message), []).append(at_s)
-        return max(
-            (sum(0 <= b - a < HOUR_S for b in cause_s) for cause_s in times.values() for a in cause_s), default=0
-        )
+                times.setdefault(pause_cause(message), []).append(time_s)
+        return max((sum(0 <= b - a < HOUR_S for b in of) for of in times.values() for a in of), default=0)
 
 
 def make_lab(folder: Path, grid: int, events: Sequence[str] = (), **changes: object) -> Path:
@@ -372,9 +370,7 @@ CAUSES: tuple[Cause, ...] = (
     Cause("a process that is stopped for fifteen seconds", process=True),
     Cause("a journal that is deleted", _damage_journal(Path.unlink), LOST),
     Cause("a journal that is overwritten", _damage_journal(_overwrite), LOST),
-    Cause(
-        "a journal that is cut to half", _damage_journal(lambda path: os.truncate(path, path.stat().st_size // 2)), LOST
-    ),
+    Cause("a journal cut to half", _damage_journal(lambda path: os.truncate(path, path.stat().st_size // 2)), LOST),
 )
 
 
@@ -391,14 +387,14 @@ class Outcome:
     resumed: int
     notices: int
     minutes: float
-    is_as_documented: bool
+    as_documented: bool
 
     def line(self) -> str:
         """Return a Markdown row."""
         return (
             f"| {self.cause.name} | {self.ended} | {self.frames} | {self.refused} | {self.refused_mb:.0f} | "
             f"{self.pauses} | {self.resumed} | {self.notices} | {self.minutes:.0f} | "
-            f"{'yes' if self.is_as_documented else 'NO'} |"
+            f"{'yes' if self.as_documented else 'NO'} |"
         )
 
 
@@ -427,21 +423,21 @@ def outcome_of(cause: Cause, scratch: Path) -> Outcome:
     verdicts = [attempt.verdict for attempt in attempts]
     # Frames in progress when the budget is exceeded are still saved.
     budget = load_lab(path).sequence.refused_gb * 1e9 + 2 * max(frame.size for frame in accepted)
-    is_as_documented = unused <= budget and lab.most_notices_an_hour() <= 1
-    is_as_documented &= len({frame.step for frame in accepted}) == len(accepted)
-    is_as_documented &= (
+    as_documented = unused <= budget and lab.most_notices_an_hour() <= 1
+    as_documented &= len({frame.step for frame in accepted}) == len(accepted)
+    as_documented &= (
         (error is None) if not cause.ends else error is not None and bool(re.search(cause.ends, str(error)))
     )
-    is_as_documented &= not cause.process or event_names.count("gap") == 1
+    as_documented &= not cause.process or event_names.count("gap") == 1
     if error is not None:
         make_lab(scratch, cause.grid)
-        second_error = TroubledLab().take(path, folder)
-        if second_error is not None:
-            print(f"{cause.name}, again: {second_error}", file=sys.stderr)
-        is_as_documented &= second_error is None
+        repeat_error = TroubledLab().take(path, folder)
+        if repeat_error is not None:
+            print(f"{cause.name}, again: {repeat_error}", file=sys.stderr)
+        as_documented &= repeat_error is None
         with Session.open(folder) as session:
             accepted_steps = [attempt.step for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
-            is_as_documented &= sorted(accepted_steps) == [step.number for step in session.steps]
+            as_documented &= sorted(accepted_steps) == [step.number for step in session.steps]
     return Outcome(
         cause,
         "continues" if error is None else f"ends ({type(error).__name__})",
@@ -452,7 +448,7 @@ def outcome_of(cause: Cause, scratch: Path) -> Outcome:
         event_names.count("resumed"),
         lab.most_notices_an_hour(),
         lab.clock_s() / MINUTE_S,
-        is_as_documented,
+        as_documented,
     )
 
 
@@ -486,14 +482,14 @@ def _wait_for_pid(notices: Path) -> int:
 def causes(name_part: str = "") -> bool:
     """Print the table of causes; return whether all effects are as documented."""
     print(HEAD)
-    is_as_documented = True
+    as_documented = True
     for cause in CAUSES:
         if name_part in cause.name:
             with tempfile.TemporaryDirectory() as scratch:
                 outcome = outcome_of(cause, Path(scratch))
             print(outcome.line(), flush=True)
-            is_as_documented &= outcome.is_as_documented
-    return is_as_documented
+            as_documented &= outcome.as_documented
+    return as_documented
 
 
 # Expected journal entries of a night: event and pattern of its detail, by fault.

@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
 def test_a_run_ends_as_the_how_to_says(tmp_path: Path) -> None:
     (cause,) = (cause for cause in CAUSES if cause.name == "one frame late, from a frame on")
     outcome = outcome_of(cause, tmp_path / "lab")
-    assert outcome.is_as_documented, outcome
+    assert outcome.as_documented, outcome
 
 
 def test_a_night_without_an_operator_becomes_a_table_and_a_story(tmp_path: Path) -> None:
