@@ -100,9 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if labs:
             lights, followed, pair_names = neighbours(labs[0].judge.state.model, labs[0].plan)
             scatter = labs[0].judge.state.model
-            print(
-                f"\nScatter in the first room: chromaticity {scatter.chroma_sd:.2%}, brightness {scatter.brightness_sd:.2%}."
-            )
+            print(f"\nScatter, first room: colour {scatter.chroma_sd:.2%}, brightness {scatter.brightness_sd:.2%}.")
             print(f"{lights} of {len(labs[0].plan)} illuminants could be replaced undetected;")
             print(f"{followed} of them by the next of the plan: {'; '.join(pair_names)}")
         if options.sessions:

@@ -1,6 +1,6 @@
-"""What every camera keeps to, written once: a suite names its camera by the fixture `bench`.
+"""Contract tests of every camera; a suite supplies its camera with the fixture `bench`.
 
-The camera photographs with a `SeededFilm`, so that each frame can be compared with what was exposed.
+The camera uses a `SeededFilm`, so each frame can be compared with the exposed one.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import pytest
 from drivers.camera import Camera, CameraIdentity, ExposureSettings, capture
 from foundation.errors import DeviceError, DeviceRefused, StorageError
 
-# What every camera under test offers.
+# Settings that every camera under test offers.
 SETTINGS = ExposureSettings(iso=100, aperture=8, shutter_s=1 / 60)
 
 
 class SeededFilm:
-    """A `sim.camera.film.Film` whose pictures are noise, each another one, and remembered."""
+    """A `sim.camera.film.Film` with a different noise image for each frame, which it stores."""
 
     suffix = ".cr2"
 
@@ -39,7 +39,7 @@ class SeededFilm:
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
         self.settings.append(settings)
-        # Now and then a size that fills whole packets.
+        # Sometimes the size fills whole packets.
         size = self._size if len(self.frames) % 7 else 512 * (1 + self._size // 512)
         self.frames.append(self._chance.randbytes(size))
         return into.write(self.frames[-1])
@@ -47,10 +47,9 @@ class SeededFilm:
 
 @dataclass(frozen=True)
 class Bench:
-    """A camera under test, the film in it, and what is true of it.
+    """A camera under test, its film, and the expected values.
 
-    `keeps_names` tells whether frames come under the names that the camera gave them; `develop` brings `film` up to
-    date where it is the image of one elsewhere.
+    `keeps_names`: frames have the names given by the camera. `develop` updates `film` if it is a copy.
     """
 
     camera: Camera
@@ -61,7 +60,7 @@ class Bench:
     develop: Callable[[], None] = lambda: None
 
     def frames(self) -> list[bytes]:
-        """Return what has been exposed."""
+        """Return all exposed frames."""
         self.develop()
         return self.film.frames
 
@@ -73,24 +72,24 @@ class CameraContract:
         assert bench.camera.identity() == bench.identity
         assert bench.camera.identity() == bench.identity
 
-    def test_takes_nothing_before_it_knows_how(self, bench: Bench) -> None:
+    def test_refuses_exposure_before_configuration(self, bench: Bench) -> None:
         with pytest.raises(DeviceRefused):
             bench.camera.expose()
         with pytest.raises(DeviceError):
             bench.camera.download(io.BytesIO())
         assert bench.frames() == []
 
-    def test_every_frame_is_the_one_that_was_exposed(self, bench: Bench) -> None:
+    def test_delivers_exposed_frames(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         names: list[str] = []
         for number in range(4):
             into = io.BytesIO()
-            before = bench.now()
+            start = bench.now()
             captured = capture(bench.camera, into)
             assert into.getvalue() == bench.frames()[number]
             assert captured.size == len(bench.frames()[number])
             assert captured.released_at.utcoffset() == timedelta(0)
-            assert before <= captured.released_at.astimezone(UTC) <= bench.now()
+            assert start <= captured.released_at.astimezone(UTC) <= bench.now()
             names.append(captured.name)
         assert len(bench.frames()) == 4
         assert len(set(names)) == 4
@@ -98,11 +97,11 @@ class CameraContract:
         if bench.keeps_names:
             assert names == ["IMG_0001.CR2", "IMG_0002.CR2", "IMG_0003.CR2", "IMG_0004.CR2"]
 
-    def test_the_light_may_change_between_exposure_and_download(self, bench: Bench) -> None:
+    def test_exposure_ends_before_download(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
-        before = bench.now()
+        start = bench.now()
         released_at = bench.camera.expose()
-        assert before <= released_at <= bench.now()
+        assert start <= released_at <= bench.now()
         assert len(bench.frames()) == 1
         into = io.BytesIO()
         captured = bench.camera.download(into)
@@ -111,7 +110,7 @@ class CameraContract:
         with pytest.raises(DeviceError):
             bench.camera.download(io.BytesIO())
 
-    def test_a_download_that_failed_is_tried_again_with_a_new_stream(self, bench: Bench) -> None:
+    def test_repeats_failed_download(self, bench: Bench) -> None:
         class Full(io.BytesIO):
             def write(self, data: object) -> int:
                 raise StorageError("the disk is full")
@@ -125,7 +124,7 @@ class CameraContract:
         bench.camera.download(into)
         assert [into.getvalue()] == bench.frames()
 
-    def test_an_exposure_that_was_not_downloaded_gives_way_to_the_next(self, bench: Bench) -> None:
+    def test_next_exposure_replaces_one_without_download(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         bench.camera.expose()
         bench.camera.expose()
@@ -143,7 +142,7 @@ class CameraContract:
         bench.develop()
         assert bench.film.settings == applied
 
-    def test_lists_the_shutter_times_that_it_takes(self, bench: Bench) -> None:
+    def test_lists_usable_shutter_times(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         speeds = bench.camera.shutter_speeds()
         assert speeds == tuple(sorted(set(speeds)))
@@ -152,7 +151,7 @@ class CameraContract:
         for speed in speeds[:: len(speeds) // 5]:
             bench.camera.configure(replace(SETTINGS, shutter_s=speed))
 
-    def test_writes_where_the_file_stands(self, bench: Bench) -> None:
+    def test_appends_at_position_of_stream(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         into = io.BytesIO(b"before")
         into.seek(0, io.SEEK_END)
@@ -160,7 +159,7 @@ class CameraContract:
         assert into.getvalue() == b"before" + bench.frames()[0]
         assert captured.size == len(bench.frames()[0])
 
-    def test_refuses_what_it_does_not_offer_and_stays_usable(self, bench: Bench) -> None:
+    def test_refuses_unavailable_setting_and_stays_usable(self, bench: Bench) -> None:
         with pytest.raises(DeviceRefused, match="100"):
             bench.camera.configure(replace(SETTINGS, iso=110))
         assert bench.frames() == []
@@ -169,7 +168,7 @@ class CameraContract:
         capture(bench.camera, into)
         assert into.getvalue() == bench.frames()[-1]
 
-    def test_a_closed_camera_is_closed(self, bench: Bench) -> None:
+    def test_closed_camera_refuses_exposure(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         bench.camera.close()
         bench.camera.close()

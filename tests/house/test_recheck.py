@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from docs.recheck import MEASURED, ROOT, checks_of, run, tables_of, without_a_source
+from docs.recheck import MEASURED, ROOT, checks_of, run, tables_of, tables_without_source
 from tests.data_files import LOCAL
 
 # What a block of commands may take in the suite; the others are run before a release.
@@ -48,7 +48,7 @@ def test_what_is_printed_is_found() -> None:
         ("1.23 /", "1.24 /", "a**; 0: 1.24 stated, 1.234 printed"),
         ("| – |", "| 4 |", "B; 1: 4 stated, not one figure printed"),
         ("| B |", "| C |", "C; 0: 3.25 stated, not one figure printed"),
-        ("mkdir FOLDER", "exit 7", "the commands ended with 7"),
+        ("mkdir FOLDER", "exit 7", "the commands ended with exit code 7"),
         ('reads = "FOLDER/out.csv"', 'reads = "FOLDER/other.csv"', "left no FOLDER/other.csv"),
         ('rows = ["Method"]', 'rows = ["Name"]', "FOLDER/out.csv has no column 'Name'"),
         ("| **a** | 1.23 / 7 | 2.5 |\n| B | 3.25 | – |\n", "| a | – | – |\n", "states no figure"),
@@ -105,11 +105,11 @@ def test_figures_of_sentences_are_compared() -> None:
     [
         ("2.5°", "2.6°", "{Med.: A; 1}: 2.6 stated, 2.5 printed"),
         ("and 3.25°", "and 2.5°", "{max Med.: *; 0}: 2.5 stated, 3.249 printed"),
-        ("of A rises from 1.23", "of A grows from 1.23", "the page does not say, with figures: of A rises"),
+        ("of A rises from 1.23", "of A grows from 1.23", "the page has no such sentence with figures: of A rises"),
         ("{Med.: A; 1}", "{Med.: A; *}", "2.5 stated, not one figure printed"),
         ("{Med.: A; 1}", "{Med.: B; 1}", "2.5 stated, not one figure printed"),
         ("{Med.: A; 1}", "{Mean: A; 1}", "has no column 'Mean'"),
-        ("{Med.: A; 0}° to {Med.: A; 1}", "1.23° to\n2.5", "the page does not say, with figures"),
+        ("{Med.: A; 0}° to {Med.: A; 1}", "1.23° to\n2.5", "the page has no such sentence with figures"),
     ],
 )
 def test_figures_of_sentences_that_differ_are_said(text: str, instead: str, said: str) -> None:
@@ -172,15 +172,15 @@ def test_what_cannot_be_run_is_said(tmp_path: Path) -> None:
 
 def test_a_table_without_a_source_is_found() -> None:
     bare = PAGE.replace("<!-- recheck", "<!-- nothing")
-    assert without_a_source(bare) == tables_of(PAGE)
-    assert without_a_source(f"taken\nwith version 0.1.0, 2026-11-24\n{bare}") == []
-    assert without_a_source(f"taken with version 0.1.0, 2026-11-24\n\n## Next\n{bare}") != []
-    assert without_a_source(PAGE) == []
+    assert tables_without_source(bare) == tables_of(PAGE)
+    assert tables_without_source(f"taken\nwith version 0.1.0, 2026-11-24\n{bare}") == []
+    assert tables_without_source(f"taken with version 0.1.0, 2026-11-24\n\n## Next\n{bare}") != []
+    assert tables_without_source(PAGE) == []
 
 
 @pytest.mark.parametrize("page", MEASURED)
 def test_each_figure_of_a_page_has_a_source(page: str) -> None:
-    left = without_a_source((ROOT / page).read_text(encoding="utf-8"))
+    left = tables_without_source((ROOT / page).read_text(encoding="utf-8"))
     assert [(table.line, table.headings) for table in left] == []
 
 
