@@ -59,7 +59,7 @@ class TestSerialLink(LinkContract):
         yield near, far
         near.close()
 
-    def test_what_was_sent_before_hanging_up_is_still_read(self, ends: Ends) -> None:
+    def test_reads_data_sent_before_close(self, ends: Ends) -> None:
         # An unplugged cable loses data that the system has not delivered, so only the end is certain.
         near, far = ends
         far.write(b"last words", PATIENCE_S)
