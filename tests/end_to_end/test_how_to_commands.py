@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from croplab import COMMANDS
-from tests.house.test_documented_commands import DOCUMENTED
+from tests.house.test_documented_commands import FOUND
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn", "unplotted")]
 
@@ -161,7 +161,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_covers_every_page_with_commands() -> None:
-    pages = {page.removeprefix(HOW_TO) for page, _ in DOCUMENTED if page.startswith(HOW_TO)}
+    pages = {page.removeprefix(HOW_TO) for page, _ in FOUND if page.startswith(HOW_TO)}
     assert pages - ELSEWHERE == set(PAGES)
 
 
@@ -174,7 +174,7 @@ def test_commands_of_page_run(
         (tmp_path / needed).parent.mkdir(parents=True, exist_ok=True)
         (shutil.copytree if (prepared / source).is_dir() else shutil.copy)(prepared / source, tmp_path / needed)
     monkeypatch.chdir(tmp_path)
-    for words in (words for page_name, words in DOCUMENTED if page_name == HOW_TO + name):
+    for words in (words for page_name, words in FOUND if page_name == HOW_TO + name):
         command = " ".join(words)
         if any(command.startswith(beginning) for beginning in page.skipped):
             continue

@@ -60,47 +60,38 @@ def _of_line(line: str) -> Iterator[list[str]]:
 def parse(words: list[str]) -> None:
     """Parse a command without running it."""
     command: Any = get_command(import_module(COMMANDS[words[0]]).app)
-    arguments = words[1:]
-    if (
-        words[0] == "evaluate"
-        and arguments
-        and not arguments[0].startswith("-")
-        and arguments[0] not in command.commands
-    ):
+    tail = words[1:]
+    if words[0] == "evaluate" and tail and not tail[0].startswith("-") and tail[0] not in command.commands:
         # Data without a subcommand are run with the usual methods (evaluation.cli).
-        arguments = ["run", *arguments]
+        tail = ["run", *tail]
     while hasattr(command, "commands"):
         if (
-            arguments
-            and arguments[0] not in command.commands
+            tail
+            and tail[0] not in command.commands
             and any(parameter.param_type_name == "argument" for parameter in command.params)
         ):
             break
-        assert arguments, f"{words} has no subcommand"
-        assert arguments[0] in command.commands, f"{arguments[0]} is not a subcommand of {words[0]}"
-        command, arguments = command.commands[arguments[0]], arguments[1:]
-    if any(word in ("--help", "-h", "--version") for word in arguments):
+        assert tail, f"{words} has no subcommand"
+        assert tail[0] in command.commands, f"{tail[0]} is not a subcommand of {words[0]}"
+        command, tail = command.commands[tail[0]], tail[1:]
+    if any(word in ("--help", "-h", "--version") for word in tail):
         return
-    context = command.make_context(words[0], arguments)
+    context = command.make_context(words[0], tail)
     assert context is not None
 
 
-DOCUMENTED = [
-    (page.relative_to(ROOT).as_posix(), words) for page in PAGES for words in commands_in(page.read_text("utf-8"))
-]
+FOUND = [(page.relative_to(ROOT).as_posix(), words) for page in PAGES for words in commands_in(page.read_text("utf-8"))]
 
 
 def test_finds_commands() -> None:
-    pages = Counter(page for page, _ in DOCUMENTED)
+    pages = Counter(page for page, _ in FOUND)
     assert pages["docs/tutorials/first-dataset.md"] >= 8
     assert len(pages) >= 15
-    assert len(DOCUMENTED) >= 60
+    assert len(FOUND) >= 60
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("page", "words"), DOCUMENTED, ids=[f"{page}: {' '.join(words)[:80]}" for page, words in DOCUMENTED]
-)
+@pytest.mark.parametrize(("page", "words"), FOUND, ids=[f"{page}: {' '.join(words)[:80]}" for page, words in FOUND])
 def test_accepts_documented_command(page: str, words: list[str]) -> None:
     try:
         parse(words)
