@@ -198,9 +198,7 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
         selected = errors.where(low, high)
         total, noise_rms, systematic, bound = beyond_noise(errors.error, errors.noise, selected)
         name = (
-            f"{case}: patch means, {low} counts or more"
-            if high == np.inf
-            else f"{case}: patch means, {low} to {high} counts"
+            f"{case}: patch means, {low} counts or more" if high == np.inf else f"{case}: patch means, {low} to {high}"
         )
         report(f"{name}, relative error, RMS", 100 * total, "%", "World.reflected / World.white")
         report(f"{name}, noise of 25 samples", 100 * noise_rms, "%", "EMVA 1288 model")
@@ -242,7 +240,7 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
             selected = (errors.level[first] >= low) & (errors.level[first] < high) & errors.clean[:, None]
             if selected.sum() > 1000:
                 report(
-                    f"{case}: variance between two frames of illuminant {first}, {low} to {high} counts",
+                    f"{case}: variance between two frames of illuminant {first}, {low} to {high}",
                     float(ratio[selected].mean()),
                     "ratio",
                     "photons and read noise alone",

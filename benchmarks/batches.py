@@ -103,10 +103,8 @@ def measure(lut: Lut) -> None:
         report(f"batches, {threads} threads", code_rate, "crops/s", description)
         report(f"batches, {threads} threads", code_rate / numpy_rate, "ratio", "numpy take, one thread")
         colour_rate = rate(seconds_by_colour[threads][IN_A_ROW - 1 :], BATCH)
-        report(f"batches by colour, black removed, {threads} threads", colour_rate, "crops/s", description)
-        report(
-            f"batches by colour, black removed, {threads} threads", colour_rate / code_rate, "ratio", "batches by codes"
-        )
+        report(f"by colour, black removed, {threads} threads", colour_rate, "crops/s", description)
+        report(f"by colour, black removed, {threads} threads", colour_rate / code_rate, "ratio", "batches by codes")
 
 
 def main() -> None:

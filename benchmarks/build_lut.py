@@ -157,16 +157,16 @@ def compare(session: Session, out: Path, kind: str) -> None:
             subprocess.run([str(dcraw), "-D", "-4", "-T", "-c", file], stdout=subprocess.DEVNULL, check=True)
 
     rounds: list[tuple[Costs, Costs, float]] = []
-    frame_ratios: list[float] = []
-    session_ratios: list[float] = []
+    ratios: list[float] = []
+    session_ratio: list[float] = []
     lens_s = measure_lens_s(session)
     for _ in range(ROUNDS):
         unpacking = timed(unpack_all, len(files))
         with patch.object(ConsistencyCheck, "_disturbed", return_value=((), (), ())):
             plain_build = build_timed(session, out, replace(PAPER_OPTIONS, lens_correction=False))
         full_build = build_timed(session, out)
-        frame_ratios.append(full_build.processor / plain_build.processor)
-        session_ratios.append((full_build.processor + lens_s / PAPER_FRAMES) / plain_build.processor)
+        ratios.append(full_build.processor / plain_build.processor)
+        session_ratio.append((full_build.processor + lens_s / PAPER_FRAMES) / plain_build.processor)
         second_unpacking = timed(unpack_all, len(files))
         unpacking = Costs(*(np.mean([unpacking, second_unpacking], axis=0).tolist()))
         rounds.append((full_build, unpacking, timed(develop, 4).wall if dcraw else np.nan))
@@ -180,19 +180,14 @@ def compare(session: Session, out: Path, kind: str) -> None:
     report(f"one frame of a build, {kind}", float(np.median([b.wall for b, _, _ in rounds])), "s", count)
     report(f"one frame of a build, {kind}, to unpacking", wall, "1", f"rawpy's unpack alone, {count}")
     report(f"one frame of a build, {kind}, to unpacking, processor time", processor, "1", "rawpy's unpack alone")
-    against_plain = "processor time of a build without lens correction and patch comparison"
-    report(
-        f"one frame of a build, {kind}, to a build without lens correction",
-        float(np.median(frame_ratios)),
-        "1",
-        against_plain,
-    )
+    against = "processor time of a build without lens correction and patch comparison"
+    report(f"one frame of a build, {kind}, to a build without lens correction", float(np.median(ratios)), "1", against)
     report("measure the lens", lens_s, "s", "processor time, once per session")
     report(
         f"707 illuminants, {kind}, to a build without lens correction",
-        float(np.median(session_ratios)),
+        float(np.median(session_ratio)),
         "1",
-        f"{against_plain}, registration in both",
+        f"{against}, registration in both",
     )
     if dcraw is not None:
         report(f"one frame of a build, {kind}, to dcraw", against_dcraw, "1", "dcraw -D -4 -T alone")
@@ -238,7 +233,7 @@ def chart_and_sampling(session: Session, world: World) -> None:
     report("read a raw frame, ratio", reading / copying, "1", "reading the bytes of the file and adding them")
     mosaic = read_raw(path)
     registering = fastest_s(lambda: register(mosaic, chart), runs=2)
-    report("register the chart and its 32 768 patches", registering, "s", "once per session, and after a bump")
+    report("register the chart and its 32 768 patches", registering, "s", "once, and after a bump")
     report("register the chart, ratio", registering / reading, "1", "reading a frame")
     registration = register(mosaic, chart)
     distance = np.linalg.norm(registration.to_pixels(chart.centres_mm) - world.project(chart.centres_mm), axis=1)

@@ -518,7 +518,7 @@ def chart_of(small: bool, seed: int = 1) -> Chart:
 
 
 # Figure of a verdict: error remaining after lens correction.
-LENS_RESIDUAL: Final = "correction_residual"
+LENS_LEFT: Final = "correction_residual"
 
 # The reported RMS error counts as correct if the RMS error of the LUT is within this many standard errors.
 _TRUE_WITHIN: Final = 2.0
@@ -543,7 +543,7 @@ class Outcome:
         is_correct = self.truth is None or self.truth.rms <= _TRUE_WITHIN * self.lens_left
         if not is_correct or len(self.rows) != len(self.says):
             return self.says
-        return tuple(text for row, text in zip(self.rows, self.says, strict=True) if row != LENS_RESIDUAL)
+        return tuple(text for row, text in zip(self.rows, self.says, strict=True) if row != LENS_LEFT)
 
     @property
     def is_wrong(self) -> bool:
@@ -588,7 +588,7 @@ def outcome_of(
     says = tuple(remark(row, result.figures) for row in verdict.remarks)
     truth = compare(result, open_lut(folder), world, chart, session, changes, every)
     names = tuple(row.figure.name for row in verdict.remarks)
-    return Outcome(verdict.outcome, names, says, truth, result.figures.lens.left if LENS_RESIDUAL in names else 0.0)
+    return Outcome(verdict.outcome, names, says, truth, result.figures.lens.left if LENS_LEFT in names else 0.0)
 
 
 def try_case(case: NamedCase, *, small: bool, seed: int = 1, body: str = "EOS 550D") -> dict[str, Any]:
@@ -606,7 +606,7 @@ def try_case(case: NamedCase, *, small: bool, seed: int = 1, body: str = "EOS 55
     # A small chart cannot detect everything: for it, a remark about the remaining lens error is not false.
     judged = replace(outcome, says=outcome.remarks_without_lens if small else outcome.says)
     names_right, names_wrong = outcome.mentions(case.right), judged.mentions(case.wrong)
-    if LENS_RESIDUAL in outcome.rows and len(outcome.remarks_without_lens) == len(outcome.says):
+    if LENS_LEFT in outcome.rows and len(outcome.remarks_without_lens) == len(outcome.says):
         # A figure that is smaller than the true error does not explain it.
         names_right = False
     row: dict[str, Any] = {"case": case.name, "what": case.what} | outcome.to_json()

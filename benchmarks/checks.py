@@ -82,25 +82,23 @@ def main() -> None:
         print(f"{'figure':<18}{'bits':<6}{'room':<52}{'grade':<13}message")
         for name, bits, room in (*ROOMS, *(FULL if full else ())):
             report = check(folder, bits, room)
-            finding = next(
-                (finding for finding in report.findings if finding.name == name), not_checked(name, "not measured")
-            )
-            other_faults = [finding.name for finding in report.with_grade("fault") if finding.name != name]
+            found = next((found for found in report.findings if found.name == name), not_checked(name, "not measured"))
+            other_faults = [found.name for found in report.with_grade("fault") if found.name != name]
             differences = ", ".join(f"{key} {value:g}" for key, value in room.items())
             suffix = f" [also at fault: {', '.join(other_faults)}]" if other_faults else ""
-            print(f"{name:<18}{bits:<6}{differences:<52}{finding.grade:<13}{finding.said[:110]}{suffix}", flush=True)
+            print(f"{name:<18}{bits:<6}{differences:<52}{found.grade:<13}{found.said[:110]}{suffix}", flush=True)
         alarm_count = 0
         for bits in (1, 2, 3):
             for seed in SEEDS:
                 report = check(folder, bits, {}, seed)
-                for finding in (*report.with_grade("fault"), *report.with_grade("remark")):
+                for found in (*report.with_grade("fault"), *report.with_grade("remark")):
                     alarm_count += 1
-                    print(f"false alarm: {bits} bits, seed {seed}: {finding.name}: {finding.sentence()}")
+                    print(f"false alarm: {bits} bits, seed {seed}: {found.name}: {found.sentence()}")
         print(f"false alarms in {3 * len(SEEDS)} good rooms: {alarm_count}")
         if full:
             reports = [check(folder, 5, {}, seed) for seed in range(3)]
             full_alarms = [
-                finding for report in reports for finding in (*report.with_grade("fault"), *report.with_grade("remark"))
+                found for report in reports for found in (*report.with_grade("fault"), *report.with_grade("remark"))
             ]
             print(f"false alarms in 3 good rooms with the full chart: {len(full_alarms)}")
 

@@ -45,7 +45,7 @@ def neighbours(model: ProjectorModel, plan: Sequence[Illumination]) -> tuple[int
     amounts = np.array([model.predict(colour).amounts for colour in codes])
     min_distance = max(limits.STALE_SIGMAS, limits.STALE_ADVANTAGE**0.5)
 
-    def is_detected(shown_index: int, ordered_index: int) -> bool:
+    def differs(shown_index: int, ordered_index: int) -> bool:
         fit = model.compare(amounts[shown_index], codes[ordered_index])
         return float(np.hypot(fit.distance, fit.brightness / fit.brightness_sd)) > min_distance
 
@@ -53,16 +53,14 @@ def neighbours(model: ProjectorModel, plan: Sequence[Illumination]) -> tuple[int
     for k in range(len(plan)):
         nearest = np.argsort(np.linalg.norm(amounts - amounts[k], axis=1))[1:9].tolist()
         pairs |= {
-            (min(k, n), max(k, n))
-            for n in nearest
-            if codes[n] != codes[k] and not (is_detected(n, k) and is_detected(k, n))
+            (min(k, n), max(k, n)) for n in nearest if codes[n] != codes[k] and not (differs(n, k) and differs(k, n))
         }
         pairs |= {(min(k, n), max(k, n)) for n in nearest if codes[n] == codes[k]}
     ambiguous = {index for pair in pairs for index in pair}
-    consecutive = sum((k, k + 1) in pairs for k in range(len(plan) - 1))
+    followed = sum((k, k + 1) in pairs for k in range(len(plan) - 1))
     return (
         len(ambiguous),
-        consecutive,
+        followed,
         [f"{tuple(plan[a].colour)} and {tuple(plan[b].colour)}" for a, b in sorted(pairs)],
     )
 
@@ -104,9 +102,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{lights} of {len(labs[0].plan)} illuminants could be replaced undetected;")
             print(f"{followed} of them by the next of the plan: {'; '.join(pair_names)}")
         if options.sessions:
-            refused, frames, alarms = false_alarms(folder, options.sessions, options.lights, options.sessions // 5)
+            bad, frames, alarms = false_alarms(folder, options.sessions, options.lights, options.sessions // 5)
             print(
-                f"\nFalse alarms: {refused} of {options.sessions} sessions, {sum(alarms.values())} of {frames} frames",
+                f"\nFalse alarms: {bad} of {options.sessions} sessions, {sum(alarms.values())} of {frames} frames",
                 end="",
             )
             print(f" ({', '.join(f'{name} {count}' for name, count in alarms.items())})" if alarms else "")

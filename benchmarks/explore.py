@@ -90,35 +90,27 @@ def main() -> None:
             base = f"http://127.0.0.1:{server.port}/"
             times: dict[str, list[float]] = {"light": [], "by codes": [], "by colour": [], "pixel": []}
             for number, (r, b) in enumerate(positions):
-                shown_s, body = _request(f"{base}shown.json", picture=0, light=f"r={r:.5f},b={b:.5f}")
+                place_s, body = _request(f"{base}shown.json", picture=0, light=f"r={r:.5f},b={b:.5f}")
                 light = json.loads(body)["light"]
-                by_codes_s, image = _request(f"{base}counts", picture=0, light=light, rendering="codes")
-                by_colour_s, _ = _request(f"{base}counts", picture=0, light=light, rendering="colorimetric")
+                codes_s, image = _request(f"{base}counts", picture=0, light=light, rendering="codes")
+                colour_s, _ = _request(f"{base}counts", picture=0, light=light, rendering="colorimetric")
                 pixel_s, _ = _request(f"{base}pixel.json", picture=0, light=light, x=500, y=400)
                 assert len(image) == 8 + 6 * SIZE[0] * SIZE[1]
                 # The first request compiles, and computes the colour map of the print, which is kept on disk.
                 if number:
-                    for name, seconds in zip(times, (shown_s, by_codes_s, by_colour_s, pixel_s), strict=True):
+                    for name, seconds in zip(times, (place_s, codes_s, colour_s, pixel_s), strict=True):
                         times[name].append(1000 * seconds)
                 else:
-                    print(
-                        json.dumps(
-                            {"answer": "first of a process", "ms": round(1000 * (shown_s + by_codes_s + by_colour_s))}
-                        )
-                    )
+                    print(json.dumps({"answer": "first request", "ms": round(1000 * (place_s + codes_s + colour_s))}))
             times["drawn by Chromium"] = _drawing_times_ms(base, positions[1:]) if CHROMIUM else []
             server.shutdown()
     times["light and both"] = [sum(answers) for answers in zip(*list(times.values())[:3], strict=True)]
-    for name, milliseconds in times.items():
-        if not milliseconds:
+    for name, times_ms in times.items():
+        if not times_ms:
             continue
         print(
             json.dumps(
-                {
-                    "answer": name,
-                    "ms": round(statistics.median(milliseconds), 1),
-                    "slowest": round(max(milliseconds), 1),
-                }
+                {"answer": name, "ms": round(statistics.median(times_ms), 1), "slowest": round(max(times_ms), 1)}
             )
         )
 

@@ -141,7 +141,7 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
     def run_numpy_processes(processes: ProcessPoolExecutor) -> None:
         plain.mkdir()
         futures = [
-            processes.submit(draw_in_process, lut.folder, paths[worker::workers], plain) for worker in range(workers)
+            processes.submit(draw_in_process, lut.folder, paths[part::workers], plain) for part in range(workers)
         ]
         for future in futures:
             future.result()

@@ -145,17 +145,14 @@ def _fetch(samples: Any, places: Any, count: int, target: int) -> None:
 def fetching(tables: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> Call:
     """Return a call that loads the samples of all pixels from each table; the width must be a multiple of GROUP."""
     height, width = picture.shape[:2]
-    positions = np.zeros((len(tables), height, width), np.uint32)
+    sites = np.zeros((len(tables), height, width), np.uint32)
     scratch = np.empty(SCRATCH_BYTES, np.uint8)
     table_shape = np.uint32(SAMPLES), np.uint32(5)
-    for light, target in enumerate(positions):
+    for light, target in enumerate(sites):
         _choose_all(picture.ctypes.data, width, height, light, *table_shape, target.ctypes.data, scratch.ctypes.data)
     starts = np.array([table.ctypes.data for table in tables])
     return lambda: _fetch(
-        starts,
-        positions.ctypes.data + positions.strides[0] * np.arange(len(positions)),
-        width * height,
-        scratch.ctypes.data,
+        starts, sites.ctypes.data + sites.strides[0] * np.arange(len(sites)), width * height, scratch.ctypes.data
     )
 
 
@@ -267,11 +264,7 @@ def measure_black(samples: npt.NDArray[np.uint16]) -> None:
     """Report the time for subtracting the print's black from all samples of an illuminant."""
     veil = Veil(np.array([300.0, 380.0, 330.0]), np.array([1.04, 1.04, 1.04]))
     call = partial(without_veil, samples, veil, WHITE)
-    report(
-        "black subtracted from the samples of an illuminant, one thread",
-        in_turns({"": call}, time.thread_time)[""],
-        "s",
-    )
+    report("black subtracted from samples, one thread", in_turns({"": call}, time.thread_time)[""], "s")
 
 
 def measure_start() -> None:

@@ -62,12 +62,8 @@ def measure(lut: Lut, name: str, black_share: float) -> None:
     scope = f"{len(lut.samples)} illuminants of {name}" + (", all black subtracted" if black_share else "")
     report("greys, largest angle to the illuminant", max(angles), "degrees", scope)
     if ratios:
-        all_ratios = np.concatenate(ratios)
-        for label, value in (
-            ("mean", all_ratios.mean()),
-            ("smallest", all_ratios.min()),
-            ("largest", all_ratios.max()),
-        ):
+        every_ratio = np.concatenate(ratios)
+        for label, value in (("mean", every_ratio.mean()), ("least", every_ratio.min()), ("most", every_ratio.max())):
             report(f"noise of greys 20 to 230, {label}", float(value), "ratio", f"photon transfer, {scope}")
         report("source colours that the print cannot show", float(rendering.map.outside.mean()), "share", name)
     report("smallest rise between neighbouring greys", smallest_rise, "standard errors", scope)

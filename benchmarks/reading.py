@@ -272,12 +272,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_size()
         return 0
     with tempfile.TemporaryDirectory() as scratch:
-        modules_by_command = measure(Path(scratch))
-    files = modules_by_command["acquire run"]
-    modules_by_command["acquire run, without the simulated lab"] = [
-        file for file in files if Path(file).parts[0] != "sim"
-    ]
-    for name, files in modules_by_command.items():
+        modules = measure(Path(scratch))
+    files = modules["acquire run"]
+    modules["acquire run, without the simulated lab"] = [file for file in files if Path(file).parts[0] != "sim"]
+    for name, files in modules.items():
         figure = {"name": f"modules used for one illuminant: {name}", "value": len(files), "unit": "modules"}
         print(json.dumps(figure | {"against": f"{BEFORE[name]} before small modules were merged"}), flush=True)
         lines = sum(len((ROOT / file).read_text(encoding="utf-8").splitlines()) for file in files)

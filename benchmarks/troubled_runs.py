@@ -303,7 +303,7 @@ class Cause:
     process: bool = False  # the run is a separate process, which is stopped for a while
 
 
-def _repeat(
+def _each(
     lab: TroubledLab, period_s: float, begins: Callable[[], object], ends: Callable[[], object], s: float
 ) -> None:
     """Let a fault occur for `s` seconds of each period."""
@@ -313,7 +313,7 @@ def _repeat(
 
 
 def _open_cable(lab: TroubledLab, s: float) -> None:
-    _repeat(lab, 2 * MINUTE_S, lab.pull_camera, lambda: lab.pull_camera(False), s)
+    _each(lab, 2 * MINUTE_S, lab.pull_camera, lambda: lab.pull_camera(False), s)
 
 
 def _hang_camera(lab: TroubledLab, s: float) -> None:
@@ -423,21 +423,19 @@ def outcome_of(cause: Cause, scratch: Path) -> Outcome:
     verdicts = [attempt.verdict for attempt in attempts]
     # Frames in progress when the budget is exceeded are still saved.
     budget = load_lab(path).sequence.refused_gb * 1e9 + 2 * max(frame.size for frame in accepted)
-    as_documented = unused <= budget and lab.most_notices_an_hour() <= 1
-    as_documented &= len({frame.step for frame in accepted}) == len(accepted)
-    as_documented &= (
-        (error is None) if not cause.ends else error is not None and bool(re.search(cause.ends, str(error)))
-    )
-    as_documented &= not cause.process or event_names.count("gap") == 1
+    is_right = unused <= budget and lab.most_notices_an_hour() <= 1
+    is_right &= len({frame.step for frame in accepted}) == len(accepted)
+    is_right &= (error is None) if not cause.ends else error is not None and bool(re.search(cause.ends, str(error)))
+    is_right &= not cause.process or event_names.count("gap") == 1
     if error is not None:
         make_lab(scratch, cause.grid)
         repeat_error = TroubledLab().take(path, folder)
         if repeat_error is not None:
             print(f"{cause.name}, again: {repeat_error}", file=sys.stderr)
-        as_documented &= repeat_error is None
+        is_right &= repeat_error is None
         with Session.open(folder) as session:
             accepted_steps = [attempt.step for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
-            as_documented &= sorted(accepted_steps) == [step.number for step in session.steps]
+            is_right &= sorted(accepted_steps) == [step.number for step in session.steps]
     return Outcome(
         cause,
         "continues" if error is None else f"ends ({type(error).__name__})",
@@ -448,7 +446,7 @@ def outcome_of(cause: Cause, scratch: Path) -> Outcome:
         event_names.count("resumed"),
         lab.most_notices_an_hour(),
         lab.clock_s() / MINUTE_S,
-        as_documented,
+        is_right,
     )
 
 
@@ -482,14 +480,14 @@ def _wait_for_pid(notices: Path) -> int:
 def causes(name_part: str = "") -> bool:
     """Print the table of causes; return whether all effects are as documented."""
     print(HEAD)
-    as_documented = True
+    is_right = True
     for cause in CAUSES:
         if name_part in cause.name:
             with tempfile.TemporaryDirectory() as scratch:
                 outcome = outcome_of(cause, Path(scratch))
             print(outcome.line(), flush=True)
-            as_documented &= outcome.as_documented
-    return as_documented
+            is_right &= outcome.as_documented
+    return is_right
 
 
 # Expected journal entries of a night: event and pattern of its detail, by fault.

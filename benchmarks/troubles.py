@@ -267,17 +267,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     false_remarks = 0
     for seed in range(options.first, options.first + options.rooms):
         troubles = random_troubles(seed)
-        verdict, remarks, errors = tried(seed, troubles, small=not options.full)
+        verdict, remarks, table = tried(seed, troubles, small=not options.full)
         verdicts[verdict] = verdicts.get(verdict, 0) + 1
         row: dict[str, Any] = {"room": seed, "troubles": troubles.to_json(), "verdict": verdict, "says": remarks}
-        if errors is not None:
-            tables.append(errors)
+        if table is not None:
+            tables.append(table)
             false_remarks += verdict != "accept" and troubles == Troubles()
             row |= {
-                "true_deg": errors.light_deg.round(4).tolist(),
-                "stated_deg": errors.light_uncertainty.round(4).tolist(),
+                "true_deg": table.light_deg.round(4).tolist(),
+                "stated_deg": table.light_uncertainty.round(4).tolist(),
             }
-            row |= {"cells_within": round(float((errors.cell <= errors.cell_uncertainty).mean()), 3)}
+            row |= {"cells_within": round(float((table.cell <= table.cell_uncertainty).mean()), 3)}
         print(json.dumps(row), flush=True)
     return _census(tables, verdicts, false_remarks)
 
@@ -285,15 +285,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _census(tables: Sequence[ReportedErrors], verdicts: dict[str, int], false_remarks: int) -> int:
     """Print the figures of all LUTs; return 1 if the reported uncertainties are too small."""
     true_deg, uncertainty_deg = (
-        np.concatenate([getattr(errors, name) for errors in tables]) for name in ("light_deg", "light_stated")
+        np.concatenate([getattr(table, name) for table in tables]) for name in ("light_deg", "light_uncertainty")
     )
-    cell, cell_uncertainty = (
-        np.concatenate([getattr(errors, name) for errors in tables]) for name in ("cell", "cell_stated")
+    patch, limits = (
+        np.concatenate([getattr(table, name) for table in tables]) for name in ("cell", "cell_uncertainty")
     )
     figures = {
         "ground truths within the uncertainty": float((true_deg <= uncertainty_deg).mean()),
         "ground truths beyond twice the uncertainty": float((true_deg > 2 * uncertainty_deg).sum()),
-        "patches within the uncertainty": float((cell <= cell_uncertainty).mean()),
+        "patches within the uncertainty": float((patch <= limits).mean()),
         "uncertainty / true error, median ground truth": float(np.median(uncertainty_deg / np.maximum(true_deg, 1e-6))),
         "rooms without trouble, but with remarks": float(false_remarks),
         **{f"rooms, {verdict}": float(count) for verdict, count in verdicts.items()},
