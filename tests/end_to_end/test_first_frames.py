@@ -110,9 +110,9 @@ def test_pauses_with_remedy_if_first_frames_never_agree(tmp_path: Path) -> None:
     flicker = [{"what": "lamp step", "percent": -10, "from_frame": n, "to_frame": n} for n in range(0, 400, 2)]
     outcome = run(tmp_path, *flicker)
     assert outcome.end != "complete"
-    remedies = [line for line in lines_of(outcome.messages, "refused") if "the same command later" in line]
+    remedies = [line for line in lines_of(outcome.messages, "refused") if "or when the command is run again" in line]
     assert remedies
-    assert "one of the first frames may be the odd one" in remedies[0]
+    assert "one of the first frames (white, dark or a primary) may be wrong" in remedies[0]
     assert not any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in outcome.attempts)
 
 
@@ -129,10 +129,10 @@ def test_follows_and_reports_lasting_change(tmp_path: Path) -> None:
 
 def test_refuses_failing_lamp_in_each_run_and_follows_recovery(tmp_path: Path) -> None:
     first = run(tmp_path, {"what": "lamp step", "percent": -21, "from_frame": 27})
-    assert "paper white is -21 %" in first.end
+    assert "by -21 % since the first frame" in first.end
     assert first.verdicts["voided"] == 0, "earlier frames were judged separately"
     second = run_again(tmp_path)
-    assert "paper white is -21 %" in second.end
+    assert "by -21 % since the first frame" in second.end
     voided = [attempt.kind for attempt in second.attempts if attempt.verdict == VOIDED]
     assert set(voided) <= {"response"}, "only the frames that link runs are repeated"
     for settings in (tmp_path / "LAB.toml", tmp_path / "session" / "session.toml"):
@@ -148,6 +148,6 @@ def test_refuses_failing_lamp_in_each_run_and_follows_recovery(tmp_path: Path) -
 def test_refuses_black_illuminant_before_the_run(tmp_path: Path) -> None:
     make_lab(tmp_path)
     save_illuminations([Illumination(0, "uniform", None, BLACK)], tmp_path / "illuminations.csv")
-    with pytest.raises(InputError, match=r"light 0 .*0, 0, 0.*take it out"):
+    with pytest.raises(InputError, match=r"illuminant 0 .*0, 0, 0.*delete it"):
         run_session(load_lab(tmp_path / "LAB.toml"), tmp_path / "another", lambda count, total: None)
     assert not (tmp_path / "another").exists()

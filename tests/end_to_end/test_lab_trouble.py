@@ -111,7 +111,7 @@ def free_port() -> int:
     [
         (
             'control = "serial"\nlanguage = "optoma"\nhost = "127.0.0.1"',
-            "Optoma projectors are reached over a serial port only",
+            "Optoma projectors have only a serial port",
         ),
         ('control = "serial"\nlanguage = "epson"\nbaud = 12345678901\ndevice = "{port}"', "set another speed"),
     ],

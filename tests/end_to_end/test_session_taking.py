@@ -232,7 +232,7 @@ def test_recommended_exposure_is_good(lab: Path, capsys: pytest.CaptureFixture[s
     text = lab.read_text() + "[camera]\nshutter_s = "
     lab.write_text(f"{text}1.3\n")
     assert run("check", lab) == 4
-    (shutter_s,) = re.findall(r"set camera\.shutter_s = (\S+) \(tried: [\d.]+ %\)", capsys.readouterr().out)
+    (shutter_s,) = re.findall(r"set camera\.shutter_s = (\S+) \(measured: [\d.]+ %\)", capsys.readouterr().out)
     assert abs(float(shutter_s) * 60 - round(float(shutter_s) * 60)) < 0.01, "whole turns of a wheel of 60 Hz"
     lab.write_text(f"{text}{shutter_s}\n")
     assert run("check", lab) == 0
