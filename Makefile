@@ -1,6 +1,6 @@
 # Two commands on a fresh machine with Python 3.11+ and make: `make demo` and `make test`. Each installs what it needs.
 
-# Where it is set, each worker of pytest would compile every test anew.
+# If it is set, each worker of pytest compiles every test again.
 unexport PYTHONDONTWRITEBYTECODE
 
 PYTHON ?= python3
@@ -16,7 +16,7 @@ ROOMS := foundation drivers sim experiment calibration acquisition synthesis gen
 
 .PHONY: install demo test suite quick lint docs bench full-session lock clean
 
-# The first part of the lock: what a plain installation has, and the photographs of the demo.
+# First part of the lock: a plain installation, and the photographs of the demo.
 $(DEMO_READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; name one with make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
@@ -28,10 +28,10 @@ $(READY): $(DEMO_READY)
 	$(INSTALL) --requirement requirements.lock
 	touch $@
 
-# What the demo needs, into .venv; no more than a plain installation and a few photographs.
+# Install the needs of the demo into .venv: a plain installation and a few photographs.
 install: $(DEMO_READY)
 
-# The main job in the simulated lab: print, light, photograph, calibrate, generate. About 12 lights, full-size frames.
+# The whole workflow in the simulated laboratory, with 12 illuminants and full-size frames.
 demo: $(DEMO_READY)
 	rm -rf $(DEMO)
 	mkdir -p $(DEMO)
@@ -48,17 +48,17 @@ demo: $(DEMO_READY)
 	$(BIN)/evaluate train kernel-ridge $(DEMO)/dataset --out $(DEMO)/model.npz
 	@echo
 	@echo "Raw linear images with their ground truth:  $(CURDIR)/$(DEMO)/dataset"
-	@echo "How the table was measured:                 $(CURDIR)/$(DEMO)/lut/report.html"
+	@echo "Report on the look-up table (LUT):          $(CURDIR)/$(DEMO)/lut/report.html"
 	@echo "Look at this first:                         $(CURDIR)/$(DEMO)/contact_sheet.png"
 
-# Lint runs beside the tests, which wait for programs and servers now and then; by one thread, which takes less in all.
+# Lint runs in parallel with the tests, which sometimes wait for programs; one thread needs the least total time.
 test: $(READY)
 	$(MAKE) --no-print-directory --jobs 2 --output-sync=line THREADS=1 lint suite
 
 suite: $(READY)
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
-# What most mistakes are caught by: every test function that takes no longer than a tenth of a second.
+# Test functions that take at most 0.1 s; they find most mistakes.
 quick: $(READY)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"
 
@@ -68,7 +68,7 @@ lint: $(READY)
 	$(BIN)/lint-imports
 	$(BIN)/pyrefly check --threads $(THREADS) --progress-bar no --min-severity error
 
-# The site: tutorial, how-to, reference from the docstrings, explanation; a warning is an error. Needs no network.
+# Site with tutorial, how-to, reference and explanation; warnings are errors. Needs no network.
 docs: $(READY)
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --jobs auto --doctree-dir build/doctrees docs build/site
 	@echo "The site: $(CURDIR)/build/site/index.html"
@@ -76,11 +76,11 @@ docs: $(READY)
 bench: $(READY)
 	@for file in benchmarks/[!_]*.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
 
-# A complete table of full-size frames, 707 lights, in the simulated lab: half an hour or more, 60 GB of disk meanwhile.
+# A complete LUT of 707 illuminants from full-size simulated frames: at least half an hour and 60 GB of disk space.
 full-session: $(DEMO_READY)
 	$(BIN)/python examples/full_session.py build/full-session
 
-# Rewrites the lock from pyproject.toml, the demo's part first; needs the network.
+# Write the lock from pyproject.toml again, the part of the demo first; needs the network.
 COMPILE = $(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	--no-emit-find-links --no-annotate --custom-compile-command "make lock" --quiet --extra demo
 lock:

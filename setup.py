@@ -1,4 +1,4 @@
-"""The long description: README.md without what leads into the repository. All else is in pyproject.toml."""
+"""The long description: README.md without links into the repository. All other settings are in pyproject.toml."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from pathlib import Path
 
 from setuptools import setup
 
-WHERE = "Pages and folders that are named here are in the source distribution: `docs/`, `examples/`, `CONTRIBUTING.md`."
+NOTE = "The pages and folders named here are in the source distribution: `docs/`, `examples/`, `CONTRIBUTING.md`."
 
 
 def long_description(readme: str) -> str:
-    """Return README for a package index, which shows neither its pictures nor the pages that it links to.
+    """Return README for a package index, without pictures and without links to pages of the repository.
 
-    A repository's address is not known; were it, links could lead there.
+    The address of the repository is not known, so links cannot lead there.
     """
     readme = re.sub(r"^!\[[^\]]*\]\((?!https?:)[^)]*\)\n+(?:\*.*\*\n+)?", "", readme, flags=re.MULTILINE)
     readme = re.sub(r"\[([^\]]*)\]\((?!https?:)[^)]*\)", r"\1", readme)
-    return f"{readme}\n{WHERE}\n"
+    return f"{readme}\n{NOTE}\n"
 
 
 if __name__ == "__main__":

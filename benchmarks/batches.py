@@ -1,8 +1,8 @@
-"""How fast training crops are drawn: `python -m benchmarks.batches [--lut LUT]` prints one JSON object a line.
+"""Speed of drawing training crops: `python -m benchmarks.batches [--lut LUT]` prints one JSON object per line.
 
-Crops of 128×128 px, each under a light of its own, from a table on disk; without `--lut` one of full size, 707 lights
-and 3.5 GB, is made of shot noise in a temporary folder first. Programs and modes, by codes and by colour, take turns in
-one run. With one thread the time is the processor's, else the clock's.
+Crops of 128 × 128 px are read from a LUT on disk; each crop has its own illuminant. Without `--lut`, a full-size LUT of
+shot noise (707 illuminants, 3.5 GB) is first written to a temporary folder. Programs and modes (by codes, by colour)
+take turns in one run. With one thread the time is processor time, otherwise wall time.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LIGHTS = 707
 def numpy_crops(
     lut: Lut, gallery: Gallery, count: int, random: np.random.Generator
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]:
-    """Return what a straightforward program makes: the same kind of crops, by numpy's take."""
+    """Draw the same kind of crops with a simple NumPy program."""
     images = np.empty((count, 3, SIDE, SIDE), np.float32)
     lights: npt.NDArray[np.int64] = random.integers(len(lut.samples), size=count)
     for image, light in zip(images, lights.tolist(), strict=True):
@@ -50,12 +50,12 @@ def numpy_crops(
 
 
 def rate(seconds: list[float], crops: int) -> float:
-    """Return crops a second of the median round."""
+    """Return crops per second in the median round."""
     return crops / median(seconds)
 
 
 def _by_colour(crops: Crops) -> Crops:
-    """Return the same crops rendered by colour, a random share of the print's black taken out."""
+    """Return the same crops rendered by colour, with a random share of the print's black removed."""
     return Crops(
         crops.lut,
         crops.gallery,
@@ -68,56 +68,57 @@ def _by_colour(crops: Crops) -> Crops:
 
 
 def measure(lut: Lut) -> None:
-    """Print every figure of a table."""
+    """Print all figures of one LUT."""
     gallery = gallery_of([np.roll(natural_picture(1536, 1024), 97 * turn, axis=1) for turn in range(8)])
     random = np.random.default_rng(1)
-    size = np.prod(lut.samples.shape) * 2 / 1e9
-    what = f"crops of {SIDE}x{SIDE} from {len(lut.samples)} lights, {size:.2f} GB"
-    # Every page of the table is read once, so that no round waits for the disk.
+    size_gb = np.prod(lut.samples.shape) * 2 / 1e9
+    description = f"crops of {SIDE}x{SIDE} from {len(lut.samples)} lights, {size_gb:.2f} GB"
+    # Read every page of the LUT once, so that no round waits for the disk.
     int(np.asarray(lut.samples).reshape(-1)[::2048].max())
-    ours = {
+    crops_by_threads = {
         threads: Crops(lut, gallery, (SIDE, SIDE), exposure=(0.5, 1.0), threads=threads, rendering="codes")
         for threads in sorted({1, processor_count()})
     }
-    coloured: dict[int, list[float]] = {threads: [] for threads in ours}
-    spent: dict[int, list[float]] = {threads: [] for threads in ours}
-    by_colour = {threads: _by_colour(crops) for threads, crops in ours.items()}
-    peer: list[float] = []
+    seconds_by_colour: dict[int, list[float]] = {threads: [] for threads in crops_by_threads}
+    seconds_by_codes: dict[int, list[float]] = {threads: [] for threads in crops_by_threads}
+    colour_crops = {threads: _by_colour(crops) for threads, crops in crops_by_threads.items()}
+    numpy_s: list[float] = []
     for turn in range(ROUNDS + 1):
         start = time.thread_time()
         numpy_crops(lut, gallery, BATCH // 4, random)
-        peer.append(time.thread_time() - start)
-        for threads, crops in ours.items():
+        numpy_s.append(time.thread_time() - start)
+        for threads, crops in crops_by_threads.items():
             clock = time.thread_time if threads == 1 else time.perf_counter
-            # The first of a row finds the processor's memory full of the other program's numbers.
+            # Do not count the first batch of a row: the cache still holds data of the other program.
             for number in range(turn * IN_A_ROW, (turn + 1) * IN_A_ROW):
-                for mode, times in ((crops, spent), (by_colour[threads], coloured)):
+                for mode, times in ((crops, seconds_by_codes), (colour_crops[threads], seconds_by_colour)):
                     start = clock()
                     mode.batch(np.arange(number * BATCH, (number + 1) * BATCH))
                     if number % IN_A_ROW:
                         times[threads].append(clock() - start)
-    slow = rate(peer[1:], BATCH // 4)
-    report("numpy take, one thread", slow, "crops/s", what)
-    for threads, seconds in spent.items():
-        fast = rate(seconds[IN_A_ROW - 1 :], BATCH)
-        report(f"batches, {threads} threads", fast, "crops/s", what)
-        report(f"batches, {threads} threads", fast / slow, "ratio", "numpy take, one thread")
-        with_cells = rate(coloured[threads][IN_A_ROW - 1 :], BATCH)
-        report(f"batches by colour, black taken out, {threads} threads", with_cells, "crops/s", what)
-        report(f"batches by colour, black taken out, {threads} threads", with_cells / fast, "ratio", "batches by codes")
+    numpy_rate = rate(numpy_s[1:], BATCH // 4)
+    report("numpy take, one thread", numpy_rate, "crops/s", description)
+    for threads, seconds in seconds_by_codes.items():
+        code_rate = rate(seconds[IN_A_ROW - 1 :], BATCH)
+        report(f"batches, {threads} threads", code_rate, "crops/s", description)
+        report(f"batches, {threads} threads", code_rate / numpy_rate, "ratio", "numpy take, one thread")
+        colour_rate = rate(seconds_by_colour[threads][IN_A_ROW - 1 :], BATCH)
+        report(f"by colour, black removed, {threads} threads", colour_rate, "crops/s", description)
+        report(f"by colour, black removed, {threads} threads", colour_rate / code_rate, "ratio", "batches by codes")
 
 
 def main() -> None:
-    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lut", type=Path, help="folder of a table of 5 bits")
-    parser.add_argument("--lights", type=int, default=LIGHTS, help="lights of the table that is made without --lut")
-    chosen = parser.parse_args()
-    if chosen.lut is not None:
-        measure(open_lut(chosen.lut))
+    parser.add_argument("--lut", type=Path, help="folder of a LUT with 5 bits")
+    parser.add_argument(
+        "--lights", type=int, default=LIGHTS, help="number of illuminants of the LUT that is made without --lut"
+    )
+    options = parser.parse_args()
+    if options.lut is not None:
+        measure(open_lut(options.lut))
         return
     with tempfile.TemporaryDirectory() as folder:
-        measure(noisy_table(Path(folder) / "lut", chosen.lights))
+        measure(noisy_table(Path(folder) / "lut", options.lights))
 
 
 if __name__ == "__main__":

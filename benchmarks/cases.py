@@ -1,14 +1,14 @@
-"""Foreign lenses and careless labs as named cases: rooms and frames in which a table went wrong, or was said to.
+"""Difficult lenses and careless laboratories as named cases: rooms and frames with a known fault.
 
-Each `NamedCase` is a room, frames that are not what the plan says, and what a verdict may say of it: words of the right
-causes, words of wrong ones. `try_case` takes a short session in it, builds its table and holds it against the truth:
+Each `NamedCase` has a room, frames that differ from the plan, and the causes that a verdict may name: right and wrong
+ones, as regular expressions. `try_case` takes a short session, builds its LUT and compares it with the truth:
 
-- *silent*: a light is `WRONG_DEG` off, or a cell's mean of 300 counts and more by `WRONG_SHARE`, its light's brightness
-  included, by more than twice what the table states of it (k = 2), and the verdict is to accept or says nothing of a
-  right cause;
-- *wrong cause*: the verdict says what is not so, or nothing of a right cause, whether a table came of it or not;
-- *false remark*: something is remarked on where nothing is the matter;
-- *unsaid*: the table is right, and what should be said of it is not.
+- *silent*: the LUT is wrong, and the verdict accepts it or names no right cause. Wrong means: a ground truth is off by
+  `WRONG_DEG`, or a patch mean of at least 300 counts (brightness error included) by `WRONG_SHARE`, and by more than
+  twice the reported uncertainty (k = 2);
+- *wrong cause*: the verdict names a wrong cause or no right cause, with or without a LUT;
+- *false remark*: a remark although nothing is wrong;
+- *unsaid*: the LUT is right, but an expected remark is missing.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ from sim.optics import MILD_SHOULDERS, STRONG_SHOULDERS
 from sim.world.sensors import BODIES
 from sim.world.world import Blob, Glare, Room, Situation, World
 
+# Ground truth error, in degrees, that counts as wrong; errors in random rooms are within 0.02°.
 WRONG_DEG: Final = 0.1
-"""Angle from which a light's ground truth is wrong; those of random rooms are within 0.02."""
 
+# Relative error of a patch mean that counts as wrong: three standard deviations of its noise at 300 counts.
 WRONG_SHARE: Final = 0.03
-"""Error from which a cell's mean is wrong: three standard deviations of its noise at 300 counts."""
 
 HALF: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.25)
 FAST: Final = ExposureSettings(iso=200, aperture=8.0, shutter_s=0.25)
@@ -69,57 +69,47 @@ _GLARE: Final = r"reflection|glare|mirror"
 _SPREAD: Final = r"bleed|neighbouring (?:cells|patches)|neighbours'? (light|colour)|spread|veil|correction"
 
 
+# Causes that are wrong in most cases.
 _NOT_SO: Final = rf"{_STAINED}|{_BRILLIANT}|{_HAND}|{_GLARE}"
-"""Causes that most cases are not."""
 
 
 @dataclass(frozen=True, eq=False)
 class NamedCase:
-    """A case.
-
-    - `name`, `what`: what it is called, and what it is.
-    - `right`: words, as a regular expression, one of which a remark or a refusal must have where the table is wrong.
-    - `wrong`: words of causes that are not there; ``.`` where nothing is the matter.
-    - `changes`: how frames differ, from the room and the plan.
-    - `room`: how the room differs.
-    - `lights`: of the plan, by name.
-    - `settings`: the session's settings.
-    - `every`: lights from one white reference to the next.
-    - `must_say`: whether the right words are expected although the table is right.
-    """
+    """One case: a room, the changes of its frames, and the causes that a verdict may name."""
 
     name: str
     what: str
-    right: str
-    wrong: str
+    right: str  # regular expression of right causes; a remark or refusal must match it if the LUT is wrong
+    wrong: str  # regular expression of wrong causes; "." if nothing is wrong
+    # differences of frames from room and plan
     changes: Callable[[World, Chart, Sequence[Illuminant]], Changes] = lambda world, chart, lights: as_planned
-    room: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    room: Mapping[str, Any] = field(default_factory=dict[str, Any])  # differences from the default room
     lights: Mapping[str, Colour] = field(default_factory=lambda: dict(EIGHT_LIGHTS))
     settings: str = "rig = 'simulated'\n"
-    every: int = 25
-    must_say: bool = False
+    every: int = 25  # illuminants between two white references
+    must_say: bool = False  # the right cause is expected although the LUT is right
 
 
 def _other_camera(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
     body = replace(world.body, model="Canon EOS 5D Mark II", sensitivities="Canon_EOS_5D_Mark_II")
-    other = World(world.sheet, body, world.room)
-    foreign = FrameChange(world=other, serial="000000000077")
-    return lambda step: foreign if light_named(lights, step) in ("warm", "violet") else AS_PLANNED
+    world_of_body = World(world.sheet, body, world.room)
+    changed = FrameChange(world=world_of_body, serial="000000000077")
+    return lambda step: changed if light_named(lights, step) in ("warm", "violet") else AS_PLANNED
 
 
-def _exchanged(one: str, two: str) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
-    """Return that the files of two lights stand for each other."""
-    first, second = EIGHT_LIGHTS[one], EIGHT_LIGHTS[two]
+def _exchanged(first_name: str, second_name: str) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
+    """Exchange the files of two illuminants."""
+    first, second = EIGHT_LIGHTS[first_name], EIGHT_LIGHTS[second_name]
 
     def changes(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
-        shown = {one: FrameChange(colour=second), two: FrameChange(colour=first)}
-        return lambda step: shown.get(light_named(lights, step) or "", AS_PLANNED)
+        exchanged = {first_name: FrameChange(colour=second), second_name: FrameChange(colour=first)}
+        return lambda step: exchanged.get(light_named(lights, step) or "", AS_PLANNED)
 
     return changes
 
 
 def _exchanged_reference(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
-    """Return that the first white reference and the frame of the red primary stand for each other."""
+    """Exchange the first white reference and the frame of the red primary."""
 
     def changes(step: SessionStep) -> FrameChange:
         if step.number == 0:
@@ -130,7 +120,7 @@ def _exchanged_reference(world: World, chart: Chart, lights: Sequence[Illuminant
 
 
 def _lights_alone(*names: str, **change: Any) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
-    """Return a change of some lights' frames."""
+    """Change the frames of some illuminants."""
     changed = FrameChange(**change)
 
     def changes(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
@@ -140,77 +130,75 @@ def _lights_alone(*names: str, **change: Any) -> Callable[[World, Chart, Sequenc
 
 
 def _whites(**change: Any) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
-    """Return a change of the white references' frames."""
     changed = FrameChange(**change)
     return lambda world, chart, lights: lambda step: changed if step.kind == "white" else AS_PLANNED
 
 
 def _later_white(**change: Any) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
-    """Return a change of all white references' frames but the first."""
+    """Change all white references except the first."""
     changed = FrameChange(**change)
     return lambda world, chart, lights: lambda step: changed if step.kind == "white" and step.number else AS_PLANNED
 
 
 def _all(**change: Any) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
-    """Return a change of every frame."""
     changed = FrameChange(**change)
     return lambda world, chart, lights: lambda step: changed
 
 
 def _later(**change: Any) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
-    """Return a change of every frame from the sixth on."""
+    """Change every frame from `_MIDWAY` on."""
     changed = FrameChange(**change)
     return lambda world, chart, lights: lambda step: changed if step.number >= _MIDWAY else AS_PLANNED
 
 
+# First step with a lasting change in a short session: half of its illuminants are taken.
 _MIDWAY: Final = 6
-"""The step from which a lasting change of a short session is there: after half of its lights."""
 
 
 def _hot_photosite(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
-    """Return that one photosite in the middle of the darkest cell stands 3000 counts too high, in dark frames too."""
+    """Add 3000 counts to one photosite in the middle of the darkest patch, in dark frames too."""
     darkest = int(np.argmin(chart.rgb.astype(np.int64).sum(axis=1)))
     column, row = np.round(world.project(chart.centres_mm[darkest])).astype(np.int64).tolist()
-    place = world.body.visible.top + 2 * row, world.body.visible.left + 2 * column + 1
-    changed = FrameChange(counts_added={place: 3000})
+    site = world.body.visible.top + 2 * row, world.body.visible.left + 2 * column + 1
+    changed = FrameChange(counts_added={site: 3000})
     return lambda step: changed
 
 
 def _other_print(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
-    """Return that another print of as many colours hangs there midway, its tags where the first's were."""
+    """Replace the print midway by another with as many colours; its tags are at the same positions."""
     small = chart.colour_count < _FULL_COLOURS
-    other = world_of(chart_of(small, seed=7), world.body, world.room)
-    changed = FrameChange(world=other)
+    second_world = world_of(chart_of(small, seed=7), world.body, world.room)
+    changed = FrameChange(world=second_world)
     return lambda step: changed if step.number >= _MIDWAY else AS_PLANNED
 
 
 class _Settling(World):
-    """A room in which the picture has not settled: part of another light's picture is in each frame."""
+    """A room whose projector is still changing: each frame contains part of another illuminant."""
 
-    def __init__(self, world: World, other: Colour, share: float) -> None:
+    def __init__(self, world: World, previous: Colour, share: float) -> None:
         super().__init__(world.sheet, world.body, world.room)
-        self._other, self._share = other, share
+        self._previous, self._share = previous, share
 
     def decoded(self, colour: Colour) -> npt.NDArray[np.float64]:
-        """Return the light of each primary, the other light's part included, as `World.decoded`."""
-        return (1 - self._share) * super().decoded(colour) + self._share * super().decoded(self._other)
+        """Return the light of each primary as `World.decoded`, including the part of the previous illuminant."""
+        return (1 - self._share) * super().decoded(colour) + self._share * super().decoded(self._previous)
 
 
-def _mixed(light: str, other: str, share: float) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
-    """Return that a share of another light is in a light's frame."""
+def _mixed(light: str, previous: str, share: float) -> Callable[[World, Chart, Sequence[Illuminant]], Changes]:
+    """Mix a share of another illuminant into the frame of `light`."""
 
     def changes(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
-        mixed = FrameChange(world=_Settling(world, EIGHT_LIGHTS[other], share))
+        mixed = FrameChange(world=_Settling(world, EIGHT_LIGHTS[previous], share))
         return lambda step: mixed if light_named(lights, step) == light else AS_PLANNED
 
     return changes
 
 
 class _CutWorld(World):
-    """A room whose camera's files are cut and filled with zeros: the last third of the sensor's rows."""
+    """A room whose camera writes zeros in the last third of the sensor rows."""
 
     def expose(self, *arguments: Any, **named: Any) -> npt.NDArray[np.uint16]:
-        """Return a frame, as `World.expose`, without its last third."""
+        """Return a frame as `World.expose` does, without its last third."""
         counts = super().expose(*arguments, **named)
         counts[2 * len(counts) // 3 :] = 0
         return counts
@@ -222,10 +210,10 @@ def _cut(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes:
 
 
 class _BandedWorld(World):
-    """A room whose sensor gives each row an offset of its own in each frame."""
+    """A room whose sensor adds a random offset to each row of each frame."""
 
     def expose(self, *arguments: Any, **named: Any) -> npt.NDArray[np.uint16]:
-        """Return a frame, as `World.expose`, with offsets of 2 counts, standard deviation."""
+        """Return a frame as `World.expose` does; the row offsets have a standard deviation of 2 counts."""
         counts = super().expose(*arguments, **named)
         rows = 2.0 * np.random.default_rng((self.room.seed, *named["key"])).standard_normal((len(counts), 1))
         return np.clip(np.rint(counts + rows), 0, self.body.saturation).astype(np.uint16)
@@ -240,20 +228,21 @@ def _banded(world: World, chart: Chart, lights: Sequence[Illuminant]) -> Changes
     return lambda step: banded
 
 
+# Colours of a chart with five bits.
 _FULL_COLOURS: Final = 32768
-"""Of a chart of five bits."""
 
+# A broad reflection on most of the upper half of the print.
 _SPOT: Final = (0.1, -0.2, 0.9, 0.8)
-"""A broad reflection: most of the upper half of the print."""
 
+# Hand and forearm in front of the print.
 _HAND_AT: Final = (0.55, 0.35, 0.68, 0.7)
-"""Hand and forearm before the print."""
 
+# The cases, in the order of the printed table.
 CASES: Final[tuple[NamedCase, ...]] = (
     NamedCase("nothing-wrong", "a good lens, a good lab", r"(?!)", r".", room={"veil": 0.002, "lateral_red_px": 0.3}),
     NamedCase(
         "other-camera",
-        "two of eight lights from another camera; model and serial number in the file",
+        "two of eight illuminants from another camera; the files contain its model and serial number",
         r"camera|model|serial|bod(y|ies)\b",
         _NOT_SO,
         _other_camera,
@@ -274,7 +263,7 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "white-red",
-        "the files of the white light and the red primary exchanged",
+        "the files of the white illuminant and the red primary exchanged",
         r"exchang|name|order|codes",
         _NOT_SO,
         _exchanged("white", "red"),
@@ -288,21 +277,21 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "half-exposed",
-        "two lights at half the exposure, as their files say",
+        "two illuminants at half the exposure, as recorded in their files",
         r"expos|shutter",
         _NOT_SO,
         _lights_alone("warm", "violet", settings=HALF),
     ),
     NamedCase(
         "half-exposed-whites",
-        "the white references at half the exposure, as their files say",
+        "the white references at half the exposure, as recorded in their files",
         r"expos|shutter",
         _NOT_SO,
         _whites(settings=HALF),
     ),
     NamedCase(
         "other-iso",
-        "two lights at twice the ISO speed and half the time: as bright, and noisier",
+        "two illuminants at twice the ISO speed and half the time: equally bright, but noisier",
         r"ISO|expos",
         _NOT_SO,
         _lights_alone("warm", "violet", settings=FAST),
@@ -332,21 +321,21 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "hot-photosite",
-        "one photosite 3000 counts too high in a dark cell, in every frame",
+        "one photosite 3000 counts too high in a dark patch, in every frame",
         r"\bhot\b",
         _NOT_SO,
         _hot_photosite,
     ),
     NamedCase(
         "fall-off",
-        "corners at half of the middle's light",
+        "half as much light in the corners as in the centre",
         r"fall-?off|vignett|corner",
         _NOT_SO,
         room={"vignetting": 0.45, "projector_falloff": 0.2},
     ),
     NamedCase(
         "short-waves",
-        "waves of 150 mm, 6 mm high, and a curl of 25 mm before a wide-angle lens",
+        "waves of 150 mm, 6 mm high, and a curl of 25 mm, with a wide-angle lens",
         r"\brim\b|edges? of|uncertain|wav|curl|flat",
         _NOT_SO,
         room={"waviness_mm": 6.0, "wave_mm": 150.0, "curl_mm": 25.0, "focal_diagonals": 0.8},
@@ -360,28 +349,28 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "hand-in-white",
-        "a hand before the print in the second white reference",
+        "a hand in front of the print in the second white reference",
         _HAND + r"|object",
         rf"{_STAINED}|{_BRILLIANT}",
         _later_white(situation=Situation(blobs=(Blob(_HAND_AT),))),
     ),
     NamedCase(
         "hand-in-light",
-        "a hand before the print in one light",
+        "a hand in front of the print under one illuminant",
         _HAND + r"|object",
         rf"{_STAINED}|{_BRILLIANT}",
         _lights_alone("warm", situation=Situation(blobs=(Blob(_HAND_AT),))),
     ),
     NamedCase(
         "broad-glare",
-        "the print mirrors 3 % of paper's light in a broad spot, in every frame",
+        "a broad reflection of 3 % of the paper's light, in every frame",
         _GLARE,
         rf"{_STAINED}|{_BRILLIANT}|{_HAND}",
         _all(situation=Situation(glares=(Glare(_SPOT, 0.03),))),
     ),
     NamedCase(
         "leak",
-        "light of the room, 1 % of white, in half of the lights and in no dark frame",
+        "room light of 1 % of white under half of the illuminants, but in no dark frame",
         r"room light|light of the room|ambient|stray light|\bleak",
         rf"{_STAINED}|{_BRILLIANT}|{_HAND}",
         _lights_alone("red", "blue", "warm", "violet", situation=Situation(ambient=(0.01, 0.01, 0.01))),
@@ -396,37 +385,37 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "stain",
-        "a thumb's stain on the print, in every frame",
+        "a stain on the print, in every frame",
         r"probably a stain",
         rf"{_BRILLIANT}|\bhands?\b",
         room={"stain_mm": 25.0, "stain_depth": 0.3},
     ),
     NamedCase(
         "bump",
-        "the print pushed by 3 px midway, and followed",
+        "the print moves by 3 px midway; the sampling grid follows",
         r"mov|push|bump|displac",
         _NOT_SO,
         _later(situation=Situation(bump_px=(2.6, 1.5))),
     ),
     NamedCase(
         "defocus",
-        "the lens turned midway: σ grows by 0.9 px",
+        "the focus changes midway: σ grows by 0.9 px",
         r"focus|blur|soft|sharp",
         _NOT_SO,
         _later(situation=Situation(defocus_px=0.9)),
     ),
     NamedCase(
         "other-print",
-        "another print hangs there midway",
+        "another print is used from the middle of the session on",
         r"print|poster|chart",
         rf"{_STAINED}|{_BRILLIANT}|{_GLARE}",
         _other_print,
     ),
-    # In a light without a code of 0 it is no error of the table: the ground truth is what was there, and eight lights
-    # say too little of the tone curve to tell 5 % from it.
+    # An illuminant without a code of 0 makes no wrong LUT: its ground truth is the light that was there. Eight
+    # illuminants do not determine the tone curve well enough to detect 5 %.
     NamedCase(
         "mixed-red",
-        "5 % of blue in the frame of the red primary: the picture had not settled",
+        "5 % of blue in the frame of the red primary: the projected image had not settled",
         r"settle|another light|name",
         _NOT_SO,
         _mixed("red", "blue", 0.05),
@@ -434,15 +423,15 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "mixed-dim",
-        "5 % of white in a dim light's frame",
+        "5 % of white in the frame of a dim illuminant",
         r"settle|another light|name",
         _NOT_SO,
         _mixed("dim", "white", 0.05),
     ),
-    NamedCase("upside-down", "the chart hangs upside down", r"(?!)", r".", room={"roll_deg": 180.0}),
+    NamedCase("upside-down", "the chart is upside down", r"(?!)", r".", room={"roll_deg": 180.0}),
     NamedCase(
         "wrong-iso",
-        "every file states another ISO speed than the session's settings",
+        "every file records another ISO speed than the settings of the session",
         r"\bISO\b",
         _NOT_SO,
         _all(settings=FAST),
@@ -451,7 +440,7 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "banding",
-        "photosites differ by 2 %, and rows have offsets of 2 counts",
+        "photosite response differs by 2 %, rows have offsets of 2 counts",
         r"hot|noise|photosites|sensor|rows",
         _NOT_SO,
         _banded,
@@ -459,7 +448,7 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "shadow-in-primary",
-        "a tenth of the light lacks in the frame of the red primary",
+        "a tenth of the light is missing in the frame of the red primary",
         r"one primary",
         rf"{_STAINED}|{_BRILLIANT}|{_GLARE}",
         _lights_alone("red", situation=Situation(lamp=(0.9, 0.9, 0.9))),
@@ -467,14 +456,14 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "shadow-on-primary",
-        "a shadow that takes a tenth of the light from a part of the print, in the frame of the red primary",
+        "a shadow of a tenth of the light on part of the print, in the frame of the red primary",
         _HAND,
         rf"{_STAINED}|{_BRILLIANT}|{_GLARE}",
         _lights_alone("red", situation=Situation(blobs=(Blob(_HAND_AT, left=0.9),))),
     ),
     NamedCase(
         "cut-file",
-        "the last third of a light's frame is zeros",
+        "the last third of one frame is zero",
         r"zeros",
         _NOT_SO,
         _cut,
@@ -482,7 +471,7 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "colour-wheel",
-        "a wheel of 50 turns a second, and exposures that end within a turn",
+        "a colour wheel with 50 turns per second, and exposures that end within a turn",
         r"wheel",
         _NOT_SO,
         _all(settings=ExposureSettings(iso=100, aperture=8.0, shutter_s=0.51)),
@@ -492,7 +481,7 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "hot-photosites",
-        "2800 hot photosites of a million",
+        "2800 hot photosites per million",
         r"\bhot\b",
         rf"{_NOT_SO}|focus",
         room={"hot_per_million": 2800.0},
@@ -500,7 +489,7 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "one-white",
-        "the white references are one file",
+        "all white references are the same file",
         r"is that of another frame|one photograph",
         _NOT_SO,
         _one_white,
@@ -509,76 +498,67 @@ CASES: Final[tuple[NamedCase, ...]] = (
     ),
     NamedCase(
         "mild-glare",
-        "the print mirrors 2 % of paper's light in a broad spot, in every frame",
+        "a broad reflection of 2 % of the paper's light, in every frame",
         _GLARE,
         rf"{_STAINED}|{_BRILLIANT}|{_HAND}",
         _all(situation=Situation(glares=(Glare(_SPOT, 0.02),))),
     ),
 )
-"""The rows of the table, and what else the causes of a verdict are to tell apart."""
 
+# Failures of a verdict.
 FAILURES: Final = ("silent", "wrong_cause", "false_remark", "unsaid")
-"""What a verdict on a case must not be."""
 
 BY_NAME: Final[Mapping[str, NamedCase]] = {case.name: case for case in CASES}
 
 
 @cache
 def chart_of(small: bool, seed: int = 1) -> Chart:
-    """Return a chart of 32768 colours on A0, or a small one of 512 on A5."""
+    """Return a chart of 32768 colours on A0, or a small one of 512 colours on A5."""
     return design_chart(3, A_SERIES_MM["A5"], seed) if small else design_chart(5, A_SERIES_MM["A0"], seed)
 
 
+# Figure of a verdict: error remaining after lens correction.
 LENS_LEFT: Final = "correction_residual"
-"""The row of a verdict on what the lens leaves."""
 
+# The reported RMS error counts as correct if the RMS error of the LUT is within this many standard errors.
 _TRUE_WITHIN: Final = 2.0
-"""Standard errors within which the RMS error of a table must lie for the error that its report states to be true."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What came of a session.
+    """Result of one session."""
 
-    - `verdict`: ``accept``, ``accept with remarks`` or ``refuse``.
-    - `rows`: names of the verdict's rows that are not accepted; of a refusal by an error, nothing.
-    - `says`: the remarks, or the refusal, as the user reads them.
-    - `truth`: the table against the truth; None where there is none.
-    - `lens_left`: RMS error of cells' means that the report says the lens leaves; 0 where nothing is said of it.
-    """
-
-    verdict: str
-    rows: tuple[str, ...]
-    says: tuple[str, ...]
-    truth: TableTruth | None
-    lens_left: float = 0.0
+    verdict: str  # accept, accept with remarks, or refuse
+    rows: tuple[str, ...]  # figures that are not accepted; empty after an error
+    says: tuple[str, ...]  # remarks or refusal, as the user reads them
+    truth: TableTruth | None  # the LUT compared with the truth; None without a LUT
+    lens_left: float = 0.0  # reported RMS error of patch means after lens correction
 
     @property
-    def told(self) -> tuple[str, ...]:
-        """What is said beside the error that the lens may leave, where that figure is true.
+    def remarks_without_lens(self) -> tuple[str, ...]:
+        """Remarks without the one about the remaining lens error, if that figure is correct.
 
-        A chart of few colours cannot show a veil, and says so whether there is one or not.
+        A chart of few colours cannot show veiling glare and reports so in any case.
         """
-        covers = self.truth is None or self.truth.rms <= _TRUE_WITHIN * self.lens_left
-        if not covers or len(self.rows) != len(self.says):
+        is_correct = self.truth is None or self.truth.rms <= _TRUE_WITHIN * self.lens_left
+        if not is_correct or len(self.rows) != len(self.says):
             return self.says
         return tuple(text for row, text in zip(self.rows, self.says, strict=True) if row != LENS_LEFT)
 
     @property
     def is_wrong(self) -> bool:
-        """Whether there is a table, and a light or a cell in it is wrong, by more than twice what is stated of it."""
+        """Whether an error in the LUT exceeds both the limit and twice the reported uncertainty."""
         truth = self.truth
         return truth is not None and bool(
-            (truth.light_deg > np.maximum(WRONG_DEG, 2 * truth.light_stated)).any()
-            or (truth.cell_error > np.maximum(WRONG_SHARE, 2 * truth.cell_stated))[truth.lit].any()
+            (truth.light_deg > np.maximum(WRONG_DEG, 2 * truth.light_uncertainty)).any()
+            or (truth.cell_error > np.maximum(WRONG_SHARE, 2 * truth.cell_uncertainty))[truth.lit].any()
         )
 
     def mentions(self, words: str) -> bool:
-        """Return whether a remark or the refusal has words, a regular expression, whatever their case."""
+        """Return whether a remark or the refusal matches a regular expression, ignoring case."""
         return any(re.search(words, text, re.IGNORECASE) for text in self.says)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the outcome for a line of JSON."""
         row: dict[str, Any] = {"verdict": self.verdict, "rows": list(self.rows)}
         if self.truth is not None:
             truth = self.truth
@@ -599,11 +579,11 @@ class Outcome:
 def outcome_of(
     session: Session, folder: Path, world: World, chart: Chart, changes: Changes = as_planned, every: int = 25
 ) -> Outcome:
-    """Build a session's table in a folder, and return what came of it."""
+    """Build the LUT of a session in a folder and return the result."""
     try:
         result = build(session, folder)
-    except CropError as refused:
-        return Outcome("refuse", (), (str(refused),), None)
+    except CropError as error:
+        return Outcome("refuse", (), (str(error),), None)
     verdict = result.verdict
     says = tuple(remark(row, result.figures) for row in verdict.remarks)
     truth = compare(result, open_lut(folder), world, chart, session, changes, every)
@@ -614,7 +594,7 @@ def outcome_of(
 
 
 def try_case(case: NamedCase, *, small: bool, seed: int = 1, body: str = "EOS 550D") -> dict[str, Any]:
-    """Take a short session in a case, build and judge its table, and return a line of JSON on it."""
+    """Take and build a short session of a case and return one JSON line about it."""
     started = time.perf_counter()
     chart, lights = chart_of(small), short_plan(case.lights)
     room = replace(Room(seed=seed), **case.room)
@@ -624,17 +604,17 @@ def try_case(case: NamedCase, *, small: bool, seed: int = 1, body: str = "EOS 55
         tempfile.TemporaryDirectory() as folder,
         short_session(Path(folder) / "session", chart, world, changes, lights, case.every, case.settings) as session,
     ):
-        found = outcome_of(session, Path(folder) / "lut", world, chart, changes, case.every)
-    # What a small chart cannot know is no false remark; of a full one it is.
-    told = replace(found, says=found.told if small else found.says)
-    right, wrong = found.mentions(case.right), told.mentions(case.wrong)
-    if LENS_LEFT in found.rows and len(found.told) == len(found.says):
-        # A figure that is less than the error says nothing of it.
-        right = False
-    row: dict[str, Any] = {"case": case.name, "what": case.what} | found.to_json()
-    row["silent"] = found.is_wrong and not right
-    row["wrong_cause"] = case.wrong != "." and bool(told.says) and (wrong or not right)
-    row["false_remark"] = case.wrong == "." and bool(told.says)
-    row["unsaid"] = case.must_say and not right
+        outcome = outcome_of(session, Path(folder) / "lut", world, chart, changes, case.every)
+    # A small chart cannot detect everything: for it, a remark about the remaining lens error is not false.
+    judged = replace(outcome, says=outcome.remarks_without_lens if small else outcome.says)
+    names_right, names_wrong = outcome.mentions(case.right), judged.mentions(case.wrong)
+    if LENS_LEFT in outcome.rows and len(outcome.remarks_without_lens) == len(outcome.says):
+        # A figure that is smaller than the true error does not explain it.
+        names_right = False
+    row: dict[str, Any] = {"case": case.name, "what": case.what} | outcome.to_json()
+    row["silent"] = outcome.is_wrong and not names_right
+    row["wrong_cause"] = case.wrong != "." and bool(judged.says) and (names_wrong or not names_right)
+    row["false_remark"] = case.wrong == "." and bool(judged.says)
+    row["unsaid"] = case.must_say and not names_right
     row["seconds"] = round(time.perf_counter() - started, 1)
     return row

@@ -1,9 +1,9 @@
-"""What `acquire check` says of simulated rooms: verdicts on both sides of their limits, false alarms in good rooms.
+"""Results of `acquire check` in simulated rooms: verdicts on both sides of the limits, and false alarms in good rooms.
 
-    python -m benchmarks.checks              # charts of 1 to 3 bits before a small sensor: two minutes
-    python -m benchmarks.checks --full       # and the full chart before an EOS 550D: three minutes more
+    python -m benchmarks.checks              # charts of 1 to 3 bits with a small sensor: two minutes
+    python -m benchmarks.checks --full       # adds the full chart with an EOS 550D: three minutes more
 
-Good rooms are the default one with other seeds: other paper, waves, noise and photosites.
+Good rooms are the default room with other seeds: other paper, waves, noise and photosites.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ from experiment.chart.layout import design_chart
 from experiment.config import load_lab
 from experiment.lights import plan_illuminants, save_illuminants
 
+# Seeds of the good rooms.
 SEEDS = range(30)
-"""Of the good rooms."""
 
+# Figure of interest, bits of the chart, and differences from the default room (`shutter_s` of the camera, with lamp
+# brightness to match).
 ROOMS: tuple[tuple[str, int, dict[str, Any]], ...] = (
     *(
         ("brightest_share", 2, {"white_level_share": share})
@@ -41,9 +43,8 @@ ROOMS: tuple[tuple[str, int, dict[str, Any]], ...] = (
     *(("white_drift_deg", 2, {"wheel_hz": 60.0, "shutter_s": time}) for time in (1 / 60, 0.1, 0.5)),
     *(("unfit_share", 2, {"hot_per_million": rate}) for rate in (20.0, 300.0)),
 )
-"""The figure that is looked at, bits of the chart, and what differs from the default room (`shutter_s` of the camera,
-with light to suit it)."""
 
+# The same for the full chart on A0.
 FULL: tuple[tuple[str, int, dict[str, Any]], ...] = (
     *(
         ("doubtful_share", 5, {"stain_mm": size, "stain_depth": depth})
@@ -52,11 +53,10 @@ FULL: tuple[tuple[str, int, dict[str, Any]], ...] = (
     ("doubtful_share", 5, {"fold_mm": 5.0}),
     ("evenness", 5, {"vignetting": 0.4}),
 )
-"""The same for the full chart on A0."""
 
 
 def check(folder: Path, bits: int, room: dict[str, Any], seed: int = 1) -> CheckReport:
-    """Return what a check says of a room; full charts hang before an EOS 550D."""
+    """Check a room; full charts are photographed by an EOS 550D."""
     chart = folder / f"chart{bits}.json"
     if not chart.exists():
         design_chart(bits).save(chart)
@@ -76,30 +76,31 @@ def check(folder: Path, bits: int, room: dict[str, Any], seed: int = 1) -> Check
 
 
 def main() -> None:
-    """Print the table of rooms, then the false alarms."""
     full = "--full" in sys.argv[1:]
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        print(f"{'figure':<18}{'bits':<6}{'room':<52}{'grade':<13}said")
+        print(f"{'figure':<18}{'bits':<6}{'room':<52}{'grade':<13}message")
         for name, bits, room in (*ROOMS, *(FULL if full else ())):
             report = check(folder, bits, room)
-            found = next((each for each in report.findings if each.name == name), not_checked(name, "not measured"))
-            others = [each.name for each in report.with_grade("fault") if each.name != name]
-            told = ", ".join(f"{key} {value:g}" for key, value in room.items())
-            more = f" [also at fault: {', '.join(others)}]" if others else ""
-            print(f"{name:<18}{bits:<6}{told:<52}{found.grade:<13}{found.said[:110]}{more}", flush=True)
-        alarms = 0
+            found = next((found for found in report.findings if found.name == name), not_checked(name, "not measured"))
+            other_faults = [found.name for found in report.with_grade("fault") if found.name != name]
+            differences = ", ".join(f"{key} {value:g}" for key, value in room.items())
+            suffix = f" [also at fault: {', '.join(other_faults)}]" if other_faults else ""
+            print(f"{name:<18}{bits:<6}{differences:<52}{found.grade:<13}{found.said[:110]}{suffix}", flush=True)
+        alarm_count = 0
         for bits in (1, 2, 3):
             for seed in SEEDS:
                 report = check(folder, bits, {}, seed)
-                for each in (*report.with_grade("fault"), *report.with_grade("remark")):
-                    alarms += 1
-                    print(f"false alarm: {bits} bits, seed {seed}: {each.name}: {each.sentence()}")
-        print(f"false alarms in {3 * len(SEEDS)} good rooms: {alarms}")
+                for found in (*report.with_grade("fault"), *report.with_grade("remark")):
+                    alarm_count += 1
+                    print(f"false alarm: {bits} bits, seed {seed}: {found.name}: {found.sentence()}")
+        print(f"false alarms in {3 * len(SEEDS)} good rooms: {alarm_count}")
         if full:
             reports = [check(folder, 5, {}, seed) for seed in range(3)]
-            bad = [each for report in reports for each in (*report.with_grade("fault"), *report.with_grade("remark"))]
-            print(f"false alarms in 3 good rooms with the full chart: {len(bad)}")
+            full_alarms = [
+                found for report in reports for found in (*report.with_grade("fault"), *report.with_grade("remark"))
+            ]
+            print(f"false alarms in 3 good rooms with the full chart: {len(full_alarms)}")
 
 
 if __name__ == "__main__":

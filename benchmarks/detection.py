@@ -1,14 +1,16 @@
-"""What the live judge sees, and what it takes for a fault that is none: `python -m benchmarks.detection`.
+"""Detected faults and false alarms of the live judge: `python -m benchmarks.detection`.
 
-Four tables, as Markdown. Detection: each disturbance and size, tried in several simulated rooms at several lights,
-deep blues, whites and dark frames among them: how often it was refused at its frame, at the next, or not at all, and by
-which causes. False alarms: frames refused in undisturbed sessions, a room each, some with a lamp that drifts and a
-sensor that warms up, some with projectors that do not add, remember the picture before, or with other light that
-flickers. Neighbours: which of the plan's 707 lights could stand for one another without being told.
+It prints four Markdown tables:
 
-Frames are simulated (`sim.world`): a small body and chart for most, an EOS 550D before the whole chart with ``--full``.
-The disturbances are those of `benchmarks.disturbance_trials`, the undisturbed sessions of `benchmarks.false_alarms`.
-The fourth table has whole runs in which causes come and go (`benchmarks.troubled_runs`).
+- detection: each disturbance and size is tried in several simulated rooms and under several illuminants (also deep
+  blue, white and dark frames). The table counts detections at the same frame, at the next one or never, and the causes;
+- false alarms: rejected frames in undisturbed sessions, one room each. Some rooms have a drifting lamp and a warming
+  sensor, or a projector that is not additive, depends on the previous image or flickers;
+- neighbours: illuminants of the plan (707) that could replace each other undetected;
+- whole runs with intermittent causes (`benchmarks.troubled_runs`).
+
+Frames are simulated (`sim.world`), mostly with a small body and chart; ``--full`` adds an EOS 550D with the whole
+chart. Disturbances come from `benchmarks.disturbance_trials`, undisturbed sessions from `benchmarks.false_alarms`.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import numpy as np
 from acquisition.judge import limits
 from acquisition.judge.state import ProjectorModel
 from benchmarks.disturbance_trials import detection
-from benchmarks.false_alarms import false_alarms, odd_worlds
+from benchmarks.false_alarms import false_alarms, unusual_worlds
 from benchmarks.judged_labs import Lab, lab_of, rooms
 from benchmarks.troubled_runs import causes
 from experiment.chart.layout import design_chart
@@ -34,84 +36,87 @@ from sim.world.world import Room
 
 
 def neighbours(model: ProjectorModel, plan: Sequence[Illuminant]) -> tuple[int, int, list[str]]:
-    """Return how many lights have another, and how many the next of the list, that they cannot be told from; and which.
+    """Count illuminants that cannot be distinguished from another one, and from the next of the plan; list the pairs.
 
-    A light that is seen instead is told if it would be on average: by `limits.STALE_SIGMAS` and `STALE_ADVANTAGE`.
+    Two illuminants are distinguished if a swap exceeds the limits `limits.STALE_SIGMAS` and `STALE_ADVANTAGE` on
+    average.
     """
     codes = [light.colour for light in plan]
-    amounts = np.array([model.predict(one).amounts for one in codes])
-    least = max(limits.STALE_SIGMAS, limits.STALE_ADVANTAGE**0.5)
+    amounts = np.array([model.predict(colour).amounts for colour in codes])
+    min_distance = max(limits.STALE_SIGMAS, limits.STALE_ADVANTAGE**0.5)
 
-    def told(seen: int, ordered: int) -> bool:
-        fit = model.compare(amounts[seen], codes[ordered])
-        return float(np.hypot(fit.distance, fit.brightness / fit.brightness_sd)) > least
+    def differs(shown_index: int, ordered_index: int) -> bool:
+        fit = model.compare(amounts[shown_index], codes[ordered_index])
+        return float(np.hypot(fit.distance, fit.brightness / fit.brightness_sd)) > min_distance
 
     pairs: set[tuple[int, int]] = set()
     for k in range(len(plan)):
-        near = np.argsort(np.linalg.norm(amounts - amounts[k], axis=1))[1:9].tolist()
-        pairs |= {(min(k, n), max(k, n)) for n in near if codes[n] != codes[k] and not (told(n, k) and told(k, n))}
-        pairs |= {(min(k, n), max(k, n)) for n in near if codes[n] == codes[k]}
-    lights = {one for pair in pairs for one in pair}
-    following = sum((k, k + 1) in pairs for k in range(len(plan) - 1))
-    return len(lights), following, [f"{tuple(plan[a].colour)} and {tuple(plan[b].colour)}" for a, b in sorted(pairs)]
+        nearest = np.argsort(np.linalg.norm(amounts - amounts[k], axis=1))[1:9].tolist()
+        pairs |= {
+            (min(k, n), max(k, n)) for n in nearest if codes[n] != codes[k] and not (differs(n, k) and differs(k, n))
+        }
+        pairs |= {(min(k, n), max(k, n)) for n in nearest if codes[n] == codes[k]}
+    ambiguous = {index for pair in pairs for index in pair}
+    followed = sum((k, k + 1) in pairs for k in range(len(plan) - 1))
+    return (
+        len(ambiguous),
+        followed,
+        [f"{tuple(plan[a].colour)} and {tuple(plan[b].colour)}" for a, b in sorted(pairs)],
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print; 0, or 1 where a run did not end, or go on, as the how-to says."""
+    """Measure and print; return 1 if a whole run did not end as documented, else 0."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.detection", description=__doc__)
-    parser.add_argument("--rooms", type=int, default=4, metavar="N", help="small rooms for the detection")
-    parser.add_argument(
-        "--tries", type=int, default=8, metavar="N", help="frames that a disturbance is tried at, a room"
-    )
-    parser.add_argument("--sessions", type=int, default=100, metavar="N", help="undisturbed sessions, a fifth drifting")
-    parser.add_argument("--lights", type=int, default=36, metavar="N", help="lights of such a session")
-    parser.add_argument("--full", action="store_true", help="an EOS 550D before the whole chart, too")
-    parser.add_argument("--frames-only", action="store_true", help="leave out the whole runs that go wrong")
+    parser.add_argument("--rooms", type=int, default=4, metavar="N", help="number of small rooms for the detection")
+    parser.add_argument("--tries", type=int, default=8, metavar="N", help="frames per disturbance and room")
+    parser.add_argument("--sessions", type=int, default=100, metavar="N", help="undisturbed sessions, 1/5 with drift")
+    parser.add_argument("--lights", type=int, default=36, metavar="N", help="illuminants of an undisturbed session")
+    parser.add_argument("--full", action="store_true", help="add an EOS 550D with the whole chart")
+    parser.add_argument("--frames-only", action="store_true", help="omit the whole runs")
     options = parser.parse_args(arguments)
-    began = time.monotonic()
+    start_s = time.monotonic()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         labs: list[Lab] = []
         for seed in range(options.rooms):
-            room, more = rooms(3 * seed + 1)
-            labs.append(lab_of(folder, room, **more))
+            room, lab_options = rooms(3 * seed + 1)
+            labs.append(lab_of(folder, room, **lab_options))
         if options.full:
             labs.append(lab_of(folder, Room(seed=9, wheel_hz=60), "EOS 550D", design_chart(5, "A0")))
         for number, lab in enumerate(labs):
-            for step, said in lab.session(options.lights, 12, number):
-                if not said.accepted:
-                    print(f"room {number}: {step.stem} refused: {said.reason}", file=sys.stderr)
-        print("| disturbance | size | tried | at the frame | at the next | missed | misnamed | causes |")
+            for step, judgement in lab.session(options.lights, 12, number):
+                if not judgement.accepted:
+                    print(f"room {number}: {step.stem} rejected: {judgement.reason}", file=sys.stderr)
+        print("| disturbance | size | tried | same frame | next frame | missed | wrong cause | causes |")
         print("|---|---|---|---|---|---|---|---|")
-        for (what, size), tally in detection(labs, options.tries).items():
-            named = ", ".join(f"{one} {count}" for one, count in tally.causes.most_common())
+        for (label, size), tally in detection(labs, options.tries).items():
+            counts_by_cause = ", ".join(f"{cause} {count}" for cause, count in tally.causes.most_common())
             tried = tally.at_once + tally.next + tally.missed
-            counts = f"{tried} | {tally.at_once} | {tally.next} | {tally.missed} | {tally.misnamed}"
-            print(f"| {what} | {size} | {counts} | {named} |")
+            counts = f"{tried} | {tally.at_once} | {tally.next} | {tally.missed} | {tally.wrong_cause}"
+            print(f"| {label} | {size} | {counts} | {counts_by_cause} |")
         if labs:
-            lights, following, which = neighbours(labs[0].judge.state.model, labs[0].plan)
+            lights, followed, pair_names = neighbours(labs[0].judge.state.model, labs[0].plan)
             scatter = labs[0].judge.state.model
-            print(
-                f"\nScatter learnt in the first room: {scatter.chroma_sd:.2%} of colours, {scatter.brightness_sd:.2%}."
-            )
-            print(f"{lights} of {len(labs[0].plan)} lights have another that could stand for them unnoticed;")
-            print(f"{following} of them are followed by it in the list: {'; '.join(which)}")
+            print(f"\nScatter, first room: colour {scatter.chroma_sd:.2%}, brightness {scatter.brightness_sd:.2%}.")
+            print(f"{lights} of {len(labs[0].plan)} illuminants could be replaced undetected;")
+            print(f"{followed} of them by the next of the plan: {'; '.join(pair_names)}")
         if options.sessions:
-            refused, frames, found = false_alarms(folder, options.sessions, options.lights, options.sessions // 5)
+            bad, frames, alarms = false_alarms(folder, options.sessions, options.lights, options.sessions // 5)
             print(
-                f"\nFalse alarms: {refused} of {options.sessions} sessions, {sum(found.values())} of {frames} frames",
+                f"\nFalse alarms: {bad} of {options.sessions} sessions, {sum(alarms.values())} of {frames} frames",
                 end="",
             )
-            print(f" ({', '.join(f'{one} {count}' for one, count in found.items())})" if found else "")
-            print("\n| world | frames | refused | causes | limit of light at the end |\n|---|---|---|---|---|")
-            for what, count, wrong, named, limit in odd_worlds(folder, options.lights):
-                print(f"| {what} | {count} | {wrong} | {dict(named) or ''} | {limit} |")
-    as_said = True
+            print(f" ({', '.join(f'{name} {count}' for name, count in alarms.items())})" if alarms else "")
+            print("\n| world | frames | rejected | causes | chromaticity limit at the end |\n|---|---|---|---|---|")
+            for label, count, rejected, counts_by_cause, limit in unusual_worlds(folder, options.lights):
+                print(f"| {label} | {count} | {rejected} | {dict(counts_by_cause) or ''} | {limit} |")
+    as_documented = True
     if not options.frames_only:
-        print("\nCauses that come and go, in whole runs:\n")
-        as_said = causes()
-    print(f"\n{time.monotonic() - began:.0f} s")
-    return int(not as_said)
+        print("\nIntermittent causes in whole runs:\n")
+        as_documented = causes()
+    print(f"\n{time.monotonic() - start_s:.0f} s")
+    return int(not as_documented)
 
 
 if __name__ == "__main__":

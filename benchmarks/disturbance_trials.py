@@ -1,4 +1,4 @@
-"""Disturbances of a frame, at which frames each is tried, and how often the live judge sees and names it."""
+"""Disturbances of a frame, the frames on which each is tried, and the detections by the live judge."""
 
 from __future__ import annotations
 
@@ -34,20 +34,16 @@ LIGHT, ANY, LIT, TWO_COLOURED = "lights", "any", "lit", "lights with more of red
 
 @dataclass(frozen=True)
 class Trial:
-    """A disturbance: its size, how it is made, whether it stays, and at which frames it is tried.
-
-    `NAMED` has what a sentence must say to have named its cause.
-    """
+    """A disturbance of one frame; `NAMED` holds the pattern that a message with the right cause matches."""
 
     name: str
-    size: str
-    events: tuple[AnyDisturbance, ...] = ()
-    stays: bool = True
-    at: str = LIGHT
-    special: str = ""
+    size: str  # description of its strength
+    events: tuple[AnyDisturbance, ...] = ()  # changes of the simulated room
+    stays: bool = True  # it lasts, so the next frame may detect it
+    at: str = LIGHT  # kinds of frames on which it is tried
+    special: str = ""  # disturbance outside the room: file, serial number, …
 
     def is_named_in(self, reason: str) -> bool:
-        """Return whether the reason of a refusal says what was done."""
         return re.search(NAMED[self.name], reason) is not None
 
 
@@ -101,6 +97,7 @@ TRIALS = (
 _ANOTHER_LIGHT = "still shows the previous|shows another illuminant|is not the ordered"
 _ELSEWHERE = "darken the room|other light than|other light falls on the chart|the room light has changed"
 
+# Pattern of the right cause for each disturbance; causes that one frame cannot distinguish are alternatives.
 NAMED = {
     "frozen screen, from a frame on": _ANOTHER_LIGHT,
     "stale frame": _ANOTHER_LIGHT,
@@ -123,22 +120,21 @@ NAMED = {
     "another ISO speed": "ISO speed 200",
     "colours exchanged": _ANOTHER_LIGHT,
 }
-"""What of each disturbance a sentence names; what cannot be told apart by one frame is named with its alternatives."""
 
 
 @dataclass
 class Tally:
-    """How often something was refused at its frame, at the next one, not at all, with another cause, and by which."""
+    """Counts of one disturbance: detected at the same frame, at the next, never; wrong causes; causes."""
 
     at_once: int = 0
     next: int = 0
     missed: int = 0
-    misnamed: int = 0
+    wrong_cause: int = 0
     causes: Counter[str] = field(default_factory=Counter)
 
 
 def steps_of(lab: Lab, at: str, random: np.random.Generator) -> Iterator[SessionStep]:
-    """Yield steps at which a disturbance is tried: lights of the plan, deep blue and red ones, white, black."""
+    """Yield the steps for a disturbance: illuminants of the plan, deep blue and red, white, black."""
     fixed = [Colour(0, 0, 255), Colour(255, 0, 0), Colour(255, 255, 255), Colour(0, 48, 255)]
     lights = [*fixed, *(lab.plan[int(k)].colour for k in random.permutation(len(lab.plan)))]
     if at == TWO_COLOURED:
@@ -151,10 +147,10 @@ def steps_of(lab: Lab, at: str, random: np.random.Generator) -> Iterator[Session
         yield SessionStep(number, "light", 0, colour)
 
 
-def disturbed(lab: Lab, trial: Trial, step: SessionStep, shown: Colour) -> Judgement:
-    """Return what is said of a frame of a step with a disturbance; `shown` is the light of the frame before."""
+def disturbed(lab: Lab, trial: Trial, step: SessionStep, previous: Colour) -> Judgement:
+    """Judge a frame with a disturbance; `shown` is the illuminant of the previous frame."""
     if trial.special == "frozen":
-        judgement = lab.show(lab.counts(shown), step)
+        judgement = lab.show(lab.counts(previous), step)
     elif trial.special == "exchanged":
         red, green, blue = step.colour
         judgement = lab.show(lab.counts(Colour(blue, green, red)), step)
@@ -172,40 +168,40 @@ def disturbed(lab: Lab, trial: Trial, step: SessionStep, shown: Colour) -> Judge
 
 
 def detection(labs: Sequence[Lab], tries: int) -> dict[tuple[str, str], Tally]:
-    """Return how often each disturbance was seen, tried so often in each lab."""
+    """Try each disturbance in each lab and count the detections."""
     table: dict[tuple[str, str], Tally] = {}
     for number, lab in enumerate(labs):
         random = np.random.default_rng(number)
         for trial in TRIALS:
             tally = table.setdefault((trial.name, trial.size), Tally())
             for step in itertools.islice(steps_of(lab, trial.at, random), tries):
-                before, after = (lab.plan[int(k)].colour for k in random.choice(len(lab.plan), 2, replace=False))
-                if step.colour in (before, after):
+                previous, following = (lab.plan[int(k)].colour for k in random.choice(len(lab.plan), 2, replace=False))
+                if step.colour in (previous, following):
                     continue
-                one = lab.fork()
-                counts = one.counts(before)
-                accepted = one.show(counts, SessionStep(8999, "light", 0, before))
-                one.before = before
+                fork = lab.fork()
+                counts = fork.counts(previous)
+                accepted = fork.show(counts, SessionStep(8999, "light", 0, previous))
+                fork.previous = previous
                 if not accepted.accepted:
-                    tally.causes["(frame before refused)"] += 1
+                    tally.causes["(previous frame rejected)"] += 1
                     continue
                 if trial.special == "file":
-                    said = one.show(counts, step)
+                    judgement = fork.show(counts, step)
                 elif trial.special == "again":
-                    said = one.show(counts, SessionStep(8999, "light", 0, before))
+                    judgement = fork.show(counts, SessionStep(8999, "light", 0, previous))
                 else:
-                    said = disturbed(one, trial, step, before)
-                if said.accepted and trial.stays:
-                    said = disturbed(one, trial, SessionStep(9999, "light", 0, after), before)
-                    tally.next += not said.accepted
+                    judgement = disturbed(fork, trial, step, previous)
+                if judgement.accepted and trial.stays:
+                    judgement = disturbed(fork, trial, SessionStep(9999, "light", 0, following), previous)
+                    tally.next += not judgement.accepted
                 else:
-                    tally.at_once += not said.accepted
-                tally.missed += said.accepted
-                tally.causes[cause(said) or "(missed)"] += 1
-                if said.accepted:
+                    tally.at_once += not judgement.accepted
+                tally.missed += judgement.accepted
+                tally.causes[cause(judgement) or "(missed)"] += 1
+                if judgement.accepted:
                     print(f"missed: {trial.name} {trial.size} at {step.kind} {step.colour}", file=sys.stderr)
-                elif not trial.is_named_in(said.reason):
-                    tally.misnamed += 1
-                    where = f"{trial.name} {trial.size} in room {number} at {step.kind} {step.colour}"
-                    print(f"misnamed: {where} after {before}: {said.reason}", file=sys.stderr)
+                elif not trial.is_named_in(judgement.reason):
+                    tally.wrong_cause += 1
+                    place = f"{trial.name} {trial.size} in room {number} at {step.kind} {step.colour}"
+                    print(f"wrong cause: {place} after {previous}: {judgement.reason}", file=sys.stderr)
     return table

@@ -1,8 +1,8 @@
-"""How fast images become files, and how large: `python -m benchmarks.encode` prints one JSON object a line.
+"""Speed of writing image files, and their size: `python -m benchmarks.encode` prints one JSON object per line.
 
-Calls alternate with `cv2.imencode` of the same image, and the fastest of each counts, so that ratios hold on a machine
-with other work to do. Three images drawn from a table: a photograph of 512 px; the same made 18 Mpx large, with the
-grain of a camera; and a picture of that size so smooth that few pixels share a colour.
+Calls alternate with `cv2.imencode` of the same image and the fastest of each counts, so the ratios are valid on a
+machine with other load. Three images are drawn from a LUT: a photograph of 512 px, the same enlarged to 18 Mpx with
+camera grain, and a smooth picture of that size in which few pixels share a colour.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from generator.files import FORMATS, ImageMetadata, encode_image
 from generator.kernels.rendering import draw_samples
 
 REPEATS = 3
+# Standard deviation of the grain, in 8-bit codes.
 GRAIN = 2.0
-"""Standard deviation of the grain, codes of 8 bits."""
 METADATA = ImageMetadata(12000, (4000.0, 4000.0, 4000.0), "Canon EOS 550D")
 
 
 def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
-    """Return a photograph (height, width, 3), enlarged where it is too small, and then with grain."""
+    """Return a photograph (height, width, 3); a larger size than the original is interpolated and gets grain."""
     picture = np.asarray(skimage.data.astronaut(), dtype=np.uint8)
     if (height, width) == picture.shape[:2]:
         return picture
@@ -40,8 +40,8 @@ def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
     return np.clip(np.rint(larger + grain), 0, 255).astype(np.uint8)
 
 
-def at_once(pool: ThreadPoolExecutor, calls: Sequence[Callable[[], object]]) -> None:
-    """Make some calls in the pool's threads and wait for all."""
+def call_in_threads(pool: ThreadPoolExecutor, calls: Sequence[Callable[[], object]]) -> None:
+    """Make calls in the threads of the pool and wait for all."""
     for future in [pool.submit(call) for call in calls]:
         future.result()
 
@@ -56,22 +56,22 @@ def main() -> None:
     }
     for (name, picture), form in itertools.product(pictures.items(), FORMATS):
         image = draw_samples(samples, picture)
-        usual = cv2.imencode(".png", image[..., ::-1])[1].size
+        reference_size = cv2.imencode(".png", image[..., ::-1])[1].size
         size = len(encode_image(image, form, METADATA))
         report(f"{form}, {name}, size", size / image.nbytes, "ratio", "the image in memory")
-        report(f"{form}, {name}, size", size / usual, "ratio", "PNG by cv2.imencode")
+        report(f"{form}, {name}, size", size / reference_size, "ratio", "PNG by cv2.imencode")
         with ThreadPoolExecutor(2) as pool:
-            ours = partial(encode_image, image, form, METADATA)
+            encode = partial(encode_image, image, form, METADATA)
             calls: dict[str, Callable[[], object]] = {
                 "cv2": partial(cv2.imencode, ".png", image),
-                "ours": ours,
-                "two": partial(at_once, pool, [ours, ours]),
+                "ours": encode,
+                "two": partial(call_in_threads, pool, [encode, encode]),
             }
-            took = in_turns(calls, time.perf_counter, REPEATS if picture.size > 10**7 else 20)
+            seconds = in_turns(calls, time.perf_counter, REPEATS if picture.size > 10**7 else 20)
         pixels = picture.size / 3e6
-        report(f"{form}, {name}, one thread", pixels / took["ours"], "Mpx/s")
-        report(f"{form}, {name}, one thread", took["cv2"] / took["ours"], "ratio", "PNG by cv2.imencode")
-        report(f"{form}, {name}, two threads", 2 * took["ours"] / took["two"], "ratio", "one thread")
+        report(f"{form}, {name}, one thread", pixels / seconds["ours"], "Mpx/s")
+        report(f"{form}, {name}, one thread", seconds["cv2"] / seconds["ours"], "ratio", "PNG by cv2.imencode")
+        report(f"{form}, {name}, two threads", 2 * seconds["ours"] / seconds["two"], "ratio", "one thread")
 
 
 if __name__ == "__main__":

@@ -1,13 +1,11 @@
-"""How fast methods estimate: `python -m benchmarks.evaluation` prints one JSON object a line.
+"""Speed of the methods: `python -m benchmarks.evaluation` prints one JSON object per line.
 
-Each method stands beside the NumPy and OpenCV that one would write for it in a few lines, on one thread, in turns with
-it; the fastest turn of each counts, by the processor's clock. The peers do the same work with the same exclusions:
-pixels saturated in a channel are left out with their neighbours (0.1 % of the image are saturated). In float32, as
-OpenCV is fastest; sums by `cv2.mean`, which is faster than NumPy's.
+Each method takes turns with a short NumPy and OpenCV version of itself, on one thread; the fastest turn of each counts,
+in processor time. Both versions do the same work with the same exclusions: saturated pixels and their neighbours are
+left out (0.1 % of the image are saturated). The versions use float32 and `cv2.mean`, which are fastest in OpenCV.
 
-From files to results is the mean rate of `evaluate` over PNG files of a generated dataset, in as many threads as there
-are processors, over that of reading the same files the same way and nothing else; again in turns. Takes
-three to four minutes.
+"Files to results" compares `evaluate` on the PNG files of a generated data set with reading the same files only, with
+as many threads as processors, also in turns. It takes three to four minutes.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks import words_given
+from benchmarks import parse_words
 from benchmarks.generator import noisy_table, photograph, report
 from evaluation.methods.gaussian import gaussian_kernel
 from evaluation.methods.gray_edge import GrayEdge
@@ -37,7 +35,7 @@ Image = npt.NDArray[np.uint16]
 
 
 def main() -> None:
-    words_given(__doc__)
+    parse_words(__doc__)
     cv2.setNumThreads(1)
     for size, (width, height) in SIZES.items():
         report_methods(size, test_image(width, height))
@@ -45,25 +43,29 @@ def main() -> None:
 
 
 def report_methods(size: str, image: Image) -> None:
-    """Report each method beside its peer, and what it saves that methods share an image's parts."""
+    """Report each method against its short version, and the gain of shared intermediate images."""
     pixels = image.size / 3e6
     turns = 15 if pixels < 1 else 3
-    several: list[Method] = []
+    methods: list[Method] = []
     for name, method in standard_methods().items():
         peer = peer_of(method)
         if peer is None:
             continue
-        several.append(method)
-        ours, theirs = in_turns(lambda method=method: method.estimate(image, SATURATION), peer_call(peer, image), turns)
-        report(f"{name}, {size}, one thread", pixels / ours, "Mpx/s", f"{theirs / ours:.2f} x NumPy and OpenCV")
-    ours, apart = in_turns(lambda: together(several, image), lambda: one_by_one(several, image), turns)
-    report(f"all of these, {size}, one thread", pixels / ours, "Mpx/s", f"{apart / ours:.2f} x one by one")
+        methods.append(method)
+        method_s, peer_s = in_turns(
+            lambda method=method: method.estimate(image, SATURATION), peer_call(peer, image), turns
+        )
+        report(f"{name}, {size}, one thread", pixels / method_s, "Mpx/s", f"{peer_s / method_s:.2f} x NumPy and OpenCV")
+    method_s, separate_s = in_turns(
+        lambda: estimate_shared(methods, image), lambda: estimate_separately(methods, image), turns
+    )
+    report(f"all of these, {size}, one thread", pixels / method_s, "Mpx/s", f"{separate_s / method_s:.2f} x one by one")
 
 
 def test_image(width: int, height: int) -> Image:
-    """Return a photograph as linear values, 0.1 % of its pixels saturated."""
+    """Return a photograph as linear values, with 0.1 % of its pixels saturated."""
     image = (photograph(width, height).astype(np.float32) ** 2.2 / 20).astype(np.uint16)
-    # Spots of 6 x 6 px that together are 0.1 % of the image.
+    # Spots of 6 × 6 px cover 0.1 % of the image.
     random = np.random.default_rng(0)
     for _ in range(width * height // 36000):
         y, x = random.integers(0, height - 6), random.integers(0, width - 6)
@@ -72,7 +74,7 @@ def test_image(width: int, height: int) -> Image:
 
 
 def peer_of(method: Method) -> Callable[[Image, npt.NDArray[np.uint8]], npt.NDArray[np.float64]] | None:
-    """Return what one would write for a method with NumPy and OpenCV, given the image and the pixels to use."""
+    """Return the short NumPy and OpenCV version of a method; it takes the image and the mask of used pixels."""
     if isinstance(method, BrightDark):
         return lambda image, used: bright_dark(image[used > 0], method.share)
     if isinstance(method, GrayEdge):
@@ -130,23 +132,23 @@ def bright_dark(pixels: Image, share: float) -> npt.NDArray[np.float64]:
     return np.abs(np.linalg.eigh(ends.T @ ends)[1][:, -1])
 
 
-def together(methods: list[Method], image: Image) -> object:
+def estimate_shared(methods: list[Method], image: Image) -> object:
     from evaluation.methods.prepared import estimate_all
 
     return estimate_all(methods, image, SATURATION)
 
 
-def one_by_one(methods: list[Method], image: Image) -> object:
+def estimate_separately(methods: list[Method], image: Image) -> object:
     return [method.estimate(image, SATURATION) for method in methods]
 
 
 def files_to_results() -> None:
-    """Report how much of the time from files to results is decoding, by the wall clock of all processors."""
+    """Report the share of decoding in the time from files to results, in wall time."""
     from evaluation.datasets import open_scenes
     from evaluation.experiments.running import evaluate
     from foundation.compiled import processor_count
 
-    chosen: Mapping[str, list[str]] = {
+    method_groups: Mapping[str, list[str]] = {
         "the paper's three": ["white-patch", "gray-world", "shades-of-gray"],
         "the first seven": [
             name for name, method in standard_methods().items() if isinstance(method, GrayEdge | BrightDark)
@@ -160,12 +162,12 @@ def files_to_results() -> None:
             with ThreadPoolExecutor(workers) as pool:
                 list(pool.map(_read, scenes))
 
-        for title, names in chosen.items():
+        for title, names in method_groups.items():
             methods = [standard_methods()[name] for name in names]
-            ours, bare = in_turns(
+            evaluate_s, decode_s = in_turns(
                 lambda methods=methods: evaluate(scenes, methods, workers), decode, 5, time.perf_counter
             )
-            report(f"files to results, {title}, {workers} threads", bare / ours, "of decoding alone", "0.9")
+            report(f"files to results, {title}, {workers} threads", decode_s / evaluate_s, "of decoding alone", "0.9")
 
 
 def _read(scene: Scene) -> int:
@@ -173,7 +175,7 @@ def _read(scene: Scene) -> int:
 
 
 def make_dataset(folder: Path) -> Path:
-    """Return a dataset of 24 PNG images of 1536 x 1024 px, a photograph with shot noise."""
+    """Generate a data set of 24 PNG images of 1536 × 1024 px from a photograph, with shot noise."""
     from generator.dataset.making import generate_dataset
     from generator.dataset.plan import DatasetOptions
     from generator.pictures.sources import find_pictures
@@ -183,8 +185,8 @@ def make_dataset(folder: Path) -> Path:
     for number in range(24):
         cv2.imwrite(str(folder / "pictures" / f"{number:02}.png"), np.roll(picture, 53 * number, axis=(0, 1)))
     table, sources = noisy_table(folder / "lut", 1), find_pictures([str(folder / "pictures")])
-    generate_dataset(table, folder / "made", sources, [0], options=DatasetOptions(previews=False))
-    return folder / "made"
+    generate_dataset(table, folder / "dataset", sources, [0], options=DatasetOptions(previews=False))
+    return folder / "dataset"
 
 
 def in_turns(
@@ -193,14 +195,14 @@ def in_turns(
     turns: int,
     clock: Callable[[], float] = time.process_time,
 ) -> tuple[float, float]:
-    """Return the seconds of the fastest of some calls of each, made in turns after one of each that does not count."""
+    """Return the seconds of the fastest call of each; the first call of each does not count."""
     times: list[list[float]] = [[], []]
     for turn in range(turns + 1):
-        for call, found in zip((first, second), times, strict=True):
+        for call, seconds in zip((first, second), times, strict=True):
             start = clock()
             call()
             if turn:
-                found.append(clock() - start)
+                seconds.append(clock() - start)
     return min(times[0]), min(times[1])
 
 

@@ -1,10 +1,9 @@
-"""What the page of a table waits for: a light is dragged over the plane, and each place asked for as the page does.
+"""Response times of the page of a LUT while an illuminant is dragged over the plane.
 
-`python -m benchmarks.explore [LUT]` prints one JSON object a line: median and slowest time of each answer over
-loopback, at 1000 x 750 px, and of the three that a page draws a light from, one after another (a page asks for both
-images at once). The demo table unless another is named. Each light is asked for once: none is in any cache, but for
-what a table keeps of its own lights. Where Chromium is installed, a last line has the time from a light's choice on the
-page to both pictures tone mapped and drawn.
+`python -m benchmarks.explore [LUT]` prints one JSON object per line: median and slowest time of each answer over
+loopback at 1000 × 750 px, and of the three answers that a page needs for an illuminant, one after another. Without an
+argument the demo LUT is used. Each illuminant is requested once, so no cache holds it, except for the illuminants of
+the LUT. If Chromium is installed, the last line is the time from choosing an illuminant to both drawn images.
 """
 
 from __future__ import annotations
@@ -30,9 +29,10 @@ from generator.lights.gamut import Gamut
 from generator.pictures.sources import Preparation, find_pictures
 from tests.acquisition.monitor.browser import CHROMIUM, browser_tab
 
+# Number of requested illuminants.
 PLACES = 40
-"""Lights that are asked for."""
 
+# Moves the illuminant on the page from place to place and returns each time, in ms.
 DRAGGED = """
 (async () => {
   const times = [];
@@ -47,14 +47,13 @@ DRAGGED = """
   return times;
 })()
 """
-"""A script that moves the light on the page from place to place, and comes to the time of each, ms."""
 
+# Size of the picture, px.
 SIZE = MAX_SIDE, 750
-"""Of the picture, px."""
 
 
 def _picture() -> bytes:
-    """Return a picture of smooth colours with the grain of a photograph, as PNG."""
+    """Return a PNG picture of smooth colours with photographic grain."""
     rng = np.random.default_rng(0)
     coarse = rng.integers(0, 256, (8, 12, 3)).astype(np.float32)
     smooth = np.asarray(cv2.resize(coarse, SIZE, interpolation=cv2.INTER_CUBIC), np.float64)
@@ -62,55 +61,58 @@ def _picture() -> bytes:
     return cv2.imencode(".png", grainy)[1].tobytes()
 
 
-def _ask(address: str, **query: object) -> tuple[float, bytes]:
-    begun = time.perf_counter()
-    with urllib.request.urlopen(f"{address}?{urllib.parse.urlencode(query)}") as answer:
-        body = answer.read()
-    return time.perf_counter() - begun, body
+def _request(address: str, **query: object) -> tuple[float, bytes]:
+    start = time.perf_counter()
+    with urllib.request.urlopen(f"{address}?{urllib.parse.urlencode(query)}") as response:
+        body = response.read()
+    return time.perf_counter() - start, body
 
 
-def _drawn(base: str, ways: npt.NDArray[np.float64]) -> list[float]:
-    """Return how long each of some chromaticities (N, 2) takes to be drawn on the page, ms."""
+def _drawing_times_ms(base: str, positions: npt.NDArray[np.float64]) -> list[float]:
+    """Return the drawing time on the page of each chromaticity (N, 2), in ms."""
     with browser_tab() as tab:
         tab.open(base)
         tab.wait_for("document.readyState === 'complete' && panels.length === 2 && panels.every((one) => one.drawn)")
-        # Lights that are not in the program's caches yet: a little beside those before.
-        return tab.value(DRAGGED.replace("PLACES", json.dumps((ways + 1e-4).tolist())))
+        # Shift the illuminants slightly, so that they are not cached.
+        return tab.value(DRAGGED.replace("PLACES", json.dumps((positions + 1e-4).tolist())))
 
 
 def main() -> None:
-    """Print the times."""
-    given = sys.argv[1] if len(sys.argv) > 1 else "demo:"
-    lut = open_lut(table_folder(Path(given)))
-    places = Gamut.of(lut).rb
-    ways = np.random.default_rng(1).dirichlet(np.ones(len(places)), PLACES + 1) @ places
+    lut_name = sys.argv[1] if len(sys.argv) > 1 else "demo:"
+    lut = open_lut(table_folder(Path(lut_name)))
+    lut_rb = Gamut.of(lut).rb
+    positions = np.random.default_rng(1).dirichlet(np.ones(len(lut_rb)), PLACES + 1) @ lut_rb
     with tempfile.TemporaryDirectory(prefix="crop-") as folder:
         (Path(folder) / "picture.png").write_bytes(_picture())
-        explorer = Explorer(given, lut, find_pictures([folder], Preparation(max_side=MAX_SIDE)))
+        explorer = Explorer(lut_name, lut, find_pictures([folder], Preparation(max_side=MAX_SIDE)))
         with ExploreServer(explorer, "127.0.0.1", 0) as server:
             Thread(target=server.serve_forever, daemon=True).start()
             base = f"http://127.0.0.1:{server.port}/"
             times: dict[str, list[float]] = {"light": [], "by codes": [], "by colour": [], "pixel": []}
-            for number, (r, b) in enumerate(ways):
-                took, body = _ask(f"{base}shown.json", picture=0, light=f"r={r:.5f},b={b:.5f}")
+            for number, (r, b) in enumerate(positions):
+                place_s, body = _request(f"{base}shown.json", picture=0, light=f"r={r:.5f},b={b:.5f}")
                 light = json.loads(body)["light"]
-                codes, image = _ask(f"{base}counts", picture=0, light=light, rendering="codes")
-                colour, _ = _ask(f"{base}counts", picture=0, light=light, rendering="colorimetric")
-                pixel, _ = _ask(f"{base}pixel.json", picture=0, light=light, x=500, y=400)
+                codes_s, image = _request(f"{base}counts", picture=0, light=light, rendering="codes")
+                colour_s, _ = _request(f"{base}counts", picture=0, light=light, rendering="colorimetric")
+                pixel_s, _ = _request(f"{base}pixel.json", picture=0, light=light, x=500, y=400)
                 assert len(image) == 8 + 6 * SIZE[0] * SIZE[1]
-                # The first compiles, and searches the print for colours, which is kept on disk.
+                # The first request compiles, and computes the colour map of the print, which is kept on disk.
                 if number:
-                    for name, seconds in zip(times, (took, codes, colour, pixel), strict=True):
+                    for name, seconds in zip(times, (place_s, codes_s, colour_s, pixel_s), strict=True):
                         times[name].append(1000 * seconds)
                 else:
-                    print(json.dumps({"answer": "first of a process", "ms": round(1000 * (took + codes + colour))}))
-            times["drawn by Chromium"] = _drawn(base, ways[1:]) if CHROMIUM else []
+                    print(json.dumps({"answer": "first request", "ms": round(1000 * (place_s + codes_s + colour_s))}))
+            times["drawn by Chromium"] = _drawing_times_ms(base, positions[1:]) if CHROMIUM else []
             server.shutdown()
-    times["light and both"] = [sum(parts) for parts in zip(*list(times.values())[:3], strict=True)]
-    for name, each in times.items():
-        if not each:
+    times["light and both"] = [sum(answers) for answers in zip(*list(times.values())[:3], strict=True)]
+    for name, times_ms in times.items():
+        if not times_ms:
             continue
-        print(json.dumps({"answer": name, "ms": round(statistics.median(each), 1), "slowest": round(max(each), 1)}))
+        print(
+            json.dumps(
+                {"answer": name, "ms": round(statistics.median(times_ms), 1), "slowest": round(max(times_ms), 1)}
+            )
+        )
 
 
 if __name__ == "__main__":

@@ -1,17 +1,15 @@
-"""Folder to folder, JPEG in, 16-bit PNG out: `python -m benchmarks.folder [--small]` prints one JSON object a line.
+"""Speed of JPEG folders to 16-bit PNG: `python -m benchmarks.folder [--small]` prints one JSON object per line.
 
-Against the program that first comes to mind (OpenCV reads and writes, numpy draws), in one process and in as many as
-there are workers, which are started and have the table before the clock runs; and against the
-encoder alone on the finished images with as many threads: once with the writing of its files, which is what a folder
-takes however its images came about, and once in memory, where what is encoded is thrown away. Neither of the two
-hashes, nor waits for the disk, as a dataset does. Where every processor is busy, nothing but waiting can be hidden
-behind an encoder, so its share of the processor time is reported too: no arrangement of the same work goes beyond. The
-faster the encoder, the less there is to hide behind, so the fastest in our libraries, ISA-L's deflate at level 1 of the
-same bytes unfiltered, is measured beside it.
+It is compared with a simple program (OpenCV reads and writes, NumPy draws), in one process and in as many processes
+as workers. These processes are started and have opened the LUT before the clock runs. It is also compared with the
+encoder alone on the finished images, with as many threads: once writing its files, once in memory. Neither of these
+two hashes data or waits for the disk, as a data set does. If all processors are busy, other work cannot overlap with
+encoding, so the ratio of processor times is reported too; it is the limit. A faster encoder leaves less time to
+overlap, so the fastest one of our libraries is also measured: ISA-L's deflate at level 1, without PNG filters.
 
-Runs alternate and the fastest of each counts. What an earlier run wrote is emptied and put aside before the clock runs,
-and removed at the end: where a file system has no journal, ext4 looks for a new file's inode past every one that was
-freed some seconds ago, which doubled the system time of whatever made many files.
+Runs alternate and the fastest of each counts. Files of an earlier run are truncated and moved away before the clock
+runs, and removed at the end. Without a journal, ext4 searches past every recently freed inode for a new file, which
+doubled the system time of programs that write many files.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 from isal import isal_zlib
 
-from benchmarks.encode import METADATA, at_once, photograph
+from benchmarks.encode import METADATA, call_in_threads, photograph
 from benchmarks.generator import SAMPLES, noisy_table, report
 from calibration.table.lut import Lut, open_lut
 from foundation.compiled import processor_count
@@ -43,8 +41,8 @@ from generator.pictures.sources import find_pictures
 from generator.rendering import Rendering
 from generator.stores import LocalStore
 
+# Number of 512 px pictures; with so many, the start and end of a data set take little of the time.
 SMALL_PICTURES = 400
-"""Pictures of 512 px: as many make what a data set takes once a small part."""
 
 LARGE_REPEATS = 3
 SMALL_REPEATS = 5
@@ -53,25 +51,25 @@ SMALL_REPEATS = 5
 def fastest(
     calls: Mapping[str, Callable[[], object]], repeats: int, prepare: Callable[[], object]
 ) -> dict[str, tuple[float, float]]:
-    """Return the least seconds, and the least processor seconds, of some calls of each, taken in turn.
+    """Return the shortest wall and processor times of the calls, in seconds; the calls take turns.
 
-    `prepare` is called before each, and not timed.
+    `prepare` is called before each, outside the measured time.
     """
-    took = dict.fromkeys(calls, (float("inf"), float("inf")))
+    fastest_s = dict.fromkeys(calls, (float("inf"), float("inf")))
     for _ in range(repeats):
         for name, call in calls.items():
             prepare()
-            start, busy = time.perf_counter(), time.process_time()
+            start, start_processor_s = time.perf_counter(), time.process_time()
             call()
-            took[name] = (
-                min(took[name][0], time.perf_counter() - start),
-                min(took[name][1], time.process_time() - busy),
+            fastest_s[name] = (
+                min(fastest_s[name][0], time.perf_counter() - start),
+                min(fastest_s[name][1], time.process_time() - start_processor_s),
             )
-    return took
+    return fastest_s
 
 
-def straightforward(samples: npt.NDArray[np.uint16], paths: Sequence[Path], out: Path) -> None:
-    """Make an image of each picture as one would without this suite; `samples` (32768, 25, 3) of one light."""
+def draw_with_numpy(samples: npt.NDArray[np.uint16], paths: Sequence[Path], out: Path) -> None:
+    """Make an image of each picture without CroP; `samples` (32768, 25, 3) of one illuminant."""
     rng = np.random.default_rng(0)
     for path in paths:
         picture = cv2.imread(str(path))
@@ -81,9 +79,9 @@ def straightforward(samples: npt.NDArray[np.uint16], paths: Sequence[Path], out:
         cv2.imwrite(str(out / f"{path.stem}.png"), image[..., ::-1])
 
 
-def in_a_process(folder: Path, paths: Sequence[Path], out: Path) -> None:
-    """Do the same in a process of a pool, which opens the table once and uses one thread."""
-    straightforward(_samples(folder), paths, out)
+def draw_in_process(folder: Path, paths: Sequence[Path], out: Path) -> None:
+    """Run `draw_with_numpy` in a process of a pool, which opens the LUT once and uses one thread."""
+    draw_with_numpy(_samples(folder), paths, out)
 
 
 @lru_cache
@@ -93,7 +91,7 @@ def _samples(folder: Path) -> npt.NDArray[np.uint16]:
 
 
 def images_of(folder: Path) -> list[npt.NDArray[np.uint16]]:
-    """Return the finished images of a dataset."""
+    """Return the finished images of a data set."""
     images: list[npt.NDArray[np.uint16]] = []
     for path in sorted((folder / "images").iterdir()):
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -103,25 +101,25 @@ def images_of(folder: Path) -> list[npt.NDArray[np.uint16]]:
 
 
 def by_isal(image: npt.NDArray[np.uint16]) -> int:
-    """Return the bytes of an image packed by ISA-L as PNG holds them: each row begins with its filter, none."""
+    """Return the size of an image compressed by ISA-L as PNG rows with filter 0, in bytes."""
     height, width, _ = image.shape
     rows = np.zeros((height, 1 + 6 * width), np.uint8)
     rows[:, 1:] = image.astype(">u2").reshape(height, -1).view(np.uint8)
     return len(isal_zlib.compress(rows.data, 1))
 
 
-def encode_away(image: npt.NDArray[np.uint16]) -> None:
-    """Encode an image and keep nothing."""
+def encode_and_discard(image: npt.NDArray[np.uint16]) -> None:
+    """Encode an image and discard the bytes."""
     for _ in encode_pieces(image, "png", METADATA):
         pass
 
 
 def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.uint8]], repeats: int) -> None:
-    sources, usual, ours, written, aside = (
+    sources, plain, ours, encoded_folder, old_folder = (
         scratch / folder for folder in ("sources", "usual", "ours", "written", "aside")
     )
     sources.mkdir()
-    aside.mkdir()
+    old_folder.mkdir()
     for number, picture in enumerate(pictures):
         cv2.imwrite(str(sources / f"{number:04d}.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
     workers = processor_count()
@@ -129,38 +127,40 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
     table, paths = np.array(lut.samples[0]), sorted(sources.iterdir())
 
     def clear() -> None:
-        for folder in (usual, ours, written):
+        for folder in (plain, ours, encoded_folder):
             if folder.is_dir():
                 for path in folder.rglob("*"):
                     if path.is_file():
                         os.truncate(path, 0)
-                folder.rename(tempfile.mkdtemp(dir=aside))
+                folder.rename(tempfile.mkdtemp(dir=old_folder))
 
-    def by_hand() -> None:
-        usual.mkdir()
-        straightforward(table, paths, usual)
+    def run_numpy() -> None:
+        plain.mkdir()
+        draw_with_numpy(table, paths, plain)
 
-    def by_hands(processes: ProcessPoolExecutor) -> None:
-        usual.mkdir()
-        shares = [processes.submit(in_a_process, lut.folder, paths[share::workers], usual) for share in range(workers)]
-        for share in shares:
-            share.result()
+    def run_numpy_processes(processes: ProcessPoolExecutor) -> None:
+        plain.mkdir()
+        futures = [
+            processes.submit(draw_in_process, lut.folder, paths[part::workers], plain) for part in range(workers)
+        ]
+        for future in futures:
+            future.result()
 
-    def by_suite(previews: bool = False, rendering: Rendering = "codes") -> None:
+    def run_crop(previews: bool = False, rendering: Rendering = "codes") -> None:
         options = DatasetOptions(previews=previews, rendering=rendering)
         generate_dataset(lut, ours, find_pictures([sources]), [0], options=options, workers=workers)
 
-    by_suite()
+    run_crop()
     images = images_of(ours)
     with (
         ThreadPoolExecutor(workers) as pool,
         ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as processes,
     ):
-        by_hands(processes)
-        sizes = [sum(path.stat().st_size for path in folder.iterdir()) for folder in (usual, ours / "images")]
+        run_numpy_processes(processes)
+        sizes = [sum(path.stat().st_size for path in folder.iterdir()) for folder in (plain, ours / "images")]
 
         def encode() -> None:
-            at_once(pool, [partial(encode_away, image) for image in images])
+            call_in_threads(pool, [partial(encode_and_discard, image) for image in images])
 
         packed: list[int] = []
 
@@ -168,9 +168,9 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
             packed[:] = pool.map(by_isal, images)
 
         def write() -> None:
-            written.mkdir()
-            put = LocalStore(written).put
-            at_once(
+            encoded_folder.mkdir()
+            put = LocalStore(encoded_folder).put
+            call_in_threads(
                 pool,
                 [
                     lambda number=number, image=image: put(f"{number:04d}.png", encode_pieces(image, "png", METADATA))
@@ -178,50 +178,53 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
                 ],
             )
 
-        took = fastest(
+        times_by_call = fastest(
             {
-                "usual": by_hand,
-                "processes": lambda: by_hands(processes),
+                "usual": run_numpy,
+                "processes": lambda: run_numpy_processes(processes),
                 "encoder": encode,
                 "files": write,
                 "isal": pack,
-                "previews": lambda: by_suite(previews=True),
-                "colour": lambda: by_suite(rendering="colorimetric"),
-                "ours": by_suite,
+                "previews": lambda: run_crop(previews=True),
+                "colour": lambda: run_crop(rendering="colorimetric"),
+                "ours": run_crop,
             },
             repeats,
             clear,
         )
-    wall, busy = ({call: times[which] for call, times in took.items()} for which in (0, 1))
-    what = f"folder to folder, {name}, {workers} workers"
+    wall, processor = ({call: times[column] for call, times in times_by_call.items()} for column in (0, 1))
+    label = f"folder to folder, {name}, {workers} workers"
     against = "cv2.imread, numpy gather, cv2.imwrite, one process"
-    alone = "the encoder alone on the finished images, as many threads"
-    report(f"{what}, by colour", len(pictures) / wall["colour"], "images/s")
-    report(what, len(pictures) / wall["ours"], "images/s")
-    report(f"{what}, by colour", wall["ours"] / wall["colour"], "ratio", "by codes")
-    report(what, wall["usual"] / wall["ours"], "ratio", against)
+    encoder_alone = "the encoder alone on the finished images, as many threads"
+    report(f"{label}, by colour", len(pictures) / wall["colour"], "images/s")
+    report(label, len(pictures) / wall["ours"], "images/s")
+    report(f"{label}, by colour", wall["ours"] / wall["colour"], "ratio", "by codes")
+    report(label, wall["usual"] / wall["ours"], "ratio", against)
     many = "cv2.imread, numpy gather, cv2.imwrite, as many processes as workers"
-    report(what, wall["processes"] / wall["ours"], "ratio", many)
-    report(f"{what}, with previews", wall["processes"] / wall["previews"], "ratio", f"{many}, without previews")
-    report(f"folder to folder, {name}, processor time", busy["usual"] / busy["ours"], "ratio", against)
+    report(label, wall["processes"] / wall["ours"], "ratio", many)
+    report(f"{label}, with previews", wall["processes"] / wall["previews"], "ratio", f"{many}, without previews")
+    report(f"folder to folder, {name}, processor time", processor["usual"] / processor["ours"], "ratio", against)
     report(f"folder to folder, {name}, size of the images", sizes[1] / sizes[0], "ratio", against)
-    report(what, wall["files"] / wall["ours"], "ratio", f"{alone}, files written")
-    report(what, wall["encoder"] / wall["ours"], "ratio", f"{alone}, in memory")
+    report(label, wall["files"] / wall["ours"], "ratio", f"{encoder_alone}, files written")
+    report(label, wall["encoder"] / wall["ours"], "ratio", f"{encoder_alone}, in memory")
     isal = "ISA-L's deflate alone on the finished images, level 1, as many threads, in memory"
-    report(what, wall["isal"] / wall["ours"], "ratio", isal)
+    report(label, wall["isal"] / wall["ours"], "ratio", isal)
     report(f"folder to folder, {name}, size of the images", sizes[1] / sum(packed), "ratio", isal)
     report(
-        f"folder to folder, {name}, processor time", busy["files"] / busy["ours"], "ratio", f"{alone}, files written"
+        f"folder to folder, {name}, processor time",
+        processor["files"] / processor["ours"],
+        "ratio",
+        f"{encoder_alone}, files written",
     )
     report(f"folder to folder, {name}, with previews", wall["ours"] / wall["previews"], "ratio", "without previews")
     clear()
-    shutil.rmtree(aside)
+    shutil.rmtree(old_folder)
     shutil.rmtree(sources)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--small", action="store_true", help="the 400 pictures of 512 px alone")
+    parser.add_argument("--small", action="store_true", help="only the 400 pictures of 512 px")
     small = parser.parse_args(arguments).small
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
@@ -230,10 +233,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not small:
             compare(scratch, lut, "18 Mpx", 2 * [large, large[::-1], large[:, ::-1], large[::-1, ::-1]], LARGE_REPEATS)
         tops, lefts = range(0, 3456 - 511, 512), range(0, 5184 - 511, 512)
-        cut = [np.ascontiguousarray(large[top : top + 512, left : left + 512]) for top in tops for left in lefts]
+        crops = [np.ascontiguousarray(large[top : top + 512, left : left + 512]) for top in tops for left in lefts]
         photo = photograph(512, 512)
-        moved = [np.roll(photo, 17 * place, axis=1) for place in range(len(cut))]
-        compare(scratch, lut, "512 px", (4 * [*cut, *moved])[:SMALL_PICTURES], SMALL_REPEATS)
+        shifted = [np.roll(photo, 17 * index, axis=1) for index in range(len(crops))]
+        compare(scratch, lut, "512 px", (4 * [*crops, *shifted])[:SMALL_PICTURES], SMALL_REPEATS)
 
 
 if __name__ == "__main__":

@@ -1,19 +1,17 @@
-"""How fast the kernels are: `python -m benchmarks.generator` prints one JSON object a line.
+"""Speed of the kernels: `python -m benchmarks.generator` prints one JSON object per line. It takes some minutes.
 
-The limit is a streaming copy of the same picture, 3 bytes in and 6 out, in as many threads. All calls take turns with
-the whole picture, which no cache holds; the fastest turn counts. With one thread the time is the processor's, else the
-clock's. So ratios hold on a machine with other work to do, the clock's less so.
+The limit is a streaming copy of the same picture, 3 bytes in and 6 bytes out, with as many threads. All calls take
+turns with the whole picture, which no cache can hold, and the fastest turn counts. With one thread the time is
+processor time, otherwise wall time. Ratios are therefore valid on a machine with other load, less so with threads.
 
-Takes some minutes.
+Two illuminants are mixed with random weights per pixel, which is the most work, and with two kinds of masks. Reading
+the weights (8 bytes per pixel) comes on top of the traffic of the copy.
 
-Two lights are mixed by random weights in each pixel, which is the most work, and by masks of two kinds. Their weights,
-8 bytes a pixel, are read beside what the copy reads and writes.
+By colour, each pixel is interpolated between four nodes and has a recorded deviation. The ratio is to the kernel by
+codes in the same turns. Means and deviations are random numbers here, which takes the same time.
 
-By colour, each pixel is interpolated between four nodes and has a recorded deviation; the ratio is to the kernel by
-codes, in the same turns. Means and deviations are made up here, which takes as long.
-
-The bound of fetching is a compiled loop that does nothing but copy the samples which the kernel draws, their places
-being known, to one place in the nearest cache: what the caches allow, whoever chooses. Two lights have a sample each.
+The bound of fetching is a compiled loop that only copies the samples drawn by the kernel to one place in the nearest
+cache; their positions are given. It shows the limit of the caches. Two illuminants have one sample each.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ import numpy as np
 import numpy.typing as npt
 import skimage.data
 
-from benchmarks import words_given
+from benchmarks import parse_words
 from calibration.table.lut import Lut, Provenance, open_lut
 from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
@@ -55,8 +53,8 @@ WHITE = 12000
 Call = Callable[[], object]
 
 
-def best(call: Callable[[], object], repeats: int = REPEATS) -> float:
-    """Return the seconds of the fastest of some calls, after one that does not count."""
+def fastest_s(call: Callable[[], object], repeats: int = REPEATS) -> float:
+    """Return the seconds of the fastest call; the first call does not count."""
     call()
     times: list[float] = []
     for _ in range(repeats):
@@ -71,7 +69,7 @@ def report(name: str, value: float, unit: str, against: str = "") -> None:
 
 
 def natural_picture(width: int, height: int) -> npt.NDArray[np.uint8]:
-    """Return a picture with the colour statistics of smooth things, edges and texture: no file is needed."""
+    """Return a synthetic picture with smooth areas, edges and texture, as in photographs."""
     rng = np.random.default_rng(1)
     layers = np.zeros((height, width, 3), np.float32)
     for octave in (3, 12, 48, 192):
@@ -82,7 +80,7 @@ def natural_picture(width: int, height: int) -> npt.NDArray[np.uint8]:
 
 
 def noisy_table(folder: Path, lights: int) -> Lut:
-    """Return a table of 32768 colours with shot noise."""
+    """Return a LUT of 32768 colours with shot noise."""
     from experiment.lights import Illuminant
 
     index = np.arange(32768)
@@ -93,21 +91,21 @@ def noisy_table(folder: Path, lights: int) -> Lut:
     writer = LutWriter(folder, lights, 32768, SAMPLES)
     for light in range(lights):
         writer.put(light, rng.poisson(means[:, None].repeat(SAMPLES, axis=1)).astype(np.uint16))
-    known = Provenance(
+    origin = Provenance(
         camera="Benchmark", bits=5, white_level=12000, session_sha256="0", chart_sha256="0", software="benchmark"
     )
     plan = [Illuminant(light, "uniform", None, Colour(255, 255, 255)) for light in range(lights)]
-    writer.finish(plan, np.full((lights, 3), 4000.0), known)
+    writer.finish(plan, np.full((lights, 3), 4000.0), origin)
     return open_lut(folder)
 
 
 def mask_weights(kind: str, height: int, width: int) -> npt.NDArray[np.float32]:
-    """Return how two lights share a picture (height, width, 2) by masks of a kind that `generate` makes."""
+    """Return the weights (height, width, 2) of two illuminants for one kind of mask of `generate`."""
     return parse_masks(kind, 2, 1).maker(0).weights(height, width, 2)
 
 
 def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
-    """Return a photograph (height, width, 3) enlarged to the size of a camera's, with a camera's grain."""
+    """Return a photograph (height, width, 3), enlarged to camera size, with camera grain."""
     small = np.asarray(skimage.data.coffee(), dtype=np.uint8)
     larger = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float32)
     grain = np.random.default_rng(3).normal(0, 3, larger.shape)
@@ -115,7 +113,7 @@ def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
 
 
 def by_numpy(samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
-    """Return a raw image in the most obvious manner."""
+    """Return a raw image, drawn with simple NumPy code."""
     colour = (picture >> 3).astype(np.int64) @ np.array([1024, 32, 1])
     choice = np.random.default_rng(0).integers(0, SAMPLES, colour.shape)
     return np.take(samples.reshape(-1, 3), colour * SAMPLES + choice, axis=0)
@@ -129,8 +127,8 @@ def _choose_all(
     for y in range(height):
         keys = row_keys(y, light, 0, np.uint64(0))
         for group in range(groups):
-            to = target + 4 * GROUP * (y * groups + group)
-            choose_group(picture + 3 * y * width, width, group, keys, count, bits, scratch, to)
+            address = target + 4 * GROUP * (y * groups + group)
+            choose_group(picture + 3 * y * width, width, group, keys, count, bits, scratch, address)
 
 
 @compiled
@@ -145,21 +143,21 @@ def _fetch(samples: Any, places: Any, count: int, target: int) -> None:
 
 
 def fetching(tables: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> Call:
-    """Return a call that loads the samples of a picture's pixels from each table; the width must be whole groups."""
+    """Return a call that loads the samples of all pixels from each table; the width must be a multiple of GROUP."""
     height, width = picture.shape[:2]
-    places = np.zeros((len(tables), height, width), np.uint32)
+    sites = np.zeros((len(tables), height, width), np.uint32)
     scratch = np.empty(SCRATCH_BYTES, np.uint8)
-    numbers = np.uint32(SAMPLES), np.uint32(5)
-    for light, its in enumerate(places):
-        _choose_all(picture.ctypes.data, width, height, light, *numbers, its.ctypes.data, scratch.ctypes.data)
+    table_shape = np.uint32(SAMPLES), np.uint32(5)
+    for light, target in enumerate(sites):
+        _choose_all(picture.ctypes.data, width, height, light, *table_shape, target.ctypes.data, scratch.ctypes.data)
     starts = np.array([table.ctypes.data for table in tables])
     return lambda: _fetch(
-        starts, places.ctypes.data + places.strides[0] * np.arange(len(places)), width * height, scratch.ctypes.data
+        starts, sites.ctypes.data + sites.strides[0] * np.arange(len(sites)), width * height, scratch.ctypes.data
     )
 
 
-def printed_by_chance() -> tuple[PrintedLight, npt.NDArray[np.uint32]]:
-    """Return what a light makes of a print, and the cells of its nodes: numbers as large as a table's, at random."""
+def random_print() -> tuple[PrintedLight, npt.NDArray[np.uint32]]:
+    """Return random numbers in the format of a printed illuminant, and the patches of its nodes."""
     rng = np.random.default_rng(6)
     means, bases = rng.uniform(500, 9000, (NODES, 4)), rng.uniform(500, 9000, (1, NODES, 2, 4))
     factors = 1e-3 * bases.astype(np.float32)
@@ -168,7 +166,7 @@ def printed_by_chance() -> tuple[PrintedLight, npt.NDArray[np.uint32]]:
 
 
 def in_turns(calls: Mapping[str, Call], clock: Callable[[], float], repeats: int = REPEATS) -> dict[str, float]:
-    """Return the seconds of each call's fastest turn, after one that does not count."""
+    """Return the seconds of the fastest turn of each call; the first turn does not count."""
     fastest = dict.fromkeys(calls, np.inf)
     for turn in range(repeats + 1):
         for name, call in calls.items():
@@ -187,22 +185,24 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
     out = np.empty(picture.shape, np.uint16)
     weights = np.random.default_rng(4).random((height, width, 2), dtype=np.float32)
     masks = {kind: mask_weights(kind, height, width) for kind in ("soft-edge", "half-plane")}
-    light, cells = printed_by_chance()
+    light, cells = random_print()
     printed = partial(draw_printed, tables[:1], picture, [light], cells, out=out)
     calls: dict[str, Call] = {
         "kernel by colour": printed,
         "streaming copy": lambda: np.copyto(out, picture),
         "bound of fetching": fetching(tables[:1], picture),
-        "bound of fetching for two lights": fetching(tables, picture),
+        "bound of fetching for two illuminants": fetching(tables, picture),
         "kernel": lambda: draw_samples(samples, picture, out=out),
-        "two lights": lambda: mix_samples(tables, picture, weights, white_level=WHITE, out=out),
+        "two illuminants": lambda: mix_samples(tables, picture, weights, white_level=WHITE, out=out),
     }
     for kind, mask in masks.items():
-        calls[f"two lights, {kind}"] = lambda mask=mask: mix_samples(tables, picture, mask, white_level=WHITE, out=out)
+        calls[f"two illuminants, {kind}"] = lambda mask=mask: mix_samples(
+            tables, picture, mask, white_level=WHITE, out=out
+        )
     seconds = in_turns(calls, time.thread_time)
     seconds |= in_turns({"numpy take": lambda: by_numpy(samples, picture)}, time.thread_time, 2)
-    for call, took in seconds.items():
-        report(f"{call}, {name}, one thread", pixels / took, "Mpx/s")
+    for call, call_s in seconds.items():
+        report(f"{call}, {name}, one thread", pixels / call_s, "Mpx/s")
     limit = seconds["streaming copy"]
     for call in (name for name in calls if name != "streaming copy"):
         report(f"{call}, {name}, one thread", limit / seconds[call], "ratio", "streaming copy, 3 bytes in and 6 out")
@@ -217,23 +217,23 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
             np.copyto(out[top:bottom], picture[top:bottom])
 
         def copy_together() -> None:
-            edges = [height * part // threads for part in range(threads + 1)]
+            edges = [height * thread // threads for thread in range(threads + 1)]
             list(pool.map(copy, edges[:-1], edges[1:]))
 
         def mix_together(weights: npt.NDArray[np.float32]) -> None:
             mix_samples(tables, picture, weights, white_level=WHITE, threads=threads, out=out)
 
-        together: dict[str, Call] = {
+        threaded_calls: dict[str, Call] = {
             "streaming copy": copy_together,
             "kernel": lambda: draw_samples(samples, picture, threads=threads, out=out),
             "kernel by colour": partial(printed, threads=threads),
-            "two lights": partial(mix_together, weights),
-            **{f"two lights, {kind}": partial(mix_together, mask) for kind, mask in masks.items()},
+            "two illuminants": partial(mix_together, weights),
+            **{f"two illuminants, {kind}": partial(mix_together, mask) for kind, mask in masks.items()},
         }
-        seconds = in_turns(together, time.perf_counter, 4 * REPEATS)
-    for call, took in seconds.items():
-        report(f"{call}, {name}, {threads} threads", pixels / took, "Mpx/s")
-    for call in (name for name in together if name != "streaming copy"):
+        seconds = in_turns(threaded_calls, time.perf_counter, 4 * REPEATS)
+    for call, call_s in seconds.items():
+        report(f"{call}, {name}, {threads} threads", pixels / call_s, "Mpx/s")
+    for call in (name for name in threaded_calls if name != "streaming copy"):
         ratio = seconds["streaming copy"] / seconds[call]
         report(f"{call}, {name}, {threads} threads", ratio, "ratio", "streaming copy in as many threads")
     by_colour = seconds["kernel"] / seconds["kernel by colour"]
@@ -241,7 +241,7 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
 
 
 def measure_small(samples: npt.NDArray[np.uint16]) -> None:
-    """Report the kernel on 512 x 512 pixels, all in the caches."""
+    """Report the kernel on 512 × 512 pixels, which fit in the caches."""
     picture = np.ascontiguousarray(photograph(5184, 3456)[:512, :512])
     out = np.empty(picture.shape, np.uint16)
     call = partial(draw_samples, samples, picture, out=out)
@@ -261,36 +261,36 @@ print(middle - begin, time.process_time() - middle)
 
 
 def measure_black(samples: npt.NDArray[np.uint16]) -> None:
-    """Report how long taking the print's black out of all samples of a light takes."""
+    """Report the time for subtracting the print's black from all samples of an illuminant."""
     veil = BlackSubtraction(np.array([300.0, 380.0, 330.0]), np.array([1.04, 1.04, 1.04]))
     call = partial(subtract_black, samples, veil, WHITE)
-    report("black taken out of a light's samples, one thread", in_turns({"": call}, time.thread_time)[""], "s")
+    report("black subtracted from samples, one thread", in_turns({"": call}, time.thread_time)[""], "s")
 
 
 def measure_start() -> None:
-    """Report what the first call costs of the processor's time, with and without machine code on disk."""
+    """Report the processor time of the first call, with and without machine code on disk."""
 
     def child(cache: str) -> tuple[float, float]:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", START],
             env={**os.environ, "NUMBA_CACHE_DIR": cache},
             capture_output=True,
             text=True,
             check=True,
         )
-        imported, called = map(float, done.stdout.split())
+        imported, called = map(float, process.stdout.split())
         return imported, called
 
     with tempfile.TemporaryDirectory() as cache:
         _, compiling = child(cache)
-        later = [child(cache) for _ in range(3)]
-    report("import of the kernel after numpy", min(imported for imported, _ in later), "s")
+        warm_starts = [child(cache) for _ in range(3)]
+    report("import of the kernel after numpy", min(imported for imported, _ in warm_starts), "s")
     report("first call, compiled", compiling, "s")
-    report("first call, machine code from disk", min(called for _, called in later), "s")
+    report("first call, machine code from disk", min(called for _, called in warm_starts), "s")
 
 
 def main() -> None:
-    words_given(__doc__)
+    parse_words(__doc__)
     with tempfile.TemporaryDirectory() as scratch:
         tables = np.array(noisy_table(Path(scratch) / "lut", 2).samples)
     measure_start()

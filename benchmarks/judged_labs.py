@@ -1,4 +1,4 @@
-"""A simulated room, the live judge of its frames, and the frames taken in it, for `benchmarks.detection`."""
+"""A simulated room with the live judge and the frames taken in it, for `benchmarks.detection`."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from sim.world.world import Room, World
 LAB = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "illuminations.csv"\n[camera]\nshutter_s = {}\n'
 
 Counts = npt.NDArray[np.uint16]
+# Light of each primary (3,) for the codes of this frame and the previous one.
 Projector = Callable[[Colour, Colour], npt.NDArray[np.float64]]
-"""The light of each primary (3,) that codes give, after those of the frame before."""
 
 
 @dataclass
 class Lab:
-    """A room, its judge, and the frames taken in it so far."""
+    """A room, its judge, and the frames taken so far."""
 
     world: World
     chart: Chart
@@ -47,7 +47,7 @@ class Lab:
     projector: Projector | None = None
     flicker: float = 0.0
     taken: int = 0
-    before: Colour = BLACK
+    previous: Colour = BLACK
     keys: Iterator[int] = field(default_factory=itertools.count)
 
     @property
@@ -55,63 +55,63 @@ class Lab:
         return self.world.body
 
     def fork(self) -> Lab:
-        """Return the same lab with a judge of its own that knows as much."""
+        """Return the same lab with a copy of the judge in its present state."""
         return replace(self, judge=copy.copy(self.judge))
 
     def counts(self, colour: Colour, *events: AnyDisturbance) -> Counts:
         """Return the counts of a new frame."""
-        moment = Moment(self.taken, float(self.taken), colour, ((-1.0, self.before),))
+        moment = Moment(self.taken, float(self.taken), colour, ((-1.0, self.previous),))
         key = next(self.keys)
-        gone_wrong = Disturbances((*self.events.events, *events))
-        situation = gone_wrong.situation(moment)
+        disturbances = Disturbances((*self.events.events, *events))
+        situation = disturbances.situation(moment)
         if self.projector is not None:
-            light = self.projector(colour, self.before).astype(np.float32)
+            light = self.projector(colour, self.previous).astype(np.float32)
             situation = replace(situation, picture=light[None, None])
         if self.flicker:
-            own = float(np.random.default_rng([7, key]).normal(1, self.flicker))
-            situation = replace(situation, ambient=(0.012 * own, 0.01 * own, 0.007 * own))
+            strength = float(np.random.default_rng([7, key]).normal(1, self.flicker))
+            situation = replace(situation, ambient=(0.012 * strength, 0.01 * strength, 0.007 * strength))
         counts = self.world.expose(
-            gone_wrong.shown(moment), self.settings.camera.exposure, key=(key,), situation=situation
+            disturbances.shown(moment), self.settings.camera.exposure, key=(key,), situation=situation
         )
-        return gone_wrong.counted(counts, moment)
+        return disturbances.counted(counts, moment)
 
     def show(self, counts: Counts, step: SessionStep, **writing: Any) -> Judgement:
-        """Return what is said of counts."""
-        given: dict[str, Any] = {"settings": self.settings.camera.exposure, "body": self.body, **writing}
-        body = given.pop("body")
+        """Judge the counts of a frame."""
+        file_options: dict[str, Any] = {"settings": self.settings.camera.exposure, "body": self.body, **writing}
+        body = file_options.pop("body")
         with self.file.open("wb") as stream:
-            write_dng(stream, counts, body, taken_at=datetime(2026, 1, 1, tzinfo=UTC), **given)
+            write_dng(stream, counts, body, taken_at=datetime(2026, 1, 1, tzinfo=UTC), **file_options)
         self.taken += 1
         return self.judge.judge(self.file, step)
 
     def take(self, step: SessionStep, *events: AnyDisturbance) -> Judgement:
-        """Return what is said of a new frame of a step."""
+        """Take and judge a new frame of a step."""
         judgement = self.show(self.counts(step.colour, *events), step)
-        self.before = step.colour
+        self.previous = step.colour
         return judgement
 
-    def session(self, count: int, every: int, seed: int) -> list[tuple[SessionStep, Judgement]]:
-        """Take a whole session of so many lights of the plan; every frame once, refused or not."""
+    def session(self, count: int, reference_every: int, seed: int) -> list[tuple[SessionStep, Judgement]]:
+        """Take a session with `count` illuminants of the plan, each frame once, even if it is rejected."""
         order: list[int] = np.random.default_rng(seed).permutation(len(self.plan)).tolist()
-        some = [replace(self.plan[k], index=n) for n, k in enumerate(order[:count])]
-        steps = plan_steps(some, every, seed=seed, response=RESPONSE)
+        lights = [replace(self.plan[k], index=n) for n, k in enumerate(order[:count])]
+        steps = plan_steps(lights, reference_every, seed=seed, response=RESPONSE)
         return [(step, self.take(step)) for step in steps]
 
 
 def lab_of(
-    folder: Path, room: Room, body: str = "Test", chart: Chart | None = None, shutter_s: float = 0.5, **more: Any
+    folder: Path, room: Room, body: str = "Test", chart: Chart | None = None, shutter_s: float = 0.5, **lab_fields: Any
 ) -> Lab:
-    """Return a lab with a judge that has seen nothing."""
+    """Return a lab with a new judge."""
     settings = parse_lab(LAB.format(shutter_s), "LAB.toml")
     chart = chart or design_chart(3, "A7")
     plan = plan_illuminants()
     judge = LiveJudge(settings, chart, plan)
     world = World(sheet(chart), BODIES[body], room)
-    return Lab(world, chart, plan, settings, folder / "frame.dng", judge, **more)
+    return Lab(world, chart, plan, settings, folder / "frame.dng", judge, **lab_fields)
 
 
 def rooms(seed: int) -> tuple[Room, dict[str, Any]]:
-    """Return a room drawn by its seed, and what else is special in its lab."""
+    """Return a random room and the options of its lab."""
     random = np.random.default_rng([5, seed])
     room = Room(
         seed=seed,
@@ -132,10 +132,10 @@ def rooms(seed: int) -> tuple[Room, dict[str, Any]]:
         pan_deg=float(random.uniform(-4, 4)),
         profile="managed" if seed % 5 == 0 else "unmanaged",
     )
-    more: dict[str, Any] = {"shutter_s": 0.25 if seed % 10 == 3 else 0.5}
-    return room, more
+    lab_options: dict[str, Any] = {"shutter_s": 0.25 if seed % 10 == 3 else 0.5}
+    return room, lab_options
 
 
 def cause(judgement: Judgement) -> str:
-    """Return the name of the check that refused a frame; empty if none did."""
+    """Return the name of the check that rejected a frame; empty if it was accepted."""
     return next((check.name for check in judgement.checks if check.reason), "")

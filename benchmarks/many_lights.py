@@ -1,9 +1,8 @@
-"""An image under two lights, with the maps of where each falls: `python -m benchmarks.many_lights`.
+"""Images under two illuminants with their maps: `python -m benchmarks.many_lights` prints one JSON object per line.
 
-Prints one JSON object a line. The usual program makes the same of the same picture: a soft edge, samples of both lights
-mixed with their noise, the light of each pixel, and four PNG files in memory, with numpy and OpenCV. Calls take turns,
-the fastest counts, and the time is the processor's with one thread. The time of each step is reported as its share.
-Takes about two minutes.
+A simple program does the same with NumPy and OpenCV: a soft edge, mixed samples of both illuminants with their noise,
+the illuminant of each pixel, and four PNG files in memory. Calls take turns, the fastest counts, in processor time of
+one thread. The time of each step is reported as a share. It takes about two minutes.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks import words_given
+from benchmarks import parse_words
 from benchmarks.encode import METADATA, photograph
 from benchmarks.generator import SAMPLES, WHITE, in_turns, mask_weights, noisy_table, report
 from calibration.table.lut import Lut
@@ -31,12 +30,12 @@ KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
 FULL = 65535
 
 
-def usual(lut: Lut, picture: npt.NDArray[np.uint8]) -> None:
-    """Make image and maps in the most obvious manner."""
+def draw_with_numpy(lut: Lut, picture: npt.NDArray[np.uint8]) -> None:
+    """Make the image and the maps with simple NumPy code."""
     height, width, _ = picture.shape
     y, x = np.mgrid[:height, :width].astype(np.float32)
-    along = np.clip((0.8 * (x / width - 0.5) + 0.6 * (y / height - 0.5)) / 0.4 + 0.5, 0, 1)
-    second = np.rint(FULL * along * along * (3 - 2 * along)) / np.float32(FULL)
+    position = np.clip((0.8 * (x / width - 0.5) + 0.6 * (y / height - 0.5)) / 0.4 + 0.5, 0, 1)
+    second = np.rint(FULL * position * position * (3 - 2 * position)) / np.float32(FULL)
     weights = np.stack([1 - second, second], axis=-1)
     colour = (picture >> 3).astype(np.int64) @ np.array([1024, 32, 1])
     rng = np.random.default_rng(0)
@@ -44,8 +43,8 @@ def usual(lut: Lut, picture: npt.NDArray[np.uint8]) -> None:
     for light, table in enumerate(np.asarray(lut.samples)):
         weight = weights[..., light, None]
         mean = table.mean(axis=1, dtype=np.float32)[colour]
-        drawn = table[colour, rng.integers(0, SAMPLES, colour.shape)]
-        image += weight * mean + np.sqrt(weight) * (drawn - mean)
+        samples = table[colour, rng.integers(0, SAMPLES, colour.shape)]
+        image += weight * mean + np.sqrt(weight) * (samples - mean)
     light = weights @ lut.white.astype(np.float32)
     truth = np.rint(FULL * light / light.sum(axis=-1, keepdims=True)).astype(np.uint16)
     files = [np.clip(np.rint(image), 0, WHITE).astype(np.uint16)[..., ::-1], truth[..., ::-1]]
@@ -56,25 +55,25 @@ def usual(lut: Lut, picture: npt.NDArray[np.uint8]) -> None:
 def measure(name: str, lut: Lut, picture: npt.NDArray[np.uint8], repeats: int) -> None:
     height, width, _ = picture.shape
     image = mix_samples(lut.samples, picture, mask_weights("soft-edge", height, width), white_level=WHITE)
-    calls: dict[str, Callable[[], object]] = {"usual": lambda: usual(lut, picture)}
+    calls: dict[str, Callable[[], object]] = {"numpy": lambda: draw_with_numpy(lut, picture)}
     for kind in KINDS:
         lighting = Lighting((single_mixture(0), single_mixture(1)), parse_masks(kind, 2, 1).maker(0))
-        its = lighting.weights_of(height, width)
+        weights = lighting.weights_of(height, width)
         calls[f"{kind}, masks"] = lambda lighting=lighting: lighting.weights_of(height, width)
-        calls[f"{kind}, mixing"] = lambda its=its: mix_samples(lut.samples, picture, its, white_level=WHITE)
-        calls[f"{kind}, maps"] = lambda its=its, lighting=lighting: encode_maps(its, lighting.whites(lut))
+        calls[f"{kind}, mixing"] = lambda weights=weights: mix_samples(lut.samples, picture, weights, white_level=WHITE)
+        calls[f"{kind}, maps"] = lambda weights=weights, lighting=lighting: encode_maps(weights, lighting.whites(lut))
     calls["image"] = lambda: sum(len(piece) for piece in encode_pieces(image, "png", METADATA))
     seconds = in_turns(calls, time.thread_time, repeats)
     for kind in KINDS:
         steps = {step: seconds[f"{kind}, {step}"] for step in ("masks", "mixing", "maps")} | {"image": seconds["image"]}
-        whole = sum(steps.values())
-        report(f"{name}, {kind}", seconds["usual"] / whole, "ratio", "numpy and cv2.imencode, a soft edge")
-        for step, took in steps.items():
-            report(f"{name}, {kind}, {step}", took / whole, "share", "image and maps")
+        total_s = sum(steps.values())
+        report(f"{name}, {kind}", seconds["numpy"] / total_s, "ratio", "numpy and cv2.imencode, a soft edge")
+        for step, step_s in steps.items():
+            report(f"{name}, {kind}, {step}", step_s / total_s, "share", "image and maps")
 
 
 def main() -> None:
-    words_given(__doc__)
+    parse_words(__doc__)
     with tempfile.TemporaryDirectory() as scratch:
         lut = noisy_table(Path(scratch) / "lut", 2)
         measure("18 Mpx", lut, photograph(5184, 3456), 3)

@@ -1,16 +1,16 @@
-"""The accuracy of mixed lights: each light of a table is left out, mixed from the others, and compared with its frames.
+"""Accuracy of mixed illuminants: each illuminant of a LUT is predicted from the others and compared with its frames.
 
-`python -m benchmarks.mixtures [LUT]` prints one JSON object a line for each figure. Without a table it takes a session
-of all 707 lights in the simulated room, with a chart of 512 colours before the small body, which takes minutes.
+`python -m benchmarks.mixtures [LUT]` prints one JSON object per figure and line. Without a LUT it takes a session of
+all 707 illuminants in the simulated room, with a chart of 512 colours and the small body, which takes minutes.
 
-Two methods, neither of which uses the frames of the light left out except to compare:
+There are two methods. Both use the frames of the predicted illuminant only for the comparison:
 
-codes    its proportion of the three primaries, known from the codes shown and the transfer function (sRGB), is mixed
-         from those of its neighbours; the white and the colours that this mixture gives are a prediction.
-match    its ground truth is asked for, as a user would; the white is then right by construction, the colours are a
-         prediction, which fails if lights of one white differ in their spectra (metamerism).
+codes    mixes the neighbours so that the proportions of the three primaries are right. The proportions follow from the
+         codes and the transfer function (sRGB). White and colours are predicted.
+match    mixes the neighbours so that the ground truth is right, as a user would. Only the colours are predicted. The
+         prediction fails if illuminants of the same white have different spectra (metamerism).
 
-The lights at the corners of the gamut are left out of both: the others cannot make them.
+Illuminants at the corners of the gamut are excluded, because no mixture of the others can reach them.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ WELL_LIT_DN = 300
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Means (L, C, 3) of the table's cells, and the variances of those means."""
+    """Means (L, C, 3) of the patches of a LUT, and the variances of these means."""
 
     mean: _Array
     noise: _Array
 
     @classmethod
     def of(cls, lut: Lut) -> Cells:
-        """Return the cells of a table; those listed as unfit are left out."""
+        """Return the patches of a LUT without those listed as unfit."""
         unfit = {cell.colour for cell in lut.provenance.unfit}
         fit = [colour for colour in range(lut.samples.shape[1]) if colour not in unfit]
         means: list[_Array] = []
@@ -63,7 +63,7 @@ class Cells:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A light left out, and the mixture of others that replaces it."""
+    """An illuminant and the mixture of others that predicts it."""
 
     light: int
     others: tuple[int, ...]
@@ -71,19 +71,18 @@ class LeftOut:
 
 
 def report(name: str, value: float, unit: str, against: str) -> None:
-    """Print one figure."""
     print(json.dumps({"name": name, "value": float(f"{value:.3g}"), "unit": unit, "against": against}), flush=True)
 
 
 def drives(lights: Sequence[Illuminant]) -> _Array:
-    """Return (L, 3) float64, the primaries' light as shares of full."""
+    """Return the light of the primaries (L, 3) float64, relative to full drive."""
     codes = [light.colour for light in lights]
     return decode_srgb(np.array(codes) / 255)
 
 
 def leave_out(rgb: _Array) -> list[LeftOut]:
-    """Return for each light that the others can make their mixture; `rgb` (L, 3) float64 is linear light."""
-    found: list[LeftOut] = []
+    """Predict each illuminant that the others can reach; `rgb` (L, 3) float64 is linear light."""
+    predictions: list[LeftOut] = []
     for light in range(len(rgb)):
         others = np.delete(np.arange(len(rgb)), light)
         try:
@@ -91,72 +90,77 @@ def leave_out(rgb: _Array) -> list[LeftOut]:
         except InputError:
             continue
         lights = tuple(int(others[number]) for number in match.mixture.lights)
-        found.append(LeftOut(light, lights, match.mixture.weights))
-    return found
+        predictions.append(LeftOut(light, lights, match.mixture.weights))
+    return predictions
 
 
-def judge(method: str, found: Sequence[LeftOut], lut: Lut, cells: Cells) -> None:
-    """Print the errors of predicted lights and colours against those measured."""
+def judge(method: str, predictions: Sequence[LeftOut], lut: Lut, cells: Cells) -> None:
+    """Print the errors of predicted illuminants and colours."""
     angles: list[float] = []
     errors: list[_Array] = []
     noises: list[_Array] = []
     worst: list[float] = []
-    summed, times = np.zeros(cells.mean.shape[1:]), np.zeros(cells.mean.shape[1:])
-    for left in found:
-        weights = np.asarray(left.weights)
-        others = list(left.others)
+    error_sums, lit_counts = np.zeros(cells.mean.shape[1:]), np.zeros(cells.mean.shape[1:])
+    for prediction in predictions:
+        weights = np.asarray(prediction.weights)
+        others = list(prediction.others)
         white = weights @ lut.white[others]
-        angles.append(float(angles_deg(white, lut.white[left.light])))
-        scale = lut.white[left.light] / white
+        angles.append(float(angles_deg(white, lut.white[prediction.light])))
+        scale = lut.white[prediction.light] / white
         mean = np.tensordot(weights, cells.mean[others], 1) * scale
-        real = cells.mean[left.light]
+        real = cells.mean[prediction.light]
         lit = real > WELL_LIT_DN
-        noise = (np.tensordot(weights**2, cells.noise[others], 1) * scale**2 + cells.noise[left.light]) / real**2
+        noise = (np.tensordot(weights**2, cells.noise[others], 1) * scale**2 + cells.noise[prediction.light]) / real**2
         error = mean / real - 1
         errors.append(error[lit])
         noises.append(noise[lit])
-        summed += np.where(lit, error, 0)
-        times += lit
+        error_sums += np.where(lit, error, 0)
+        lit_counts += lit
         if lit.any():
             worst.append(float(np.sqrt((error[lit] ** 2).mean())))
-    among = f"{len(found)} lights of {len(lut.white)}, each made of others"
-    count = np.bincount([len(left.others) for left in found], minlength=4)
-    report(f"{method}: lights in a mixture, mean", float((count @ np.arange(len(count))) / len(found)), "lights", among)
-    report(f"{method}: white, median angle", float(np.median(angles)), "degrees", among)
-    report(f"{method}: white, worst angle", float(np.max(angles)), "degrees", among)
+    scope = f"{len(predictions)} of {len(lut.white)} illuminants, each predicted from others"
+    count = np.bincount([len(prediction.others) for prediction in predictions], minlength=4)
+    report(
+        f"{method}: illuminants per mixture, mean",
+        float((count @ np.arange(len(count))) / len(predictions)),
+        "illuminants",
+        scope,
+    )
+    report(f"{method}: white, median angle", float(np.median(angles)), "degrees", scope)
+    report(f"{method}: white, worst angle", float(np.max(angles)), "degrees", scope)
     error, noise = np.concatenate(errors), np.concatenate(noises)
     rms = float(np.sqrt((error**2).mean()))
-    alone = float(np.sqrt(noise.mean()))
-    above = f"colour over white, cells above {WELL_LIT_DN} counts, {among}"
-    report(f"{method}: colour means, RMS", 100 * rms, "%", above)
-    report(f"{method}: colour means, RMS that noise alone gives", 100 * alone, "%", above)
-    often = times >= len(found) / 4
+    noise_rms = float(np.sqrt(noise.mean()))
+    colour_scope = f"colour / white, patches above {WELL_LIT_DN} counts, {scope}"
+    report(f"{method}: colour means, RMS", 100 * rms, "%", colour_scope)
+    report(f"{method}: colour means, RMS of the noise alone", 100 * noise_rms, "%", colour_scope)
+    frequent = lit_counts >= len(predictions) / 4
     report(
-        f"{method}: colour means, RMS of each colour's error averaged over lights, which takes the noise out",
-        100 * float(np.sqrt(((summed[often] / times[often]) ** 2).mean())),
+        f"{method}: colour means, RMS of errors averaged over illuminants (without noise)",
+        100 * float(np.sqrt(((error_sums[frequent] / lit_counts[frequent]) ** 2).mean())),
         "%",
-        f"{int(often.sum())} channels of colours that are above {WELL_LIT_DN} counts under a quarter of the lights",
+        f"{int(frequent.sum())} channels of colours above {WELL_LIT_DN} counts under a quarter of the illuminants",
     )
-    report(f"{method}: colour means, mean error", 100 * float(error.mean()), "%", above)
-    report(f"{method}: colour means, RMS of the worst light", 100 * max(worst), "%", above)
+    report(f"{method}: colour means, mean error", 100 * float(error.mean()), "%", colour_scope)
+    report(f"{method}: colour means, RMS of the worst illuminant", 100 * max(worst), "%", colour_scope)
 
 
 def judge_black_bodies(lut: Lut) -> None:
-    """Print how far a black body is from its two neighbours joined by mired."""
+    """Print the error of each black body interpolated from its two neighbours by mired."""
     bodies = sorted((light.cct_k, light.index) for light in lut.illuminations if light.cct_k is not None)
     angles: list[float] = []
     for (cold, first), (kelvin, light), (hot, second) in zip(bodies, bodies[1:], bodies[2:], strict=False):
         share = (1 / cold - 1 / kelvin) / (1 / cold - 1 / hot)
-        joined = (1 - share) * lut.ground_truth[first] + share * lut.ground_truth[second]
-        angles.append(float(angles_deg(joined, lut.white[light])))
+        interpolated = (1 - share) * lut.ground_truth[first] + share * lut.ground_truth[second]
+        angles.append(float(angles_deg(interpolated, lut.white[light])))
     if angles:
-        against = f"{len(angles)} black bodies between two others, twice as far apart as in use"
+        against = f"{len(angles)} black bodies between two others, at twice the usual distance"
         report("black bodies: white, median angle", float(np.median(angles)), "degrees", against)
         report("black bodies: white, worst angle", max(angles), "degrees", against)
 
 
 def small_table(folder: Path) -> Lut:
-    """Return a table of all lights and 512 colours, photographed by the small body."""
+    """Return a LUT of all illuminants and 512 colours, photographed by the small body."""
     settings = LabSettings(
         rig="simulated",
         chart=folder / "chart.json",
@@ -165,14 +169,13 @@ def small_table(folder: Path) -> Lut:
     )
     design_chart(3, A_SERIES_MM["A5"], 20).save(settings.chart)
     save_illuminants(plan_illuminants(), settings.illuminations)
-    run_session(settings, folder / "session", lambda done, total: None)
+    run_session(settings, folder / "session", lambda count, total: None)
     with Session.open(folder / "session") as session:
         build(session, folder / "lut")
     return open_lut(folder / "lut")
 
 
 def measure(lut: Lut) -> None:
-    """Print the errors of one table."""
     cells = Cells.of(lut)
     judge("codes", leave_out(drives(lut.illuminations)), lut, cells)
     judge("match", leave_out(lut.white), lut, cells)
@@ -180,15 +183,15 @@ def measure(lut: Lut) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the errors of the table named, or of one made for the purpose, and return 0."""
+    """Print the errors of the given LUT, or of a new one, and return 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("lut", nargs="?", type=Path, help="folder of a table of many lights")
+    parser.add_argument("lut", nargs="?", type=Path, help="folder of a LUT with many illuminants")
     folder: Path | None = parser.parse_args(argv).lut
     if folder is not None:
         measure(open_lut(folder))
         return 0
-    with tempfile.TemporaryDirectory() as place:
-        measure(small_table(Path(place)))
+    with tempfile.TemporaryDirectory() as scratch:
+        measure(small_table(Path(scratch)))
     return 0
 
 

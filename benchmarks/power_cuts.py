@@ -1,16 +1,17 @@
-"""Power cuts during a run: what was flushed stays, and the session ends in the frames of an undisturbed one.
+"""Power cuts during a run: flushed data survive, and the session ends with the frames of an undisturbed one.
 
-`python -m benchmarks.power_cuts [CUTS [SEED]]` prints one JSON object a line. Needs Linux, root, `mkfs.ext4`, libfuse 2
-and `pip install fusepy`; it says what is missing, and is skipped then.
+`python -m benchmarks.power_cuts [CUTS [SEED]]` prints one JSON object per line. It needs Linux, root, `mkfs.ext4`,
+libfuse 2 and `pip install fusepy`. If one is missing, it reports that and measures nothing.
 
-A session is taken on an ext4 file system whose disk is a loop device over a file that this program serves by FUSE. That
-file knows which sectors were written since the disk was last told to flush. A cut comes at an operation of chance (of
-those of `benchmarks.session_kills`): the run is killed, and of the sectors that were not flushed the disk keeps each
-with a chance of a half, as a drive with a cache does. That disk is mounted, which recovers its journal, and the session
-is taken to its end on it and compared: bytes, hashes, times, rows. Then a tenth as many cuts of runs whose raw files
-are never flushed: where those end alike, the disk forgets nothing, and the figures before say nothing.
+A session is taken on an ext4 file system on a loop device over a file that this program serves by FUSE. The file
+records the sectors written since the last flush. At a random operation (see `benchmarks.session_kills`) the run is
+killed. Each sector that was not flushed survives with a probability of one half, as in a drive with a cache. The disk
+is mounted, which recovers its journal. The session is completed on it and compared: bytes, hashes, times, rows.
 
-What is flattered: files are small, sectors are whole (no drive of today tears 512 bytes), a flush is believed.
+A control follows, with a tenth as many cuts of runs whose raw files are never flushed. If their sessions do not differ,
+the disk forgets nothing, and the other figures are meaningless.
+
+Simplifications: files are small, sectors are never torn, and the disk reports flushes truthfully.
 """
 
 from __future__ import annotations
@@ -39,19 +40,19 @@ from experiment.session.folder import Session
 from experiment.session.journal import Journal, ReceivedFile
 from experiment.session.records import Judgement
 
+# Default number of cuts: a few minutes on an idle machine.
 CUTS = 200
-"""Cuts that are made unless more are asked for: a few minutes on a quiet machine."""
+# Minimum number of control cuts: about every second one hits a file that was not flushed.
 LEAST_CONTROL = 10
-"""Cuts of the control at least: about every second one of them takes a file that was not flushed."""
 
 DISK_BYTES = 24 << 20
 SECTOR = 512
+# Name of the served file.
 NAME = "/disk"
-"""Of the one file that is served."""
 
 
 class CachedDisk:
-    """A disk with a cache: reads see everything, and a cut keeps what was flushed and some of the rest."""
+    """A disk with a cache: reads see all data; a cut keeps the flushed sectors and some of the others."""
 
     def __init__(self, content: bytes) -> None:
         self._flushed = bytearray(content)
@@ -60,14 +61,14 @@ class CachedDisk:
         self.flushes = 0
 
     def read(self, size: int, offset: int) -> bytes:
-        """Return bytes as they were written last."""
+        """Return the bytes as last written."""
         with self._guard:
             first, last = offset // SECTOR, -(-(offset + size) // SECTOR)
-            parts = [self._cached.get(number) or self._sector(number) for number in range(first, last)]
-        return b"".join(parts)[offset - first * SECTOR :][:size]
+            sectors = [self._cached.get(number) or self._sector(number) for number in range(first, last)]
+        return b"".join(sectors)[offset - first * SECTOR :][:size]
 
     def write(self, data: bytes, offset: int) -> int:
-        """Take whole sectors into the cache."""
+        """Write whole sectors to the cache."""
         assert offset % SECTOR == 0, offset
         assert len(data) % SECTOR == 0, len(data)
         with self._guard:
@@ -76,7 +77,6 @@ class CachedDisk:
         return len(data)
 
     def flush(self) -> None:
-        """Put the cache on the disk."""
         with self._guard:
             self._keep(self._cached)
             self._cached = {}
@@ -85,8 +85,8 @@ class CachedDisk:
     def cut(self, chance: random.Random) -> bytes:
         """Return the disk after a power cut."""
         with self._guard:
-            kept = {number: data for number, data in sorted(self._cached.items()) if chance.random() < 0.5}
-            self._keep(kept)
+            surviving = {number: data for number, data in sorted(self._cached.items()) if chance.random() < 0.5}
+            self._keep(surviving)
             return bytes(self._flushed)
 
     def _sector(self, number: int) -> bytes:
@@ -110,9 +110,11 @@ def serve(disk: CachedDisk, folder: Path, at_cut: Callable[[], object]) -> None:
             return {"st_mode": stat.S_IFREG | 0o600, "st_nlink": 1, "st_size": DISK_BYTES}
 
         def read(self, path: str, size: int, offset: int, fh: int) -> bytes:
+            """Return the bytes as last written."""
             return disk.read(size, offset)
 
         def write(self, path: str, data: bytes, offset: int, fh: int) -> int:
+            """Write whole sectors to the cache."""
             return disk.write(data, offset)
 
         def fsync(self, path: str, datasync: int, fh: int) -> int:
@@ -130,10 +132,10 @@ def serve(disk: CachedDisk, folder: Path, at_cut: Callable[[], object]) -> None:
 
 
 class CutSessions:
-    """Sessions whose power is cut by chance and which are then taken to their end.
+    """Sessions with random power cuts that are then completed.
 
-    - `cuts`, `differing`: how many there were, and how many sessions ended otherwise than the undisturbed one.
-    - `lost`: of the frames whose row was in the journal before the cut, those that were not afterwards.
+    `differing` counts sessions that differ from the undisturbed one. `lost` counts frames that had a journal row before
+    a cut but not after it.
     """
 
     def __init__(self, scratch: Path, seed: int, flushing: bool = True) -> None:
@@ -147,18 +149,18 @@ class CutSessions:
         undisturbed = scratch / "undisturbed"
         Session.create(undisturbed, SETTINGS.to_toml(), design_chart(bits=1), LIGHTS, STEPS).close()
         self.blank = self._blank_disk(undisturbed)
-        told = scratch / "told"
+        count_file = scratch / "told"
 
         def work() -> None:
-            from benchmarks.session_kills import counting
+            from benchmarks.session_kills import count_operations
 
-            most = [0]
-            counting(lambda number: most.__setitem__(0, number))
+            operation_count = [0]
+            count_operations(lambda number: operation_count.__setitem__(0, number))
             take(undisturbed)
-            told.write_text(str(most[0]))
+            count_file.write_text(str(operation_count[0]))
 
         assert in_child(work) == 0
-        self.operations = int(told.read_text())
+        self.operations = int(count_file.read_text())
         self.expected = contents(undisturbed)
 
     def _blank_disk(self, session: Path) -> bytes:
@@ -172,7 +174,7 @@ class CutSessions:
         return image.read_bytes()
 
     def session(self) -> None:
-        """Cut the power of a run, take the session to its end on what the disk kept, and compare."""
+        """Cut the power during a run one to three times, complete the session and compare it."""
         image, ready = self.scratch / "after.img", self.scratch / "ready"
         content = self.blank
         for _ in range(self.chance.randint(1, 3)):
@@ -180,9 +182,9 @@ class CutSessions:
             self.cuts += 1
             _run("mount", "-o", "loop", str(image), str(self.mounted))
             try:
-                with Session.open(self.mounted / "session") as opened:
-                    kept = {frame.sha256 for frame in opened.journal.accepted_files()}
-                self.lost += len(committed - kept)
+                with Session.open(self.mounted / "session") as session:
+                    surviving = {frame.sha256 for frame in session.journal.accepted_files()}
+                self.lost += len(committed - surviving)
             finally:
                 _run("umount", str(self.mounted))
             content = image.read_bytes()
@@ -195,14 +197,14 @@ class CutSessions:
             _run("umount", str(self.mounted))
 
     def _cut(self, content: bytes, image: Path, ready: Path) -> tuple[bytes, set[str]]:
-        """Run until the power fails; leave the disk in `image`, return the journal's frames before, by hash."""
+        """Run until the power fails; leave the disk in `image` and return the hashes of the frames committed before."""
         disk, chance = CachedDisk(content), random.Random(self.chance.random())
         operation = self.chance.randrange(1, self.operations)
         ready.unlink(missing_ok=True)
 
         def at_cut() -> None:
             image.write_bytes(disk.cut(chance))
-            # Whoever waits for it must not find it empty.
+            # Rename the file when it is complete, so that the waiting process never reads an empty one.
             partial = ready.with_suffix(".partial")
             partial.write_text(str(disk.flushes))
             partial.replace(ready)
@@ -215,27 +217,27 @@ class CutSessions:
         file = self.served / NAME[1:]
         log = self.scratch / "committed"
         log.unlink(missing_ok=True)
-        # Whatever fails, no file system stays mounted over a disk that is gone.
-        with ExitStack() as at_last:
-            at_last.callback(os.waitpid, server, 0)
-            at_last.callback(_until, lambda: _succeeds("umount", str(self.served)))
-            _until(file.exists)
+        # Unmount in any case: no file system may stay on a disk that is gone.
+        with ExitStack() as cleanup:
+            cleanup.callback(os.waitpid, server, 0)
+            cleanup.callback(_wait_until, lambda: _succeeds("umount", str(self.served)))
+            _wait_until(file.exists)
             device = _run("losetup", "--find", "--show", str(file)).strip()
-            at_last.callback(_run, "losetup", "--detach", device)
+            cleanup.callback(_run, "losetup", "--detach", device)
             _run("mount", device, str(self.mounted))
-            at_last.callback(_run, "umount", str(self.mounted))
+            cleanup.callback(_run, "umount", str(self.mounted))
             with _LoggedCommits(log), _Flushing(self.flushing):
-                ended = killed_at_operation(self.mounted / "session", operation)
-            assert ended in (0, -signal.SIGKILL), ended
+                exit_code = killed_at_operation(self.mounted / "session", operation)
+            assert exit_code in (0, -signal.SIGKILL), exit_code
             os.kill(server, signal.SIGUSR1)
-            _until(ready.exists)
+            _wait_until(ready.exists)
             self.flushes += int(ready.read_text())
         committed = set(log.read_text().split()) if log.exists() else set[str]()
         return image.read_bytes(), committed
 
 
 class _Flushing:
-    """Let files be flushed, or, for the control, only seem to be; the journal is flushed by SQLite all the same."""
+    """Enable flushing, or disable it for the control; SQLite still flushes the journal."""
 
     def __init__(self, flushing: bool) -> None:
         self._flushing, self._real = flushing, os.fsync
@@ -249,7 +251,7 @@ class _Flushing:
 
 
 class _LoggedCommits:
-    """Note the hash of every frame whose row is committed, outside the disk that fails."""
+    """Log the hash of every committed frame outside the failing disk."""
 
     def __init__(self, log: Path) -> None:
         self._log, self._real = log, Journal.commit
@@ -258,9 +260,14 @@ class _LoggedCommits:
         real, log = self._real, self._log
 
         def commit(
-            journal: Journal, attempt: int, received: ReceivedFile, judgement: Judgement, *given: Any, **named: Any
+            journal: Journal,
+            attempt: int,
+            received: ReceivedFile,
+            judgement: Judgement,
+            *arguments: Any,
+            **options: Any,
         ) -> None:
-            real(journal, attempt, received, judgement, *given, **named)
+            real(journal, attempt, received, judgement, *arguments, **options)
             if judgement.accepted:
                 with log.open("a") as stream:
                     stream.write(f"{received.sha256}\n")
@@ -279,16 +286,16 @@ def _succeeds(*words: str) -> bool:
     return subprocess.run(words, check=False, capture_output=True).returncode == 0
 
 
-def _until(holds: Callable[[], bool]) -> None:
-    until = time.monotonic() + 30
-    while not holds():
-        if time.monotonic() > until:
-            raise TimeoutError("the served disk does not answer")
+def _wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 30
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError("the served disk did not answer within 30 s; look for an error of fusepy above")
         time.sleep(0.01)
 
 
 def _missing() -> str:
-    """Return what this machine lacks; empty if nothing."""
+    """Return a message about a missing requirement; empty if nothing is missing."""
     if sys.platform != "linux" or os.geteuid() != 0:
         return "Linux and root are needed, to mount file systems"
     if shutil.which("mkfs.ext4") is None:
@@ -301,31 +308,30 @@ def _missing() -> str:
 
 
 def main(argv: list[str]) -> int:
-    """Cut the power and print what came of it."""
     if missing := _missing():
-        print(f"power cuts: not tried: {missing}", file=sys.stderr)
+        print(f"power cuts: not measured: {missing}", file=sys.stderr)
         return 0
-    wanted, seed = int(argv[0]) if argv else CUTS, int(argv[1]) if argv[1:] else 20190601
-    begun = time.perf_counter()
+    cut_count, seed = int(argv[0]) if argv else CUTS, int(argv[1]) if argv[1:] else 20190601
+    start_s = time.perf_counter()
     with tempfile.TemporaryDirectory() as scratch:
         sessions = CutSessions(Path(scratch) / "flushed", seed)
-        count = 0
-        while sessions.cuts < wanted:
+        session_count = 0
+        while sessions.cuts < cut_count:
             sessions.session()
-            count += 1
+            session_count += 1
         control = CutSessions(Path(scratch) / "control", seed, flushing=False)
-        while control.cuts < max(wanted // 10, LEAST_CONTROL):
+        while control.cuts < max(cut_count // 10, LEAST_CONTROL):
             control.session()
     for name, value, unit in (
         ("power cuts: cuts", sessions.cuts, "cuts"),
-        ("power cuts: sessions", count, "sessions"),
-        ("power cuts: flushes of the disk before them", sessions.flushes, "flushes"),
-        ("power cuts: frames that the journal had and lost", sessions.lost, "frames"),
+        ("power cuts: sessions", session_count, "sessions"),
+        ("power cuts: flushes of the disk before the cuts", sessions.flushes, "flushes"),
+        ("power cuts: frames lost from the journal", sessions.lost, "frames"),
         ("power cuts: sessions that differ from an undisturbed one", sessions.differing, "sessions"),
         ("power cuts: control without flushing: cuts", control.cuts, "cuts"),
         ("power cuts: control without flushing: frames lost", control.lost, "frames"),
         ("power cuts: control without flushing: sessions that differ", control.differing, "sessions"),
-        ("power cuts: time", round(time.perf_counter() - begun, 1), "s"),
+        ("power cuts: time", round(time.perf_counter() - start_s, 1), "s"),
     ):
         print(json.dumps({"name": name, "value": value, "unit": unit, "against": ""}), flush=True)
     return int(sessions.differing > 0 or sessions.lost > 0 or control.differing == 0)

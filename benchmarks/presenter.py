@@ -1,8 +1,8 @@
-"""What it costs to be sure of the colour: `FullScreen.show` of all 707 lights, against empty swaps of the same size.
+"""Cost of a confirmed colour: `FullScreen.show` of all 707 illuminants, compared with empty swaps of the same size.
 
-`python -m benchmarks.presenter` prints one JSON object a line for each figure. It lights the display that DISPLAY
-names; where there is none, one of Xvfb, where swaps wait for no refresh and OpenGL is done in software. A slowest show
-that took much longer than the processor worked for it has waited for other programs.
+`python -m benchmarks.presenter` prints one JSON object per figure and line. It uses the display in DISPLAY. Without one
+it starts Xvfb, where swaps do not wait for a refresh and OpenGL runs in software. If the slowest show took much longer
+than its processor time, it waited for other programs.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ SIZE = "1920x1080"
 
 @contextlib.contextmanager
 def _desktop() -> Generator[str]:
-    """Yield what kind of desktop there is, starting a virtual one where there is none; "" where that cannot be."""
+    """Yield a description of the desktop, starting a virtual one if needed; empty if there is none."""
     if sys.platform != "linux" or os.environ.get("DISPLAY"):
-        yield "the display there is"
+        yield "the existing display"
         return
     if shutil.which("Xvfb") is None:
         yield ""
@@ -45,7 +45,7 @@ def _desktop() -> Generator[str]:
 
 
 def _swaps(count: int, display: int) -> list[float]:
-    """Return the seconds of `count` cleared, swapped and finished frames on a display, by GLFW alone."""
+    """Return the seconds of `count` cleared, swapped and finished frames on a display, with GLFW alone."""
     import glfw
 
     glfw.init()
@@ -60,13 +60,13 @@ def _swaps(count: int, display: int) -> list[float]:
     finish = prototype(None)(glfw.get_proc_address("glFinish"))
     times: list[float] = []
     for number in range(count):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         glfw.poll_events()
         colour(number % 2, 0.0, 0.0, 1.0)
         clear(0x4000)
         glfw.swap_buffers(window)
         finish()
-        times.append(time.perf_counter() - begun)
+        times.append(time.perf_counter() - start)
     glfw.destroy_window(window)
     glfw.terminate()
     return times
@@ -74,31 +74,36 @@ def _swaps(count: int, display: int) -> list[float]:
 
 def main() -> int:
     """Measure on the left display."""
-    with _desktop() as where:
-        if not where:
-            print("no display here and no Xvfb (Debian: xvfb): the presenter is not measured", file=sys.stderr)
+    with _desktop() as desktop:
+        if not desktop:
+            print("no DISPLAY and no Xvfb; nothing was measured. Install xvfb", file=sys.stderr)
             return 0
         display = list_displays()[0]
         size = f"{display.width}×{display.height}"
         lights = plan_illuminants()
         screen = FullScreen(display.number)
-        shows: list[float] = []
+        show_s: list[float] = []
         busy: list[float] = []
         for light in lights:
-            begun, worked = time.perf_counter(), time.process_time()
+            start, processor_start = time.perf_counter(), time.process_time()
             screen.show(light.colour)
-            shows.append(time.perf_counter() - begun)
-            busy.append(time.process_time() - worked)
+            show_s.append(time.perf_counter() - start)
+            busy.append(time.process_time() - processor_start)
         screen.close()
-        swaps = _swaps(len(lights), display.number)
-    median, empty = statistics.median(shows), statistics.median(swaps)
+        swap_s = _swaps(len(lights), display.number)
+    median, empty = statistics.median(show_s), statistics.median(swap_s)
     for name, value, unit, against in (
-        (f"presenter: show to confirmed, median of {len(lights)}, {size}", median, "s", where),
-        (f"presenter: show to confirmed, worst of {len(lights)}, {size}", max(shows), "s", where),
-        (f"presenter: processor time of the slowest show, {size}", busy[shows.index(max(shows))], "s", "this process"),
-        (f"presenter: empty clear, swap and finish, median, {size}", empty, "s", where),
-        (f"presenter: empty clear, swap and finish, worst, {size}", max(swaps), "s", where),
-        ("presenter: show to confirmed over an empty swap, medians", median / empty, "ratio", "clear, swap, glFinish"),
+        (f"presenter: show to confirmed, median of {len(lights)}, {size}", median, "s", desktop),
+        (f"presenter: show to confirmed, worst of {len(lights)}, {size}", max(show_s), "s", desktop),
+        (
+            f"presenter: processor time of the slowest show, {size}",
+            busy[show_s.index(max(show_s))],
+            "s",
+            "this process",
+        ),
+        (f"presenter: empty clear, swap and finish, median, {size}", empty, "s", desktop),
+        (f"presenter: empty clear, swap and finish, worst, {size}", max(swap_s), "s", desktop),
+        ("presenter: show to confirmed / empty swap", median / empty, "ratio", "clear, swap, glFinish"),
     ):
         print(json.dumps({"name": name, "value": float(f"{value:.3g}"), "unit": unit, "against": against}), flush=True)
     return 0

@@ -1,7 +1,7 @@
-"""How fast PTP goes through our cables: `python -m benchmarks.ptp` prints one JSON object a line.
+"""Speed of PTP over CroP's cables: `python -m benchmarks.ptp` prints one JSON object per line.
 
-Both ends run in this process and share its processor, on loopback and on the simulated bus. Each thing is done in turns
-with what it is compared to; speeds are the best of all turns, ratios the median over the turns.
+Both ends run in this process and share its processor, on loopback and on the simulated bus. Each measurement takes
+turns with its comparison. Speeds are the best of all turns, ratios the median over the turns.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from foundation.clock import SystemClock
 from sim.buses.ptp import serve_ptpip
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 
+# 30 MB, the size of a raw file.
 OBJECT = bytes(range(256)) * 117_188
-"""30 MB, a raw file."""
 DOWNLOADS = 21
 TURNS = 5
 OPERATIONS = 2000
@@ -32,14 +32,14 @@ TIMEOUT_S = 10.0
 
 
 class Store:
-    """A device that holds one object and answers everything else with success."""
+    """A device that holds one object and answers all other requests with success."""
 
     def takes_data(self, request: PtpRequest) -> bool:
         return False
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-        given = OBJECT if request.code == Operation.GET_OBJECT else None
-        return Answer(PtpResponse(ResponseCode.OK, request.transaction), given)
+        content = OBJECT if request.code == Operation.GET_OBJECT else None
+        return Answer(PtpResponse(ResponseCode.OK, request.transaction), content)
 
     def events(self) -> tuple[PtpEvent, ...]:
         return ()
@@ -50,7 +50,7 @@ class Store:
 
 
 class Plain:
-    """A socket that sends the object for each byte it is sent, or for a ``1`` that byte alone."""
+    """A socket that answers each byte with the object, and a ``1`` with one byte."""
 
     def __init__(self) -> None:
         self._listener = socket.create_server((LOOPBACK, 0))
@@ -62,9 +62,9 @@ class Plain:
 
     def download(self) -> None:
         self._socket.sendall(b"0")
-        left = len(OBJECT)
-        while left:
-            left -= self._socket.recv_into(self._buffer)
+        missing = len(OBJECT)
+        while missing:
+            missing -= self._socket.recv_into(self._buffer)
 
     def exchange(self) -> None:
         self._socket.sendall(b"1")
@@ -83,32 +83,32 @@ class Plain:
                 connection.sendall(OBJECT if word == b"0" else word)
 
 
-def took(work: Callable[[], object]) -> float:
-    """Return how long it takes, seconds."""
+def time_s(work: Callable[[], object]) -> float:
+    """Return the duration of `work`, in seconds."""
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
 
 
 def turns(runs: int, *works: Callable[[], object]) -> list[list[float]]:
-    """Return the times of each over several turns, seconds."""
-    return [list(times) for times in zip(*([took(work) for work in works] for _ in range(runs)), strict=True)]
+    """Return the times of each work over several turns, in seconds."""
+    return [list(times) for times in zip(*([time_s(work) for work in works] for _ in range(runs)), strict=True)]
 
 
 def ratio(to: list[float], of: list[float]) -> float:
-    """Return how fast one is in parts of the other's speed."""
-    return median(theirs / ours for theirs, ours in zip(to, of, strict=True))
+    """Return the median speed ratio of `of` to `to`."""
+    return median(to_s / of_s for to_s, of_s in zip(to, of, strict=True))
 
 
 def download(transport: Transport) -> None:
-    taken = 0
+    received = 0
 
     def take(piece: bytes) -> None:
-        nonlocal taken
-        taken += len(piece)
+        nonlocal received
+        received += len(piece)
 
     transport.transact(PtpRequest(Operation.GET_OBJECT, 1, (1,)), receive=take, timeout=TIMEOUT_S)
-    assert taken == len(OBJECT)
+    assert received == len(OBJECT)
 
 
 def operate(transport: Transport) -> None:
@@ -121,7 +121,6 @@ def report(name: str, value: float, unit: str, against: str) -> None:
 
 
 def main() -> None:
-    """Measure and print."""
     bus = SimulatedBus()
     bus.plug(PtpUsbDevice(Store()))
     over_usb = UsbTransport(open_usb(backend=bus), SystemClock())
@@ -144,14 +143,14 @@ def main() -> None:
     size = len(OBJECT) / 1e6
     report("PTP/IP download of 30 MB", size / min(by_ip), "MB/s", "none")
     report(
-        "PTP/IP download over a socket's",
+        "PTP/IP download / plain socket",
         ratio(by_socket, by_ip),
         "1",
         "a plain socket copy in the same run; at least 0.5",
     )
     report("PTP/IP operations", OPERATIONS / min(operating_ip), "1/s", "none")
     report(
-        "PTP/IP operations over a socket's", ratio(exchanging, operating_ip), "1", "one byte there and back, same run"
+        "PTP/IP operations / plain socket", ratio(exchanging, operating_ip), "1", "one byte in each direction, same run"
     )
     report("USB download of 30 MB, simulated bus", size / min(by_usb), "MB/s", "35 to 40 MB/s of high speed")
     report("USB operations, simulated bus", OPERATIONS / min(operating_usb), "1/s", "none")

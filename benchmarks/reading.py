@@ -1,15 +1,14 @@
-"""Count what a reader opens to follow one light through each command, and how large the house is.
+"""Count the modules that one illuminant passes in each command, and the size of the code.
 
-`python -m benchmarks.reading [--files] [--size]` prints one JSON object a line for each figure; with `--files`, each
-figure is followed by its modules in the order in which they are first needed; with `--size`, packages and tests are
-counted in place of that: modules with code, lines, lines of code (no docstrings, comments and blank lines), and how
-long functions and lines of code are in the mean. Takes a minute; `--size` a second or two.
+`python -m benchmarks.reading [--files] [--size]` prints one JSON object per figure and line. `--files` lists the
+modules of each figure in the order of first use. `--size` counts packages and tests instead: modules with code, lines,
+lines of code (no docstrings, comments and blank lines), and the mean length of functions and lines. It takes a minute,
+`--size` a second or two.
 
-What is counted: each command does the same small work twice, the second time with one light (for `generate`: one
-picture) more. A module belongs to that light where one of its functions ran more often the second time. Only functions
-and methods with a name of their own are counted, no lambda and no comprehension; functions compiled by numba are
-counted as those that the interpreter runs. So what runs once a command (reading settings, finding the chart, the
-report) is left out, and nothing here knows the name of a module: the figures of two layouts can be compared.
+Each command does the same small work twice, the second time with one more illuminant (`generate`: one more picture). A
+module counts if one of its functions ran more often the second time. Only named functions and methods count, not
+lambdas and comprehensions; functions compiled by numba count as others. Work that happens once per command (settings,
+registration, the report) is therefore excluded. No module name is used here, so layouts of the code can be compared.
 """
 
 from __future__ import annotations
@@ -40,20 +39,20 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 ROOMS = frozenset[str](PROJECT["tool"]["importlinter"]["root_packages"])
+# Counts at commit a3796081, before small modules were merged.
 BEFORE = {"acquire run": 94, "acquire run, without the simulated lab": 76, "build-lut": 41, "generate": 40}
-"""The same count at commit a3796081, before modules were made deep."""
+# Lines of these modules at that commit.
 LINES_BEFORE = {
     "acquire run": 20906,
     "acquire run, without the simulated lab": 16414,
     "build-lut": 8119,
     "generate": 8163,
 }
-"""Lines of those modules, at that commit."""
+# Size figures at that commit.
 SIZE_BEFORE = {
     "packages": {"modules": 622, "lines": 111471, "lines of code": 65673, "lines of code a function": 9.2},
     "tests": {"lines": 63836},
 }
-"""Figures of size at that commit."""
 
 LAB = """\
 rig = "simulated"
@@ -65,7 +64,7 @@ body = "Test"
 
 
 class Function(NamedTuple):
-    """A function of the product: the file, relative to the checkout, its name in it and its first line."""
+    """A function of the product: file relative to the checkout, qualified name, first line."""
 
     file: str
     name: str
@@ -73,7 +72,7 @@ class Function(NamedTuple):
 
 
 def function_of(code: CodeType) -> Function | None:
-    """Return which function of the product `code` is; None for other software, lambdas and module bodies."""
+    """Return the function of `code`; None for other software, lambdas and module bodies."""
     path = Path(code.co_filename)
     if code.co_name.startswith("<") or not path.is_relative_to(ROOT):
         return None
@@ -82,7 +81,7 @@ def function_of(code: CodeType) -> Function | None:
 
 
 class Calls:
-    """How often each function of the product was called, in the order of the first calls."""
+    """Number of calls of each product function, in the order of first calls."""
 
     def __init__(self) -> None:
         self.counts: Counter[Function] = Counter()
@@ -90,7 +89,7 @@ class Calls:
         self._compiled: dict[int, tuple[Function, ...]] = {}
 
     def on_event(self, frame: FrameType, event: str, _: object) -> None:
-        """Count a call; what `sys.setprofile` wants."""
+        """Count a call; this is the callback for `sys.setprofile`."""
         if event != "call":
             return
         code = frame.f_code
@@ -101,34 +100,34 @@ class Calls:
             self.counts[function] += 1
 
     def on_compiled(self, dispatcher: Any) -> None:
-        """Count a call of a compiled function and of those compiled into it."""
+        """Count a call of a compiled function and of the functions compiled into it."""
         if id(dispatcher) not in self._compiled:
             self._compiled[id(dispatcher)] = compiled_into(dispatcher)
         self.counts.update(self._compiled[id(dispatcher)])
 
 
 def compiled_into(dispatcher: Any) -> tuple[Function, ...]:
-    """Return a compiled function and the compiled functions and intrinsics it names, and so on, each once."""
-    found: dict[Function, None] = {}
-    waiting, seen = [dispatcher], set[int]()
-    while waiting:
-        one = waiting.pop()
+    """Return a compiled function and all compiled functions and intrinsics that it uses, each once."""
+    functions: dict[Function, None] = {}
+    queue, visited = [dispatcher], set[int]()
+    while queue:
+        dispatcher_or_intrinsic = queue.pop()
         # numba keeps the Python function of a dispatcher as py_func and that of an intrinsic as _defn.
-        source = getattr(one, "py_func", None) or getattr(one, "_defn", None)
-        if source is None or id(one) in seen:
+        source = getattr(dispatcher_or_intrinsic, "py_func", None) or getattr(dispatcher_or_intrinsic, "_defn", None)
+        if source is None or id(dispatcher_or_intrinsic) in visited:
             continue
-        seen.add(id(one))
-        # That of a step in LLVM's terms is made by a decorator from what writes it.
+        visited.add(id(dispatcher_or_intrinsic))
+        # The function of an intrinsic is made by a decorator; unwrap it.
         source = inspect.unwrap(source)
         function = function_of(source.__code__)
         if function is not None:
-            found[function] = None
-        waiting.extend(source.__globals__.get(name) for name in names_in(source.__code__))
-    return tuple(found)
+            functions[function] = None
+        queue.extend(source.__globals__.get(name) for name in names_in(source.__code__))
+    return tuple(functions)
 
 
 def names_in(code: CodeType) -> Iterable[str]:
-    """Yield the global names that a function and those inside it use."""
+    """Yield the global names used by a function and its inner functions."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -136,15 +135,15 @@ def names_in(code: CodeType) -> Iterable[str]:
 
 
 def trace(command: str, arguments: Sequence[str], out: Path) -> int:
-    """Run a console command in this process, save how often each function was called, and return its exit code."""
+    """Run a console command in this process, save the number of calls per function and return the exit code."""
     calls = Calls()
     module, name = PROJECT["project"]["scripts"][command].split(":")
     registry: Any = importlib.import_module("numba.core.registry")
     original = registry.CPUDispatcher.__call__
 
-    def counted(dispatcher: Any, *given: Any, **named: Any) -> Any:
+    def counted(dispatcher: Any, *arguments: Any, **options: Any) -> Any:
         calls.on_compiled(dispatcher)
-        return original(dispatcher, *given, **named)
+        return original(dispatcher, *arguments, **options)
 
     registry.CPUDispatcher.__call__ = counted
     main = getattr(importlib.import_module(module), name)
@@ -161,20 +160,24 @@ def trace(command: str, arguments: Sequence[str], out: Path) -> int:
 
 
 def called(folder: Path, command: str, *arguments: str) -> dict[Function, int]:
-    """Run a command in a process of its own in `folder`; return how often each function was called."""
+    """Run a command in a separate process in `folder`; return the calls per function."""
     out = folder / "calls.json"
-    line = [sys.executable, "-m", "benchmarks.reading", "--trace", str(out), command, *arguments]
-    # The command runs in `folder`; this file and the product are found in the checkout all the same.
+    command_line = [sys.executable, "-m", "benchmarks.reading", "--trace", str(out), command, *arguments]
+    # The command runs in `folder`, so this module and the product must be on the path.
     search = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(line, cwd=folder, env=search, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(f"{command} {' '.join(arguments)} ended with {done.returncode}: {done.stderr}")
+    process = subprocess.run(command_line, cwd=folder, env=search, capture_output=True, text=True, check=False)
+    if process.returncode:
+        raise RuntimeError(
+            f"{command} {' '.join(arguments)} ended with exit code {process.returncode}, 0 expected: {process.stderr}"
+        )
     return {Function(*row[:3]): row[3] for row in json.loads(out.read_text(encoding="utf-8"))}
 
 
-def opened(fewer: Mapping[Function, int], more: Mapping[Function, int]) -> list[str]:
-    """Return the files of the functions that were called more often, in the order of their first calls."""
-    return list(dict.fromkeys(function.file for function, count in more.items() if count > fewer.get(function, 0)))
+def opened(base_calls: Mapping[Function, int], larger_calls: Mapping[Function, int]) -> list[str]:
+    """Return the files of functions that were called more often, in the order of first calls."""
+    return list(
+        dict.fromkeys(function.file for function, count in larger_calls.items() if count > base_calls.get(function, 0))
+    )
 
 
 def save_picture(path: Path, seed: int) -> None:
@@ -184,8 +187,8 @@ def save_picture(path: Path, seed: int) -> None:
 
 
 def measure(folder: Path) -> dict[str, list[str]]:
-    """Return the modules opened for one light of each command, in order."""
-    found: dict[str, list[str]] = {}
+    """Return the modules used for one more illuminant in each command, in order."""
+    modules_by_command: dict[str, list[str]] = {}
     called(folder, "acquire", "chart", "chart", "--bits", "2", "--no-tiff")
     for lights, kelvins in (("fewer", "2500:7500:2500"), ("more", "2500:10000:2500")):
         called(folder, "acquire", "illuminations", f"{lights}.csv", "--grid", "1", "--blackbodies", kelvins)
@@ -197,45 +200,45 @@ def measure(folder: Path) -> dict[str, list[str]]:
     for command, arguments in (
         ("acquire", ("run", "{}.toml", "{}_session")),
         ("build-lut", ("{}_session", "{}_lut")),
-        # The smaller run of each pair comes first, so that what is compiled and kept is not counted for the larger.
-        # One thread, since with several it is chance who waits for whom.
+        # The smaller run comes first, so that compiled and cached data do not count for the larger run. One worker,
+        # because with several it is random which one waits.
         ("generate", ("more_lut", "{}_dataset", "--sources", "{}_pictures", "--workers", "1")),
     ):
-        fewer = called(folder, command, *(argument.format("fewer") for argument in arguments))
-        more = called(folder, command, *(argument.format("more") for argument in arguments))
-        found["acquire run" if command == "acquire" else command] = opened(fewer, more)
-    return found
+        base_calls = called(folder, command, *(argument.format("fewer") for argument in arguments))
+        larger_calls = called(folder, command, *(argument.format("more") for argument in arguments))
+        modules_by_command["acquire run" if command == "acquire" else command] = opened(base_calls, larger_calls)
+    return modules_by_command
 
 
 def code_lines(text: str, tree: ast.Module) -> set[int]:
-    """Return the numbers of the lines that hold code: no docstring, comment or blank line."""
+    """Return the numbers of the lines with code: no docstring, comment or blank line."""
     skipped = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
-    found: set[int] = set()
+    line_numbers: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type not in skipped:
-            found |= set(range(token.start[0], token.end[0] + 1))
+            line_numbers |= set(range(token.start[0], token.end[0] + 1))
     for node in ast.walk(tree):
         match node:
             case ast.Expr(value=ast.Constant(value=str())):
-                found -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+                line_numbers -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
             case _:
                 pass
-    return found
+    return line_numbers
 
 
 def size(folders: Iterable[str]) -> dict[str, float]:
-    """Return how large the Python files below folders are, figure by figure."""
+    """Return the size figures of the Python files in folders."""
     modules, lines, code = 0, 0, 0
     functions, lengths = list[int](), list[int]()
     for path in (path for folder in folders for path in (ROOT / folder).rglob("*.py")):
         text = path.read_text(encoding="utf-8")
         tree = ast.parse(text)
-        rows, own = text.splitlines(), code_lines(text, tree)
-        modules, lines, code = modules + bool(own), lines + len(rows), code + len(own)
-        lengths += [len(rows[number - 1]) for number in own]
+        rows, code_rows = text.splitlines(), code_lines(text, tree)
+        modules, lines, code = modules + bool(code_rows), lines + len(rows), code + len(code_rows)
+        lengths += [len(rows[number - 1]) for number in code_rows]
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                functions.append(len(own.intersection(range(node.lineno, (node.end_lineno or node.lineno) + 1))))
+                functions.append(len(code_rows.intersection(range(node.lineno, (node.end_lineno or node.lineno) + 1))))
     return {
         "modules": modules,
         "lines": lines,
@@ -246,39 +249,39 @@ def size(folders: Iterable[str]) -> dict[str, float]:
 
 
 def print_size() -> None:
-    """Print how large the packages, each of them, and the tests are."""
+    """Print the size figures of all packages, of each package, and of the tests."""
     groups = {"packages": sorted(ROOMS), **{room: [room] for room in sorted(ROOMS)}, "tests": ["tests"]}
     for group, folders in groups.items():
         for name, value in size(folders).items():
-            before = SIZE_BEFORE.get(group, {}).get(name)
-            against = {} if before is None else {"against": f"{before} before modules were made deep"}
+            old_value = SIZE_BEFORE.get(group, {}).get(name)
+            against = {} if old_value is None else {"against": f"{old_value} before small modules were merged"}
             print(json.dumps({"name": f"{name}: {group}", "value": value, "unit": "", **against}), flush=True)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Count and print; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--files", action="store_true", help="list the modules, too")
-    parser.add_argument("--size", action="store_true", help="count the house in place of ways through it")
+    parser.add_argument("--files", action="store_true", help="also list the modules")
+    parser.add_argument("--size", action="store_true", help="print the size of the code instead")
     parser.add_argument("--trace", type=Path, metavar="OUT", help=argparse.SUPPRESS)
     parser.add_argument("command", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
-    given = parser.parse_args(argv)
-    if given.trace is not None:
-        return trace(given.command[0], given.command[1:], given.trace)
-    if given.size:
+    options = parser.parse_args(argv)
+    if options.trace is not None:
+        return trace(options.command[0], options.command[1:], options.trace)
+    if options.size:
         print_size()
         return 0
     with tempfile.TemporaryDirectory() as scratch:
-        found = measure(Path(scratch))
-    files = found["acquire run"]
-    found["acquire run, without the simulated lab"] = [file for file in files if Path(file).parts[0] != "sim"]
-    for name, files in found.items():
-        figure = {"name": f"modules opened to follow one light: {name}", "value": len(files), "unit": "modules"}
-        print(json.dumps(figure | {"against": f"{BEFORE[name]} before modules were made deep"}), flush=True)
+        modules = measure(Path(scratch))
+    files = modules["acquire run"]
+    modules["acquire run, without the simulated lab"] = [file for file in files if Path(file).parts[0] != "sim"]
+    for name, files in modules.items():
+        figure = {"name": f"modules used for one illuminant: {name}", "value": len(files), "unit": "modules"}
+        print(json.dumps(figure | {"against": f"{BEFORE[name]} before small modules were merged"}), flush=True)
         lines = sum(len((ROOT / file).read_text(encoding="utf-8").splitlines()) for file in files)
         figure = {"name": f"lines of these modules: {name}", "value": lines, "unit": "lines"}
         print(json.dumps(figure | {"against": f"{LINES_BEFORE[name]} before"}), flush=True)
-        if given.files:
+        if options.files:
             print(*(f"  {file}" for file in files), sep="\n", flush=True)
     return 0
 

@@ -1,20 +1,20 @@
-"""Rooms that nothing was tuned for: short sessions in random rooms, their tables compared with the truth.
+"""Random rooms, for which nothing was tuned: short sessions are taken and their LUTs compared with the truth.
 
-`python -m benchmarks.rooms [--rooms N] [--first SEED] [--calm N]` takes a session of eight lights in each of N random
-rooms and in as many calm ones as are asked for, builds its table, and prints one JSON object a line for each room, then
-a census. A random room has waves, long or short, a curl, a lens with shoulders, veil and lateral colour, uneven light
-and hot photosites; a calm one has less of each than a careful lab tolerates.
+`python -m benchmarks.rooms [--rooms N] [--first SEED] [--calm N]` takes a session of eight illuminants in each of N
+random rooms and in a number of calm rooms, builds the LUT and prints one JSON object per room, then a summary. A random
+room has short or long waves, a curl, a lens with shoulders, veiling glare and lateral colour, uneven light and hot
+photosites. A calm room has less of each than a careful laboratory tolerates.
 
-A room fails loudly when registration or the verdict refuses it, which is allowed. It fails silently when there is a
-table in which a light is 0.1° or a cell's mean of 300 counts and more 3 % off, and the verdict accepts it or remarks on
-something else; that must not happen. An error of up to twice what the table states of it is not silent. A remark in a
-calm room whose table is right is false, but for one on small cells where they are.
+If registration or the verdict refuses a room, that is allowed. A failure is silent if the LUT is wrong (a ground truth
+by 0.1°, or a patch mean of at least 300 counts by 3 %) and the verdict accepts it or names another fault. Errors of up
+to twice the reported uncertainty are not silent. In a calm room, a remark on a correct LUT is false, except about small
+patches if they are small.
 
-`--case NAME` takes one of the named cases instead (`benchmarks.cases`; `--case all` takes all): a lens, a mixed-up
-session, a hand, a leak, and whether the verdict says so. `--small` takes charts of 512 colours and small frames.
+`--case NAME` takes a named case instead (`benchmarks.cases`; `--case all` takes all): a lens, exchanged files, a hand,
+a leak, and the verdict about it. `--small` uses charts of 512 colours and small frames.
 
-On one core a room of 18 megapixels takes some 40 s, a small one 3. Returns 1 when anything failed silently, was given a
-wrong cause, or was remarked on without a reason.
+On one core a room of 18 megapixels takes about 40 s, a small one 3 s. The exit code is 1 after a silent failure, a
+wrong cause or a false remark.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ from sim.world.rendering import Print
 from sim.world.sensors import BODIES
 from sim.world.world import Room, World
 
+# A position error that may hit another colour: well beyond the margin of the sample windows, 0.25 px.
 SILENT_PX = 1.0
-"""A cell this far off lies beyond what its samples' window allows for, 0.25 px, by enough to hold another colour."""
 
+# Words of remarks that explain wrong patches in a random room.
 OF_CELLS = r"bleed|spread|veil|glare|correct|neighbour|uncertain|focus|blur|window|fall-?off|hot"
-"""Words of remarks that say why cells are off in a random room."""
 
+# Words of remarks that explain a wrong ground truth there.
 OF_LIGHTS = r"ground truth|fall-?off|uneven"
-"""Words of remarks that say why a light is off there."""
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 TAKEN_AT = datetime(2024, 3, 1, 9, 0, tzinfo=UTC)
@@ -66,7 +66,7 @@ LIGHTS = {"white": WHITE, "deep red": Colour(255, 0, 0), "deep blue": Colour(0, 
 
 @dataclass(frozen=True)
 class Case:
-    """A room, a camera and a light."""
+    """A room, a camera and an illuminant."""
 
     seed: int
     body: str
@@ -75,16 +75,16 @@ class Case:
 
 
 def random_case(seed: int) -> Case:
-    """Return the case of a seed.
+    """Return the room, body and illuminant of a seed.
 
-    Perspective to 15°, waves to 6 mm, a third of them short; blur 0.4 to 0.9 px, shoulders to 4.5 %, veil to 1.5 %,
-    lateral colour to 1 px, vignetting to 40 %; hot photosites and the response's spread as bodies have them.
+    Ranges: perspective up to 15°, waves up to 6 mm (a third of them short), blur 0.4 to 0.9 px, shoulders up to 4.5 %,
+    veiling glare up to 1.5 %, lateral colour up to 1 px, vignetting up to 40 %.
     """
     random = np.random.default_rng([20, seed])
     tilt, pan = random.uniform(-10.6, 10.6, 2)
     room = Room(
         seed=seed + 1000,
-        # Perspective and rotation take room in the frame.
+        # Leave space in the frame for perspective and rotation.
         fill=float(random.uniform(0.86, 0.92)),
         focal_diagonals=float(random.uniform(0.9, 2.0)),
         tilt_deg=float(tilt),
@@ -108,7 +108,7 @@ def random_case(seed: int) -> Case:
 
 
 def _with_lens(seed: int, room: Room) -> Room:
-    """Return a room with what a Gaussian lens and a long-waved paper lack; drawn apart from the rest."""
+    """Add what a Gaussian lens and long paper waves lack, from a separate random sequence."""
     random = np.random.default_rng([21, seed])
     short, curled, spread = random.random(3) < (0.33, 0.5, 0.75)
     return replace(
@@ -126,23 +126,22 @@ def _with_lens(seed: int, room: Room) -> Room:
 
 
 def natural_vignetting(focal_diagonals: float) -> float:
-    """Return the share of the light that the best lens loses at the frame's corner, by its focal length in diagonals.
+    """Return the share of light that the best lens loses at the corner of the frame, by focal length in diagonals.
 
-    The fourth power of the cosine of the field angle, of which an entrance pupil that grows with it (the Slyusarev
-    effect) is taken to give one back (chosen).
+    The loss follows the fourth power of the cosine of the field angle. A growing entrance pupil (Slyusarev effect) is
+    assumed to recover one power.
 
-    >>> round(natural_vignetting(2.0), 3)
-    0.087
+    >>> round(natural_vignetting(2.0), 3) 0.087
     """
     cosine = 1 / np.sqrt(1 + (0.5 / focal_diagonals) ** 2)
     return float(1 - cosine**3)
 
 
 def calm_case(seed: int) -> Case:
-    """Return the case of a seed in a careful lab: what a room has too much of is cut to what is tolerated.
+    """Return the room of a seed with all faults limited to what a careful laboratory tolerates.
 
-    Its lens darkens the corners as far as any lens does: in light that is more even than that nothing shows whether a
-    lens has a veil, which is remarked on (`natural_vignetting`).
+    The corners are as dark as with any lens: under more even light, a lens with veiling glare cannot be recognised,
+    which causes a remark (`natural_vignetting`).
     """
     case = random_case(seed)
     room = case.room
@@ -172,32 +171,28 @@ def calm_case(seed: int) -> Case:
 
 @dataclass(frozen=True, eq=False)
 class PhotographedChart:
-    """One frame of a chart in a room.
+    """One frame of a chart in a room."""
 
-    - `case`, `chart`, `world`: the random case, the chart in its room, and the room.
-    - `mosaic`: the frame as read from its file.
-    """
-
-    case: Case
+    case: Case  # the room
     chart: Chart
     world: World
-    mosaic: Mosaic
+    mosaic: Mosaic  # the frame as read from its file
 
     def crop_offset_px(self) -> npt.NDArray[np.float64]:
-        """Return (2,) float64, half-size px: column and row of the visible frame where the frame as read begins."""
+        """Return the position (2,) of the decoded frame within the visible frame: column, row, half-size px."""
         visible = self.world.body.visible
         return np.array([self.mosaic.visible.left - visible.left, self.mosaic.visible.top - visible.top]) / 2
 
     def corners_px(self) -> npt.NDArray[np.float64] | None:
-        """Return the corners of the field, (4, 2) float64 half-size px, whole pixels; None for a chart with tags."""
+        """Return the field corners (4, 2), rounded half-size px; None for a chart with tags."""
         if self.chart.tags:
             return None
         return (self.world.project(field_mm(self.chart)) - self.crop_offset_px()).round()
 
     def miss_px(self, registration: Registration) -> npt.NDArray[np.float64]:
-        """Return (C,) float64, the distance of each registered cell from its true place, half-size px."""
-        places = self.world.project(self.chart.centres_mm) - self.crop_offset_px()
-        return np.linalg.norm(registration.to_pixels(self.chart.centres_mm) - places, axis=1)
+        """Return the distance (C,) of each registered patch from its true position, half-size px."""
+        true_px = self.world.project(self.chart.centres_mm) - self.crop_offset_px()
+        return np.linalg.norm(registration.to_pixels(self.chart.centres_mm) - true_px, axis=1)
 
 
 def photographed_case(case: Case, bits: int = 5, page: str = "A0") -> PhotographedChart:
@@ -207,8 +202,8 @@ def photographed_case(case: Case, bits: int = 5, page: str = "A0") -> Photograph
 
 def photographed(case: Case, chart: Chart) -> PhotographedChart:
     """Return a frame of a chart in the room of a case."""
-    drawn = drawing(chart)
-    world = World(Print(drawn.page_mm, drawn.rectangles_mm, drawn.rgb), BODIES[case.body], case.room)
+    printed = drawing(chart)
+    world = World(Print(printed.page_mm, printed.rectangles_mm, printed.rgb), BODIES[case.body], case.room)
     stream = BytesIO()
     write_dng(
         stream, world.expose(LIGHTS[case.light], SETTINGS, key=(1,)), world.body, settings=SETTINGS, taken_at=TAKEN_AT
@@ -220,13 +215,13 @@ def photographed(case: Case, chart: Chart) -> PhotographedChart:
 
 
 def miss(case: Case, bits: int = 5, page: str = "A0") -> npt.NDArray[np.float64]:
-    """Return (C,) float64, the distance of each registered cell from its true place, half-size px."""
+    """Return the distance (C,) of each registered patch from its true position, half-size px."""
     shot = photographed_case(case, bits, page)
     return shot.miss_px(register(shot.mosaic, shot.chart, f"room {case.seed}"))
 
 
-def tried(case: Case, small: bool) -> Outcome:
-    """Take a short session in a room, build its table, and return what came of it."""
+def take_room(case: Case, small: bool) -> Outcome:
+    """Take a short session in a room, build its LUT and return the result."""
     chart = chart_of(small, case.seed)
     world = world_of(chart, BODIES["Test" if small else case.body], case.room)
     with tempfile.TemporaryDirectory() as folder, short_session(Path(folder) / "session", chart, world) as session:
@@ -234,10 +229,7 @@ def tried(case: Case, small: bool) -> Outcome:
 
 
 def _cell_sides_px(to_pixels: Callable[..., npt.NDArray[np.float64]], chart: Chart) -> npt.NDArray[np.float64]:
-    """Return the shorter side of each cell (N,) float64 half-size px, in the chart's order.
-
-    `to_pixels`: takes places on the print (N, 2) mm to the half-size frame.
-    """
+    """Return the shorter side (N,) of each patch, half-size px; `to_pixels` maps chart mm to the half-size frame."""
     half = np.array(chart.cell_mm) / 2
     sides = [
         np.linalg.norm(to_pixels(chart.centres_mm + half * axis) - to_pixels(chart.centres_mm - half * axis), axis=1)
@@ -247,32 +239,34 @@ def _cell_sides_px(to_pixels: Callable[..., npt.NDArray[np.float64]], chart: Cha
 
 
 def true_rows(case: Case, small: bool) -> set[str]:
-    """Return the rows of a verdict that may remark on a calm room: that of the cells' size where one is too small."""
+    """Return the figures that may be remarked on in a calm room: patch size, if a patch is too small."""
     chart = chart_of(small, case.seed)
     world = world_of(chart, BODIES["Test" if small else case.body], case.room)
     return {CELL_PX.name} if _cell_sides_px(world.project, chart).min() < CELL_PX.accept else set()
 
 
-def is_silent(found: Outcome) -> bool:
-    """Return whether a table is wrong and nothing that is said of it says why."""
-    truth = found.truth
-    if truth is None or not found.is_wrong:
+def is_silent(result: Outcome) -> bool:
+    """Return whether the LUT is wrong and no remark explains it."""
+    truth = result.truth
+    if truth is None or not result.is_wrong:
         return False
-    # An error that the report states is not silent where it is as large as it says, and silent where it is not.
-    if len(found.told) < len(found.says) and truth.worst > WRONG_SHARE:
+    # A reported lens error explains an error of this size; a smaller one does not.
+    if len(result.remarks_without_lens) < len(result.says) and truth.worst > WRONG_SHARE:
         return False
-    return not replace(found, says=_without_lens(found)).mentions(OF_LIGHTS if truth.worst <= WRONG_SHARE else OF_CELLS)
+    return not replace(result, says=_without_lens(result)).mentions(
+        OF_LIGHTS if truth.worst <= WRONG_SHARE else OF_CELLS
+    )
 
 
-def _without_lens(found: Outcome) -> tuple[str, ...]:
-    """Return what is said beside the error that the lens may leave."""
-    if len(found.rows) != len(found.says):
-        return found.says
-    return tuple(text for row, text in zip(found.rows, found.says, strict=True) if row != LENS_LEFT)
+def _without_lens(outcome: Outcome) -> tuple[str, ...]:
+    """Return the remarks without the one about the remaining lens error."""
+    if len(outcome.rows) != len(outcome.says):
+        return outcome.says
+    return tuple(text for row, text in zip(outcome.rows, outcome.says, strict=True) if row != LENS_LEFT)
 
 
 def described(case: Case) -> dict[str, Any]:
-    """Return the settings of a case's room that its table may depend on, for a line of JSON."""
+    """Return the room settings that may influence its LUT, for a JSON line."""
     names = (
         "blur_px", "shoulder_share", "shoulder_px", "veil", "lateral_red_px", "lateral_blue_px",
         "waviness_mm", "wave_mm", "curl_mm", "vignetting", "projector_falloff", "primary_difference",
@@ -281,89 +275,89 @@ def described(case: Case) -> dict[str, Any]:
     return {"room": case.seed, "body": case.body} | {name: round(getattr(case.room, name), 4) for name in names}
 
 
-def census(outcomes: Sequence[tuple[Case, Outcome]], what: str) -> int:
-    """Print how many rooms went which way, and the worst of those that have a table; return how many were silent."""
-    silent = sum(is_silent(found) for _, found in outcomes)
+def census(outcomes: Sequence[tuple[Case, Outcome]], room_kind: str) -> int:
+    """Print the numbers of verdicts and the worst LUTs; return the number of silent failures."""
+    silent = sum(is_silent(outcome) for _, outcome in outcomes)
     counts = {
-        "refused": sum(found.verdict == "refuse" for _, found in outcomes),
-        "with remarks": sum(found.verdict == "accept with remarks" for _, found in outcomes),
-        "wrong": sum(found.is_wrong for _, found in outcomes),
-        "wrong without a word of why": silent,
+        "refused": sum(outcome.verdict == "refuse" for _, outcome in outcomes),
+        "with remarks": sum(outcome.verdict == "accept with remarks" for _, outcome in outcomes),
+        "wrong": sum(outcome.is_wrong for _, outcome in outcomes),
+        "wrong without an explaining remark": silent,
     }
-    against = f"{len(outcomes)} {what}"
+    against = f"{len(outcomes)} {room_kind}"
     for name, value in counts.items():
-        print(json.dumps({"name": f"{what}, {name}", "value": value, "unit": "rooms", "against": against}))
-    tables = [(case, found, found.truth) for case, found in outcomes if found.truth is not None]
+        print(json.dumps({"name": f"{room_kind}, {name}", "value": value, "unit": "rooms", "against": against}))
+    lut_outcomes = [(case, outcome, outcome.truth) for case, outcome in outcomes if outcome.truth is not None]
     for verdict in ("accept", "accept with remarks"):
-        truths = [truth for _, found, truth in tables if found.verdict == verdict]
+        truths = [truth for _, outcome, truth in lut_outcomes if outcome.verdict == verdict]
         if not truths:
             continue
         figures = (
-            ("light, worst", max(float(truth.light_deg.max()) for truth in truths), "degrees"),
-            ("cells, worst room's RMS", 100 * max(truth.rms for truth in truths), "%"),
-            ("cells, worst of all", 100 * max(truth.worst for truth in truths), "%"),
+            ("ground truth, worst", max(float(truth.light_deg.max()) for truth in truths), "degrees"),
+            ("patches, RMS in the worst room", 100 * max(truth.rms for truth in truths), "%"),
+            ("patches, worst of all", 100 * max(truth.worst for truth in truths), "%"),
         )
         for name, value, unit in figures:
-            figure = {"name": f"{what}, {verdict}, {name}", "value": float(f"{value:.3g}"), "unit": unit}
-            print(json.dumps(figure | {"against": "World, noise taken out, from 300 counts on"}))
-    for waves, chosen in (("long", False), ("short", True)):
-        truths = [truth for case, _, truth in tables if (case.room.wave_mm > 0) == chosen]
+            figure = {"name": f"{room_kind}, {verdict}, {name}", "value": float(f"{value:.3g}"), "unit": unit}
+            print(json.dumps(figure | {"against": "World, noise subtracted, from 300 counts on"}))
+    for waves, is_short in (("long", False), ("short", True)):
+        truths = [truth for case, _, truth in lut_outcomes if (case.room.wave_mm > 0) == is_short]
         if not truths:
             continue
         offsets = np.array([truth.offset_rms_px() for truth in truths]).max(axis=0)
         channels = ("red", "green", "blue")
-        placed = {f"worst room's RMS in {name}": value for name, value in zip(channels, offsets, strict=True)}
-        placed["worst of all fit cells"] = max(truth.worst_offset_px() for truth in truths)
-        for name, value in placed.items():
-            figure = {"name": f"{what}, {waves} waves, cell centres, {name}", "value": round(float(value), 4)}
+        offset_px = {f"worst room's RMS, {name}": value for name, value in zip(channels, offsets, strict=True)}
+        offset_px["worst of all fit patches"] = max(truth.worst_offset_px() for truth in truths)
+        for name, value in offset_px.items():
+            figure = {"name": f"{room_kind}, {waves} waves, patch centres, {name}", "value": round(float(value), 4)}
             print(json.dumps(figure | {"unit": "px", "against": "World.project"}))
     return silent
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Try rooms or named cases, print what came of each, and return 1 if one failed silently or wrongly, else 0."""
+    """Run rooms or named cases and print the results; return 1 after a silent failure or a wrong remark, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rooms", type=int, default=50, help="random rooms")
-    parser.add_argument("--calm", type=int, default=10, help="calm rooms")
-    parser.add_argument("--first", type=int, default=0, help="the first room's seed")
-    parser.add_argument("--small", action="store_true", help="small charts and frames")
+    parser.add_argument("--rooms", type=int, default=50, help="number of random rooms")
+    parser.add_argument("--calm", type=int, default=10, help="number of calm rooms")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first room")
+    parser.add_argument("--small", action="store_true", help="use small charts and frames")
     parser.add_argument("--case", action="append", choices=["all", *BY_NAME], default=[], help="a named case instead")
-    given = parser.parse_args(arguments)
-    if given.case:
-        names = [case.name for case in CASES] if "all" in given.case else given.case
-        failed = [_case_failed(name, small=given.small, seed=given.first + 1) for name in names]
+    options = parser.parse_args(arguments)
+    if options.case:
+        names = [case.name for case in CASES] if "all" in options.case else options.case
+        failed = [_case_failed(name, small=options.small, seed=options.first + 1) for name in names]
         print(
             json.dumps(
                 {"name": "cases failed", "value": sum(failed), "unit": "cases", "against": f"{len(failed)} cases"}
             )
         )
         return int(any(failed))
-    seeds = range(given.first, given.first + given.rooms), range(given.first, given.first + given.calm)
-    wild = [(case, _printed(case, "random", small=given.small)) for case in map(random_case, seeds[0])]
-    calm = [(case, _printed(case, "calm", small=given.small)) for case in map(calm_case, seeds[1])]
+    seeds = range(options.first, options.first + options.rooms), range(options.first, options.first + options.calm)
+    wild = [(case, _run_room(case, "random", small=options.small)) for case in map(random_case, seeds[0])]
+    calm = [(case, _run_room(case, "calm", small=options.small)) for case in map(calm_case, seeds[1])]
     silent = sum(
         census(outcomes, what) for outcomes, what in ((wild, "random rooms"), (calm, "calm rooms")) if outcomes
     )
-    false = sum(bool(set(found.rows) - true_rows(case, given.small)) and not found.is_wrong for case, found in calm)
-    false += sum(found.verdict == "refuse" for _, found in calm)
-    print(json.dumps({"name": "calm rooms, false remarks", "value": false, "unit": "rooms", "against": f"{len(calm)}"}))
-    return int(silent > 0 or false > 0)
+    wrong = sum(bool(set(room.rows) - true_rows(case, options.small)) and not room.is_wrong for case, room in calm)
+    wrong += sum(room.verdict == "refuse" for _, room in calm)
+    print(json.dumps({"name": "calm rooms, false remarks", "value": wrong, "unit": "rooms", "against": f"{len(calm)}"}))
+    return int(silent > 0 or wrong > 0)
 
 
 def _case_failed(name: str, *, small: bool, seed: int) -> bool:
-    """Print what came of a named case, and return whether it failed."""
+    """Run and print a named case; return whether it failed."""
     row = try_case(BY_NAME[name], small=small, seed=seed)
     print(json.dumps(row), flush=True)
     return any(row[failure] for failure in FAILURES)
 
 
-def _printed(case: Case, kind: str, *, small: bool) -> Outcome:
-    """Print what came of a room, and return it."""
-    started = time.perf_counter()
-    found = tried(case, small)
-    row = {"kind": kind} | described(case) | found.to_json() | {"silent": is_silent(found)}
-    print(json.dumps(row | {"seconds": round(time.perf_counter() - started, 1)}), flush=True)
-    return found
+def _run_room(case: Case, kind: str, *, small: bool) -> Outcome:
+    """Run and print a room; return the result."""
+    start_s = time.perf_counter()
+    outcome = take_room(case, small)
+    row = {"kind": kind} | described(case) | outcome.to_json() | {"silent": is_silent(outcome)}
+    print(json.dumps(row | {"seconds": round(time.perf_counter() - start_s, 1)}), flush=True)
+    return outcome
 
 
 if __name__ == "__main__":

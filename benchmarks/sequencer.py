@@ -1,22 +1,22 @@
-"""How near a session comes to the time that exposure, settling and download need in any case, and what saving costs.
+"""Efficiency of a session compared with the time for exposure, settling and download, and the cost of saving.
 
-`python -m benchmarks.sequencer` prints one JSON object a line for each figure:
+`python -m benchmarks.sequencer` prints one JSON object per figure and line:
 
-- in simulated time, 767 frames (707 lights and their references) of the layout of an EOS 550D's CR2, with the latencies
-  of a camera, a screen and a projector; each file is written, flushed, hashed and decoded;
-- in real time on the machine at hand, frames of 25 MB at 30 MB/s, exposure 0.5 s, settling 0.2 s, decoded and judged;
-- a frame saved, hashed and judged against the same bytes written, flushed and hashed by a few lines.
+- in simulated time, 767 frames (707 illuminants with references) in the layout of EOS 550D CR2 files, with latencies of
+  a camera, a screen and a projector. Each file is written, flushed, hashed and decoded;
+- in real time on this machine, frames of 25 MB at 30 MB/s, exposure 0.5 s, settling 0.2 s, decoded and judged;
+- the time to save, hash and judge a frame, compared with a few lines that write, flush and hash the same bytes.
 
-``python -m benchmarks.sequencer quick`` takes a tenth of the frames in simulated time, and some minutes. Frames are
-judged as in a session (`acquisition.judge.judge.LiveJudge`); with ``exposure`` among the words by their exposure alone,
-as it was before.
+``quick`` takes a tenth of the frames in simulated time, in some minutes. Frames are judged as in a session
+(`acquisition.judge.judge.LiveJudge`); with the word ``exposure`` only their exposure is judged.
 
-The unavoidable time of a frame is release, exposure and readout, and then the longer of settling and download: a body
-does not expose while it sends, and the light may change when it has announced the frame. What is flattered: files are
-prepared (two, a dark and a lit one, with the slices of a 550D and without its previews), cable and body do their work
-without a processor of this machine, the latencies are constants, and no frame is refused: the judge measures and
-compares each as in a session without frames of the primaries, before a bare wall, and what it says of a light that does
-not change is passed over. In simulated time work of this machine takes none; the figures in real time have it.
+The unavoidable time of a frame is release, exposure and readout, plus the longer of settling and download. A camera
+does not expose while it sends a file, and the illuminant may change when it has announced the frame.
+
+Simplifications: two files (a dark and a lit one, with the slices of a 550D, without previews) are prepared. Cable and
+camera use no processor time, latencies are constant, and no frame is rejected. The judge measures and compares each
+frame as in a session without primaries; its message that the illuminant does not change is ignored. In simulated time,
+work of this machine takes no time; the figures in real time include it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from acquisition.judge.measure import ExposureJudge
 from acquisition.run.devices import Devices
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import take_session
-from benchmarks import words_given
+from benchmarks import parse_words
 from calibration.figures.light import OFF_CODES_DEG
 from calibration.figures.single_frames import REPEATED
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
@@ -60,37 +60,28 @@ from tests.drivers.raw.raw_files import write_cr2
 BODY = BODIES["EOS 550D"]
 EXPOSURE = ExposureSettings(100, 8.0, 0.5)
 LIGHTS = plan_illuminants(35, list(range(2000, 10001, 200)))
+# Illuminants of the session in real time: some tens of frames, one minute.
 REAL_LIGHTS = 36
-"""Lights of the session in real time: some tens of frames, a minute."""
+# Slices of the lossless JPEG of an EOS 550D: two of the first width, one of the last, together 5344 columns.
 SLICES = (2, 1728, 1888)
-"""Of an EOS 550D's lossless JPEG: two of the first width, one of the last; together its 5344 columns."""
+# Number of files in the comparison with plain saving.
 SAVED = 12
-"""Files of the comparison with plain saving."""
 
 
 @dataclass(frozen=True)
 class Latencies:
-    """What devices take, seconds.
+    """Latencies of the devices."""
 
-    - `release_s`: from the command to the open shutter: mirror and two messages (60D: 2 … 40 ms a message; mirror
-      chosen).
-    - `readout_s`: from the closed shutter to the announcement: an EOS 550D's in `sim.camera.bodies`.
-    - `bytes_per_s`: of the cable: USB 2.0 carries 25 to 40 million.
-    - `show_s`: from the call to a colour that is known to be on the screen: a picture or two at 60 Hz.
-    - `verify_s`: reading the screen back.
-    - `question_s`: A projector's answer over the network; it is asked five things a frame.
-    """
-
-    release_s: float = 0.08
-    readout_s: float = 0.783
-    bytes_per_s: float = 27.5e6
-    show_s: float = 1.5 / 60
-    verify_s: float = 0.008
-    question_s: float = 0.004
+    release_s: float = 0.08  # command to open shutter: mirror and two messages (60D: 2 to 40 ms each)
+    readout_s: float = 0.783  # closed shutter to announcement, EOS 550D (`sim.camera.bodies`)
+    bytes_per_s: float = 27.5e6  # of the cable; USB 2.0 transfers 25 to 40 MB/s
+    show_s: float = 1.5 / 60  # call to confirmed colour: one or two images at 60 Hz
+    verify_s: float = 0.008  # reading the screen back
+    question_s: float = 0.004  # one answer of a network projector; a frame needs five
 
 
 class PacedScreen:
-    """Remembers the colour, and takes its time."""
+    """A screen that stores the colour, with realistic delays."""
 
     def __init__(self, clock: Clock, latencies: Latencies) -> None:
         self.clock, self.latencies = clock, latencies
@@ -111,7 +102,7 @@ class PacedScreen:
 
 
 class PacedProjector:
-    """A healthy projector that takes its time to say so."""
+    """A projector without faults that answers with realistic delays."""
 
     def __init__(self, clock: Clock, latencies: Latencies) -> None:
         self.clock, self.latencies = clock, latencies
@@ -125,7 +116,7 @@ class PacedProjector:
         return ProjectorIdentity("CroP", "paced", "")
 
     def power(self) -> Power:
-        """Say that the lamp burns, or cools when it was switched off."""
+        """Report a lit lamp, or a cooling one after `switch_off`."""
         self._ask()
         return self.state
 
@@ -133,11 +124,11 @@ class PacedProjector:
         """Do nothing."""
 
     def switch_off(self) -> None:
-        """Do so: one that went on burning would be looked at for five seconds more, a tenth of a short session."""
+        """Start cooling: a projector that stays on is watched for five seconds, a tenth of a short session."""
         self.state = Power.COOLING
 
     def muted(self) -> bool:
-        """Say that it is not."""
+        """Report that the image is visible."""
         self._ask()
         return False
 
@@ -145,12 +136,12 @@ class PacedProjector:
         """Do nothing."""
 
     def faults(self) -> tuple[Fault, ...]:
-        """Say that there are none."""
+        """Report no faults."""
         self._ask()
         return ()
 
     def picture_fault(self) -> str | None:
-        """Say that the picture follows: signal and freeze are two questions."""
+        """Report no fault; signal and freeze are two requests."""
         self._ask()
         self._ask()
         return None
@@ -164,7 +155,7 @@ class PacedProjector:
 
 
 class PacedCamera:
-    """Hands out prepared files in the time that a camera takes."""
+    """A camera that delivers prepared files with realistic delays."""
 
     def __init__(self, screen: PacedScreen, clock: Clock, latencies: Latencies, files: dict[str, bytes]) -> None:
         self.screen, self.clock, self.latencies, self.files = screen, clock, latencies, files
@@ -182,11 +173,11 @@ class PacedCamera:
         """Do nothing."""
 
     def shutter_speeds(self) -> tuple[float, ...]:
-        """Offer none: nobody asks."""
+        """Return none; they are not requested here."""
         return ()
 
     def expose(self) -> datetime:
-        """Release, expose, read out."""
+        """Release, expose and read out."""
         self._frame = self.files["dark" if self.screen.colour == BLACK else "lit"]
         self.frames += 1
         self._released = self.clock.now()
@@ -196,13 +187,13 @@ class PacedCamera:
         return self._released
 
     def download(self, into: BinaryIO) -> CapturedFrame:
-        """Send the file in pieces of a mebibyte, as fast as the cable."""
-        begun = self.clock.monotonic()
+        """Send the file in pieces of 1 MiB at the speed of the cable."""
+        start = self.clock.monotonic()
         self.downloading_s.append(len(self._frame) / self.latencies.bytes_per_s)
-        for at in range(0, len(self._frame), 1 << 20):
-            into.write(self._frame[at : at + (1 << 20)])
-            due = begun + min(at + (1 << 20), len(self._frame)) / self.latencies.bytes_per_s
-            self.clock.sleep(max(due - self.clock.monotonic(), 0))
+        for offset in range(0, len(self._frame), 1 << 20):
+            into.write(self._frame[offset : offset + (1 << 20)])
+            due_s = start + min(offset + (1 << 20), len(self._frame)) / self.latencies.bytes_per_s
+            self.clock.sleep(max(due_s - self.clock.monotonic(), 0))
         return CapturedFrame(f"IMG_{self.frames:04d}.CR2", len(self._frame), self._released)
 
     def close(self) -> None:
@@ -210,7 +201,7 @@ class PacedCamera:
 
 
 def prepared_files() -> dict[str, bytes]:
-    """Return a dark and a lit file, with the noise of the body; a fixed code table makes up for missing previews."""
+    """Return a dark and a lit file with the noise of the body; a fixed code table replaces the previews in size."""
     rng = np.random.default_rng(20190601)
     rows, columns = np.mgrid[0 : BODY.sensor[0], 0 : BODY.sensor[1]]
     scene = 0.6 + 0.4 * np.sin(columns / 90) * np.cos(rows / 70)
@@ -221,20 +212,17 @@ def _file(signal: np.ndarray[tuple[int, int], np.dtype[np.float64]], rng: np.ran
     noise = rng.standard_normal(BODY.sensor, dtype=np.float32)
     counts = BODY.black + signal + noise * np.sqrt(signal / BODY.electrons_per_dn + BODY.read_noise_dn**2)
     for area in BODY.masked:
-        part = (slice(area.top, area.top + area.height), slice(area.left, area.left + area.width))
-        counts[part] = BODY.black + BODY.read_noise_dn * noise[part]
-    whole = counts.round().clip(0, BODY.saturation).astype(np.uint16)
+        area_slices = (slice(area.top, area.top + area.height), slice(area.left, area.left + area.width))
+        counts[area_slices] = BODY.black + BODY.read_noise_dn * noise[area_slices]
+    sensor_counts = counts.round().clip(0, BODY.saturation).astype(np.uint16)
     with tempfile.TemporaryDirectory() as scratch:
         file = Path(scratch) / "frame.cr2"
-        write_cr2(file, whole, BODY.model, EXPOSURE.iso, SLICES)
+        write_cr2(file, sensor_counts, BODY.model, EXPOSURE.iso, SLICES)
         return file.read_bytes()
 
 
 class PassingJudge:
-    """The judge of a session, whose refusals of a frame that was seen before are passed over.
-
-    What is refused for anything else is not: the judge did not look at it whole.
-    """
+    """The judge of a session, without rejections for repeated frames; other rejections stay."""
 
     def __init__(self) -> None:
         settings = LabSettings.model_validate(
@@ -248,7 +236,7 @@ class PassingJudge:
         self._judge = LiveJudge(settings, design_chart(bits=1), LIGHTS)
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
-        """Return the judgement with all its numbers, accepted."""
+        """Return the judgement with all figures, accepted."""
         judgement = self._judge.judge(file, step)
         passed = all(check.passed or check.name in (OFF_CODES_DEG.name, REPEATED.name) for check in judgement.checks)
         if not passed:
@@ -261,7 +249,6 @@ class PassingJudge:
         )
 
     def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
-        """Take in a frame of an earlier run."""
         self._judge.recall(step, measurement, accepted)
 
 
@@ -275,8 +262,8 @@ def _settings(settle_s: float) -> LabSettings:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """A session: frames, its time by its clock and by this machine's, the unavoidable time, and where time went."""
+class SessionTimes:
+    """A measured session: frames, its time by its own clock and by this machine's, unavoidable time, phases."""
 
     frames: int
     taken_s: float
@@ -286,104 +273,112 @@ class Measured:
 
     @property
     def efficiency(self) -> float:
-        """Unavoidable time over the time taken."""
+        """Unavoidable time / time taken."""
         return self.unavoidable_s / self.taken_s
 
 
 def measure(
     clock: Clock, latencies: Latencies, settle_s: float, lights: int, files: dict[str, bytes], live: bool = True
-) -> Measured:
-    """Take a session of `lights` lights; files are emptied when they are judged, so that the disk need not hold all.
+) -> SessionTimes:
+    """Take a session of `lights` illuminants.
 
-    They keep their size: a run takes frames again whose files are gone or cut.
+    Judged files are emptied to save disk space. They keep their size, because a run repeats frames with missing or cut
+    files.
     """
     screen = PacedScreen(clock, latencies)
     camera = PacedCamera(screen, clock, latencies, files)
-    chosen = [Illuminant(n, "uniform", None, LIGHTS[n].colour) for n in range(lights)]
+    plan = [Illuminant(n, "uniform", None, LIGHTS[n].colour) for n in range(lights)]
     settings = _settings(settle_s)
-    steps = plan_steps(chosen, settings.sequence.reference_every)
+    steps = plan_steps(plan, settings.sequence.reference_every)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "session"
-        with Session.create(folder, settings.to_toml(), design_chart(bits=1), chosen, steps) as session:
+        with Session.create(folder, settings.to_toml(), design_chart(bits=1), plan, steps) as session:
 
-            def tidy(taken: Taken) -> None:
-                assert taken.judgement.accepted, taken.judgement.reason
-                for path in session.frames_folder.glob(f"{taken.step.stem}.*"):
+            def tidy(frame: Taken) -> None:
+                assert frame.judgement.accepted, frame.judgement.reason
+                for path in session.frames_folder.glob(f"{frame.step.stem}.*"):
                     size = path.stat().st_size
                     os.truncate(path, 0)
                     os.truncate(path, size)
 
-            begun, machine = clock.monotonic(), time.perf_counter()
+            start, machine_start = clock.monotonic(), time.perf_counter()
             devices = Devices(camera, screen, PacedProjector(clock, latencies), clock)
             judge = PassingJudge() if live else ExposureJudge(settings)
             assert take_session(session, devices, settings, judge, tidy).complete
             assert camera.frames == len(steps)
-            taken_s, machine_s = clock.monotonic() - begun, time.perf_counter() - machine
-            parts = [details.timings for details in session.journal.details().values()]
-    medians = {name: statistics.median(part[name] for part in parts) for name in parts[0]}
-    # The first light settles with nothing to hide it; behind the last frame there is no light to settle.
+            taken_s, machine_s = clock.monotonic() - start, time.perf_counter() - machine_start
+            step_timings = [details.timings for details in session.journal.details().values()]
+    medians = {name: statistics.median(timings[name] for timings in step_timings) for name in step_timings[0]}
+    # Settling of the first illuminant overlaps with nothing; after the last frame nothing settles.
     *downloads, last = camera.downloading_s
     waits = [settle_s, *(max(settle_s, downloading_s) for downloading_s in downloads), last]
-    return Measured(len(steps), taken_s, machine_s, camera.exposing_s + sum(waits), medians)
+    return SessionTimes(len(steps), taken_s, machine_s, camera.exposing_s + sum(waits), medians)
 
 
 def report(name: str, value: float, unit: str, against: str = "") -> None:
-    """Print one figure."""
     print(json.dumps({"name": name, "value": float(f"{value:.4g}"), "unit": unit, "against": against}), flush=True)
 
 
-def report_session(name: str, measured: Measured) -> None:
-    """Print what a session took, and where its time went."""
+def report_session(name: str, measured: SessionTimes) -> None:
+    """Print the time of a session and its phases."""
     frames = measured.frames
     report(f"{name}: frames", frames, "frames")
-    report(f"{name}: seconds a frame", measured.taken_s / frames, "s")
+    report(f"{name}: seconds per frame", measured.taken_s / frames, "s")
     report(
-        f"{name}: unavoidable", measured.unavoidable_s / frames, "s", "exposure and the longer of settling, download"
+        f"{name}: unavoidable",
+        measured.unavoidable_s / frames,
+        "s",
+        "exposure, then the longer of settling and download",
     )
-    report(f"{name}: efficiency", measured.efficiency, "ratio", "unavoidable time over time taken")
-    for part, seconds in measured.timings.items():
-        report(f"{name}: median of {part}", seconds, "s")
+    report(f"{name}: efficiency", measured.efficiency, "ratio", "unavoidable time / time taken")
+    for phase, seconds in measured.timings.items():
+        report(f"{name}: median of {phase}", seconds, "s")
 
 
 @contextmanager
 def counted_writes() -> Generator[list[float]]:
     """Collect the seconds of each write to the journal."""
-    spent: list[float] = []
-    real = {name: getattr(Journal, name) for name in ("begin", "commit", "beat", "note")}
+    write_s: list[float] = []
+    original = {name: getattr(Journal, name) for name in ("begin", "commit", "beat", "note")}
 
     def timed(name: str):
-        def call(*given: object, **named: object) -> object:
-            begun = time.perf_counter()
+        def call(*arguments: object, **options: object) -> object:
+            start = time.perf_counter()
             try:
-                return real[name](*given, **named)
+                return original[name](*arguments, **options)
             finally:
-                spent.append(time.perf_counter() - begun)
+                write_s.append(time.perf_counter() - start)
 
         return call
 
-    for name in real:
+    for name in original:
         setattr(Journal, name, timed(name))
     try:
-        yield spent
+        yield write_s
     finally:
-        for name, method in real.items():
+        for name, method in original.items():
             setattr(Journal, name, method)
 
 
 def compare_saving(files: dict[str, bytes], live: bool) -> None:
-    """Compare what becomes of a frame on this machine with plain saving of the same bytes."""
+    """Compare the processing of a frame with plain saving of the same bytes."""
     instant = Latencies(0, 0, 1e15, 0, 0, 0)
     measured = measure(SimulatedClock(), instant, 0.0, SAVED - 4, files, live)
     with tempfile.TemporaryDirectory() as scratch:
-        begun = time.perf_counter()
+        start = time.perf_counter()
         for number in range(measured.frames):
             _save(Path(scratch) / f"{number}.cr2", files["lit"])
-        saved_s = time.perf_counter() - begun
+        saved_s = time.perf_counter() - start
     name = "sequencer: a frame of 18 Mpx saved, hashed, decoded, judged"
     report(name, measured.machine_s / measured.frames, "s")
-    report(f"{name}, over saving alone", measured.machine_s / saved_s, "ratio", "write, fsync, SHA-256")
+    report(f"{name}/ saving alone", measured.machine_s / saved_s, "ratio", "write, fsync, SHA-256")
     judged_s = measured.timings["judge"] * measured.frames
-    report(f"{name}, over saving and judging", measured.machine_s / (saved_s + judged_s), "ratio", "and judging")
+    report(
+        f"{name}/ saving and judging",
+        measured.machine_s / (saved_s + judged_s),
+        "ratio",
+        "write, fsync, SHA-256, judging",
+    )
 
 
 def _save(path: Path, content: bytes) -> None:
@@ -395,23 +390,22 @@ def _save(path: Path, content: bytes) -> None:
 
 
 def main() -> int:
-    """Measure sessions of prepared frames."""
-    words = words_given(__doc__, ("quick", "exposure"))
+    words = parse_words(__doc__, ("quick", "exposure"))
     files = prepared_files()
     report("size of a frame", len(files["lit"]) / 1e6, "MB")
-    report("load of the machine when begun", os.getloadavg()[0], "processes", f"{os.cpu_count()} processors")
+    report("load of the machine at the start", os.getloadavg()[0], "processes", f"{os.cpu_count()} processors")
     live = "exposure" not in words
     report("judged", float(live), "", "1: by the live judge, 0: by exposure alone")
     compare_saving(files, live)
-    real = Latencies(0, 0, 30e6, 0, 0, 0)
-    with counted_writes() as spent:
-        measured = measure(SystemClock(), real, 0.2, REAL_LIGHTS, files, live)
-    report_session("real time", measured)
-    report("real time: journal's writes a frame", sum(spent) / measured.frames, "s")
+    latencies = Latencies(0, 0, 30e6, 0, 0, 0)
+    with counted_writes() as write_s:
+        real_session = measure(SystemClock(), latencies, 0.2, REAL_LIGHTS, files, live)
+    report_session("real time", real_session)
+    report("real time: journal writes per frame", sum(write_s) / real_session.frames, "s")
     lights = len(LIGHTS) // 10 if "quick" in words else len(LIGHTS)
     report_session("simulated time", measure(SimulatedClock(), Latencies(), 0.5, lights, files, live))
-    slow = measure(SimulatedClock(), Latencies(question_s=0.02), 0.5, len(LIGHTS) // 10, files, live)
-    report_session("simulated time, a projector that takes 20 ms an answer", slow)
+    slow_session = measure(SimulatedClock(), Latencies(question_s=0.02), 0.5, len(LIGHTS) // 10, files, live)
+    report_session("simulated time, a projector with 20 ms per answer", slow_session)
     return 0
 
 

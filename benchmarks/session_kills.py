@@ -1,21 +1,21 @@
-"""Kills of a run at random operations and times: the session ends in the frames of an undisturbed one.
+"""Kills of a run at random operations and times: the session must end with the frames of an undisturbed one.
 
-`python -m benchmarks.session_kills [KILLS [SEED]]` kills 10 000 runs and prints one JSON object a line. Each run is a
-process of its own that is killed by the system (SIGKILL): half of them at the n-th operation (a call that writes,
-flushes, renames, journals, shows, exposes or fetches; before or after it), half of them by a timer at any moment. After
-a few kills a session is taken to its end, and its frames, the accepted rows of its journal and `frames.csv` are
-compared with those of an undisturbed run: bytes, hashes, times. A table follows from these alone. Ctrl-C ends it with
-the figures so far; a kill costs some 50 ms of one core.
+`python -m benchmarks.session_kills [KILLS [SEED]]` kills 10 000 runs and prints one JSON object per line. Each run is a
+separate process that is killed by SIGKILL. Half of the kills happen before or after the n-th operation (a call that
+writes, flushes, renames, journals, shows, exposes or downloads), half by a timer at any moment. After a few kills the
+session is completed. Its frames, the accepted rows of its journal and `frames.csv` are compared with an undisturbed
+run: bytes, hashes, times. A LUT depends on these alone. Ctrl-C ends the program with the figures so far. A kill takes
+about 50 ms of one core.
 
-`python -m benchmarks.session_kills troubled [KILLS [SEED]]` kills runs that are in trouble all the time: frames that
-are refused and taken again, a camera that fails, power that goes, a lamp that is lit again, a journal that was deleted
-or cut and is made anew. Each kill is told by where it fell. Times differ there with each kill; what must hold is that
-no frame that counted is lost, each step has one frame of its own light in the end, and no exposure counts twice.
-`… programs [KILLS [SEED]]` kills `acquire run` itself, started as a program of its own, from outside.
+`python -m benchmarks.session_kills troubled [KILLS [SEED]]` kills runs with continuous faults: rejected and repeated
+frames, a failing camera, power cuts, a lamp that is lit again, a deleted or cut journal that is rebuilt. Kills are
+counted by the phase of the run. Times differ with each kill. Required: no counted frame is lost, each step has one
+frame of its own illuminant in the end, and no exposure counts twice. `… programs [KILLS [SEED]]` kills `acquire run`
+itself, started as a separate program.
 
-Camera and screen are the simplest that keep the contracts; their files are the light, its number and the time of
-release, so that a frame that is lost, doubled or of another moment differs. What is flattered: a kill is no power cut
-(what was written and not flushed stays), and the files are small.
+Camera and screen are minimal implementations of the contracts. Their files contain the illuminant, its number and the
+release time, so lost, doubled and exchanged frames differ. Simplifications: a kill is no power cut (data that were
+written but not flushed survive), and the files are small.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ from sim.projectors.projector import SimulatedProjector
 from tests.end_to_end.conftest import make_lab
 
 KILLS = 10_000
+# Average number of kills per session.
 KILLS_A_SESSION = 4
-"""Kills, on the average, between the beginning and the end of a session."""
 
-TOLD_EVERY = 100
-"""Sessions from one line about the kills so far to the next."""
+# Sessions between two progress lines.
+PROGRESS_EVERY = 100
 
 LIGHTS = tuple(Illuminant(n, "uniform", None, Colour(255, 20 * n, 255 - n)) for n in range(6))
 SETTINGS = LabSettings.model_validate(
@@ -77,7 +77,7 @@ STEPS = plan_steps(LIGHTS, 3)
 
 
 class SmallLab:
-    """Devices in the state that a session's journal gives: the same time, the same pictures taken."""
+    """Devices in the state given by the journal of a session: same time, same number of exposures."""
 
     def __init__(self, session: Session) -> None:
         attempts = [attempt for attempt in session.journal.attempts() if attempt.has_frame]
@@ -91,7 +91,6 @@ class SmallLab:
 
     @property
     def devices(self) -> Devices:
-        """Return the devices: this is all of them."""
         return Devices(self, self, None, self.clock)
 
     def identity(self) -> CameraIdentity:
@@ -106,7 +105,7 @@ class SmallLab:
         return ()
 
     def show(self, colour: Colour) -> None:
-        """Show a colour after one picture."""
+        """Show a colour after one frame of the display."""
         self.clock.sleep(1 / 60)
         self.colour = colour
 
@@ -135,17 +134,18 @@ class SmallLab:
 
 
 class LightJudge:
-    """Accepts a file that shows the light of its step."""
+    """A judge that accepts a file with the illuminant of its step."""
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
-        """Look at the file's first words."""
-        shown = file.read_bytes().startswith(f"{step.colour} ".encode())
-        return Judgement.of_reason("light", None if shown else "another light")
+        """Compare the first words of the file."""
+        is_ordered = file.read_bytes().startswith(f"{step.colour} ".encode())
+        return Judgement.of_reason("light", None if is_ordered else "another illuminant")
 
     def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
-        """Remember nothing."""
+        """Do nothing."""
 
 
+# Operations before and after which a run is killed.
 OPERATIONS: tuple[tuple[Any, str], ...] = (
     *((os, name) for name in ("fsync", "replace", "unlink", "close")),
     *((Journal, name) for name in ("begin", "commit", "note", "beat", "add_steps")),
@@ -153,37 +153,36 @@ OPERATIONS: tuple[tuple[Any, str], ...] = (
     *((Session, name) for name in ("write_frames_csv", "set_aside_strays")),
     *((IncomingFile, "__init__"), (IncomingFile, "complete"), (LightJudge, "judge"), (StepQueue, "accept")),
 )
-"""Where a run is killed: before or after a call."""
 
 
 def take(folder: Path) -> None:
-    """Take the session as far as it goes, as `acquire run` does."""
+    """Take the session as `acquire run` does."""
     with Session.open_for_run(folder) as session:
         session.verify()
         assert take_session(session, SmallLab(session).devices, SETTINGS, LightJudge()).complete
 
 
-def counting(happens: Callable[[int], object]) -> None:
-    """Call `happens` with the number of each operation from now on, before and after it."""
-    count = [0]
+def count_operations(on_operation: Callable[[int], object]) -> None:
+    """Call `on_operation` with the number of each operation from now on, before and after it."""
+    counter = [0]
 
-    def counted(real: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*given: Any, **named: Any) -> Any:
-            count[0] += 1
-            happens(count[0])
-            result = real(*given, **named)
-            count[0] += 1
-            happens(count[0])
+    def wrap(original: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            counter[0] += 1
+            on_operation(counter[0])
+            result = original(*arguments, **options)
+            counter[0] += 1
+            on_operation(counter[0])
             return result
 
         return call
 
     for owner, name in OPERATIONS:
-        setattr(owner, name, counted(getattr(owner, name)))
+        setattr(owner, name, wrap(getattr(owner, name)))
 
 
 def in_child(work: Callable[[], object]) -> int:
-    """Do `work` in a process of its own; return how that ended, as `os.waitstatus_to_exitcode`."""
+    """Run `work` in a child process; return its exit code as `os.waitstatus_to_exitcode` does."""
     child = os.fork()
     if child == 0:
         code = 1
@@ -198,24 +197,24 @@ def in_child(work: Callable[[], object]) -> int:
 
 
 def killed_at_operation(folder: Path, number: int) -> int:
-    """Take the session in a process that kills itself at an operation; return how it ended."""
+    """Take the session in a process that kills itself at an operation; return its exit code."""
 
     def die(count: int) -> None:
         if count == number:
             os.kill(os.getpid(), signal.SIGKILL)
 
     def work() -> None:
-        counting(die)
+        count_operations(die)
         take(folder)
 
     return in_child(work)
 
 
 def killed_at_time(folder: Path, seconds: float) -> int:
-    """Take the session in a process that the system ends after some time; return how it ended."""
+    """Take the session in a process that is killed after some time; return its exit code."""
 
     def work() -> None:
-        # The signal's own action ends the process wherever it is.
+        # The default action of the signal ends the process wherever it is.
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, seconds)
         take(folder)
@@ -225,7 +224,7 @@ def killed_at_time(folder: Path, seconds: float) -> int:
 
 
 def contents(folder: Path) -> dict[str, object]:
-    """Return what must be the same: frames with their bytes, the accepted rows, the list of frames."""
+    """Return what must be equal: frames with their bytes, the accepted rows, the list of frames."""
     with Session.open(folder) as session:
         rows = sorted((frame.step, frame.sha256, frame.size) for frame in session.journal.accepted_files())
         frames = {
@@ -235,12 +234,12 @@ def contents(folder: Path) -> dict[str, object]:
             for frame in session.frames()
             if frame.accepted
         }
-    listed = [line for line in (folder / "frames.csv").read_text().splitlines() if line.endswith(",accepted")]
-    return {"rows": rows, "frames": frames, "listed": sorted(listed)}
+    accepted_lines = [line for line in (folder / "frames.csv").read_text().splitlines() if line.endswith(",accepted")]
+    return {"rows": rows, "frames": frames, "listed": sorted(accepted_lines)}
 
 
+# Phases of a troubled run at the moment of a kill.
 PHASES = ("taking", "pause", "retake", "relighting", "rebuilding")
-"""What a run that is in trouble does where it is killed."""
 
 RESPONSES = (Colour(250, 0, 0), Colour(0, 250, 0), Colour(0, 0, 250))
 TROUBLED = SETTINGS.model_copy(
@@ -253,7 +252,7 @@ TROUBLED = SETTINGS.model_copy(
 
 
 class TroubledLab(SmallLab):
-    """Devices of which each fails at some frames of every run, and is mended while it is waited for."""
+    """Devices that fail at some frames of every run and recover while the run waits."""
 
     def __init__(self, session: Session, phase: Callable[[str], object]) -> None:
         super().__init__(session)
@@ -263,36 +262,35 @@ class TroubledLab(SmallLab):
 
     @property
     def devices(self) -> Devices:
-        """Return the devices, with a projector."""
         return Devices(self, self, self.projector, self.clock)
 
     def expose(self) -> datetime:
-        """Fail for a while at each seventh frame; let the power go before each ninth."""
-        taken = sum(self.exposed.values())
-        if taken % 7 == 6 and self._fails < 4:
+        """Fail for a while at every seventh frame; cut the power before every ninth."""
+        exposure_count = sum(self.exposed.values())
+        if exposure_count % 7 == 6 and self._fails < 4:
             self._fails += 1
             raise DeviceError("the camera does not answer; look at its cable")
         self._fails = 0
-        if taken % 9 == 8:
+        if exposure_count % 9 == 8:
             self.projector._enter(Power.STANDBY, self.clock.monotonic())
         return super().expose()
 
 
 class TroubledJudge(LightJudge):
-    """Refuses the first frame of every third colour, and the first two of another for something that lasts."""
+    """A judge that rejects the first frame of every third colour, and the first two of another with a lasting cause."""
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
-        """Look at the colour, and how often it was exposed."""
-        seen = super().judge(file, step)
-        tries = int(file.read_bytes().split(b") ")[1].split()[0])
-        kind = sum(step.colour) % 3
-        if not seen.accepted or step.kind == "dark" or tries >= kind:
-            return seen
-        return Judgement((Check("light", reason="somebody walks past"),), lasting=kind == 2)
+        """Decide by the colour and the number of its exposures."""
+        judgement = super().judge(file, step)
+        exposures = int(file.read_bytes().split(b") ")[1].split()[0])
+        rejections = sum(step.colour) % 3
+        if not judgement.accepted or step.kind == "dark" or exposures >= rejections:
+            return judgement
+        return Judgement((Check("light", reason="somebody walks past"),), lasting=rejections == 2)
 
 
 def take_troubled(folder: Path, phase: Callable[[str], object]) -> None:
-    """Take a session that is in trouble as far as it goes; its journal is made anew first where that is needed."""
+    """Take a troubled session to its end; first rebuild its journal if needed."""
     phase("rebuilding")
     try:
         with Session.open(folder):
@@ -309,42 +307,41 @@ def take_troubled(folder: Path, phase: Callable[[str], object]) -> None:
         assert take_session(session, lab.devices, TROUBLED, TroubledJudge(), first=first).complete
 
 
-def telling(phase: Callable[[str], object], owner: Any, name: str, what: str) -> None:
-    """Let `phase` know while a method is at work."""
-    real = getattr(owner, name)
+def report_phase_of(phase: Callable[[str], object], owner: Any, name: str, phase_name: str) -> None:
+    """Call `phase` while a method is running."""
+    original = getattr(owner, name)
 
-    def told(*given: Any, **named: Any) -> Any:
-        phase(what)
+    def report_phase(*arguments: Any, **options: Any) -> Any:
+        phase(phase_name)
         try:
-            return real(*given, **named)
+            return original(*arguments, **options)
         finally:
             phase("taking")
 
-    setattr(owner, name, told)
+    setattr(owner, name, report_phase)
 
 
-def counted_run(blank: Path, scratch: Path, take_it: Callable[[Path], object]) -> tuple[int, float]:
-    """Return how many operations an undisturbed run of a copy of `blank` has, and how many seconds it takes."""
-    folder, count = scratch / "counted", scratch / "count"
+def counted_run(blank: Path, scratch: Path, take_session_in: Callable[[Path], object]) -> tuple[int, float]:
+    """Return the number of operations of an undisturbed run of a copy of `blank`, and its seconds."""
+    folder, count_file = scratch / "counted", scratch / "count"
     shutil.copytree(blank, folder)
-    most = [0]
+    operation_count = [0]
 
     def work() -> None:
-        counting(lambda number: most.__setitem__(0, number))
-        take_it(folder)
-        count.write_text(str(most[0]))
+        count_operations(lambda number: operation_count.__setitem__(0, number))
+        take_session_in(folder)
+        count_file.write_text(str(operation_count[0]))
 
-    begun = time.perf_counter()
+    start = time.perf_counter()
     assert in_child(work) == 0
-    return int(count.read_text()), time.perf_counter() - begun
+    return int(count_file.read_text()), time.perf_counter() - start
 
 
 class TroubledSessions:
-    """Sessions in trouble that are killed by chance and then taken to their end.
+    """Troubled sessions that are killed at random and then completed.
 
-    - `kills`: how many there were, by what the run did.
-    - `lost`, `doubled`: frames that had counted and do not any more, for no reason; steps with another number of
-      frames than one, frames of another light, exposures that count twice.
+    `kills` counts kills by phase. `lost` counts frames that had counted and no longer do, without a reason. `doubled`
+    counts steps without exactly one frame, frames of a wrong illuminant, and exposures that count twice.
     """
 
     def __init__(self, scratch: Path, seed: int) -> None:
@@ -355,70 +352,74 @@ class TroubledSessions:
         self.blank = scratch / "blank"
         steps = plan_steps(LIGHTS, 3, response=RESPONSES)
         Session.create(self.blank, TROUBLED.to_toml(), design_chart(bits=1), LIGHTS, steps).close()
-        taken = partial(take_troubled, phase=self._tell)
-        self.operations, self.seconds = counted_run(self.blank, scratch, taken)
+        take_session_in = partial(take_troubled, phase=self._set_phase)
+        self.operations, self.seconds = counted_run(self.blank, scratch, take_session_in)
 
-    def _tell(self, what: str) -> None:
-        self.phase[0] = PHASES.index(what)
+    def _set_phase(self, phase_name: str) -> None:
+        self.phase[0] = PHASES.index(phase_name)
 
     def session(self) -> None:
-        """Kill a session some times, take it to its end, and look what is there."""
+        """Kill a session several times, complete it and check the result."""
         self.sessions += 1
         folder = self.scratch / f"session-{self.sessions}"
         shutil.copytree(self.blank, folder)
-        counted = set[str]()
+        counted_hashes = set[str]()
         for _ in range(self.chance.randint(2, 4 * KILLS_A_SESSION)):
             if self.sessions % 2 and self.chance.random() < 0.3:
                 self._lose_journal(folder)
-            by_operation, rebuilt = self.chance.random() < 0.5, self.chance.random() < 0.1
-            operation = self.chance.randrange(1, 60 if rebuilt else self.operations)
+            is_by_operation, is_early = self.chance.random() < 0.5, self.chance.random() < 0.1
+            operation = self.chance.randrange(1, 60 if is_early else self.operations)
             seconds = self.chance.uniform(0.001, self.seconds)
 
-            def work(by_operation: bool = by_operation, operation: int = operation, seconds: float = seconds) -> None:
-                telling(self._tell, Pause, "wait", "pause")
-                telling(self._tell, devices, "_wait_until_healthy", "relighting")
-                telling(self._tell, devices, "_warm_up", "relighting")
-                telling(self._tell, Journal, "rebuild", "rebuilding")
-                self._tell_retakes()
-                if by_operation:
-                    counting(lambda count: os.kill(os.getpid(), signal.SIGKILL) if count == operation else None)
+            def work(
+                is_by_operation: bool = is_by_operation, operation: int = operation, seconds: float = seconds
+            ) -> None:
+                report_phase_of(self._set_phase, Pause, "wait", "pause")
+                report_phase_of(self._set_phase, devices, "_wait_until_healthy", "relighting")
+                report_phase_of(self._set_phase, devices, "_warm_up", "relighting")
+                report_phase_of(self._set_phase, Journal, "rebuild", "rebuilding")
+                self._report_retakes()
+                if is_by_operation:
+                    count_operations(lambda count: os.kill(os.getpid(), signal.SIGKILL) if count == operation else None)
                 else:
                     signal.signal(signal.SIGALRM, signal.SIG_DFL)
                     signal.setitimer(signal.ITIMER_REAL, seconds)
-                take_troubled(folder, self._tell)
+                take_troubled(folder, self._set_phase)
                 signal.setitimer(signal.ITIMER_REAL, 0)
 
-            ended = in_child(work)
-            assert ended in (0, -signal.SIGKILL, -signal.SIGALRM), ended
-            if ended:
+            exit_code = in_child(work)
+            assert exit_code in (0, -signal.SIGKILL, -signal.SIGALRM), exit_code
+            if exit_code:
                 self.kills[PHASES[self.phase[0]]] += 1
-            counted |= {sha256 for _, sha256, verdict in settled_frames(ledger_path(folder)) if verdict == ACCEPTED}
-        assert in_child(lambda: take_troubled(folder, self._tell)) == 0
-        self._look(folder, counted)
+            counted_hashes |= {
+                sha256 for _, sha256, verdict in settled_frames(ledger_path(folder)) if verdict == ACCEPTED
+            }
+        assert in_child(lambda: take_troubled(folder, self._set_phase)) == 0
+        self._check(folder, counted_hashes)
         shutil.rmtree(folder)
 
-    def _tell_retakes(self) -> None:
+    def _report_retakes(self) -> None:
         begin = Journal.begin
 
-        def begun(journal: Journal, step: SessionStep, file: str, at: datetime) -> int:
-            self._tell("retake" if "_try" in file else "taking")
-            return begin(journal, step, file, at)
+        def begin_and_report(journal: Journal, step: SessionStep, file: str, started_at: datetime) -> int:
+            self._set_phase("retake" if "_try" in file else "taking")
+            return begin(journal, step, file, started_at)
 
-        setattr(Journal, "begin", begun)  # noqa: B010 - another function, for this process alone
+        setattr(Journal, "begin", begin_and_report)  # noqa: B010 - another function, for this process alone
 
     def _lose_journal(self, folder: Path) -> None:
         path = folder / "journal.sqlite"
         if path.is_file() and ledger_path(folder).is_file():
             path.unlink() if self.chance.random() < 0.5 else os.truncate(path, self.chance.randrange(5000))
 
-    def _look(self, folder: Path, counted: set[str]) -> None:
+    def _check(self, folder: Path, counted_hashes: set[str]) -> None:
         with Session.open(folder) as session:
             accepted = session.journal.accepted_files()
             colours = {step.number: step.colour for step in session.steps}
-            voided = {one.id for one in session.journal.attempts() if one.verdict == VOIDED}
-            not_used = {frame.sha256 for frame in session.frames() if frame.attempt in voided}
-            gone = damaged_files(folder, accepted, lambda done, total: None)
-            self.lost += len(counted - {frame.sha256 for frame in accepted} - not_used) + len(gone)
+            voided_attempts = {attempt.id for attempt in session.journal.attempts() if attempt.verdict == VOIDED}
+            voided_hashes = {frame.sha256 for frame in session.frames() if frame.attempt in voided_attempts}
+            damaged = damaged_files(folder, accepted, lambda count, total: None)
+            self.lost += len(counted_hashes - {frame.sha256 for frame in accepted} - voided_hashes) + len(damaged)
             self.doubled += sorted(frame.step for frame in accepted) != sorted(colours)
             contents = {frame.step: (folder / frame.file).read_bytes() for frame in accepted}
             self.doubled += len(accepted) - len(set(contents.values()))
@@ -428,11 +429,10 @@ class TroubledSessions:
 
 
 class KilledSessions:
-    """Sessions that are killed by chance and then taken to their end.
+    """Sessions that are killed at random and then completed.
 
-    - `kills`, `sessions`, `differing`: how many there were, and how many sessions ended otherwise than the undisturbed
-      one.
-    - `strays`: complete files that no row counts, set aside.
+    `differing` counts sessions that differ from the undisturbed one. `strays` counts complete files without a row,
+    which were moved aside.
     """
 
     def __init__(self, scratch: Path, seed: int) -> None:
@@ -442,24 +442,24 @@ class KilledSessions:
         Session.create(self.blank, SETTINGS.to_toml(), design_chart(bits=1), LIGHTS, STEPS).close()
         undisturbed = scratch / "undisturbed"
         shutil.copytree(self.blank, undisturbed)
-        begun = time.perf_counter()
+        start = time.perf_counter()
         assert in_child(lambda: take(undisturbed)) == 0
-        self.seconds = time.perf_counter() - begun
+        self.seconds = time.perf_counter() - start
         self.expected = contents(undisturbed)
         self.operations, _ = counted_run(self.blank, scratch, take)
 
     def session(self) -> None:
-        """Kill a session some times, take it to its end, and compare."""
+        """Kill a session several times, complete it and compare it."""
         self.sessions += 1
         folder = self.scratch / f"session-{self.sessions}"
         shutil.copytree(self.blank, folder)
         for _ in range(self.chance.randint(1, 2 * KILLS_A_SESSION - 1)):
             if self.chance.random() < 0.5:
-                ended = killed_at_operation(folder, self.chance.randrange(1, self.operations))
+                exit_code = killed_at_operation(folder, self.chance.randrange(1, self.operations))
             else:
-                ended = killed_at_time(folder, self.chance.uniform(0.001, self.seconds))
-            assert ended in (0, -signal.SIGKILL, -signal.SIGALRM), ended
-            self.kills += ended != 0
+                exit_code = killed_at_time(folder, self.chance.uniform(0.001, self.seconds))
+            assert exit_code in (0, -signal.SIGKILL, -signal.SIGALRM), exit_code
+            self.kills += exit_code != 0
         assert in_child(lambda: take(folder)) == 0
         self.differing += contents(folder) != self.expected
         self.differing += any(folder.rglob(".*partial*"))
@@ -468,7 +468,7 @@ class KilledSessions:
 
 
 class KilledPrograms:
-    """Sessions of the simulated lab whose program, `acquire run`, is killed from outside; fields as those above."""
+    """Sessions of the simulated laboratory with `acquire run` killed from outside; fields as above."""
 
     def __init__(self, scratch: Path, seed: int) -> None:
         self.chance = random.Random(seed)
@@ -476,10 +476,10 @@ class KilledPrograms:
         self.kills = self.sessions = self.lost = self.doubled = 0
 
     def session(self) -> None:
-        """Kill the program until it ends by itself."""
+        """Kill the program until it completes the session."""
         self.sessions += 1
         folder = self.lab.parent / f"session-{self.sessions}"
-        counted = set[str]()
+        counted_hashes = set[str]()
         while True:
             command = [sys.executable, "-m", "acquisition.cli", "run", str(self.lab), str(folder)]
             with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as program:
@@ -488,24 +488,26 @@ class KilledPrograms:
                     break
                 program.kill()
             self.kills += 1
-            counted |= {sha256 for _, sha256, verdict in settled_frames(ledger_path(folder)) if verdict == ACCEPTED}
+            counted_hashes |= {
+                sha256 for _, sha256, verdict in settled_frames(ledger_path(folder)) if verdict == ACCEPTED
+            }
         with Session.open(folder) as session:
             accepted = session.journal.accepted_files()
-            self.lost += len(counted - {frame.sha256 for frame in session.frames()})
-            self.lost += len(damaged_files(folder, accepted, lambda done, total: None))
+            self.lost += len(counted_hashes - {frame.sha256 for frame in session.frames()})
+            self.lost += len(damaged_files(folder, accepted, lambda count, total: None))
             self.doubled += sorted(frame.step for frame in accepted) != [step.number for step in session.steps]
             self.doubled += len(accepted) - len({frame.sha256 for frame in accepted})
         shutil.rmtree(folder)
 
 
-def _disturb(kind: str, wanted: int, seed: int) -> int:
-    """Kill sessions of a kind until so many kills are done, and print what came of it."""
-    begun = time.perf_counter()
+def _kill_sessions(kind: str, kill_count: int, seed: int) -> int:
+    """Kill sessions of one kind until there are `kill_count` kills, and print the result."""
+    start = time.perf_counter()
     with tempfile.TemporaryDirectory() as scratch:
-        made = TroubledSessions if kind == "troubled" else KilledPrograms
-        sessions = made(Path(scratch), seed)
+        make_sessions = TroubledSessions if kind == "troubled" else KilledPrograms
+        sessions = make_sessions(Path(scratch), seed)
         with suppress(KeyboardInterrupt):
-            while (sessions.kills.total() if isinstance(sessions.kills, Counter) else sessions.kills) < wanted:
+            while (sessions.kills.total() if isinstance(sessions.kills, Counter) else sessions.kills) < kill_count:
                 sessions.session()
                 print(
                     f"{sessions.kills}, {sessions.lost} lost, {sessions.doubled} doubled", file=sys.stderr, flush=True
@@ -513,33 +515,32 @@ def _disturb(kind: str, wanted: int, seed: int) -> int:
     kills = sessions.kills if isinstance(sessions.kills, Counter) else {"by SIGKILL from outside": sessions.kills}
     figures = {f"kills: {phase}": count for phase, count in kills.items()}
     figures |= {"sessions": sessions.sessions, "lost": sessions.lost, "doubled": sessions.doubled}
-    figures["seconds"] = round(time.perf_counter() - begun)
+    figures["seconds"] = round(time.perf_counter() - start)
     for name, value in figures.items():
         print(json.dumps({"name": f"session kills, {kind}: {name}", "value": value, "unit": "", "against": ""}))
     return int(bool(sessions.lost or sessions.doubled))
 
 
 def main(argv: list[str]) -> int:
-    """Kill runs and print what came of it."""
     if argv[:1] in (["troubled"], ["programs"]):
-        return _disturb(argv[0], int(argv[1]) if argv[1:] else 500, int(argv[2]) if argv[2:] else 20190601)
-    wanted, seed = int(argv[0]) if argv else KILLS, int(argv[1]) if argv[1:] else 20190601
-    begun = time.perf_counter()
+        return _kill_sessions(argv[0], int(argv[1]) if argv[1:] else 500, int(argv[2]) if argv[2:] else 20190601)
+    kill_count, seed = int(argv[0]) if argv else KILLS, int(argv[1]) if argv[1:] else 20190601
+    start = time.perf_counter()
     with tempfile.TemporaryDirectory() as scratch:
         sessions = KilledSessions(Path(scratch), seed)
-        # What was killed until somebody ends it counts.
+        # Ctrl-C ends the kills; those so far count.
         with suppress(KeyboardInterrupt):
-            while sessions.kills < wanted:
+            while sessions.kills < kill_count:
                 sessions.session()
-                if sessions.sessions % TOLD_EVERY == 0:
+                if sessions.sessions % PROGRESS_EVERY == 0:
                     print(f"{sessions.kills} kills, {sessions.differing} sessions differ", file=sys.stderr, flush=True)
     for name, value, unit in (
         ("session kills: kills", sessions.kills, "kills"),
         ("session kills: sessions", sessions.sessions, "sessions"),
         ("session kills: operations of an undisturbed run", sessions.operations, "operations"),
-        ("session kills: complete files that were not in the journal, set aside", sessions.strays, "files"),
+        ("session kills: complete files without a journal row, moved aside", sessions.strays, "files"),
         ("session kills: sessions that differ from an undisturbed one", sessions.differing, "sessions"),
-        ("session kills: time", round(time.perf_counter() - begun, 1), "s"),
+        ("session kills: time", round(time.perf_counter() - start, 1), "s"),
     ):
         print(json.dumps({"name": name, "value": value, "unit": unit, "against": ""}), flush=True)
     return int(sessions.differing > 0)

@@ -1,11 +1,11 @@
-"""Short sessions in simulated rooms, some of whose frames are not what the plan says, and their tables against truth.
+"""Short simulated sessions with frames that differ from the plan, and the comparison of their LUTs with the truth.
 
-A `FrameChange` says how one frame differs: another light or camera, another exposure or file header, something in the
-room, counts painted over. `frames_of` makes the files of a plan, `record_session` a session of them, `compare` holds a
-table against the room that it should show: the session's own camera, room and chart with nothing else in them.
+A `FrameChange` describes the differences of one frame: another illuminant or camera, another exposure or file header, a
+disturbance in the room, changed counts. `frame_file` makes the file of a step and `record_session` a whole session.
+`compare` compares a LUT with the room that it should show: camera, room and chart of the session without changes.
 
-Noise is no error of a table. The counts that the same frame has without noise are known here, so that what noise adds
-to each cell's mean is taken out cell by cell, and what remains is systematic, hot photosites included.
+Noise is no error of a LUT. The counts of each frame without noise are known here, so the noise of each patch mean can
+be subtracted. The rest is systematic and includes hot photosites.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ TAKEN_AT = datetime(2024, 3, 1, 9, 0, tzinfo=UTC)
 SECONDS_A_FRAME = 4
 WELL_LIT_DN = 300.0
 
+# Illuminants of a short session by name: primaries, white, a warm and a cool white, two mixtures.
 EIGHT_LIGHTS: Mapping[str, Colour] = {
     "red": Colour(255, 0, 0),
     "green": Colour(0, 255, 0),
@@ -59,7 +60,6 @@ EIGHT_LIGHTS: Mapping[str, Colour] = {
     "violet": Colour(180, 60, 255),
     "dim": Colour(110, 70, 20),
 }
-"""The lights of a short session by name: the primaries, white, a warm and a cool white, two mixtures."""
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -67,7 +67,7 @@ _Counts = npt.NDArray[np.uint16]
 
 
 def short_plan(lights: Mapping[str, Colour] = EIGHT_LIGHTS) -> tuple[Illuminant, ...]:
-    """Return named lights as a session's plan."""
+    """Return named illuminants as the plan of a session."""
     return tuple(
         Illuminant(index, "uniform", None, colour, name) for index, (name, colour) in enumerate(lights.items())
     )
@@ -75,65 +75,56 @@ def short_plan(lights: Mapping[str, Colour] = EIGHT_LIGHTS) -> tuple[Illuminant,
 
 @lru_cache(maxsize=1)
 def world_of(chart: Chart, body: Body, room: Room) -> World:
-    """Return a chart in a room before a camera; the last one again, whose light is as long to compute as ten frames."""
+    """Return a chart in a room with a camera; the last one is cached, because its light takes as long as ten frames."""
     return World(_printed(chart), body, room)
 
 
 @lru_cache(maxsize=4)
 def _printed(chart: Chart) -> Print:
-    """Return a chart's print; marks in its margins take seconds to find a place for."""
-    picture = drawing(chart)
-    return Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
+    """Return the print of a chart; it is cached, because placing the margin marks takes seconds."""
+    print_image = drawing(chart)
+    return Print(print_image.page_mm, print_image.rectangles_mm, print_image.rgb)
 
 
 @dataclass(frozen=True, eq=False)
 class FrameChange:
-    """How one frame differs from what the plan says.
+    """Differences of one frame from the plan."""
 
-    - `colour`: what the projector shows instead: the file is of another light.
-    - `settings`: how it is exposed, and what its file says.
-    - `tagged`: what its file says where that is not how it was exposed.
-    - `world`: another camera, room or chart that it is taken of.
-    - `situation`: what is otherwise in the room.
-    - `counts_added`: photosites of the sensor, (row, column) from its corner, and what is added to their counts.
-    - `serial`: of the body, in the file.
-    - `reason`: why the frame was refused; None: it is accepted.
-    - `number`: the step whose frame it is, by noise and time; None: its own.
-    """
-
-    colour: Colour | None = None
-    settings: ExposureSettings = SETTINGS
-    tagged: ExposureSettings | None = None
-    world: World | None = None
-    situation: Situation = UNDISTURBED
+    colour: Colour | None = None  # colour of the projector, if another
+    settings: ExposureSettings = SETTINGS  # exposure, also recorded in the file
+    tagged: ExposureSettings | None = None  # exposure recorded in the file, if another
+    world: World | None = None  # another camera, room or chart
+    situation: Situation = UNDISTURBED  # disturbance in the room
+    # counts added to photosites (row, column) of the sensor
     counts_added: Mapping[tuple[int, int], int] = field(default_factory=dict[tuple[int, int], int])
-    serial: str = "000000000000"
-    reason: str | None = None
-    number: int | None = None
+    serial: str = "000000000000"  # serial number in the file
+    reason: str | None = None  # reason of a rejection; None if accepted
+    number: int | None = None  # step that determines noise and time, if another
 
 
 AS_PLANNED = FrameChange()
-"""Nothing is otherwise."""
 
 Changes = Callable[[SessionStep], FrameChange]
 
 
 def as_planned(step: SessionStep) -> FrameChange:
-    """Return that nothing is otherwise."""
+    """Return no differences."""
     return AS_PLANNED
 
 
 def light_named(lights: Sequence[Illuminant], step: SessionStep) -> str | None:
-    """Return the name of a step's light; None for references."""
+    """Return the name of the illuminant of a step; None for references."""
     return None if step.illumination is None else lights[step.illumination].name
 
 
 def counts_of(world: World, step: SessionStep, change: FrameChange = AS_PLANNED) -> _Counts:
-    """Return the whole sensor's counts of a step's frame; its noise depends on the room and the step's number alone."""
-    seen, number = change.world or world, _number_of(step, change)
-    counts = seen.expose(change.colour or step.colour, change.settings, key=(number,), situation=change.situation)
-    for place, added in change.counts_added.items():
-        counts[place] = min(int(counts[place]) + added, seen.body.saturation)
+    """Return the counts of the whole sensor; the noise depends only on the room and the step number."""
+    actual_world, number = change.world or world, _number_of(step, change)
+    counts = actual_world.expose(
+        change.colour or step.colour, change.settings, key=(number,), situation=change.situation
+    )
+    for site, added in change.counts_added.items():
+        counts[site] = min(int(counts[site]) + added, actual_world.body.saturation)
     return counts
 
 
@@ -142,13 +133,13 @@ def _number_of(step: SessionStep, change: FrameChange) -> int:
 
 
 def expected_counts(world: World, step: SessionStep, change: FrameChange = AS_PLANNED) -> npt.NDArray[np.float32]:
-    """Return the visible photosites' counts above black, (rows, columns) float32, that the frame has without noise."""
-    seen = change.world or world
-    expected = seen.signal(change.colour or step.colour, change.settings, situation=change.situation)
-    visible, body = seen.body.visible, seen.body
-    rows, columns = seen.hot.rows - visible.top, seen.hot.columns - visible.left
+    """Return the counts above black of the visible photosites without noise, (rows, columns) float32."""
+    actual_world = change.world or world
+    expected = actual_world.signal(change.colour or step.colour, change.settings, situation=change.situation)
+    visible, body = actual_world.body.visible, actual_world.body
+    rows, columns = actual_world.hot.rows - visible.top, actual_world.hot.columns - visible.left
     inside = (rows >= 0) & (rows < visible.height) & (columns >= 0) & (columns < visible.width)
-    excess = seen.hot.excess_dn(change.settings.iso, change.settings.shutter_s)
+    excess = actual_world.hot.excess_dn(change.settings.iso, change.settings.shutter_s)
     expected[rows[inside], columns[inside]] += excess[inside].astype(np.float32)
     for (row, column), added in change.counts_added.items():
         expected[row - visible.top, column - visible.left] += added
@@ -156,7 +147,7 @@ def expected_counts(world: World, step: SessionStep, change: FrameChange = AS_PL
 
 
 def frame_file(world: World, step: SessionStep, change: FrameChange = AS_PLANNED) -> bytes:
-    """Return the raw file of a step's frame."""
+    """Return the raw file of a step."""
     stream, body = BytesIO(), (change.world or world).body
     write_dng(
         stream,
@@ -180,22 +171,21 @@ def record_session(
     settings: str = "rig = 'simulated'\n",
     steps: Sequence[SessionStep] | None = None,
 ) -> Session:
-    """Return an open session with a frame for every step of its plan.
+    """Record a session with a frame for every step of its plan, and open it.
 
-    `settings`: as `session.toml` has them. `reason`: why a step's frame is refused; None where it is accepted. `steps`:
-    the plan, if it is not the usual one.
+    `reason` returns why a frame is rejected, or None. `steps` replaces the usual plan.
     """
     with Session.create(folder, settings, chart, lights) as session:
         for step in plan_steps(lights, every) if steps is None else steps:
             data = frame(step)
-            at = TAKEN_AT + timedelta(seconds=SECONDS_A_FRAME * step.number)
+            taken_at = TAKEN_AT + timedelta(seconds=SECONDS_A_FRAME * step.number)
             path = session.frames_folder / f"{step.stem}.dng"
-            attempt = session.journal.begin(step, f"frames/{path.name}", at)
+            attempt = session.journal.begin(step, f"frames/{path.name}", taken_at)
             path.write_bytes(data)
-            captured = CapturedFrame(path.name, len(data), at)
+            captured = CapturedFrame(path.name, len(data), taken_at)
             received = ReceivedFile(path, len(data), hashlib.sha256(data).hexdigest(), captured)
             judgement = Judgement.of_reason("exposure", None if reason is None else reason(step))
-            session.journal.commit(attempt, received, judgement, exposure_s=SETTINGS.shutter_s, ended_at=at)
+            session.journal.commit(attempt, received, judgement, exposure_s=SETTINGS.shutter_s, ended_at=taken_at)
         session.write_frames_csv()
     return Session.open(folder)
 
@@ -209,9 +199,9 @@ def short_session(
     every: int = 25,
     settings: str = "rig = 'simulated'\n",
 ) -> Session:
-    """Return an open session of a few lights whose frames differ from the plan as they are said to.
+    """Record a session of a few illuminants with `changes`, and open it.
 
-    A session without the file of a frame is made by a plan without its light.
+    A session without one of its files is made by a plan without that illuminant.
     """
     return record_session(
         folder,
@@ -226,59 +216,48 @@ def short_session(
 
 @dataclass(frozen=True, eq=False)
 class TableTruth:
-    """A table against the room that it should show; L lights, C cells.
+    """Errors of a LUT, compared with the room that it should show; L illuminants, C patches."""
 
-    - `light_deg`: (L,) float64, angle between the ground truth and bare paper's light, its mean over the cells, less
-      dark light where the table lacks it.
-    - `light_stated`, `cell_stated`: (L,) float64 degrees and (C, 3) float64, what the table states of both.
-    - `brightness`: (L,) float64, the light's brightness over the truth, 1 for the median light.
-    - `level`: (L, C, 3) float64 counts that cells should have in the table.
-    - `error`: (L, C, 3) float64, mean of the samples over the truth, less 1, noise taken out; the light's own error and
-      its brightness are not in it.
-    - `fit`: (C,) bool, cells that the table lists as fit for use.
-    - `offset_px`: (3, C, 2) float64, by channel: where cells were found less where they are seen, half-size px.
-    """
-
-    light_deg: _Array
-    light_stated: _Array
-    cell_stated: _Array
-    brightness: _Array
-    level: _Array
-    error: _Array
-    fit: _Mask
-    offset_px: _Array
+    light_deg: _Array  # (L,) angle between ground truth and mean light of bare paper over the patches
+    light_uncertainty: _Array  # (L,) degrees, reported by the LUT
+    cell_uncertainty: _Array  # (C, 3) reported by the LUT
+    brightness: _Array  # (L,) brightness / true brightness; 1 for the median illuminant
+    level: _Array  # (L, C, 3) true counts in the LUT
+    error: _Array  # (L, C, 3) mean / true mean − 1 without noise and without errors of the illuminant
+    fit: _Mask  # (C,) patches that the LUT lists as fit
+    offset_px: _Array  # (3, C, 2) registered − true position by channel, half-size px
 
     @property
     def lit(self) -> _Mask:
-        """(L, C, 3) bool: means of fit cells from 300 counts on."""
+        """Means of fit patches from 300 counts on, (L, C, 3) bool."""
         return (self.level >= WELL_LIT_DN) & self.fit[:, None]
 
     @property
     def rms(self) -> float:
-        """Root mean square of `error` where cells are lit."""
+        """RMS of `error` for lit patches."""
         return float(np.sqrt((self.error[self.lit] ** 2).mean())) if self.lit.any() else 0.0
 
     @property
     def worst(self) -> float:
-        """Largest of `error` where cells are lit."""
+        """Largest absolute `error` of lit patches."""
         return float(np.abs(self.error[self.lit]).max(initial=0))
 
     @property
     def cell_error(self) -> _Array:
-        """(L, C, 3) float64, size of the errors of cells' means, their light's brightness included."""
+        """Absolute errors of patch means including the brightness error, (L, C, 3)."""
         return np.abs((1 + self.error) * self.brightness[:, None, None] - 1)
 
     def cells_beyond(self, share: float) -> int:
-        """Return how many fit cells are off by more than a share under some light, in some channel, where lit."""
+        """Return the number of fit patches with a lit error above `share`."""
         return int((self.lit & (np.abs(self.error) > share)).any(axis=(0, 2)).sum())
 
     def offset_rms_px(self) -> tuple[float, float, float]:
-        """Return the RMS distance of cell centres from the truth in red, green and blue."""
+        """Return the RMS position error in red, green and blue, half-size px."""
         red, green, blue = np.sqrt((self.offset_px**2).sum(axis=-1).mean(axis=-1)).tolist()
         return red, green, blue
 
     def worst_offset_px(self) -> float:
-        """Return the largest distance of a fit cell's centre from the truth, in the channel where it is largest."""
+        """Return the largest position error of a fit patch in any channel, half-size px."""
         return float(np.linalg.norm(self.offset_px[:, self.fit], axis=-1).max(initial=0))
 
 
@@ -291,7 +270,7 @@ def compare(
     changes: Changes = as_planned,
     every: int = 25,
 ) -> TableTruth:
-    """Return a table compared with the room that it should show."""
+    """Compare a LUT with the room that it should show."""
     lights = lut.illuminations
     cells_mm = chart.centres_mm[chart.cell_of_colour]
     codes = chart.rgb[chart.cell_of_colour]
@@ -311,24 +290,26 @@ def compare(
             session.folder / figures.record.file,
             (change.world or world).body,
             expected_counts(world, steps[number], change),
-            _places_px(result, figures, world, change, cells_mm),
+            _patches_px(result, figures, world, change, cells_mm),
             lut.samples.shape[2],
         )
         means -= noise / figures.paper.field.at(cells_mm)
         error[number] = means / level[number] - 1
-    share = (lut.white / white).max(axis=1)
+    brightness = (lut.white / white).max(axis=1)
     unfit = [cell.colour for cell in lut.provenance.unfit]
     fit = np.ones(len(codes), dtype=np.bool_)
     fit[unfit] = False
     offset = offsets_px(result.figures.registration, world, cells_mm, session.folder / records[0].record.file)
-    stated_light = lut.truth_uncertainty_deg
-    assert stated_light is not None
+    light_uncertainty = lut.truth_uncertainty_deg
+    assert light_uncertainty is not None
     light = angles_deg(white, lut.white)
-    return TableTruth(light, stated_light, stated_of_cells(lut), share / np.median(share), level, error, fit, offset)
+    return TableTruth(
+        light, light_uncertainty, patch_uncertainty(lut), brightness / np.median(brightness), level, error, fit, offset
+    )
 
 
-def stated_of_cells(lut: Lut) -> _Array:
-    """Return (C, 3) float64: the expanded relative uncertainty (k = 2) that a table states of its cells' means."""
+def patch_uncertainty(lut: Lut) -> _Array:
+    """Return the expanded relative uncertainty (k = 2) of the patch means reported by a LUT, (C, 3)."""
     return np.loadtxt(lut.folder / CELLS, delimiter=",", skiprows=1)[:, 1:]
 
 
@@ -336,13 +317,12 @@ def noise_of(
     file: Path,
     body: Body,
     expected: npt.NDArray[np.float32],
-    places_px: _Array,
+    patches_px: _Array,
     samples: int,
 ) -> _Array:
-    """Return (C, 3) float64 counts: what noise adds to the means of cells in one frame.
+    """Return the noise contained in the patch means of one frame, (C, 3) counts.
 
-    `expected`: (rows, columns) float32 counts above black of its visible photosites without noise. `places_px`: (C, 2)
-    float64, where the cells lie in the frame as read, half-size px.
+    `expected`: counts above black without noise, (rows, columns). `places_px`: patch positions (C, 2), half-size px.
     """
     from cv2 import BORDER_REPLICATE, boxFilter
 
@@ -352,45 +332,50 @@ def noise_of(
     first_row, first_column = mosaic.visible.top - top, mosaic.visible.left - left
     rows, columns = mosaic.block_planes().shape[2:]
     side = round(samples**0.5)
-    sites = sites_at(places_px, (rows, columns), side)
+    sites = sites_at(patches_px, (rows, columns), side)
     inside = sites.inside
-    means = np.zeros((len(places_px), 3))
-    for place, letter in enumerate(mosaic.pattern):
-        row, column = first_row + place // 2, first_column + place % 2
+    means = np.zeros((len(patches_px), 3))
+    for block_index, letter in enumerate(mosaic.pattern):
+        row, column = first_row + block_index // 2, first_column + block_index % 2
         plane = np.ascontiguousarray(noise[row::2, column::2][:rows, :columns])
         boxed = np.asarray(boxFilter(plane, -1, (side, side), borderType=BORDER_REPLICATE))
-        found = boxed[sites.rows[inside], sites.columns[inside]] / mosaic.pattern.count(letter)
-        means[inside, CHANNELS.index(letter)] += found
+        patch_noise = boxed[sites.rows[inside], sites.columns[inside]] / mosaic.pattern.count(letter)
+        means[inside, CHANNELS.index(letter)] += patch_noise
     return means
 
 
-def _places_px(
+def _patches_px(
     result: BuildResult, figures: FrameMeasurements, world: World, change: FrameChange, cells_mm: _Array
 ) -> _Array:
-    """Return (C, 2) float64: where cells were sampled in a frame, nearly, if the chart was found anew in it."""
-    registration, anew = result.figures.registration, any(frame.reregistered for frame in result.figures.frames)
-    if not anew or change.situation == UNDISTURBED:
-        still = math.hypot(figures.shift.dx, figures.shift.dy) <= STILL_PX
-        return (registration if still else registration.shifted(figures.shift.dx, figures.shift.dy)).to_pixels(cells_mm)
-    found = registration.to_pixels(cells_mm) - world.project(cells_mm)
-    return found + world.project(cells_mm, situation=change.situation)
+    """Return where the patches were sampled in a frame (C, 2); approximate after a new registration."""
+    registration, is_reregistered = (
+        result.figures.registration,
+        any(frame.reregistered for frame in result.figures.frames),
+    )
+    if not is_reregistered or change.situation == UNDISTURBED:
+        is_still = math.hypot(figures.shift.dx, figures.shift.dy) <= STILL_PX
+        return (registration if is_still else registration.shifted(figures.shift.dx, figures.shift.dy)).to_pixels(
+            cells_mm
+        )
+    offset_px = registration.to_pixels(cells_mm) - world.project(cells_mm)
+    return offset_px + world.project(cells_mm, situation=change.situation)
 
 
 def offsets_px(registration: Registration, world: World, points_mm: _Array, file: Path) -> _Array:
-    """Return (3, N, 2) float64: where points of the print were found in each channel less where they are seen."""
+    """Return registered minus true positions of chart points by channel, (3, N, 2)."""
     mosaic = read_raw(file)
     visible = world.body.visible
     crop = np.array([mosaic.visible.left - visible.left, mosaic.visible.top - visible.top]) / 2
     return np.stack(
         [
-            found_px(registration, points_mm, channel) - (world.project(points_mm, channel) - crop)
+            registered_px(registration, points_mm, channel) - (world.project(points_mm, channel) - crop)
             for channel in CHANNELS
         ]
     )
 
 
-def found_px(registration: Registration, points_mm: _Array, channel: str) -> _Array:
-    """Return (N, 2) float64: where a registration has points of the print in a channel, if it tells channels apart."""
+def registered_px(registration: Registration, points_mm: _Array, channel: str) -> _Array:
+    """Return the registered positions of chart points in a channel (N, 2); older registrations have one for all."""
     to_pixels: Callable[..., _Array] = registration.to_pixels
     return (
         to_pixels(points_mm, channel) if "channel" in inspect.signature(to_pixels).parameters else to_pixels(points_mm)

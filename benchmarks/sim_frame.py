@@ -1,7 +1,7 @@
-"""How long a simulated 18 Mpx frame takes: `python -m benchmarks.sim_frame` prints one JSON object a line.
+"""Time for a simulated 18 Mpx frame: `python -m benchmarks.sim_frame` prints one JSON object per line.
 
-Times are processor seconds (all threads together), the least of several runs, so that other load on the machine counts
-little; each is also given as a ratio to a plain pass of the same size in the same run.
+Times are processor seconds of all threads, the shortest of several runs, so that other load matters little. Each is
+also given relative to a simple pass of the same size in the same run.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ RUNS = 5
 
 
 def sheet() -> Print:
-    """Return A0 with as many random cells as the chart has."""
+    """Return an A0 sheet with as many random patches as the chart."""
     cell = 5.29
     x, y = (grid.ravel() for grid in np.meshgrid(10 + cell * np.arange(CELLS[0]), 10 + cell * np.arange(CELLS[1])))
     boxes = np.stack([x, y, x + cell, y + cell], axis=-1).astype(np.float64)
@@ -34,8 +34,8 @@ def sheet() -> Print:
     return Print(PAGE_MM, boxes, rgb)
 
 
-def least(work: Callable[[], object], runs: int = RUNS) -> float:
-    """Return the least processor time of several runs, seconds."""
+def fastest_s(work: Callable[[], object], runs: int = RUNS) -> float:
+    """Return the shortest processor time of several runs, in seconds."""
     times: list[float] = []
     for _ in range(runs):
         start = time.process_time()
@@ -49,34 +49,33 @@ def report(name: str, value: float, unit: str, against: str) -> None:
 
 
 def main() -> None:
-    """Measure and print."""
     body = BODIES["EOS 550D"]
-    # A first small world compiles the loops, or reads them from numba's cache.
+    # A small world first compiles the loops, or reads them from the cache of numba.
     World(sheet(), BODIES["Test"], Room()).expose(WHITE, REFERENCE_EXPOSURE, key=(0,))
 
     world = World(sheet(), body, Room())
-    rendering = least(lambda: world.expose(WHITE, REFERENCE_EXPOSURE, key=(0,)), runs=1)
+    rendering = fastest_s(lambda: world.expose(WHITE, REFERENCE_EXPOSURE, key=(0,)), runs=1)
     frame = world.expose(WHITE, REFERENCE_EXPOSURE, key=(0,))
-    exposing = least(lambda: world.expose(WHITE, REFERENCE_EXPOSURE, key=(1,)))
+    exposing = fastest_s(lambda: world.expose(WHITE, REFERENCE_EXPOSURE, key=(1,)))
 
     def write() -> None:
         write_dng(BytesIO(), frame, body, settings=REFERENCE_EXPOSURE, taken_at=datetime(2021, 1, 1, tzinfo=UTC))
 
-    writing = least(write)
+    writing = fastest_s(write)
     random = np.random.Generator(np.random.SFC64(0))
     noise = np.empty(body.sensor, dtype=np.float32)
-    drawing = least(lambda: random.standard_normal(out=noise, dtype=np.float32))
+    drawing = fastest_s(lambda: random.standard_normal(out=noise, dtype=np.float32))
     planes = np.ones((3, *body.sensor), dtype=np.float32)
-    passing = least(lambda: planes.sum(axis=0).astype(np.uint16))
-    copying = least(lambda: BytesIO().write(frame.data))
+    passing = fastest_s(lambda: planes.sum(axis=0).astype(np.uint16))
+    copying = fastest_s(lambda: BytesIO().write(frame.data))
 
-    report("rendering of one world", rendering - exposing, "s", "none; once a world")
+    report("rendering of one world", rendering - exposing, "s", "none; once per world")
     report("frame", exposing, "s", "none")
-    report("frame over noise", exposing / drawing, "1", "numpy standard_normal, float32, of as many values")
-    report("frame over a pass of memory", exposing / passing, "1", "numpy sum of three float32 planes to uint16")
+    report("frame / noise", exposing / drawing, "1", "numpy standard_normal, float32, same size")
+    report("frame / one pass of memory", exposing / passing, "1", "numpy sum of three float32 planes to uint16")
     report("DNG", writing, "s", "none")
-    report("DNG over a copy", writing / copying, "1", "copying the counts into a BytesIO")
-    report("frame and DNG", exposing + writing, "s", "1.5 s allowed on one core")
+    report("DNG / copy", writing / copying, "1", "copying the counts into a BytesIO")
+    report("frame and DNG", exposing + writing, "s", "limit 1.5 s on one core")
 
 
 if __name__ == "__main__":

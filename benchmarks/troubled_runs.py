@@ -1,12 +1,12 @@
-"""Whole runs in which things go wrong, in the simulated lab: causes that come and go, and a night of twelve hours.
+"""Whole runs with faults in the simulated laboratory: intermittent causes, and a night of twelve hours.
 
-`python -m benchmarks.troubled_runs night [GRID [FOLDER]]` takes a night without an operator, builds its table, and
-prints one JSON object a line (33 steps of grid are 597 lights); `python -m benchmarks.troubled_runs causes`, and
-`benchmarks.detection`, print the table of causes. Everything is what `acquire run` uses; parts of the simulated lab
-(clock, body, projector, cables) are held so that something can happen to them at a moment of the lab's time.
+`python -m benchmarks.troubled_runs night [GRID [FOLDER]]` takes a night without an operator, builds its LUT and prints
+one JSON object per line (a grid of 33 steps has 597 illuminants). `python -m benchmarks.troubled_runs causes` and
+`benchmarks.detection` print the table of causes. All code is that of `acquire run`; clock, body, projector and cables
+of the simulated laboratory are replaced, so that faults can happen at given times.
 
-What is flattered: a disk is full where files are flushed and not where SQLite writes; time passes at once; somebody
-changes the battery and empties the card in time, and a service manager starts the command again when power is back.
+Simplifications: a full disk affects flushing, but not SQLite. Time passes at once. Somebody changes the battery and
+empties the card in time. A service manager restarts the command after a power cut.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ NIGHT_S = 12 * HOUR_S
 
 
 class _Machine:
-    """The machine's own clock, whose date somebody may set."""
+    """The clock of the machine, whose date can be set."""
 
     def __init__(self, time: SimulatedClock) -> None:
         self.time = time
@@ -86,7 +86,7 @@ class _Machine:
 
 
 class EventfulClock(SteadyClock):
-    """A session's clock, as a lab has it; what is due happens while it is waited."""
+    """Clock of a session; events that are due happen while it sleeps."""
 
     def __init__(self, lab: TroubledLab, start: datetime) -> None:
         self.time = SimulatedClock(start)
@@ -96,22 +96,22 @@ class EventfulClock(SteadyClock):
         super().__init__(self.machine, None, self.time.monotonic)
 
     def lab_s(self) -> float:
-        """Return seconds since the lab opened."""
+        """Return seconds since the start of the lab."""
         return self._before_s + self.time.monotonic()
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass; each event happens at its moment, once."""
-        until_s = self.lab_s() + seconds
+        """Let time pass; each event happens once, at its time."""
+        end_s = self.lab_s() + seconds
         due = self._lab.due
-        while due and due[0][0] <= until_s:
-            at_s, happens = due.pop(0)
-            self.time.sleep(max(at_s - self.lab_s(), 0))
-            happens()
-        self.time.sleep(max(until_s - self.lab_s(), 0))
+        while due and due[0][0] <= end_s:
+            event_s, event = due.pop(0)
+            self.time.sleep(max(event_s - self.lab_s(), 0))
+            event()
+        self.time.sleep(max(end_s - self.lab_s(), 0))
 
 
 class _Presenter(SimulatedPresenter):
-    """Shows the picture that was ordered before, while the lab says so."""
+    """A presenter that shows the previously ordered colour while `lab.is_late`."""
 
     def __init__(self, lab: TroubledLab, screen: Screen, clock: EventfulClock) -> None:
         super().__init__(screen, clock)
@@ -119,14 +119,14 @@ class _Presenter(SimulatedPresenter):
 
     def show(self, colour: Colour) -> None:
         self._lab.shows += 1
-        if happens := self._lab.at_show.pop(self._lab.shows, None):
-            happens()
+        if event := self._lab.at_show.pop(self._lab.shows, None):
+            event()
         super().show(self._ordered if self._lab.is_late else colour)
         self._ordered = colour
 
 
 class _Eos(SimulatedEos):
-    """A body that says nothing, has no space left, or an empty battery, while the lab says so."""
+    """A camera body that hangs, or has a full card, while the lab demands it."""
 
     lab: ClassVar[TroubledLab]
 
@@ -141,17 +141,16 @@ class _Eos(SimulatedEos):
 
 
 class TroubledLab:
-    """The simulated lab, and what goes wrong in it: call what begins and ends it, now, or when it is `due`.
+    """The simulated laboratory with methods that start and end faults, now or at a given time.
 
-    - `due`: what happens at moments, seconds since the lab opened; see `at`.
-    - `at_show`: what happens when so many pictures were shown.
-    - `told`: what somebody was notified of: lab seconds, event and message.
+    `due` holds events by lab time (see `at`), `at_show` by the number of shown colours. `notices` holds the notices:
+    lab time, event, message.
     """
 
     def __init__(self, *, after_power_cut: bool = False) -> None:
         self.due: list[tuple[float, Callable[[], object]]] = []
         self.at_show: dict[int, Callable[[], object]] = {}
-        self.told: list[tuple[float, str, str]] = []
+        self.notices: list[tuple[float, str, str]] = []
         self.shows = 0
         self.is_late = self.camera_hangs = self.card_is_full = self.disk_is_full = False
         self._camera_is_there = self._projector_is_there = True
@@ -163,25 +162,25 @@ class TroubledLab:
         self.projector = SimulatedProjector(self.clock)
         self.eos: _Eos | None = None
 
-    def at(self, lab_s: float, happens: Callable[[], object]) -> None:
-        """Let something happen when the lab has been open for so long."""
-        bisect.insort(self.due, (lab_s, happens), key=lambda event: event[0])
+    def at(self, lab_s: float, action: Callable[[], object]) -> None:
+        """Schedule an event at a lab time."""
+        bisect.insort(self.due, (lab_s, action), key=lambda event: event[0])
 
     def pull_camera(self, pulled: bool = True) -> None:
-        """Pull the camera's cable, or put it back."""
+        """Disconnect or reconnect the cable of the camera."""
         self._camera_is_there = not pulled
         if pulled and self._bus is not None and self._device is not None:
             self._bus.unplug(self._device)
             self._bus = None
 
     def restart_router(self, off: bool = True) -> None:
-        """Let the projector be out of reach, or be back."""
+        """Make the projector unreachable, or reachable again."""
         self._projector_is_there = not off
         if off and self._line is not None:
             self._line.close()
 
     def cut_power(self) -> None:
-        """Let the power dip: the lamp goes out, and the camera is gone for twenty seconds."""
+        """Interrupt the power: the lamp goes out, and the camera is missing for twenty seconds."""
         self.projector = self._strike(Power.STANDBY)
         self.pull_camera()
         self.at(self.clock.lab_s() + 20, lambda: self.pull_camera(False))
@@ -192,7 +191,7 @@ class TroubledLab:
 
     @contextmanager
     def opened(self, settings: LabSettings, chart: Chart, session: Session | None) -> Generator[Devices]:
-        """Open the simulated lab with parts that this one holds."""
+        """Open the simulated laboratory with the parts of this one."""
 
         def clock(start: datetime) -> EventfulClock:
             self.clock = EventfulClock(self, start)
@@ -202,15 +201,15 @@ class TroubledLab:
             self.projector = SimulatedProjector(clock, Power.STANDBY if self._after_power_cut else power)
             return self.projector
 
-        def eos(*given: Any, **named: Any) -> _Eos:
+        def eos(*arguments: Any, **options: Any) -> _Eos:
             _Eos.lab = self
-            self.eos = _Eos(*given, **named)
+            self.eos = _Eos(*arguments, **options)
             return self.eos
 
         def presenter(screen: Screen, clock: EventfulClock) -> _Presenter:
             return _Presenter(self, screen, clock)
 
-        replaced: dict[str, Any] = {
+        replacements: dict[str, Any] = {
             "SimulatedClock": clock,
             "SimulatedProjector": projector,
             "SimulatedEos": eos,
@@ -218,7 +217,7 @@ class TroubledLab:
             "MemoryTransport": self._connect_camera,
             "PeerLink": self._connect_projector,
         }
-        with patch.multiple(simulated, **replaced), open_rig(settings, chart, session) as devices:
+        with patch.multiple(simulated, **replacements), open_rig(settings, chart, session) as devices:
             yield devices
 
     def _connect_camera(self, eos: SimulatedEos) -> Transport:
@@ -235,49 +234,49 @@ class TroubledLab:
         return self._line
 
     def take(self, lab: Path, folder: Path) -> CropError | None:
-        """Take the session as `acquire run` does; return what ended it, None where it is complete."""
-        real = os.fsync
+        """Take the session as `acquire run` does; return the error that ended it, or None if it is complete."""
+        fsync_file = os.fsync
 
         def fsync(handle: int) -> None:
             if self.disk_is_full:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            real(handle)
+            fsync_file(handle)
 
-        told, seconds = self.told, self.clock_s
+        notices, seconds = self.notices, self.clock_s
 
         class Recorded:
             def __init__(self, *_: object) -> None: ...
 
             def send(self, event: str, message: str, at: datetime) -> None:
-                told.append((seconds(), event, message))
+                notices.append((seconds(), event, message))
 
             def report_failures(self) -> None: ...
 
             def close(self) -> None: ...
 
-        replaced: dict[str, Any] = {"open_rig": self.opened, "Notices": Recorded}
-        with patch.multiple(runs, **replaced), patch.object(os, "fsync", fsync):
+        replacements: dict[str, Any] = {"open_rig": self.opened, "Notices": Recorded}
+        with patch.multiple(runs, **replacements), patch.object(os, "fsync", fsync):
             try:
-                outcome = run_session(load_lab(lab), folder, lambda done, total: None)
+                outcome = run_session(load_lab(lab), folder, lambda count, total: None)
             except CropError as error:
                 return error
         return None if outcome.complete else QualityError("; ".join(outcome.refused))
 
     def clock_s(self) -> float:
-        """Return seconds since the lab opened."""
+        """Return seconds since the start of the lab."""
         return self.clock.lab_s()
 
     def most_notices_an_hour(self) -> int:
-        """Return how often somebody was told of a pause for one cause within an hour, at most."""
+        """Return the largest number of pause notices for one cause within an hour."""
         times: dict[str, list[float]] = {}
-        for at_s, event, message in self.told:
+        for time_s, event, message in self.notices:
             if event == "paused":
-                times.setdefault(pause_cause(message), []).append(at_s)
+                times.setdefault(pause_cause(message), []).append(time_s)
         return max((sum(0 <= b - a < HOUR_S for b in of) for of in times.values() for a in of), default=0)
 
 
 def make_lab(folder: Path, grid: int, events: Sequence[str] = (), **changes: object) -> Path:
-    """Write LAB.toml, a chart of 64 colours and lights; return the path of the first."""
+    """Write LAB.toml, a chart of 64 colours and the illuminants; return the path of LAB.toml."""
     folder.mkdir(exist_ok=True)
     design_chart(bits=2, seed=3).save(folder / "chart.json")
     save_illuminants(plan_illuminants(grid, [3000, 6500]), folder / "illuminations.csv")
@@ -292,37 +291,32 @@ def make_lab(folder: Path, grid: int, events: Sequence[str] = (), **changes: obj
 
 @dataclass(frozen=True)
 class Cause:
-    """Something that goes wrong in a run, and what docs/how-to/night-run.md says becomes of that.
-
-    - `begins`: called with the lab and the session's folder before the run.
-    - `ends`: words of the error that ends the run; empty where it goes on.
-    - `grid`, `events`, `changes`: of `make_lab`.
-    - `process`: whether the run is a process of its own, which is stopped for a while.
-    """
+    """A fault during a run and its documented effect (docs/how-to/night-run.md)."""
 
     name: str
+    # called with the lab and the session folder
     begins: Callable[[TroubledLab, Path], object] = lambda lab, folder: None
-    ends: str = ""
+    ends: str = ""  # pattern of the error that ends the run; empty if it goes on
     grid: int = 4
     events: tuple[str, ...] = ()
     changes: Mapping[str, object] = field(default_factory=dict[str, object])
-    process: bool = False
+    process: bool = False  # the run is a separate process, which is stopped for a while
 
 
 def _each(
     lab: TroubledLab, period_s: float, begins: Callable[[], object], ends: Callable[[], object], s: float
 ) -> None:
-    """Let a cause come and go all night: for `s` seconds of each period."""
+    """Let a fault occur for `s` seconds of each period."""
     for number in range(1, round(2 * HOUR_S / period_s)):
         lab.at(number * period_s, begins)
         lab.at(number * period_s + s, ends)
 
 
-def _opens(lab: TroubledLab, s: float) -> None:
+def _open_cable(lab: TroubledLab, s: float) -> None:
     _each(lab, 2 * MINUTE_S, lab.pull_camera, lambda: lab.pull_camera(False), s)
 
 
-def _hangs(lab: TroubledLab, s: float) -> None:
+def _hang_camera(lab: TroubledLab, s: float) -> None:
     def begin() -> None:
         lab.camera_hangs = True
         lab.at(lab.clock_s() + s, end)
@@ -333,7 +327,7 @@ def _hangs(lab: TroubledLab, s: float) -> None:
     lab.at_show[12] = begin
 
 
-def _is_late(lab: TroubledLab, first: int, last: int) -> None:
+def _delay_picture(lab: TroubledLab, first: int, last: int) -> None:
     def late(is_late: bool) -> None:
         lab.is_late = is_late
 
@@ -345,7 +339,7 @@ def _overwrite(path: Path) -> None:
         stream.write(bytes(path.stat().st_size))
 
 
-def _journal(mishap: Callable[[Path], object]) -> Callable[[TroubledLab, Path], object]:
+def _damage_journal(mishap: Callable[[Path], object]) -> Callable[[TroubledLab, Path], object]:
     def begins(lab: TroubledLab, folder: Path) -> None:
         lab.at_show[25] = lambda: mishap(folder / "journal.sqlite")
 
@@ -353,15 +347,15 @@ def _journal(mishap: Callable[[Path], object]) -> Callable[[TroubledLab, Path], 
 
 
 def pop_up(frame: int) -> str:
-    """Return an event of the simulated lab."""
+    """Return a pop-up event of the simulated laboratory, as TOML."""
     return f'{{ what = "pop-up", from_frame = {frame}, to_frame = {frame} }}'
 
 
 LOST = "acquire rebuild"
 
 CAUSES: tuple[Cause, ...] = (
-    Cause("one frame late, from a frame on", lambda lab, _: _is_late(lab, 30, 10**9), "illuminant|first frames"),
-    Cause("one frame late for eight frames", lambda lab, _: _is_late(lab, 30, 38)),
+    Cause("one frame late, from a frame on", lambda lab, _: _delay_picture(lab, 30, 10**9), "illuminant|first frames"),
+    Cause("one frame late for eight frames", lambda lab, _: _delay_picture(lab, 30, 38)),
     Cause("a pop-up in every tenth frame", events=tuple(pop_up(frame) for frame in range(25, 400, 10))),
     Cause(
         "a pop-up in every second frame",
@@ -369,20 +363,20 @@ CAUSES: tuple[Cause, ...] = (
         events=tuple(pop_up(frame) for frame in range(25, 400, 2)),
         changes={"refused_gb": 0.015, "attempts": 20},
     ),
-    Cause("a cable that opens each second minute, thirty frames between", lambda lab, _: _opens(lab, 60), grid=8),
-    Cause("the same, a frame or two between", lambda lab, _: _opens(lab, 114), "no camera"),
-    Cause("a camera that hangs for four minutes", lambda lab, _: _hangs(lab, 240)),
-    Cause("a camera that hangs for good", lambda lab, _: _hangs(lab, 10**6), "camera"),
+    Cause("a cable that opens every two minutes, after thirty frames", lambda lab, _: _open_cable(lab, 60), grid=8),
+    Cause("the same, after one or two frames", lambda lab, _: _open_cable(lab, 114), "no camera"),
+    Cause("a camera that hangs for four minutes", lambda lab, _: _hang_camera(lab, 240)),
+    Cause("a camera that hangs for good", lambda lab, _: _hang_camera(lab, 10**6), "camera"),
     Cause("a process that is stopped for fifteen seconds", process=True),
-    Cause("a journal that is deleted", _journal(Path.unlink), LOST),
-    Cause("a journal that is overwritten", _journal(_overwrite), LOST),
-    Cause("a journal that is cut to half", _journal(lambda path: os.truncate(path, path.stat().st_size // 2)), LOST),
+    Cause("a journal that is deleted", _damage_journal(Path.unlink), LOST),
+    Cause("a journal that is overwritten", _damage_journal(_overwrite), LOST),
+    Cause("a journal cut to half", _damage_journal(lambda path: os.truncate(path, path.stat().st_size // 2)), LOST),
 )
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a cause: one row of the table; `as_said`: whether that is what the how-to says."""
+    """Result of one cause: a row of the table. `is_as_documented`: the effect is that of the how-to."""
 
     cause: Cause
     ended: str
@@ -393,71 +387,71 @@ class Outcome:
     resumed: int
     notices: int
     minutes: float
-    as_said: bool
+    as_documented: bool
 
     def line(self) -> str:
-        """Return a row of Markdown."""
+        """Return a Markdown row."""
         return (
             f"| {self.cause.name} | {self.ended} | {self.frames} | {self.refused} | {self.refused_mb:.0f} | "
             f"{self.pauses} | {self.resumed} | {self.notices} | {self.minutes:.0f} | "
-            f"{'yes' if self.as_said else 'NO'} |"
+            f"{'yes' if self.as_documented else 'NO'} |"
         )
 
 
 HEAD = (
-    "| cause | the run | accepted | refused | MB of them | paused | resumed | notices a cause and hour | minutes "
-    "| as said |"
+    "| cause | run | accepted | rejected | rejected MB | paused | resumed | notices per cause and hour | minutes "
+    "| as documented |"
     "\n|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
 def outcome_of(cause: Cause, scratch: Path) -> Outcome:
-    """Take a session under a cause; where that ended the run, let the same command end it when the cause is gone."""
+    """Take a session under a cause; if that ended the run, complete it with the same command without the cause."""
     path = make_lab(scratch, cause.grid, cause.events, **cause.changes)
     folder, lab = scratch / "session", TroubledLab()
     cause.begins(lab, folder)
-    error = _stopped_for_a_while(path, folder) if cause.process else lab.take(path, folder)
-    lost = error is not None and LOST in str(error)
-    if lost:
+    error = _take_with_stop(path, folder) if cause.process else lab.take(path, folder)
+    is_journal_lost = error is not None and LOST in str(error)
+    if is_journal_lost:
         assert acquire(["rebuild", str(folder)]) == 0
     with Session.open(folder) as session:
         attempts, events = session.journal.attempts(), session.journal.events()
         unused, accepted = session.journal.unused_bytes(0), session.journal.accepted_files()
     if error is not None:
         print(f"{cause.name}: {error}", file=sys.stderr)
-    words = [event.what for event in events]
+    event_names = [event.what for event in events]
     verdicts = [attempt.verdict for attempt in attempts]
-    # The frames under way when it is spent are there all the same.
+    # Frames in progress when the budget is exceeded are still saved.
     budget = load_lab(path).sequence.refused_gb * 1e9 + 2 * max(frame.size for frame in accepted)
-    as_said = unused <= budget and lab.most_notices_an_hour() <= 1
-    as_said &= len({frame.step for frame in accepted}) == len(accepted)
-    as_said &= (error is None) if not cause.ends else error is not None and bool(re.search(cause.ends, str(error)))
-    as_said &= not cause.process or words.count("gap") == 1
+    is_right = unused <= budget and lab.most_notices_an_hour() <= 1
+    is_right &= len({frame.step for frame in accepted}) == len(accepted)
+    is_right &= (error is None) if not cause.ends else error is not None and bool(re.search(cause.ends, str(error)))
+    is_right &= not cause.process or event_names.count("gap") == 1
     if error is not None:
         make_lab(scratch, cause.grid)
-        again = TroubledLab().take(path, folder)
-        if again is not None:
-            print(f"{cause.name}, again: {again}", file=sys.stderr)
-        as_said &= again is None
+        repeat_error = TroubledLab().take(path, folder)
+        if repeat_error is not None:
+            print(f"{cause.name}, again: {repeat_error}", file=sys.stderr)
+        is_right &= repeat_error is None
         with Session.open(folder) as session:
-            done = [attempt.step for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
-            as_said &= sorted(done) == [step.number for step in session.steps]
+            accepted_steps = [attempt.step for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
+            is_right &= sorted(accepted_steps) == [step.number for step in session.steps]
     return Outcome(
         cause,
-        "goes on" if error is None else f"ends ({type(error).__name__})",
+        "continues" if error is None else f"ends ({type(error).__name__})",
         verdicts.count(ACCEPTED),
         verdicts.count(REFUSED) + verdicts.count(VOIDED),
         unused / 1e6,
-        words.count("paused"),
-        words.count("resumed"),
+        event_names.count("paused"),
+        event_names.count("resumed"),
         lab.most_notices_an_hour(),
         lab.clock_s() / MINUTE_S,
-        as_said,
+        is_right,
     )
 
 
-def _stopped_for_a_while(path: Path, folder: Path) -> None:
-    """Take a session in a process of its own, which is stopped (SIGSTOP) at its twelfth frame for fifteen seconds."""
+def _take_with_stop(path: Path, folder: Path) -> None:
+    """Take a session in a separate process that is stopped (SIGSTOP) for 15 s at its twelfth frame."""
     pids: list[int] = []
 
     def stop() -> None:
@@ -470,33 +464,34 @@ def _stopped_for_a_while(path: Path, folder: Path) -> None:
     def work() -> None:
         assert TroubledLab().take(path, folder) is None
 
-    told = path.with_name("pid")
-    thread = threading.Thread(target=lambda: (pids.append(_awaited(told)), stop()))
+    notices = path.with_name("pid")
+    thread = threading.Thread(target=lambda: (pids.append(_wait_for_pid(notices)), stop()))
     thread.start()
-    assert in_child(lambda: (told.write_text(str(os.getpid())), work())) == 0
+    assert in_child(lambda: (notices.write_text(str(os.getpid())), work())) == 0
     thread.join()
 
 
-def _awaited(told: Path) -> int:
-    while not (told.is_file() and told.read_text()):
+def _wait_for_pid(notices: Path) -> int:
+    while not (notices.is_file() and notices.read_text()):
         time.sleep(0.01)
-    return int(told.read_text())
+    return int(notices.read_text())
 
 
-def causes(only: str = "") -> bool:
-    """Print the table of causes; return whether each ended or went on as the how-to says."""
+def causes(name_part: str = "") -> bool:
+    """Print the table of causes; return whether all effects are as documented."""
     print(HEAD)
-    as_said = True
+    is_right = True
     for cause in CAUSES:
-        if only in cause.name:
+        if name_part in cause.name:
             with tempfile.TemporaryDirectory() as scratch:
                 outcome = outcome_of(cause, Path(scratch))
             print(outcome.line(), flush=True)
-            as_said &= outcome.as_said
-    return as_said
+            is_right &= outcome.as_documented
+    return is_right
 
 
-STORY: Mapping[str, tuple[str, str]] = {
+# Expected journal entries of a night: event and pattern of its detail, by fault.
+EXPECTED_EVENTS: Mapping[str, tuple[str, str]] = {
     "router": ("paused", "projector.*(nothing listens|out of reach)"),
     "first power dip": ("relit", "standby"),
     "clock": ("clock", "set ahead by 1 h"),
@@ -506,14 +501,13 @@ STORY: Mapping[str, tuple[str, str]] = {
     "second power dip": ("killed", "power was lost"),
     "lamp lit again": ("warming up", ""),
 }
-"""What the journal, and so the report, is to tell of a night: by what happened, an event and words of its sentence."""
 
 
 @dataclass(frozen=True)
 class Night:
-    """How a night went: what the story lacks, how many frames, how long, and which table came of it."""
+    """Result of a night."""
 
-    untold: tuple[str, ...]
+    missing_events: tuple[str, ...]
     frames: int
     doubled: int
     hours: float
@@ -521,7 +515,7 @@ class Night:
 
 
 def night(scratch: Path, grid: int, night_s: float = NIGHT_S) -> Night:
-    """Take a session that lasts a night in which power dips twice and much else happens; nobody comes."""
+    """Take a session that lasts a night, with two power cuts and other faults, without an operator."""
     lights = len(plan_illuminants(grid, [3000, 6500]))
     frames = 21 + lights + 2 * (lights // 10 + 2)
     path = make_lab(scratch, grid, settle_s=max(night_s / frames - 2, 0.5), patience_s=HOUR_S, warm_up_s=20 * MINUTE_S)
@@ -529,7 +523,7 @@ def night(scratch: Path, grid: int, night_s: float = NIGHT_S) -> Night:
 
     def before_the_second_cut() -> None:
         lab = TroubledLab()
-        _happen(lab, night_s, 1.2 * night_s / frames)
+        _schedule_night(lab, night_s, 1.2 * night_s / frames)
         lab.at(night_s * 10 / 12, lambda: os.kill(os.getpid(), signal.SIGKILL))
         lab.take(path, folder)
 
@@ -541,21 +535,27 @@ def night(scratch: Path, grid: int, night_s: float = NIGHT_S) -> Night:
         events, attempts = session.journal.events(), session.journal.attempts()
         assert not session.lost_files()
         steps = [step.number for step in session.steps]
-    done = [attempt.step for attempt in attempts if attempt.verdict == ACCEPTED]
-    assert sorted(set(done)) == steps
-    untold = tuple(
-        what
-        for what, (word, said) in STORY.items()
-        if not any(event.what == word and re.search(said, event.detail, re.IGNORECASE) for event in events)
+    accepted_steps = [attempt.step for attempt in attempts if attempt.verdict == ACCEPTED]
+    assert sorted(set(accepted_steps)) == steps
+    missing_events = tuple(
+        fault
+        for fault, (event_name, detail) in EXPECTED_EVENTS.items()
+        if not any(event.what == event_name and re.search(detail, event.detail, re.IGNORECASE) for event in events)
     )
     hours = (attempts[-1].started_at - SIM_START).total_seconds() / HOUR_S
     times = [attempt.started_at for attempt in attempts]
     assert times == sorted(times), "time never goes back"
-    return Night(untold, len(attempts), len(done) - len(set(done)), hours, [e.what for e in events].count("paused"))
+    return Night(
+        missing_events,
+        len(attempts),
+        len(accepted_steps) - len(set(accepted_steps)),
+        hours,
+        [e.what for e in events].count("paused"),
+    )
 
 
-def _happen(lab: TroubledLab, night_s: float, least_s: float) -> None:
-    """Let a night's events fall due, at shares of it; each lasts for `least_s` at least, so that a frame meets it."""
+def _schedule_night(lab: TroubledLab, night_s: float, least_s: float) -> None:
+    """Schedule the faults of a night; each lasts at least `least_s`, so that it affects a frame."""
 
     def switch(name: str, value: object) -> Callable[[], None]:
         return lambda: setattr(lab, name, value)
@@ -587,7 +587,7 @@ def _happen(lab: TroubledLab, night_s: float, least_s: float) -> None:
 
 
 def main(argv: list[str]) -> int:
-    """Print the table of causes, or what came of a night."""
+    """Print the table of causes, or the result of a night."""
     if argv[:1] != ["night"]:
         return int(not causes(argv[1] if argv[1:] else ""))
     from calibration.cli import main as build_lut
@@ -595,21 +595,25 @@ def main(argv: list[str]) -> int:
     grid = int(argv[1]) if argv[1:] else 33
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(argv[2]) if argv[2:] else Path(scratch) / "night"
-        begun = time.perf_counter()
-        found = night(folder, grid)
-        taken_s = time.perf_counter() - begun
+        start = time.perf_counter()
+        result = night(folder, grid)
+        duration_s = time.perf_counter() - start
         code = build_lut([str(folder / "session"), str(folder / "lut")])
     for name, value, unit in (
-        ("night: hours of the lab's time", round(found.hours, 2), "h"),
-        ("night: attempts", found.frames, "frames"),
-        ("night: steps with two accepted frames", found.doubled, "frames"),
-        ("night: pauses", found.pauses, "pauses"),
-        ("night: events that the story lacks", len(found.untold), f"of {len(STORY)} {' '.join(found.untold)}".strip()),
+        ("night: hours of lab time", round(result.hours, 2), "h"),
+        ("night: attempts", result.frames, "frames"),
+        ("night: steps with two accepted frames", result.doubled, "frames"),
+        ("night: pauses", result.pauses, "pauses"),
+        (
+            "night: expected events that are missing",
+            len(result.missing_events),
+            f"of {len(EXPECTED_EVENTS)} {' '.join(result.missing_events)}".strip(),
+        ),
         ("night: exit code of build-lut", code, ""),
-        ("night: time", round(taken_s, 1), "s"),
+        ("night: time", round(duration_s, 1), "s"),
     ):
         print(json.dumps({"name": name, "value": value, "unit": unit, "against": ""}), flush=True)
-    return int(bool(found.untold) or code != 0)
+    return int(bool(result.missing_events) or code != 0)
 
 
 if __name__ == "__main__":

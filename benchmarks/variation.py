@@ -1,7 +1,8 @@
-"""What variation costs: `python -m benchmarks.variation` prints one JSON object a line.
+"""Cost of variation: `python -m benchmarks.variation` prints one JSON object per line.
 
-Of a photograph of 6 Mpx, in one thread: to draw its samples, to draw and vary them in each way, and to write the image
-as PNG, which most datasets do besides. All calls take turns; the fastest turn counts, in the processor's time.
+For a photograph of 6 Mpx and one thread it measures drawing the samples, drawing and varying them in each way, and
+writing the image as PNG, which most data sets also do. All calls take turns; the fastest turn counts, in processor
+time.
 """
 
 from __future__ import annotations
@@ -28,20 +29,20 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         lut = noisy_table(Path(scratch) / "lut", 2)
         start = time.process_time()
-        everything = variation_of(
+        all_variations = variation_of(
             lut, parse_exposure("clip:share=.01"), parse_gradient("smooth:stops=1"), parse_iso("1600/100")
         )
-        report("noise of a table", time.process_time() - start, "s")
+        report("noise of a LUT", time.process_time() - start, "s")
         samples = np.array(lut.samples[0])
-    noise = everything.noise
-    kinds = {
+    noise = all_variations.noise
+    variations = {
         "less light": Variation(parse_exposure(".5"), noise=noise),
         "more light": Variation(parse_exposure("2"), noise=noise),
         "automatic exposure": Variation(parse_exposure("clip:share=.01"), noise=noise),
         "gradient, soft edge": Variation(gradient=parse_gradient("soft-edge:stops=1"), noise=noise),
         "gradient, smooth": Variation(gradient=parse_gradient("smooth:stops=1"), noise=noise),
         "ISO 1600": Variation(iso=parse_iso("1600/100"), noise=noise),
-        "all": everything,
+        "all": all_variations,
     }
     metadata = ImageMetadata(WHITE, (0.3, 0.4, 0.3), "Benchmark")
 
@@ -55,19 +56,19 @@ def main() -> None:
 
         return call
 
-    calls: dict[str, Callable[[], object]] = {"plain": draw, **{name: vary(kind) for name, kind in kinds.items()}}
+    calls: dict[str, Callable[[], object]] = {"plain": draw, **{name: vary(kind) for name, kind in variations.items()}}
     seconds = in_turns(calls, time.thread_time)
     draw()
     image = out.copy()
-    written = in_turns({"PNG": lambda: encode_image(image, "png", metadata)}, time.thread_time, 2)["PNG"]
+    png_s = in_turns({"PNG": lambda: encode_image(image, "png", metadata)}, time.thread_time, 2)["PNG"]
     pixels = WIDTH * HEIGHT / 1e6
-    for name, took in seconds.items():
-        report(f"{name}, one thread", pixels / took, "Mpx/s")
+    for name, call_s in seconds.items():
+        report(f"{name}, one thread", pixels / call_s, "Mpx/s")
         if name != "plain":
-            report(f"{name}, one thread", (took - seconds["plain"]) / seconds["plain"], "ratio", "added to drawing")
+            report(f"{name}, one thread", (call_s - seconds["plain"]) / seconds["plain"], "ratio", "added to drawing")
             report(
                 f"{name}, one thread",
-                (took - seconds["plain"]) / (seconds["plain"] + written),
+                (call_s - seconds["plain"]) / (seconds["plain"] + png_s),
                 "ratio",
                 "added to drawing and writing a PNG",
             )

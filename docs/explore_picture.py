@@ -1,6 +1,6 @@
-"""Photograph the page of a table for the site: ``python -m docs.explore_picture`` writes docs/images/explore.jpg.
+"""Screenshot of the LUT page for the site: ``python -m docs.explore_picture`` writes docs/images/explore.jpg.
 
-A table of 707 lights is computed (`sim table`), and Chromium, without a screen, shows it with the photographs of
+A LUT of 707 illuminants is computed (`sim table`), and headless Chromium shows it with the photographs of
 examples/photographs.py.
 """
 
@@ -21,18 +21,18 @@ from generator.pictures.sources import Preparation, find_pictures
 from synthesis.cli import main as sim
 from tests.acquisition.monitor.browser import browser_tab
 
+# Size of the browser window, px: it shows the illuminant, the picture and the pixel.
 WINDOW = 1280, 790
-"""Of the browser, px: the light, the picture and the pixel."""
 
+# Few colours, so that the LUT takes seconds; rendering by colour does not show it.
 SETTINGS = 'room.profile = "managed"\nchart.bits = 4\n'
-"""Few colours, so that the table takes seconds; what is rendered by colour does not show it."""
 
+# True when both images and the pixel values are drawn.
 DRAWN = "panels.every((one) => one.drawn.endsWith(shown.light) && one.rows.textContent.includes('±'))"
-"""All that is asked of the program is there."""
 
 
 def main() -> None:
-    """Write the picture beside the others of the documentation."""
+    """Write docs/images/explore.jpg."""
     target = Path(__file__).resolve().with_name("images") / "explore.jpg"
     with tempfile.TemporaryDirectory(prefix="crop-") as folder, contextlib.chdir(folder):
         Path("settings.toml").write_text(SETTINGS, encoding="utf-8")

@@ -1,7 +1,7 @@
-"""Make what docs/gallery.md shows: `python -m docs.gallery`, which the site's build calls.
+"""Make the files of docs/gallery.md: `python -m docs.gallery`; the build of the site calls it.
 
-The commands of the page run as they stand, one after another, in a folder that is removed. What the page names below
-`gallery/` is copied to docs/gallery, which is in no repository.
+The commands of the page run one after another in a temporary folder. Files that the page names below `gallery/` are
+copied to docs/gallery, which git ignores.
 """
 
 from __future__ import annotations
@@ -17,31 +17,33 @@ PAGE = ROOT / "docs" / "gallery.md"
 
 
 def make(page: Path = PAGE) -> list[Path]:
-    """Run the commands of a page and return the files that it shows, beside it.
+    """Run the commands of a page and copy the files that it shows next to it.
 
     Raises
     ------
     RuntimeError
-        The commands ended with another code than 0, or left no such file.
+        if the commands fail or do not make a file
     """
     text = page.read_text(encoding="utf-8")
     commands = "\n".join(re.findall(r"^    (.+)$", text, re.MULTILINE))
-    named = sorted(set(re.findall(r"\bgallery/([\w./-]+)", text)))
-    made: list[Path] = []
+    file_names = sorted(set(re.findall(r"\bgallery/([\w./-]+)", text)))
+    files: list[Path] = []
     with tempfile.TemporaryDirectory(prefix="crop-") as folder:
         Path(folder, "examples").symlink_to(ROOT / "examples")
-        done = run_commands(commands, Path(folder))
-        if done.returncode:
-            raise RuntimeError(f"the commands of {page} ended with {done.returncode}: {done.stderr[-500:]}")
-        for name in named:
+        process = run_commands(commands, Path(folder))
+        if process.returncode:
+            raise RuntimeError(
+                f"the commands of {page} ended with exit code {process.returncode}, 0 expected: {process.stderr[-500:]}"
+            )
+        for name in file_names:
             target = page.parent / "gallery" / name
             if not Path(folder, name).is_file():
-                raise RuntimeError(f"{page} shows gallery/{name}, which its commands did not make")
+                raise RuntimeError(f"{page} shows gallery/{name}, but its commands did not make it; correct the page")
             target.parent.mkdir(parents=True, exist_ok=True)
-            made.append(shutil.copyfile(Path(folder, name), target))
-    return made
+            files.append(shutil.copyfile(Path(folder, name), target))
+    return files
 
 
 if __name__ == "__main__":
-    for place in make():
-        print(place.relative_to(ROOT))
+    for file in make():
+        print(file.relative_to(ROOT))

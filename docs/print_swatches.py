@@ -1,7 +1,7 @@
-"""Draw what the simulated prints of one file look like under daylight of 5000 K: ``python -m docs.print_swatches``.
+"""Draw simulated prints of one file under daylight of 5000 K: ``python -m docs.print_swatches``.
 
-Writes docs/images/prints.png: a file's colours and greys, then on each paper ink codes (left) and managed (right). The
-pictures are the reflectances' sRGB as an observer sees them beside an ideal white, so paper is not quite white.
+It writes docs/images/prints.png: colours and greys of the file, then on each paper ink codes (left) and managed
+(right). The pictures show the sRGB of the reflectances next to an ideal white, so paper is slightly darker than white.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from sim.spectral import WAVELENGTHS_NM, PaperName, ProfileName, printed_reflect
 
 PAPERS: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 PROFILES: tuple[ProfileName, ...] = ("unmanaged", "managed")
+# Side of a colour square, px, so that six prints fit into 910 px.
 SQUARE = 7
-"""Pixels of a colour's side, so that six prints stand in 910 pixels."""
+# White gap between prints, px.
 GAP = 14
-"""Pixels of white between prints."""
 
 
 def file_codes() -> NDArray[np.float64]:
-    """Return (19, 64, 3) float64 codes 0 … 255: 16 by 16 of red and green at four of blue, and three rows of grey."""
+    """Return codes 0 to 255 (19, 64, 3): 16 × 16 of red and green at four levels of blue, and three rows of grey."""
     steps = np.linspace(0, 255, 16)
     red, green = np.meshgrid(steps, steps)
     planes = [np.stack([red, green, np.full_like(red, blue)], axis=-1) for blue in (0.0, 85.0, 170.0, 255.0)]
@@ -33,8 +33,8 @@ def file_codes() -> NDArray[np.float64]:
     return np.concatenate([np.concatenate(planes, axis=1), np.repeat(grey, 3, axis=0)])
 
 
-def seen(codes: NDArray[np.float64], profile: ProfileName, paper: PaperName) -> NDArray[np.uint8]:
-    """Return (rows, columns, 3) uint8 sRGB of the print of codes (rows, columns, 3) under D50."""
+def print_srgb(codes: NDArray[np.float64], profile: ProfileName, paper: PaperName) -> NDArray[np.uint8]:
+    """Return the sRGB (rows, columns, 3) uint8 of the printed codes (rows, columns, 3) under D50."""
     shape = colour.SpectralShape(float(WAVELENGTHS_NM[0]), float(WAVELENGTHS_NM[-1]), 5)
     observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape).values
     light = observer * colour.SDS_ILLUMINANTS["D50"].copy().align(shape).values[:, None]
@@ -46,18 +46,18 @@ def seen(codes: NDArray[np.float64], profile: ProfileName, paper: PaperName) -> 
 
 
 def large(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return (SQUARE · rows, SQUARE · columns, 3): each colour of (rows, columns, 3) as a square."""
+    """Enlarge each colour of (rows, columns, 3) to a square."""
     return picture.repeat(SQUARE, axis=0).repeat(SQUARE, axis=1)
 
 
 def main() -> None:
-    """Write the picture beside the others of the documentation."""
+    """Write docs/images/prints.png."""
     codes = file_codes()
     across = np.full((SQUARE * len(codes), GAP, 3), 255, dtype=np.uint8)
     file = large(np.round(codes).astype(np.uint8))
     rows = [np.concatenate([file, across, np.full_like(file, 255)], axis=1)]
     for paper in PAPERS:
-        left, right = (large(seen(codes, profile, paper)) for profile in PROFILES)
+        left, right = (large(print_srgb(codes, profile, paper)) for profile in PROFILES)
         rows += [
             np.full((GAP, rows[0].shape[1], 3), 255, dtype=np.uint8),
             np.concatenate([left, across, right], axis=1),

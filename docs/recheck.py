@@ -1,33 +1,32 @@
-"""Run what the pages state as printed by commands, and list the figures that differ from what is printed now.
+"""Run the commands of the pages, and list the figures that differ from their output.
 
-`python -m docs.recheck [PAGE…] [--data FOLDER]… [--seconds S]` runs, before a release, all of README and docs, in
-folders that are removed afterwards. A table of figures that commands print has a comment before it, in TOML:
+`python -m docs.recheck [PAGE…] [--data FOLDER]… [--seconds S]` checks README and docs before a release, in
+temporary folders. A comment in TOML precedes each table of printed figures:
 
     <!-- recheck
-    reads = "FOLDER/bits.csv"          # the file that holds the figures; commands write to FOLDER
-    rows = ["Algorithm"]               # its columns that name a row, as the table's first ones do; "a, b" joins two
-    columns = "Bits set to zero"       # its column with the table's other headings; else they are names of columns
-    value = "Med."                     # its column with the figures; else, with `columns`, the row's label names it
-    where = { error = "recovery" }     # which rows are meant, by columns that the table does not show
-    names = { "Best 25 %" = "best25" } # columns whose names are not the table's headings
-    needs = ["thumbnails.npz"]         # files that do not come with the suite, looked for below the folders of --data
-    seconds = 2                        # what the commands take
-    tolerance = 0.02                   # by default a bit more than half of the last digit's unit
-    command = "evaluate …"             # by default the last block of commands above, or all blocks of Python
-    first = "sim table …"              # commands further up that it needs
+    reads = "FOLDER/bits.csv"          # file with the figures; commands write to FOLDER
+    rows = ["Algorithm"]               # columns that name a row, as in the table; "a, b" joins two
+    columns = "Bits set to zero"       # column with the table's other headings; else they are column names
+    value = "Med."                     # column with the figures; else, with `columns`, the row names it
+    where = { error = "recovery" }     # selects rows by columns that the table does not show
+    names = { "Best 25 %" = "best25" } # columns with other names than the table's headings
+    needs = ["thumbnails.npz"]         # files outside the suite, searched below the folders of --data
+    seconds = 2                        # time of the commands
+    tolerance = 0.02                   # default: slightly more than half a unit of the last digit
+    command = "evaluate …"             # default: the last block of commands above, or all Python blocks
+    first = "sim table …"              # earlier commands that it needs
     -->
 
-The first number of each cell is compared. Where the comment has `says`, sentences below it are compared in place of a
-table: each text is that of the page, with a column in braces where a figure stands, behind a colon the row by what its
-`rows` hold, between semicolons (* for any), and before it min or max where several rows are meant:
+The first number of each table cell is compared. With `says`, sentences below the comment are compared instead. Each
+text is a sentence of the page with figures replaced by {COLUMN: ROW}. ROW lists the values of `rows`, separated by
+semicolons (* for any). With several rows, min or max precedes the column:
 
     says = ["Gray-world lies between {min Med.: Gray-world; *}° and {max Med.: Gray-world; *}° in the median"]
 
-Without `reads` the comment stands before a fenced block of text, which is what the commands print, figures within the
-tolerance; on a page of cells of Python before the last, and all such blocks above are compared with it. Commands run as
-they stand, so recheck only a copy that you trust. Figures that cannot be run so, because they take hours or data that
-nobody may pass on, have in their section the words "taken with version", the version and the date; on pages of
-measurements (`MEASURED`) a table with neither counts as a difference.
+Without `reads`, the comment precedes a fenced text block that is compared with the printed output, figures within the
+tolerance. On a page of Python cells it precedes the last one, and all text blocks above are compared too. The commands
+run unchanged, so check only a copy that you trust. Figures that take hours or restricted data have the words "taken
+with version", version and date in their section. On pages in `MEASURED`, a table with neither is a difference.
 """
 
 from __future__ import annotations
@@ -50,6 +49,7 @@ from pydantic import BaseModel, ConfigDict
 
 ROOT = Path(__file__).resolve().parents[1]
 
+# Pages with measured tables; decimals on other pages are limits, formats and settings.
 MEASURED = (
     "README.md",
     "docs/paper.md",
@@ -58,23 +58,22 @@ MEASURED = (
     "docs/how-to/transfer.md",
     "docs/how-to/tune.md",
 )
-"""Pages whose tables of decimals are measurements; tables of other pages state limits, formats and settings."""
 
-NO_SOURCE = 'figures with neither a recheck comment nor, in their section, "taken with version X, YYYY-MM-DD"'
+NO_SOURCE = 'figures without a source; add a recheck comment or, in their section, "taken with version X, YYYY-MM-DD"'
 NUMBER = re.compile(r"-?(?:\d+\.?\d*|\.\d+)")
 TAKEN = re.compile(r"taken\s+with\s+version\s+(\S+),\s+(\d{4}-\d\d-\d\d)", re.IGNORECASE)
 
 
+# Start of a Python cell.
 PYTHON = "```python\n"
-"""What a cell begins with."""
 
+# A figure in a sentence: min or max, column, row.
 SLOT = re.compile(r"\{(?:(min|max) )?([^{}:]+)(?:: ([^{}]*))?\}")
-"""A figure of a sentence: which of several, its column, its row."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a page: the line it begins in, headings, and rows of cells."""
+    """A table of a page: first line, headings, rows of cells."""
 
     line: int
     headings: list[str]
@@ -86,7 +85,7 @@ class Table:
 
 
 class Mark(BaseModel):
-    """What the comment says; see above."""
+    """Content of the comment; see the module docstring."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -106,9 +105,9 @@ class Mark(BaseModel):
 
 @dataclass(frozen=True)
 class Check:
-    """What a page states below a comment, the commands that print its figures, and how these are found.
+    """A comment of a page with the stated figures and the commands that print them.
 
-    `stated`: a table, a text with the sentences of `mark.says`, or the lines of a block. `line` is where it begins.
+    `stated`: a table, a text with the sentences of `mark.says`, or the lines of a block, from `line` on.
     """
 
     page: str
@@ -125,71 +124,73 @@ class Check:
 
 def checks_of(page: str, text: str) -> list[Check]:
     """Return the checks of a page."""
-    found: list[Check] = []
+    checks: list[Check] = []
     for comment in re.finditer(r"^<!-- recheck\n(.*?)^-->\n", text, re.MULTILINE | re.DOTALL):
         mark = Mark.model_validate(tomllib.loads(comment[1]))
         line = text.count("\n", 0, comment.end()) + 1
-        below = text[comment.end() :]
+        text_below = text[comment.end() :]
         stated: Table | str | list[str] | None
         if mark.says:
-            stated = below
+            stated = text_below
         elif mark.reads is None:
-            block = re.match(r"\n*```text\n(?:.*\n)*?```\n", below)
-            # Cells run as one program, which prints what stands below each.
-            whole = (text[: comment.start()] if PYTHON in text[: comment.start()] else "") + (block[0] if block else "")
-            stated = [line for lines in re.findall(r"(?ms)^```text\n(.*?)^```\n", whole) for line in lines.splitlines()]
+            block = re.match(r"\n*```text\n(?:.*\n)*?```\n", text_below)
+            # Cells run as one program, which prints the text of all blocks.
+            source = (text[: comment.start()] if PYTHON in text[: comment.start()] else "") + (
+                block[0] if block else ""
+            )
+            stated = [
+                line for lines in re.findall(r"(?ms)^```text\n(.*?)^```\n", source) for line in lines.splitlines()
+            ]
         else:
-            stated = next((one for one in tables_of(text) if one.line >= line), None)
+            stated = next((table for table in tables_of(text) if table.line >= line), None)
             line = stated.line if stated else line
         if not stated:
-            raise ValueError(
-                f"{page}:{line}: a recheck comment has neither a table below it nor, as it has no reads, text"
-            )
+            raise ValueError(f"{page}:{line}: no table or text block below a recheck comment; add one")
         command = mark.command or _commands_above(text[: comment.start()])
-        # What comes first prints nothing that is compared.
-        before = f"{{\n{mark.first}\n}} >&2\n" if mark.first else ""
-        found.append(Check(page, line, stated, before + command, mark))
-    return found
+        # The output of the first commands is not compared.
+        setup = f"{{\n{mark.first}\n}} >&2\n" if mark.first else ""
+        checks.append(Check(page, line, stated, setup + command, mark))
+    return checks
 
 
 def tables_of(text: str) -> list[Table]:
-    """Return the tables of a page, in its order."""
+    """Return the tables of a page, in order."""
     lines = text.splitlines()
-    found: list[Table] = []
+    tables: list[Table] = []
     for is_table, group in itertools.groupby(enumerate(lines, 1), key=lambda pair: pair[1].startswith("|")):
         if is_table and len(rows := [(n, [cell.strip() for cell in row[1:-1].split("|")]) for n, row in group]) > 2:
-            found.append(Table(rows[0][0], rows[0][1], [cells for _, cells in rows[2:]]))
-    return found
+            tables.append(Table(rows[0][0], rows[0][1], [cells for _, cells in rows[2:]]))
+    return tables
 
 
-def without_a_source(text: str) -> list[Table]:
-    """Return the tables of figures that have neither commands nor, in their section, a version and a date."""
+def tables_without_source(text: str) -> list[Table]:
+    """Return the tables of figures without commands and without version and date in their section."""
     checked = {check.line for check in checks_of("", text)}
     starts = [1, *(n for n, line in enumerate(text.splitlines(), 1) if line.startswith("## "))]
     lines = text.splitlines()
-    left: list[Table] = []
+    tables: list[Table] = []
     for table in tables_of(text):
         start = max(n for n in starts if n <= table.line)
         end = min((n for n in starts if n > table.line), default=len(lines) + 1)
         dated = TAKEN.search("\n".join(lines[start - 1 : end - 1]))
         if table.has_figures() and table.line not in checked and not dated:
-            left.append(table)
-    return left
+            tables.append(table)
+    return tables
 
 
 def _commands_above(text: str) -> str:
-    """Return the last block of commands: lines with four spaces, or a fenced block; of Python all blocks, as one."""
+    """Return the last block of commands (indented or fenced); of Python, all blocks joined."""
     text = re.sub(r"^<!--.*?-->\n", "", text, flags=re.MULTILINE | re.DOTALL)
     found = re.finditer(r"(?:^    .*\n)+|^```(\w*)\n((?:.*\n)*?)```\n", text, re.MULTILINE)
     blocks = [(block[1], block[2] or block[0]) for block in found if block[1] in (None, "", "sh", "console", "python")]
-    language, last = blocks[-1]
+    language, last_block = blocks[-1]
     if language != "python":
-        return "\n".join(line.removeprefix("    ") for line in last.splitlines())
+        return "\n".join(line.removeprefix("    ") for line in last_block.splitlines())
     return "\n".join(["python - <<'END'", *(code for language, code in blocks if language == "python"), "END"])
 
 
 def differences(check: Check, folder: Path, output: str = "") -> list[str]:
-    """Return what a page states otherwise than the file in `folder`, or the output, of its commands, a line each."""
+    """Compare the figures of a page with the file in `folder` or the output; return one line per difference."""
     if check.mark.reads is None:
         assert isinstance(check.stated, list)
         return list(_differences_of_lines(check, check.stated, output.splitlines()))
@@ -219,23 +220,23 @@ def _differences_of_lines(check: Check, stated: Sequence[str], printed: Sequence
 
 def _differences_of_sentence(check: Check, template: str, printed: Sequence[dict[str, str]]) -> Iterator[str]:
     slots = list(SLOT.finditer(template))
-    texts = [r"\s+".join(map(re.escape, part.split(" "))) for part in SLOT.split(template)[:: SLOT.groups + 1]]
-    found = re.search(f"({NUMBER.pattern})".join(texts), str(check.stated).replace("−", "-"))
-    if not slots or found is None:
-        yield f"{check.place}: the page does not say, with figures: {template}"
+    texts = [r"\s+".join(map(re.escape, value.split(" "))) for value in SLOT.split(template)[:: SLOT.groups + 1]]
+    match = re.search(f"({NUMBER.pattern})".join(texts), str(check.stated).replace("−", "-"))
+    if not slots or match is None:
+        yield f"{check.place}: the page has no such sentence with figures: {template}"
         return
-    for slot, number in zip(slots, found.groups(), strict=True):
-        which, column, row = slot.groups()
-        wanted = [part.strip() for part in (row or "").split(";")]
+    for slot, number in zip(slots, match.groups(), strict=True):
+        pick, column, row = slot.groups()
+        row_values = [value.strip() for value in (row or "").split(";")]
         values = [
-            float(one[column])
-            for one in printed
-            if NUMBER.fullmatch(one[column])
-            and all(want in ("*", "", one[key]) for key, want in zip(check.mark.rows, wanted, strict=False))
+            float(row[column])
+            for row in printed
+            if NUMBER.fullmatch(row[column])
+            and all(wanted in ("*", "", row[key]) for key, wanted in zip(check.mark.rows, row_values, strict=False))
         ]
-        if not values or (which is None and len(values) > 1):
+        if not values or (pick is None and len(values) > 1):
             yield f"{check.place}: {slot[0]}: {number} stated, not one figure printed"
-        elif abs(float(number) - (value := max(values) if which == "max" else min(values))) > _tolerance(
+        elif abs(float(number) - (value := max(values) if pick == "max" else min(values))) > _tolerance(
             check.mark, number
         ):
             yield f"{check.place}: {slot[0]}: {number} stated, {value:.6g} printed"
@@ -245,8 +246,8 @@ def _differences_of_row(
     check: Check, table: Table, cells: Sequence[str], printed: Sequence[dict[str, str]]
 ) -> Iterator[str]:
     labels = max(len(check.mark.rows), 1)
-    named = [_plain(cell) for cell in cells[: len(check.mark.rows)]]
-    rows = [row for row in printed if [_label(row, names) for names in check.mark.rows] == named]
+    row_labels = [_plain(cell) for cell in cells[: len(check.mark.rows)]]
+    rows = [row for row in printed if [_label(row, names) for names in check.mark.rows] == row_labels]
     for heading, cell in zip(table.headings[labels:], cells[labels:], strict=True):
         stated = NUMBER.search(_plain(cell))
         if stated is None:
@@ -264,16 +265,16 @@ def _label(row: Mapping[str, str], names: str) -> str:
 
 
 def _printed(mark: Mark, heading: str, label: str, rows: Sequence[dict[str, str]]) -> float | None:
-    """Return the printed figure; None where there is none, or more than one."""
+    """Return the printed figure; None if there is none or more than one."""
     if mark.columns is not None:
         rows = [row for row in rows if _plain(row[mark.columns]) == _plain(heading)]
     name = mark.names.get(heading, heading) if mark.columns is None else mark.value or label
-    found = [value for row in rows for key, value in row.items() if _plain(key) == _plain(name)]
-    return float(found[0]) if len(found) == 1 and re.fullmatch(r"-?[\d.]+(?:e[+-]?\d+)?", found[0]) else None
+    figures = [value for row in rows for key, value in row.items() if _plain(key) == _plain(name)]
+    return float(figures[0]) if len(figures) == 1 and re.fullmatch(r"-?[\d.]+(?:e[+-]?\d+)?", figures[0]) else None
 
 
 def _plain(text: str) -> str:
-    """Return a cell or a name without emphasis, typographic signs and differences of case and blanks."""
+    """Remove emphasis, typographic signs, case and blanks from a cell or name."""
     return re.sub(r"[*`\s]", "", text).replace("−", "-").casefold()
 
 
@@ -282,45 +283,44 @@ def _tolerance(mark: Mark, stated: str) -> float:
     return mark.tolerance if mark.tolerance is not None else 0.51 * 10.0**-digits
 
 
-def run(checks: Sequence[Check], data: Sequence[Path], most_s: float = math.inf) -> tuple[list[str], list[str]]:
-    """Run the commands of checks, each block once; return what differs and what was not run, a line each."""
-    differ: list[str] = []
+def run(checks: Sequence[Check], data: Sequence[Path], max_s: float = math.inf) -> tuple[list[str], list[str]]:
+    """Run each block of commands once; return the differences and the checks that were not run, one line each."""
+    differing: list[str] = []
     skipped: list[str] = []
     blocks: dict[str, list[Check]] = {}
     for check in checks:
         blocks.setdefault(check.command, []).append(check)
     for command, block in blocks.items():
-        places = {name: _found(name, data) for check in block for name in check.mark.needs}
-        missing = [name for name, place in places.items() if place is None]
+        paths = {name: _find_file(name, data) for check in block for name in check.mark.needs}
+        missing = [name for name, path in paths.items() if path is None]
         seconds = max(check.mark.seconds for check in block)
-        if missing or seconds > most_s:
-            why = f"needs {', '.join(missing)}; name its folder by --data" if missing else f"takes {seconds:g} s"
-            skipped += [f"{check.place}: {why}" for check in block]
+        if missing or seconds > max_s:
+            cause = f"needs {', '.join(missing)}; name its folder with --data" if missing else f"takes {seconds:g} s"
+            skipped += [f"{check.place}: {cause}" for check in block]
             continue
         with tempfile.TemporaryDirectory() as folder:
-            for name, place in (places | {"examples": ROOT / "examples"}).items():
-                (Path(folder) / name).symlink_to(str(place))
-            differ += _run_block(command, block, Path(folder))
-    return differ, skipped
+            for name, path in (paths | {"examples": ROOT / "examples"}).items():
+                (Path(folder) / name).symlink_to(str(path))
+            differing += _run_block(command, block, Path(folder))
+    return differing, skipped
 
 
 def run_commands(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run commands of a page in a folder, ours those beside this Python, up to the first that fails."""
+    """Run commands of a page in a folder with the programs of this Python, up to the first failure."""
     paths = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     settings = os.environ | {"PATH": paths, "PYTHONPATH": str(ROOT)}
     return subprocess.run(["bash", "-euc", command], cwd=folder, env=settings, capture_output=True, text=True)
 
 
 def _run_block(command: str, block: Sequence[Check], folder: Path) -> list[str]:
-    done = run_commands(command, folder)
-    if done.returncode:
-        said = (done.stderr or done.stdout).strip()[-500:]
-        return [f"{block[0].place}: the commands ended with {done.returncode}: {said}"]
-    return [line for check in block for line in _differences_or_why_not(check, folder, done.stdout)]
+    process = run_commands(command, folder)
+    if process.returncode:
+        output = (process.stderr or process.stdout).strip()[-500:]
+        return [f"{block[0].place}: the commands ended with exit code {process.returncode}: {output}"]
+    return [line for check in block for line in _differences_or_error(check, folder, process.stdout)]
 
 
-def _differences_or_why_not(check: Check, folder: Path, output: str) -> list[str]:
-    """Return what differs, or why nothing could be compared."""
+def _differences_or_error(check: Check, folder: Path, output: str) -> list[str]:
     try:
         return differences(check, folder, output)
     except OSError as error:
@@ -329,36 +329,38 @@ def _differences_or_why_not(check: Check, folder: Path, output: str) -> list[str
         return [f"{check.place}: {check.mark.reads} has no column {error.args[0]!r}"]
 
 
-def _found(name: str, folders: Sequence[Path]) -> Path | None:
+def _find_file(name: str, folders: Sequence[Path]) -> Path | None:
     return next((path.resolve() for folder in folders for path in sorted(folder.rglob(name))), None)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the checks of pages and print what differs and what was not run; return 1 where something differs."""
+    """Run the checks of pages; print differences and skipped checks; return 1 if there is a difference."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pages", nargs="*", metavar="PAGE", help="by default README.md and all of docs")
-    parser.add_argument("--data", type=Path, action="append", default=[], help="where files lie that commands need")
-    parser.add_argument("--seconds", type=float, default=math.inf, help="leave out commands that take longer")
-    given = parser.parse_args(arguments)
-    for folder in given.data:
+    parser.add_argument("pages", nargs="*", metavar="PAGE", help="default: README.md and all of docs")
+    parser.add_argument("--data", type=Path, action="append", default=[], help="folder with files that commands need")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="skip commands that take longer")
+    options = parser.parse_args(arguments)
+    for folder in options.data:
         if not folder.is_dir():
-            parser.error(f"--data {folder} is no folder; name one in which the files lie that commands need")
-    named = [Path(page).resolve() for page in given.pages]
+            parser.error(f"--data {folder} is not a folder; name the folder with the files that commands need")
+    named = [Path(page).resolve() for page in options.pages]
     pages = named or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     texts = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in pages}
     checks = [check for page, text in texts.items() for check in checks_of(page, text)]
-    differ, skipped = run(checks, given.data, given.seconds)
-    done = len(checks) - len(skipped)
-    skipped += [f"{page}: nothing on it is run" for page, text in texts.items() if named and not checks_of(page, text)]
+    differing, skipped = run(checks, options.data, options.seconds)
+    run_count = len(checks) - len(skipped)
+    skipped += [
+        f"{page}: no checks on this page" for page, text in texts.items() if named and not checks_of(page, text)
+    ]
     for page in set(texts).intersection(MEASURED):
-        differ += [f"{page}:{table.line}: {NO_SOURCE}" for table in without_a_source(texts[page])]
+        differing += [f"{page}:{table.line}: {NO_SOURCE}" for table in tables_without_source(texts[page])]
     for page, text in texts.items():
-        taken = sorted(set(TAKEN.findall(text)))
-        skipped += [f"{page}: taken with version {version}, {date}" for version, date in taken]
-    for line in (*(f"not run  {line}" for line in skipped), *(f"differs  {line}" for line in differ)):
+        dates = sorted(set(TAKEN.findall(text)))
+        skipped += [f"{page}: taken with version {version}, {date}" for version, date in dates]
+    for line in (*(f"not run  {line}" for line in skipped), *(f"differs  {line}" for line in differing)):
         print(line)
-    print(f"{done} of {len(checks)} tables, texts and outputs with commands were run; {len(differ)} differences")
-    return int(bool(differ))
+    print(f"{run_count} of {len(checks)} checks were run; {len(differing)} differences")
+    return int(bool(differing))
 
 
 if __name__ == "__main__":

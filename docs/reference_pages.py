@@ -25,20 +25,20 @@ _SOURCE_COLUMNS = ("command", "version", "date", "machine")
 
 _FIGURES_HEAD = """# Figures
 
-What `build-lut` judges a table by. Within what is *accepted* nothing is said; beyond it a figure is remarked on, and
-beyond what is *refused* there is no table. `acquire check` judges most of them before a session, by trial frames.
-`build-lut check` reads one frame, and judges those that this tells; what more frames can only make worse it judges
-where it is *beyond* already. The names are those of `report.json`.
+`build-lut` judges a LUT by these figures. A figure within the *accepted* limit causes no remark, beyond it a remark,
+and beyond the *refused* limit no LUT is made. `acquire check` judges most figures before a session, from trial frames.
+`build-lut check` judges those that one frame determines. Figures that more frames can only make worse are judged if
+they are already *beyond* the limit. The names are those of `report.json`.
 
 *Written by `python -m docs.reference_pages` from `calibration/figures`.*
 """
 
 _CAUSES_HEAD = """# Causes
 
-Each remark and refusal of `build-lut` names the frame, the place on the print, the probable cause, and what mends it.
-The cause is decided by the table below, from evidence that stands in `report.json` under `causes` and in the report
-beside each cause. The first rule that holds decides; what was not measured lies in no interval. Where no rule holds,
-the cause is said to be unknown: look at the place in the report, where it is circled.
+Each remark and refusal of `build-lut` names the frame, the position on the print, the probable cause and the remedy.
+The cause follows from the table below. Its evidence is in `report.json` under `causes`, and in the report next to each
+cause. The first rule whose intervals all match decides; values that were not measured match no interval. If no rule
+applies, the cause is reported as unknown, and the position is circled in the report.
 
 *Written by `python -m docs.reference_pages` from `calibration/causes`.*
 """
@@ -49,11 +49,11 @@ _AGAIN = {
     "nothing": "nothing",
 }
 
+# Smallest value that is printed as "more than 0".
 _LEAST = 1e-9
-"""What stands in the table for "more than none"."""
 
 
-_TOLD = {"known": "yes", "bounded": "beyond", "unknown": "–"}
+_OF_ONE_FRAME = {"known": "yes", "bounded": "beyond", "unknown": "–"}
 
 
 def figures_page() -> str:
@@ -62,69 +62,73 @@ def figures_page() -> str:
     for group, question in QUESTIONS.items():
         parts.append(f"## {group.capitalize()}\n\n{question}\n")
         parts.append(
-            "| figure | accepted | refused beyond | in a check | of one frame | what goes wrong beyond | what helps |"
+            "| figure | accepted | refused beyond | in `acquire check` | from one frame | effect beyond | remedy |"
         )
-        parts += ["|---|---|---|---|---|---|---|", *(_limits(one) for one in FIGURES if one.group == group), ""]
+        parts += [
+            "|---|---|---|---|---|---|---|",
+            *(_limits(figure) for figure in FIGURES if figure.group == group),
+            "",
+        ]
     for heading, limits in (("Before a session", RIG_LIMITS), ("While a session is taken", FRAME_LIMITS)):
-        parts += [f"## {heading}\n", "| limit | accepted | fault beyond | what goes wrong beyond | what helps |"]
-        parts += ["|---|---|---|---|---|", *(_plain_limit(one) for one in limits), ""]
+        parts += [f"## {heading}\n", "| limit | accepted | fault beyond | effect beyond | remedy |"]
+        parts += ["|---|---|---|---|---|", *(_plain_limit(figure) for figure in limits), ""]
     return "\n".join(parts)
 
 
-def _plain_limit(one: Limit) -> str:
-    limits = f"{one.expected} | {_refused(one)}"
-    return f"| {one.title} (`{one.name}`) | {limits} | {one.why} ({one.source}) | {one.remedy} |"
+def _plain_limit(limit: Limit) -> str:
+    limits = f"{limit.expected} | {_refused(limit)}"
+    return f"| {limit.title} (`{limit.name}`) | {limits} | {limit.why} ({limit.source}) | {limit.remedy} |"
 
 
-def _refused(one: Limit) -> str:
-    return "–" if one.refuse is None else one.text(one.refuse)
+def _refused(limit: Limit) -> str:
+    return "–" if limit.refuse is None else limit.text(limit.refuse)
 
 
-def _limits(one: Figure) -> str:
-    refused, known = _refused(one), "yes" if one.before_session else "–"
-    helps = one.remedy or "what most of them are decides"
-    told = _TOLD[one.of_one_frame]
-    limits = f"{one.expected} | {refused} | {known} | {told}"
-    return f"| {one.title} (`{one.name}`) | {limits} | {one.why} ({one.source}) | {helps} |"
+def _limits(figure: Figure) -> str:
+    refused, before_session = _refused(figure), "yes" if figure.before_session else "–"
+    remedy = figure.remedy or "see the most frequent cause"
+    of_one_frame = _OF_ONE_FRAME[figure.of_one_frame]
+    limits = f"{figure.expected} | {refused} | {before_session} | {of_one_frame}"
+    return f"| {figure.title} (`{figure.name}`) | {limits} | {figure.why} ({figure.source}) | {remedy} |"
 
 
 def causes_page() -> str:
     """Return the page of the causes, Markdown."""
     parts = [_CAUSES_HEAD]
-    parts += ["## What helps\n", "| cause | what it is | what helps | to be taken again |\n|---|---|---|---|"]
+    parts += ["## Remedies\n", "| cause | description | remedy | frames to repeat |\n|---|---|---|---|"]
     parts += [
-        f"| {one.name} | {one.description} | {one.remedy} | {_AGAIN[one.repeats]} |"
-        for one in CAUSES
-        if one is not UNKNOWN
+        f"| {cause.name} | {cause.description} | {cause.remedy} | {_AGAIN[cause.repeats]} |"
+        for cause in CAUSES
+        if cause is not UNKNOWN
     ]
-    parts += ["\n## The table\n", "| cause | figures | holds where | because |\n|---|---|---|---|"]
+    parts += ["\n## The table\n", "| cause | figures | condition | reason |\n|---|---|---|---|"]
     for rule in RULES:
         figures = ", ".join(f"`{name}`" for name in _names(rule))
-        where = ", ".join(_interval(one) for one in rule.conditions)
+        where = ", ".join(_interval(condition) for condition in rule.conditions)
         parts.append(f"| {rule.cause.name} | {figures} | {where} | {rule.why} |")
-    parts += ["\n## The evidence\n", "| name | what it is |\n|---|---|"]
+    parts += ["\n## The evidence\n", "| name | description |\n|---|---|"]
     parts += [f"| `{name}` | {text} |" for name, text in _evidence()]
     return "\n".join(parts) + "\n"
 
 
 def _names(rule: Rule) -> list[str]:
-    """Return the names of the figures that a rule may explain."""
-    return sorted(one.name for one in FIGURES if one.cause is not None and one.cause.about in rule.about)
+    """Return the names of the figures that a rule can explain."""
+    return sorted(figure.name for figure in FIGURES if figure.cause is not None and figure.cause.about in rule.about)
 
 
-def _interval(one: Condition) -> str:
-    low, high = (f"{value:.9g}" for value in (one.low, one.high))
-    if one.low == one.high:
-        return f"{one.name} = {low}"
-    if one.low == _LEAST:
-        return f"0 < {one.name} ≤ {high}"
-    if math.isinf(one.high):
-        return f"{one.name} ≥ {low}"
-    return f"{one.name} ≤ {high}" if math.isinf(one.low) else f"{low} ≤ {one.name} ≤ {high}"
+def _interval(condition: Condition) -> str:
+    low, high = (f"{value:.9g}" for value in (condition.low, condition.high))
+    if condition.low == condition.high:
+        return f"{condition.name} = {low}"
+    if condition.low == _LEAST:
+        return f"0 < {condition.name} ≤ {high}"
+    if math.isinf(condition.high):
+        return f"{condition.name} ≥ {low}"
+    return f"{condition.name} ≤ {high}" if math.isinf(condition.low) else f"{low} ≤ {condition.name} ≤ {high}"
 
 
 def _evidence() -> list[tuple[str, str]]:
-    """Return each name of the evidence with what its docstring says of it."""
+    """Return each name of the evidence with its description in the docstring of `Evidence`."""
     text = inspect.cleandoc(Evidence.__doc__ or "")
     entries = re.findall(r"^- `(\w+)`: ((?:.*\n?)(?:  .*\n?)*)", text, flags=re.MULTILINE)
     texts = ((name, " ".join(line.strip() for line in lines.splitlines())) for name, lines in entries)

@@ -1,7 +1,7 @@
-"""Develop the raw images of a real data set to sRGB pictures, to generate from: white balanced by their ground truths.
+"""Develop the raw images of a data set to sRGB source pictures, white balanced by their ground truths.
 
 Usage: python examples/develop.py DATA FOLDER [--matrix CAMERA] [--side PX]. DATA is any data set that evaluate reads.
-How it is done says evaluation/experiments/paper/material.py; the pictures are PNG, named after the images.
+The method is described in evaluation/experiments/paper/material.py. The pictures are PNG with the names of the images.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ def main() -> None:
     """Write a picture for each image."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", help="data set")
-    parser.add_argument("folder", type=Path, help="where the pictures go")
+    parser.add_argument("folder", type=Path, help="folder for the pictures")
     parser.add_argument("--matrix", default="none", help="colour matrix: a camera, or a file of 3 x 3 numbers")
-    parser.add_argument("--side", type=int, help="longest side, px; as it is by default")
-    chosen = parser.parse_args()
-    sources = develop_sources(open_scenes(chosen.data), choose_matrix(chosen.matrix))
-    chosen.folder.mkdir(parents=True)
+    parser.add_argument("--side", type=int, help="longest side, px; unchanged by default")
+    options = parser.parse_args()
+    sources = develop_sources(open_scenes(options.data), choose_matrix(options.matrix))
+    options.folder.mkdir(parents=True)
     for source in sources:
-        picture = (ScaledSource(source, chosen.side) if chosen.side else source).read().picture
+        picture = (ScaledSource(source, options.side) if options.side else source).read().picture
         name = PurePosixPath(source.name).with_suffix(".png").name
-        cv2.imwrite(str(chosen.folder / name), picture[..., ::-1])
-    print(f"{chosen.folder}: {len(sources)} pictures")
+        cv2.imwrite(str(options.folder / name), picture[..., ::-1])
+    print(f"{options.folder}: {len(sources)} pictures")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""How grey a source's greys are under the lights of a table, and how much chroma is kept, when rendered by colour.
+"""Neutrality of a source's greys under the illuminants of a LUT, and preserved chroma, when rendered by colour.
 
     python examples/greys.py LUT [--lights 0,35,665 | --every 50] [--picture cat.jpg ...]
 
-For each light: the angle between the light and the source's 17 greys, in the mean and the worst, as the chart shows
-their codes and by colour; the share of chroma that is kept by colour, as slopes of ln R/G and ln B/G of what is seen,
-without the print's black, against what is wanted; and the share of colours that the print cannot show. Chroma and
-shares are those of the pictures' colours, or of all source colours alike if none is given. What is seen is the mean of
-the table's own samples, so nothing here is random.
+For each illuminant: the angle between the illuminant and 17 source greys, mean and largest, rendered by codes and by
+colour; the chroma preserved by colour, as slopes of ln R/G and ln B/G of the rendered colours, without the print's
+black, against the target colours; and the share of colours that the print cannot show. Chroma and shares are weighted
+by the colours of the pictures, or equally if there are none. Rendered colours are means of the samples, so there is no
+randomness.
 """
 
 from __future__ import annotations
@@ -27,40 +27,40 @@ from generator.pictures.sources import open_picture
 from generator.rendering.colorimetric import ColorimetricRendering, source_colours
 from generator.rendering.matrices import matrix_for
 
+# Nodes of equal codes of red, green and blue.
 GREYS = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)
-"""Nodes of equal codes of red, green and blue."""
 
 Array = npt.NDArray[np.float64]
 
 
-def kept(seen: Array, wanted: Array, shares: Array) -> str:
-    """Return the slopes of ln R/G and ln B/G of (K, 3) float64 seen against wanted, by (K,) shares of sum 1."""
+def chroma_slopes(rendered: Array, target: Array, shares: Array) -> str:
+    """Return the slopes of ln R/G and ln B/G of rendered against target colours (K, 3), weighted by `shares` (K,)."""
     slopes: list[float] = []
     for channel in (0, 2):
-        x, y = (np.log(colours[:, channel] / colours[:, 1]) for colours in (wanted, seen))
+        x, y = (np.log(colours[:, channel] / colours[:, 1]) for colours in (target, rendered))
         x, y = x - shares @ x, y - shares @ y
         slopes.append(float((shares * x) @ y / ((shares * x) @ x)))
     return "{:.2f} {:.2f}".format(*slopes)
 
 
 def row(rendering: ColorimetricRendering, light: int, shares: Array) -> list[str]:
-    """Return the figures of one light."""
+    """Return the figures of one illuminant."""
     lut, white = rendering.lut, rendering.lut.white[light]
-    wanted, seen = source_colours(rendering.matrix), rendering.node_means(single_mixture(light)) / white
-    black = seen[0]
-    bare = (seen - black) / (seen[-1] - black)
+    target, rendered = source_colours(rendering.matrix), rendering.node_means(single_mixture(light)) / white
+    black = rendered[0]
+    without_black = (rendered - black) / (rendered[-1] - black)
     side = 1 << lut.provenance.bits
     greys = np.arange(SIDE) * side // SIDE * (side * side + side + 1)
     printed = lut.samples[light][greys].mean(axis=1) / white
-    angles = [angles_deg(colours, np.ones(3)) for colours in (printed, seen[GREYS])]
+    angles = [angles_deg(colours, np.ones(3)) for colours in (printed, rendered[GREYS])]
     plan = lut.illuminations[light]
     name = "{} {} {}".format(*plan.colour) if plan.cct_k is None else f"{plan.cct_k:g} K"
-    inside = shares * (wanted.min(axis=1) > 0.01) * (bare.min(axis=1) > 0.01)
+    inside = shares * (target.min(axis=1) > 0.01) * (without_black.min(axis=1) > 0.01)
     return [
         f"{light}",
         name,
         *(f"{angle.mean():.2f} {angle.max():.2f}" for angle in angles),
-        kept(np.maximum(bare, 1e-6), np.maximum(wanted, 1e-6), inside / inside.sum()),
+        chroma_slopes(np.maximum(without_black, 1e-6), np.maximum(target, 1e-6), inside / inside.sum()),
         f"{shares @ rendering.map.outside:.3f}",
     ]
 
@@ -69,21 +69,21 @@ def main() -> int:
     """Print the table; return 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("lut", type=Path)
-    parser.add_argument("--lights", default="", help="numbers, as in generate --light")
-    parser.add_argument("--every", type=int, default=50, help="or each so-maniest light, from the last")
+    parser.add_argument("--lights", default="", help="illuminant numbers, as in generate --light")
+    parser.add_argument("--every", type=int, default=50, help="or every N-th illuminant, from the last")
     parser.add_argument("--picture", type=Path, nargs="*", default=[])
-    given = parser.parse_args()
-    lut = open_lut(given.lut)
+    options = parser.parse_args()
+    lut = open_lut(options.lut)
     total = len(lut.white)
-    lights = light_numbers(given.lights, total) if given.lights else range(total - 1, -1, -given.every)
+    lights = light_numbers(options.lights, total) if options.lights else range(total - 1, -1, -options.every)
     shares = np.full(NODES, 1 / NODES)
-    if given.picture:
-        counts = [count_by_node(open_picture(path).picture) for path in given.picture]
+    if options.picture:
+        counts = [count_by_node(open_picture(path).picture) for path in options.picture]
         shares = np.mean([count / count.sum() for count in counts], axis=0)
     matrix = matrix_for(lut)
     print(f"matrix of {matrix.name}: {matrix.source}")
     rendering = ColorimetricRendering(lut, matrix)
-    head = ["light", "shown as", "greys: codes", "by colour", "chroma kept", "outside"]
+    head = ["light", "shown as", "greys: codes", "by colour", "chroma slopes", "outside"]
     for cells in (head, *(row(rendering, light, shares) for light in lights if isinstance(light, int))):
         print(" | ".join(f"{cell:>14}" for cell in cells))
     return 0

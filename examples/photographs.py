@@ -1,7 +1,7 @@
-"""Save a few real photographs to generate from: those that come with scikit-image, as PNG.
+"""Save a few real photographs as source pictures: those of scikit-image, as PNG.
 
-Usage: python examples/photographs.py FOLDER. The photographs' sources and licences are listed in scikit-image's
-data/README.txt; none of them is part of CroP.
+Usage: python examples/photographs.py FOLDER. Sources and licences are listed in data/README.txt of scikit-image; the
+photographs are not part of CroP.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 try:
     import skimage.data
 except ModuleNotFoundError:
-    sys.exit("scikit-image, whose photographs these are, is missing; pip install scikit-image, or use your own")
+    sys.exit("scikit-image is not installed; run pip install scikit-image, or use your own pictures")
 
 NAMES = ("astronaut", "chelsea", "coffee", "rocket")
 

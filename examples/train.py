@@ -1,11 +1,11 @@
-"""Train a small network to see the light, from scratch, in minutes on a processor; and hold it against statistics.
+"""Train a small network to estimate the illuminant, in minutes on a CPU, and compare it with statistics-based methods.
 
     pip install torch
     python examples/train.py LUT [--train FOLDER --test FOLDER] [--steps 1500]
 
-The table's lights and the pictures are divided: every fifth light and the test pictures are never trained on. Without
-folders, photographs that come with scikit-image are used; more of your own make a better network. At the end both are
-tried on the same crops of the test pictures under the lights held out.
+Every fifth illuminant of the LUT and the test pictures are not used for training. Without folders, photographs of
+scikit-image are used; with more pictures the network gets better. At the end all methods are tested on the same crops
+of the test pictures under the held-out illuminants.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from generator.training.torch_crops import CropDataset, collated
 
 SIDE = 64
 BATCH = 64
-TRAINED_ON = ("astronaut", "chelsea", "hubble_deep_field", "immunohistochemistry", "retina", "stereo_motorcycle")
-TRIED_ON = ("coffee", "rocket")
+TRAINING_NAMES = ("astronaut", "chelsea", "hubble_deep_field", "immunohistochemistry", "retina", "stereo_motorcycle")
+TEST_NAMES = ("coffee", "rocket")
 
 
 def photographs(names: tuple[str, ...]) -> Gallery:
     """Return photographs of scikit-image."""
-    taken = [getattr(skimage.data, name)() for name in names]
-    pictures = [np.asarray(one[0] if isinstance(one, tuple) else one, dtype=np.uint8) for one in taken]
+    arrays = [getattr(skimage.data, name)() for name in names]
+    pictures = [np.asarray(array[0] if isinstance(array, tuple) else array, dtype=np.uint8) for array in arrays]
     return gallery_of([np.ascontiguousarray(picture[..., :3]) for picture in pictures], names)
 
 
@@ -48,7 +48,7 @@ def gallery_from(folder: Path) -> Gallery:
 
 
 def network() -> Any:
-    """Return a network from crops (N, 3, side, side) to four maps: a light for each place, and how far to trust it."""
+    """Return a network from crops (N, 3, side, side) to four maps: a local illuminant and its confidence."""
     nn = torch.nn
     return nn.Sequential(
         *(nn.Conv2d(3, 32, 5, stride=2), nn.ReLU()),
@@ -59,17 +59,17 @@ def network() -> Any:
 
 
 def light_of(model: Any, image: Any) -> Any:
-    """Return the lights (N, 3), of unit length, that the network sees in crops."""
-    # How bright a crop is says nothing of the light's colour; roots spread the dark values that linear light crowds.
+    """Return the estimated illuminants (N, 3) of crops, of unit length."""
+    # Brightness tells nothing about the illuminant colour, so it is divided out. Square roots spread the dark values.
     level = image.mean(dim=(1, 2, 3), keepdim=True).clamp_min(1e-6)
     maps = model((image / level).clamp(0, 8).sqrt())
     light = torch.nn.functional.softplus(maps[:, :3])
-    seen = (light * torch.sigmoid(maps[:, 3:])).mean(dim=(2, 3))
-    return torch.nn.functional.normalize(seen, dim=1)
+    estimate = (light * torch.sigmoid(maps[:, 3:])).mean(dim=(2, 3))
+    return torch.nn.functional.normalize(estimate, dim=1)
 
 
 def train(model: Any, crops: Crops, steps: int, workers: int) -> None:
-    """Fit the network by the cosine of the angle to the ground truth."""
+    """Fit the network with the cosine of the angle to the ground truth as loss."""
     optimiser = torch.optim.AdamW(model.parameters(), lr=2e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=2e-3, total_steps=steps)
     loader = DataLoader(CropDataset(crops), batch_size=BATCH, num_workers=workers, collate_fn=collated)
@@ -89,45 +89,45 @@ def train(model: Any, crops: Crops, steps: int, workers: int) -> None:
 
 
 def main() -> None:
-    """Train, try, tell."""
+    """Train, test and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("lut", type=Path, help="folder of a table")
-    parser.add_argument("--train", type=Path, help="folder of pictures to train on")
-    parser.add_argument("--test", type=Path, help="folder of pictures to try on; none of them among the others")
-    parser.add_argument("--steps", type=int, default=1500, help="batches of 64 crops")
-    parser.add_argument("--workers", type=int, default=0, help="processes that draw crops beside the training")
-    chosen = parser.parse_args()
+    parser.add_argument("lut", type=Path, help="folder of a LUT")
+    parser.add_argument("--train", type=Path, help="folder of training pictures")
+    parser.add_argument("--test", type=Path, help="folder of test pictures, different from the training pictures")
+    parser.add_argument("--steps", type=int, default=1500, help="number of batches of 64 crops")
+    parser.add_argument("--workers", type=int, default=0, help="processes that draw crops during training")
+    options = parser.parse_args()
     torch.manual_seed(0)
-    lut = open_lut(chosen.lut)
+    lut = open_lut(options.lut)
     lights = range(len(lut.samples))
     held_out = [light for light in lights if light % 5 == 2]
-    training = photographs(TRAINED_ON) if chosen.train is None else gallery_from(chosen.train)
-    trial = photographs(TRIED_ON) if chosen.test is None else gallery_from(chosen.test)
+    training = photographs(TRAINING_NAMES) if options.train is None else gallery_from(options.train)
+    test = photographs(TEST_NAMES) if options.test is None else gallery_from(options.test)
     crops = Crops(
         lut,
         training,
         (SIDE, SIDE),
-        length=chosen.steps * BATCH,
+        length=options.steps * BATCH,
         lights=[light for light in lights if light not in held_out],
         exposure=(0.5, 1.0),
     )
     model = network()
-    train(model, crops, chosen.steps, chosen.workers)
-    tried = Crops(lut, trial, (SIDE, SIDE), length=1024, lights=held_out, exposure=(0.5, 1.0), seed=1)
-    batch = tried.batch(np.arange(len(tried)))
+    train(model, crops, options.steps, options.workers)
+    test_crops = Crops(lut, test, (SIDE, SIDE), length=1024, lights=held_out, exposure=(0.5, 1.0), seed=1)
+    batch = test_crops.batch(np.arange(len(test_crops)))
     with torch.no_grad():
-        found = {"this network": light_of(model, torch.from_numpy(batch.images)).numpy()}
-    # A single light that is always guessed is what a network must beat before it can be said to see anything.
+        estimates = {"this network": light_of(model, torch.from_numpy(batch.images)).numpy()}
+    # Baseline: a constant estimate. A network must beat it to be of any use.
     guess = np.stack([lut.ground_truth[light] for light in lights if light not in held_out]).mean(axis=0)
-    found["always the mean light"] = np.broadcast_to(guess, batch.illuminants.shape)
+    estimates["constant mean illuminant"] = np.broadcast_to(guess, batch.illuminants.shape)
     pictures = batch.images.transpose(0, 2, 3, 1)
     for name in ("gray-world", "white-patch", "shades-of-gray", "gray-edge-1"):
         method = standard_methods()[name]
-        found[method.name] = np.stack([method.estimate(picture, 0.98) for picture in pictures])
-    print(f"\n{len(tried)} crops of {len(trial)} unseen pictures under {len(held_out)} unseen lights, angle in degrees")
+        estimates[method.name] = np.stack([method.estimate(picture, 0.98) for picture in pictures])
+    print(f"\n{len(test_crops)} crops of {len(test)} test pictures, {len(held_out)} held-out illuminants, degrees")
     print(f"{'':24}{'mean':>8}{'median':>8}{'worst 25 %':>12}")
-    for name, lights_found in found.items():
-        summary = summarise(recovery_error(lights_found, batch.illuminants))
+    for name, illuminants in estimates.items():
+        summary = summarise(recovery_error(illuminants, batch.illuminants))
         print(f"{name:24}{summary.mean:8.2f}{summary.median:8.2f}{summary.worst25:12.2f}")
 
 

@@ -1,4 +1,4 @@
-"""Which tests are slow, what all have in common, and that comparisons of arrays compare something."""
+"""Common settings of all tests: slow tests, threads, temporary folders, and checks of array comparisons."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-# Test processes share the machine. Threads that libraries start in each of them spin while they wait for one another:
-# without this a system of a hundred equations takes OpenBLAS fifty times as long, and a build twice. Must stand before
-# NumPy is imported; what tests start inherits it. Threads of our own are as many as ever.
+# Test processes share the machine. Library threads in each process spin while they wait for one another: OpenBLAS takes
+# fifty times as long for a hundred equations, and a build twice. This must precede the import of NumPy; programs
+# started by tests inherit it. Our own threads are not affected.
 for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(_threads, "1")
 
@@ -27,50 +27,51 @@ import numpy as np  # noqa: E402 - after the threads
 
 from tests.pinned import TESTS, Pinned  # noqa: E402 - it needs NumPy
 
-# Sessions and tables are written to the disk for good, step by step: a run of twenty lights waits for it half a second.
-# What is lost with the power is of no interest here, and in memory nobody waits.
+# Sessions and LUTs are flushed step by step: a run of twenty illuminants waits half a second for the disk. Tests need
+# no protection against power cuts, and memory does not wait.
 MEMORY = Path("/dev/shm")
+# Minimum free memory for temporary folders. A whole run needs less than one gigabyte, because folders of passed tests
+# are removed at once.
 MEMORY_BYTES = 4 << 30
-"""Free space from which temporary folders lie in memory: what is there at a time of a whole run is below a gigabyte,
-since the folders of tests that pass are removed at once."""
 
 if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MEMORY_BYTES:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
-# PyTorch loads Triton's LLVM where that is installed, which crashes a process in which Mesa has loaded its own for
-# OpenGL. No program shows a full screen and trains; a test process may do both. None keeps a module from
-# being imported.
+# PyTorch loads the LLVM of Triton, if installed. This crashes a process in which Mesa has loaded its own LLVM for
+# OpenGL. No program shows a full screen and trains, but a test process may do both. None prevents the import.
 sys.modules.setdefault("triton", None)  # pyrefly: ignore[no-matching-overload]
 
-# Ten thousand tests stay to the end, and are looked through by the garbage collector again and again as they become
-# more: a sixth of the time that reading them takes.
+# Ten thousand tests are never freed, but the garbage collector checks them repeatedly: a sixth of the time of
+# collection.
 gc.disable()
-# At the end bindings of C++ look whether anything of theirs is left.
+# C++ bindings check for leaked objects at exit.
 atexit.register(gc.unfreeze)
 
 
-def _of_something(compare: Callable[..., None]) -> Callable[..., None]:
-    """Return a comparison of NumPy's that fails where an array without numbers is held against a number."""
+def _of_nonempty(compare: Callable[..., None]) -> Callable[..., None]:
+    """Wrap a comparison of NumPy so that it fails if an empty array is compared with a number."""
 
     @functools.wraps(compare)
-    def compared(actual: Any, desired: Any, *given: Any, **named: Any) -> None:
-        assert np.size(actual) or np.ndim(desired), "an array without numbers equals any number: nothing was tested"
-        compare(actual, desired, *given, **named)
+    def compared(actual: Any, desired: Any, *arguments: Any, **options: Any) -> None:
+        assert np.size(actual) or np.ndim(desired), (
+            "an empty array equals any number, so nothing was tested; compare a non-empty array"
+        )
+        compare(actual, desired, *arguments, **options)
 
     return compared
 
 
-np.testing.assert_allclose = _of_something(np.testing.assert_allclose)
-np.testing.assert_array_equal = _of_something(np.testing.assert_array_equal)
+np.testing.assert_allclose = _of_nonempty(np.testing.assert_allclose)
+np.testing.assert_array_equal = _of_nonempty(np.testing.assert_array_equal)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put first the tests that wait for programs: lint runs beside them, and nobody waits for them at the end."""
+    """Start the tests that wait for programs first, while lint runs in parallel."""
     items.sort(key=lambda item: item.path.name != "test_rehearsal.py")
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage from here on, but for what has come by now; seldom, as what stays is looked through each time."""
+    """Collect garbage from now on, except existing objects; rarely, because what stays is checked each time."""
     gc.freeze()
     gc.set_threshold(5_000, 20, 100)
     gc.enable()
@@ -78,52 +79,51 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
-    """Print arrays as NumPy does by itself: the package colour sets its own way for all of a process."""
+    """Print arrays in the style of NumPy: the package colour changes it for the whole process."""
     np.set_printoptions(legacy=False)
 
 
+# Mark of a file in which all tests are slow.
 SLOW_FILE = re.compile(r"^pytestmark = (\[\s*)?pytest\.mark\.slow\b", re.MULTILINE)
-"""What marks all tests of a file."""
 
+# Hypothesis examples per property: in `make test` (others each time), and in `make quick`, where a hundred took 20 s.
 WHOLE_EXAMPLES, QUICK_EXAMPLES = 30, 12
-"""Examples of each property in `make test`, others each time, and in `make quick`, whose properties took a third of a
-minute at a hundred; tests that need more say so."""
 
-# No test says how long an example may take: a machine that does other things as well takes ten times as long.
+# No deadline: a busy machine may take ten times as long.
 settings.register_profile("whole", max_examples=WHOLE_EXAMPLES, deadline=None)
 settings.register_profile("quick", max_examples=QUICK_EXAMPLES, deadline=None)
 settings.load_profile("whole")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Try fewer examples where slow tests are not wanted."""
+    """Use fewer examples if slow tests are excluded."""
     if config.getoption("markexpr") == "not slow":
         settings.load_profile("quick")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Let the numbers of known runs be written anew."""
-    parser.addoption("--renew-pinned", action="store_true", help="keep the numbers of known runs as they are now")
+    """Add the option that writes new pinned numbers."""
+    parser.addoption("--renew-pinned", action="store_true", help="write the present numbers of known runs")
 
 
 @pytest.fixture
 def pinned(request: pytest.FixtureRequest) -> Pinned:
-    """Return what compares numbers with those in the file of the test's module."""
+    """Return a function that compares numbers with the file of the test module."""
     return Pinned(request.path.relative_to(TESTS), renew=bool(request.config.getoption("--renew-pinned")))
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave slow files unread where they are not wanted: what they import takes seconds, too."""
+    """Do not read slow files if slow tests are excluded: their imports take seconds."""
     if config.getoption("markexpr") != "not slow" or collection_path.suffix != ".py":
         return None
     return True if SLOW_FILE.search(collection_path.read_text(encoding="utf-8")) else None
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Return half as many workers again as there are processors: tests wait for programs and servers that they start.
+    """Return 1.5 workers per processor, because tests wait for programs and servers.
 
-    On two processors a third worker takes a quarter of the time away, 6:51 in place of 9:16. Quick tests wait for
-    nothing, and each worker reads all of them.
+    On two processors a third worker saves a quarter of the time: 6:51 instead of 9:16 minutes. Quick tests do not wait,
+    and each worker reads all of them.
     """
     processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if config.getoption("markexpr") == "not slow":
@@ -133,10 +133,10 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 @pytest.fixture(scope="session", autouse=True)
 def kept_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keep what is computed once for a table, and costs a second, in one folder for a whole run, not in the user's."""
+    """Use one cache folder for a whole run, not that of the user; each result costs a second."""
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
-        # Those of the other processes lie beside it.
+        # The folders of the other processes are next to it.
         folder = folder.parent
     os.environ["XDG_CACHE_HOME"] = str(folder / "kept")
     return folder / "kept"
@@ -144,7 +144,7 @@ def kept_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def undrawn() -> Iterator[None]:
-    """Leave the pictures of build-lut's reports blank, where a module's tests look at none."""
+    """Skip drawing the pictures of build-lut reports in modules that do not test them."""
     from tests.calibration.lab import blank_pictures
 
     with blank_pictures():
@@ -153,7 +153,7 @@ def undrawn() -> Iterator[None]:
 
 @pytest.fixture
 def hang_up() -> Iterator[None]:
-    """Let SIGHUP end programs as it does on a terminal, also where the tests run under nohup, which ignores it."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    """Let SIGHUP end programs as on a terminal, also under nohup, which ignores it."""
+    previous = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
-    signal.signal(signal.SIGHUP, before)
+    signal.signal(signal.SIGHUP, previous)

@@ -1,19 +1,19 @@
-"""Find measured data for tests: what the repository ships, and what a developer may have beside it.
+"""Find measured data for tests: shipped files and optional local files.
 
-`tests/data` holds the files that a licence lets us ship; its README names source, licence and hash of each. Files that
-no licence lets us ship are looked for under the same names in the folders of `LOCAL`. A test never needs one of those:
-where one is found, it is a further case of a test that has a case without it, so nothing skips where it is missing.
+`tests/data` holds the files with a licence for redistribution; its README lists source, licence and hash. Other files
+are searched under the same names in the folders of `LOCAL`. No test needs them: each is an additional case of a test
+that also has a case without it, so no test is skipped.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+# Folder of the shipped data.
 SHIPPED = Path(__file__).parent / "data"
-"""Data in the repository."""
 
+# Folders that are not in git: an ignored one, and one next to the checkout.
 LOCAL = (SHIPPED / "local", Path(__file__).parents[2] / "shared" / "data")
-"""Folders outside the repository's history: one that git ignores, and one beside the checkout."""
 
 
 def shipped(name: str) -> Path:
@@ -24,7 +24,7 @@ def shipped(name: str) -> Path:
 
 
 def available(*names: str) -> list[Path]:
-    """Return the paths of those files of `names` that are shipped or found locally, in the order of `names`."""
+    """Return the paths of the files that are shipped or exist locally, in the order of `names`."""
     folders = (SHIPPED, *LOCAL)
-    places = ([folder / name for folder in folders if (folder / name).is_file()] for name in names)
-    return [found[0] for found in places if found]
+    paths_by_name = ([folder / name for folder in folders if (folder / name).is_file()] for name in names)
+    return [paths[0] for paths in paths_by_name if paths]

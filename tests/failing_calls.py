@@ -1,10 +1,10 @@
-"""A disk that fails at any one system call: the kernel asks us before each call of a thread, and may be told an error.
+"""Make single system calls of a thread fail as a failing disk would.
 
-Nothing of the program is replaced: what Python, its C code and SQLite ask of the kernel is seen alike. A thread
-installs a filter for itself alone (seccomp, `SECCOMP_FILTER_FLAG_NEW_LISTENER`); another process answers each of its
-calls that concerns a file below a folder, one of them with an error. Linux on x86-64 and ARM64.
+Nothing in the program is replaced: calls of Python, its C code and SQLite are treated alike. A thread installs a
+seccomp filter for itself (`SECCOMP_FILTER_FLAG_NEW_LISTENER`). A helper process answers each of its calls on files
+below a folder, one of them with an error. It works on Linux on x86-64 and ARM64.
 
-Sources: seccomp(2), seccomp_unotify(2), <linux/seccomp.h>, <linux/filter.h>; numbers of calls: <asm/unistd.h>.
+Sources: seccomp(2), seccomp_unotify(2), <linux/seccomp.h>, <linux/filter.h>; call numbers: <asm/unistd.h>.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+# Errors of a disk that is broken, full, read-only, over quota, removed, or on a restarted server.
 DISK_FAULTS = (errno.EIO, errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.ENODEV, errno.ESTALE)
-"""What a disk answers that breaks, is full, read-only, used up, pulled out, or on a server that was started anew."""
 
-# What asks a disk (lseek does not, nor the locks of fcntl that SQLite takes), by number on x86-64 and on ARM64, and by
-# what names the file: a file descriptor, a path, or a folder's descriptor with a path ("at").
+# Calls that access a disk (not lseek, nor the fcntl locks of SQLite): number on x86-64 and on ARM64, and how the file
+# is given: file descriptor, path, or folder descriptor with path ("at").
 _CALLS: dict[str, tuple[int | None, int | None, str]] = {
     "read": (0, 63, "fd"),
     "write": (1, 64, "fd"),
@@ -74,32 +74,20 @@ _AT_FDCWD = 0xFFFFFF9C
 
 @dataclass(frozen=True)
 class Ran:
-    """What came of an action: the calls that it made, the one that failed, and how it ended.
+    """Result of an action."""
 
-    Attributes
-    ----------
-    calls
-        Name and file of each call below the folder, in order.
-    failed
-        That which got the error; None where the action made fewer.
-    result
-        What it returned.
-    error
-        What it raised.
-    """
-
-    calls: tuple[str, ...]
-    failed: str | None
-    result: Any
-    error: BaseException | None
+    calls: tuple[str, ...]  # name and file of each call below the folder, in order
+    failed: str | None  # the call that failed; None if the action made fewer calls
+    result: Any  # returned value
+    error: BaseException | None  # raised error
 
 
 class FailingCalls:
-    """Runs actions in threads whose calls to files below `folder` fail; given by `failing_calls`."""
+    """Runs actions in threads with failing calls on files below `folder`; made by `failing_calls`."""
 
-    def __init__(self, folder: Path, answering: socket.socket, pid: int) -> None:
+    def __init__(self, folder: Path, helper: socket.socket, pid: int) -> None:
         self._folder = folder
-        self._answering = answering
+        self._helper = helper
         self._pid = pid
 
     def run(
@@ -111,53 +99,53 @@ class FailingCalls:
         lasting: bool = False,
         calls: tuple[str, ...] = (),
     ) -> Ran:
-        """Run `action` in a thread of its own.
+        """Run `action` in a separate thread.
 
         Parameters
         ----------
         at
-            Which of its calls fails, from 0; None: none does.
+            index of the failing call, from 0; None: no call fails
         number
-            With which error.
+            error number
         lasting
-            Whether all calls after it fail, too, until the action has ended.
+            whether all later calls of the action fail too
         calls
-            Names of the calls that count; all where empty.
+            names of the calls that count; empty: all
         """
         outcome: dict[str, Any] = {}
         listener: list[int] = []
 
         def work() -> None:
             libc = ctypes.CDLL(None, use_errno=True)
-            # Where processes may look into their children only, the one that answers is allowed to look at us.
+            # If processes may trace only their children, permit the helper to trace this one.
             libc.prctl(_SET_PTRACER, self._pid, 0, 0, 0)
-            order = {"folder": str(self._folder), "at": at, "errno": number, "lasting": lasting, "calls": calls}
+            request = {"folder": str(self._folder), "at": at, "errno": number, "lasting": lasting, "calls": calls}
             listener.append(_listen(libc))
-            socket.send_fds(self._answering, [json.dumps(order).encode()], listener)
+            socket.send_fds(self._helper, [json.dumps(request).encode()], listener)
             try:
                 outcome["result"] = action()
             except BaseException as error:
                 outcome["error"] = error
             finally:
-                self._answering.send(b"done")
-                self._answering.recv(4)
+                self._helper.send(b"done")
+                self._helper.recv(4)
 
         thread = threading.Thread(target=work)
         thread.start()
         thread.join()
         if listener:
             os.close(listener[0])
-        size = struct.unpack("I", _exactly(self._answering, 4))[0]
-        said = json.loads(_exactly(self._answering, size))
-        for handle in said["unclosed"]:
+        size = struct.unpack("I", _exactly(self._helper, 4))[0]
+        report = json.loads(_exactly(self._helper, size))
+        for handle in report["unclosed"]:
             with suppress(OSError):
                 os.close(handle)
-        return Ran(tuple(said["calls"]), said["failed"], outcome.get("result"), outcome.get("error"))
+        return Ran(tuple(report["calls"]), report["failed"], outcome.get("result"), outcome.get("error"))
 
 
 @contextmanager
 def failing_calls(folder: Path) -> Generator[FailingCalls]:
-    """Start the process that answers; it ends with the block."""
+    """Start the helper process; it ends with the block."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
     with ours:
         with theirs:
@@ -171,16 +159,16 @@ def failing_calls(folder: Path) -> Generator[FailingCalls]:
 
 
 def why_not() -> str:
-    """Return why calls cannot be made to fail here; empty where they can."""
+    """Return why calls cannot be made to fail here; empty if they can."""
     if platform.machine() not in _MACHINES or not sys.platform.startswith("linux"):
-        return "only on Linux on x86-64 and ARM64"
+        return "failing calls need Linux on x86-64 or ARM64"
     failed: list[str] = []
 
     def install() -> None:
         try:
-            os.close(_listen(ctypes.CDLL(None, use_errno=True), nothing=True))
+            os.close(_listen(ctypes.CDLL(None, use_errno=True), is_empty=True))
         except OSError as error:
-            failed.append(f"seccomp cannot be used here: {error.strerror}")
+            failed.append(f"seccomp is not available: {error.strerror}")
 
     thread = threading.Thread(target=install)
     thread.start()
@@ -188,20 +176,20 @@ def why_not() -> str:
     return "".join(failed)
 
 
-def _listen(libc: ctypes.CDLL, nothing: bool = False) -> int:
-    """Let the calls of this thread be asked for; return the file descriptor that they come from."""
+def _listen(libc: ctypes.CDLL, is_empty: bool = False) -> int:
+    """Request notifications of this thread's calls; return the file descriptor of the notifications."""
     machine = _MACHINES[platform.machine()]
-    numbers = [] if nothing else [number for call in _CALLS.values() if (number := call[:2][machine]) is not None]
-    # Load the number; for each of ours jump to the last instruction, else go on; allow; ask.
+    numbers = [] if is_empty else [number for call in _CALLS.values() if (number := call[:2][machine]) is not None]
+    # Load the call number; jump from each listed number to the last instruction; allow others; notify.
     program = [struct.pack("HBBI", 0x20, 0, 0, 0)]
-    for place, number in enumerate(numbers):
-        program.append(struct.pack("HBBI", 0x15, len(numbers) - place, 0, number))
+    for index, number in enumerate(numbers):
+        program.append(struct.pack("HBBI", 0x15, len(numbers) - index, 0, number))
     program.append(struct.pack("HBBI", 0x06, 0, 0, _ALLOW))
     program.append(struct.pack("HBBI", 0x06, 0, 0, _NOTIFY))
     code = ctypes.create_string_buffer(b"".join(program))
-    described = ctypes.create_string_buffer(struct.pack("HxxxxxxP", len(program), ctypes.addressof(code)))
+    header = ctypes.create_string_buffer(struct.pack("HxxxxxxP", len(program), ctypes.addressof(code)))
     libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
-    handle = libc.syscall(_SECCOMP[machine], _FILTER, _NEW_LISTENER, described)
+    handle = libc.syscall(_SECCOMP[machine], _FILTER, _NEW_LISTENER, header)
     if handle < 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
@@ -210,33 +198,33 @@ def _listen(libc: ctypes.CDLL, nothing: bool = False) -> int:
 
 def _exactly(stream: socket.socket, size: int) -> bytes:
     data = b""
-    while len(data) < size and (more := stream.recv(size - len(data))):
-        data += more
+    while len(data) < size and (chunk := stream.recv(size - len(data))):
+        data += chunk
     return data
 
 
 def _answer(control: socket.socket) -> None:
-    """Answer the calls of one thread after another, until the other end is closed."""
+    """Answer the calls of one thread after another until the other end closes."""
     machine = _MACHINES[platform.machine()]
-    known = {call[:2][machine]: (name, call[2]) for name, call in _CALLS.items()}
+    call_names = {call[:2][machine]: (name, call[2]) for name, call in _CALLS.items()}
     while True:
-        text, handles, _, _ = socket.recv_fds(control, 4096, 1)
-        if not text:
+        message, handles, _, _ = socket.recv_fds(control, 4096, 1)
+        if not message:
             return
-        order = json.loads(text)
-        said = _answer_thread(control, handles[0], order, known)
+        request = json.loads(message)
+        report = _answer_thread(control, handles[0], request, call_names)
         os.close(handles[0])
-        data = json.dumps(said).encode()
+        data = json.dumps(report).encode()
         control.sendall(struct.pack("I", len(data)) + data)
 
 
 def _answer_thread(
-    control: socket.socket, listener: int, order: dict[str, Any], known: dict[int | None, tuple[str, str]]
+    control: socket.socket, listener: int, request: dict[str, Any], call_names: dict[int | None, tuple[str, str]]
 ) -> dict[str, Any]:
     calls: list[str] = []
     unclosed: list[int] = []
     failed: str | None = None
-    ended = False
+    has_ended = False
     poll = select.poll()
     poll.register(listener, select.POLLIN)
     poll.register(control, select.POLLIN)
@@ -244,7 +232,7 @@ def _answer_thread(
         ready = dict(poll.poll())
         if control.fileno() in ready:
             assert control.recv(4) == b"done"
-            ended = True
+            has_ended = True
             poll.unregister(control)
             control.send(b"well")
         if ready.get(listener, 0) & select.POLLIN:
@@ -252,29 +240,29 @@ def _answer_thread(
             try:
                 fcntl.ioctl(listener, _RECEIVE, notice)
             except OSError:
-                continue  # The call was interrupted before it was asked for.
+                continue  # The call was interrupted before its notification was read.
             id_, pid, _, number, _, _, *arguments = _NOTICE.unpack(notice)
-            name, kind = known[number]
-            about = _about(pid, kind, arguments)
+            name, kind = call_names[number]
+            file = _file_of(pid, kind, arguments)
             fails = False
-            counts = about.startswith(order["folder"]) and (not order["calls"] or name in order["calls"])
-            if counts and not ended:
-                at = order["at"]
-                fails = at is not None and (len(calls) >= at if order["lasting"] else len(calls) == at)
-                calls.append(f"{name} {about.removeprefix(order['folder'])}")
+            counts = file.startswith(request["folder"]) and (not request["calls"] or name in request["calls"])
+            if counts and not has_ended:
+                at = request["at"]
+                fails = at is not None and (len(calls) >= at if request["lasting"] else len(calls) == at)
+                calls.append(f"{name} {file.removeprefix(request['folder'])}")
                 if fails:
                     failed = failed or calls[-1]
                     if name == "close":
                         unclosed.append(arguments[0])
-            answer = _ANSWER.pack(id_, 0, -order["errno"], 0) if fails else _ANSWER.pack(id_, 0, 0, _CONTINUE)
+            answer = _ANSWER.pack(id_, 0, -request["errno"], 0) if fails else _ANSWER.pack(id_, 0, 0, _CONTINUE)
             with suppress(OSError):
                 fcntl.ioctl(listener, _SEND, bytearray(answer))
         elif ready.get(listener, 0) & select.POLLHUP:
             return {"calls": calls, "failed": failed, "unclosed": unclosed}
 
 
-def _about(pid: int, kind: str, arguments: list[int]) -> str:
-    """Return the file that a call is about, as the thread `pid` names it."""
+def _file_of(pid: int, kind: str, arguments: list[int]) -> str:
+    """Return the file of a call, as the thread `pid` names it."""
     with suppress(OSError):
         if kind == "fd":
             return str(Path(f"/proc/{pid}/fd/{arguments[0]}").readlink())
@@ -289,10 +277,10 @@ def _about(pid: int, kind: str, arguments: list[int]) -> str:
 def _text(pid: int, address: int) -> str:
     with Path(f"/proc/{pid}/mem").open("rb", buffering=0) as memory:
         memory.seek(address)
-        # A page boundary may lie behind the text.
+        # The text may end before a page boundary.
         data = memory.read(min(4096, 4096 - address % 4096))
-        while b"\0" not in data and (more := memory.read(4096)):
-            data += more
+        while b"\0" not in data and (chunk := memory.read(4096)):
+            data += chunk
     return os.fsdecode(data.split(b"\0", 1)[0])
 
 

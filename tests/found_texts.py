@@ -1,4 +1,4 @@
-"""Where a text stands in what a program has written: in any file, name or archive, in the usual encodings."""
+"""Search for a text in all files, names and archives of a folder, in the usual encodings."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from urllib.parse import quote
 
 
 def files_with(folder: Path, *texts: str) -> list[str]:
-    """Return the files below a folder, hidden ones included, whose name or content has a text, plain or encoded."""
-    wanted = [form for text in texts for form in _forms(text)]
-    found: list[str] = []
+    """Return the files below a folder, also hidden ones, that contain a text in name or content, plain or encoded."""
+    encoded_texts = [form for text in texts for form in _forms(text)]
+    names: list[str] = []
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         data = path.read_bytes() if path.is_file() else b""
         contents = data, _unpacked(data)
-        if any(text in name for text in texts) or any(form in content for form in wanted for content in contents):
-            found.append(name)
-    return found
+        if any(text in name for text in texts) or any(
+            form in content for form in encoded_texts for content in contents
+        ):
+            names.append(name)
+    return names
 
 
 def _forms(text: str) -> tuple[bytes, ...]:
@@ -32,7 +34,7 @@ def _forms(text: str) -> tuple[bytes, ...]:
 
 
 def _unpacked(data: bytes) -> bytes:
-    """Return what a gzip or zlib file holds; nothing of others."""
+    """Return the content of a gzip or zlib file; empty for others."""
     try:
         return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else zlib.decompress(data)
     except (OSError, EOFError, zlib.error):

@@ -1,4 +1,4 @@
-"""Two ends of one cable: what one writes, the other reads, in the same thread or another."""
+"""Two joined ends of a cable: one end reads what the other writes, in any thread."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from foundation.errors import LinkClosed, LinkTimeout
 
 
 @dataclass
-class _Way:
+class _Direction:
     """Bytes under way in one direction."""
 
     waiting: bytes = b""
@@ -19,13 +19,13 @@ class _Way:
 class JoinedLink:
     """One end; see `joined_links`."""
 
-    def __init__(self, changed: threading.Condition, outgoing: _Way, incoming: _Way) -> None:
+    def __init__(self, changed: threading.Condition, outgoing: _Direction, incoming: _Direction) -> None:
         self._changed, self._outgoing, self._incoming = changed, outgoing, incoming
 
     def write(self, data: bytes, timeout: float) -> None:
         with self._changed:
             if self._outgoing.closed or self._incoming.closed:
-                raise LinkClosed("an end is closed")
+                raise LinkClosed("one end of the link is closed")
             self._outgoing.waiting += data
             self._changed.notify_all()
 
@@ -35,10 +35,10 @@ class JoinedLink:
             if not self._changed.wait_for(lambda: coming.waiting or coming.closed or self._outgoing.closed, timeout):
                 if not timeout:
                     return b""
-                raise LinkTimeout("nothing came")
+                raise LinkTimeout(f"no bytes within {timeout} s")
             taken, coming.waiting = coming.waiting[:limit], coming.waiting[limit:]
         if not taken or self._outgoing.closed:
-            raise LinkClosed("an end is closed")
+            raise LinkClosed("one end of the link is closed")
         return taken
 
     def close(self) -> None:
@@ -48,6 +48,5 @@ class JoinedLink:
 
 
 def joined_links() -> tuple[JoinedLink, JoinedLink]:
-    """Return both ends."""
-    changed, there, back = threading.Condition(), _Way(), _Way()
-    return JoinedLink(changed, there, back), JoinedLink(changed, back, there)
+    changed, forward, backward = threading.Condition(), _Direction(), _Direction()
+    return JoinedLink(changed, forward, backward), JoinedLink(changed, backward, forward)

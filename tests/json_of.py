@@ -1,4 +1,4 @@
-"""What ``--json`` prints, as a test reads it: one JSON object and nothing else on standard output."""
+"""Read the output of ``--json`` in a test: one JSON object and nothing else."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import pytest
 def json_of(
     main: Callable[[list[str]], int], arguments: Sequence[object], capsys: pytest.CaptureFixture[str], code: int = 0
 ) -> dict[str, Any]:
-    """Return the object that a command prints with ``--json``, which ends with `code`.
+    """Return the JSON object printed by a command that ends with `code`.
 
-    Infinities and NaN, which JSON does not have, make it no object.
+    Infinity and NaN are not valid JSON and cause an error.
     """
     capsys.readouterr()
     assert main([*map(str, arguments), "--json"]) == code
 
     def refuse(text: str) -> float:
-        raise ValueError(f"{text} is no JSON")
+        raise ValueError(f"{text} is not valid JSON")
 
-    found: Any = json.loads(capsys.readouterr().out, parse_constant=refuse)
-    assert isinstance(found, dict)
-    return cast("dict[str, Any]", found)
+    output: Any = json.loads(capsys.readouterr().out, parse_constant=refuse)
+    assert isinstance(output, dict)
+    return cast("dict[str, Any]", output)

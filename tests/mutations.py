@@ -46,7 +46,7 @@ PACKAGES: list[str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool
 LINES_FOLDER = "CROP_LINES_FOLDER"  # where pytest, with this file as a plugin, keeps the lines of each test
 ENDLESS_S = 90  # a test that takes longer counts as failed; the slowest takes 60 s beside others
 
-# How coverage.py records the lines of programs that tests start.
+# Settings with which coverage.py records the lines of programs started by tests.
 SUBPROCESSES = """
 [run]
 parallel = true
@@ -74,7 +74,7 @@ STOPPED_AT = re.compile(
 
 @dataclass(frozen=True)
 class Mutation:
-    """A changed place: its file, its number in the file, its lines, old and new source."""
+    """A changed place: file, number in the file, lines, old and new source."""
 
     file: str
     number: int
@@ -88,9 +88,9 @@ class Mutation:
         """Change the place in a copy of the repository, and change it back."""
         path = folder / self.file
         text = path.read_text(encoding="utf-8")
-        places = _Places(text)
-        node, changed, _ = places.found[self.number]
-        path.write_text(cst.ensure_type(places.module.deep_replace(node, changed), cst.Module).code, encoding="utf-8")
+        visitor = _Places(text)
+        node, changed, _ = visitor.places[self.number]
+        path.write_text(cst.ensure_type(visitor.module.deep_replace(node, changed), cst.Module).code, encoding="utf-8")
         try:
             yield
         finally:
@@ -104,7 +104,7 @@ class _Places(cst.CSTVisitor):
 
     def __init__(self, source: str) -> None:
         super().__init__()
-        self.found: list[tuple[cst.CSTNode, cst.CSTNode, CodeRange]] = []
+        self.places: list[tuple[cst.CSTNode, cst.CSTNode, CodeRange]] = []
         self.module = MetadataWrapper(cst.parse_module(source), unsafe_skip_copy=True).visit(self)
 
     def on_visit(self, node: cst.CSTNode) -> bool:
@@ -115,20 +115,20 @@ class _Places(cst.CSTVisitor):
                 pass
         for kind, operator in mutation_operators:
             for changed in operator(node) if isinstance(node, kind) else ():
-                self.found.append((node, changed, cast("CodeRange", self.get_metadata(PositionProvider, node))))
+                self.places.append((node, changed, cast("CodeRange", self.get_metadata(PositionProvider, node))))
         return True
 
 
 def mutations_of(path: Path) -> Iterator[Mutation]:
     code = cst.Module([]).code_for_node
-    for number, (node, changed, place) in enumerate(_Places(path.read_text(encoding="utf-8")).found):
-        lines = place.start.line, place.end.line
+    for number, (node, changed, position) in enumerate(_Places(path.read_text(encoding="utf-8")).places):
+        lines = position.start.line, position.end.line
         yield Mutation(path.relative_to(ROOT).as_posix(), number, *lines, code(node), code(changed))
 
 
-def drawn(count: int, seed: int, packages: Sequence[str]) -> list[Mutation]:
+def draw_mutations(count: int, seed: int, packages: Sequence[str]) -> list[Mutation]:
     paths = [path for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
-    return random.Random(seed).sample([one for path in paths for one in mutations_of(path)], count)
+    return random.Random(seed).sample([mutation for path in paths for mutation in mutations_of(path)], count)
 
 
 class Covered:
@@ -145,34 +145,37 @@ class Covered:
     def tests_of(self, mutation: Mutation) -> list[str]:
         """Return the tests of a place, the quickest first."""
         lines = self._lines(mutation.file)
-        found = {test for line in range(mutation.line, mutation.last_line + 1) for test in lines.get(line, ())}
-        for file in () if found else (mutation.file, *_importers(mutation.file)):
-            found |= {test for tests in self._lines(file).values() for test in tests}
-        # A shared fixture counts for the first test that asks for it.
-        files = {test.partition("::")[0] for test in found}
+        places = {test for line in range(mutation.line, mutation.last_line + 1) for test in lines.get(line, ())}
+        for file in () if places else (mutation.file, *_importers(mutation.file)):
+            places |= {test for tests in self._lines(file).values() for test in tests}
+        # A shared fixture counts for the first test that uses it.
+        files = {test.partition("::")[0] for test in places}
         near = f"test_{Path(mutation.file).stem}.py::"
         order = sorted(self.seconds, key=lambda test: self.seconds[test] * (0.3 if near in test else 1.0))
-        mates = [test for test in order if test not in found and test.partition("::")[0] in files]
-        return [*(test for test in order if test in found), *mates]
+        mates = [test for test in order if test not in places and test.partition("::")[0] in files]
+        return [*(test for test in order if test in places), *mates]
 
     def _lines(self, file: str) -> dict[int, set[str]]:
         # Programs name the phase of the test as well: "tests/a.py::test (call)".
         contexts = self._data.contexts_by_lineno(str(self._copy / file))
-        return {line: {one.partition(" (")[0] for one in ran} & self.seconds.keys() for line, ran in contexts.items()}
+        return {
+            line: {name.partition(" (")[0] for name in tests_of_line} & self.seconds.keys()
+            for line, tests_of_line in contexts.items()
+        }
 
 
 def _importers(file: str) -> list[str]:
     """Return the files of the product that import a module."""
     package, _, name = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".").rpartition(".")
     imported = re.compile(rf"^\s*(?:from {package}\.{name} import|from {package} import .*\b{name}\b)", re.MULTILINE)
-    paths = [path for one in PACKAGES for path in sorted((ROOT / one).rglob("*.py"))]
+    paths = [path for package_name in PACKAGES for path in sorted((ROOT / package_name).rglob("*.py"))]
     return [path.relative_to(ROOT).as_posix() for path in paths if imported.search(path.read_text(encoding="utf-8"))]
 
 
 def _trace(folder: Path, tests: Sequence[str]) -> None:
     """Run all tests in a copy of the repository and keep the lines that each of them ran."""
     shutil.rmtree(folder, ignore_errors=True)
-    copy = copied(folder / "copy")
+    copy = copy_repository(folder / "copy")
     (copy / "sitecustomize.py").write_text(SITECUSTOMIZE, encoding="utf-8")
     (copy / "started.ini").write_text(SUBPROCESSES % ", ".join(PACKAGES), encoding="utf-8")
     words = ["-p", "tests.mutations", "-n", "auto", "--dist", "worksteal", "-q", "--tb=no", *tests]
@@ -201,9 +204,9 @@ class _Tracer:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, Any, Any]:
         self._measured.switch_context(item.nodeid)
-        done = yield
+        result = yield
         self._measured.switch_context("")
-        return done
+        return result
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self._seconds[report.nodeid] = self._seconds.get(report.nodeid, 0.0) + report.duration
@@ -218,21 +221,21 @@ class _Tracer:
 def noticed_by(mutation: Mutation, covered: Covered, folder: Path, limit_s: float) -> str:
     """Return the first test that notices a mutation within a time, "types", or ""."""
     end_s = time.monotonic() + limit_s
-    asked = covered.tests_of(mutation)
-    while asked:
-        (folder / "asked").write_text("\n".join(asked), encoding="utf-8")
+    candidates = covered.tests_of(mutation)
+    while candidates:
+        (folder / "candidates").write_text("\n".join(candidates), encoding="utf-8")
         with mutation.applied(folder):
-            code, failed = tested(folder, ["@asked"], end_s - time.monotonic())
+            code, failed = run_tests(folder, ["@candidates"], end_s - time.monotonic())
             if code == pytest.ExitCode.USAGE_ERROR:
                 # The mutation renamed cases of a test, or a conftest cannot be imported.
-                files = list(dict.fromkeys(test.partition("::")[0] for test in asked))
-                code, failed = tested(folder, files, end_s - time.monotonic())
+                files = list(dict.fromkeys(test.partition("::")[0] for test in candidates))
+                code, failed = run_tests(folder, files, end_s - time.monotonic())
         if code in (0, None):
             break
-        if not failed or tested(folder, [failed], 2 * ENDLESS_S)[0] == 0:
+        if not failed or run_tests(folder, [failed], 2 * ENDLESS_S)[0] == 0:
             return failed or "pytest"
         # It fails without the mutation as well.
-        asked = [test for test in asked if test != failed]
+        candidates = [test for test in candidates if test != failed]
     with mutation.applied(folder):
         return "" if has_types_that_fit(folder) else "types"
 
@@ -243,11 +246,11 @@ def has_types_that_fit(folder: Path) -> bool:
     return subprocess.run(words, cwd=folder, capture_output=True, check=False).returncode == 0
 
 
-def tested(folder: Path, words: Sequence[str], limit_s: float) -> tuple[int | None, str]:
+def run_tests(folder: Path, words: Sequence[str], limit_s: float) -> tuple[int | None, str]:
     """Run tests in a copy of the repository; return pytest's exit code, None if time ran out, and the failed test."""
-    endless = ("-o", f"faulthandler_timeout={ENDLESS_S}", "-o", "faulthandler_exit_on_timeout=true")
+    time_limit = ("-o", f"faulthandler_timeout={ENDLESS_S}", "-o", "faulthandler_exit_on_timeout=true")
     running = subprocess.Popen(
-        [sys.executable, "-m", "pytest", "-x", "-vv", "-rE", "--tb=no", "-p", "no:cacheprovider", *endless, *words],
+        [sys.executable, "-m", "pytest", "-x", "-vv", "-rE", "--tb=no", "-p", "no:cacheprovider", *time_limit, *words],
         cwd=folder,
         env=_environment(folder),
         stdout=subprocess.PIPE,
@@ -256,31 +259,31 @@ def tested(folder: Path, words: Sequence[str], limit_s: float) -> tuple[int | No
         start_new_session=True,
     )
     try:
-        said, _ = running.communicate(timeout=max(limit_s, 1.0))
+        output, _ = running.communicate(timeout=max(limit_s, 1.0))
     except subprocess.TimeoutExpired:
         return None, ""
     finally:
         with suppress(ProcessLookupError):
             os.killpg(running.pid, signal.SIGKILL)
         running.communicate()
-    stopped = STOPPED_AT.findall(said)
+    stopped = STOPPED_AT.findall(output)
     return running.returncode, "".join(stopped[-1]) if stopped else ""
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    own = {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "PYTHONUNBUFFERED": "1"}
-    return os.environ | own | {"NUMBA_CACHE_DIR": str(folder / ".compiled")}
+    settings = {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "PYTHONUNBUFFERED": "1"}
+    return os.environ | settings | {"NUMBA_CACHE_DIR": str(folder / ".compiled")}
 
 
-def copied(folder: Path) -> Path:
+def copy_repository(folder: Path) -> Path:
     """Copy the repository into a folder, and link the data beside it."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in listed.split("\0")[:-1]:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, folder / name)
-    data, beside = ROOT.parent / "shared", folder.parent / "shared"
-    if data.is_dir() and not beside.exists():
-        beside.symlink_to(data)
+    data, link = ROOT.parent / "shared", folder.parent / "shared"
+    if data.is_dir() and not link.exists():
+        link.symlink_to(data)
     return folder
 
 
@@ -295,32 +298,32 @@ def _digest(tests: Sequence[str]) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Draw, try and print; return 0 if at least nine of ten are noticed, else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=60, help="mutations")
-    parser.add_argument("--seed", type=int, default=1, help="of the draw")
+    parser.add_argument("--count", type=int, default=60, help="number of mutations")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the draw")
     parser.add_argument("--jobs", type=int, default=2, help="mutations tried at a time")
     parser.add_argument("--limit", type=float, default=300.0, help="seconds of tests for a mutation")
-    parser.add_argument("--packages", nargs="+", default=PACKAGES, help="of the draw")
+    parser.add_argument("--packages", nargs="+", default=PACKAGES, help="packages to mutate")
     parser.add_argument("--tests", nargs="+", default=["tests"], help="files or folders of tests")
-    given = parser.parse_args(argv)
-    mutations = drawn(given.count, given.seed, given.packages)
-    covered = Covered(ROOT / "build/mutations" / _digest(given.tests), given.tests)
-    with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(given.jobs) as pool:
-        free: Queue[Path] = Queue()
-        for number in range(given.jobs):
-            free.put(copied(Path(scratch) / str(number)))
+    options = parser.parse_args(argv)
+    mutations = draw_mutations(options.count, options.seed, options.packages)
+    covered = Covered(ROOT / "build/mutations" / _digest(options.tests), options.tests)
+    with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(options.jobs) as pool:
+        free_folders: Queue[Path] = Queue()
+        for number in range(options.jobs):
+            free_folders.put(copy_repository(Path(scratch) / str(number)))
         if not has_types_that_fit(Path(scratch) / "0"):
-            raise SystemExit("pyrefly reports errors in the repository as it is: mend them first")
+            raise SystemExit("pyrefly reports errors in the unchanged repository; correct them first")
 
-        def tried(mutation: Mutation) -> bool:
-            folder = free.get()
+        def try_mutation(mutation: Mutation) -> bool:
+            folder = free_folders.get()
             try:
-                by = noticed_by(mutation, covered, folder, given.limit)
+                test = noticed_by(mutation, covered, folder, options.limit)
             finally:
-                free.put(folder)
-            print(json.dumps({"mutation": asdict(mutation), "noticed by": by or None}), flush=True)
-            return bool(by)
+                free_folders.put(folder)
+            print(json.dumps({"mutation": asdict(mutation), "noticed by": test or None}), flush=True)
+            return bool(test)
 
-        noticed = sum(pool.map(tried, mutations))
+        noticed = sum(pool.map(try_mutation, mutations))
     print(json.dumps({"name": "mutations noticed", "value": noticed, "unit": "", "against": f"{len(mutations)} tried"}))
     return 0 if noticed >= 0.9 * len(mutations) else 1
 

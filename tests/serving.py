@@ -1,4 +1,4 @@
-"""A page's server that answers in a thread of its own."""
+"""Run the server of a page in a separate thread."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Server = TypeVar("Server", bound=LocalServer)
 
 @contextmanager
 def serving(server: Server) -> Generator[Server]:
-    """Let a server answer, and end it."""
+    """Run a server during the block."""
     with server:
         thread = threading.Thread(target=lambda: server.serve_forever(0.01))
         thread.start()

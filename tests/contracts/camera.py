@@ -1,6 +1,6 @@
-"""Contract of all cameras; a test module supplies its camera by the fixture `bench`.
+"""Contract tests of every camera; a suite supplies its camera with the fixture `bench`.
 
-The camera exposes a `SeededFilm`, so that each frame can be compared with the exposed one.
+The camera uses a `SeededFilm`, so each frame can be compared with the exposed one.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import pytest
 from drivers.camera import Camera, CameraIdentity, ExposureSettings, capture
 from foundation.errors import DeviceError, DeviceRefused, StorageError
 
+# Settings that every camera under test offers.
 SETTINGS = ExposureSettings(iso=100, aperture=8, shutter_s=1 / 60)
-"""What every camera under test offers."""
 
 
 class SeededFilm:
-    """Film (`sim.camera.film.Film`) whose frames are different noise, and are kept."""
+    """A `sim.camera.film.Film` with a different noise image for each frame, which it stores."""
 
     suffix = ".cr2"
 
@@ -39,7 +39,7 @@ class SeededFilm:
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
         self.settings.append(settings)
-        # Now and then a size that fills whole packets.
+        # Sometimes the size fills whole packets.
         size = self._size if len(self.frames) % 7 else 512 * (1 + self._size // 512)
         self.frames.append(self._chance.randbytes(size))
         return into.write(self.frames[-1])
@@ -47,9 +47,9 @@ class SeededFilm:
 
 @dataclass(frozen=True)
 class Bench:
-    """A camera under test and its film.
+    """A camera under test, its film, and the expected values.
 
-    `keeps_names`: whether frames keep the file names of the camera. `develop` updates `film` if it is a copy.
+    `keeps_names`: frames have the names given by the camera. `develop` updates `film` if it is a copy.
     """
 
     camera: Camera
@@ -60,7 +60,7 @@ class Bench:
     develop: Callable[[], None] = lambda: None
 
     def frames(self) -> list[bytes]:
-        """Return the exposed frames."""
+        """Return all exposed frames."""
         self.develop()
         return self.film.frames
 
@@ -72,24 +72,24 @@ class CameraContract:
         assert bench.camera.identity() == bench.identity
         assert bench.camera.identity() == bench.identity
 
-    def test_requires_settings_before_an_exposure(self, bench: Bench) -> None:
+    def test_refuses_exposure_before_configuration(self, bench: Bench) -> None:
         with pytest.raises(DeviceRefused):
             bench.camera.expose()
         with pytest.raises(DeviceError):
             bench.camera.download(io.BytesIO())
         assert bench.frames() == []
 
-    def test_delivers_the_exposed_frame(self, bench: Bench) -> None:
+    def test_delivers_exposed_frames(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         names: list[str] = []
         for number in range(4):
             into = io.BytesIO()
-            earliest = bench.now()
+            start = bench.now()
             captured = capture(bench.camera, into)
             assert into.getvalue() == bench.frames()[number]
             assert captured.size == len(bench.frames()[number])
             assert captured.released_at.utcoffset() == timedelta(0)
-            assert earliest <= captured.released_at.astimezone(UTC) <= bench.now()
+            assert start <= captured.released_at.astimezone(UTC) <= bench.now()
             names.append(captured.name)
         assert len(bench.frames()) == 4
         assert len(set(names)) == 4
@@ -97,11 +97,11 @@ class CameraContract:
         if bench.keeps_names:
             assert names == ["IMG_0001.CR2", "IMG_0002.CR2", "IMG_0003.CR2", "IMG_0004.CR2"]
 
-    def test_light_may_change_before_the_download(self, bench: Bench) -> None:
+    def test_exposure_ends_before_download(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
-        earliest = bench.now()
+        start = bench.now()
         released_at = bench.camera.expose()
-        assert earliest <= released_at <= bench.now()
+        assert start <= released_at <= bench.now()
         assert len(bench.frames()) == 1
         into = io.BytesIO()
         captured = bench.camera.download(into)
@@ -110,7 +110,7 @@ class CameraContract:
         with pytest.raises(DeviceError):
             bench.camera.download(io.BytesIO())
 
-    def test_failed_download_can_be_repeated(self, bench: Bench) -> None:
+    def test_repeats_failed_download(self, bench: Bench) -> None:
         class Full(io.BytesIO):
             def write(self, data: object) -> int:
                 raise StorageError("the disk is full")
@@ -124,7 +124,7 @@ class CameraContract:
         bench.camera.download(into)
         assert [into.getvalue()] == bench.frames()
 
-    def test_new_exposure_replaces_an_unread_one(self, bench: Bench) -> None:
+    def test_next_exposure_replaces_one_without_download(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         bench.camera.expose()
         bench.camera.expose()
@@ -142,7 +142,7 @@ class CameraContract:
         bench.develop()
         assert bench.film.settings == applied
 
-    def test_accepts_the_listed_shutter_times(self, bench: Bench) -> None:
+    def test_lists_usable_shutter_times(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         speeds = bench.camera.shutter_speeds()
         assert speeds == tuple(sorted(set(speeds)))
@@ -151,7 +151,7 @@ class CameraContract:
         for speed in speeds[:: len(speeds) // 5]:
             bench.camera.configure(replace(SETTINGS, shutter_s=speed))
 
-    def test_writes_at_the_position_of_the_stream(self, bench: Bench) -> None:
+    def test_appends_at_position_of_stream(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         into = io.BytesIO(b"before")
         into.seek(0, io.SEEK_END)
@@ -159,7 +159,7 @@ class CameraContract:
         assert into.getvalue() == b"before" + bench.frames()[0]
         assert captured.size == len(bench.frames()[0])
 
-    def test_refuses_impossible_settings_and_stays_usable(self, bench: Bench) -> None:
+    def test_refuses_unavailable_setting_and_stays_usable(self, bench: Bench) -> None:
         with pytest.raises(DeviceRefused, match="100"):
             bench.camera.configure(replace(SETTINGS, iso=110))
         assert bench.frames() == []
@@ -168,7 +168,7 @@ class CameraContract:
         capture(bench.camera, into)
         assert into.getvalue() == bench.frames()[-1]
 
-    def test_refuses_calls_after_close(self, bench: Bench) -> None:
+    def test_closed_camera_refuses_exposure(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)
         bench.camera.close()
         bench.camera.close()

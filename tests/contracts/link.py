@@ -1,4 +1,4 @@
-"""Contract of all links; a test module supplies its link by the fixture `ends`."""
+"""Contract tests of every cable; a suite supplies its cable with the fixture `ends`."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import pytest
 from drivers.links.link import Link
 from foundation.errors import LinkClosed, LinkTimeout
 
+# The near end, which is tested, and the far end, which helps.
 Ends = tuple[Link, Link]
-"""The near end, which is under test, and the far one, which helps."""
 
+# Time limit for expected data; reached only by a failing test.
 PATIENCE_S = 10.0
-"""For what must come; nothing waits this long unless it fails."""
 
 
 def read_exactly(link: Link, size: int) -> bytes:
-    """Return `size` bytes from any number of reads."""
+    """Return `size` bytes, read in pieces of any size."""
     data = b""
     while len(data) < size:
         data += link.read(size - len(data), PATIENCE_S)
@@ -46,7 +46,7 @@ class LinkContract:
         assert 1 <= len(first) <= 2
         assert first + read_exactly(near, 6 - len(first)) == b"abcdef"
 
-    def test_silence_raises_a_timeout_and_keeps_the_link(self, ends: Ends) -> None:
+    def test_silence_is_timeout_and_link_stays_usable(self, ends: Ends) -> None:
         near, far = ends
         assert near.read(10, 0.0) == b""
         with pytest.raises(LinkTimeout):
@@ -54,7 +54,7 @@ class LinkContract:
         far.write(b"late", PATIENCE_S)
         assert read_exactly(near, 4) == b"late"
 
-    def test_reads_bytes_sent_before_the_end(self, ends: Ends) -> None:
+    def test_reads_data_sent_before_close(self, ends: Ends) -> None:
         near, far = ends
         far.write(b"last words", PATIENCE_S)
         far.close()
@@ -62,14 +62,14 @@ class LinkContract:
         with pytest.raises(LinkClosed):
             near.read(1, PATIENCE_S)
 
-    def test_detects_that_the_other_end_closed(self, ends: Ends) -> None:
+    def test_notices_closed_far_end_at_next_exchange(self, ends: Ends) -> None:
         near, far = ends
         far.close()
-        # A cable may take the bytes before it learns that nobody is there.
+        # A cable may accept bytes before it notices that the far end is closed.
         with pytest.raises(LinkClosed):
             _exchange(near)
 
-    def test_refuses_calls_after_close(self, ends: Ends) -> None:
+    def test_closed_end_refuses_data(self, ends: Ends) -> None:
         near, _ = ends
         near.close()
         near.close()

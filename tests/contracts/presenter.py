@@ -1,4 +1,4 @@
-"""Contract of all presenters; a test module supplies its presenter by the fixture `bench`."""
+"""Contract tests of every presenter; a suite supplies its presenter with the fixture `bench`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RAMPS = tuple(
 
 @dataclass(frozen=True)
 class Bench:
-    """A presenter under test; `seen` returns the displayed codes independently of the presenter."""
+    """A presenter under test; `seen` reads the codes of the shown light independently of the presenter."""
 
     presenter: Presenter
     seen: Callable[[], Colour]
@@ -29,31 +29,31 @@ class PresenterContract:
     def test_starts_black(self, bench: Bench) -> None:
         assert bench.seen() == BLACK
 
-    def test_shows_all_codes_of_each_channel(self, bench: Bench) -> None:
+    def test_shows_each_channel_at_all_levels(self, bench: Bench) -> None:
         for colour in RAMPS:
             bench.presenter.show(colour)
             assert bench.seen() == colour
 
-    def test_separates_the_channels(self, bench: Bench) -> None:
+    def test_does_not_mix_channels(self, bench: Bench) -> None:
         for colour in (Colour(1, 2, 3), Colour(254, 128, 127), Colour(3, 2, 1), WHITE, BLACK):
             bench.presenter.show(colour)
             assert bench.seen() == colour
 
-    def test_repeats_a_colour(self, bench: Bench) -> None:
+    def test_shows_same_colour_twice(self, bench: Bench) -> None:
         for _ in range(2):
             bench.presenter.show(Colour(200, 100, 50))
             assert bench.seen() == Colour(200, 100, 50)
 
-    def test_reads_back_the_displayed_colour(self, bench: Bench) -> None:
+    def test_verifies_shown_colour(self, bench: Bench) -> None:
         if not isinstance(bench.presenter, ReadsBack):
-            pytest.skip("it cannot read back")
+            pytest.skip("the presenter cannot read back")
         for colour in (Colour(1, 2, 3), WHITE, BLACK):
             bench.presenter.show(colour)
             for _ in range(2):
                 bench.presenter.verify(colour)
             with pytest.raises(DeviceError):
                 bench.presenter.verify(Colour(1, 2, 4))
-            assert bench.seen() == colour, "reading back changes nothing"
+            assert bench.seen() == colour, "verify must not change the colour"
         bench.presenter.close()
         with pytest.raises(DeviceError):
             bench.presenter.verify(BLACK)

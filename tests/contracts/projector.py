@@ -1,4 +1,4 @@
-"""Contract of all projectors; a test module supplies its projector by the fixture `bench`.
+"""Contract tests of every projector; a suite supplies its projector with the fixture `bench`.
 
 The projector is in standby at first. `Bench.wait` advances its simulated clock.
 """
@@ -17,10 +17,9 @@ from sim.projectors.projector import SimulatedProjector
 
 @dataclass(frozen=True)
 class Bench:
-    """A projector under test.
+    """A projector under test with controls for faults and time.
 
-    `break_part` and `repair` change its faults; `identity`, `warm_up_s` and `cool_down_s` are the true values; `told`
-    are the faults that its protocol can report; `counts_hours` is whether it reports lamp hours.
+    `reported` maps true faults to those that the protocol can report. `counts_hours`: the protocol reports lamp hours.
     """
 
     projector: Projector
@@ -30,18 +29,18 @@ class Bench:
     identity: ProjectorIdentity
     warm_up_s: float
     cool_down_s: float
-    told: Callable[[frozenset[Fault]], frozenset[Fault]] = lambda faults: faults
+    reported: Callable[[frozenset[Fault]], frozenset[Fault]] = lambda faults: faults
     counts_hours: bool = True
 
     @classmethod
     def of(cls, projector: Projector, device: SimulatedProjector) -> Bench:
-        """Return the bench of a driver on a simulated projector that can report all faults."""
+        """Return the bench of a driver on a simulated projector that reports all faults."""
         traits = device.traits
-        play = device.clock.sleep, device.break_part, device.repair
-        return cls(projector, *play, traits.identity, traits.warm_up_s, traits.cool_down_s)
+        controls = device.clock.sleep, device.break_part, device.repair
+        return cls(projector, *controls, traits.identity, traits.warm_up_s, traits.cool_down_s)
 
     def switched_on(self) -> Projector:
-        """Return the projector after warm-up."""
+        """Return the projector after it has warmed up."""
         self.projector.switch_on()
         self.wait(self.warm_up_s)
         return self.projector
@@ -53,7 +52,7 @@ class ProjectorContract:
     def test_names_itself(self, bench: Bench) -> None:
         assert bench.projector.identity() == bench.identity
 
-    def test_passes_its_four_states(self, bench: Bench) -> None:
+    def test_passes_through_four_states(self, bench: Bench) -> None:
         projector = bench.projector
         assert projector.power() is Power.STANDBY
         projector.switch_on()
@@ -69,14 +68,14 @@ class ProjectorContract:
         bench.wait(1)
         assert projector.power() is Power.STANDBY
 
-    def test_switching_to_the_current_state_does_nothing(self, bench: Bench) -> None:
+    def test_switching_to_present_state_changes_nothing(self, bench: Bench) -> None:
         bench.projector.switch_off()
         assert bench.projector.power() is Power.STANDBY
         projector = bench.switched_on()
         projector.switch_on()
         assert projector.power() is Power.ON
 
-    def test_refuses_switching_during_a_transition(self, bench: Bench) -> None:
+    def test_refuses_to_reverse_during_change(self, bench: Bench) -> None:
         projector = bench.projector
         projector.switch_on()
         with pytest.raises(DeviceRefused):
@@ -104,7 +103,7 @@ class ProjectorContract:
         bench.break_part("temperature", Severity.WARNING)
         bench.break_part("fan", Severity.ERROR)
         true = frozenset({Fault("fan", Severity.ERROR), Fault("temperature", Severity.WARNING)})
-        assert set(bench.projector.faults()) == bench.told(true)
+        assert set(bench.projector.faults()) == bench.reported(true)
         bench.repair()
         assert bench.projector.faults() == ()
 
@@ -112,16 +111,16 @@ class ProjectorContract:
         if not bench.counts_hours:
             assert bench.projector.lamps() == ()
             return
-        (first_lamp,) = bench.projector.lamps()
-        assert not first_lamp.lit
+        (first,) = bench.projector.lamps()
+        assert not first.lit
         bench.wait(10 * 3600)
-        assert bench.projector.lamps() == (first_lamp,)
+        assert bench.projector.lamps() == (first,)
         bench.switched_on()
         bench.wait(10 * 3600)
-        assert bench.projector.lamps() == (Lamp(first_lamp.hours + 10, lit=True),)
+        assert bench.projector.lamps() == (Lamp(first.hours + 10, lit=True),)
         bench.projector.switch_off()
         bench.wait(bench.cool_down_s)
-        assert bench.projector.lamps() == (Lamp(first_lamp.hours + 10, lit=False),)
+        assert bench.projector.lamps() == (Lamp(first.hours + 10, lit=False),)
 
     def test_works_after_an_idle_time(self, bench: Bench) -> None:
         assert bench.projector.power() is Power.STANDBY

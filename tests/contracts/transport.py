@@ -1,4 +1,4 @@
-"""Contract of all PTP transports; a test module supplies its transport by the fixture `bench`."""
+"""Contract tests of every PTP cable; a suite supplies its cable with the fixture `bench`."""
 
 from __future__ import annotations
 
@@ -15,28 +15,29 @@ from drivers.ptp.codes import ResponseCode
 from drivers.ptp.protocol import MAX_COLLECTED, Answer, NoAnswer, PtpEvent, PtpRequest, PtpResponse, Transport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
+# Time limit for expected data; reached only by a failing test.
 PATIENCE_S = 10.0
-"""For what must come; nothing waits this long unless it fails."""
+# Time limit for data that never arrive.
 GIVE_UP_S = 0.05
-"""For what never comes."""
 
+# Answers with the parameters of the request.
 ECHO = 0x9F01
-"""Answers with the parameters it was given."""
+# Sends as many bytes of data as its parameter gives.
 GIVE = 0x9F02
-"""Gives as many bytes of data as its parameter."""
+# Takes data, and answers with their length and CRC-32.
 TAKE = 0x9F03
-"""Takes data, and answers with their length and CRC-32."""
+# Answers busy instead of sending data.
 REFUSE = 0x9F04
-"""Answers busy, although asked for data."""
+# Sends data, then reports an incomplete transfer.
 BREAK_OFF = 0x9F05
-"""Gives data, then reports that they are incomplete."""
+# Raises as many events as its parameter gives.
 RAISE = 0x9F06
-"""Raises as many events as its parameter."""
+# Never answers.
 HANG = 0x9F07
-"""Never answers."""
+# Answers with the number of another transaction.
 MIX_UP = 0x9F08
-"""Answers in the name of another transaction."""
 
+# Payload sizes at which packets, pieces or reads are just full; 500 bytes and a header of 12 make a packet of 512.
 EDGES = (
     0,
     1,
@@ -57,17 +58,16 @@ EDGES = (
     524288,
     786432,
 )
-"""Payloads at which packets, pieces or reads are just full; 500 and 12 bytes of header make a packet of 512."""
 
 
 def payload(size: int) -> bytes:
-    """Return `size` bytes of a pattern with a period of 251."""
+    """Return `size` bytes without short repetitions."""
     return (bytes(range(251)) * (size // 251 + 1))[:size]
 
 
 @dataclass
 class Echo:
-    """Responder (`drivers.ptp.protocol.Responder`) that does what its operation codes request."""
+    """A `drivers.ptp.protocol.Responder` that carries out the operations above."""
 
     raised: list[PtpEvent] = field(default_factory=list[PtpEvent])
     cancellations: list[int] = field(default_factory=list[int])
@@ -85,8 +85,8 @@ class Echo:
             case 0x9F02:
                 return Answer(ok, payload(request.parameters[0]))
             case 0x9F03:
-                sent = data or b""
-                return Answer(PtpResponse(ResponseCode.OK, transaction, (len(sent), zlib.crc32(sent))))
+                received = data or b""
+                return Answer(PtpResponse(ResponseCode.OK, transaction, (len(received), zlib.crc32(received))))
             case 0x9F05:
                 return Answer(PtpResponse(ResponseCode.INCOMPLETE_TRANSFER, transaction), payload(1000))
             case 0x9F06:
@@ -113,7 +113,7 @@ class Echo:
 
 @dataclass
 class Bench:
-    """A transport under test, its device, and a function that disconnects the cable."""
+    """A cable under test, the device at its far end, and a function that disconnects it."""
 
     transport: Transport
     device: Echo
@@ -127,9 +127,9 @@ class TransportContract:
         for count in range(6):
             parameters = tuple(0xFFFFFFFF - number for number in range(count))
             request = PtpRequest(ECHO, 7 + count, parameters)
-            result = bench.transport.transact(request, timeout=PATIENCE_S)
-            assert result.response == PtpResponse(ResponseCode.OK, 7 + count, parameters)
-            assert result.data == b""
+            transaction = bench.transport.transact(request, timeout=PATIENCE_S)
+            assert transaction.response == PtpResponse(ResponseCode.OK, 7 + count, parameters)
+            assert transaction.data == b""
 
     @pytest.mark.slow
     def test_transfers_full_packets_in_both_directions(self, bench: Bench) -> None:
@@ -138,7 +138,7 @@ class TransportContract:
             _take(bench, size)
             _give(bench, 3)
 
-    # The fixture is shared by all examples: a transport may be used for many transactions.
+    # The contract is shared by many cables, and a cable may be used for many transactions.
     @settings(
         max_examples=40,
         deadline=None,
@@ -151,38 +151,38 @@ class TransportContract:
         _take(bench, size)
 
     @pytest.mark.slow
-    def test_pieces_are_the_complete_data(self, bench: Bench) -> None:
+    def test_pieces_form_the_data(self, bench: Bench) -> None:
         pieces: list[bytes] = []
         request = PtpRequest(GIVE, 1, (5_000_000,))
-        result = bench.transport.transact(request, receive=pieces.append, timeout=PATIENCE_S)
-        assert result.response.ok
-        assert result.data == b""
+        transaction = bench.transport.transact(request, receive=pieces.append, timeout=PATIENCE_S)
+        assert transaction.response.ok
+        assert transaction.data == b""
         assert b"".join(pieces) == payload(5_000_000)
-        assert len(pieces) > 4, "objects must not be kept in memory completely"
+        assert len(pieces) > 4, "an object must not be held in memory as a whole"
 
     @pytest.mark.slow
-    def test_refuses_data_above_the_limit(self, bench: Bench) -> None:
+    def test_refuses_too_much_data(self, bench: Bench) -> None:
         _give(bench, MAX_COLLECTED)
         with pytest.raises(ProtocolError):
             bench.transport.transact(PtpRequest(GIVE, 1, (MAX_COLLECTED + 1,)), timeout=PATIENCE_S)
 
-    def test_returns_an_error_instead_of_data(self, bench: Bench) -> None:
-        result = bench.transport.transact(PtpRequest(REFUSE, 3), timeout=PATIENCE_S)
-        assert result.response == PtpResponse(ResponseCode.DEVICE_BUSY, 3)
+    def test_returns_error_instead_of_data(self, bench: Bench) -> None:
+        transaction = bench.transport.transact(PtpRequest(REFUSE, 3), timeout=PATIENCE_S)
+        assert transaction.response == PtpResponse(ResponseCode.DEVICE_BUSY, 3)
         _give(bench, 100)
 
-    def test_returns_an_error_after_data(self, bench: Bench) -> None:
-        result = bench.transport.transact(PtpRequest(BREAK_OFF, 3), timeout=PATIENCE_S)
-        assert result.response.code == ResponseCode.INCOMPLETE_TRANSFER
+    def test_returns_error_after_data(self, bench: Bench) -> None:
+        transaction = bench.transport.transact(PtpRequest(BREAK_OFF, 3), timeout=PATIENCE_S)
+        assert transaction.response.code == ResponseCode.INCOMPLETE_TRANSFER
         _give(bench, 100)
 
-    def test_delivers_events_once_in_order(self, bench: Bench) -> None:
+    def test_reports_events_once_and_in_order(self, bench: Bench) -> None:
         assert bench.transport.events() == ()
         bench.transport.transact(PtpRequest(RAISE, 1, (20,)), timeout=PATIENCE_S)
-        assert [event.parameters for event in _awaited(bench, 20)] == [(number,) for number in range(20)]
+        assert [event.parameters for event in _next_events(bench, 20)] == [(number,) for number in range(20)]
         assert bench.transport.events() == ()
 
-    def test_resets_a_silent_device(self, bench: Bench) -> None:
+    def test_resets_silent_device(self, bench: Bench) -> None:
         with pytest.raises(LinkTimeout):
             bench.transport.transact(PtpRequest(HANG, 1), timeout=GIVE_UP_S)
         with pytest.raises(ProtocolError):
@@ -191,32 +191,32 @@ class TransportContract:
         assert bench.device.unplugs == 1
         _give(bench, 100)
 
-    def test_refuses_the_response_of_another_transaction(self, bench: Bench) -> None:
+    def test_refuses_response_of_other_transaction(self, bench: Bench) -> None:
         with pytest.raises(ProtocolError, match="transaction 6"):
             bench.transport.transact(PtpRequest(MIX_UP, 5), timeout=PATIENCE_S)
         bench.transport.reset()
         _give(bench, 100)
 
-    def test_continues_after_a_failed_reader_of_data(self, bench: Bench) -> None:
+    def test_continues_after_failed_receiver(self, bench: Bench) -> None:
         with pytest.raises(_DiskFullError):
             bench.transport.transact(PtpRequest(GIVE, 4, (3_000_000,)), receive=_full, timeout=PATIENCE_S)
         _give(bench, 100)
         assert bench.device.unplugs == 0
 
-    def test_disconnection_closes_the_transport(self, bench: Bench) -> None:
+    def test_unplugged_cable_is_closed(self, bench: Bench) -> None:
         _give(bench, 100)
         bench.pull()
         for _ in range(2):
             with pytest.raises(LinkClosed):
                 bench.transport.transact(PtpRequest(GIVE, 2, (100,)), timeout=PATIENCE_S)
 
-    def test_refuses_calls_after_close(self, bench: Bench) -> None:
+    def test_closed_cable_refuses_requests(self, bench: Bench) -> None:
         bench.transport.close()
         bench.transport.close()
         with pytest.raises(LinkClosed):
             bench.transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S)
 
-    def test_messages_name_the_device(self, bench: Bench) -> None:
+    def test_times_out_with_label(self, bench: Bench) -> None:
         assert bench.transport.label
         with pytest.raises(LinkTimeout):
             bench.transport.transact(PtpRequest(HANG, 1), timeout=GIVE_UP_S)
@@ -230,22 +230,22 @@ def _full(piece: bytes) -> None:
     raise _DiskFullError
 
 
-def _awaited(bench: Bench, count: int) -> list[PtpEvent]:
-    """Return the next `count` events, which may arrive after the response."""
-    received: list[PtpEvent] = []
+def _next_events(bench: Bench, count: int) -> list[PtpEvent]:
+    """Return the next `count` events: on a network they may arrive after the response."""
+    events: list[PtpEvent] = []
     deadline = time.monotonic() + PATIENCE_S
-    while len(received) < count and time.monotonic() < deadline:
-        received.extend(bench.transport.events())
-    return received
+    while len(events) < count and time.monotonic() < deadline:
+        events.extend(bench.transport.events())
+    return events
 
 
 def _give(bench: Bench, size: int) -> None:
-    result = bench.transport.transact(PtpRequest(GIVE, 1, (size,)), timeout=PATIENCE_S)
-    assert result.response == PtpResponse(ResponseCode.OK, 1)
-    assert result.data == payload(size)
+    transaction = bench.transport.transact(PtpRequest(GIVE, 1, (size,)), timeout=PATIENCE_S)
+    assert transaction.response == PtpResponse(ResponseCode.OK, 1)
+    assert transaction.data == payload(size)
 
 
 def _take(bench: Bench, size: int) -> None:
     data = payload(size)
-    result = bench.transport.transact(PtpRequest(TAKE, 2), send=data, timeout=PATIENCE_S)
-    assert result.response.parameters == (size, zlib.crc32(data))
+    transaction = bench.transport.transact(PtpRequest(TAKE, 2), send=data, timeout=PATIENCE_S)
+    assert transaction.response.parameters == (size, zlib.crc32(data))

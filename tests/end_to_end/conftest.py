@@ -1,4 +1,4 @@
-"""A small laboratory on disk: a chart of 64 colours, four lights, the small simulated body."""
+"""A small laboratory on disk: a chart of 64 colours, four illuminants, the small simulated body."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ seed = 7
 
 
 def make_lab(folder: Path) -> Path:
-    """Write a LAB.toml with chart and lights beside it, and return its path."""
+    """Write a LAB.toml with its chart and illuminants, and return its path."""
     design_chart(bits=2, seed=3).save(folder / "chart.json")
     save_illuminants(LIGHTS, folder / "illuminations.csv")
     path = folder / "LAB.toml"
@@ -51,13 +51,12 @@ def make_lab(folder: Path) -> Path:
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Path:
-    """Return the path of a LAB.toml whose chart and lights lie beside it."""
     return make_lab(tmp_path)
 
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the session that `acquire run` takes in such a lab; it is read only."""
+    """Return the session that `acquire run` takes in this lab; do not change it."""
     lab = make_lab(tmp_path_factory.mktemp("undisturbed"))
     session = lab.parent / "session"
     assert main(["run", str(lab), str(session)]) == 0
@@ -66,22 +65,22 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def session(lab: Path, undisturbed: Path) -> Path:
-    """Return the lab's complete session, a copy that may be changed."""
+    """Return a copy of the complete session, which may be changed."""
     return shutil.copytree(undisturbed, lab.parent / "session")
 
 
 @pytest.fixture
 def frame_hashes() -> Callable[[Path], dict[tuple[str, str], list[str]]]:
-    """Return a function that hashes a session's accepted frames as they lie on disk, by kind and light."""
+    """Return a function that hashes the accepted frames of a session on disk, by kind and illuminant."""
 
     def hashes(session: Path) -> dict[tuple[str, str], list[str]]:
-        found: dict[tuple[str, str], list[str]] = {}
+        digests: dict[tuple[str, str], list[str]] = {}
         with (session / "frames.csv").open() as stream:
             for row in csv.DictReader(stream):
                 digest = hashlib.sha256((session / row["file"]).read_bytes()).hexdigest()
                 assert digest == row["sha256"]
                 if row["verdict"] == "accepted":
-                    found.setdefault((row["kind"], row["illumination"]), []).append(digest)
-        return found
+                    digests.setdefault((row["kind"], row["illumination"]), []).append(digest)
+        return digests
 
     return hashes

@@ -1,4 +1,4 @@
-"""A whole series over the EOS driver, while body and cable misbehave as seldom as in a bad lab, which is often."""
+"""A long series over the EOS driver with frequent faults of body and cable."""
 
 from __future__ import annotations
 
@@ -25,48 +25,50 @@ from tests.drivers.eos_lab import Lab
 pytestmark = pytest.mark.slow
 
 FRAMES = 150
+# Attempts per frame; the default of the sequencer is three, for a better laboratory.
 ATTEMPTS = 6
-"""Tries at a frame; the sequencer's default is three, in a better lab."""
+# Share of operations with a fault.
 TROUBLE = 0.05
-"""Share of operations at which something happens."""
 KILLED_EVERY = 40
 
 
-class BadDay(TroubledResponder):
-    """A body to which something happens now and then, by chance."""
+class FaultyBody(TroubledResponder):
+    """A body with random faults."""
 
     def __init__(self, good: Responder, seed: int, unplug: Callable[[], object]) -> None:
         super().__init__(good)
         self._chance = random.Random(seed)
         self._unplug = unplug
-        self.happened: Counter[str] = Counter()
+        self.fault_counts: Counter[str] = Counter()
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         if self._chance.random() >= TROUBLE:
             return super().answer(request, data)
-        trouble = self._chance.choice((self._busy, self._ill, self._silent, self._lost, self._pulled, self._wrong))
-        self.happened[trouble.__name__] += 1
-        return trouble(request, data)
+        fault = self._chance.choice(
+            (self._busy, self._general_error, self._no_answer, self._lost_answer, self._unplugged, self._wrong_data)
+        )
+        self.fault_counts[fault.__name__] += 1
+        return fault(request, data)
 
     def _busy(self, request: PtpRequest, data: bytes | None) -> Answer:
         return Answer(PtpResponse(ResponseCode.DEVICE_BUSY, request.transaction))
 
-    def _ill(self, request: PtpRequest, data: bytes | None) -> Answer:
+    def _general_error(self, request: PtpRequest, data: bytes | None) -> Answer:
         return Answer(PtpResponse(ResponseCode.GENERAL_ERROR, request.transaction))
 
-    def _silent(self, request: PtpRequest, data: bytes | None) -> Answer:
+    def _no_answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         raise NoAnswer
 
-    def _lost(self, request: PtpRequest, data: bytes | None) -> Answer:
+    def _lost_answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         super().answer(request, data)
         raise NoAnswer
 
-    def _pulled(self, request: PtpRequest, data: bytes | None) -> Answer:
+    def _unplugged(self, request: PtpRequest, data: bytes | None) -> Answer:
         self._unplug()
         raise NoAnswer
 
-    def _wrong(self, request: PtpRequest, data: bytes | None) -> Answer:
-        """Send too little or too much; of events lose, double and invent some."""
+    def _wrong_data(self, request: PtpRequest, data: bytes | None) -> Answer:
+        """Send too few or too many data; lose, double and invent events."""
         answer = super().answer(request, data)
         if answer.data is None:
             return answer
@@ -74,19 +76,19 @@ class BadDay(TroubledResponder):
             changed = self._chance.choice((answer.data[:-1], answer.data + b"more", b""))
             return Answer(answer.response, changed)
         records = decode_events(answer.data)
-        frames = [record for record in records if isinstance(record, TransferRequest)]
-        others = [record for record in records if record not in frames]
-        changed = self._chance.choice((others, [*records, *frames], [*records, OtherRecord(0xC1FE, b"?")]))
+        transfers = [record for record in records if isinstance(record, TransferRequest)]
+        other_records = [record for record in records if record not in transfers]
+        changed = self._chance.choice((other_records, [*records, *transfers], [*records, OtherRecord(0xC1FE, b"?")]))
         return Answer(answer.response, encode_events(changed))
 
 
 @pytest.mark.parametrize("forgetful", [False, True], ids=["keeps frames", "forgets frames"])
-def test_a_series_on_a_bad_day_is_whole(tmp_path: Path, forgetful: bool) -> None:
+def test_completes_series_with_faulty_body_and_cable(tmp_path: Path, forgetful: bool) -> None:
     lab = Lab(replace(EOS_550D, shots_per_charge=10_000), film_bytes=300, forgetful=forgetful)  # on mains power
     chance = random.Random(707)
     cables: list[_Cable] = []
-    day = BadDay(lab.eos, 1, lambda: cables[-1].pull())
-    lab.device = day
+    body = FaultyBody(lab.eos, 1, lambda: cables[-1].pull())
+    lab.device = body
 
     def cable(pipes: UsbPipes) -> UsbPipes:
         cables.append(_Cable(pipes, lab, chance.randrange(40_000, 400_000)))
@@ -94,46 +96,46 @@ def test_a_series_on_a_bad_day_is_whole(tmp_path: Path, forgetful: bool) -> None
 
     lab.pipes = cable
     lab.camera.configure(SETTINGS)
-    taken: list[CapturedFrame] = []
+    captured_frames: list[CapturedFrame] = []
     failed = 0
     for number in range(FRAMES):
         if number % KILLED_EVERY == KILLED_EVERY - 1:
-            # The host dies without a word, and begins anew.
+            # The host program dies and starts again.
             lab.camera = CanonEos(lab.open, lab.clock)
             lab.camera.configure(SETTINGS)
-        for left in reversed(range(ATTEMPTS)):
-            before = len(lab.film.frames)
+        for attempts_left in reversed(range(ATTEMPTS)):
+            frames_before = len(lab.film.frames)
             try:
                 with atomic_file(tmp_path / f"{number:04d}.cr2") as stream:
                     captured = capture(lab.camera, stream)
             except DeviceError as error:
                 failed += 1
-                if not left or isinstance(error, DeviceRefused):
+                if not attempts_left or isinstance(error, DeviceRefused):
                     raise
                 continue
-            assert len(lab.film.frames) > before, "the frame was exposed for this light"
-            taken.append(captured)
+            assert len(lab.film.frames) > frames_before, "the frame was exposed in this attempt"
+            captured_frames.append(captured)
             break
     lab.camera.close()
-    numbers = [int(captured.name[4:8]) for captured in taken]
+    numbers = [int(captured.name[4:8]) for captured in captured_frames]
     assert len(numbers) == FRAMES
     assert numbers == sorted(set(numbers)), "each frame once, in the order of exposure"
     for step, number in enumerate(numbers):
         assert (tmp_path / f"{step:04d}.cr2").read_bytes() == lab.film.frames[number - 1]
     assert len(list(tmp_path.iterdir())) == FRAMES
-    assert min(day.happened.values()) > 5, "every kind of trouble came up"
+    assert min(body.fault_counts.values()) > 5, "every kind of fault occurred"
     assert failed > 0
     assert lab.waiting() == 0
 
 
 class _Cable(CutOff):
-    """A cable that is pulled by hand, or breaks after some bytes."""
+    """A cable that can be unplugged, or breaks after some bytes."""
 
     def __init__(self, good: UsbPipes, lab: Lab, after: int) -> None:
         super().__init__(good, after)
         self._lab = lab
 
     def pull(self) -> None:
-        """Pull it: the body notices, and so does who speaks over it."""
-        self._left = 0
+        """Unplug the cable; body and driver notice it."""
+        self._remaining = 0
         self._lab.eos.unplugged()

@@ -1,4 +1,4 @@
-"""Folders that somebody else made may hold anything; `tests/fuzz/fuzz_folders.py` tries a million of them."""
+"""Damaged and hostile folders are read or refused; `tests/fuzz/fuzz_folders.py` tries a million of them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from tests.fuzz.foreign.trial import READERS, Trials
 
 pytestmark = pytest.mark.slow
 
+# Mutated folders per kind, a few seconds; earlier failures are listed in KNOWN.
 COUNT = 8
-"""Mutated folders of each kind, a few seconds; what they found once stands in KNOWN."""
 
 KNOWN = (
     ("dataset folder", 73),  # a list of hashes that names a file of a terabyte without a byte
@@ -42,9 +42,9 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Seed]:
     return make_seeds(tmp_path_factory.mktemp("work") / "seeds")
 
 
-@pytest.mark.parametrize("what", sorted(READERS))
-def test_mutated_folders_are_read_or_refused(trials: Trials, seeds: dict[str, Seed], what: str) -> None:
-    kinds = [kind for kind in seeds if kind.split()[0] == what]
+@pytest.mark.parametrize("reader", sorted(READERS))
+def test_mutated_folders_are_read_or_refused(trials: Trials, seeds: dict[str, Seed], reader: str) -> None:
+    kinds = [kind for kind in seeds if kind.split()[0] == reader]
     assert kinds
     for kind in kinds:
         for number in range(COUNT):
@@ -52,11 +52,11 @@ def test_mutated_folders_are_read_or_refused(trials: Trials, seeds: dict[str, Se
 
 
 @pytest.mark.parametrize(("kind", "number"), KNOWN)
-def test_what_was_found_once_stays_mended(trials: Trials, seeds: dict[str, Seed], kind: str, number: int) -> None:
+def test_earlier_failures_stay_fixed(trials: Trials, seeds: dict[str, Seed], kind: str, number: int) -> None:
     assert trials.judge(kind, seeds[kind], number) is None
 
 
-def test_sound_folders_are_read(trials: Trials, seeds: dict[str, Seed], tmp_path: Path) -> None:
+def test_reads_intact_folders(trials: Trials, seeds: dict[str, Seed], tmp_path: Path) -> None:
     for kind, seed in seeds.items():
         folder = tmp_path / kind
         for name, data in seed.items():

@@ -1,8 +1,8 @@
-"""ptpy, somebody else's PTP/IP initiator, on the simulated camera: it shares nothing with ours.
+"""The independent PTP/IP initiator ptpy with the simulated camera.
 
-ptpy 0.3.2 asks for construct 2.8.8, with which its PTP/IP does not work; with 2.8.12 it does. So it is in no extra:
-continuous integration installs both (`.ci/run`). Its Canon extension divides record sizes by `/`, as Python 2 did, and
-reads no events on Python 3; so it is used as any still camera's initiator.
+ptpy 0.3.2 requires construct 2.8.8, with which its PTP/IP does not work; it works with 2.8.12. Therefore no extra lists
+it; `.ci/run` installs both. Its Canon extension divides record sizes by `/`, as in Python 2, and reads no events in
+Python 3, so it is used as a generic still camera initiator.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ with camera.session():
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ptpy") is None, reason="ptpy is not installed, see .ci/run")
-def test_ptpy_fetches_the_frames_on_the_card(tmp_path: Path) -> None:
+def test_ptpy_downloads_frames_on_card(tmp_path: Path) -> None:
     film, clock = SeededFilm(70_000), SimulatedClock()
     eos = SimulatedEos(TEST_BODY, film, clock, auto_power_off_s=0)
     for _ in range(2):
@@ -50,12 +50,12 @@ def test_ptpy_fetches_the_frames_on_the_card(tmp_path: Path) -> None:
         clock.sleep(5)
         assert not eos.busy
     with serve_ptpip(eos, 0) as server:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", SCRIPT, str(server.address[1])],
             cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    head, *frames = done.stdout.splitlines()
+    assert process.returncode == 0, process.stderr
+    head, *frames = process.stdout.splitlines()
     assert head == "Canon Inc. CroP Test True"
     assert frames == [
         f"IMG_{number:04d}{film.suffix.upper()} {hashlib.sha256(data).hexdigest()} True"

@@ -1,4 +1,4 @@
-"""Lenses and habits that no table may hide: the cases of `benchmarks.cases` at small size, and their comparison."""
+"""Faults of lenses and laboratories are noticed: small `benchmarks.cases`, and the comparison with the truth."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from sim.world.world import Blob, Glare, Room, Situation, World
 
 pytestmark = pytest.mark.slow
 
-TRIED_ELSEWHERE = {
+# Cases with a stricter test of the same size elsewhere; `benchmarks.rooms --case all` runs all cases.
+TESTED_ELSEWHERE = {
     # tests/calibration/pipeline/test_held_against_itself.py
     "other-camera", "red-blue", "warm-cool", "white-red", "white-reference-red", "half-exposed", "half-exposed-whites",
     "red-missing", "other-iso",
@@ -49,7 +50,6 @@ TRIED_ELSEWHERE = {
     # Here, both at once, and in tests/calibration/spread/test_spread.py
     "mild-shoulders", "strong-shoulders", "veil",
 }  # fmt: skip
-"""Cases whose session has a sharper test of its own, of the same size; `benchmarks.rooms --case all` tries all."""
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +57,8 @@ def world() -> World:
     return world_of(chart_of(small=True), BODIES["Test"], Room(seed=1))
 
 
-def test_what_noise_adds_is_taken_out_and_what_is_planted_is_found(world: World, tmp_path: Path) -> None:
-    """A table whose samples of a few cells are raised by 5 % has these errors and hardly others."""
+def test_comparison_subtracts_noise_and_finds_errors(world: World, tmp_path: Path) -> None:
+    """Samples of a few patches are raised by 5 %; the comparison finds these errors and almost no others."""
     chart = chart_of(small=True)
     with short_session(tmp_path / "session", chart, world) as session:
         result = build(session, tmp_path / "lut")
@@ -66,16 +66,16 @@ def test_what_noise_adds_is_taken_out_and_what_is_planted_is_found(world: World,
         clean = compare(result, table, world, chart, session)
         raised = np.asarray(table.samples).copy()
         raised[3, 10:14] = np.rint(raised[3, 10:14] * 1.05).astype(raised.dtype)
-        off = compare(result, replace(table, samples=raised), world, chart, session)
+        raised_errors = compare(result, replace(table, samples=raised), world, chart, session)
     # A mean of 25 samples has noise of 0.3 % and more.
     assert clean.rms < 0.002
     assert clean.worst < 0.02
     assert clean.light_deg.max() < 0.1
-    added = (off.error - clean.error)[3, 10:14]
+    added = (raised_errors.error - clean.error)[3, 10:14]
     lit = clean.lit[3, 10:14]
     assert lit.any()
     np.testing.assert_allclose(added[lit], 0.05, atol=0.004)
-    assert off.cells_beyond(0.03) == int(lit.any(axis=1).sum())
+    assert raised_errors.cells_beyond(0.03) == int(lit.any(axis=1).sum())
 
 
 @pytest.mark.parametrize(
@@ -88,26 +88,24 @@ def test_what_noise_adds_is_taken_out_and_what_is_planted_is_found(world: World,
     ],
     ids=["as planned", "hand", "glare", "hot"],
 )
-def test_expected_counts_are_those_of_the_frame_without_its_noise(
-    change: FrameChange, world: World, tmp_path: Path
-) -> None:
-    """Photon transfer of EMVA 1288: standardised, the difference has a variance of 1 and no photosite beyond seven."""
+def test_expected_counts_equal_frame_without_noise(change: FrameChange, world: World, tmp_path: Path) -> None:
+    """The standardised difference has a variance of 1 and no value beyond 7 (photon transfer, EMVA 1288)."""
     step = SessionStep(3, "light", 0, BY_NAME["veil"].lights["warm"])
     (tmp_path / "frame.dng").write_bytes(frame_file(world, step, change))
     area, body = world.body.visible, world.body
     counts = read_raw(tmp_path / "frame.dng").sensor[area.top : area.top + area.height, area.left :][:, : area.width]
     expected = expected_counts(world, step, change).astype(np.float64)
     spread = np.sqrt(expected / body.gain_e(100) + body.noise_dn(100) ** 2 + 1 / 12)
-    deviate = (counts - float(body.black) - expected) / spread
+    standardised = (counts - float(body.black) - expected) / spread
     if change.counts_added:
-        deviate = np.delete(deviate.ravel(), (200 - area.top) * area.width + 300 - area.left)
-    assert abs(float(deviate.mean())) < 0.01
-    assert float(deviate.var()) == pytest.approx(1, abs=0.02)
-    assert float(np.abs(deviate).max()) < 7
+        standardised = np.delete(standardised.ravel(), (200 - area.top) * area.width + 300 - area.left)
+    assert abs(float(standardised.mean())) < 0.01
+    assert float(standardised.var()) == pytest.approx(1, abs=0.02)
+    assert float(np.abs(standardised).max()) < 7
 
 
 def test_every_case_changes_the_room_the_plan_or_a_frame(world: World) -> None:
-    assert BY_NAME.keys() >= TRIED_ELSEWHERE
+    assert BY_NAME.keys() >= TESTED_ELSEWHERE
     for case in CASES:
         lights = short_plan(case.lights)
         changes = case.changes(world, chart_of(small=True), lights)
@@ -115,7 +113,7 @@ def test_every_case_changes_the_room_the_plan_or_a_frame(world: World) -> None:
         assert changed or case.room or len(lights) < len(EIGHT_LIGHTS), case.name
 
 
-@pytest.mark.parametrize("name", [name for name in BY_NAME if name not in TRIED_ELSEWHERE])
-def test_a_case_is_refused_or_named_or_right(name: str) -> None:
+@pytest.mark.parametrize("name", [name for name in BY_NAME if name not in TESTED_ELSEWHERE])
+def test_case_is_refused_or_named_or_right(name: str) -> None:
     row = try_case(BY_NAME[name], small=True)
     assert not [failure for failure in FAILURES if row[failure]], row["says"]

@@ -1,7 +1,7 @@
-"""gphoto2 takes pictures with the simulated camera over PTP/IP: a foreign initiator judges our responder.
+"""gphoto2 takes photographs with the simulated camera over PTP/IP, as an independent initiator.
 
-gphoto2 of the system and python-gphoto2, where they are installed; they bring libgphoto2 in two versions. Each has a
-home folder of its own, for libgphoto2 keeps settings there.
+The system's gphoto2 and python-gphoto2 are used if installed; they contain two versions of libgphoto2. Each has its own
+home folder, because libgphoto2 stores settings there.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ pytestmark = pytest.mark.slow
 LIMIT_S = 60
 
 
-class WitnessedFilm:
-    """A film whose frames are noted as it writes them."""
+class RecordingFilm:
+    """A film that records its frames."""
 
     def __init__(self, film: Film) -> None:
         self._film = film
@@ -66,47 +66,46 @@ class WitnessedFilm:
 
 
 class Served:
-    """A simulated camera on the network, and a gphoto2 that knows where it is."""
+    """A simulated camera on the network, with a gphoto2 that uses it."""
 
-    def __init__(self, eos: SimulatedEos, film: WitnessedFilm, port: int, folder: Path) -> None:
+    def __init__(self, eos: SimulatedEos, film: RecordingFilm, port: int, folder: Path) -> None:
         self.eos = eos
         self.film = film
         self.path = f"ptpip:127.0.0.1:{port}:{port}"
         self.folder = folder
 
     def gphoto2(self, *arguments: str) -> str:
-        """Run gphoto2 in the test's folder and return what it says."""
+        """Run gphoto2 in the folder of the test and return its output."""
         return gphoto2(self.path, self.folder, *arguments)
 
     def current(self, setting: str) -> str:
-        """Return the value that gphoto2 reads."""
         return re.findall(r"^Current: (.*)$", self.gphoto2("--get-config", setting), re.MULTILINE)[0]
 
     def choices(self, setting: str) -> list[str]:
-        """Return what gphoto2 offers for a setting."""
+        """Return the choices of gphoto2 for a setting."""
         return re.findall(r"^Choice: \d+ (.*)$", self.gphoto2("--get-config", setting), re.MULTILINE)
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """Return the environment for Debian's gphoto2: its settings in `folder`, and its own libraries.
+    """Return the environment for the gphoto2 of Debian: settings in `folder`, and its own libraries.
 
-    python-gphoto2, once imported, points every libgphoto2 started from here at the drivers it brings along.
+    After its import, python-gphoto2 points every libgphoto2 started here to its own drivers.
     """
-    own = {name: value for name, value in os.environ.items() if name not in ("CAMLIBS", "IOLIBS")}
-    return own | {"HOME": str(folder), "LC_ALL": "C"}
+    variables = {name: value for name, value in os.environ.items() if name not in ("CAMLIBS", "IOLIBS")}
+    return variables | {"HOME": str(folder), "LC_ALL": "C"}
 
 
 def gphoto2(path: str, folder: Path, *arguments: str) -> str:
     program = shutil.which("gphoto2")
     if program is None:
         pytest.skip("gphoto2 is not installed")
-    done = subprocess.run(
+    process = subprocess.run(
         [program, "--camera", "PTP/IP Camera", "--port", path, *arguments],
         cwd=folder, env=_environment(folder), capture_output=True, text=True,
         timeout=LIMIT_S, check=False,
     )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    assert process.returncode == 0, process.stdout + process.stderr
+    return process.stdout
 
 
 @pytest.fixture(scope="session")
@@ -119,9 +118,9 @@ def world() -> World:
 
 @pytest.fixture
 def served(world: World, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Served]:
-    """Return a served camera; parametrise indirectly with another body than the test body."""
+    """Return a served camera; the parameter is another body than the test body."""
     body = getattr(request, "param", TEST_BODY)
-    film = WitnessedFilm(WorldFilm(world, lambda: WHITE, lambda: 1.0, "1", {}))
+    film = RecordingFilm(WorldFilm(world, lambda: WHITE, lambda: 1.0, "1", {}))
     with ThreadPoolExecutor(1) as executor:
         eos = SimulatedEos(body, film, SystemClock(), serial="1", auto_power_off_s=0, executor=executor)
         with serve_ptpip(eos, 0) as server:
@@ -129,22 +128,22 @@ def served(world: World, tmp_path: Path, request: pytest.FixtureRequest) -> Iter
 
 
 def test_summary(served: Served) -> None:
-    said = served.gphoto2("--summary")
+    summary = served.gphoto2("--summary")
     for line in (
         "Manufacturer: Canon Inc.",
         "Model: CroP Test",
         "Canon EOS Capture",
         "StorageDescription: SD",
-        # As gphoto2 has printed it for a real EOS 550D: the levels come widened to 16 bits.
+        # As printed by gphoto2 for a real EOS 550D: the levels are widened to 16 bits.
         "Battery Level(0x5001):(read only) (type=0x2) Enumeration [100,0,75,0,50] value: 100% (100)",
     ):
-        assert line in said
+        assert line in summary
 
 
-def test_settings_are_listed_and_set(served: Served) -> None:
-    listed = served.gphoto2("--list-config").split()
+def test_lists_and_sets_settings(served: Served) -> None:
+    settings = served.gphoto2("--list-config").split()
     for setting in ("iso", "shutterspeed", "aperture", "imageformat", "capturetarget", "autoexposuremode", "focusmode"):
-        assert any(entry.endswith(f"/{setting}") for entry in listed)
+        assert any(entry.endswith(f"/{setting}") for entry in settings)
     assert served.choices("iso") == ["Auto", *(str(100 << stop) for stop in range(7))]
     served.gphoto2("--set-config", "iso=400", "--set-config", "shutterspeed=1/50", "--set-config", "aperture=11")
     assert [served.current(name) for name in ("iso", "shutterspeed", "aperture")] == ["400", "1/50", "11"]
@@ -153,8 +152,8 @@ def test_settings_are_listed_and_set(served: Served) -> None:
 
 
 @pytest.mark.parametrize("served", [EOS_550D_AS_LISTED], indirect=True)
-def test_the_lists_are_those_of_a_real_550d(served: Served) -> None:
-    # libgphoto2, cameras/canon-eos550d.txt: what gphoto2 printed for a real one.
+def test_lists_equal_real_550d(served: Served) -> None:
+    # libgphoto2, cameras/canon-eos550d.txt: output for a real camera.
     assert served.choices("aperture") == ["4", "4.5", "5.6", "6.7", "8", "9.5", "11", "13", "16", "19", "22", "27"]
     assert served.choices("imageformat") == [
         "Large Fine JPEG", "Large Normal JPEG", "Medium Fine JPEG", "Medium Normal JPEG", "Small Fine JPEG",
@@ -168,7 +167,7 @@ def test_the_lists_are_those_of_a_real_550d(served: Served) -> None:
 
 
 @pytest.mark.parametrize("served", [replace(TEST_BODY, aperture_codes=())], indirect=True)
-def test_a_lens_without_contacts_is_shown_as_libgphoto2_shows_one(served: Served) -> None:
+def test_shows_lens_without_contacts(served: Served) -> None:
     assert served.current("aperture") == "implicit auto"
     assert served.choices("aperture") == ["implicit auto"]
     served.gphoto2("--capture-image-and-download", "--filename", "frame.%C")
@@ -177,7 +176,7 @@ def test_a_lens_without_contacts_is_shown_as_libgphoto2_shows_one(served: Served
 
 
 @pytest.mark.parametrize("served", [EOS_6D_MARK_II], indirect=True)
-def test_the_lists_are_those_of_a_real_6d_mark_ii(served: Served) -> None:
+def test_lists_equal_real_6d_mark_ii(served: Served) -> None:
     # libgphoto2, cameras/canon-eos6d-mark2.txt.
     assert served.current("model") == "2147484678"
     formats = served.choices("imageformat")
@@ -188,7 +187,7 @@ def test_the_lists_are_those_of_a_real_6d_mark_ii(served: Served) -> None:
     assert served.choices("aeb")[-1] == "+/- 3"
 
 
-def test_a_picture_is_downloaded_as_the_film_wrote_it(served: Served) -> None:
+def test_downloads_frame_unchanged(served: Served) -> None:
     served.gphoto2("--set-config", "shutterspeed=1/4", "--capture-image-and-download", "--filename", "frame.%C")
     (file,) = served.folder.glob("frame.*")
     assert [file.read_bytes()] == served.film.frames
@@ -197,7 +196,7 @@ def test_a_picture_is_downloaded_as_the_film_wrote_it(served: Served) -> None:
     assert (mosaic.counts.shape, mosaic.iso, mosaic.aperture, mosaic.shutter_s) == ((557, 800), 100, 8.0, 0.25)
 
 
-def test_raw_and_jpeg_by_way_of_the_card(served: Served) -> None:
+def test_downloads_raw_and_jpeg_from_card(served: Served) -> None:
     served.eos.set_menu(Property.EOS_IMAGE_FORMAT, ImageFormat((*RAW_ONLY.files, ImageFile(1, 0, 3))))
     served.gphoto2("--set-config", "capturetarget=1", "--capture-image-and-download", "--keep", "--filename", "%f.%C")
     assert [(served.folder / "IMG_0001.DNG").read_bytes()] == served.film.frames
@@ -209,7 +208,7 @@ def test_raw_and_jpeg_by_way_of_the_card(served: Served) -> None:
     assert "IMG_0001" not in served.gphoto2("--list-files")
 
 
-def test_python_gphoto2_takes_a_picture(served: Served) -> None:
+def test_python_gphoto2_takes_photographs(served: Served) -> None:
     if importlib.util.find_spec("gphoto2") is None:
         pytest.skip("python-gphoto2 is not installed")
     script = """
@@ -231,11 +230,11 @@ for number in range(2):
     camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL).save(f"frame{number}")
 camera.exit()
 """
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", script, served.path],
         cwd=served.folder, env=os.environ | {"HOME": str(served.folder)}, capture_output=True, text=True,
         timeout=LIMIT_S, check=False,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
     assert [(served.folder / f"frame{number}").read_bytes() for number in range(2)] == served.film.frames
     assert served.film.exposures == [ExposureSettings(200, 8.0, canon.SHUTTER.value(0x60))] * 2

@@ -1,8 +1,8 @@
-"""The commands of the how-to pages are run as they stand there, page by page, each in a folder that has what it names.
+"""Run the commands of the how-to pages, page by page, each in a folder with the files that it names.
 
-A small simulated lab stands in for the lab, a computed table of 64 colours for the table, two dozen generated images
-for each data set. What a command cannot be run on here is in `Page.skipped` with its reason; the commands of
-rehearsal.md have a test of their own, those of the tutorial are run by `make demo`.
+A small simulated laboratory, a computed LUT of 64 colours and small generated data sets replace the real ones.
+`Page.skipped` lists commands that cannot run here, with the reason. The commands of rehearsal.md have a separate test;
+`make demo` runs those of the tutorial.
 """
 
 from __future__ import annotations
@@ -23,42 +23,27 @@ from tests.house.test_documented_commands import FOUND
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn", "unplotted")]
 
 HOW_TO = "docs/how-to/"
+# Pages with a separate test.
 ELSEWHERE = {"rehearsal.md"}
-"""Pages whose commands have a test of their own."""
 
 LAB = 'rig = "simulated"\nchart = "chart/chart.json"\nilluminations = "illuminations.csv"\n[sequence]\nwarm_up_s = 0\n'
 SIMULATED = '[simulated]\nbody = "Test"\nseed = 11\n'
-_REAL = (
-    "takes the real data set of the page, which is downloaded from its makers; tests/evaluation/commands has it made up"
-)
-_SERVES = "serves until somebody ends it; tests/acquisition/monitor, tests/generator/explore"
+_REAL = "needs the real data set of the page; tests/evaluation/commands uses an artificial one"
+_SERVES = "runs until it is ended; tests/acquisition/monitor, tests/generator/explore"
 
 
 @dataclass(frozen=True)
 class Page:
-    """What the commands of a page are run on.
+    """Conditions for the commands of a page."""
 
-    Attributes
-    ----------
-    needs
-        Names in its folder, and what stands there.
-    written
-        Words of the page, and what is written in their place.
-    added
-        Words that are added to commands that begin so.
-    fresh
-        What is removed before commands that begin so: the page has alternatives with one result.
-    refused
-        Commands that end in a sentence here, and its words: all is well in this lab.
-    skipped
-        Beginnings of commands that are not run, and why.
-    """
-
-    needs: Mapping[str, str] = field(default_factory=dict[str, str])
-    written: Mapping[str, str] = field(default_factory=dict[str, str])
-    added: Mapping[str, str] = field(default_factory=dict[str, str])
+    needs: Mapping[str, str] = field(default_factory=dict[str, str])  # names in the folder, and their sources
+    written: Mapping[str, str] = field(default_factory=dict[str, str])  # words of the page, and their replacements
+    added: Mapping[str, str] = field(default_factory=dict[str, str])  # beginnings of commands, and words added to them
+    # beginnings of commands, and results to remove first
     fresh: Mapping[str, str] = field(default_factory=dict[str, str])
+    # commands that fail here, and part of the message
     refused: Mapping[str, str] = field(default_factory=dict[str, str])
+    # beginnings of commands that are not run, and the reason
     skipped: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
@@ -95,7 +80,7 @@ PAGES = {
     "table-without-a-lab.md": Page(
         {"small.toml": "small.toml", "mine.json": "mine.json", "photographs": "pictures"},
         written={"cie,2000:10000:200K": "cie-d,2000:10000:2000K"},
-        # Of 32 768 colours and 707 lights it takes a minute.
+        # 32 768 colours and 707 illuminants would take a minute.
         added={"sim table": "--settings small.toml", "sim table lut/ --camera Canon": "--lights 2000:10000:2000K"},
         fresh={"sim table": "lut"},
     ),
@@ -124,14 +109,14 @@ PAGES = {
 
 
 def run(*words: object) -> int:
-    """Run a command as the shell would and return its exit code."""
+    """Run a command as the shell does and return its exit code."""
     name, *arguments = map(str, words)
     return int(import_module(COMMANDS[name]).main(arguments))
 
 
 @pytest.fixture(scope="module")
 def unplotted() -> Iterator[None]:
-    """Leave the plots of results blank: the commands' own tests draw them."""
+    """Skip drawing the plots of results, which other tests check."""
 
     def blank(draw: Callable[..., None], *arguments: object, inches: tuple[float, float]) -> bytes:
         return b"<svg></svg>"
@@ -143,67 +128,67 @@ def unplotted() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with everything that a page may need."""
-    at = tmp_path_factory.mktemp("made")
+    folder = tmp_path_factory.mktemp("made")
     rng = np.random.default_rng(1)
-    # Large ones have four places of 512 × 512 that do not touch.
-    for folder, count, side in (("pictures", 4, 48), ("large", 2, 1040)):
-        (at / folder).mkdir()
+    # Large pictures have four separate areas of 512 × 512.
+    for kind, count, side in (("pictures", 4, 48), ("large", 2, 1040)):
+        (folder / kind).mkdir()
         for number in range(count):
             blocks = rng.integers(0, 256, (side // 8, side // 8, 3), dtype=np.uint8)
-            cv2.imwrite(str(at / folder / f"{number}.png"), cv2.resize(blocks, (side, side), interpolation=0))
-    (at / "small.toml").write_text("[chart]\nbits = 2\n")
+            cv2.imwrite(str(folder / kind / f"{number}.png"), cv2.resize(blocks, (side, side), interpolation=0))
+    (folder / "small.toml").write_text("[chart]\nbits = 2\n")
     sensitivities = next((Path(__file__).parents[2] / "sim" / "data").rglob("*EOS_600D*.json"))
-    shutil.copy(sensitivities, at / "mine.json")
-    assert run("acquire", "chart", at / "chart", "--bits", 2, "--no-tiff") == 0
-    assert run("acquire", "illuminations", at / "illuminations.csv", "--grid", 1, "--blackbodies", "3000,5000") == 0
-    (at / "LAB.toml").write_text(LAB + "[judge]\nresponse = false\n" + SIMULATED)
-    assert run("acquire", "run", at / "LAB.toml", at / "session") == 0
-    assert run("build-lut", at / "session", at / "lut") == 0
+    shutil.copy(sensitivities, folder / "mine.json")
+    assert run("acquire", "chart", folder / "chart", "--bits", 2, "--no-tiff") == 0
+    assert run("acquire", "illuminations", folder / "illuminations.csv", "--grid", 1, "--blackbodies", "3000,5000") == 0
+    (folder / "LAB.toml").write_text(LAB + "[judge]\nresponse = false\n" + SIMULATED)
+    assert run("acquire", "run", folder / "LAB.toml", folder / "session") == 0
+    assert run("build-lut", folder / "session", folder / "lut") == 0
     parts = ("--split", "1,1")
     spectra = ("--lights", "2000:10000:2000K,D65")
-    assert run("sim", "table", at / "computed", "--settings", at / "small.toml", *spectra) == 0
-    assert run("generate", at / "computed", at / "dataset", "--sources", at / "pictures", *parts) == 0
-    shutil.copy(at / "dataset" / "gt.txt", at / "gt.txt")
-    assert run("evaluate", "run", at / "dataset", "--out", at / "results") == 0
-    rows = [line.split(",") for line in (at / "dataset" / "ground_truth.csv").read_text().splitlines()[1:]]
+    assert run("sim", "table", folder / "computed", "--settings", folder / "small.toml", *spectra) == 0
+    assert run("generate", folder / "computed", folder / "dataset", "--sources", folder / "pictures", *parts) == 0
+    shutil.copy(folder / "dataset" / "gt.txt", folder / "gt.txt")
+    assert run("evaluate", "run", folder / "dataset", "--out", folder / "results") == 0
+    rows = [line.split(",") for line in (folder / "dataset" / "ground_truth.csv").read_text().splitlines()[1:]]
     estimates = [",".join([row[0], *row[-3:]]) for row in rows]
-    (at / "estimates.csv").write_text("\n".join(["image,r,g,b", *estimates]) + "\n")
+    (folder / "estimates.csv").write_text("\n".join(["image,r,g,b", *estimates]) + "\n")
     page = (Path(__file__).parents[2] / HOW_TO / "evaluate.md").read_text("utf-8")
-    (at / "brightest.py").write_text(page.partition("```python brightest.py\n")[2].partition("```")[0])
-    return at
+    (folder / "brightest.py").write_text(page.partition("```python brightest.py\n")[2].partition("```")[0])
+    return folder
 
 
-def test_every_page_with_commands_is_here() -> None:
+def test_covers_every_page_with_commands() -> None:
     pages = {page.removeprefix(HOW_TO) for page, _ in FOUND if page.startswith(HOW_TO)}
     assert pages - ELSEWHERE == set(PAGES)
 
 
 @pytest.mark.parametrize("name", [name for name, page in PAGES.items() if "" not in page.skipped])
-def test_the_commands_of_a_page_run(
-    name: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_commands_of_page_run(
+    name: str, prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page, done = PAGES[name], 0
-    for needed, what in page.needs.items():
+    page, run_count = PAGES[name], 0
+    for needed, source in page.needs.items():
         (tmp_path / needed).parent.mkdir(parents=True, exist_ok=True)
-        (shutil.copytree if (made / what).is_dir() else shutil.copy)(made / what, tmp_path / needed)
+        (shutil.copytree if (prepared / source).is_dir() else shutil.copy)(prepared / source, tmp_path / needed)
     monkeypatch.chdir(tmp_path)
-    for words in (words for where, words in FOUND if where == HOW_TO + name):
+    for words in (words for page_name, words in FOUND if page_name == HOW_TO + name):
         command = " ".join(words)
         if any(command.startswith(beginning) for beginning in page.skipped):
             continue
         for beginning, result in page.fresh.items():
             if command.startswith(beginning):
                 shutil.rmtree(result, ignore_errors=True)
-        more = [
+        added_words = [
             word for beginning, added in page.added.items() if command.startswith(beginning) for word in added.split()
         ]
-        code = run(*(page.written.get(word, word) for word in words), *more)
-        said = capsys.readouterr()
+        code = run(*(page.written.get(word, word) for word in words), *added_words)
+        output = capsys.readouterr()
         refusal = page.refused.get(command)
         if refusal is not None:
-            assert refusal in " ".join(said.err.split())
-        assert code == (0 if refusal is None else 2), f"{command}: {code}\n{said.out[-2000:]}{said.err[-2000:]}"
-        done += 1
-    assert done
+            assert refusal in " ".join(output.err.split())
+        assert code == (0 if refusal is None else 2), f"{command}: {code}\n{output.out[-2000:]}{output.err[-2000:]}"
+        run_count += 1
+    assert run_count

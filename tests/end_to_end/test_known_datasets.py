@@ -1,4 +1,4 @@
-"""Datasets of every kind of light, mask, variation, rendering, layout and part, as the command made them before."""
+"""Data sets with all kinds of illuminants, masks, variations and layouts equal those of earlier versions."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def picture(name: str, height: int, width: int, seed: int) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Go to a folder with a table, pictures of odd and even sizes, masks, and lists of lights."""
+def work_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Change to a folder with a LUT, pictures of odd and even sizes, masks, and lists of illuminants."""
     folder = tmp_path_factory.mktemp("known")
     with chdir(folder):
         table_in(Path("lut"))
@@ -90,21 +90,19 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_a_dataset(name: str, place: Path, pinned: Pinned) -> None:
+def test_dataset(name: str, work_folder: Path, pinned: Pinned) -> None:
     words = RUNS[name].split()
     if "--sources" not in words:
         words += ["--sources", "cat.png", "--random-scenes", "1:21x16"]
-    out = place / name.replace(" ", "-")
+    out = work_folder / name.replace(" ", "-")
     assert main(["lut", out.name, *words, "--seed", "5", "--workers", "1"]) in (0, 1)
     pinned(f"dataset, {name}", data_set_content(out))
 
 
-def test_scenes_under_the_lights_of_another_table(
-    place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]
-) -> None:
-    table_in(place / "other", order=(3, 1, 0, 2))
+def test_illuminants_of_other_data_set(work_folder: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
+    table_in(work_folder / "other", order=(3, 1, 0, 2))
     first = "--sources small --random-scenes 2:9x7 --seed 6 --max-side 30 --rendering codes"
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name, lights in (
         ("single", "--light 0,3"),
         ("mixed", "--light 0:.3+2:.7"),
@@ -115,31 +113,31 @@ def test_scenes_under_the_lights_of_another_table(
         for table in ("lut", "other") if name == "single" else ("other",):
             words = f"{table} again-{name}-{table} --lights-of first-{name} --sources small --rendering codes"
             code = main(words.split())
-            again = place / f"again-{name}-{table}"
-            found[f"{name} {table}"] = {"failed": code} if code else data_set_content(again)
-    pinned("datasets under the lights of others", found)
+            repeated = work_folder / f"again-{name}-{table}"
+            results[f"{name} {table}"] = {"failed": code} if code else data_set_content(repeated)
+    pinned("datasets under the lights of others", results)
 
 
-def test_a_dataset_in_shares(place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
+def test_data_set_in_parts(work_folder: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
     plan = "lut shares --random-scenes 7:12x9 --random 2 --rendering codes --seed 1 --shard-images 3"
-    found: list[Any] = []
+    results: list[Any] = []
 
     def run(words: str) -> None:
-        found.append([main([*words.split(), "--json"]), *told(capsys)])
+        results.append([main([*words.split(), "--json"]), *printed_json(capsys)])
 
     for words in (f"{plan} --shard 0/2", f"{plan} --shard 2/2", f"{plan} --shard 1/2", plan, plan):
         run(words)
     run("--verify shares")
-    found.append(data_set_content(place / "shares"))
-    (place / "shares/images/000003.png").write_bytes(b"1")
-    (place / "shares/images/000004.png").unlink()
-    (place / "shares/new.txt").touch()
+    results.append(data_set_content(work_folder / "shares"))
+    (work_folder / "shares/images/000003.png").write_bytes(b"1")
+    (work_folder / "shares/images/000004.png").unlink()
+    (work_folder / "shares/new.txt").touch()
     run("--verify shares")
-    pinned("a dataset in shares", found)
+    pinned("a dataset in shares", results)
 
 
-def told(capsys: pytest.CaptureFixture[str]) -> list[Any]:
-    """Return what was printed, without the speed."""
+def printed_json(capsys: pytest.CaptureFixture[str]) -> list[Any]:
+    """Return the printed object without the speed."""
     printed = json.loads(capsys.readouterr().out or "{}")
     return [printed]
 
@@ -173,23 +171,25 @@ DAMAGES: dict[str, list[tuple[str, str]]] = {
 }
 
 
-def test_damaged_datasets(place: Path, pinned: Pinned) -> None:
+def test_damaged_datasets(work_folder: Path, pinned: Pinned) -> None:
     plan = "lut damaged --random-scenes 2:9x8 --rendering codes --light 0 --no-preview"
     assert main(plan.split()) == 0
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name, changes in DAMAGES.items():
-        path = place / "damaged" / name
-        whole = path.read_bytes()
+        path = work_folder / "damaged" / name
+        intact = path.read_bytes()
         for old, new in changes:
-            path.write_bytes(whole.replace(old.encode(), new.encode(), 1))
-            told: list[Any] = []
+            path.write_bytes(intact.replace(old.encode(), new.encode(), 1))
+            outcome: list[Any] = []
             try:
-                told.append(len(list(file_faults(place / "damaged"))))
-                dataset = open_dataset(place / "damaged")
-                told += [[entry.image, entry.truth, dataset.read_image(entry).tobytes()] for entry in dataset.entries]
-                told.append(len(dataset.sources))
+                outcome.append(len(list(file_faults(work_folder / "damaged"))))
+                dataset = open_dataset(work_folder / "damaged")
+                outcome += [
+                    [entry.image, entry.truth, dataset.read_image(entry).tobytes()] for entry in dataset.entries
+                ]
+                outcome.append(len(dataset.sources))
             except CropError:
-                told.append({"refused": 1})
-            found[f"{name} {old!r} {new!r}"] = told
-        path.write_bytes(whole)
-    pinned("damaged datasets", found)
+                outcome.append({"refused": 1})
+            results[f"{name} {old!r} {new!r}"] = outcome
+        path.write_bytes(intact)
+    pinned("damaged datasets", results)

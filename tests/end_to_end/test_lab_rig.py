@@ -1,8 +1,8 @@
-"""A real lab in which nothing but the world is simulated: every wire and cable is the one that real devices use.
+"""A real laboratory in which only the world is simulated, with the wires and cables of real devices.
 
-The camera hangs on loopback PTP/IP, or on the simulated USB bus; the projector on loopback PJLink, or on a
-pseudo-terminal; the light is a window on a virtual X display, which the world watches from outside. The frames are
-those of `rig = "simulated"` with the same seed.
+The camera uses PTP/IP on loopback or the simulated USB bus; the projector PJLink on loopback or a pseudo-terminal. The
+light is a window on a virtual X display, which the world observes. The frames equal those of `rig = "simulated"` with
+the same seed.
 """
 
 from __future__ import annotations
@@ -59,34 +59,34 @@ white_level_share = 3.5
 
 
 def simulated_display(display: str | int | None, clock: Clock) -> SimulatedPresenter:
-    """Stand in for `FullScreen`: whatever display this machine has stays dark."""
+    """Replace `FullScreen`, so that displays of this machine stay dark."""
     return SimulatedPresenter(Screen(), clock)
 
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the session that the simulated lab takes in that room."""
+    """Return the session that the simulated laboratory takes in that room."""
     lab = make_lab(tmp_path_factory.mktemp("simulated"))
     lab.write_text(lab.read_text() + ROOM)
-    assert run_session(load_lab(lab), lab.parent / "session", lambda done, total: None).complete
+    assert run_session(load_lab(lab), lab.parent / "session", lambda count, total: None).complete
     return lab.parent / "session"
 
 
 @pytest.mark.parametrize("cables", ["network", "usb and serial"])
-def test_a_real_lab_takes_the_frames_of_the_simulated_one(
+def test_real_lab_takes_frames_of_simulated_lab(
     lab: Path, simulated: Path, cables: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = lab.parent
     lab.write_text(lab.read_text() + ROOM)
     settings = load_lab(lab)
-    with ExitStack() as opened:
-        screen = opened.enter_context(virtual_screen(folder, "320x240"))
+    with ExitStack() as stack:
+        screen = stack.enter_context(virtual_screen(folder, "320x240"))
         monkeypatch.setenv("DISPLAY", screen.display)
         monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
         def look() -> Colour:
             colours = np.unique(screen.picture())
-            assert len(colours) == 1, "the screen is not of one plain colour"
+            assert len(colours) == 1, "the screen is not one plain colour"
             code = int(colours[0])
             return Colour(code >> 16 & 255, code >> 8 & 255, code & 255)
 
@@ -94,42 +94,42 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
         beamer = SimulatedProjector(clock, power=Power.ON)
         world = World(sheet(load_chart(settings.chart)), simulated_body(settings), simulated_room(settings))
         film = WorldFilm(world, look, beamer.light, "0000000001", {})
-        executor = opened.enter_context(ThreadPoolExecutor(1))
+        executor = stack.enter_context(ThreadPoolExecutor(1))
         world.expose(Colour(0, 0, 0), settings.camera.exposure, key=(0,))  # renders before time counts
         eos = SimulatedEos(EOS_BODIES["Test"], film, clock, auto_power_off_s=0, executor=executor)
         bus = SimulatedBus()
         text = lab.read_text().replace('rig = "simulated"', 'rig = "lab"')
         text = text.replace("[sequence]\n", "[sequence]\nsettle_s = 0.0\n")
         if cables == "network":
-            _, port = opened.enter_context(serve_ptpip(eos, 0)).address
-            _, control = opened.enter_context(serve_pjlink(beamer, 0, PASSWORD)).address
+            _, port = stack.enter_context(serve_ptpip(eos, 0)).address
+            _, control = stack.enter_context(serve_pjlink(beamer, 0, PASSWORD)).address
             monkeypatch.setenv("LAB_PROJECTOR", PASSWORD)
             text += f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\nport = {port}\n'
             text += f'[lab.projector]\ncontrol = "pjlink"\nhost = "127.0.0.1"\nport = {control}\n'
             text += 'password = { env = "LAB_PROJECTOR" }\n'
         else:
             bus.plug(PtpUsbDevice(eos))
-            terminal = opened.enter_context(PseudoTerminal(LinePeer(beamer, load_language("benq"))))
+            terminal = stack.enter_context(PseudoTerminal(LinePeer(beamer, load_language("benq"))))
             text += '[lab.camera]\nconnection = "usb"\n'
             text += f'[lab.projector]\ncontrol = "serial"\nlanguage = "benq"\ndevice = "{terminal.path}"\n'
         lab.write_text(text)
         monkeypatch.setattr("acquisition.run.rig.lab.open_usb", partial(open_usb, backend=bus))
-        assert run_session(load_lab(lab), folder / "real", lambda done, total: None).complete
+        assert run_session(load_lab(lab), folder / "real", lambda count, total: None).complete
         assert beamer.power() is not Power.ON, "a complete session switches the lamp off"
-        assert look() == Colour(0, 0, 0), "the screen is black when the lab is left"
+        assert look() == Colour(0, 0, 0), "the screen is black at the end"
     assert files_with(folder / "real", PASSWORD) == []
-    with Session.open(simulated) as there, Session.open(folder / "real") as real:
-        pairs = list(zip(there.frames(), real.frames(), strict=True))
+    with Session.open(simulated) as simulated_session, Session.open(folder / "real") as real_session:
+        pairs = list(zip(simulated_session.frames(), real_session.frames(), strict=True))
         assert len(pairs) == FRAMES
-        for ours, theirs in pairs:
-            assert (ours.kind, ours.illumination) == (theirs.kind, theirs.illumination)
-            one = read_raw(there.folder / ours.file)
-            other = read_raw(real.folder / theirs.file)
-            np.testing.assert_array_equal(one.sensor, other.sensor)
-            assert theirs.taken_at > SIM_START
+        for simulated_frame, real_frame in pairs:
+            assert (simulated_frame.kind, simulated_frame.illumination) == (real_frame.kind, real_frame.illumination)
+            simulated_raw = read_raw(simulated_session.folder / simulated_frame.file)
+            real_raw = read_raw(real_session.folder / real_frame.file)
+            np.testing.assert_array_equal(simulated_raw.sensor, real_raw.sensor)
+            assert real_frame.taken_at > SIM_START
 
 
-def test_check_reports_what_may_alter_the_light(
+def test_check_reports_changes_of_light(
     lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class WarningPresenter(SimulatedPresenter):
@@ -145,19 +145,19 @@ def test_check_reports_what_may_alter_the_light(
     assert "warming up: the lamp was just lit; the run waits 20 min 00 s" in printed.err
 
 
-@pytest.mark.parametrize("named", ["epson", "languages/lantern.toml"])
-def test_a_makers_language_over_the_network(lab: Path, named: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("language_name", ["epson", "languages/lantern.toml"])
+def test_maker_language_over_network(lab: Path, language_name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
     monkeypatch.setattr("acquisition.run.rig.lab.CanonEos", Mock())
     (lab.parent / "languages").mkdir(exist_ok=True)
     (lab.parent / "languages" / "lantern.toml").write_text(TEXT)
     beamer = SimulatedProjector(SystemClock(), power=Power.ON)
-    language = MADE_UP if named.endswith(".toml") else load_language(named)
+    language = MADE_UP if language_name.endswith(".toml") else load_language(language_name)
     with serve_peer(lambda: LinePeer(beamer, language, network=True)) as server:
         host, port = server.address
         text = lab.read_text().replace('rig = "simulated"', 'rig = "lab"')
         text += '[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\n'
-        text += f'[lab.projector]\ncontrol = "serial"\nlanguage = "{named}"\n'
+        text += f'[lab.projector]\ncontrol = "serial"\nlanguage = "{language_name}"\n'
         lab.write_text(text + f'host = "{host}"\nport = {port}\n')
         settings = load_lab(lab)
         with open_rig(settings, load_chart(settings.chart)) as devices:

@@ -1,6 +1,6 @@
-"""What goes wrong when a real lab is set up: `acquire check` and `acquire run` tell it in one sentence with its remedy.
+"""Set-up faults of a real laboratory: `acquire check` and `acquire run` report each in one sentence with its remedy.
 
-The devices are simulated at the ends of real cables; where a display would be needed, a presenter stands in for it.
+The devices are simulated at the ends of real cables; a simulated presenter replaces the display.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DESK = Display(1, "DP-1", 0, 0, 2560, 1440, 60)
 
 @dataclass
 class Bench:
-    """A lab.toml in the making, and the devices that it will meet."""
+    """A LAB.toml under construction, and its devices."""
 
     lab: Path
     monkeypatch: pytest.MonkeyPatch
@@ -46,14 +46,14 @@ class Bench:
     bus: SimulatedBus = field(default_factory=SimulatedBus)
 
     def plug(self, serial: str = "1") -> PtpUsbDevice:
-        """Put a camera on the bus."""
+        """Connect a camera to the bus."""
         eos = SimulatedEos(EOS_BODIES["EOS 550D"], SeededFilm(1000), SystemClock(), serial=serial)
         device = PtpUsbDevice(eos, UsbIdentity(*eos.body.usb, serial=serial))
         self.bus.plug(device)
         return device
 
-    def told(self, text: str) -> tuple[int, str]:
-        """Return the exit code and what both commands say, a sentence or one for each device; it is the same."""
+    def messages_of(self, text: str) -> tuple[int, str]:
+        """Return the exit code and the message, which must be equal for both commands."""
         self.lab.write_text(self.lab.read_text().replace('rig = "simulated"', 'rig = "lab"') + text)
         outcomes = [self._outcome("check", str(self.lab)), self._outcome("run", str(self.lab), str(self.session))]
         assert outcomes[0] == outcomes[1]
@@ -65,10 +65,10 @@ class Bench:
 
     def _outcome(self, *arguments: str) -> tuple[int, str]:
         code = main(arguments)
-        said = self.capsys.readouterr().err
-        assert said.count("error: ") == 1
-        # What was left of a time limit is never twice the same.
-        return code, re.sub(r"\b0\.0\d+ s", "0.05 s", said.partition("error: ")[2].rstrip())
+        message = self.capsys.readouterr().err
+        assert message.count("error: ") == 1
+        # Remaining times differ from run to run.
+        return code, re.sub(r"\b0\.0\d+ s", "0.05 s", message.partition("error: ")[2].rstrip())
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def bench(lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
 
 @pytest.fixture
 def camera() -> Iterator[str]:
-    """Return the table of a camera that answers on the loopback."""
+    """Return the settings of a camera that answers on loopback."""
     eos = SimulatedEos(EOS_BODIES["Test"], SeededFilm(1000), SystemClock(), auto_power_off_s=0)
     with serve_ptpip(eos, 0) as server:
         yield f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\nport = {server.address[1]}\n'
@@ -116,74 +116,74 @@ def free_port() -> int:
         ('control = "serial"\nlanguage = "epson"\nbaud = 12345678901\ndevice = "{port}"', "set another speed"),
     ],
 )
-def test_a_cable_that_cannot_be(bench: Bench, camera: str, text: str, words: str) -> None:
+def test_refuses_impossible_cable(bench: Bench, camera: str, text: str, words: str) -> None:
     with PseudoTerminal(LinePeer(SimulatedProjector(SystemClock()), load_language("epson"))) as terminal:
-        code, said = bench.told(f"{camera}[lab.projector]\n{text.format(port=terminal.path)}\n")
+        code, message = bench.messages_of(f"{camera}[lab.projector]\n{text.format(port=terminal.path)}\n")
     assert code == 2
-    assert words in said
+    assert words in message
 
 
-def test_a_serial_port_that_is_not_there(bench: Bench, camera: str) -> None:
-    code, said = bench.told(
+def test_reports_missing_serial_port(bench: Bench, camera: str) -> None:
+    code, message = bench.messages_of(
         f'{camera}[lab.projector]\ncontrol = "serial"\nlanguage = "benq"\ndevice = "/dev/ttyCROP9"\n'
     )
     assert code == 3
-    assert said.startswith("projector: serial port /dev/ttyCROP9 does not exist; present: ")
+    assert message.startswith("projector: serial port /dev/ttyCROP9 does not exist; present: ")
 
 
-def test_another_language_than_the_projectors(bench: Bench, camera: str) -> None:
+def test_reports_wrong_language(bench: Bench, camera: str) -> None:
     with PseudoTerminal(LinePeer(SimulatedProjector(SystemClock()), load_language("epson"))) as terminal:
-        code, said = bench.told(
+        code, message = bench.messages_of(
             f'{camera}[lab.projector]\ncontrol = "serial"\nlanguage = "optoma"\ndevice = "{terminal.path}"\n'
         )
     assert code == 3
-    assert "answers 'ERR" in said
-    assert "check speed and parity against the projector's menu, and that the language is the correct one" in said
+    assert "answers 'ERR" in message
+    assert "check speed and parity against the projector's menu, and that the language is the correct one" in message
 
 
-def test_a_port_at_which_nobody_listens(bench: Bench, camera: str) -> None:
-    code, said = bench.told(camera + pjlink(port := free_port()))
+def test_reports_closed_port(bench: Bench, camera: str) -> None:
+    code, message = bench.messages_of(camera + pjlink(port := free_port()))
     assert code == 3
-    assert said == (
+    assert message == (
         f"projector: nothing listens at 127.0.0.1:{port}; check the port, and that network control is enabled on the "
         "device"
     )
 
 
-def test_a_projector_that_does_not_answer(bench: Bench, camera: str) -> None:
+def test_reports_silent_projector(bench: Bench, camera: str) -> None:
     bench.monkeypatch.setattr("acquisition.run.rig.lab.PjLinkProjector", partial(PjLinkProjector, timeout=0.05))
 
-    def say_nothing(link: TcpLink) -> None:
+    def stay_silent(link: TcpLink) -> None:
         link.read(1, 60.0)
 
-    with TcpServer(say_nothing) as server:
-        code, said = bench.told(camera + pjlink(server.address[1]))
+    with TcpServer(stay_silent) as server:
+        code, message = bench.messages_of(camera + pjlink(server.address[1]))
     assert code == 3
-    assert "has not answered within 0.05 s" in said
-    assert "check that it is on the network" in said
+    assert "has not answered within 0.05 s" in message
+    assert "check that it is on the network" in message
 
 
-def test_a_display_and_a_camera_that_are_not_there(bench: Bench) -> None:
-    code, said = bench.told('[lab.light]\ndisplay = "HDMI-1"\n')
-    # The camera is asked all the same; a device's fault decides the code.
+def test_reports_missing_display_and_camera(bench: Bench) -> None:
+    code, message = bench.messages_of('[lab.light]\ndisplay = "HDMI-1"\n')
+    # The camera is still tested; the fault of a device determines the exit code.
     assert code == 3
-    assert "display 'HDMI-1' is not connected" in said
-    assert str(DESK) in said
-    assert "no camera with vendor 04a9 on USB; present: none" in said
+    assert "display 'HDMI-1' is not connected" in message
+    assert str(DESK) in message
+    assert "no camera with vendor 04a9 on USB; present: none" in message
 
 
-def test_two_cameras_of_which_none_is_named(bench: Bench) -> None:
+def test_refuses_ambiguous_cameras(bench: Bench) -> None:
     bench.plug("1")
     bench.plug("2")
-    code, said = bench.told("")
+    code, message = bench.messages_of("")
     assert code == 2
-    assert "2 cameras on USB match, 1 expected: " in said
-    assert "set a serial number or port" in said
+    assert "2 cameras on USB match, 1 expected: " in message
+    assert "set a serial number or port" in message
 
 
-def test_what_answers_at_the_cameras_port_is_none(bench: Bench) -> None:
+def test_reports_wrong_device_at_camera_port(bench: Bench) -> None:
     with serve_pjlink(SimulatedProjector(SystemClock(), power=Power.ON), 0) as server:
         port = server.address[1]
-        code, said = bench.told(f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\nport = {port}\n')
+        code, message = bench.messages_of(f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\nport = {port}\n')
     assert code == 3
-    assert f"the camera at 127.0.0.1:{port} sent no valid PTP/IP reply" in said
+    assert f"the camera at 127.0.0.1:{port} sent no valid PTP/IP reply" in message

@@ -1,4 +1,4 @@
-"""What is deleted, replaced or cut under a run is noticed, and nothing is lost: the facts stand in a second place."""
+"""A journal that is deleted, replaced or cut during a run is noticed, and can be rebuilt from the ledger."""
 
 from __future__ import annotations
 
@@ -37,45 +37,45 @@ def lab(tmp_path: Path) -> Lab:
     return Lab(tmp_path / "session", lights=LIGHTS, reference_every=3)
 
 
-def run(lab: Lab, after: int = 0, happens: Callable[[Path], object] = lambda folder: None) -> RunOutcome:
-    """Take the session; `happens` is called once when so many frames were judged."""
+def run(lab: Lab, after: int = 0, mishap: Callable[[Path], object] = lambda folder: None) -> RunOutcome:
+    """Take the session; call `mishap` once after `after` judged frames."""
     judged = 0
 
     def observe(taken: Taken) -> None:
         nonlocal judged
         judged += 1
         if judged == after:
-            happens(lab.session.folder)
+            mishap(lab.session.folder)
 
     return take_session(lab.session, lab.devices, SETTINGS, observe=observe)
 
 
-def deleted(folder: Path) -> None:
+def delete(folder: Path) -> None:
     (folder / "journal.sqlite").unlink()
 
 
-def cut(folder: Path) -> None:
+def cut_half(folder: Path) -> None:
     path = folder / "journal.sqlite"
     os.truncate(path, path.stat().st_size // 2)
 
 
-def emptied(folder: Path) -> None:
+def empty(folder: Path) -> None:
     os.truncate(folder / "journal.sqlite", 0)
 
 
-def replaced(folder: Path) -> None:
+def replace_by_copy(folder: Path) -> None:
     copy = folder / "copy"
     shutil.copyfile(folder / "journal.sqlite", copy)
     copy.replace(folder / "journal.sqlite")
 
 
-def overwritten(folder: Path) -> None:
+def overwrite(folder: Path) -> None:
     path = folder / "journal.sqlite"
     with path.open("r+b") as stream:
         stream.write(bytes(path.stat().st_size))
 
 
-def overwritten_by_another(folder: Path) -> None:
+def overwrite_by_other(folder: Path) -> None:
     other = folder.parent / "other.sqlite"
     Journal.create(other, ())
     other.write_bytes(other.read_bytes().ljust((folder / "journal.sqlite").stat().st_size, b"\0"))
@@ -83,47 +83,47 @@ def overwritten_by_another(folder: Path) -> None:
         stream.write(other.read_bytes())
 
 
-def log_deleted(folder: Path) -> None:
+def delete_log(folder: Path) -> None:
     (folder / "journal.sqlite-wal").unlink()
 
 
-def log_cut(folder: Path) -> None:
+def cut_log(folder: Path) -> None:
     os.truncate(folder / "journal.sqlite-wal", 40)
 
 
-def both_deleted(folder: Path) -> None:
+def delete_both(folder: Path) -> None:
     ledger_path(folder).unlink()
-    deleted(folder)
+    delete(folder)
 
 
-MISHAPS = (both_deleted, deleted, cut, emptied, replaced, overwritten, overwritten_by_another, log_deleted, log_cut)
+MISHAPS = (delete_both, delete, cut_half, empty, replace_by_copy, overwrite, overwrite_by_other, delete_log, cut_log)
 
 
 def facts(folder: Path) -> Rows:
-    """Return what the journal says, as every reader sees it."""
+    """Return the rows of the journal as readers see them."""
     with closing(open_to_read(folder / "journal.sqlite")) as connection:
         return rows_of(connection)
 
 
 @pytest.mark.parametrize(
-    ("happens", "frame"),
-    [*zip(MISHAPS, itertools.cycle((2, 7, 12)), strict=False), (deleted, 12), (log_deleted, 12)],
+    ("mishap", "frame"),
+    [*zip(MISHAPS, itertools.cycle((2, 7, 12)), strict=False), (delete, 12), (delete_log, 12)],
 )
-def test_a_lost_journal_ends_the_run_and_is_made_anew(lab: Lab, happens: Callable[[Path], object], frame: int) -> None:
+def test_lost_journal_ends_run_and_is_rebuilt(lab: Lab, mishap: Callable[[Path], object], frame: int) -> None:
     folder = lab.session.folder
-    assert len(lab.session.steps) == 12, "after the last frame it happens, too"
+    assert len(lab.session.steps) == 12, "the last case happens after the last frame"
     with pytest.raises(LostJournalError, match="acquire rebuild"):
-        run(lab, frame, happens)
+        run(lab, frame, mishap)
     assert lab.camera.captures <= frame + 2, "noticed at the next frame"
     lab.session.close()
-    known = read_ledger(ledger_path(folder))
-    accepted = [row for row in known["attempts"].values() if row["verdict"] == ACCEPTED]
+    ledger = read_ledger(ledger_path(folder))
+    accepted = [row for row in ledger["attempts"].values() if row["verdict"] == ACCEPTED]
     assert len(accepted) >= frame
     assert all((folder / row["file"]).stat().st_size == row["size"] for row in accepted)
-    # Of a log that is cut SQLite cannot read which number the event would have.
-    assert happens is log_cut or any(row["what"] == "ended" for row in known["events"].values())
+    # If the log is cut, SQLite cannot read the number of the event.
+    assert mishap is cut_log or any(row["what"] == "ended" for row in ledger["events"].values())
     assert main(["rebuild", str(folder)]) == 0
-    assert facts(folder) == known
+    assert facts(folder) == ledger
     assert main(["status", str(folder)]) == 0
     assert read_session(folder).head(lab.clock.now()).done == len(accepted)
     lab.session = Session.open_for_run(folder)
@@ -132,7 +132,7 @@ def test_a_lost_journal_ends_the_run_and_is_made_anew(lab: Lab, happens: Callabl
     lab.session.close()
 
 
-def test_the_ledger_equals_the_journal_after_every_kind_of_end(lab: Lab) -> None:
+def test_ledger_equals_journal_after_every_end(lab: Lab) -> None:
     lab.camera.script |= {2: b"no raw file", 5: StorageError("lost")}
     with pytest.raises(StorageError):
         run(lab)
@@ -146,62 +146,62 @@ def test_the_ledger_equals_the_journal_after_every_kind_of_end(lab: Lab) -> None
     lab.session.journal.record("camera", "one")
     lab.session.journal.record("camera", "another")
     lab.session.close()
-    before = facts(folder)
-    assert before == read_ledger(ledger_path(folder))
+    rows = facts(folder)
+    assert rows == read_ledger(ledger_path(folder))
     (folder / "journal.sqlite").unlink()
     rebuild_journal(folder)
-    assert facts(folder) == before
+    assert facts(folder) == rows
 
 
-def test_the_same_command_makes_a_journal_anew_that_is_gone(lab: Lab) -> None:
+def test_same_command_rebuilds_missing_journal(lab: Lab) -> None:
     run(lab)
     lab.session.close()
     folder = lab.session.folder
-    before, said = facts(folder), list[str]()
-    deleted(folder)
+    rows, messages = facts(folder), list[str]()
+    delete(folder)
     with pytest.raises(FormatError, match="acquire rebuild") as refused:
         Session.open(folder)
     assert "remove" not in str(refused.value)
     assert session_exists(folder)
-    with Session.open_for_run(folder, announce=said.append):
-        assert facts(folder) == before
-    assert [sentence.split(":")[0] for sentence in said] == ["journal"]
+    with Session.open_for_run(folder, announce=messages.append):
+        assert facts(folder) == rows
+    assert [sentence.split(":")[0] for sentence in messages] == ["journal"]
 
 
-def test_a_session_of_older_software_without_its_journal_is_not_to_be_removed(lab: Lab) -> None:
+def test_refuses_old_session_without_journal(lab: Lab) -> None:
     lab.session.close()
     folder = lab.session.folder
-    deleted(folder)
+    delete(folder)
     ledger_path(folder).unlink()
     with pytest.raises(FormatError) as refused:
         session_exists(folder)
     assert "remove" not in str(refused.value)
 
 
-def test_an_older_journal_in_its_place_is_refused_and_kept(lab: Lab) -> None:
+def test_refuses_and_keeps_older_journal(lab: Lab) -> None:
     folder = lab.session.folder
     lab.session.close()
-    older = (folder / "journal.sqlite").read_bytes()
+    old_journal = (folder / "journal.sqlite").read_bytes()
     lab.session = Session.open_for_run(folder)
     run(lab)
     lab.session.close()
-    known = read_ledger(ledger_path(folder))
-    (folder / "journal.sqlite").write_bytes(older)
+    ledger = read_ledger(ledger_path(folder))
+    (folder / "journal.sqlite").write_bytes(old_journal)
     with pytest.raises(FormatError, match="lacks 12 frames"):
         Session.open_for_run(folder)
     assert main(["rebuild", str(folder)]) == 0
-    assert facts(folder) == known
+    assert facts(folder) == ledger
     assert (folder / "journal.sqlite.1.lost").is_file()
 
 
-def test_a_ledger_that_is_gone_is_written_again(lab: Lab) -> None:
+def test_rewrites_missing_ledger(lab: Lab) -> None:
     path = ledger_path(lab.session.folder)
     assert run(lab, 4, lambda folder: path.unlink()).complete
     lab.session.close()
     assert read_ledger(path) == facts(lab.session.folder)
 
 
-def test_a_ledger_that_was_cut_off_by_a_crash_follows_the_journal(lab: Lab) -> None:
+def test_completes_ledger_cut_by_crash(lab: Lab) -> None:
     run(lab)
     lab.session.close()
     path = ledger_path(lab.session.folder)
@@ -210,20 +210,27 @@ def test_a_ledger_that_was_cut_off_by_a_crash_follows_the_journal(lab: Lab) -> N
     assert read_ledger(path) == facts(lab.session.folder)
 
 
-def test_a_transaction_that_never_was_is_no_fact(lab: Lab) -> None:
-    """Power went when the ledger had a line, and the journal had not committed it."""
+def test_ignores_ledger_line_without_commit(lab: Lab) -> None:
+    """The power failed after the ledger line and before the commit of the journal."""
     lab.session.close()
     path = ledger_path(lab.session.folder)
-    begun = {"id": 1, "step": 0, "kind": "white", "illumination": None, "file": "frames/a", "started_at": "2026-01-01"}
+    attempt = {
+        "id": 1,
+        "step": 0,
+        "kind": "white",
+        "illumination": None,
+        "file": "frames/a",
+        "started_at": "2026-01-01",
+    }
     with path.open("a") as stream:
-        stream.write(json.dumps({"attempts": [begun | {"sha256": "00", "verdict": ACCEPTED}]}) + "\n")
+        stream.write(json.dumps({"attempts": [attempt | {"sha256": "00", "verdict": ACCEPTED}]}) + "\n")
     lab.session = Session.open_for_run(lab.session.folder)
     assert read_ledger(path) == facts(lab.session.folder)
     assert run(lab).complete
 
 
 @pytest.mark.parametrize("line", ['{"attempts": [{"id": 1, "x y": 2}]}', "[]", '{"heartbeat": [{"id": 1}]}', "no"])
-def test_a_ledger_of_a_stranger_becomes_no_statement(lab: Lab, line: str) -> None:
+def test_refuses_foreign_ledger(lab: Lab, line: str) -> None:
     lab.session.close()
     path = ledger_path(lab.session.folder)
     path.write_text(line + "\n" + path.read_text())
@@ -232,7 +239,7 @@ def test_a_ledger_of_a_stranger_becomes_no_statement(lab: Lab, line: str) -> Non
 
 
 @pytest.mark.parametrize(("mishap", "after"), [(Path.unlink, 4), (lambda path: os.truncate(path, 9), 12)])  # type: ignore[misc]
-def test_a_frame_that_is_deleted_or_cut_is_taken_again(lab: Lab, mishap: Callable[[Path], object], after: int) -> None:
+def test_repeats_deleted_or_cut_frame(lab: Lab, mishap: Callable[[Path], object], after: int) -> None:
     folder = lab.session.folder
     assert run(lab, after, lambda folder: mishap(folder / "frames" / "0002_light_000.dng")).complete
     assert len(lab.session.done_steps()) == len(lab.session.steps)
@@ -241,7 +248,7 @@ def test_a_frame_that_is_deleted_or_cut_is_taken_again(lab: Lab, mishap: Callabl
     assert (folder / "frames" / "0002_light_000_try2.dng").is_file()
 
 
-def test_a_program_that_writes_the_journal_and_leaves_its_facts_alone_ends_no_run(lab: Lab) -> None:
+def test_foreign_heartbeat_does_not_end_run(lab: Lab) -> None:
     folder = lab.session.folder
 
     def beat(folder: Path) -> None:
@@ -252,39 +259,39 @@ def test_a_program_that_writes_the_journal_and_leaves_its_facts_alone_ends_no_ru
     assert facts(folder) == read_ledger(ledger_path(folder))
 
 
-def test_no_command_believes_a_journal_that_the_ledger_contradicts(
+def test_commands_refuse_journal_contradicted_by_ledger(
     lab: Lab, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is whole, sound, and says that the session is complete: by a frame that must not be used any more."""
-    older = lab.session.folder
+    """The journal is intact and the session complete, but with a frame that must no longer be used."""
+    old_journal = lab.session.folder
     run(lab)
     lab.session.close()
-    journal = (older / "journal.sqlite").read_bytes()
-    lab.session = Session.open_for_run(older)
+    journal = (old_journal / "journal.sqlite").read_bytes()
+    lab.session = Session.open_for_run(old_journal)
     lab.session.retake("1")
     assert run(lab).complete
     lab.session.close()
-    (older / "journal.sqlite").write_bytes(journal)
-    (older.parent / "LAB.toml").write_text(SETTINGS.to_toml())
-    monkeypatch.chdir(older.parent)
+    (old_journal / "journal.sqlite").write_bytes(journal)
+    (old_journal.parent / "LAB.toml").write_text(SETTINGS.to_toml())
+    monkeypatch.chdir(old_journal.parent)
     for command in (["status"], ["report"], ["run", "LAB.toml"]):
-        assert main([*command, str(older)]) == 2
+        assert main([*command, str(old_journal)]) == 2
         assert "acquire rebuild" in capsys.readouterr().err, command
     with pytest.raises(FormatError, match="lacks 4 frames"):
-        Session.open(older)
-    watch = SessionWatch(older)
+        Session.open(old_journal)
+    watch = SessionWatch(old_journal)
     assert (watch.head().state, "acquire rebuild" in watch.head().sentence) == ("unreadable", True)
 
 
-def test_a_page_without_its_journal_names_what_makes_it_anew(lab: Lab) -> None:
+def test_page_names_rebuild_command(lab: Lab) -> None:
     watch = SessionWatch(lab.session.folder)
     assert watch.head().total
-    deleted(lab.session.folder)
+    delete(lab.session.folder)
     assert "acquire rebuild" in watch.head().sentence
 
 
 @pytest.mark.parametrize("mishap", [Path.unlink, lambda path: os.truncate(path, 9)])  # type: ignore[misc]
-def test_a_complete_session_whose_files_go_is_complete_no_more(
+def test_session_with_lost_file_is_incomplete(
     lab: Lab, mishap: Callable[[Path], object], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = lab.session.folder
@@ -295,7 +302,7 @@ def test_a_complete_session_whose_files_go_is_complete_no_more(
     assert watch.head().state == "complete"
     mishap(folder / "frames" / "0002_light_000.dng")
     clock.sleep(LOOK_AGAIN_S)
-    assert watch.head().state == "incomplete", "a page that is open looks again"
+    assert watch.head().state == "incomplete", "an open page checks again"
     assert main(["status", str(folder)]) == 4
     assert "incomplete: frames/0002_light_000.dng: deleted or truncated" in capsys.readouterr().out
     assert read_session(folder).head(lab.clock.now()).done == len(lab.session.steps) - 1
@@ -305,19 +312,19 @@ def test_a_complete_session_whose_files_go_is_complete_no_more(
     ("name", "mishap"),
     [("chart.json", Path.unlink), ("illuminations.csv", lambda path: os.truncate(path, 9))],  # type: ignore[misc]
 )
-def test_a_complete_session_without_its_chart_or_lights_says_what_is_lost(
+def test_reports_lost_chart_or_illuminants(
     lab: Lab, name: str, mishap: Callable[[Path], object], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """All frames are there, and no table can be made of them."""
+    """All frames exist, but no LUT can be built from them."""
     folder = lab.session.folder
     run(lab)
     lab.session.close()
-    kept = (folder / name).read_bytes()
+    content = (folder / name).read_bytes()
     mishap(folder / name)
     assert main(["status", str(folder)]) == 4
-    said = capsys.readouterr()
-    assert "incomplete" in said.out
-    assert str(folder / name) in said.err
-    assert "restore it from a copy" in said.err
-    (folder / name).write_bytes(kept)
+    output = capsys.readouterr()
+    assert "incomplete" in output.out
+    assert str(folder / name) in output.err
+    assert " from a copy" in output.err
+    (folder / name).write_bytes(content)
     assert main(["status", str(folder)]) == 0

@@ -1,4 +1,4 @@
-"""A disk without locks, as some network file systems are: every command goes on, and says so once."""
+"""A disk without locks, like some network file systems: every command continues and warns once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
 WARNING = "this file system has no locks; make sure that no other program uses the folder"
 
 
-def test_every_command_goes_on_without_locks(
+def test_commands_continue_without_locks(
     lab: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def flock(handle: int, operation: int) -> None:

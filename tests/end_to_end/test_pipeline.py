@@ -1,4 +1,4 @@
-"""The whole way once, through the commands: chart, lights, session, table, images, evaluation."""
+"""The whole workflow with the commands: chart, illuminants, session, LUT, images, evaluation."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ seed = 11
 
 @pytest.fixture(scope="module")
 def run() -> Run:
-    """Return a function that runs a command as the shell would and returns its exit code."""
+    """Return a function that runs a command as the shell does and returns its exit code."""
 
     def call(module: str, *arguments: object) -> int:
         return importlib.import_module(module).main([*map(str, arguments)])
@@ -50,7 +50,7 @@ def run() -> Run:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory, run: Run) -> Path:
-    """Return a folder with a chart of 512 colours, a session of seven lights, and its table."""
+    """Return a folder with a chart of 512 colours, a session of seven illuminants, and its LUT."""
     folder = tmp_path_factory.mktemp("lab")
     assert run("acquisition.cli", "chart", folder / "chart", "--bits", 3, "--no-tiff") == 0
     lights = folder / "illuminations.csv"
@@ -68,7 +68,7 @@ def lut(built: Path) -> Lut:
 
 @pytest.fixture(scope="module")
 def pictures(built: Path) -> Path:
-    """Return a folder with two pictures: one plain, one with an edge; and one file that is no picture."""
+    """Return a folder with a plain picture, a picture with an edge, and a broken file."""
     folder = built / "pictures"
     folder.mkdir()
     plain = np.full((80, 120, 3), (200, 90, 40), dtype=np.uint8)
@@ -80,7 +80,7 @@ def pictures(built: Path) -> Path:
     return folder
 
 
-def test_the_table_has_the_promised_form(lut: Lut, built: Path) -> None:
+def test_lut_has_documented_format(lut: Lut, built: Path) -> None:
     assert lut.samples.shape == (7, 512, 25, 3)
     assert lut.samples.dtype == np.dtype("<u2")
     assert lut.samples.flags.c_contiguous
@@ -90,7 +90,7 @@ def test_the_table_has_the_promised_form(lut: Lut, built: Path) -> None:
     assert lut.provenance.bits == 3
 
 
-def test_the_ground_truth_is_the_rooms_white(lut: Lut, built: Path) -> None:
+def test_ground_truth_equals_white_of_room(lut: Lut, built: Path) -> None:
     settings = load_lab(built / "LAB.toml")
     with Session.open(built / "session") as session:
         world = World(sheet(session.chart), simulated_body(settings), simulated_room(settings))
@@ -103,18 +103,18 @@ def test_the_ground_truth_is_the_rooms_white(lut: Lut, built: Path) -> None:
 
 @pytest.fixture(scope="module")
 def dataset(built: Path, pictures: Path, run: Run) -> Path:
-    """Return a dataset of the pictures under two lights."""
+    """Return a data set of the pictures under two illuminants."""
     out = built / "dataset"
-    wish = ("--sources", pictures, "--light", "3,5", "--seed", 4, "--rendering", "codes")
-    assert run("generator.cli", built / "lut", out, *wish) == 0
+    options = ("--sources", pictures, "--light", "3,5", "--seed", 4, "--rendering", "codes")
+    assert run("generator.cli", built / "lut", out, *options) == 0
     return out
 
 
-def test_a_generated_patch_has_the_tables_mean(lut: Lut, dataset: Path) -> None:
+def test_generated_area_has_mean_of_lut(lut: Lut, dataset: Path) -> None:
     out = dataset
     with (out / "ground_truth.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == 4, "two pictures under two lights; the broken one is left out"
+    assert len(rows) == 4, "two pictures under two illuminants; the broken one is skipped"
     colour = (200 >> 5) << 6 | (90 >> 5) << 3 | 40 >> 5
     for row in rows:
         image = cv2.imread(str(next((out / "images").glob(f"{row['image'].split('.')[0]}*"))), cv2.IMREAD_UNCHANGED)
@@ -131,12 +131,12 @@ def test_a_generated_patch_has_the_tables_mean(lut: Lut, dataset: Path) -> None:
     assert '"seed"' in (out / "dataset.json").read_text()
 
 
-def test_the_dataset_can_be_evaluated(dataset: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluates_data_set(dataset: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("evaluation.cli", dataset) == 0
     assert "Gray-world" in capsys.readouterr().out
 
 
-def test_a_table_of_another_version_is_named(built: Path, lut: Lut, tmp_path: Path) -> None:
+def test_refuses_lut_of_other_version(built: Path, lut: Lut, tmp_path: Path) -> None:
     head = json.loads((built / "lut" / "lut.json").read_text())
     head["version"] = 2
     for name in ("illuminations.csv", "samples.npy"):
@@ -146,7 +146,7 @@ def test_a_table_of_another_version_is_named(built: Path, lut: Lut, tmp_path: Pa
         open_lut(tmp_path)
 
 
-def test_a_session_without_frames_is_said(built: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refuses_session_without_frames(built: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     settings = load_lab(built / "LAB.toml")
     lights = load_illuminants(settings.illuminations)
     steps = planned_steps(settings, lights)

@@ -1,8 +1,7 @@
-"""A lab is rehearsed with the shipped programs alone: `sim projector`, `sim camera` before a screen, `acquire`.
+"""Rehearse a laboratory with the shipped programs alone: `sim projector`, `sim camera` in front of a screen, `acquire`.
 
-Every program that is there at the same time as others is a process of its own, and the commands are those of
-docs/how-to/rehearsal.md. The screen is an X server without a monitor, with a window manager on it. Nothing waits for a
-time: tests go on when a program has said something.
+Programs that run at the same time are separate processes; the commands are those of docs/how-to/rehearsal.md. The
+screen is an X server without a monitor, with a window manager. Tests wait for output of the programs, not for times.
 """
 
 from __future__ import annotations
@@ -37,14 +36,14 @@ pytestmark = [
 
 HOW_TO = (Path(__file__).parents[2] / "docs" / "how-to" / "rehearsal.md").read_text(encoding="utf-8")
 SIZE = "320x240"
+# Time limit for expected output; reached only by a failing test.
 PATIENCE_S = 180.0
-"""For what must come; nothing takes this long unless it fails."""
 
 PROGRAMS = {"acquire": "acquisition.cli", "build-lut": "calibration.cli", "sim": "synthesis.cli"}
 
 
 def run_here(command: str, folder: Path) -> None:
-    """Run a command of ours to its good end in this process, as one that meets no other program may be run."""
+    """Run one of our commands in this process, which is possible if it meets no other program."""
     name, *words = shlex.split(command)
     with contextlib.chdir(folder):
         assert import_module(PROGRAMS[name]).main(words) == 0
@@ -52,52 +51,54 @@ def run_here(command: str, folder: Path) -> None:
 
 @dataclass
 class Running:
-    """A program under way: what it has said so far, on both its outputs."""
+    """A running program with its output so far."""
 
     process: subprocess.Popen[str]
     lines: list[str] = field(default_factory=list)
-    said: threading.Condition = field(default_factory=threading.Condition)
+    condition: threading.Condition = field(default_factory=threading.Condition)
 
     def read(self) -> None:
         assert self.process.stdout is not None
         with self.process.stdout:
             for line in self.process.stdout:
-                with self.said:
+                with self.condition:
                     self.lines.append(line)
-                    self.said.notify_all()
-        with self.said:
-            self.lines.append(_END)
-            self.said.notify_all()
+                    self.condition.notify_all()
+        with self.condition:
+            self.lines.append(_END_OF_OUTPUT)
+            self.condition.notify_all()
 
-    def hears(self, words: str) -> str:
-        """Return the first line that holds a pattern, when it has come; it must come while the program runs."""
-        with self.said:
-            assert self.said.wait_for(lambda: self._found(words) or _END in self.lines, PATIENCE_S), self.text
-            found = self._found(words)
-        assert found, f"{words!r} was never said:\n{self.text}"
-        return found
+    def wait_for_line(self, pattern: str) -> str:
+        """Return the first line that matches; it must come while the program runs."""
+        with self.condition:
+            assert self.condition.wait_for(
+                lambda: self._matching_line(pattern) or _END_OF_OUTPUT in self.lines, PATIENCE_S
+            ), self.text
+            line = self._matching_line(pattern)
+        assert line, f"{pattern!r} is missing in the output:\n{self.text}"
+        return line
 
-    def ends(self) -> int:
+    def wait_for_end(self) -> int:
         """Return the exit code."""
         code = self.process.wait(PATIENCE_S)
-        with self.said:
-            assert self.said.wait_for(lambda: _END in self.lines, PATIENCE_S)
+        with self.condition:
+            assert self.condition.wait_for(lambda: _END_OF_OUTPUT in self.lines, PATIENCE_S)
         return code
 
     @property
     def text(self) -> str:
         return "".join(self.lines)
 
-    def _found(self, words: str) -> str:
-        return next((line for line in self.lines if re.search(words, line)), "")
+    def _matching_line(self, pattern: str) -> str:
+        return next((line for line in self.lines if re.search(pattern, line)), "")
 
 
-_END = "\0the end"
+_END_OF_OUTPUT = "\0the end"
 
 
 @dataclass
 class Rehearsal:
-    """A folder, a screen, and the programs that were started."""
+    """A folder, a screen, and the started programs."""
 
     folder: Path
     replaced: dict[str, str]
@@ -105,9 +106,9 @@ class Rehearsal:
     programs: dict[str, Running] = field(default_factory=dict)
 
     def start(self, command: str) -> Running:
-        """Start a command of the how-to; it is ended with the rehearsal."""
-        for written, used in self.replaced.items():
-            command = command.replace(written, used)
+        """Start a command of the how-to; it ends with the rehearsal."""
+        for page_text, replacement in self.replaced.items():
+            command = command.replace(page_text, replacement)
         words = [word for word in shlex.split(command) if word != "&"]
         environment = dict(os.environ) | {"PYTHONUNBUFFERED": "1", "COLUMNS": "400"}
         while "=" in words[0]:
@@ -128,27 +129,27 @@ class Rehearsal:
         return running
 
     def run(self, command: str) -> str:
-        """Run a command of the how-to to its end, which must be a good one, and return what it said."""
+        """Run a command of the how-to to its end and return its output."""
         running = self.start(command)
-        code = running.ends()
+        code = running.wait_for_end()
         assert code == 0, running.text
         return running.text
 
     def serve(self) -> None:
-        """Start projector and camera as the how-to does, in a brighter room, on ports that are free."""
+        """Start projector and camera as in the how-to, in a brighter room, on free ports."""
         for name, port, options in (("projector", "4353", ""), ("camera", "15741", QUICK_ROOM)):
             command = next(line for line in commands("sim ") if line.startswith(f"sim {name}"))
             running = self.start(command.replace(f" {port} ", " 0 ").removesuffix("&") + options)
-            address = running.hears(r" at 127\.0\.0\.1:\d+").split(":")[-1].strip()
+            address = running.wait_for_line(r" at 127\.0\.0\.1:\d+").split(":")[-1].strip()
             self.replaced[port] = address
             self.programs[name] = running
 
     def settings(self, change: Callable[[str], str]) -> None:
-        """Write the how-to's LAB.toml with the addresses that there are."""
-        (found,) = re.findall(r"^```toml\n(.*?)^```", HOW_TO, re.MULTILINE | re.DOTALL)
-        for written, used in self.replaced.items():
-            found = found.replace(written, used)
-        (self.folder / "LAB.toml").write_text(change(found))
+        """Write the LAB.toml of the how-to with the present addresses."""
+        (text,) = re.findall(r"^```toml\n(.*?)^```", HOW_TO, re.MULTILINE | re.DOTALL)
+        for page_text, replacement in self.replaced.items():
+            text = text.replace(page_text, replacement)
+        (self.folder / "LAB.toml").write_text(change(text))
 
     @property
     def camera(self) -> Running:
@@ -156,13 +157,13 @@ class Rehearsal:
 
 
 def commands(beginning: str = "") -> list[str]:
-    """Return the how-to's commands in their order, those that begin with some words."""
+    """Return the commands of the how-to that start with `beginning`, in order."""
     blocks = re.findall(r"^```sh\n(.*?)^```", HOW_TO, re.MULTILINE | re.DOTALL)
     return [line for block in blocks for line in block.splitlines() if line.startswith(beginning)]
 
 
 def _press_freeze(port: int, frozen: bool) -> None:
-    """Freeze the projector's picture, or let it go on, as its remote control would (PJLink class 2, 5.3)."""
+    """Freeze or release the projected image, as with the remote control (PJLink class 2, 5.3)."""
     with socket.create_connection(("127.0.0.1", port), timeout=10.0) as line:
         assert line.recv(64) == b"PJLINK 0\r"
         line.sendall(b"%%2FREZ %d\r" % frozen)
@@ -177,7 +178,7 @@ def _end(process: subprocess.Popen[Any]) -> None:
 
 @pytest.fixture
 def rehearsal(tmp_path: Path) -> Iterator[Rehearsal]:
-    """Return a rehearsal of the how-to's chart and lights, on a screen with a window manager."""
+    """Return a rehearsal with the chart and illuminants of the how-to, on a screen with a window manager."""
     for command in [*commands("acquire chart"), *commands("acquire illuminations")]:
         run_here(command, tmp_path)
     screens = tmp_path / "screen"
@@ -187,7 +188,7 @@ def rehearsal(tmp_path: Path) -> Iterator[Rehearsal]:
         rehearsal = Rehearsal(tmp_path, {":77": screen.display}, opened)
         manager = next((name for name in ("openbox", "twm") if shutil.which(name)), None)
         if manager is None:
-            pytest.skip("there is no window manager (Debian: openbox, or twm)")
+            pytest.skip("no window manager is installed (Debian: openbox or twm)")
         rehearsal.start(f"DISPLAY=:77 {manager}")
         yield rehearsal
 
@@ -197,23 +198,23 @@ def refusals(session: Path) -> list[str]:
         return [attempt.reason for attempt in taken.journal.attempts() if attempt.reason]
 
 
+# A short exposure.
 QUICK = "\n[camera]\nshutter_s = 0.25\n"
-"""A short exposure."""
-UNTAUGHT = "\n[judge]\nresponse = false\n"
-"""Without the frames that teach the judge the projector: 21 exposures fewer."""
+# Without the response frames: 21 exposures fewer.
+NO_RESPONSE = "\n[judge]\nresponse = false\n"
+# Option of a room that suits this exposure.
 QUICK_ROOM = " --room white_level_share=1.4"
-"""Of the room in which that exposure is a good one."""
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_what_the_how_to_says_is_what_happens(rehearsal: Rehearsal, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its commands, its pop-up and what it says is worth a try: each is told by its cause, and costs no frame."""
+def test_faults_of_how_to_are_reported(rehearsal: Rehearsal, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each fault of the how-to is reported with its cause, and no frame is lost."""
     if shutil.which("xmessage") is None:
         pytest.skip("xmessage is not installed (Debian: x11-utils)")
     rehearsal.serve()
-    # One step may meet it all; in between there are lights alone.
+    # One step may meet all faults; in between there are only illuminants.
     sequence = "attempts = 10\nreference_every = 8"
-    rehearsal.settings(lambda text: text.replace("reference_every = 3", sequence) + QUICK + UNTAUGHT)
+    rehearsal.settings(lambda text: text.replace("reference_every = 3", sequence) + QUICK + NO_RESPONSE)
     port = int(rehearsal.replaced["4353"])
     check, run = commands("DISPLAY=:77 acquire")
     (message,) = commands("DISPLAY=:77 xmessage")
@@ -221,49 +222,49 @@ def test_what_the_how_to_says_is_what_happens(rehearsal: Rehearsal, capsys: pyte
     session = rehearsal.start(run)
 
     def after_exposures(count: int) -> None:
-        rehearsal.camera.hears(r"exposure \d+ ends: plain picture, .* lamp 1\.00")
-        rehearsal.camera.hears(rf"exposure {_last(rehearsal.camera) + count} ends")
+        rehearsal.camera.wait_for_line(r"exposure \d+ ends: plain picture, .* lamp 1\.00")
+        rehearsal.camera.wait_for_line(rf"exposure {_last(rehearsal.camera) + count} ends")
 
-    rehearsal.camera.hears(r"exposure \d+ ends: .* lamp 1\.00")
-    rehearsal.camera.hears(rf"exposure {_last(rehearsal.camera) + 3} half over")
+    rehearsal.camera.wait_for_line(r"exposure \d+ ends: .* lamp 1\.00")
+    rehearsal.camera.wait_for_line(rf"exposure {_last(rehearsal.camera) + 3} half over")
     pop_up = rehearsal.start(message)
-    assert "in front of it lies “xmessage”" in session.hears("refused: .*in front of it lies")
+    assert "in front of it lies “xmessage”" in session.wait_for_line("refused: .*in front of it lies")
     _end(pop_up.process)
     after_exposures(1)
     projector = PjLinkProjector(lambda: TcpLink.connect("127.0.0.1", port, 10.0), timeout=10.0)
     _press_freeze(port, True)
-    session.hears("paused: .*frozen")
+    session.wait_for_line("paused: .*frozen")
     _press_freeze(port, False)
     after_exposures(1)
     projector.set_muted(True)
-    session.hears("paused: .*muted")
+    session.wait_for_line("paused: .*muted")
     projector.set_muted(False)
     projector.close()
     after_exposures(1)
     if shutil.which("xset") is not None:
         rehearsal.run("xset -display :77 s activate")
-        session.hears("(paused|retry|refused): .*the screen shows")
+        session.wait_for_line("(paused|retry|refused): .*the screen shows")
         rehearsal.run("xset -display :77 s reset")
         after_exposures(1)
-    found = ["in front of it lies “xmessage”", "the screen shows .* look for a window"]
-    be_covered_for_half_an_exposure(rehearsal, 1)
+    patterns = ["in front of it lies “xmessage”", "the screen shows .* look for a window"]
+    cover_half_exposure(rehearsal, 1)
     if shutil.which("xcompmgr") is not None:
         rehearsal.start("DISPLAY=:77 xcompmgr")
-        # It is there by then: it starts within a frame's time.
-        be_covered_for_half_an_exposure(rehearsal, 3)
-        found.append("window .*covers")
+        # The compositor starts within one frame.
+        cover_half_exposure(rehearsal, 3)
+        patterns.append("window .*covers")
     after_exposures(1)
     _end(rehearsal.programs["projector"].process)
-    session.hears(f"paused: .*nothing listens at 127.0.0.1:{port}")
-    again = rehearsal.start(f"sim projector --pjlink {port} --lit")
-    again.hears("PJLink projector at")
-    assert session.ends() == 0, session.text
-    with Session.open(rehearsal.folder / "session") as taken:
-        assert len(taken.done_steps()) == len(taken.steps)
-        files = {frame.file for frame in taken.frames() if frame.accepted}
-    assert len(files) == len(taken.steps)
+    session.wait_for_line(f"paused: .*nothing listens at 127.0.0.1:{port}")
+    restarted = rehearsal.start(f"sim projector --pjlink {port} --lit")
+    restarted.wait_for_line("PJLink projector at")
+    assert session.wait_for_end() == 0, session.text
+    with Session.open(rehearsal.folder / "session") as result:
+        assert len(result.done_steps()) == len(result.steps)
+        files = {frame.file for frame in result.frames() if frame.accepted}
+    assert len(files) == len(result.steps)
     reasons = refusals(rehearsal.folder / "session")
-    for words in found:
+    for words in patterns:
         assert any(re.search(words, reason) for reason in reasons), reasons
     (build,) = commands("build-lut")
     capsys.readouterr()
@@ -271,23 +272,23 @@ def test_what_the_how_to_says_is_what_happens(rehearsal: Rehearsal, capsys: pyte
     assert "accept" in capsys.readouterr().out
 
 
-def be_covered_for_half_an_exposure(rehearsal: Rehearsal, after: int) -> None:
-    """Let a window come and go within one of the next exposures.
+def cover_half_exposure(rehearsal: Rehearsal, offset: int) -> None:
+    """Cover the screen with a window during half of one of the next exposures.
 
-    It leaves its pixels on a screen that no compositor repairs; where one does, they are in the frame alone.
+    Without a compositor its pixels stay on the screen; with one, they are only in the frame.
     """
-    covered = _last(rehearsal.camera) + after
-    rehearsal.camera.hears(f"exposure {covered} begins")
+    exposure = _last(rehearsal.camera) + offset
+    rehearsal.camera.wait_for_line(f"exposure {exposure} begins")
     with notification(rehearsal.replaced[":77"], (160, 20, 120, 90), 0xFF8800):
-        rehearsal.camera.hears(f"exposure {covered} half over")
-    assert "not plain" in rehearsal.camera.hears(f"exposure {covered} ends")
+        rehearsal.camera.wait_for_line(f"exposure {exposure} half over")
+    assert "not plain" in rehearsal.camera.wait_for_line(f"exposure {exposure} ends")
 
 
 def _last(camera: Running) -> int:
-    """Return the number of the exposure that began last."""
+    """Return the number of the exposure that started last."""
     return int(re.findall(r"exposure (\d+) begins", camera.text)[-1])
 
 
-def test_the_how_to_shows_what_the_programs_say() -> None:
+def test_how_to_shows_output_of_programs() -> None:
     assert "in front of it lies “xmessage”" in HOW_TO
     assert re.search(r"exposure \d+ ends: not plain picture, mean light [\d. ]+, lamp 1\.00", HOW_TO)

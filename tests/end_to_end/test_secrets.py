@@ -1,4 +1,4 @@
-"""Passwords and secret addresses are in no file that a run and a table leave, nor on the terminal."""
+"""Passwords and secret addresses are in no file of a session or LUT, and not on the terminal."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def command(module: str, *arguments: object) -> int:
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Path:
-    """Return a LAB.toml with a password and a webhook that nobody answers."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    """Return a LAB.toml with a password and a webhook that does not answer."""
+    with socket.socket() as free_socket:
+        free_socket.bind(("127.0.0.1", 0))
+        port = free_socket.getsockname()[1]
     folder = tmp_path / "private"
     folder.mkdir()
     path = make_lab(folder)
@@ -55,32 +55,30 @@ def lab(tmp_path: Path) -> Path:
     return path
 
 
-def test_no_file_of_a_session_and_its_table_holds_a_secret(
-    lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_writes_no_secret_to_session_or_lut(lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     public = tmp_path / "public"
     public.mkdir()
     session = public / "session"
-    said: list[str] = []
-    seen: list[list[str]] = []
+    messages: list[str] = []
+    files_by_frame: list[list[str]] = []
 
-    def look(done: int, total: int) -> None:
-        # While the run is under way its journal has a write-ahead log.
-        seen.append(files_with(public, PASSWORD, TOKEN))
+    def look(count: int, total: int) -> None:
+        # During the run its journal has a write-ahead log.
+        files_by_frame.append(files_with(public, PASSWORD, TOKEN))
 
     settings = load_lab(lab)
-    assert run_session(settings, session, look, said.append, state=said.append).complete
-    assert any("http://127.0.0.1" in sentence and "did not receive" in sentence for sentence in said)
+    assert run_session(settings, session, look, messages.append, state=messages.append).complete
+    assert any("http://127.0.0.1" in sentence and "did not receive" in sentence for sentence in messages)
     assert command("acquisition.cli", "status", session) == 0
     assert command("acquisition.cli", "status", session, "--json") == 0
     assert command("acquisition.cli", "report", session) == 0
     assert command("acquisition.cli", "run", lab, session, "--dry-run") == 0
     assert command("calibration.cli", session, public / "lut") in (0, 4)
     with open_monitor(session, 0) as server:
-        shown = server.page[0] + json.dumps(server.watch.state(""), default=str)
-    seen.append(files_with(public, PASSWORD, TOKEN))
-    assert len(seen) > 6
-    assert not any(seen)
-    told = "".join(capsys.readouterr()) + "".join(said) + shown
-    assert PASSWORD not in told
-    assert TOKEN not in told
+        page = server.page[0] + json.dumps(server.watch.state(""), default=str)
+    files_by_frame.append(files_with(public, PASSWORD, TOKEN))
+    assert len(files_by_frame) > 6
+    assert not any(files_by_frame)
+    output = "".join(capsys.readouterr()) + "".join(messages) + page
+    assert PASSWORD not in output
+    assert TOKEN not in output

@@ -1,4 +1,4 @@
-"""What may befall a session between and during runs: files exchanged, copies, disks that fail."""
+"""Accidents between and during runs: exchanged files, copies, failing disks."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def run(*arguments: object) -> int:
     return main(list(map(str, arguments)))
 
 
-def interrupted(lab: Path, frames: int) -> Path:
-    """Return the folder of a session that was ended after some frames."""
+def interrupt_session(lab: Path, frames: int) -> Path:
+    """Return the folder of a session that was interrupted after some frames."""
     folder = lab.parent / "session"
-    told: list[int] = []
+    calls: list[int] = []
 
-    def interrupt(done: int, total: int) -> None:
-        told.append(done)
-        if len(told) > frames:
+    def interrupt(count: int, total: int) -> None:
+        calls.append(count)
+        if len(calls) > frames:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -42,85 +42,83 @@ def interrupted(lab: Path, frames: int) -> Path:
     return folder
 
 
-def counted_once(folder: Path) -> bool:
+def has_one_frame_per_step(folder: Path) -> bool:
     """Return whether each step has one accepted frame."""
     with Session.open(folder) as session:
         accepted = [frame.step for frame in session.journal.accepted_files()]
         return sorted(accepted) == [step.number for step in session.steps]
 
 
-def test_exchanged_frames_are_both_taken_again_and_stay(
+def test_repeats_exchanged_frames_and_keeps_files(
     lab: Path, frame_hashes: Hashes, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = interrupted(lab, 7)
+    folder = interrupt_session(lab, 7)
     first, second = sorted((folder / "frames").glob("*_light_*"))[:2]
     contents = first.read_bytes(), second.read_bytes()
     first.write_bytes(contents[1])
     second.write_bytes(contents[0])
     assert run("run", lab, folder) == 0
-    said = capsys.readouterr().err
+    output = capsys.readouterr().err
     for path in (first, second):
-        assert f"frames/{path.name} has changed since it was taken" in said
-    assert counted_once(folder)
+        assert f"frames/{path.name} has changed since it was taken" in output
+    assert has_one_frame_per_step(folder)
     assert (first.read_bytes(), second.read_bytes()) == contents[::-1]
 
 
-def test_a_copy_of_a_session_that_is_being_taken_goes_on_by_itself(lab: Path, frame_hashes: Hashes) -> None:
+def test_copy_of_running_session_is_independent(lab: Path, frame_hashes: Hashes) -> None:
     folder, copy = lab.parent / "session", lab.parent / "elsewhere" / "copy"
 
-    def copied(done: int, total: int) -> None:
-        if done == 5:
-            # What is being written has a hidden name, and may be gone before it is copied.
+    def copied(count: int, total: int) -> None:
+        if count == 5:
+            # Files in progress have hidden names, and may disappear before they are copied.
             shutil.copytree(folder, copy, ignore=shutil.ignore_patterns(".*"))
 
     assert run_session(load_lab(lab), folder, copied).complete
-    before = frame_hashes(folder)
+    hashes = frame_hashes(folder)
     assert run("run", lab, copy) == 0
-    assert counted_once(copy)
-    assert frame_hashes(folder) == before
+    assert has_one_frame_per_step(copy)
+    assert frame_hashes(folder) == hashes
 
 
-def test_a_session_that_another_run_makes_meanwhile_is_not_to_be_removed(
-    lab: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refuses_session_created_by_other_run(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = lab.parent / "session"
-    real = runs.require_plan
+    original = runs.require_plan
 
-    def meanwhile(*given: Any) -> object:
-        monkeypatch.setattr(runs, "require_plan", real)
+    def meanwhile(*arguments: Any) -> object:
+        monkeypatch.setattr(runs, "require_plan", original)
         assert run("run", lab, folder) == 0
-        return real(*given)
+        return original(*arguments)
 
     monkeypatch.setattr(runs, "require_plan", meanwhile)
     with pytest.raises(InputError):
-        run_session(load_lab(lab), folder, lambda done, total: None)
-    assert counted_once(folder)
+        run_session(load_lab(lab), folder, lambda count, total: None)
+    assert has_one_frame_per_step(folder)
 
 
 @pytest.mark.parametrize(
-    ("part", "said", "code"), [("previews", "preview: ", errno.ENOSPC), ("report.html", "report: ", errno.EIO)]
+    ("name", "prefix", "code"), [("previews", "preview: ", errno.ENOSPC), ("report.html", "report: ", errno.EIO)]
 )
-def test_what_is_derived_and_cannot_be_written_is_said_once_and_costs_no_frame(
-    lab: Path, part: str, said: str, code: int, monkeypatch: pytest.MonkeyPatch
+def test_reports_unwritable_reports_once(
+    lab: Path, name: str, prefix: str, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = lab.parent / "session"
     replace = Path.replace
 
     def fail(path: Path, target: Path) -> Path:
-        if part in Path(target).parts:
+        if name in Path(target).parts:
             raise OSError(code, "the disk's fault", str(target))
         return replace(path, target)
 
     monkeypatch.setattr(Path, "replace", fail)
-    told: list[str] = []
-    assert run_session(load_lab(lab), folder, lambda done, total: None, told.append).complete
-    (sentence,) = [one for one in told if one.startswith(said)]
-    assert str(folder / part) in sentence
+    messages: list[str] = []
+    assert run_session(load_lab(lab), folder, lambda count, total: None, messages.append).complete
+    (sentence,) = [message for message in messages if message.startswith(prefix)]
+    assert str(folder / name) in sentence
     assert "the disk's fault" in sentence
-    assert counted_once(folder)
+    assert has_one_frame_per_step(folder)
 
 
-def test_a_heartbeat_that_cannot_be_written_costs_no_frame(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritable_heartbeat_costs_no_frame(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = lab.parent / "session"
 
     def fail(journal: Journal, *_: object) -> None:
@@ -128,5 +126,5 @@ def test_a_heartbeat_that_cannot_be_written_costs_no_frame(lab: Path, monkeypatc
 
     monkeypatch.setattr(Journal, "beat", fail)
     assert run("run", lab, folder) == 0
-    assert counted_once(folder)
+    assert has_one_frame_per_step(folder)
     assert run("status", folder) == 0

@@ -1,4 +1,4 @@
-"""A session is taken, interrupted anywhere, taken up again and imported; its frames stay the same."""
+"""A session is taken, interrupted, resumed and imported; its frames stay the same."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ pytestmark = pytest.mark.slow
 
 Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 
+# Parallel programs that need not import everything again.
 FORKS = multiprocessing.get_context("forkserver")
-"""Programs beside this one, without waiting for their imports each time."""
 FORKS.set_forkserver_preload([__name__, "acquisition.run.run", "acquisition.run.run", "sim.camera.eos"])
 
 
-def run_to_pipe(answer: Connection, *arguments: str) -> None:
-    """Run `acquire` and send its exit code and what it says on stderr."""
-    said = io.StringIO()
-    with contextlib.redirect_stderr(said):
+def run_to_pipe(connection: Connection, *arguments: str) -> None:
+    """Run `acquire` and send its exit code and its stderr."""
+    stderr = io.StringIO()
+    with contextlib.redirect_stderr(stderr):
         code = main(arguments)
-    answer.send((code, said.getvalue()))
+    connection.send((code, stderr.getvalue()))
 
 
 def run(*arguments: object) -> int:
     return main(list(map(str, arguments)))
 
 
-def test_a_session_holds_every_frame_of_the_plan(
+def test_session_has_every_planned_frame(
     lab: Path, session: Path, frame_hashes: Hashes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     hashes = frame_hashes(session)
@@ -64,21 +64,21 @@ def test_a_session_holds_every_frame_of_the_plan(
         ("dark", ""): 3,
     }
     everything = [digest for files in hashes.values() for digest in files]
-    assert len(set(everything)) == len(everything), "two frames have the same noise"
+    assert len(set(everything)) == len(everything), "two frames must not have the same noise"
     capsys.readouterr()
     assert run("status", session) == 0
     assert "10 of 10" in capsys.readouterr().out
-    assert run("run", lab, session) == 0, "a complete session is complete again"
+    assert run("run", lab, session) == 0, "running a complete session again succeeds"
 
 
-def test_ctrl_c_at_every_frame_ends_in_the_same_frames(lab: Path, undisturbed: Path, frame_hashes: Hashes) -> None:
+def test_ctrl_c_at_every_frame_keeps_frames(lab: Path, undisturbed: Path, frame_hashes: Hashes) -> None:
     interrupted = lab.parent / "interrupted"
     settings = load_lab(lab)
     for _ in range(50):
         last: list[int] = []
 
-        def interrupt(done: int, total: int, last: list[int] = last) -> None:
-            last.append(done)
+        def interrupt(count: int, total: int, last: list[int] = last) -> None:
+            last.append(count)
             if len(last) == 3:
                 raise KeyboardInterrupt
 
@@ -90,24 +90,22 @@ def test_ctrl_c_at_every_frame_ends_in_the_same_frames(lab: Path, undisturbed: P
     assert frame_hashes(interrupted) == frame_hashes(undisturbed)
 
 
-@pytest.mark.parametrize(("text", "said"), [(None, "No such file"), ("garbage", "illuminants in the columns")])
-def test_a_look_reads_the_lights_too(
-    lab: Path, text: str | None, said: str, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("text", "expected"), [(None, "No such file"), ("garbage", "illuminants in the columns")])
+def test_check_reads_illuminants(
+    lab: Path, text: str | None, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lights = lab.parent / "illuminations.csv"
     lights.unlink()
     if text is not None:
         lights.write_text(text)
     assert run("check", lab) == 2
-    told = capsys.readouterr().err
-    assert str(lights) in told
-    assert said in told
+    message = capsys.readouterr().err
+    assert str(lights) in message
+    assert expected in message
 
 
 @pytest.mark.usefixtures("hang_up")
-def test_a_run_that_is_told_to_end_closes_its_devices(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_sigterm_closes_devices(lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     closed: list[str] = []
 
     def spy(owner: type, name: str) -> None:
@@ -124,22 +122,22 @@ def test_a_run_that_is_told_to_end_closes_its_devices(
     spy(Session, "journal")
     commit = Journal.commit
 
-    def told_to_end(self: Journal, *given: Any, **named: Any) -> None:
-        commit(self, *given, **named)
+    def commit_and_terminate(self: Journal, *arguments: Any, **options: Any) -> None:
+        commit(self, *arguments, **options)
         os.kill(os.getpid(), signal.SIGTERM)
 
     session = lab.parent / "session"
-    before = signal.getsignal(signal.SIGTERM)
+    handler = signal.getsignal(signal.SIGTERM)
     with monkeypatch.context() as patched:
-        patched.setattr(Journal, "commit", told_to_end)
+        patched.setattr(Journal, "commit", commit_and_terminate)
         assert run("run", lab, session) == 130
     assert "interrupted; run the same command again to continue" in capsys.readouterr().err
     assert set(closed) == {"camera", "projector", "journal"}
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert signal.getsignal(signal.SIGTERM) == handler
     assert run("run", lab, session) == 0
 
 
-def test_an_imported_session_has_the_same_frames(lab: Path, session: Path, frame_hashes: Hashes) -> None:
+def test_imported_session_has_same_frames(lab: Path, session: Path, frame_hashes: Hashes) -> None:
     imported = lab.parent / "imported"
     rows = (session / "frames.csv").read_text().replace(",accepted", ",")
     (session / "list.csv").write_text(rows)
@@ -154,17 +152,17 @@ def test_an_imported_session_has_the_same_frames(lab: Path, session: Path, frame
         ("[simulated.room]\nblur_px = 0.9\n", "simulated"),
     ],
 )
-def test_a_session_is_not_continued_with_other_settings(
+def test_refuses_to_resume_with_other_settings(
     lab: Path, session: Path, capsys: pytest.CaptureFixture[str], change: str, expected: str
 ) -> None:
-    before = (session / "frames.csv").read_bytes()
+    rows = (session / "frames.csv").read_bytes()
     lab.write_text(lab.read_text() + change)
     assert run("run", lab, session) == 2
     assert expected in capsys.readouterr().err
-    assert (session / "frames.csv").read_bytes() == before
+    assert (session / "frames.csv").read_bytes() == rows
 
 
-def test_a_foreign_folder_is_left_alone(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_does_not_touch_foreign_folder(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = lab.parent / "thesis"
     folder.mkdir()
     (folder / "chapter1.tex").write_text("all my work")
@@ -173,7 +171,7 @@ def test_a_foreign_folder_is_left_alone(lab: Path, capsys: pytest.CaptureFixture
     assert [path.name for path in folder.iterdir()] == ["chapter1.tex"]
 
 
-def test_overexposed_frames_are_refused_and_said(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rejects_overexposed_frames(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lab.write_text(lab.read_text() + "[camera]\nshutter_s = 2.0\n")
     folder = lab.parent / "session"
     assert run("run", lab, folder) == 4
@@ -181,48 +179,46 @@ def test_overexposed_frames_are_refused_and_said(lab: Path, capsys: pytest.Captu
     assert "clipped" in message
     assert "0.1 % allowed" in message
     with Session.open(folder) as session:
-        refused = [frame for frame in session.frames() if not frame.accepted]
-        assert refused
-        assert all((folder / frame.file).is_file() for frame in refused), "a refused frame is evidence and is kept"
+        rejected = [frame for frame in session.frames() if not frame.accepted]
+        assert rejected
+        assert all((folder / frame.file).is_file() for frame in rejected), "rejected frames are kept"
 
 
-def test_two_programs_do_not_take_the_same_session(lab: Path) -> None:
+def test_refuses_second_program_on_session(lab: Path) -> None:
     settings = load_lab(lab)
     folder = lab.parent / "session"
     ours, theirs = FORKS.Pipe()
 
-    def meanwhile(done: int, total: int) -> None:
-        if done == 2 and not ours.poll():
+    def meanwhile(count: int, total: int) -> None:
+        if count == 2 and not ours.poll():
             program = FORKS.Process(target=run_to_pipe, args=(theirs, "run", str(lab), str(folder)))
             program.start()
             program.join()
 
     assert run_session(settings, folder, meanwhile).complete
-    code, said = ours.recv()
+    code, message = ours.recv()
     assert code == 2
-    assert "another program" in said
+    assert "another program" in message
 
 
-def test_a_journal_that_another_program_holds_is_waited_for_as_long_as_the_settings_say(
-    lab: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_waits_for_locked_journal_up_to_patience(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("experiment.session.opening.TRY_S", 0.01)
     lab.write_text(lab.read_text().replace("[sequence]", "[sequence]\npatience_s = 0"))
     folder = lab.parent / "session"
-    others: list[sqlite3.Connection] = []
+    connections: list[sqlite3.Connection] = []
 
-    def hold(done: int, total: int) -> None:
-        if done == 2 and not others:
-            others.append(sqlite3.connect(folder / "journal.sqlite", isolation_level=None))
-            others[0].execute("BEGIN IMMEDIATE")
+    def hold(count: int, total: int) -> None:
+        if count == 2 and not connections:
+            connections.append(sqlite3.connect(folder / "journal.sqlite", isolation_level=None))
+            connections[0].execute("BEGIN IMMEDIATE")
 
     with pytest.raises(StorageError):
         run_session(load_lab(lab), folder, hold)
-    others[0].close()
-    assert run_session(load_lab(lab), folder, lambda done, total: None).complete
+    connections[0].close()
+    assert run_session(load_lab(lab), folder, lambda count, total: None).complete
 
 
-def test_a_series_longer_than_a_battery_lasts(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_takes_series_longer_than_battery(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = load_lab(lab)
     few = {name: replace(body, shots_per_charge=4) for name, body in EOS_BODIES.items()}
     monkeypatch.setattr("acquisition.run.rig.simulated.EOS_BODIES", few)
@@ -232,14 +228,12 @@ def test_a_series_longer_than_a_battery_lasts(lab: Path, monkeypatch: pytest.Mon
     assert len(frames) == 9
 
 
-def test_following_what_a_check_recommends_leads_to_a_good_exposure(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_recommended_exposure_is_good(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = lab.read_text() + "[camera]\nshutter_s = "
     lab.write_text(f"{text}1.3\n")
     assert run("check", lab) == 4
-    (said,) = re.findall(r"set camera\.shutter_s = (\S+) \(measured: [\d.]+ %\)", capsys.readouterr().out)
-    assert abs(float(said) * 60 - round(float(said) * 60)) < 0.01, "whole turns of a wheel of 60 Hz"
-    lab.write_text(f"{text}{said}\n")
+    (shutter_s,) = re.findall(r"set camera\.shutter_s = (\S+) \(measured: [\d.]+ %\)", capsys.readouterr().out)
+    assert abs(float(shutter_s) * 60 - round(float(shutter_s) * 60)) < 0.01, "whole turns of a wheel of 60 Hz"
+    lab.write_text(f"{text}{shutter_s}\n")
     assert run("check", lab) == 0
     assert "good        brightest_share" in capsys.readouterr().out

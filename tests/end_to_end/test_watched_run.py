@@ -1,4 +1,4 @@
-"""A real run is seen from outside: at work while it is, stopped once it is killed, complete in the end."""
+"""A real run observed from outside: running, stopped after a kill, complete at the end."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from acquisition.monitor.view import Head, SessionWatch
 
 pytestmark = pytest.mark.slow
 
+# Time limit for a simulated frame on a busy machine.
 LIMIT_S = 120.0
-"""How long a frame of the simulated lab may take on a machine that does other things."""
 
 
-def seen(watch: SessionWatch, frames: int) -> Head:
-    """Return how the session stands as soon as so many frames are accepted."""
+def wait_for_frames(watch: SessionWatch, frames: int) -> Head:
+    """Wait for `frames` accepted frames and return the state."""
     end = time.monotonic() + LIMIT_S
     while (head := watch.head()).done < frames:
         assert time.monotonic() < end, head
@@ -27,15 +27,15 @@ def seen(watch: SessionWatch, frames: int) -> Head:
     return head
 
 
-def test_a_run_is_seen_at_work_then_stopped_then_complete(lab: Path) -> None:
+def test_observes_running_stopped_and_complete_run(lab: Path) -> None:
     folder = lab.parent / "session"
     watch = SessionWatch(folder)
     assert watch.head().state == "absent"
     command = [sys.executable, "-m", "acquisition.cli", "run", str(lab), str(folder)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
         try:
-            # The sign of life follows the row of its frame.
-            head = seen(watch, 2)
+            # The heartbeat follows the row of its frame.
+            head = wait_for_frames(watch, 2)
         finally:
             run.kill()
     assert head.state == "running"

@@ -1,4 +1,4 @@
-"""What holds for every command and for the distribution as a whole."""
+"""Tests of all commands, and of the distribution as a whole."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from foundation.version import PACKAGES
 
 pytestmark = pytest.mark.slow
 
+# Escape sequences for colours (ECMA-48, SGR).
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|10[0-7])(?:;\d+)*m")
-"""Escape sequences that choose a colour (ECMA-48, SGR)."""
 
 HEAVY = (
     *("numpy", "numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),
@@ -31,7 +31,7 @@ HEAVY = (
 )
 
 
-def test_opening_a_table_or_a_dataset_loads_no_commands() -> None:
+def test_opening_data_imports_no_command_libraries() -> None:
     code = (
         "import sys, calibration.table.lut, generator\n"
         "generator.open_lut, generator.open_dataset, generator.render\n"
@@ -41,11 +41,11 @@ def test_opening_a_table_or_a_dataset_loads_no_commands() -> None:
 
 
 def commands_of(command: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield a command, and what is below it, with the words that lead there."""
+    """Yield a command and its subcommands with their words."""
     yield (), command
-    for name, below in getattr(command, "commands", {}).items():
-        for path, found in commands_of(below):
-            yield (name, *path), found
+    for name, subcommand in getattr(command, "commands", {}).items():
+        for path, command_found in commands_of(subcommand):
+            yield (name, *path), command_found
 
 
 def paths_of(module: str) -> list[tuple[str, ...]]:
@@ -53,7 +53,7 @@ def paths_of(module: str) -> list[tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_command_is_installed(command: str) -> None:
+def test_command_is_installed(command: str) -> None:
     entries = importlib.metadata.entry_points(group="console_scripts", name=command)
     (entry,) = set(entries)
     assert entry.value == f"croplab:{command.replace('-', '_')}"
@@ -61,23 +61,23 @@ def test_the_command_is_installed(command: str) -> None:
 
 
 @pytest.mark.parametrize("module", COMMANDS.values())
-def test_the_module_is_the_command_an_unknown_option_the_users_fault_and_nothing_heavy_is_loaded(module: str) -> None:
+def test_unknown_option_is_refused_without_heavy_imports(module: str) -> None:
     code = (
         f"import atexit, runpy, sys\nsys.argv = ['it', '--unknown']\n"
         f"atexit.register(lambda: print('LOADED', *sorted(set({HEAVY!r}) & sys.modules.keys()), file=sys.stderr))\n"
         f"runpy.run_module({module!r}, run_name='__main__')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "--unknown" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert done.stderr.splitlines()[-1] == "LOADED"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert process.returncode == 2
+    assert "--unknown" in process.stderr
+    assert "Traceback" not in process.stderr
+    assert process.stderr.splitlines()[-1] == "LOADED"
 
 
 @pytest.mark.parametrize(
     ("module", "path"), [(module, path) for module in COMMANDS.values() for path in paths_of(module)], ids=str
 )
-def test_help_shows_all_that_is_written(
+def test_help_shows_complete_texts(
     module: str, path: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     room = import_module(module)
@@ -85,42 +85,42 @@ def test_help_shows_all_that_is_written(
     assert room.main([*path, "--help"]) == 0
     command, text = dict(commands_of(get_command(room.app)))[path], " ".join(capsys.readouterr().out.split())
     for option in command.params:
-        # Rich takes what stands in brackets for its own unless a backslash is before it.
-        written = (getattr(option, "help", None) or "").replace("\\[", "[")
-        assert " ".join(written.split()) in text, option.name
+        # Rich interprets text in brackets as markup unless a backslash precedes it.
+        help_text = (getattr(option, "help", None) or "").replace("\\[", "[")
+        assert " ".join(help_text.split()) in text, option.name
 
 
-def test_a_mistake_of_ours_shows_a_plain_traceback() -> None:
-    module, *others = COMMANDS.values()
+def test_internal_error_shows_plain_traceback() -> None:
+    module, *other_modules = COMMANDS.values()
     code = (
         f"from {module} import app\n@app.command()\ndef fail():\n    raise ValueError('our mistake')\n"
         "from foundation.console import run\nrun(lambda: app(['fail']))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert done.stderr.startswith("Traceback (most recent call last):")
-    assert done.stderr.endswith("\nValueError: our mistake\n")
-    for other in others:
-        assert not import_module(other).app.pretty_exceptions_enable
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert process.returncode == 1
+    assert process.stderr.startswith("Traceback (most recent call last):")
+    assert process.stderr.endswith("\nValueError: our mistake\n")
+    for other_module in other_modules:
+        assert not import_module(other_module).app.pretty_exceptions_enable
 
 
-def test_every_name_of_ours_has_one_owner() -> None:
+def test_each_package_has_one_owner() -> None:
     owners = importlib.metadata.packages_distributions()
     assert {room: set(owners[room]) for room in PACKAGES} == {room: {"croplab"} for room in PACKAGES}
 
 
-def test_no_color_is_obeyed() -> None:
-    """https://no-color.org: any value that is not empty; colours there are without it."""
-    wish = [sys.executable, "-m", "acquisition.cli", "--help"]
-    for more, coloured in (({}, True), ({"NO_COLOR": "1"}, False)):
+def test_obeys_no_color() -> None:
+    """https://no-color.org: any value that is not empty; without it there are colours."""
+    command_line = [sys.executable, "-m", "acquisition.cli", "--help"]
+    for variables, is_coloured in (({}, True), ({"NO_COLOR": "1"}, False)):
         settings = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "TERM")}
-        settings |= {"FORCE_COLOR": "1", "TERM": "xterm-256color", **more}
-        shown = subprocess.run(wish, env=settings, capture_output=True, text=True, check=True).stdout
-        assert bool(COLOUR.search(shown)) == coloured
+        settings |= {"FORCE_COLOR": "1", "TERM": "xterm-256color", **variables}
+        output = subprocess.run(command_line, env=settings, capture_output=True, text=True, check=True).stdout
+        assert bool(COLOUR.search(output)) == is_coloured
 
 
-def test_settings_of_a_windows_editor_are_read(tmp_path: Path) -> None:
-    """Notepad begins a file with the byte order mark of UTF-8."""
+def test_reads_settings_with_byte_order_mark(tmp_path: Path) -> None:
+    """Notepad writes the byte order mark of UTF-8."""
     text = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "lights.csv"\n[simulated]\nbody = "Test"\n'
     read: list[LabSettings] = []
     for mark in (b"", b"\xef\xbb\xbf"):

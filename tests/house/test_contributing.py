@@ -1,4 +1,4 @@
-"""The worked examples of CONTRIBUTING.md work: what stands there is done in a copy of the repository."""
+"""The worked examples of CONTRIBUTING.md work; they are carried out in a copy of the repository."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ COPIED = (
     "examples",
 )
 
+# Temporary files of other processes disappear. Machine code is copied with the times of the sources, because compiling
+# it again took half a minute per example.
 IGNORED = ("*.pyc.*", "*.tmp.*")
-"""Half-written files of other processes go away. Kept machine code comes with the copy, whose times are those of the
-sources: compiling anew took half a minute an example."""
 
 
 @dataclass(frozen=True)
 class Example:
-    """One worked example: new files, changed files, and the command that tries it."""
+    """A worked example: new files, changed files, and the command that tests it."""
 
     title: str
     text: str
@@ -49,22 +49,22 @@ class Example:
         return dict(re.findall(r"^```(?:python|toml) (\S+)\n(.*?)^```$", self.text, re.MULTILINE | re.DOTALL))
 
     def changes(self) -> list[tuple[str, str, str]]:
-        """Return path, what stands there and what shall stand there, hunk by hunk."""
-        found: list[tuple[str, str, str]] = []
+        """Return path, old text and new text of each hunk."""
+        hunk_texts: list[tuple[str, str, str]] = []
         for block in re.findall(r"^```diff\n(.*?)^```$", self.text, re.MULTILINE | re.DOTALL):
-            for part in re.split(r"^--- ", block, flags=re.MULTILINE)[1:]:
-                path, _, hunks = part.partition("\n")
+            for file_diff in re.split(r"^--- ", block, flags=re.MULTILINE)[1:]:
+                path, _, hunks = file_diff.partition("\n")
                 for hunk in re.split(r"^@@\n", hunks, flags=re.MULTILINE):
                     lines = hunk.splitlines(keepends=True)
-                    before = "".join(line[1:] for line in lines if line[0] in " -")
-                    found.append((path, before, "".join(line[1:] for line in lines if line[0] in " +")))
-        return found
+                    old = "".join(line[1:] for line in lines if line[0] in " -")
+                    hunk_texts.append((path, old, "".join(line[1:] for line in lines if line[0] in " +")))
+        return hunk_texts
 
-    def tried(self) -> tuple[list[str], str]:
-        """Return what the command that tries it names: files or folders of tests, and which of their tests."""
+    def selection(self) -> tuple[list[str], str]:
+        """Return the test files or folders of the test command, and its selection of tests."""
         (command,) = re.findall(r"^    python -m pytest (.*)$", self.text, re.MULTILINE)
-        places, *which = command.split(" -k ")
-        return shlex.split(places), " ".join(shlex.split("".join(which))) or "test"
+        paths, *filters = command.split(" -k ")
+        return shlex.split(paths), " ".join(shlex.split("".join(filters))) or "test"
 
 
 EXAMPLES = [Example(*part.split("\n", 1)) for part in PAGE.partition("## Worked examples\n")[2].split("\n### ")[1:]]
@@ -72,10 +72,10 @@ EXAMPLES = [Example(*part.split("\n", 1)) for part in PAGE.partition("## Worked 
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a copy of the repository in which all examples were followed, one after another."""
+    """Return a copy of the repository in which all examples were carried out, one after another."""
     folder = tmp_path_factory.mktemp("followed")
     for name in COPIED:
-        # The data of tests are large, and linked to.
+        # The data of tests are large, so they are linked.
         linked = ("data",) if name == "tests" else ()
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns(*IGNORED, *linked))
     for data in (ROOT / "tests").rglob("data"):
@@ -87,17 +87,17 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for path, text in example.files().items():
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_text(text, encoding="utf-8")
-        for path, before, after in example.changes():
+        for path, old, new in example.changes():
             text = (folder / path).read_text(encoding="utf-8")
-            assert text.count(before) == 1, f"{path} has this {text.count(before)} times, 1 expected:\n{before}"
-            (folder / path).write_text(text.replace(before, after), encoding="utf-8")
+            assert text.count(old) == 1, f"{path} has this {text.count(old)} times, 1 expected:\n{old}"
+            (folder / path).write_text(text.replace(old, new), encoding="utf-8")
     return folder
 
 
-def test_what_the_examples_write_is_as_the_checks_want_it(copy: Path) -> None:
+def test_code_of_examples_passes_checks(copy: Path) -> None:
     paths = {path for example in EXAMPLES for path in (*example.files(), *(path for path, _, _ in example.changes()))}
     changed = sorted(path for path in paths if path.endswith(".py"))
-    # The order of imports is ruff's to mend.
+    # ruff corrects the order of imports.
     ruff = [sys.executable, "-m", "ruff", "check", "--no-cache"]
     run(copy, [*ruff, "--fix", "--select", "I", *changed])
     run(copy, [*ruff, *changed])
@@ -105,20 +105,22 @@ def test_what_the_examples_write_is_as_the_checks_want_it(copy: Path) -> None:
     run(copy, [sys.executable, "-c", "from importlinter.cli import lint_imports_command as run; run()", "--no-cache"])
 
 
-def test_the_worked_examples_work(copy: Path) -> None:
-    """By one pytest for all, whose start takes longer than most of the tests."""
-    tried = [example.tried() for example in EXAMPLES]
-    which = " or ".join(f"(({' or '.join(Path(one).stem for one in places)}) and ({of}))" for places, of in tried)
-    words = [sys.executable, "-m", "pytest", *(one for places, _ in tried for one in places), "-k", which]
+def test_worked_examples_pass(copy: Path) -> None:
+    """A single pytest runs all, because its start takes longer than most of the tests."""
+    selection = [example.selection() for example in EXAMPLES]
+    expression = " or ".join(
+        f"(({' or '.join(Path(one).stem for one in paths)}) and ({of}))" for paths, of in selection
+    )
+    words = [sys.executable, "-m", "pytest", *(one for paths, _ in selection for one in paths), "-k", expression]
     passed = re.findall(r"^PASSED (\S+?)::", run(copy, [*words, "-q", "-rA", "-p", "no:cacheprovider"]), re.MULTILINE)
-    for places, _ in tried:
-        for place in places:
-            assert any(Path(one).is_relative_to(place) for one in passed), place
+    for paths, _ in selection:
+        for path in paths:
+            assert any(Path(one).is_relative_to(path) for one in passed), path
 
 
 def run(folder: Path, words: list[str]) -> str:
-    """Run a command in a folder, whose modules it finds first, and return what it prints."""
+    """Run a command in a folder with its modules first on the path, and return the output."""
     settings = os.environ | {"PYTHONPATH": str(folder)}
-    done = subprocess.run(words, cwd=folder, env=settings, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"{' '.join(words)}:\n{done.stdout[-4000:]}{done.stderr[-2000:]}"
-    return done.stdout
+    process = subprocess.run(words, cwd=folder, env=settings, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, f"{' '.join(words)}:\n{process.stdout[-4000:]}{process.stderr[-2000:]}"
+    return process.stdout

@@ -1,4 +1,4 @@
-"""The measured data that tests read: each file is described, unchanged and small."""
+"""The measured data of tests: each file is listed, unchanged and small."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from tests.data_files import SHIPPED
 LARGEST_MIB = 15
 
 
-def test_the_readme_names_every_file_with_its_hash() -> None:
+def test_readme_lists_every_file_with_hash() -> None:
     text = (SHIPPED / "README.md").read_text(encoding="utf-8")
-    named = dict(re.findall(r"^\| `(\S+)` \|.* `([0-9a-f]{64})` \|$", text, re.MULTILINE))
+    listed_hashes = dict(re.findall(r"^\| `(\S+)` \|.* `([0-9a-f]{64})` \|$", text, re.MULTILINE))
     local = SHIPPED / "local"
     files = [path for path in SHIPPED.rglob("*") if path.is_file() and local not in path.parents]
-    found = {
+    file_hashes = {
         path.relative_to(SHIPPED).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in files
         if path.name != "README.md"
     }
-    assert found == named
+    assert file_hashes == listed_hashes
     assert sum(path.stat().st_size for path in files) < LARGEST_MIB << 20

@@ -1,4 +1,4 @@
-"""The examples in the docstrings do what they say; those of generator and evaluation have tests beside them."""
+"""The examples in docstrings are correct; generator and evaluation have separate tests."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ MODULES = sorted(
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODULES)
 def test_examples(name: str) -> None:
-    # colour-science, which other tests import, makes numpy print arrays as its version 1.13 did.
+    # colour-science, imported by other tests, makes NumPy print arrays as version 1.13 did.
     with np.printoptions(legacy=False):
-        done = doctest.testmod(import_module(name), optionflags=doctest.ELLIPSIS)
-    assert done.attempted > 0
-    assert done.failed == 0
+        result = doctest.testmod(import_module(name), optionflags=doctest.ELLIPSIS)
+    assert result.attempted > 0
+    assert result.failed == 0
 
 
-def test_there_are_examples() -> None:
+def test_finds_examples() -> None:
     assert len(MODULES) >= 14

@@ -1,4 +1,4 @@
-"""No import circles. The walls between rooms are contracts of import-linter in `pyproject.toml`."""
+"""There are no import cycles. Contracts of import-linter in `pyproject.toml` separate the packages."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from foundation.version import PACKAGES
 
 
 @pytest.mark.slow
-def test_no_modules_import_each_other_in_a_circle() -> None:
+def test_has_no_import_cycles() -> None:
     graph = grimp.build_graph(*PACKAGES, cache_dir=None)
     imports = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
-    circle: list[str] = []
+    cycle: list[str] = []
     try:
         TopologicalSorter(imports).prepare()
     except CycleError as error:
-        circle = error.args[1]
-    assert not circle, f"imports go round: {' <- '.join(circle)}; move what both need to a module below them"
+        cycle = error.args[1]
+    assert not cycle, f"import cycle: {' <- '.join(cycle)}; move the common code to a lower module"

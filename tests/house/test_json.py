@@ -1,4 +1,4 @@
-"""`--json`: of every command that has figures, one object, described in docs/reference/json.md, and nothing else."""
+"""`--json` prints one object as described in docs/reference/json.md, and nothing else."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from foundation.console import JsonOutput, json_output, json_value, with_json
 from foundation.errors import QualityError
 from tests.json_of import json_of
 
+# Commands that write or serve something and have no figures.
 WITHOUT_FIGURES = {
     "acquire init",
     "acquire rebuild",
@@ -30,62 +31,61 @@ WITHOUT_FIGURES = {
     "sim projector",
     "sim camera",
 }
-"""Commands that write or serve something and have no figure to tell."""
 
 REFERENCE = Path(__file__).parents[2] / "docs/reference/json.md"
 
 
 def leaves(words: tuple[str, ...], command: Any) -> Iterator[tuple[str, Any]]:
     """Yield every command that does something itself, with its words."""
-    below = getattr(command, "commands", {})
-    if not below or any(parameter.param_type_name == "argument" for parameter in command.params):
+    subcommands = getattr(command, "commands", {})
+    if not subcommands or any(parameter.param_type_name == "argument" for parameter in command.params):
         yield " ".join(words), command
-    for name, found in below.items():
-        yield from leaves((*words, name), found)
+    for name, subcommand in subcommands.items():
+        yield from leaves((*words, name), subcommand)
 
 
-EVERY = dict(leaf for name, room in COMMANDS.items() for leaf in leaves((name,), get_command(import_module(room).app)))
+LEAVES = dict(leaf for name, room in COMMANDS.items() for leaf in leaves((name,), get_command(import_module(room).app)))
 
 
-def described() -> dict[str, str]:
-    """Return the section of the reference on each command."""
+def reference_sections() -> dict[str, str]:
+    """Return the section of the reference for each command."""
     parts = re.split(r"^## (.*)$", REFERENCE.read_text(encoding="utf-8"), flags=re.MULTILINE)
     return {title.strip("`"): text for title, text in zip(parts[1::2], parts[2::2], strict=True)}
 
 
-@pytest.mark.parametrize("name", EVERY)
-def test_every_command_with_figures_has_it_and_is_described(name: str) -> None:
-    has = any("--json" in option.opts for option in EVERY[name].params)
-    assert has == (name not in WITHOUT_FIGURES)
-    assert (name in described()) == has
+@pytest.mark.parametrize("name", LEAVES)
+def test_commands_with_figures_have_json_and_reference(name: str) -> None:
+    has_json = any("--json" in option.opts for option in LEAVES[name].params)
+    assert has_json == (name not in WITHOUT_FIGURES)
+    assert (name in reference_sections()) == has_json
 
 
-def test_nothing_else_is_described() -> None:
-    assert set(described()) == set(EVERY) - WITHOUT_FIGURES
+def test_reference_has_no_other_commands() -> None:
+    assert set(reference_sections()) == set(LEAVES) - WITHOUT_FIGURES
 
 
 class TestOutput:
-    def test_what_is_printed_goes_elsewhere(self, capsys: pytest.CaptureFixture[str]) -> None:
-        with json_output("generate", is_requested=True) as told:
+    def test_sends_text_to_stderr(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with json_output("generate", is_requested=True) as output:
             print("for a reader")
-            told.add(
+            output.add(
                 images=3, share=math.nan, most=math.inf, place=Path("a"), levels=np.arange(2), mean=np.float32(0.5)
             )
-            told.append("notes", "é")
-        said = capsys.readouterr()
-        assert json.loads(said.out) == {
+            output.append("notes", "é")
+        printed = capsys.readouterr()
+        assert json.loads(printed.out) == {
             **{"command": "generate", "images": 3, "share": None, "most": None, "place": "a", "levels": [0, 1]},
             **{"mean": 0.5, "notes": ["é"]},
         }
-        assert said.err == "for a reader\n"
+        assert printed.err == "for a reader\n"
 
-    def test_nothing_changes_unless_asked(self, capsys: pytest.CaptureFixture[str]) -> None:
-        with json_output("generate", is_requested=False) as told:
+    def test_changes_nothing_without_option(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with json_output("generate", is_requested=False) as output:
             print("for a reader")
-            told.add(images=3)
+            output.add(images=3)
         assert capsys.readouterr().out == "for a reader\n"
 
-    def test_figures_of_bad_data_are_told(self, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_prints_figures_of_refused_data(self, capsys: pytest.CaptureFixture[str]) -> None:
         with pytest.raises(QualityError):
             _refuse(faults=["a"])
         assert json.loads(capsys.readouterr().out) == {"command": "build-lut", "faults": ["a"]}
@@ -93,30 +93,30 @@ class TestOutput:
             _refuse()
         assert capsys.readouterr().out == ""
 
-    def test_a_command_without_a_place_for_it_is_our_mistake(self) -> None:
+    def test_requires_parameter_for_output(self) -> None:
         with pytest.raises(ValueError, match="JsonOutput"):
             with_json("x")(lambda: None)
 
-    def test_standard_output_is_given_back(self) -> None:
+    def test_restores_standard_output(self) -> None:
         before = sys.stdout
         with json_output("x", is_requested=True):
             pass
         assert sys.stdout is before
 
-    def test_objects_are_plain(self) -> None:
+    def test_converts_values_to_json(self) -> None:
         assert json_value(JsonOutput) == str(JsonOutput)
         assert json_value({1: {2.5}}) == {"1": [2.5]}
 
 
 def _refuse(**figures: Any) -> None:
-    with json_output("build-lut", is_requested=True) as told:
-        told.add(**figures)
+    with json_output("build-lut", is_requested=True) as output:
+        output.add(**figures)
         raise QualityError("bad")
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a small computed table `lut`, pictures, and a dataset `set` of 12 images made of them."""
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a small computed LUT `lut`, pictures, and a data set `set` of 12 images."""
     folder = tmp_path_factory.mktemp("json")
     (folder / "pictures").mkdir()
     for number in range(6):
@@ -125,8 +125,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "table.toml").write_text("[chart]\nbits = 2\n")
     table = ["table", str(folder / "lut"), "--settings", str(folder / "table.toml"), "--lights", "D65,A,FL2,7500K"]
     assert main_of("sim")(table) == 0
-    wish = ["--sources", str(folder / "pictures"), "--random", "2"]
-    assert main_of("generate")([str(folder / "lut"), str(folder / "set"), *wish]) == 0
+    options = ["--sources", str(folder / "pictures"), "--random", "2"]
+    assert main_of("generate")([str(folder / "lut"), str(folder / "set"), *options]) == 0
     return folder
 
 
@@ -157,39 +157,39 @@ CALLS: dict[str, tuple[str, dict[str, Any]]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CALLS)
-def test_a_command_prints_one_object_with_the_keys_of_the_reference(
-    name: str, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_prints_one_object_with_documented_keys(
+    name: str, prepared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = name.removesuffix(" again").split()
     text, expected = CALLS[name]
-    arguments = [word.replace("MADE", str(made)).replace("OUT", str(tmp_path)) for word in text.split()]
-    found = json_of(main_of(words[0]), [*words[1:], *arguments], capsys)
+    arguments = [word.replace("MADE", str(prepared)).replace("OUT", str(tmp_path)) for word in text.split()]
+    output = json_of(main_of(words[0]), [*words[1:], *arguments], capsys)
     command = " ".join(word for word in words if not word.startswith("--"))
-    assert found["command"] == command
-    assert {key: found[key] for key in expected} == expected
-    section = described()[command]
-    assert {key for key in found if key != "command" and f"`{key}`" not in section} == set()
+    assert output["command"] == command
+    assert {key: output[key] for key in expected} == expected
+    section = reference_sections()[command]
+    assert {key for key in output if key != "command" and f"`{key}`" not in section} == set()
 
 
 @pytest.mark.slow
-def test_comparisons(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_prints_comparison(prepared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     evaluate = main_of("evaluate")
-    data, results = str(made / "set"), tmp_path / "results"
+    data, results = str(prepared / "set"), tmp_path / "results"
     assert evaluate(["run", data, "--method", "gray-world,white-patch", "--out", str(results)]) == 0
     compared = json_of(evaluate, ["compare", results], capsys)
     assert len(compared["verdicts"]) == 1
     assert [len(table["rows"]) > 0 for table in compared["tables"]] == [True] * 3
     rows = compared["tables"][0]["rows"]
     assert set(rows[0]) == set(compared["tables"][0]["columns"])
-    section = described()["evaluate compare"]
+    section = reference_sections()["evaluate compare"]
     assert {key for key in compared if key != "command" and f"`{key}`" not in section} == set()
 
 
 @pytest.mark.slow
-def test_faults_are_figures_too(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    wish = ["--random-scenes", "2:20x20"]
-    found = json_of(main_of("generate"), [made / "lut", tmp_path / "set", *wish, "--shard-images", "1"], capsys)
-    assert found["splits"] == {}
+def test_prints_faults(prepared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--random-scenes", "2:20x20"]
+    output = json_of(main_of("generate"), [prepared / "lut", tmp_path / "set", *options, "--shard-images", "1"], capsys)
+    assert output["splits"] == {}
     (tmp_path / "set/images/000001.png").write_bytes(b"")
     (fault,) = json_of(main_of("generate"), ["--verify", tmp_path / "set"], capsys, code=4)["faults"]
     assert "000001.png" in fault

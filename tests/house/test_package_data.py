@@ -1,4 +1,4 @@
-"""What a package reads beside its code is in the wheel: a checkout has it in any case, an installation has not."""
+"""Data files of packages are part of the wheel."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ SHIPPED: dict[str, list[str]] = PROJECT["tool"]["setuptools"]["package-data"]
 
 
 def shipped(package: str) -> set[Path]:
-    """Return the files below a package that the patterns of pyproject.toml name, as setuptools reads them."""
+    """Return the files below a package that match the patterns of pyproject.toml, as setuptools does."""
     folders = {path.parent for path in (ROOT / package).rglob("__init__.py")}
-    found = set[Path]()
+    files = set[Path]()
     for folder in folders:
         name = ".".join(folder.relative_to(ROOT).parts)
         for pattern in (*SHIPPED.get("*", ()), *SHIPPED.get(name, ())):
-            found |= set(folder.glob(pattern))
-    return found
+            files |= set(folder.glob(pattern))
+    return files
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_every_file_beside_the_code_is_shipped(package: str) -> None:
-    ours = {path for path in (ROOT / package).rglob("*") if path.is_file() and "__pycache__" not in path.parts}
-    assert {path for path in ours if path.suffix != ".py"} - shipped(package) == set()
+def test_ships_every_data_file(package: str) -> None:
+    files = {path for path in (ROOT / package).rglob("*") if path.is_file() and "__pycache__" not in path.parts}
+    assert {path for path in files if path.suffix != ".py"} - shipped(package) == set()
 
 
-def test_patterns_name_packages_that_are_there() -> None:
+def test_patterns_name_existing_packages() -> None:
     assert {name for name in SHIPPED if name != "*" and not (ROOT / Path(*name.split("."))).is_dir()} == set()

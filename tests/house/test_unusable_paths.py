@@ -1,4 +1,4 @@
-"""Every command tells of a path that it may not look at, or that no disk can hold, in one sentence."""
+"""Every command reports a path without permission, or with an impossible name, in one sentence."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ COMMANDS = (
     ("generator.cli", "--verify", "{}"),
 )
 CAPABILITIES_3 = 0x20080522
+# Linux's CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH.
 IGNORE_PERMISSIONS = 1 << 1 | 1 << 2
-"""Linux's CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
 
 
 @contextmanager
-def as_anybody() -> Generator[None]:
-    """Let permissions hold in this thread, for root too."""
+def with_permissions() -> Generator[None]:
+    """Enforce permissions in this thread, also for root."""
     if os.geteuid() != 0:
         yield
         return
     if sys.platform != "linux":
-        pytest.skip("root may look everywhere, and only Linux lets it do without")
+        pytest.skip("root ignores permissions, and only Linux can change that")
     libc = ctypes.CDLL(None, use_errno=True)
     header, sets = (ctypes.c_uint32 * 2)(CAPABILITIES_3, 0), (ctypes.c_uint32 * 6)()
     if libc.capget(header, sets):
-        pytest.skip(f"root may look everywhere: capget: {os.strerror(ctypes.get_errno())}")
-    before = sets[0]
+        pytest.skip(f"root ignores permissions: capget: {os.strerror(ctypes.get_errno())}")
+    permissions = sets[0]
     sets[0] &= ~IGNORE_PERMISSIONS
     if libc.capset(header, sets):
-        pytest.skip(f"root may look everywhere: capset: {os.strerror(ctypes.get_errno())}")
+        pytest.skip(f"root ignores permissions: capset: {os.strerror(ctypes.get_errno())}")
     try:
         yield
     finally:
-        sets[0] = before
+        sets[0] = permissions
         assert libc.capset(header, sets) == 0
 
 
-def failed(capsys: pytest.CaptureFixture[str], command: tuple[str, ...]) -> str:
-    """Return the last line that a command says, which ends with 2."""
+def refusal_of(capsys: pytest.CaptureFixture[str], command: tuple[str, ...]) -> str:
+    """Return the message of a command that ends with exit code 2."""
     module, *arguments = command
     assert import_module(module).main(arguments) == 2
     return " ".join(capsys.readouterr().err.split())
@@ -61,30 +61,30 @@ def failed(capsys: pytest.CaptureFixture[str], command: tuple[str, ...]) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_folder_that_may_not_be_searched(
+def test_refuses_folder_without_permission(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     theirs = Path("theirs")
     theirs.mkdir(mode=0)
     try:
-        with as_anybody():
-            said = failed(capsys, tuple(part.format("theirs/it") for part in command))
+        with with_permissions():
+            message = refusal_of(capsys, tuple(part.format("theirs/it") for part in command))
     finally:
         theirs.chmod(0o700)
-    assert "error: cannot " in said
-    assert "theirs/" in said
-    assert "Permission denied; " in said
+    assert "error: cannot " in message
+    assert "theirs/" in message
+    assert "Permission denied; " in message
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_name_that_is_too_long(
+def test_refuses_too_long_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    said = failed(capsys, tuple(part.format("x" * 300) for part in command))
-    assert "error: cannot " in said
-    assert "x" * 300 in said
-    assert "File name too long; " in said
+    message = refusal_of(capsys, tuple(part.format("x" * 300) for part in command))
+    assert "error: cannot " in message
+    assert "x" * 300 in message
+    assert "File name too long; " in message
     assert not list(tmp_path.iterdir())

@@ -19,13 +19,13 @@ from matplotlib.text import Text
 
 def drawn(figure: Figure) -> dict[str, list[float]]:
     """Return all numbers of a figure by kind of artist, without those that depend on fonts."""
-    found: dict[str, list[float]] = {"size": list(figure.get_size_inches())}
+    numbers: dict[str, list[float]] = {"size": list(figure.get_size_inches())}
     for artist in figure.findobj():
         if artist.get_visible():
             for values in _artist(artist):
                 flat = np.ma.filled(np.ma.asarray(values, float), np.nan).ravel()
-                found.setdefault(type(artist).__name__, []).extend(flat.tolist())
-    return found
+                numbers.setdefault(type(artist).__name__, []).extend(flat.tolist())
+    return numbers
 
 
 def _artist(artist: Artist) -> Iterator[Any]:

@@ -59,7 +59,7 @@ class TestSerialLink(LinkContract):
         yield near, far
         near.close()
 
-    def test_reads_bytes_sent_before_the_end(self, ends: Ends) -> None:
+    def test_reads_data_sent_before_close(self, ends: Ends) -> None:
         # An unplugged cable loses data that the system has not delivered, so only the end is certain.
         near, far = ends
         far.write(b"last words", PATIENCE_S)

@@ -93,7 +93,7 @@ def bench_of(
         catch_up()
 
     own = {"wait": wait, "break_part": break_part, "repair": repair, "identity": identity_in(language)}
-    bench = replace(Bench.of(projector, device), **own, told=lambda faults: faults_in(language, faults))
+    bench = replace(Bench.of(projector, device), **own, reported=lambda faults: faults_in(language, faults))
     return replace(bench, counts_hours=language.lamp_hours is not None)
 
 

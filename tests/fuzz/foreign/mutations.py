@@ -1,8 +1,8 @@
-"""What a careless or hostile sender makes of a folder: one change after another, drawn from a seed.
+"""Random changes that a careless or hostile sender makes to a folder, drawn from a seed.
 
-Bytes are flipped, cut, doubled; numbers, texts and JSON values replaced by nasty ones; tar headers lie; SQLite tables
-become views; files become links, pipes, devices, folders. Half of the time hashes are made to fit again, so that what
-lies behind them is reached.
+Bytes are flipped, cut, doubled. Numbers, texts and JSON values are replaced by extreme ones. Tar headers are wrong,
+SQLite tables become views, files become links, pipes, devices or folders. Half of the time the hashes are corrected, so
+that the code behind the hash check is reached.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from typing import Any, cast
 
 from tests.fuzz.foreign.seeds import Seed
 
+# Name of a file outside the folder that must not be touched.
 CANARY = "canary.png"
-"""Name of the file outside that nobody may touch."""
 
 NUMBERS = [
     "-1",
@@ -105,18 +105,20 @@ Mutation = Callable[[random.Random, Seed, str], None]
 
 
 def mutate(rng: random.Random, seed: Seed) -> tuple[Seed, Callable[[Path], None]]:
-    """Return the files of a folder after some changes, and what is to be done to the folder once they are written."""
+    """Return the files of a folder after some changes, and a function that changes the written folder."""
     files = dict(seed)
-    after: list[Callable[[Path], None]] = []
+    folder_changes: list[Callable[[Path], None]] = []
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
-        # Lists and descriptions decide most; they are few among images.
+        # Lists and descriptions matter most, but there are few among the images.
         names = sorted(files)
         if not names:
             break
-        plain = [name for name in names if name.endswith((".json", ".csv", ".txt", ".toml", "SUMS", ".sqlite", ".npy"))]
-        name = rng.choice(plain if plain and rng.random() < 0.7 else names)
+        text_files = [
+            name for name in names if name.endswith((".json", ".csv", ".txt", ".toml", "SUMS", ".sqlite", ".npy"))
+        ]
+        name = rng.choice(text_files if text_files and rng.random() < 0.7 else names)
         if rng.random() < 0.15:
-            after.append(_replaced(rng, name))
+            folder_changes.append(_replacement(rng, name))
         else:
             rng.choice(_mutations_of(name))(rng, files, name)
     if rng.random() < 0.5:
@@ -124,7 +126,7 @@ def mutate(rng: random.Random, seed: Seed) -> tuple[Seed, Callable[[Path], None]
             reseal(files)
 
     def change(folder: Path) -> None:
-        for step in after:
+        for step in folder_changes:
             with suppress(OSError):
                 step(folder)
 
@@ -132,31 +134,31 @@ def mutate(rng: random.Random, seed: Seed) -> tuple[Seed, Callable[[Path], None]
 
 
 def reseal(files: Seed) -> None:
-    """Make the hashes of a folder fit its files, as somebody who means harm would."""
+    """Correct the hashes of a folder, as an attacker would."""
     if "zarr.json" in files:
-        described = json.loads(files["zarr.json"])
-        texts = described["attributes"]["files"]
+        description = json.loads(files["zarr.json"])
+        texts = description["attributes"]["files"]
         inner = {name: text.encode() for name, text in texts.items()}
         reseal(inner)
         texts.update({name: text.decode() for name, text in inner.items() if name in texts})
-        files["zarr.json"] = json.dumps(described).encode()
+        files["zarr.json"] = json.dumps(description).encode()
     if "lut.json" in files:
-        known = json.loads(files["lut.json"])
-        known["illuminations_sha256"] = _hash(files["illuminations.csv"])
+        provenance = json.loads(files["lut.json"])
+        provenance["illuminations_sha256"] = _hash(files["illuminations.csv"])
         if "samples.npy" in files:
-            known["samples_sha256"] = _hash(files["samples.npy"])
+            provenance["samples_sha256"] = _hash(files["samples.npy"])
             size = 8 * 4 * 3 * 2
             data = files["samples.npy"][128:]
-            known["lights_sha256"] = [
-                _hash(data[i * size : (i + 1) * size]) for i in range(len(known["lights_sha256"]))
+            provenance["lights_sha256"] = [
+                _hash(data[i * size : (i + 1) * size]) for i in range(len(provenance["lights_sha256"]))
             ]
-        known["files_sha256"] = {name: _hash(files[name]) for name in known["files_sha256"] if name in files}
-        files["lut.json"] = json.dumps(known).encode()
+        provenance["files_sha256"] = {name: _hash(files[name]) for name in provenance["files_sha256"] if name in files}
+        files["lut.json"] = json.dumps(provenance).encode()
     if "SHA256SUMS" in files:
         lines = files["SHA256SUMS"].decode().splitlines()
-        listed = [line.partition("  ") for line in lines]
+        rows = [line.partition("  ") for line in lines]
         files["SHA256SUMS"] = "".join(
-            f"{_hash(files[name]) if name in files else digest}  {name}\n" for digest, _, name in listed
+            f"{_hash(files[name]) if name in files else digest}  {name}\n" for digest, _, name in rows
         ).encode()
 
 
@@ -179,59 +181,59 @@ def _mutations_of(name: str) -> list[Mutation]:
     return by_bytes
 
 
-def _place(rng: random.Random, data: bytes) -> int:
-    # Heads decide more than pixels.
-    most = len(data) if rng.random() < 0.5 else min(len(data), 200)
-    return rng.randrange(most) if most else 0
+def _random_offset(rng: random.Random, data: bytes) -> int:
+    # Headers matter more than pixels.
+    range_end = len(data) if rng.random() < 0.5 else min(len(data), 200)
+    return rng.randrange(range_end) if range_end else 0
 
 
 def _flip(rng: random.Random, files: Seed, name: str) -> None:
     data = bytearray(files[name])
     for _ in range(rng.choice((1, 1, 4))):
         if data:
-            data[_place(rng, bytes(data))] ^= 1 << rng.randrange(8)
+            data[_random_offset(rng, bytes(data))] ^= 1 << rng.randrange(8)
     files[name] = bytes(data)
 
 
 def _cut(rng: random.Random, files: Seed, name: str) -> None:
-    data, at = files[name], _place(rng, files[name])
-    files[name] = data[:at] if rng.random() < 0.5 else data[:at] + data[at + rng.choice((1, 4, 16, 500)) :]
+    data, offset = files[name], _random_offset(rng, files[name])
+    files[name] = data[:offset] if rng.random() < 0.5 else data[:offset] + data[offset + rng.choice((1, 4, 16, 500)) :]
 
 
 def _double(rng: random.Random, files: Seed, name: str) -> None:
-    data, at = files[name], _place(rng, files[name])
-    piece = data[at : at + rng.choice((1, 8, 100, len(data)))]
-    files[name] = data[:at] + piece * rng.choice((2, 3, 50)) + data[at:]
+    data, offset = files[name], _random_offset(rng, files[name])
+    piece = data[offset : offset + rng.choice((1, 8, 100, len(data)))]
+    files[name] = data[:offset] + piece * rng.choice((2, 3, 50)) + data[offset:]
 
 
 def _zero(rng: random.Random, files: Seed, name: str) -> None:
-    data, at = files[name], _place(rng, files[name])
+    data, offset = files[name], _random_offset(rng, files[name])
     size = rng.choice((1, 4, 64, len(data)))
-    files[name] = (data[:at] + bytes([rng.choice((0, 255))]) * size + data[at + size :])[: len(data)]
+    files[name] = (data[:offset] + bytes([rng.choice((0, 255))]) * size + data[offset + size :])[: len(data)]
 
 
 def _overwrite(rng: random.Random, files: Seed, name: str) -> None:
-    data, at = files[name], _place(rng, files[name])
+    data, offset = files[name], _random_offset(rng, files[name])
     value = rng.choice((0, 1, 2**31 - 1, 2**32 - 1, 2**63 - 1, 2**64 - 1, 1 << 40))
     size = rng.choice((2, 4, 8))
     files[name] = (
-        data[:at] + (value % (1 << 8 * size)).to_bytes(size, rng.choice(("little", "big"))) + data[at + size :]
+        data[:offset] + (value % (1 << 8 * size)).to_bytes(size, rng.choice(("little", "big"))) + data[offset + size :]
     )
 
 
 def _number(rng: random.Random, files: Seed, name: str) -> None:
-    found = list(re.finditer(rb"-?[0-9]+(\.[0-9]+)?", files[name][:200000]))
-    if found:
-        place = rng.choice(found)
-        files[name] = files[name][: place.start()] + rng.choice(NUMBERS).encode() + files[name][place.end() :]
+    matches = list(re.finditer(rb"-?[0-9]+(\.[0-9]+)?", files[name][:200000]))
+    if matches:
+        match = rng.choice(matches)
+        files[name] = files[name][: match.start()] + rng.choice(NUMBERS).encode() + files[name][match.end() :]
 
 
 def _text(rng: random.Random, files: Seed, name: str) -> None:
-    found = list(re.finditer(rb"[A-Za-z_./]{3,}", files[name][:200000]))
-    if found:
-        place = rng.choice(found)
+    matches = list(re.finditer(rb"[A-Za-z_./]{3,}", files[name][:200000]))
+    if matches:
+        match = rng.choice(matches)
         word = rng.choice(TEXTS).encode("utf-8", "surrogatepass")
-        files[name] = files[name][: place.start()] + word + files[name][place.end() :]
+        files[name] = files[name][: match.start()] + word + files[name][match.end() :]
 
 
 def _cell(rng: random.Random, files: Seed, name: str) -> None:
@@ -258,7 +260,7 @@ def _line(rng: random.Random, files: Seed, name: str) -> None:
     files[name] = b"\n".join(lines)
 
 
-def _spots(value: Any, found: list[tuple[Any, Any]]) -> None:
+def _spots(value: Any, matches: list[tuple[Any, Any]]) -> None:
     holder = value
     children: list[tuple[Any, Any]] = []
     if isinstance(value, dict):
@@ -266,8 +268,8 @@ def _spots(value: Any, found: list[tuple[Any, Any]]) -> None:
     elif isinstance(value, list):
         children = list(enumerate(cast("list[Any]", value)))
     for key, inner in children:
-        found.append((holder, key))
-        _spots(inner, found)
+        matches.append((holder, key))
+        _spots(inner, matches)
 
 
 def _json_value(rng: random.Random, files: Seed, name: str) -> None:
@@ -276,12 +278,12 @@ def _json_value(rng: random.Random, files: Seed, name: str) -> None:
     except (ValueError, RecursionError):
         _flip(rng, files, name)
         return
-    found: list[tuple[Any, Any]] = []
-    _spots(content, found)
-    if found:
-        # Keys at the top and their like are as probable as the thousands of numbers of a list.
-        shallow = [spot for spot in found if isinstance(spot[0], dict)]
-        holder, key = rng.choice(shallow if shallow and rng.random() < 0.8 else found)
+    matches: list[tuple[Any, Any]] = []
+    _spots(content, matches)
+    if matches:
+        # Choose keys of objects as often as the thousands of numbers in lists.
+        shallow = [spot for spot in matches if isinstance(spot[0], dict)]
+        holder, key = rng.choice(shallow if shallow and rng.random() < 0.8 else matches)
         holder[key] = rng.choice(VALUES)
     files[name] = json.dumps(content if rng.random() < 0.97 else rng.choice(VALUES)).encode()
 
@@ -292,9 +294,9 @@ def _json_key(rng: random.Random, files: Seed, name: str) -> None:
     except (ValueError, RecursionError):
         _flip(rng, files, name)
         return
-    found: list[tuple[Any, Any]] = []
-    _spots(content, found)
-    holders = [cast("dict[Any, Any]", holder) for holder, _ in found if isinstance(holder, dict)]
+    matches: list[tuple[Any, Any]] = []
+    _spots(content, matches)
+    holders = [cast("dict[Any, Any]", holder) for holder, _ in matches if isinstance(holder, dict)]
     if holders:
         holder = rng.choice(holders)
         key = rng.choice(sorted(holder))
@@ -335,9 +337,9 @@ def _number_in_head(rng: random.Random, files: Seed, name: str) -> None:
 
 def _tar_header(rng: random.Random, files: Seed, name: str) -> None:
     data = bytearray(files[name])
-    at = 512 * rng.randrange(max(len(data) // 512, 1))
+    offset = 512 * rng.randrange(max(len(data) // 512, 1))
     try:
-        header = tarfile.TarInfo.frombuf(bytes(data[at : at + 512]), "utf-8", "surrogateescape")
+        header = tarfile.TarInfo.frombuf(bytes(data[offset : offset + 512]), "utf-8", "surrogateescape")
     except tarfile.TarError:
         _flip(rng, files, name)
         return
@@ -354,7 +356,7 @@ def _tar_header(rng: random.Random, files: Seed, name: str) -> None:
         case _:
             header.size = -rng.choice((1, 512, 2**30))
     with suppress(ValueError, OverflowError):
-        data[at : at + 512] = header.tobuf(tarfile.GNU_FORMAT)[:512]
+        data[offset : offset + 512] = header.tobuf(tarfile.GNU_FORMAT)[:512]
     files[name] = bytes(data)
 
 
@@ -466,19 +468,19 @@ def _schema(rng: random.Random, files: Seed, name: str) -> None:
     )
 
 
-def _replaced(rng: random.Random, name: str) -> Callable[[Path], None]:
-    """Return what puts something that is no file in the place of one, or beside it."""
+def _replacement(rng: random.Random, name: str) -> Callable[[Path], None]:
+    """Return a function that replaces a file by something else, or adds something next to it."""
     kind = rng.randrange(11)
 
     def replace(folder: Path) -> None:
         path = folder / name
         outside = folder.parent / "outside"
         if path.parent.is_symlink():
-            return  # By an earlier change: what lies behind is for nobody to touch.
+            return  # Made by an earlier change; its target must not be touched.
         if kind == 10 and "/" in name:
             inner = folder / name.split("/")[0]
-            for below in sorted(inner.rglob("*"), reverse=True):
-                below.rmdir() if below.is_dir() and not below.is_symlink() else below.unlink()
+            for inner_path in sorted(inner.rglob("*"), reverse=True):
+                inner_path.rmdir() if inner_path.is_dir() and not inner_path.is_symlink() else inner_path.unlink()
             inner.rmdir()
             inner.symlink_to(outside)
             return

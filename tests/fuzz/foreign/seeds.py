@@ -1,4 +1,4 @@
-"""Small sound folders of each kind that a stranger may send: the beginnings of everything that is fuzzed."""
+"""Small intact folders of each kind that can be received from others; fuzzing starts from them."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 LIGHTS = tuple(Illuminant(number, "uniform", None, Colour(255, 200, 9 * number)) for number in range(3))
 FRAMES = [SourceFrame("light", light.index, f"frames/{light.index}.dng", f"{light.index}" * 64) for light in LIGHTS]
 
+# The files of a folder by name.
 Seed = dict[str, bytes]
-"""The files of a folder by name."""
 
 
 def files_of(folder: Path) -> Seed:
@@ -44,13 +44,13 @@ def files_of(folder: Path) -> Seed:
 
 
 def make_seeds(work: Path) -> dict[str, Seed]:
-    """Return sound folders by kind: ``table``, ``published``, ``session``, ``dataset …``."""
+    """Return intact folders by kind: ``table``, ``published``, ``session``, ``dataset …``."""
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     lut = _table(work / "table")
     publish(lut, str(work / "published"))
     _session(work / "session")
-    several = SimultaneousLights(ListedLights((0, 1)), 2, parse_masks("half-plane", 2, 1))
+    two_lights = SimultaneousLights(ListedLights((0, 1)), 2, parse_masks("half-plane", 2, 1))
     scenes = random_scenes(2, 12, 8)
     options = {
         "dataset folder": DatasetOptions(rendering="codes", split=(0.5, 0.5, 0.0)),
@@ -59,9 +59,9 @@ def make_seeds(work: Path) -> dict[str, Seed]:
         "dataset tar": DatasetOptions(rendering="codes", layout="webdataset", shard_images=2),
         "dataset parquet": DatasetOptions(rendering="codes", layout="parquet", shard_images=2),
     }
-    for kind, chosen in options.items():
-        lights = several if kind in ("dataset folder", "dataset tar") else ListedLights((0, 2))
-        generate_dataset(lut, work / kind, scenes, lights, options=chosen)
+    for kind, dataset_options in options.items():
+        lights = two_lights if kind in ("dataset folder", "dataset tar") else ListedLights((0, 2))
+        generate_dataset(lut, work / kind, scenes, lights, options=dataset_options)
     return {path.name: files_of(path) for path in sorted(work.iterdir())}
 
 
@@ -72,7 +72,7 @@ def _table(folder: Path) -> Lut:
     rng = np.random.default_rng(1)
     for light in range(len(LIGHTS)):
         writer.put(light, rng.integers(100, 9000, (8, 4, 3)).astype(np.uint16))
-    known = Provenance(
+    provenance = Provenance(
         camera="Test",
         bits=1,
         white_level=11000,
@@ -82,28 +82,28 @@ def _table(folder: Path) -> Lut:
         unfit=[Unfit(colour=3, cause="a test")],
     )
     references = "light,name,r,g,b,r_error,g_error,b_error\n0,white,9000,9000,9000,1,1,1\n"
-    writer.finish(LIGHTS, np.full((len(LIGHTS), 3), 9000.0), known, FRAMES, {"references.csv": references})
+    writer.finish(LIGHTS, np.full((len(LIGHTS), 3), 9000.0), provenance, FRAMES, {"references.csv": references})
     return open_lut(folder)
 
 
 def _session(folder: Path) -> None:
     settings = LabSettings(rig="simulated", chart=Path("chart.json"), illuminations=Path("illuminations.csv"))
     steps = plan_steps(LIGHTS, 25)
-    at = datetime(2026, 1, 1, tzinfo=UTC)
+    time = datetime(2026, 1, 1, tzinfo=UTC)
     with Session.create(folder, settings.to_toml(), design_chart(bits=1), LIGHTS, steps) as session:
         for step in steps:
-            at += timedelta(seconds=2)
+            time += timedelta(seconds=2)
             stem = f"{step.number:04d}_{step.kind}"
-            attempt = session.journal.begin(step, f"frames/{stem}", at)
+            attempt = session.journal.begin(step, f"frames/{stem}", time)
 
-            def fill(into: BinaryIO, number: int = step.number, at: datetime = at) -> CapturedFrame:
-                return CapturedFrame("a.CR2", into.write(b"raw %d" % number), at)
+            def fill(stream: BinaryIO, number: int = step.number, time: datetime = time) -> CapturedFrame:
+                return CapturedFrame("a.CR2", stream.write(b"raw %d" % number), time)
 
             checks = (Check("light", 0.1, None, 0.5, "degrees", ""),)
             judgement = Judgement(checks, seen=(1.0, 2.0, 3.0))
             received = session.receive(stem, fill)
-            session.journal.commit(attempt, received, judgement, {"expose": 0.5}, exposure_s=0.5, ended_at=at)
-        session.journal.note(at, "paused", "a test")
-        session.journal.beat("ended", "it ended", at)
+            session.journal.commit(attempt, received, judgement, {"expose": 0.5}, exposure_s=0.5, ended_at=time)
+        session.journal.note(time, "paused", "a test")
+        session.journal.beat("ended", "it ended", time)
         session.journal.record("camera", "Test")
         session.write_frames_csv()

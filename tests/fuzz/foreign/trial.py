@@ -1,7 +1,7 @@
-"""One try: a folder is written, read by everything that reads its kind, and watched meanwhile.
+"""One trial: a folder is written and read by all its readers, while file access is watched.
 
-What must hold, whatever the folder: an error is a `CropError`, the end comes within `LIMIT_S`, no file outside is
-opened, and nothing is written but in the place that is given for it.
+Requirements for every folder: errors are `CropError`, reading ends within `LIMIT_S`, no file outside is opened, and
+files are written only in the given folder.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from generator.dataset.reader import file_faults, open_dataset
 from tests.fuzz.foreign.mutations import CANARY, mutate
 from tests.fuzz.foreign.seeds import Seed
 
+# Time limit, s: no folder of some kilobytes takes so long, even on a busy machine.
 LIMIT_S = 20
-"""Nothing of a folder of some kilobytes takes as long, whatever else the machine does."""
 
 
 class Hang(BaseException):
-    """The time was over; no handler of errors may take it for one."""
+    """The time limit was exceeded; no `except Exception` may catch it."""
 
 
 class Trespass(BaseException):
-    """A file outside was touched."""
+    """A file outside was accessed."""
 
 
 class Watch:
-    """Watches which files the process opens, by the audit events of Python (PEP 578)."""
+    """Watches the files opened by the process, by audit events of Python (PEP 578)."""
 
     def __init__(self, work: Path) -> None:
         self._outside = os.path.realpath(work / "outside")
         self._work = os.path.realpath(work)
         self._armed = False
-        sys.addaudithook(self._hear)
+        sys.addaudithook(self._on_event)
 
-    def _hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+    def _on_event(self, event: str, arguments: tuple[Any, ...]) -> None:
         if not self._armed:
             return
         if event in (
@@ -76,7 +76,7 @@ class Watch:
             return
         text = os.fsdecode(path)
         if event in ("os.remove", "os.mkdir") and arguments[-1] != -1:
-            return  # Below a folder that is open: its own path was judged.
+            return  # Relative to an open folder, whose path was checked.
         if text.startswith("file:"):
             text = text[5:].partition("?")[0]
         real = os.path.realpath(text)
@@ -86,7 +86,7 @@ class Watch:
             event == "open" and isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
         )
         if changes and not real.startswith((self._work, "/tmp", "/dev/null", "/dev/shm")):
-            raise Trespass(f"{event} {text} -> {real} changes what is outside")
+            raise Trespass(f"{event} {text} -> {real} changes a file outside")
 
     @contextmanager
     def armed(self) -> Generator[None]:
@@ -145,7 +145,7 @@ def read_session_folder(folder: Path, spare: Path) -> None:
         session.journal.heartbeat()
         session.journal.details()
         session.journal.records()
-        damaged_files(folder, session.journal.accepted_files(), lambda done, total: None)
+        damaged_files(folder, session.journal.accepted_files(), lambda count, total: None)
 
 
 def read_published(folder: Path, spare: Path) -> None:
@@ -161,14 +161,14 @@ READERS: dict[str, Callable[[Path, Path], None]] = {
 
 
 class Trials:
-    """A place to try folders in, on a disk of memory where there is one."""
+    """A place for trials, in memory if possible."""
 
     def __init__(self, work: Path) -> None:
         self._work = work
         self.watch = Watch(work)
 
     def judge(self, kind: str, seed: Seed, number: int) -> str | None:
-        """Return what is wrong with how a mutated folder is read; None where nothing is."""
+        """Return the fault in reading a mutated folder, or None."""
         rng = random.Random(f"{kind} {number}")
         files, change = mutate(rng, seed)
         folder, spare, outside = self._work / "in", self._work / "spare", self._work / "outside"
@@ -195,7 +195,7 @@ class Trials:
         finally:
             signal.alarm(0)
         if fault is None and sorted(path.name for path in outside.iterdir()) != [CANARY]:
-            fault = "something was written outside"
+            fault = "a file was written outside"
         if fault is None and (outside / CANARY).read_bytes() != b"canary":
             fault = "a file outside was changed"
         return fault
