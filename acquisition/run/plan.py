@@ -265,7 +265,7 @@ def free_bytes_at(folder: Path) -> int:
             raise storage_error(folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
         return shutil.disk_usage(existing).free
     except OSError as error:
-        raise storage_error(folder, error, "look at") from error
+        raise storage_error(folder, error, "read") from error
 
 
 def bytes_text(number: float, up: bool = False) -> str:

@@ -83,7 +83,7 @@ class PeerLink:
                 raise LinkClosed("the simulated device closed the connection; open a new one")
             if not timeout:
                 return b""
-            raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s")
+            raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s; open a new connection")
         data = bytes(self._incoming[:limit])
         del self._incoming[:limit]
         return data

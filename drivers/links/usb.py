@@ -97,7 +97,7 @@ _PERMISSION_REMEDY = (
     "plug the camera in again"
 )
 _BUSY_REMEDY = (
-    ", e.g. the photo monitor of the desktop; close photo programs, and on Linux run: "
+    ", such as the photo monitor of the desktop; close photo programs, and on Linux run: "
     "systemctl --user stop gvfs-gphoto2-volume-monitor.service (on macOS: killall ptpcamerad)"
 )
 
@@ -298,7 +298,7 @@ class OpenUsbDevice:
                 case errno.EPIPE:
                     fault = PipeStalled(f"{label} halted the pipe; clear the halt")
                 case errno.EBUSY:
-                    fault = DeviceRefused(f"{label} is held by another program{_BUSY_REMEDY}")
+                    fault = DeviceRefused(f"{label} is in use by another program{_BUSY_REMEDY}")
                 case errno.EACCES | errno.EPERM:
                     fault = DeviceRefused(f"{label} {_PERMISSION_REMEDY}")
                 case errno.EOVERFLOW:

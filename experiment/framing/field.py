@@ -348,7 +348,9 @@ def parse_corners(texts: Sequence[str]) -> Corners:
     """Return four corners (x, y), half-size px, from four texts X,Y in raw pixels."""
     if len(texts) != 4:
         raise InputError(
-            f"{len(texts)} corners are given, {' '.join(texts)}; 4 are expected, X,Y each, in pixels of the raw file"
+            f"{len(texts)} corners are given, {' '.join(texts)}, expected 4, X,Y each, in pixels of the raw file; "
+            "correct "
+            "--corners"
         )
     corners: list[tuple[float, float]] = []
     for text in texts:
@@ -357,7 +359,7 @@ def parse_corners(texts: Sequence[str]) -> Corners:
         except ValueError:
             x = y = math.nan
         if not (math.isfinite(x) and math.isfinite(y)):
-            raise InputError(f"{text!r} is not a corner; two numbers X,Y are expected, in pixels of the raw file")
+            raise InputError(f"{text!r} is not a corner, expected X,Y in pixels of the raw file; correct --corners")
         corners.append(((x - 0.5) / 2, (y - 0.5) / 2))
     require_corners(np.array(corners))
     return tuple(corners)

@@ -146,11 +146,11 @@ def find_chart(
         is_small = module < MIN_MODULE_PX
         raise RegistrationError(
             f"{image_name}: {len(tags)} of {expected_tags} detected, at least "
-            f"{int(np.ceil(MIN_TAG_SHARE * len(ids)))} expected; missing: {_first_ids(missing_ids)}; "
+            f"{int(np.ceil(MIN_TAG_SHARE * len(ids)))} expected (missing: {_first_ids(missing_ids)}); "
             + (
                 f"a tag module is {module:.1f} px, at least {MIN_MODULE_PX:g} px expected: move the camera closer"
                 if is_small
-                else "uncover the chart, light all of it, and bring all of it into the image and into focus"
+                else "uncover the chart, light all of it, and bring all of it into the frame and into focus"
             )
         )
     residual = project(homography, chart_points[fits]) - frame_points[fits]
@@ -210,7 +210,7 @@ def _missing_tags_error(
             "this is another chart: give the chart.json of the print in front of the camera"
         )
     return RegistrationError(
-        f"{image_name}: {len(tags) or 'none'} of the {expected} detected; "
+        f"{image_name}: {len(tags)} of the {expected} detected; "
         "point the camera at the chart, focus it, and light all of it"
     )
 

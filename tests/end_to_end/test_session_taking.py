@@ -90,7 +90,9 @@ def test_ctrl_c_at_every_frame_ends_in_the_same_frames(lab: Path, undisturbed: P
     assert frame_hashes(interrupted) == frame_hashes(undisturbed)
 
 
-@pytest.mark.parametrize(("text", "said"), [(None, "No such file"), ("garbage", "illuminants in the columns")])
+@pytest.mark.parametrize(
+    ("text", "said"), [(None, "No such file"), ("garbage", "has no illuminants, expected columns")]
+)
 def test_a_look_reads_the_lights_too(
     lab: Path, text: str | None, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -133,7 +135,7 @@ def test_a_run_that_is_told_to_end_closes_its_devices(
     with monkeypatch.context() as patched:
         patched.setattr(Journal, "commit", told_to_end)
         assert run("run", lab, session) == 130
-    assert "interrupted; run the same command again to continue" in capsys.readouterr().err
+    assert "interrupted; run the same command again" in capsys.readouterr().err
     assert set(closed) == {"camera", "projector", "journal"}
     assert signal.getsignal(signal.SIGTERM) == before
     assert run("run", lab, session) == 0
