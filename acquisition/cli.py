@@ -24,7 +24,7 @@ from foundation.console import (
     progress,
     with_json,
 )
-from foundation.errors import DeviceError, InputError, QualityError, StorageError, counted, first_few
+from foundation.errors import RUN_AGAIN, DeviceError, InputError, QualityError, StorageError, counted, first_few
 from foundation.files import make_folder, write_atomic
 from foundation.folders import atomic_folder, locked_folder, require_free
 
@@ -172,12 +172,12 @@ def illuminations(
 
     plot = out.with_suffix(".png")
     if plot == out:
-        raise InputError(f"{out} is the name of the plot; name the file of illuminants {out.with_suffix('.csv')}")
+        raise InputError(f"{out} is the name of the plot, expected another name; give {out.with_suffix('.csv')}")
     require_free(out, "the illuminants")
     require_free(plot, "the plot of the illuminants")
     lights = plan_illuminations(grid, parse_ccts(blackbodies))
     if not lights:
-        raise InputError("there are 0 illuminants, at least 1 is needed; set --grid or --blackbodies")
+        raise InputError("0 illuminants are planned, expected at least 1; set --grid or --blackbodies")
     save_illuminations(lights, out)
     plot_illuminations(lights, plot)
     output.add(file=out, plot=plot, lights=len(lights), kinds=Counter(light.kind for light in lights))
@@ -284,7 +284,7 @@ def run(
         bool,
         typer.Option(
             "--dry-run",
-            help="Ask every device, and print the frames, time and space of the run, and faults that would end it; "
+            help="Query every device, and print the frames, time and space of the run, and faults that would end it; "
             "switches no lamp on, takes no frame, shows and writes nothing.",
         ),
     ] = False,
@@ -315,7 +315,7 @@ def run(
     if not outcome.complete:
         raise QualityError(
             f"{outcome.total - missing} of {outcome.total} planned frames are complete, {missing} are missing; remove "
-            "the causes, and run the same command again: " + "; ".join(refused)
+            f"the causes, {RUN_AGAIN}: " + "; ".join(refused)
         )
     print(f"{session}: complete, {outcome.total} frames; next: build-lut {shlex.quote(str(session))} LUT/")
 

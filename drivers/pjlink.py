@@ -429,7 +429,7 @@ class PjLinkProjector:
         if self._value_now(self.pjlink_class, 1) < 2:
             return None
         if self._value_now(self.frozen, None):
-            return "the projector's image is frozen; release freeze on its remote control"
+            return "the projected image is frozen; release freeze on its remote control"
         if self._value_now(self.input_resolution, None) is NoResolution.NO_SIGNAL:
             return "no signal arrives at the projector's input; check the cable, the input and the display's settings"
         return None

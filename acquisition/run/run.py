@@ -161,7 +161,7 @@ class Notices:
             except subprocess.TimeoutExpired:
                 with suppress(OSError):
                     os.killpg(process.pid, signal.SIGKILL)
-                return f"it did not end within {LIMIT_S:g} s"
+                return f"it has not ended within {LIMIT_S:g} s"
         return f"it ended with {process.returncode}, 0 expected" if process.returncode else ""
 
     def _posted(self, event: str, message: str, body: bytes) -> str:
@@ -680,7 +680,7 @@ def _make_ready(job: Job) -> None:
         make_ready(devices.projector, settings.sequence, job.retry)
 
 
-BEGINS = "a run begins: it looks at its frames and opens its devices"  # Sign of life of a run before its first frame
+BEGINS = "the run starts: it checks its frames and opens its devices"  # Sign of life of a run before its first frame
 
 
 # Reports that a run is alive, and what it waits for; "" while it takes frames.

@@ -145,7 +145,7 @@ def create_file(path: Path) -> sqlite3.Connection:
         connection = connect(path, "rwc")
         _make_tables(connection)
     except sqlite3.DatabaseError as error:
-        raise StorageError(f"cannot write {path}: {error}; free some space or choose another disk") from error
+        raise StorageError(f"cannot write {path}: {error}; free space or choose another disk") from error
     return connection
 
 

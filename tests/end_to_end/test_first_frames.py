@@ -108,7 +108,7 @@ def test_first_frames_that_never_agree_pause_the_run_with_what_to_do(tmp_path: P
     flicker = [{"what": "lamp step", "percent": -10, "from_frame": n, "to_frame": n} for n in range(0, 400, 2)]
     taken = run(tmp_path, *flicker)
     assert taken.end != "complete"
-    asked = [sentence for sentence in of(taken.said, "refused") if "when the command is run again" in sentence]
+    asked = [sentence for sentence in of(taken.said, "refused") if "when the same command is run again" in sentence]
     assert asked
     assert "one of the first frames" in asked[0]
     assert not any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in taken.attempts)
