@@ -133,7 +133,7 @@ def build_lut(
         output.add(table=lut, progress=result)
         print(
             f"{lut}: {result.lights} of {result.lights_planned} illuminants, {result.new_frames} new frames, "
-            f"{result.frames} in total; run the same command again when more frames are available"
+            f"{result.frames} in total; when more frames are available, run the same command again"
         )
         return
     output.add(table=lut)
@@ -243,7 +243,8 @@ def verify(
         print(fault)
     if faults:
         raise FormatError(
-            f"{folder} has changed: {len(faults)} faults, expected 0; restore it from a copy, or build it again"
+            f"{folder} has changed: {counted(len(faults), 'fault')}, expected 0; restore it from a copy, or build the "
+            "LUT again"
         )
     frames = "" if session is None else f" and of its {len(table.frames)} frames in {session}"
     print(f"{folder}: the hashes of all files{frames} are correct")
@@ -366,7 +367,7 @@ def _hash_text(lut: Lut, expect: str | None) -> str:
     if expect is not None:
         return "it is the expected LUT, and all hashes are correct"
     return (
-        f"all files match its own hashes. Compare its hash, {lut.sha256}, with the expected one, or give that with "
+        f"all files match its own hashes. Compare its hash, {lut.sha256}, with the expected hash, or give that with "
         "--expect"
     )
 

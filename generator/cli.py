@@ -225,7 +225,7 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers, output: Json
         done_count, shard_count = make_share(plan, out, share, workers, callbacks)
     output.add(dataset=masked(out), shard=shard, shards_done=done_count, shards=shard_count)
     finish = "run the same command without --shard to complete the data set"
-    next_step = finish if done_count == shard_count else "run the command for the other shares"
+    next_step = finish if done_count == shard_count else "run the same command with the other shares"
     print(masked(f"{done_count} of {shard_count} shards of {out} are done; {next_step}"))
 
 
@@ -309,7 +309,7 @@ def _verify(out: str, workers: int | None, output: JsonOutput) -> Dataset:
     output.add(dataset=masked(out), faults=faults)
     if faults:
         raise QualityError(
-            f"{out} has {counted(len(faults), 'fault')}, listed above; expected unchanged files. Generate the data set "
+            f"{out} has {counted(len(faults), 'fault')}, listed above, expected unchanged files; make the data set "
             "again, or copy it again"
         )
     dataset = open_dataset(out)

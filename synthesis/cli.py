@@ -77,7 +77,7 @@ def table(
     output.add(table=out, lights=result.lights, colours=result.cells, samples=task.window**2, unfit=result.unfit)
     print(
         f"{out}: computed, {result.lights} illuminants, {result.cells} colours, {task.window**2} samples each; "
-        f"{result.unfit} patches unfit for use"
+        f"{result.unfit} unfit patches"
     )
 
 

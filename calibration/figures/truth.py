@@ -77,7 +77,7 @@ def _fewest_references_text(table: TableMeasurements, accepted: float) -> str:
 REFERENCES_USED = Figure(
     "references_used", "Used white references, worst frame", "truth", "share", "at least", 0.9, 0.3,
     why="flat field and ground truth are based on few positions", source=JUDGEMENT,
-    remedy="uncover the print, bring all of it into the picture, and expose so that bare paper stays below saturation",
+    remedy="uncover the print, bring all of it into the frame, and expose so that bare paper stays below saturation",
     measure=_fraction_of_references, of_one_frame="bounded", where=_fewest_references_text, drawing="course",
 )  # fmt: skip
 

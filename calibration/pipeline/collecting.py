@@ -233,7 +233,9 @@ class Accumulator:
         for colour in range(self.baseline.chart.colour_count):
             cause = ""
             if self.outside[colour]:
-                cause = f"outside: some of its {samples} pixels are outside the frame; move the chart into the picture"
+                cause = (
+                    f"outside: some of its {samples} pixels are outside the frame; bring the whole chart into the frame"
+                )
             elif self.highest[colour] >= limit:
                 light = int(self.highest_at[colour])
                 under = f"illuminant {light}" if light >= 0 else "white"

@@ -233,7 +233,7 @@ def _masks_of(dataset: Dataset) -> GivenMaskPlan | None:
     if is_remote(location) or folder is None:
         remedy = "make it with --layout folder" if folder is None else "copy it to this machine"
         raise InputError(
-            f"{location} has several illuminants in an image and the layout {dataset.layout}; expected masks in a "
-            f"local folder: {remedy}"
+            f"{location} has several illuminants in an image and the layout {dataset.layout}, expected masks in a "
+            f"local folder; {remedy}"
         )
     return find_masks(local_path(location) / folder, together)
