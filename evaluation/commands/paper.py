@@ -318,11 +318,11 @@ def _pictures(location: str, matrix: str) -> tuple[Sequence[Source], str, str]:
         layout = None
     if layout is None:
         if colour_matrix is not None:
-            raise InputError(f"--matrix {matrix} needs a data set of raw images, {location} is none; omit --matrix")
+            raise InputError(f"--matrix {matrix} needs a data set of raw images, {location} is not one; omit --matrix")
         pictures = find_pictures(location)
         return pictures, f"{len(pictures)} of {location}", Path(location).resolve().name
     if layout == "generated":
-        raise InputError(f"{location} was made by generate, expected photographs or real raw images; use those")
+        raise InputError(f"{location} was made by generate, expected photographs or real raw images; give others")
     data = open_scenes(location, layout)
     matrix_text = f"with the colour matrix of {colour_matrix.name}" if colour_matrix else "without a colour matrix"
     text = f"{len(data.scenes)} of {data.name}, developed to sRGB {matrix_text}"

@@ -281,7 +281,7 @@ def _require_sensor(body: Body, where: str, key: str) -> None:
     limits = (
         ("bits", body.bits, 8 <= body.bits <= 16, "8 to 16"),
         ("black", body.black, 0 <= body.black < body.saturation, f"0 to below saturation, {body.saturation}"),
-        ("saturation", body.saturation, body.saturation <= top, f"{top} at most with {body.bits} bits"),
+        ("saturation", body.saturation, body.saturation <= top, f"at most {top} with {body.bits} bits"),
         ("electrons_per_dn", body.electrons_per_dn, body.electrons_per_dn > 0, "more than 0"),
         ("read_noise_dn", body.read_noise_dn, body.read_noise_dn >= 0, "0 or more"),
         (

@@ -163,7 +163,7 @@ def find_source_pictures(dataset: Dataset, folder: Path | str) -> tuple[Mapping[
             return file_sha256(files[name])
         except OSError as error:
             reason = os.strerror(error.errno or 0)
-            raise InputError(f"cannot read {files[name]}: {reason}; name another folder") from error
+            raise InputError(f"cannot read {files[name]}: {reason}; give another folder") from error
 
     @cache
     def by_hash() -> Mapping[str, Path]:
@@ -362,7 +362,7 @@ def plan_transfer(
         generated = tuple(scene for scene in scenes if isinstance(scene, GeneratedScene))
         if not generated:
             training.append(TrainingSet(scene_set.name, "other", scenes))
-            notes.append(f"{scene_set.name} was not made by generate: its rows are no results of generated images")
+            notes.append(f"{scene_set.name} was not made by generate: its rows are not results of generated images")
         elif pictures is None:
             training.append(TrainingSet(scene_set.name, "generated", generated))
         else:
