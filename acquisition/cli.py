@@ -181,7 +181,7 @@ def illuminations(
     save_illuminations(lights, out)
     plot_illuminations(lights, plot)
     output.add(file=out, plot=plot, lights=len(lights), kinds=Counter(light.kind for light in lights))
-    print(f"{out}: {len(lights)} illuminants; plot in {plot}")
+    print(f"{out}: {counted(len(lights), 'illuminant')}; plot in {plot}")
 
 
 @app.command(epilog=EXIT_CODES)
@@ -294,8 +294,8 @@ def run(
     """Take the session, or resume an interrupted one.
 
     First checks everything that a dry run prints. Reads LAB.toml, its chart and its illuminants. Writes SESSION:
-    session.toml, chart.json, illuminations.csv, frames/, previews/, journal.sqlite, frames.csv, report.html. It can be
-    interrupted at any time and run again. Ends with 4 if frames were refused; the next run repeats them.
+    session.toml, chart.json, illuminations.csv, frames/, previews/, journal.sqlite, frames.csv, report.html. To resume
+    an interrupted run, run the same command again. Ends with 4 if frames were refused; the next run repeats them.
     """
     from acquisition.run.run import Terminal, run_session
     from experiment.config import load_lab
@@ -384,7 +384,7 @@ def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) ->
 
     with locked_folder(session, busy_message(session)):
         attempts = rebuild_journal(session)
-    print(f"{session / JOURNAL_FILE}: restored with {attempts} attempts; next: acquire status {session}")
+    print(f"{session / JOURNAL_FILE}: restored with {counted(attempts, 'attempt')}; next: acquire status {session}")
 
 
 @app.command(epilog=EXIT_CODES)
@@ -448,7 +448,7 @@ def import_(
     with progress("files") as advance:
         imported = import_session(frames, chart, session, advance)
     output.add(session=session, refused=imported.refused, left=imported.missing)
-    print(f"{session}: imported; {len(imported.refused)} frames refused")
+    print(f"{session}: imported; {counted(len(imported.refused), 'frame')} refused")
     if imported.unchecked:
         print(
             f"{', '.join(imported.unchecked)}: the completeness of files of this format cannot be checked; convert "

@@ -414,7 +414,7 @@ def load_library():
     try:
         import gphoto2
     except ImportError as error:
-        raise ConfigurationError("python-gphoto2 is not installed; install it: pip install gphoto2") from error
+        raise ConfigurationError("python-gphoto2 is not installed; install it with: pip install gphoto2") from error
     return gphoto2
 
 
@@ -427,7 +427,7 @@ def _translate_lookup_errors(subject: str, remedy: str) -> Generator[None]:
     except gp.GPhoto2Error as error:
         raise ConfigurationError(
             f"libgphoto2 has no {subject} ({remedy}; detected: {_detected_cameras()})",
-            remedy="set one of these or none",
+            remedy="set one of these, or omit the setting",
         ) from error
 
 

@@ -1,17 +1,17 @@
 #!/usr/bin/env bash
-# What training on generated images is worth on three real cameras: the figures of docs/transfer.md.
+# Measure the benefit of generated training images for three real cameras, with the settings of docs/how-to/transfer.md.
 #
 #   examples/worth.sh PICTURES ARCHIVES OUT [SEEDS]
 #
-# PICTURES  a folder of sRGB photographs: there BSDS500 (500) and imagenet-sample-images (1000), which you fetch yourself
-#           and which are not part of this software.
-# ARCHIVES  a folder with nus_canon_600d_64x64.npz, nus_canon_1ds_mk3_64x64.npz and intel_tau_5dsr_64x64.npz.
-# OUT       tables (3.5 GB each), generated sets and results. What is there already is kept: the script goes on where it was.
-# SEEDS     of learners, training images and folds, by default 5.
+# PICTURES  folder of sRGB photographs, such as BSDS500 and imagenet-sample-images, which are not part of this software
+# ARCHIVES  folder with nus_canon_600d_64x64.npz, nus_canon_1ds_mk3_64x64.npz and intel_tau_5dsr_64x64.npz
+# OUT       folder for LUTs (3.5 GB each), generated data sets and results; existing ones are kept, so run the same
+#           command again to resume
+# SEEDS     number of seeds of learners, training images and folds; 5 by default
 #
-# LEVERS (environment) chooses some of the renderings below, by default all. Naive rows are made for each of them, of the same
-# pictures under the same lights; NAIVE=no leaves them out, which are half of the work. LEARNERS names the methods; most
-# of the time is log-chroma's. REAL=20,100,all also trains beside so many real images of the tested part.
+# Environment variables: LEVERS lists the renderings, by default all of them. NAIVE=no omits the naive rows, which take
+# half of the time. LEARNERS lists the methods; log-chroma takes most of the time. REAL=20,100,all adds rows with so many
+# real images of the other parts.
 set -euo pipefail
 pictures=$(realpath "$1") archives=$(realpath "$2") out=$3 seeds=${4:-5}
 here=$(realpath "$(dirname "$0")")
@@ -20,13 +20,13 @@ mkdir -p "$out" && cd "$out"
 declare -A archive=([600d]=nus_canon_600d_64x64 [1ds]=nus_canon_1ds_mk3_64x64 [5dsr]=intel_tau_5dsr_64x64)
 declare -A part=([600d]=Canon [1ds]=Canon [5dsr]=field)
 declare -A sensitivities=([600d]=Canon_EOS_600D [1ds]=Canon_EOS-1Ds_Mark_III [5dsr]=Canon_EOS_5DS)
-# Parts that are tested one by one: of the 5DS R three, so that the others hold 400 images.
+# Number of parts, each tested once: three for the 5DS R, so that the other parts have 400 images.
 declare -A parts=([600d]=2 [1ds]=2 [5dsr]=3)
 declare -A matrix=([600d]="Canon EOS 600D" [1ds]="Canon EOS-1Ds Mark III" [5dsr]="Canon EOS 5DS R")
 declare -A relit=([600d]=1ds [1ds]=600d [5dsr]=1ds)
 learners=${LEARNERS:-regression-trees,kernel-ridge,log-chroma}
 
-once() { # RESULT COMMAND...: run the command unless its result is there
+once() { # RESULT COMMAND...: run the command if its result does not exist
     [ -e "$1" ] || "${@:2}"
 }
 
@@ -44,7 +44,7 @@ for camera in 600d 1ds 5dsr; do
                 colorimetric) options=("${colorimetric[@]}") ;;
                 compensate) options=("${colorimetric[@]}" --black-point compensate) ;;
                 random) options=("${colorimetric[@]}" --black-point random) ;;
-                *) echo "no lever $lever" >&2; exit 2 ;;
+                *) echo "LEVERS contains $lever, expected codes, colorimetric, compensate or random; correct it" >&2; exit 2 ;;
             esac
             set=sets/$camera$test/$lever
             once "$set" generate "tables/$camera" "$set" --sources "$pictures" --max-side 160 --no-preview \

@@ -162,7 +162,7 @@ class SequenceSettings(Settings):
     """Disk space in gigabytes for refused and void frames of one run, after which it ends: 200 frames of 18 megapixels,
     a quarter of a session; ``inf``: no limit."""
     notify: Annotated[str, AfterValidator(_check_target), Field(repr=False)] = ""
-    """Receiver of notices when a run pauses, continues and ends: a URL that gets JSON by POST, or a command that gets
+    """Receiver of notices when a run pauses, resumes and ends: a URL that gets JSON by POST, or a command that gets
     it on its standard input; empty: none. ``{ env = "NAME" }`` or ``{ file = "PATH" }`` read it from an environment
     variable or a file. Messages and `session.toml` contain only the host or the name of the program."""
 

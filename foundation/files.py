@@ -438,7 +438,7 @@ def _require_plain(folder: Path, name: str, entry: os.DirEntry[str]) -> None:
 
 def _require_regular(mode: int, path: Path) -> None:
     if not stat.S_ISREG(mode):
-        raise FormatError(f"{path} is {_kind(mode)}, a regular file expected; {_COPY_REMEDY}")
+        raise FormatError(f"{path} is {_kind(mode)}, expected a regular file; {_COPY_REMEDY}")
 
 
 def _require_filled(handle: int, path: Path) -> None:

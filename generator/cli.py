@@ -62,7 +62,7 @@ of a store supported by fsspec. OUT appears when it is complete: images/ (linear
 Each image shows a print of the picture under an illuminant, as the camera would record it. A pixel is the response to
 its colour, interpolated between patches, plus the noise of one sample; with --rendering codes it is one sample of its
 patch. Equal seed, pictures and LUT give equal bytes, with any workers. A picture that cannot be read is skipped and
-listed. To resume an interrupted run, repeat the same command.
+listed. To resume an interrupted run, run the same command again.
 
 Examples: a first data set from a computed LUT; training crops under illuminants of any chromaticity; test images with
 two illuminants each, rendered as in the paper.

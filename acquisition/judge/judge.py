@@ -62,7 +62,7 @@ from experiment.measures.exposure import Exposure
 from experiment.measures.frame import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured, measure
 from experiment.session.records import REFERENCES, Check, Judgement, SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
-from foundation.errors import FormatError, RegistrationError
+from foundation.errors import FormatError, RegistrationError, counted
 from foundation.robust import robust_sigma
 
 _BEFORE_RESTART = "this frame was exposed before earlier frames proved inconsistent; those frames are repeated first"
@@ -407,7 +407,7 @@ def _judge_movement(
         blurred = (
             f"the frame is {'softer' if softer > 0 else 'sharper'} than the first white frame by a blur of "
             f"{abs(softer):.2f} px, at most {judge.blur_px if softer > 0 else -low:g} px allowed; check the focus, "
-            "switch off autofocus and stabilisation, and look for vibrations"
+            "switch off autofocus and stabilisation, and check for vibrations"
         )
     return [*checks, Check("blur", round(softer, 3), low, judge.blur_px, "px", blurred)], position
 
@@ -1104,7 +1104,7 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
         if soft is not None and _deviation(soft) < _EXPLAINED * _deviation(rest) and _deviation(rest) > _BLURRED:
             reason = (
                 f"the frame is out of focus or shaken: its rows match with an additional blur of {sigma:g} px; check "
-                "the focus, switch off autofocus, and look for vibrations"
+                "the focus, switch off autofocus, and check for vibrations"
             )
             return [*checks, Check("blur", sigma, None, None, "px", reason)]
     # Rows of other places are brighter and darker alternately; a shadow or other light has one sign.
@@ -1119,7 +1119,8 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
         cause = f"check the frame: a screen saver or a window covers the projected image, or {cause}"
     rows = np.flatnonzero(is_wrong.reshape(-1, SEGMENTS).any(axis=1))
     reason = (
-        f"{len(rows)} rows of blocks, from row {2 * int(rows[0])} of the frame to {2 * int(rows[-1]) + 1}, do not have "
+        f"{counted(len(rows), 'row')} of blocks, from row {2 * int(rows[0])} of the frame to {2 * int(rows[-1]) + 1}, "
+        "do not have "
         f"the expected content; {cause}"
     )
     return [Check(ROWS.name, float(count), None, float(ROWS.accept), "", reason)]

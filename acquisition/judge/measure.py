@@ -374,7 +374,7 @@ def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str |
     if kind != "response" and exposure.brightest_dn < limits.too_dark_dn:
         return (
             f"the brightest photosites are {exposure.brightest_dn:.0f} counts above black, "
-            f"at least {limits.too_dark_dn:g} counts expected; make sure that the projector is on, its image is not "
+            f"at least {limits.too_dark_dn:g} counts allowed; make sure that the projector is on, its image is not "
             "muted "
             "and the lens cap is off, or start a new session with a longer exposure"
         )

@@ -455,7 +455,7 @@ def settings_doubts(settings: LabSettings) -> tuple[str, ...]:
         )
     if settings.rig == "lab" and has_lamp_control(settings) and warm_up_s < SHORT_WARM_UP_S:
         doubts.append(
-            f"sequence.warm_up_s = {warm_up_s:g} s, at least {SHORT_WARM_UP_S:g} s expected for a lamp; ignore this "
+            f"sequence.warm_up_s = {warm_up_s:g} s, expected at least {SHORT_WARM_UP_S:g} s for a lamp; ignore this "
             "for a laser or LEDs"
         )
     return tuple(doubts)

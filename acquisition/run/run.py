@@ -162,7 +162,7 @@ class Notices:
                 with suppress(OSError):
                     os.killpg(process.pid, signal.SIGKILL)
                 return f"it has not ended within {LIMIT_S:g} s"
-        return f"it ended with {process.returncode}, 0 expected" if process.returncode else ""
+        return f"it ended with {process.returncode}, expected 0" if process.returncode else ""
 
     def _posted(self, event: str, message: str, body: bytes) -> str:
         url = urlsplit(self._target)

@@ -99,7 +99,7 @@ DEFOCUS = Cause(
 )
 ANOTHER_PRINT = Cause(
     "another print",
-    "another print, whose patches differ from chart.json",
+    "another print: its patches differ from chart.json",
     "give the chart.json of this print, and keep it in place until the session ends",
     "frames",
 )

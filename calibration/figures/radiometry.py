@@ -100,7 +100,7 @@ ADDED_LIGHT = Figure(
     "at most", 0.004, 0.01,
     why="it is equal on dark and bright patches, and extends beyond the patches listed as unfit",
     source=SIMULATED + ": 0 in healthy rooms; 1 % of paper white makes patches of 10 % of paper white 10 % brighter, "
-    "those of 3 % 30 %; a reflection of 3 % causes errors of 57 %",
+    "and patches of 3 % 30 % brighter; a reflection of 3 % causes errors of 57 %",
     remedy="turn the print or the projector until it shows no reflection, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",

@@ -52,7 +52,7 @@ def _transfer_row(table: TableMeasurements) -> SummaryRow:
     transfer = table.sensor.transfer
     gain = " / ".join(f"{value:.2f}" for value in transfer.gain_e.tolist())
     read_noise = " / ".join(f"{value:.1f}" for value in transfer.read_noise.tolist())
-    note = f"R, G, B of half-size pixels; {int(transfer.noisy.sum())} patches are noisier than the curve"
+    note = f"R, G, B of half-size pixels; patches noisier than the curve: {int(transfer.noisy.sum())}"
     return SummaryRow("Photon transfer", f"{gain} e⁻ per count, {read_noise} counts of read noise", note)
 
 

@@ -239,7 +239,7 @@ class Accumulator:
             elif self.highest[colour] >= limit:
                 light = int(self.highest_at[colour])
                 under = f"illuminant {light}" if light >= 0 else "white"
-                cause = f"clipped: {int(self.highest[colour])} counts under {under}, less than {limit:.0f} expected"
+                cause = f"clipped: {int(self.highest[colour])} counts under {under}, expected less than {limit:.0f}"
             elif self.covered[colour]:
                 cause = "covered: it does not match the chart (covered, damaged, or another print)"
             elif self.place_error[colour] > MAX_PLACE_ERROR_PX:

@@ -46,7 +46,7 @@ from experiment.framing.pictures import REREGISTER_PX, Shift
 from experiment.lights import Illumination
 from experiment.measures.sensor import HIGHEST, LOWEST, deviations
 from foundation.colorimetry import angles_deg
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, counted
 
 _Array = npt.NDArray[np.float64]
 
@@ -221,7 +221,8 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
         ) from error
     if len(paths) < MIN_EXPOSURES:
         raise InputError(
-            f"{folder} contains {len(paths)} files, expected at least {MIN_EXPOSURES}; take raw files of the chart "
+            f"{folder} contains {counted(len(paths), 'file')}, expected at least {MIN_EXPOSURES}; take raw files of "
+            "the chart "
             "with different exposure times, preferably 8, from dim to almost saturated"
         )
     means_by_file: list[_Array] = []

@@ -223,7 +223,7 @@ class Exchange:
         remaining = wait
         while (parsed := parse(self._received)) is None:
             if len(self._received) > MAX_MESSAGE:
-                sent = f"sent {len(self._received)} bytes without the end of a message, at most {MAX_MESSAGE} expected"
+                sent = f"sent {len(self._received)} bytes without the end of a message, expected at most {MAX_MESSAGE}"
                 raise ProtocolError(f"{self._label} {sent}; {self._endless_remedy}")
             if remaining < 0:
                 raise self._timeout_error(wait)

@@ -163,7 +163,7 @@ def open_usb(
         raise LinkClosed(_no_camera_message(vendor, serial, port, other_devices))
     if len(matching) > 1:
         choice = "; ".join(str(description) for _, description in matching)
-        raise InputError(f"{len(matching)} cameras on USB match, 1 expected: {choice}; set a serial number or port")
+        raise InputError(f"{len(matching)} cameras on USB match, expected 1: {choice}; set a serial number or port")
     return OpenUsbDevice(*matching[0])
 
 

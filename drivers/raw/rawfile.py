@@ -927,7 +927,7 @@ def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, 
     if not -1 < black.min() <= black.max() < white_level:
         raise _unreadable_error(
             path,
-            f"its black level is {black.min():g} to {black.max():g}, 0 to its white level of {white_level:g} expected",
+            f"its black level is {black.min():g} to {black.max():g}, expected 0 to its white level of {white_level:g}",
         )
 
 

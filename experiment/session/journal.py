@@ -124,7 +124,8 @@ class IncomingFile:
             size = self.stream.seek(0, 2)
             if size != captured.size or size == 0:
                 raise DeviceError(
-                    f"{captured.name}: {size} bytes arrived, {captured.size} expected by the camera; the frame is "
+                    f"{captured.name}: {size} bytes arrived, expected {captured.size} as announced by the camera; the "
+                    "frame is "
                     "repeated"
                 )
             self.stream.seek(0)

@@ -83,7 +83,7 @@ def _fault(folder: Path, frame: AcceptedFile) -> str | OSError:
     try:
         size = path.stat().st_size
         if size != frame.size:
-            return f"{frame.file} has {size} bytes, {frame.size} expected; the frame is repeated"
+            return f"{frame.file} has {size} bytes, expected {frame.size}; the frame is repeated"
         changed = file_sha256(path) != frame.sha256
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
         return f"{frame.file} is missing; the frame is repeated"

@@ -1093,7 +1093,7 @@ def test_refuses_too_many_records(monkeypatch: pytest.MonkeyPatch) -> None:
         ("10000000 89c10000 03d10000 68000000 08", "the size of a record at byte 16 has 1 byte, expected 4"),
         ("07000000 89c10000", "the size of a record at byte 0 is 7, expected at least 8"),
         ("00000000 00000000 01", "expected at least 8"),
-        ("ffffffff 89c10000 03d10000", r"PROPERTY_CHANGED \(0xc189\) at byte 8 has 9 bytes, expected 4294967287"),
+        ("ffffffff 89c10000 03d10000", r"PROPERTY_CHANGED \(0xc189\) at byte 8 has 4 bytes, expected 4294967287"),
         ("0a000000 89c10000 03d1 08000000 00000000", "record 0 at byte 0: PROPERTY_CHANGED"),
         (
             "18000000 8ac10000 01d10000 03000000 ffffff7f 00000000 08000000 00000000",

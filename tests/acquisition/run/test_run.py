@@ -551,7 +551,7 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("target", "label", "why"),
         [
-            ("false s3cret", "false …", "it ended with 1, 0 expected"),
+            ("false s3cret", "false …", "it ended with 1, expected 0"),
             ("/nowhere/notify s3cret", "/nowhere/notify …", "No such file or directory"),
             ("true s3cret", "", ""),
         ],
