@@ -159,8 +159,8 @@ def check(
 ) -> None:
     """Register the chart in a session's best frame and judge the frame.
 
-    Reads the best light or white frame of SESSION and a dark frame. Writes only the file of --picture. Figures that need
-    all frames are judged by a build. Exit code 4 if a figure is refused.
+    Reads the best light or white frame of SESSION and a dark frame. Writes only the file of --picture. Figures that
+    need all frames are judged by a build. Exit code 4 if a figure is refused.
     """
     from calibration.pipeline.build import check as check_session
     from calibration.pipeline.frames import BuildOptions

@@ -124,7 +124,10 @@ def main() -> None:
     for name in ("gray-world", "white-patch", "shades-of-gray", "gray-edge-1"):
         method = standard_methods()[name]
         found[method.name] = np.stack([method.estimate(picture, 0.98) for picture in pictures])
-    print(f"\n{len(tried)} crops of {len(trial)} unseen pictures under {len(held_out)} unseen lights, angle in degrees")
+    print(
+        f"\n{len(tried)} crops of {len(trial)} unseen pictures under {len(held_out)} unseen illuminants, angle in "
+        "degrees"
+    )
     print(f"{'':24}{'mean':>8}{'median':>8}{'worst 25 %':>12}")
     for name, lights_found in found.items():
         summary = summarise(recovery_error(lights_found, batch.illuminants))

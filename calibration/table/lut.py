@@ -436,7 +436,7 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
     Raises
     ------
     FormatError
-        If the folder is no LUT, its version is unknown, its files disagree, or a file has changed since the build.
+        If the folder is not a LUT, its version is unknown, its files disagree, or a file has changed since the build.
     """
     path = folder / PROVENANCE
     require_plain_table(folder)
