@@ -256,7 +256,7 @@ def tried(seed: int, troubles: Troubles, small: bool) -> tuple[str, list[str], S
             options = BuildOptions(subtract_dark=troubles.in_darks is not None)
             result = build(session, Path(folder) / "lut", options=options)
         except CropError as refused:
-            return "refuse", [str(refused).split("the LUT is refused. ")[-1][:160]], None
+            return "refuse", [str(refused).split("the LUT is refused: ")[-1][:160]], None
         lut = open_lut(Path(folder) / "lut")
         truth = compare(result, lut, world, chart, session, changes, every=3)
         # Under the light in which the chart is registered, as the table states them.

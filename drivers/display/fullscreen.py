@@ -87,8 +87,8 @@ def choose_display(displays: tuple[Display, ...], selection: str | int | None = 
         x_positions = [display.x for display in displays]
         if len(set(x_positions)) < 2:
             raise ConfigurationError(
-                f"display {selection!r} requires two displays side by side (present: {present}); "
-                "connect the projector and extend the desktop to it"
+                f"display {selection!r} requires two displays side by side (present: {present})",
+                remedy="connect the projector and extend the desktop to it",
             )
         x_position = min(x_positions) if selection == "left" else max(x_positions)
         matches = [display for display in displays if display.x == x_position]
@@ -104,7 +104,8 @@ def choose_display(displays: tuple[Display, ...], selection: str | int | None = 
     if matches:
         raise ConfigurationError(f"{subject}: {len(matches)} match, expected 1; set one of these positions: {present}")
     raise ConfigurationError(
-        f"{subject} is not connected (present: {present}); connect and switch on the projector, or set another display"
+        f"{subject} is not connected (present: {present})",
+        remedy="connect and switch on the projector, or set another display",
     )
 
 
@@ -396,8 +397,8 @@ class FullScreen:
         if not self._is_full():
             present = "; ".join(str(display) for display, _ in self._displays_now()) or "none"
             raise DeviceError(
-                f"the window does not fill display {self.display} (present displays: {present}); check its cable, and "
-                "restore the desktop's display settings"
+                f"the window does not fill display {self.display} (present displays: {present})",
+                remedy="check its cable, and restore the desktop's display settings",
             )
 
     def _displays_now(self) -> list[tuple[Display, Any]]:

@@ -160,10 +160,12 @@ def open_usb(
     if not matching:
         if read_error is not None:
             raise read_error
-        raise LinkClosed(_no_camera_message(vendor, serial, port, other_devices))
+        fault = _no_camera_message(vendor, serial, port, other_devices)
+        raise LinkClosed(fault, remedy="switch the camera on, check cable and sleep timer")
     if len(matching) > 1:
         choice = "; ".join(str(description) for _, description in matching)
-        raise InputError(f"{len(matching)} cameras on USB match, expected 1: {choice}; set a serial number or port")
+        fault = f"{len(matching)} cameras on USB match, expected 1: {choice}"
+        raise InputError(fault, remedy="set a serial number or port")
     return OpenUsbDevice(*matching[0])
 
 
@@ -401,7 +403,7 @@ def _no_camera_message(vendor: int | None, serial: str | None, port: str | None,
     ]
     expected = ", ".join(text for text in properties if text) or "PTP"
     present = "; ".join(str(device) for device in devices) or "none"
-    return f"no camera with {expected} on USB; present: {present}; switch the camera on, check cable and sleep timer"
+    return f"no camera with {expected} on USB (present: {present})"
 
 
 def _milliseconds(timeout: float) -> int:

@@ -128,7 +128,7 @@ def test_a_serial_port_that_is_not_there(bench: Bench, camera: str) -> None:
         f'{camera}[lab.projector]\ncontrol = "serial"\nlanguage = "benq"\ndevice = "/dev/ttyCROP9"\n'
     )
     assert code == 3
-    assert said.startswith("projector: serial port /dev/ttyCROP9 does not exist; present: ")
+    assert said.startswith("projector: serial port /dev/ttyCROP9 does not exist (present: ")
 
 
 def test_another_language_than_the_projectors(bench: Bench, camera: str) -> None:
@@ -169,7 +169,7 @@ def test_a_display_and_a_camera_that_are_not_there(bench: Bench) -> None:
     assert code == 3
     assert "display 'HDMI-1' is not connected" in said
     assert str(DESK) in said
-    assert "no camera with vendor 04a9 on USB; present: none" in said
+    assert "no camera with vendor 04a9 on USB (present: none)" in said
 
 
 def test_two_cameras_of_which_none_is_named(bench: Bench) -> None:
@@ -177,7 +177,7 @@ def test_two_cameras_of_which_none_is_named(bench: Bench) -> None:
     bench.plug("2")
     code, said = bench.told("")
     assert code == 2
-    assert "2 cameras on USB match, 1 expected: " in said
+    assert "2 cameras on USB match, expected 1: " in said
     assert "set a serial number or port" in said
 
 
