@@ -981,8 +981,7 @@ class EosBody:
             raise DeviceRefused(
                 f"{self.label} is a {self._info.model}, expected a body with the remote mode of EOS bodies, which EOS "
                 'M and compact bodies lack; set connection = "gphoto2" in [lab.camera], or take the frames otherwise '
-                "and use "
-                "`acquire import`"
+                "and use `acquire import`"
             )
         self._session.call(Operation.EOS_SET_REMOTE_MODE, _REMOTE_ON)
         self._session.call(Operation.EOS_SET_EVENT_MODE, _REMOTE_ON)

@@ -1120,8 +1120,7 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
     rows = np.flatnonzero(is_wrong.reshape(-1, SEGMENTS).any(axis=1))
     reason = (
         f"{counted(len(rows), 'row')} of blocks, from row {2 * int(rows[0])} of the frame to {2 * int(rows[-1]) + 1}, "
-        "do not have "
-        f"the expected content; {cause}"
+        f"do not have the expected content; {cause}"
     )
     return [Check(ROWS.name, float(count), None, float(ROWS.accept), "", reason)]
 
@@ -1164,8 +1163,7 @@ def _uneven_reason(rest: Residuals, deviating: npt.NDArray[np.bool_], late: floa
         return (
             f"{amount} still showed the previous illuminant for {max(late, 0.01):.0%} of the exposure: only part of "
             "the projected image had changed, or a window of that colour covers it; increase sequence.settle_s, and "
-            "close "
-            "other programs that draw on the screen"
+            "close other programs that draw on the screen"
         )
     if share > _WHOLE_FRAME:
         return (
@@ -1182,8 +1180,7 @@ def _uneven_reason(rest: Residuals, deviating: npt.NDArray[np.bool_], late: floa
     passed = "somebody walked past, " if median < 0 else ""
     return (
         f"{amount} are lit differently from the rest, by {median:+.0%}; check whether {passed}only part of the "
-        "projected image "
-        "has changed, a window or a screen saver covers it, or other light falls on the chart"
+        "projected image has changed, a window or a screen saver covers it, or other light falls on the chart"
     )
 
 

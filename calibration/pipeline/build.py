@@ -446,8 +446,7 @@ def _require_dark_frames(session: Session, options: BuildOptions) -> None:
     if options.subtract_dark and not any(record.kind == "dark" and record.accepted for record in session.frames()):
         raise FormatError(
             f"{session.folder} has 0 accepted dark frames, expected at least 1 for --subtract-dark; take the session "
-            "with "
-            "acquire run, which takes dark frames, or build the LUT without --subtract-dark"
+            "with acquire run, which takes dark frames, or build the LUT without --subtract-dark"
         )
 
 

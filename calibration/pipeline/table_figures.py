@@ -222,8 +222,7 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
     if len(paths) < MIN_EXPOSURES:
         raise InputError(
             f"{folder} contains {counted(len(paths), 'file')}, expected at least {MIN_EXPOSURES}; take raw files of "
-            "the chart "
-            "with different exposure times, preferably 8, from dim to almost saturated"
+            "the chart with different exposure times, preferably 8, from dim to almost saturated"
         )
     means_by_file: list[_Array] = []
     times: list[float] = []

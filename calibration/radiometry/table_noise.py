@@ -57,7 +57,6 @@ def noise_curve(lut: Lut) -> PhotonTransfer | None:
         raise InputError(
             f"the samples of {lut.folder} do not follow the photon-transfer curve: their variances differ by "
             f"{curve.misfit.max():.0%} RMS, expected at most {_MISFIT:.0%}; omit --iso, --exposure and --gradient, or "
-            "use "
-            "another LUT"
+            "use another LUT"
         )
     return curve if has_noise else None

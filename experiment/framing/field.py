@@ -349,8 +349,7 @@ def parse_corners(texts: Sequence[str]) -> Corners:
     if len(texts) != 4:
         raise InputError(
             f"{len(texts)} corners are given, {' '.join(texts)}, expected 4, X,Y each, in pixels of the raw file; "
-            "correct "
-            "--corners"
+            "correct --corners"
         )
     corners: list[tuple[float, float]] = []
     for text in texts:

@@ -125,8 +125,7 @@ class IncomingFile:
             if size != captured.size or size == 0:
                 raise DeviceError(
                     f"{captured.name}: {size} bytes arrived, expected {captured.size} as announced by the camera; the "
-                    "frame is "
-                    "repeated"
+                    "frame is repeated"
                 )
             self.stream.seek(0)
             sha256 = stream_sha256(self.stream)

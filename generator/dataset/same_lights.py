@@ -212,8 +212,7 @@ def _require_single(dataset: Dataset, tinted: bool) -> None:
     if mixed:
         raise InputError(
             f"{len(mixed)} images of {dataset.store.location}, such as {mixed[0]}, mix spectra with separate "
-            "exposures, expected single illuminants; make the first data set with --light, --random or "
-            "--nearest"
+            "exposures, expected single illuminants; make the first data set with --light, --random or --nearest"
         )
 
 

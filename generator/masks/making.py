@@ -413,8 +413,7 @@ class GivenMasks:
         if len(masks) not in (lights, lights - 1):
             raise FormatError(
                 f"{names} in {self.files[0].parent} have {len(masks)} masks, expected {lights} for {lights} "
-                "illuminants, or "
-                f"{lights - 1} without the first; add or remove masks"
+                f"illuminants, or {lights - 1} without the first; add or remove masks"
             )
         total = np.sum(masks, axis=0, dtype=np.float32)
         if len(masks) == lights:

@@ -317,13 +317,10 @@ def test_refuses_a_display_in_use_by_another_process(virtual: VirtualScreen) -> 
 
 def test_process_survives_the_end_of_the_server(tmp_path: Path) -> None:
     program = (
-        "from foundation.errors import DeviceError; from drivers.display.fullscreen import FullScreen\n"
-        "from drivers.presenter import WHITE\n"
-        "screen = FullScreen(); screen.show(WHITE); print('lit', flush=True); input()\n"
-        "for _ in range(2):\n"
-        "    try: screen.show(WHITE)\n"
-        "    except DeviceError as error: print(error, flush=True)\n"
-        "screen.close()"
+        "from foundation.errors import DeviceError; from drivers.display.fullscreen import FullScreen\nfrom "
+        "drivers.presenter import WHITE\nscreen = FullScreen(); screen.show(WHITE); print('lit', flush=True); "
+        "input()\nfor _ in range(2):\n    try: screen.show(WHITE)\n    except DeviceError as error: print(error, "
+        "flush=True)\nscreen.close()"
     )
     with contextlib.ExitStack() as served:
         server = served.enter_context(virtual_screen(tmp_path, "320x200"))
