@@ -24,7 +24,7 @@ from foundation.console import (
     progress,
     with_json,
 )
-from foundation.errors import DeviceError, InputError, QualityError, StorageError, counted, first_few
+from foundation.errors import RUN_AGAIN, DeviceError, InputError, QualityError, StorageError, counted, first_few
 from foundation.files import make_folder, write_atomic
 from foundation.folders import atomic_folder, locked_folder, require_free
 
@@ -172,16 +172,16 @@ def illuminations(
 
     plot = out.with_suffix(".png")
     if plot == out:
-        raise InputError(f"{out} is the name of the plot; name the file of illuminants {out.with_suffix('.csv')}")
+        raise InputError(f"{out} is the name of the plot, expected another name; give {out.with_suffix('.csv')}")
     require_free(out, "the illuminants")
     require_free(plot, "the plot of the illuminants")
     lights = plan_illuminants(grid, parse_ccts(blackbodies))
     if not lights:
-        raise InputError("there are 0 illuminants, at least 1 is needed; set --grid or --blackbodies")
+        raise InputError("0 illuminants are planned, expected at least 1; set --grid or --blackbodies")
     save_illuminants(lights, out)
     plot_illuminants(lights, plot)
     output.add(file=out, plot=plot, lights=len(lights), kinds=Counter(light.kind for light in lights))
-    print(f"{out}: {len(lights)} illuminants; plot in {plot}")
+    print(f"{out}: {counted(len(lights), 'illuminant')}; plot in {plot}")
 
 
 @app.command(epilog=EXIT_CODES)
@@ -284,7 +284,7 @@ def run(
         bool,
         typer.Option(
             "--dry-run",
-            help="Ask every device, and print the frames, time and space of the run, and faults that would end it; "
+            help="Query every device, and print the frames, time and space of the run, and faults that would end it; "
             "switches no lamp on, takes no frame, shows and writes nothing.",
         ),
     ] = False,
@@ -294,8 +294,8 @@ def run(
     """Take the session, or resume an interrupted one.
 
     First checks everything that a dry run prints. Reads LAB.toml, its chart and its illuminants. Writes SESSION:
-    session.toml, chart.json, illuminations.csv, frames/, previews/, journal.sqlite, frames.csv, report.html. It can be
-    interrupted at any time and run again. Ends with 4 if frames were refused; the next run repeats them.
+    session.toml, chart.json, illuminations.csv, frames/, previews/, journal.sqlite, frames.csv, report.html. To resume
+    an interrupted run, run the same command again. Ends with 4 if frames were refused; the next run repeats them.
     """
     from acquisition.run.run import Terminal, run_session
     from experiment.config import load_lab
@@ -315,7 +315,7 @@ def run(
     if not outcome.complete:
         raise QualityError(
             f"{outcome.total - missing} of {outcome.total} planned frames are complete, {missing} are missing; remove "
-            "the causes, and run the same command again: " + "; ".join(refused)
+            f"the causes, {RUN_AGAIN}: " + "; ".join(refused)
         )
     print(f"{session}: complete, {outcome.total} frames; next: build-lut {shlex.quote(str(session))} LUT/")
 
@@ -384,7 +384,7 @@ def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) ->
 
     with locked_folder(session, busy_message(session)):
         attempts = rebuild_journal(session)
-    print(f"{session / JOURNAL_FILE}: restored with {attempts} attempts; next: acquire status {session}")
+    print(f"{session / JOURNAL_FILE}: restored with {counted(attempts, 'attempt')}; next: acquire status {session}")
 
 
 @app.command(epilog=EXIT_CODES)
@@ -448,7 +448,7 @@ def import_(
     with progress("files") as advance:
         imported = import_session(frames, chart, session, advance)
     output.add(session=session, refused=imported.refused, left=imported.missing)
-    print(f"{session}: imported; {len(imported.refused)} frames refused")
+    print(f"{session}: imported; {counted(len(imported.refused), 'frame')} refused")
     if imported.unchecked:
         print(
             f"{', '.join(imported.unchecked)}: the completeness of files of this format cannot be checked; convert "

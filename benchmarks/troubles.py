@@ -240,7 +240,7 @@ def tried(seed: int, troubles: Troubles, small: bool) -> tuple[str, list[str], R
             options = BuildOptions(subtract_dark=troubles.in_darks is not None)
             result = build(session, Path(folder) / "lut", options=options)
         except CropError as refusal:
-            return "refuse", [str(refusal).split("the LUT is refused. ")[-1][:160]], None
+            return "refuse", [str(refusal).split("the LUT is refused: ")[-1][:160]], None
         lut = open_lut(Path(folder) / "lut")
         truth = compare(result, lut, world, chart, session, changes, every=3)
         # Compare under the illuminant of the registration, as the LUT reports them.

@@ -141,7 +141,7 @@ def serial_text(origin: OriginRecord | None) -> str:
     if origin is None:
         return NOT_RECORDED
     if origin.camera_serial is None:
-        return "withheld by the lab" if origin.camera_serial_is == "withheld" else "not stated by the raw files"
+        return "withheld by the lab" if origin.camera_serial_is == "withheld" else "not recorded by the raw files"
     return f"{origin.camera_serial} (hash)" if origin.camera_serial_is == "hash" else origin.camera_serial
 
 
@@ -246,7 +246,7 @@ def table_title(camera: str, lights: int | None, origin: OriginRecord | None, co
     if origin is not None and origin.title:
         return origin.title
     description = "Computed look-up table" if computed else "Look-up table"
-    return f"{description} of the {camera}" + ("" if lights is None else f" under {lights} lights")
+    return f"{description} of the {camera}" + ("" if lights is None else f" under {lights} illuminants")
 
 
 def bibtex(
@@ -270,7 +270,7 @@ def bibtex(
     if not record.licence:
         missing.append("licence")
     body = "".join(f"  {name} = {{{value}}},\n" for name, value in fields.items() if value)
-    comment = f"% {NOT_RECORDED} by the table: {', '.join(missing)}\n" if missing else ""
+    comment = f"% {NOT_RECORDED} by the LUT: {', '.join(missing)}\n" if missing else ""
     return f"{comment}@misc{{{key},\n{body}}}\n"
 
 

@@ -132,8 +132,9 @@ def build_lut(
     if isinstance(result, TableProgress):
         output.add(table=lut, progress=result)
         print(
-            f"{lut}: {result.lights} of {result.lights_planned} illuminants, {result.new_frames} new frames, "
-            f"{result.frames} in total; run the same command again when more frames are available"
+            f"{lut}: {result.lights} of {result.lights_planned} illuminants, "
+            f"{counted(result.new_frames, 'new frame')}, "
+            f"{result.frames} in total; when more frames are available, run the same command again"
         )
         return
     output.add(table=lut)
@@ -158,8 +159,8 @@ def check(
 ) -> None:
     """Register the chart in a session's best frame and judge the frame.
 
-    Reads the best illuminant or white frame of SESSION and a dark frame. Writes only the picture. Figures that need all
-    frames are judged only by a build. Exit code 4 if a figure is refused.
+    Reads the best light or white frame of SESSION and a dark frame. Writes only the file of --picture. Figures that
+    need all frames are judged by a build. Exit code 4 if a figure is refused.
     """
     from calibration.pipeline.build import check as check_session
     from calibration.pipeline.frames import BuildOptions
@@ -243,7 +244,8 @@ def verify(
         print(fault)
     if faults:
         raise FormatError(
-            f"{folder} has changed: {counted(len(faults), 'fault')}, 0 expected; restore a copy or build it again"
+            f"{folder} has changed: {counted(len(faults), 'fault')}, expected 0; restore it from a copy, or build the "
+            "LUT again"
         )
     frames = "" if session is None else f" and of {len(table.frames)} frames in {session}"
     print(f"{folder}: the hashes of all files{frames} are correct")
@@ -331,7 +333,7 @@ def publish(
     with progress("writing illuminants") as show:
         publish_table(table, url, show)
     output.add(table=folder, url=masked(url), lights=len(table.samples), sha256=table.sha256)
-    print(f"{masked(url)}: {len(table.samples)} illuminants of {folder}. Others can copy the LUT with")
+    print(f"{masked(url)}: {counted(len(table.samples), 'illuminant')} of {folder}. Others can copy the LUT with")
     print(f"build-lut fetch {masked(url)} LUT --expect {table.sha256}")
 
 

@@ -264,5 +264,5 @@ def positions_text(cause: ProbableCause | None) -> str:
         if position.size_mm > 0:
             described.append(f"{position.size_mm:.0f} mm across")
         if not files:
-            described[0] = f"seen in {position.file} {described[0]}"
+            described[0] = f"visible in {position.file} {described[0]}"
     return ", ".join(described)

@@ -146,7 +146,7 @@ class ImageFormat:
     def encode(self) -> bytes:
         """Return the property value."""
         if not 1 <= len(self.files) <= _MAX_IMAGE_FILES:
-            raise ValueError(f"{len(self.files)} files; expected 1 or {_MAX_IMAGE_FILES}")
+            raise ValueError(f"{len(self.files)} files, expected 1 or {_MAX_IMAGE_FILES}")
         return encode_integer(len(self.files), 4) + b"".join(
             encode_integer(number, 4)
             for file in self.files
@@ -240,7 +240,7 @@ class ObjectEntry:
         if len(name) > self.name_width or b"\0" in name:
             raise ValueError(f"name {self.name!r}: expected at most {self.name_width} characters and no NUL")
         if self.name_width < _NAME_WIDTH if self.time is not None else self.name_width >= _NAME_WIDTH + _TIME_LENGTH:
-            raise ValueError(f"a name field of {self.name_width} bytes cannot be told apart from a following time")
+            raise ValueError(f"a name field of {self.name_width} bytes cannot be distinguished from a following time")
         time = b"" if self.time is None else encode_integer(self.time, _TIME_LENGTH)
         return b"".join(
             (
@@ -498,7 +498,7 @@ def _encode_transfer_request(record: TransferRequest) -> bytes:
     size_length, extra_count = _TRANSFER_REQUESTS[record.type]
     extra = record.extra or (0,) * extra_count
     if len(extra) != extra_count:
-        raise ValueError(f"{len(extra)} extra numbers; expected {extra_count} in a record of type 0x{record.type:04x}")
+        raise ValueError(f"{len(extra)} extra numbers, expected {extra_count} in a record of type 0x{record.type:04x}")
     return b"".join(
         (
             *(encode_integer(number, 4) for number in (record.handle, record.format, record.reserved)),
@@ -542,7 +542,7 @@ class Scale:
         step = self._step(code)
         if step is None:
             raise ProtocolError(
-                f"the camera reports {self.name} {self.label(code)} (0x{code:02x}), a fixed value is required; "
+                f"the camera reports {self.name} {self.label(code)} (0x{code:02x}), expected a fixed value; "
                 "turn its mode dial to M and set a value"
             )
         return step.value
@@ -572,7 +572,9 @@ class Scale:
     def _not_offered_error(self, setting: float | str, number: float | None, steps: list[DialPosition]) -> InputError:
         nearest = steps if number is None else sorted(steps, key=lambda step: abs(math.log2(step.value / number)))[:4]
         labels = ", ".join(dict.fromkeys(step.label for step in sorted(nearest, key=lambda step: step.code)))
-        return InputError(f"{self.name} {setting} is not offered; nearest: {labels or 'none, the list is empty'}")
+        return InputError(
+            f"{self.name} {setting} is not offered; set one of the nearest: {labels or 'the camera lists no value'}"
+        )
 
 
 def _parse_number(setting: float | str) -> float | None:
@@ -813,7 +815,9 @@ def plan_settings(state: EosState, settings: ExposureSettings) -> dict[int, byte
         offered_codes = _offered_codes(state, code, scale)
         if value is None:
             if offered_codes:
-                faults.append(f"the lens offers apertures, e.g. {scale.label(offered_codes[0])}: set one as f-number")
+                faults.append(
+                    f"the lens offers apertures, such as {scale.label(offered_codes[0])}: set one as f-number"
+                )
         elif scale is APERTURE and not offered_codes:
             faults.append(f'aperture {value:g} cannot be set, because the lens reports none: set aperture = "none"')
         else:
@@ -822,7 +826,7 @@ def plan_settings(state: EosState, settings: ExposureSettings) -> dict[int, byte
             except InputError as error:
                 faults.append(str(error))
     if faults:
-        raise DeviceRefused(f"the camera cannot take the series: {'; '.join(faults)}")
+        raise DeviceRefused("the camera cannot take the series", remedy="; ".join(faults))
     if WhiteBalance.DAYLIGHT in state.lists.get(Property.EOS_WHITE_BALANCE, ()):
         # Raw values do not depend on it; a fixed value gives previews of the series the same colours.
         values[Property.EOS_WHITE_BALANCE] = number_value(WhiteBalance.DAYLIGHT)
@@ -842,7 +846,7 @@ def host_destination(state: EosState) -> bytes:
     if offered and CaptureDestination.HOST not in values:
         offered_text = ", ".join(str(number) for number in offered)
         raise DeviceRefused(
-            f"the camera offers capture destinations {offered_text}, required: {CaptureDestination.HOST.value} (host); "
+            f"the camera offers capture destinations {offered_text}, expected {CaptureDestination.HOST.value} (host); "
             "use another camera"
         )
     return number_value(CaptureDestination.HOST)
@@ -852,7 +856,9 @@ def _raw_format(state: EosState) -> ImageFormat:
     offered = state.formats.get(Property.EOS_IMAGE_FORMAT, ())
     if RAW_ONLY not in offered and not state.has_value(Property.EOS_IMAGE_FORMAT, RAW_ONLY.encode()):
         raws = ", ".join(str(item) for item in offered if any(file.is_raw for file in item.files))
-        raise InputError(f"image format {RAW_ONLY} alone is not offered; formats with raw: {raws or 'none'}")
+        raise InputError(
+            f"image format {RAW_ONLY} alone is not offered (formats with raw: {raws or 'none'}); use another camera"
+        )
     return RAW_ONLY
 
 
@@ -921,10 +927,10 @@ _SLOT_FILLED = 0xFFFF  # Bits of a storage number; 0 for an empty slot (ISO 1574
 _MAX_CARDS = 8  # Most cards to query; bodies have one or two
 # Parameter of the response to RemoteRelease; 0 is success.
 _RELEASE_RESULTS = {
-    1: "the autofocus failed: set the lens to MF",
-    3: "its mirror is up: switch mirror lockup off",
-    7: "its card is full: empty it",
-    8: "its card is read-only: unlock it",
+    1: "the autofocus failed; set the lens to MF",
+    3: "its mirror is up; switch mirror lockup off",
+    7: "its card is full; empty it or insert another",
+    8: "its card is read-only; unlock it",
 }
 
 
@@ -968,14 +974,14 @@ class EosBody:
         required = (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_GET_EVENT)
         if "canon" not in self._info.manufacturer.lower() or not all(map(self._offers, required)):
             raise DeviceRefused(
-                f"{self.label} is a {self._info.manufacturer} {self._info.model}, a Canon EOS body was "
-                "expected; connect an EOS body, or take the frames otherwise and use `acquire import`"
+                f"{self.label} is a {self._info.manufacturer} {self._info.model}, expected a Canon EOS "
+                "body; connect one, or take the frames otherwise and use `acquire import`"
             )
         if _OTHER_REMOTE_MODE.match(self._info.model):
             raise DeviceRefused(
-                f"{self.label} is a {self._info.model}; EOS M and compact bodies require another remote mode, which "
-                'this driver lacks; set connection = "gphoto2" in [lab.camera], or take the frames otherwise and use '
-                "`acquire import`"
+                f"{self.label} is a {self._info.model}, expected a body with the remote mode of EOS bodies, which EOS "
+                'M and compact bodies lack; set connection = "gphoto2" in [lab.camera], or take the frames otherwise '
+                "and use `acquire import`"
             )
         self._session.call(Operation.EOS_SET_REMOTE_MODE, _REMOTE_ON)
         self._session.call(Operation.EOS_SET_EVENT_MODE, _REMOTE_ON)
@@ -1053,7 +1059,7 @@ class EosBody:
         parameters, _ = self._session.call(Operation.EOS_REMOTE_RELEASE, timeout=CAPTURE_TIMEOUT_S)
         result = parameters[0] if parameters else 0
         if result:
-            reason = _RELEASE_RESULTS.get(result, f"result 0x{result:x}")
+            reason = _RELEASE_RESULTS.get(result, f"result 0x{result:x}; switch it off and on")
             raise DeviceRefused(f"{self.label} does not release: {reason}")
 
     def _press_button(self) -> None:
@@ -1093,14 +1099,15 @@ class EosBody:
                 if fits(candidate):
                     return candidate
             if self._clock.monotonic() >= until:
-                raise LinkTimeout(f"{self.label} announced no frame in time")
+                raise LinkTimeout(f"{self.label} announced no frame in time; switch it off and on")
             self._clock.sleep(next(pauses, _PAUSES_S[-1]))
 
     def fetch(self, pending: PendingObject, into: BinaryIO, offset: int = 0) -> None:
         """Append the bytes of an object from `offset` on to `into`, piece by piece."""
         if not 0 < pending.size <= MAX_FRAME_BYTES:
             raise DeviceError(
-                f"{self.label} announces {pending.name!r} of {pending.size} bytes; 1 to {MAX_FRAME_BYTES} expected"
+                f"{self.label} announces {pending.name!r} of {pending.size} bytes, expected 1 to {MAX_FRAME_BYTES}; "
+                "repeat it"
             )
         while offset < pending.size:
             operation = next((candidate for candidate in _PARTIAL_READS if self._offers(candidate)), None)
@@ -1141,7 +1148,9 @@ class EosBody:
         def append(piece: bytes) -> None:
             nonlocal received
             if received + len(piece) > pending.size:
-                raise ProtocolError(f"{self.label} announced {pending.size} bytes for {pending.name!r} and sends more")
+                raise ProtocolError(
+                    f"{self.label} announced {pending.size} bytes for {pending.name!r} and sends more; repeat it"
+                )
             into.write(piece[max(offset - received, 0) :])
             received += len(piece)
 
@@ -1160,7 +1169,9 @@ class EosBody:
                     raise
             else:
                 if len(data) > limit:
-                    raise ProtocolError(f"{self.label} sent {len(data)} bytes at {offset}; at most {limit} expected")
+                    raise ProtocolError(
+                        f"{self.label} sent {len(data)} bytes at {offset}, expected at most {limit}; repeat it"
+                    )
                 # The standard's operation reports the number of sent bytes; the parameters of Canon's are unknown.
                 count = parameters[0] if parameters and operation == Operation.GET_PARTIAL_OBJECT else len(data)
                 if data and count == len(data):
@@ -1170,8 +1181,7 @@ class EosBody:
 
     def _truncated_error(self, pending: PendingObject, received: int) -> DeviceError:
         return DeviceError(
-            f"{self.label} announced {pending.size} bytes for {pending.name!r}, sent only {received}; "
-            "the frame is invalid; repeat it"
+            f"{self.label} announced {pending.size} bytes for {pending.name!r}, sent only {received}; repeat it"
         )
 
     def _send_frames_to_host(self) -> None:
@@ -1414,7 +1424,7 @@ class CanonEos:
         """
         release = self._last_release
         if release is None:
-            raise DeviceError("the camera holds no exposed frame; expose again")
+            raise DeviceError("the camera has no exposed frame; expose again")
         self._start_call()
         start = into.tell()
         frame = self._run(lambda body: self._receive_frame(body, release, into, start))
@@ -1476,7 +1486,7 @@ class CanonEos:
 
     def _failure_message(self, last_fault: DeviceError, attempts: str) -> str:
         first, latest = (fault.without_remedy() for fault in (self._first_fault or last_fault, last_fault))
-        return f"{first}; {attempts}{'' if latest == first else f'; last fault: {latest}'}; {_REMEDY}"
+        return f"{first}, {attempts}{'' if latest == first else f', last fault: {latest}'}; {_REMEDY}"
 
     def _release(self, settings: ExposureSettings) -> _Release:
         """Release the shutter; return the release, which has or may have happened."""
@@ -1514,7 +1524,7 @@ class CanonEos:
             if not is_new_connection:
                 raise  # the announcement may be lost; a new connection repeats it
             self._last_release = None
-            raise DeviceError(f"{error}, and its memory holds none; expose again") from error
+            raise DeviceError(f"{error}, and its memory has none; expose again") from error
         return release.announced
 
     def _receive_frame(self, body: EosBody, release: _Release, into: BinaryIO, start: int) -> PendingObject:

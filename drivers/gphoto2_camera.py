@@ -122,14 +122,14 @@ def plan_settings(body: Body, settings: ExposureSettings) -> dict[str, str]:
             continue
         label = next((label for label in labels if label in setting.choices), None)
         if label is None or setting.fixed:
-            faults.append(f"{name} is {setting.value}; {effect}: set it to {labels[0]} on the camera")
+            faults.append(f"{name} is {setting.value}, so {effect}: set it to {labels[0]} on the camera")
         else:
             values[name] = label
     _select(first_setting(body, TARGET), HOST_TARGETS, values, faults)
     raw = first_setting(body, RAW_FORMAT)
     if raw is None:
         faults.append(
-            f"a raw format cannot be set: the body shows neither {' nor '.join(RAW_FORMAT)}; set it to raw alone "
+            f"a raw format cannot be set: the body has neither {' nor '.join(RAW_FORMAT)}; set it to raw alone "
             "by hand and take the frames with another program, then use `acquire import`"
         )
     _select(raw, _RAW_LABELS, values, faults)
@@ -148,13 +148,15 @@ def plan_settings(body: Body, settings: ExposureSettings) -> dict[str, str]:
             continue
         label = None if setting is None else find_label(setting, value)
         if setting is None:
-            faults.append(f"{' or '.join(names)} {value:g} cannot be set: the body does not show it")
+            faults.append(f"{' or '.join(names)} {value:g} cannot be set: the body has no such setting")
         elif label is None:
-            faults.append(f"{setting.name} {value:g} is not offered; offered: {setting.describe_choices()}")
+            faults.append(
+                f"{setting.name} {value:g} is not offered (offered: {setting.describe_choices()}): set one of these"
+            )
         else:
             values[setting.name] = label
     if faults:
-        raise DeviceRefused(f"the camera cannot take the series: {'; '.join(faults)}")
+        raise DeviceRefused("the camera cannot take the series", remedy="; ".join(faults))
     return values
 
 
@@ -212,7 +214,10 @@ def _select(setting: BodySetting | None, labels: tuple[str, ...], values: dict[s
     if offered_label is not None and not setting.fixed:
         values[setting.name] = offered_label
     elif setting.value not in labels:
-        faults.append(f"{setting.name} offers {setting.describe_choices()}; one of {', '.join(labels)} expected")
+        faults.append(
+            f"{setting.name} offers {setting.describe_choices()}, expected one of {', '.join(labels)}: set it on the "
+            "camera"
+        )
 
 
 # Time for a body to report a new value, seconds: a Sony changes its dials step by step.
@@ -304,7 +309,7 @@ class Gphoto2Camera:
             self._exposed = path, released_at
             if path.name.lower().endswith(_NOT_RAW_SUFFIXES):
                 self._delete_exposed(camera)
-                raise DeviceRefused(f"the camera wrote {path.name}, a raw file was expected; set raw alone by hand")
+                raise DeviceRefused(f"the camera wrote {path.name}, expected a raw file; set raw alone by hand")
         return released_at
 
     def download(self, into: BinaryIO) -> CapturedFrame:
@@ -313,7 +318,7 @@ class Gphoto2Camera:
         It may be repeated if writing failed. After a fault of the connection, libgphoto2 has lost the frame.
         """
         if self._exposed is None:
-            raise DeviceError("the camera holds no exposed frame; expose again")
+            raise DeviceError("the camera has no exposed frame; expose again")
         path, released_at = self._exposed
         with self._connection() as camera:
             # `file` owns the bytes and must live until they are written.
@@ -400,7 +405,7 @@ class Gphoto2Camera:
             if are_equal(reported, label):
                 return
             if self._clock.monotonic() >= end:
-                raise DeviceRefused(f"{name} is {reported} on the camera, {label} was set; set it by hand")
+                raise DeviceRefused(f"{name} is {reported} on the camera, expected {label} as set; set it by hand")
             self._clock.sleep(_POLL_S)
 
 
@@ -409,7 +414,7 @@ def load_library():
     try:
         import gphoto2
     except ImportError as error:
-        raise ConfigurationError("python-gphoto2 is not installed; install it: pip install gphoto2") from error
+        raise ConfigurationError("python-gphoto2 is not installed; install it with: pip install gphoto2") from error
     return gphoto2
 
 
@@ -421,7 +426,8 @@ def _translate_lookup_errors(subject: str, remedy: str) -> Generator[None]:
         yield
     except gp.GPhoto2Error as error:
         raise ConfigurationError(
-            f"libgphoto2 has no {subject} ({remedy}); detected: {_detected_cameras()}; set one of these or none"
+            f"libgphoto2 has no {subject} ({remedy}; detected: {_detected_cameras()})",
+            remedy="set one of these, or omit the setting",
         ) from error
 
 
@@ -438,12 +444,13 @@ def _translate_error(error: gphoto2.GPhoto2Error, label: str) -> DeviceError:
         case gp.GP_ERROR_TIMEOUT:
             return LinkTimeout(f"{fault}; check that the camera is on and awake")
         case gp.GP_ERROR_IO_USB_CLAIM | gp.GP_ERROR_IO_LOCK:
-            return LinkClosed(f"{fault}; close the other program that uses it, e.g. the desktop's photo importer")
+            return LinkClosed(f"{fault}; close the other program that uses it, such as the desktop's photo importer")
         case gp.GP_ERROR_CAMERA_BUSY:
             return DeviceError(f"{fault}; repeat the frame when the camera is idle")
         case gp.GP_ERROR_MODEL_NOT_FOUND | gp.GP_ERROR_UNKNOWN_PORT | gp.GP_ERROR_IO_USB_FIND:
             return LinkClosed(
-                f"{fault}; detected: {_detected_cameras()}; connect the camera, switch it on, or set its port and model"
+                f"{fault} (detected: {_detected_cameras()})",
+                remedy="connect the camera, switch it on, or set its port and model",
             )
         case gp.GP_ERROR_IO | gp.GP_ERROR_IO_READ | gp.GP_ERROR_IO_WRITE | gp.GP_ERROR_IO_INIT:
             return LinkClosed(f"{fault}; check the cable and the USB permission, switch the camera off and on")

@@ -23,7 +23,7 @@ from drivers.links.link import Exchange, Link, quoted
 from drivers.links.network import BROADCAST, UdpSocket
 from drivers.projector import FAULT_PARTS, Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.clock import SYSTEM_CLOCK, Clock
-from foundation.errors import DeviceFault, DeviceRefused, LinkError, LinkTimeout, ProtocolError
+from foundation.errors import RUN_AGAIN, DeviceFault, DeviceRefused, LinkError, LinkTimeout, ProtocolError
 
 PORT = 4352  # TCP and UDP port of PJLink (PJLink Specifications 1.04 and 2.00)
 MAX_LINE = 136  # Longest command or reply with its CR, bytes
@@ -86,7 +86,7 @@ def split_line(data: bytes, limit: int = MAX_LINE) -> tuple[bytes, int] | None:
     line = data[start : None if line_end is None else line_end.start()].replace(b"\0", b"")
     if len(line) >= limit:
         raise ProtocolError(
-            f"a PJLink line starts with {quoted(line)} and has {len(line)} bytes, fewer than {limit} expected; "
+            f"a PJLink line starts with {quoted(line)} and has {len(line)} bytes, expected fewer than {limit}; "
             "check that this is the control port of a projector"
         )
     return None if line_end is None else (line, line_end.end())
@@ -115,13 +115,13 @@ def parse_greeting(line: bytes) -> str | Refused | None:
             return Refused.WRONG_PASSWORD
         case [word, *_] if word.startswith("HTTP/"):
             raise ProtocolError(
-                f"an HTTP server answers {quoted(line)}, a PJLink projector was expected; set the projector's port, "
+                f"an HTTP server answers {quoted(line)}, expected a PJLink projector; set the projector's port, "
                 f"{PORT} unless its menu shows another"
             )
         case _:
             raise ProtocolError(
-                f"the projector greets with {quoted(line)}; expected PJLINK 0, or PJLINK 1 and a seed of 8 characters. "
-                f"Check that PJLink is enabled on it and that the port is {PORT}"
+                f"the projector greets with {quoted(line)}, expected PJLINK 0, or PJLINK 1 and a seed of 8 characters; "
+                f"check that PJLink is enabled on it and that the port is {PORT}"
             )
 
 
@@ -140,7 +140,7 @@ def parse_request(line: bytes) -> PjLinkRequest:
     match = re.fullmatch(rb"([0-9A-Fa-f]{32})?%([0-9])([0-9A-Za-z]{4}) (.{1,128})", line, re.DOTALL)
     if match is None:
         raise ProtocolError(
-            f"{quoted(line)} is not a PJLink command; expected %1 or %2, four letters, a space, a parameter"
+            f"{quoted(line)} is not a PJLink command, expected %1 or %2, four letters, a space, a parameter"
         )
     digest, level, command, parameter = match.groups(b"")
     return PjLinkRequest(
@@ -164,7 +164,7 @@ def parse_reply(line: bytes) -> PjLinkReply | Refused:
         return Refused.WRONG_PASSWORD
     match = re.fullmatch(rb"%([0-9])([0-9A-Za-z]{4})=(.{0,128})", line, re.DOTALL)
     if match is None:
-        raise ProtocolError(f"the projector answers {quoted(line)}; expected %1 or %2, four letters, = and a value")
+        raise ProtocolError(f"the projector answers {quoted(line)}, expected %1 or %2, four letters, = and a value")
     level, command, value = match.groups()
     return PjLinkReply(command.decode("ascii").upper(), value.decode("utf-8", "replace").strip(), int(level))
 
@@ -291,7 +291,7 @@ def parse_class(value: str) -> int:
 
 
 def _unexpected(command: str, value: str, expected: str) -> ProtocolError:
-    return ProtocolError(f"the projector answers {value!r} to {command} ?; expected {expected}")
+    return ProtocolError(f"the projector answers {value!r} to {command} ?, expected {expected}")
 
 
 SEARCH = b"%2SRCH\r"
@@ -429,7 +429,7 @@ class PjLinkProjector:
         if self._value_now(self.pjlink_class, 1) < 2:
             return None
         if self._value_now(self.frozen, None):
-            return "the projector's image is frozen; release freeze on its remote control"
+            return "the projected image is frozen; release freeze on its remote control"
         if self._value_now(self.input_resolution, None) is NoResolution.NO_SIGNAL:
             return "no signal arrives at the projector's input; check the cable, the input and the display's settings"
         return None
@@ -448,7 +448,7 @@ class PjLinkProjector:
     def _query_class_2(self, command: str) -> str | None:
         if self.pjlink_class() < 2:
             raise DeviceRefused(
-                f"{self._label} has PJLink class 1, {command} requires class 2; look in its menu or on its type plate"
+                f"{self._label} has PJLink class 1, {command} requires class 2; set this with its remote control"
             )
         return self._query_if_supported(command, level=2)
 
@@ -479,7 +479,7 @@ class PjLinkProjector:
         value = self._value(self._exchange_request(PjLinkRequest(command, parameter)), parameter)
         if value.upper() != OK:
             self.close()
-            raise ProtocolError(f"{self._label} answers {value!r} to {command} {parameter}; expected OK")
+            raise ProtocolError(f"{self._label} answers {value!r} to {command} {parameter}, expected OK")
 
     def _value(self, reply: PjLinkReply, parameter: str = QUERY) -> str:
         exchange = f"{self._label} answers {reply.value} to {reply.command} {parameter}"
@@ -492,7 +492,7 @@ class PjLinkProjector:
                 raise DeviceRefused(f"{exchange}: it does not offer this value; set it with its remote control")
             case ErrorCode.UNAVAILABLE:
                 raise DeviceRefused(
-                    f"{exchange}: it is warming up, cooling down or in standby; wait until it is on and try again"
+                    f"{exchange}: it is warming up, cooling down or in standby; wait until it is on, {RUN_AGAIN}"
                 )
             case ErrorCode.FAILURE:
                 raise DeviceFault(f"{exchange}: it reports an internal failure; check its indicator lamps and display")

@@ -216,7 +216,7 @@ def is_tiff(data: bytes | memoryview) -> bool:
 def read_directories(data: bytes | memoryview) -> list[Directory]:
     """Return the directories of the main chain, each followed by its SubIFDs and Exif directory."""
     if not is_tiff(data) or len(data) < 8:
-        raise TiffDamaged("its first bytes are not those of a TIFF file")
+        raise TiffDamaged("it does not start as a TIFF file")
     order = "<" if data[:2] == b"II" else ">"
     directories: list[Directory] = []
     read_offsets: set[int] = set()
@@ -236,7 +236,7 @@ def read_directories(data: bytes | memoryview) -> list[Directory]:
 def _read_directory(order: str, data: bytes | memoryview, offset: int) -> tuple[Directory, int]:
     (count,) = _unpack(order, "H", data, offset)
     if count > _MAX_ENTRIES:
-        raise TiffDamaged(f"a directory has {count} entries, at most {_MAX_ENTRIES} expected")
+        raise TiffDamaged(f"a directory has {count} entries, expected at most {_MAX_ENTRIES}")
     values: dict[int, ReadValue] = {}
     value_count = 0
     for number in range(count):
@@ -247,11 +247,11 @@ def _read_directory(order: str, data: bytes | memoryview, offset: int) -> tuple[
             continue
         value_count += length
         if value_count > _MAX_VALUES:
-            raise TiffDamaged(f"a directory has {value_count} values, at most {_MAX_VALUES} expected")
+            raise TiffDamaged(f"a directory has {value_count} values, expected at most {_MAX_VALUES}")
         if value_type in allowed:
             values[tag] = _read_value(order, data, entry_offset + 8, value_type, length, exact=tag not in _EXPOSURES)
         elif _TEXT not in allowed:
-            raise TiffDamaged(f"its tag {tag} is of type {value_type}, one of {sorted(allowed)} expected")
+            raise TiffDamaged(f"its tag {tag} is of type {value_type}, expected one of {sorted(allowed)}")
     end = offset + 2 + 12 * count
     # Some writers leave out the final link of the chain if the directory ends the file.
     next_offset = _unpack(order, "I", data, end)[0] if end + 4 <= len(data) else 0
@@ -344,7 +344,7 @@ def head(main: Tags, strip: int, exif: Tags | None = None) -> bytes:
         end += len(_directory(exif, 0))
     strip_at = end + -end % _ALIGNMENT
     if strip_at + strip > LARGEST_FILE:
-        raise ValueError(f"{strip} bytes of pixels; a TIFF file holds at most 4 GiB")
+        raise ValueError(f"{strip} bytes of pixels, expected at most 4 GiB in a TIFF file")
     tags[TiffTag.STRIP_OFFSETS] = (ValueType.LONG, [strip_at])
     directories = _directory(tags, len(_HEADER)) + (b"" if exif is None else _directory(exif, exif_at))
     return _HEADER + directories + bytes(strip_at - end)

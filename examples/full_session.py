@@ -63,7 +63,7 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     free_gb = shutil.disk_usage(out).free / 1e9
     if free_gb < NEEDED_GB and not (out / "session").exists():
-        sys.exit(f"{out}: {free_gb:.0f} GB are free, {NEEDED_GB} expected; name a folder on a larger disk")
+        sys.exit(f"{out}: {free_gb:.0f} GB are free, expected {NEEDED_GB} GB; give a folder on a larger disk")
     if not (out / "illuminations.csv").exists():
         step(out, "chart", "acquire", "chart", "chart", "--no-tiff")
         step(out, "illuminations.csv", "acquire", "illuminations", "illuminations.csv")

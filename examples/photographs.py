@@ -15,7 +15,7 @@ import numpy as np
 try:
     import skimage.data
 except ModuleNotFoundError:
-    sys.exit("scikit-image is not installed; run pip install scikit-image, or use your own pictures")
+    sys.exit("scikit-image is not installed; install it with: pip install scikit-image, or use your own photographs")
 
 NAMES = ("astronaut", "chelsea", "coffee", "rocket")
 

@@ -55,9 +55,9 @@ def _check_target(target: str) -> str:
         return target
     url = urlsplit(target)
     if not url.hostname or url.port == 0:
-        raise ValueError("the URL has no host; expected a URL such as https://ntfy.sh/my-lab")
+        raise ValueError("the URL has no host, expected a URL such as https://ntfy.sh/my-lab")
     if not target.removesuffix(f"/{MASK}").isascii() or any(character.isspace() for character in target):
-        raise ValueError("the URL has spaces or non-ASCII letters; write them as %20 and similar")
+        raise ValueError("the URL has spaces or non-ASCII letters, expected %20 and similar instead")
     return target
 
 
@@ -72,7 +72,7 @@ def spdx_expression(licence: str) -> str:
         return str(canonicalize_license_expression(licence))
     except InvalidLicenseExpression as error:
         raise ValueError(
-            "not an SPDX licence expression; expected an identifier of spdx.org/licenses, such as CC-BY-4.0 or "
+            "not an SPDX licence expression, expected an identifier of spdx.org/licenses, such as CC-BY-4.0 or "
             "CC0-1.0, or LicenseRef-NAME for your own licence"
         ) from error
 
@@ -81,7 +81,7 @@ def _parse_seconds(value: object) -> object:
     if not isinstance(value, str):
         return value
     if value.strip().lower() != "forever":
-        raise ValueError('a number of seconds is expected, or "forever"')
+        raise ValueError('expected a number of seconds, or "forever"')
     return math.inf
 
 
@@ -90,16 +90,16 @@ def _parse_f_number(value: object) -> float | Literal["none"]:
         return "none"
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf:
         return float(value)
-    raise ValueError('an f-number above 0 is expected, or "none" for a lens without contacts')
+    raise ValueError('expected an f-number above 0, or "none" for a lens without contacts')
 
 
 def _check_host(host: str) -> str:
     if host.startswith("/dev/") or re.fullmatch(r"COM\d+", host, re.IGNORECASE):
-        raise ValueError("a serial port; an address is expected, such as 192.168.1.30; give the port as device instead")
+        raise ValueError("a serial port, expected an address such as 192.168.1.30; give the port as device instead")
     if "/" in host:
-        raise ValueError("only an address is expected, such as 192.168.1.30, without http:// or a path")
+        raise ValueError("expected only an address, such as 192.168.1.30, without http:// or a path")
     if (match := re.fullmatch(r"([^:\[\]]+):(\d+)", host)) is not None:
-        raise ValueError(f'only an address is expected; write host = "{match[1]}" and port = {match[2]}')
+        raise ValueError(f'expected only an address; write host = "{match[1]}" and port = {match[2]}')
     return host
 
 
@@ -146,7 +146,7 @@ class SequenceSettings(Settings):
     """Seconds that a run waits for a device (camera, screen, projector) or the disk after a failure, before it ends;
     ``inf`` or ``"forever"``: no limit. Each of them restarts within ten minutes. When a run ends, the lamp goes out."""
     order: Literal["shuffled", "listed"] = "shuffled"
-    """Order of the illuminants: shuffled by `seed`, so that drift of the lamp and unchanged pictures do not correlate
+    """Order of the illuminants: shuffled by `seed`, so that drift of the lamp and unchanged images do not correlate
     with colour; or as listed."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the shuffled order."""
@@ -162,7 +162,7 @@ class SequenceSettings(Settings):
     """Disk space in gigabytes for refused and void frames of one run, after which it ends: 200 frames of 18 megapixels,
     a quarter of a session; ``inf``: no limit."""
     notify: Annotated[str, AfterValidator(_check_target), Field(repr=False)] = ""
-    """Receiver of notices when a run pauses, continues and ends: a URL that gets JSON by POST, or a command that gets
+    """Receiver of notices when a run pauses, resumes and ends: a URL that gets JSON by POST, or a command that gets
     it on its standard input; empty: none. ``{ env = "NAME" }`` or ``{ file = "PATH" }`` read it from an environment
     variable or a file. Messages and `session.toml` contain only the host or the name of the program."""
 
@@ -297,7 +297,7 @@ class ProjectorCable(Settings):
     baud: Annotated[int, Field(ge=300)] | None = None
     """Baud rate, if different from the default of the language."""
     refresh_hz: Positive = 60.0
-    """Pictures per second."""
+    """Images per second."""
     colour_wheel_hz: NotNegative = 60.0
     """Turns of the colour wheel per second; 0: none (LCD, LCoS, LED)."""
 
@@ -362,7 +362,7 @@ def load_lab(path: Path) -> LabSettings:
     """Read `LAB.toml` and resolve every path against its folder; `ConfigurationError` if a value is not usable."""
     if path.is_dir():
         remedy = f"give {path / 'LAB.toml'}"
-        raise ConfigurationError("a folder, but a settings file is expected", about=path, remedy=remedy)
+        raise ConfigurationError("a folder, expected a settings file", about=path, remedy=remedy)
     folder = path.resolve().parent
     settings = parse_lab(
         read_text(path, "acquire init writes a first one; give it before the session", "settings"),
@@ -452,7 +452,7 @@ def _read_secret(key: str, source: dict[str, Any], folder: Path) -> str:
                 with path.open(encoding="utf-8-sig") as stream:
                     secret = stream.read(_SECRET_BYTES).partition("\n")[0].strip()
             except (OSError, UnicodeDecodeError, ValueError) as error:
-                reason = (error.strerror if isinstance(error, OSError) else None) or "it is not a text"
+                reason = (error.strerror if isinstance(error, OSError) else None) or "it is not text in UTF-8"
                 raise ConfigurationError(f"{key}: cannot read {path}: {reason}; give a readable file") from error
             if not secret:
                 raise ConfigurationError(f"{key}: the first line of {path} is empty; write the secret there")

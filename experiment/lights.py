@@ -108,28 +108,28 @@ def load_illuminants(path: Path, *, computed: bool = False) -> tuple[Illuminant,
     """
     rows = read_csv(path, "make one with: acquire illuminations", "illuminations")[1]
     if not rows or any(column not in rows[0] for column in COLUMNS):
-        raise FormatError(f"{path}: illuminants in the columns {','.join(COLUMNS)} expected; run acquire illuminations")
+        raise FormatError(f"{path} has no illuminants, expected columns {','.join(COLUMNS)}; run acquire illuminations")
     lights: list[Illuminant] = []
     for number, row in enumerate(rows):
         kind, kelvin = row["kind"], row["cct_k"]
         cct_k: float | None = None
         try:
             if kind not in ("uniform", "blackbody", "spectrum") or (kind == "spectrum" and not computed):
-                raise ValueError(f"kind is {kind!r}, uniform{', spectrum' if computed else ''} or blackbody expected")
+                raise ValueError(f"kind is {kind!r}, expected uniform{', spectrum' if computed else ''} or blackbody")
             for column in ("index", "red", "green", "blue"):
                 if not row[column].strip().removeprefix("-").isdecimal():
-                    raise ValueError(f"{column} is {row[column] or 'missing'}, a whole number expected")
+                    raise ValueError(f"{column} is {row[column] or 'missing'}, expected a whole number")
             if int(row["index"]) != number:
-                raise ValueError(f"index is {row['index']}, {number} expected")
+                raise ValueError(f"index is {row['index']}, expected {number}")
             if kind == "blackbody":
                 with suppress(ValueError):
                     cct_k = float(kelvin)
                 if cct_k is None or not 0 < cct_k < math.inf:
-                    raise ValueError(f"cct_k is {kelvin or 'missing'}, a temperature above 0 K expected")
+                    raise ValueError(f"cct_k is {kelvin or 'missing'}, expected a temperature above 0 K")
             colour = Colour(int(row["red"]), int(row["green"]), int(row["blue"]))
             for name, code in zip(Colour._fields, colour, strict=True):
                 if not 0 <= code <= 255:
-                    raise ValueError(f"{name} is {code}, a code 0 … 255 expected")
+                    raise ValueError(f"{name} is {code}, expected a code from 0 to 255")
         except ValueError as error:
             raise FormatError(f"{path}, illuminant {number}: {error}; correct this row") from error
         lights.append(Illuminant(number, kind, cct_k, colour, (row.get(NAME) or None) if computed else None))
@@ -142,10 +142,10 @@ def parse_ccts(text: str) -> tuple[float, ...]:
     try:
         ccts = [float(field) for field in text.split(":" if ":" in text else ",") if field.strip()]
     except ValueError as error:
-        raise InputError(f"{description}: FIRST:LAST:STEP or K,K,… in kelvin expected") from error
+        raise InputError(f"{description}, expected FIRST:LAST:STEP or K,K,… in kelvin; correct them") from error
     if ":" in text:
         if len(ccts) != 3:
-            raise InputError(f"{description}: FIRST:LAST:STEP or K,K,… in kelvin expected")
+            raise InputError(f"{description}, expected FIRST:LAST:STEP or K,K,… in kelvin; correct them")
         first, last, step = ccts
         _require_kelvin((first, last), description)
         steps = (last - first) / step if step else math.nan
@@ -162,7 +162,7 @@ def parse_ccts(text: str) -> tuple[float, ...]:
 def _require_kelvin(ccts: Sequence[float], description: str) -> None:
     for cct_k in ccts:
         if not 1000 <= cct_k <= 100_000:
-            raise InputError(f"{description}: {cct_k:g} K given, temperatures from 1000 to 100 000 K expected")
+            raise InputError(f"{description}: {cct_k:g} K is given, expected 1000 to 100 000 K; correct it")
 
 
 def plot_illuminants(illuminations: Sequence[Illuminant], path: Path) -> None:
@@ -176,7 +176,7 @@ def plot_illuminants(illuminations: Sequence[Illuminant], path: Path) -> None:
 
     ending = path.suffix.lower().removeprefix(".")
     if ending not in FORMATS:
-        raise InputError(f"the plot {path.name} has no known format; choose a name that ends in .{', .'.join(FORMATS)}")
+        raise InputError(f"the plot is {path.name}, expected a name that ends in .{', .'.join(FORMATS)}; rename it")
     lit_lights = [light for light in illuminations if any(light.colour)]
     codes = np.array([light.colour for light in lit_lights]).reshape(-1, 3) / 255
     linear = decode_srgb(codes)

@@ -120,5 +120,5 @@ class SimulatedClock:
     def sleep(self, seconds: float) -> None:
         """Advance simulated time by `seconds` (≥ 0) and return at once."""
         if seconds < 0:
-            raise ValueError(f"cannot sleep {seconds} s; expected 0 s or more")
+            raise ValueError(f"cannot sleep {seconds} s, expected 0 s or more")
         self._elapsed += timedelta(seconds=seconds)

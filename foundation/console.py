@@ -35,7 +35,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
-from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
+from foundation.errors import EXIT_INTERRUPTED, RUN_AGAIN, CropError, InputError, StorageError
 from foundation.files import disk_remedy, path_remedy
 from foundation.secret_texts import masked, printable
 
@@ -48,7 +48,7 @@ EXIT_CODES = (
 )
 
 # Printed instead of the errors that it causes: all relative paths depend on that folder.
-_NO_FOLDER = "the current folder does not exist any more; change to an existing one (cd), then run it again"
+_NO_FOLDER = f"the current folder does not exist any more; change to an existing one (cd), {RUN_AGAIN}"
 _WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
@@ -79,7 +79,7 @@ def run(command: Callable[[], object], *, is_resumable: bool = True, pause_gc: b
         # Errors of the last output are handled here; otherwise they would occur at the end of the interpreter.
         sys.stdout.flush()
     except OSError as error:
-        print_error(f"cannot print: {error.strerror}; redirect the output to another place and run again")
+        print_error(f"cannot print: {error.strerror}; redirect the output, {RUN_AGAIN}")
         _discard_output(sys.stdout.fileno())
         return code or StorageError.exit_code
     return code
@@ -195,7 +195,7 @@ def _discard_output(descriptor: int) -> None:
 
 
 def _report_interruption(is_resumable: bool) -> int:
-    print_error(f"interrupted; {'run the same command again to continue' if is_resumable else 'no results were kept'}")
+    print_error(f"interrupted; {'run the same command again' if is_resumable else 'no results were kept'}")
     return EXIT_INTERRUPTED
 
 

@@ -37,7 +37,7 @@ _PART_IS_A_FILE = "a part of that path is a file, not a folder; choose another p
 _REMEDIES = {
     errno.EACCES: "ask its owner for permission, or choose another path",
     errno.EPERM: "ask its owner for permission, or choose another path",
-    errno.EISDIR: "it is a folder; name a file",
+    errno.EISDIR: "it is a folder; give a file",
     errno.ENOTDIR: _PART_IS_A_FILE,
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.ELOOP: "its links form a circle; give the path without links",
@@ -51,7 +51,7 @@ _DISK_REMEDIES = {
     "EFBIG": f"the file is too large there (FAT32 allows 4 GiB; ulimit -f): choose another disk, {RUN_AGAIN}",
     "EROFS": f"choose another path, or mount it for writing (dmesg lists disk errors), {RUN_AGAIN}",
     "EIO": (
-        "the disk fails: look at the output of dmesg, check its cable, copy its files to another disk while they can "
+        "the disk fails: read the output of dmesg, check its cable, copy its files to another disk while they can "
         f"be read, {RUN_AGAIN}"
     ),
     "ENODEV": _DISCONNECTED,
@@ -111,7 +111,7 @@ def _write_error(path: Path, error: OSError) -> InputError | StorageError:
     missing = error.filename if error.errno == errno.ENOENT and error.filename2 is None else None
     if isinstance(missing, str | bytes) and Path(os.fsdecode(missing)).parent.is_dir():
         return InputError(
-            f"cannot write {path}: {error.strerror}; the system allows no new files there; choose a path on an "
+            f"cannot write {path}: {error.strerror}, the system allows no new files there; choose a path on an "
             "ordinary disk"
         )
     return storage_error(path, error)
@@ -382,9 +382,7 @@ def _require_size(path: Path, limit: int) -> None:
     except (FileNotFoundError, NotADirectoryError):
         return
     if stat.S_ISREG(status.st_mode) and status.st_size > limit:
-        raise FormatError(
-            f"{path} has {status.st_size} bytes, expected at most {limit}; it is damaged or another file: restore it"
-        )
+        raise FormatError(f"{path} has {status.st_size} bytes, expected at most {limit}; restore it from a copy")
 
 
 def require_plain_tree(folder: Path) -> None:
@@ -393,14 +391,16 @@ def require_plain_tree(folder: Path) -> None:
         for name in (*folders, *files):
             mode = (Path(path) / name).lstat().st_mode
             if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-                raise FormatError(f"{Path(path) / name} is {_kind(mode)}, a regular file expected; {_COPY_REMEDY}")
+                raise FormatError(f"{Path(path) / name} is {_kind(mode)}, expected a regular file; {_COPY_REMEDY}")
 
 
 def bounded_lines(stream: BinaryIO, name: str) -> Iterator[bytes]:
     """Yield the lines of a stream; raise a FormatError, with `name`, for a line longer than `MAX_LINE_BYTES`."""
     while line := stream.readline(MAX_LINE_BYTES + 1):
         if len(line) > MAX_LINE_BYTES:
-            raise FormatError(f"{name} has a line of more than {MAX_LINE_BYTES} bytes; it is damaged: restore it")
+            raise FormatError(
+                f"{name} has a line of more than {MAX_LINE_BYTES} bytes, which is too long; restore it from a copy"
+            )
         yield line
 
 
@@ -411,14 +411,16 @@ def _parse_json(data: bytes | str, name: str) -> Any:
     try:
         return pydantic_core.from_json(data)
     except ValueError as error:
-        raise FormatError(f"{name} is not valid JSON: {error}; it is damaged: restore it") from error
+        raise FormatError(f"{name} is not valid JSON: {error}; restore it from a copy") from error
 
 
 def parse_json_object(data: bytes | str, name: str) -> dict[str, Any]:
     """Return the object of a JSON text (RFC 8259); a FormatError, with `name`, if it is not a JSON object."""
     value = _parse_json(data, name)
     if not isinstance(value, dict):
-        raise FormatError(f"{name} has a value of type {type(value).__name__}, expected a JSON object; restore it")
+        raise FormatError(
+            f"{name} has a value of type {type(value).__name__}, expected a JSON object; restore it from a copy"
+        )
     return cast("dict[str, Any]", value)
 
 
@@ -436,7 +438,7 @@ def _require_plain(folder: Path, name: str, entry: os.DirEntry[str]) -> None:
 
 def _require_regular(mode: int, path: Path) -> None:
     if not stat.S_ISREG(mode):
-        raise FormatError(f"{path} is {_kind(mode)}, a regular file expected; {_COPY_REMEDY}")
+        raise FormatError(f"{path} is {_kind(mode)}, expected a regular file; {_COPY_REMEDY}")
 
 
 def _require_filled(handle: int, path: Path) -> None:

@@ -75,7 +75,7 @@ def require_free_file(path: Path, content: str) -> None:
             raise
         raise storage_error(path, error, "read") from error
     if exists:
-        raise InputError(f"{path} already exists; name another place for {content}, or remove it")
+        raise InputError(f"{path} already exists; choose another place for {content}, or remove it")
     if is_probed:
         try:
             # Permissions and mount options can be misleading: only writing a file is a reliable test.

@@ -213,7 +213,7 @@ class LocalServer(ABC, ThreadingHTTPServer):
         except (OSError, OverflowError) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else error
             hint = "" if is_loopback(host) else " or an address of this machine with --host"
-            raise InputError(f"cannot serve on {host} port {port}: {reason}; name another with --port{hint}") from error
+            raise InputError(f"cannot serve on {host} port {port}: {reason}; give another with --port{hint}") from error
 
     @abstractmethod
     def answer(self, request: Request) -> Response | Refusal:

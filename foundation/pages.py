@@ -175,7 +175,7 @@ def _element(picture: bytes, alt: str) -> Markup:
             return Markup("<img alt='{}' src='data:image/{};base64,{}'>").format(alt, kind, data)
     svg = re.search(r"<svg\b.*</svg>", picture.decode("utf-8", errors="replace"), re.DOTALL)
     if not svg:
-        raise ValueError(f"picture data begin with {picture[:8]!r}; expected PNG, JPEG or SVG")
+        raise ValueError(f"image data start with {picture[:8]!r}, expected PNG, JPEG or SVG")
     # Drawings are never enlarged, so that all drawings of a page have the same text size.
     width = re.search(r'<svg\b[^>]* width="([\d.]+)pt"', svg[0])
     style = f" style='min-width: min({_MIN_SVG_WIDTH}, {width[1]}pt)'" if width else ""

@@ -154,7 +154,11 @@ def find_mistakes(
             value_text = "" if isinstance(value, dict) else f" = {MASK if is_secret(key) else repr(value)}"
             prefix = f"{key}{value_text}: " if key else ""
             # A value that may have several types has an error for each of them.
-            mistakes[key] = f"{mistakes[key]}, or {expected}" if key in mistakes else f"{prefix}{expected}"
+            mistakes[key] = (
+                f"{mistakes[key]}, or {expected.removeprefix('expected ')}"
+                if key in mistakes
+                else f"{prefix}{expected}"
+            )
     return list(mistakes.values())
 
 
@@ -176,7 +180,7 @@ def _missing(key: str, table: type[BaseModel] | None) -> str:
         return f"{key} is missing; add it"
     required = [name for name, field in table.model_fields.items() if field.is_required()]
     optional = [name for name in table.model_fields if name not in required]
-    option_text = f"; it may also have {', '.join(optional)}" if optional else ""
+    option_text = f" (optional: {', '.join(optional)})" if optional else ""
     return f"the table [{key}] is missing; add it, with {', '.join(required) or 'at least one key'}{option_text}"
 
 
@@ -189,29 +193,29 @@ def _expectation(key: str, error: ErrorDetails, is_secret: bool = False, hidden_
             return f"expected one of {', '.join(map(repr, choices))}" if choices else error["msg"]
         case "tuple_type" | "list_type":
             if isinstance(value, dict):
-                return f"a list of tables was expected: write [[{key}]]"
+                return f"expected a list of tables: write [[{key}]]"
             example = f": [{json.dumps(value, ensure_ascii=False)}]" if isinstance(value, str) and not is_secret else ""
-            return f"a list was expected, in square brackets{example}"
+            return f"expected a list, in square brackets{example}"
         case "float_parsing" | "float_type" | "int_parsing" | "int_type" | "int_from_float":
             noun = "a whole number" if error["type"].startswith("int") else "a number"
             unit = " of seconds" if key.endswith("_s") else ""
             is_number = isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d+)?", value) and not is_secret
-            return f"{noun}{unit} was expected{f', without quotation marks: {value}' if is_number else ''}"
+            return f"expected {noun}{unit}{f', without quotation marks: {value}' if is_number else ''}"
         case "bool_parsing" | "bool_type":
-            return "true or false was expected, without quotation marks"
+            return "expected true or false, without quotation marks"
         case "string_type" | "path_type":
             is_number = isinstance(value, int | float) and not isinstance(value, bool)
             example = f': "{MASK if is_secret else value}"' if is_number else ""
-            return f"a text was expected, in quotation marks{example}"
+            return f"expected a text, in quotation marks{example}"
         case "model_type" | "dict_type":
-            return f"a table was expected, as in {key.rsplit('.', 1)[-1]} = {{ … }} or [{key}]"
+            return f"expected a table, as in {key.rsplit('.', 1)[-1]} = {{ … }} or [{key}]"
         case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal":
             ((bound, limit),) = limits.items()
-            return f"a number {_BOUNDS[bound]} {limit:g} was expected"
+            return f"expected a number {_BOUNDS[bound]} {limit:g}"
         case "too_short" | "string_too_short":
-            return f"at least {_length(value, limits['min_length'])} expected"
+            return f"expected at least {_length(value, limits['min_length'])}"
         case "too_long" | "string_too_long":
-            return f"at most {_length(value, limits['max_length'])} expected"
+            return f"expected at most {_length(value, limits['max_length'])}"
         case _:
             return error["msg"].removeprefix("Value error, ")
 
@@ -221,8 +225,7 @@ _BOUNDS: Final = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of a
 
 
 def _length(value: Any, limit: int) -> str:
-    unit = "character" if isinstance(value, str) else "value"
-    return counted(limit, f"{unit} was", f"{unit}s were")
+    return counted(limit, "character" if isinstance(value, str) else "value")
 
 
 def _table_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel] | None:
@@ -242,8 +245,8 @@ def _table_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[B
 def unknown_key(key: str, known_keys: Iterable[str]) -> str:
     """Return a message about an unknown key, with the most similar known key or all known keys."""
     names = sorted(known_keys)
-    hint = nearest_names(key.rsplit(".", 1)[-1], names) or f"known are {', '.join(names)}"
-    return f"unknown key {key!r}; {hint}"
+    hint = nearest_names(key.rsplit(".", 1)[-1], names)
+    return f"unknown key {key!r}; {hint}" if hint else f"unknown key {key!r}, expected one of {', '.join(names)}"
 
 
 def from_settings(
@@ -261,4 +264,4 @@ def from_settings(
     except ValidationError as error:
         first = error.errors()[0]
         path = ".".join([key, *(str(component) for component in first["loc"][:1])])
-        raise ConfigurationError(f"{where}: {path}: {_expectation(path, first)}, got {first['input']!r}") from error
+        raise ConfigurationError(f"{where}: {path} = {first['input']!r}: {_expectation(path, first)}") from error

@@ -61,7 +61,7 @@ of a store supported by fsspec. OUT appears when it is complete: images/ (linear
 Each image shows a print of the picture under an illuminant, as the camera would record it. A pixel is the response to
 its colour, interpolated between patches, plus the noise of one sample; with --rendering codes it is one sample of its
 patch. Equal seed, pictures and LUT give equal bytes with any number of workers. A picture that cannot be read is
-skipped and listed. To resume an interrupted run, repeat the same command.
+skipped and listed. To resume an interrupted run, run the same command again.
 
 Examples: a first data set from a computed LUT; training crops under illuminants of any chromaticity; test images with
 two illuminants each, rendered as in the paper.
@@ -224,7 +224,7 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers, output: Json
         done_count, shard_count = make_share(plan, out, share, workers, callbacks)
     output.add(dataset=masked(out), shard=shard, shards_done=done_count, shards=shard_count)
     finish = "run the same command without --shard to complete the data set"
-    next_step = finish if done_count == shard_count else "run the command for the other shares first"
+    next_step = finish if done_count == shard_count else "run the same command with the other shares first"
     print(masked(f"{done_count} of {shard_count} shards of {out} are done; {next_step}"))
 
 
@@ -297,7 +297,7 @@ def _verify(out: str, workers: int | None, output: JsonOutput) -> Dataset:
     output.add(dataset=masked(out), faults=faults)
     if faults:
         raise QualityError(
-            f"{out} has {counted(len(faults), 'fault')}, listed above; expected unchanged files. Generate the data set "
+            f"{out} has {counted(len(faults), 'fault')}, listed above, expected unchanged files; make the data set "
             "again, or copy it again"
         )
     dataset = open_dataset(out)

@@ -458,7 +458,7 @@ def encode_pieces(image: Image, form: Format, metadata: ImageMetadata) -> Iterab
 
 def _require_rgb16(image: Image) -> None:
     if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        raise InputError(f"the image is {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
+        raise InputError(f"the image is {image.dtype} {image.shape}, expected uint16 (height, width, 3); convert it")
 
 
 def decode_image(data: bytes, form: Format, name: str) -> Image:
@@ -539,7 +539,7 @@ def fit_flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2
     """
     if not linear.size or a <= 0 or gamma <= 0:
         raise InputError(
-            f"the image has shape {linear.shape}, a is {a}, gamma is {gamma}; expected pixels, and numbers above 0"
+            f"the image has shape {linear.shape}, a is {a}, gamma is {gamma}, expected pixels, and numbers above 0"
         )
     brightness = _brightness(np.asarray(linear))
     return flash_from_brightness(float(np.log(brightness).mean(dtype=np.float64)), float(brightness.max()), a, gamma)

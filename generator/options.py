@@ -89,7 +89,9 @@ class PictureOptions:
         size, *flags = self.crop.split(",")
         unknown = [flag for flag in flags if flag not in ("cover", "random")]
         if unknown:
-            raise InputError(f"--crop {self.crop} contains {unknown[0]!r}, expected cover or random after the size")
+            raise InputError(
+                f"--crop {self.crop} contains {unknown[0]!r}, expected cover or random after the size; correct it"
+            )
         return Preparation(
             self.max_side,
             _size(size, "--crop"),
@@ -117,7 +119,7 @@ class PictureOptions:
             number, _, size = self.random_scenes.partition(":")
             if not re.fullmatch(r"[1-9]\d{0,8}", number, re.ASCII):
                 raise InputError(
-                    f"--random-scenes is {self.random_scenes!r}, expected a number such as 8, or 8:256x256"
+                    f"--random-scenes is {self.random_scenes!r}, expected a number such as 8, or 8:256x256; correct it"
                 )
             sources += random_scenes(int(number), *_size(size or "512x512", "--random-scenes"), preparation.seed)
         if not sources:
@@ -199,7 +201,7 @@ class LightOptions:
 
         per_image = self.lights_per_image or (1 if self.masks is None else 2)
         if self.lights_per_image is not None and self.lights_per_image < 1:
-            raise InputError(f"--lights-per-image is {self.lights_per_image}, expected 1 or more")
+            raise InputError(f"--lights-per-image is {self.lights_per_image}, expected 1 or more; correct it")
         if self.masks is not None and per_image == 1:
             raise InputError(
                 f"--masks {self.masks} needs several illuminants in an image, but there is 1; use --lights-per-image 2 "
@@ -226,7 +228,7 @@ class LightOptions:
         given_options = [name for name, is_given in is_given_by_option.items() if is_given]
         if len(given_options) > 1:
             raise InputError(
-                f"{' and '.join(given_options)} exclude each other; give only one (--random may be used with "
+                f"{' and '.join(given_options)} exclude each other; give only one of them (--random may be used with "
                 "--distribution)"
             )
         count = per_image * (1 if self.random is None else self.random)
@@ -434,7 +436,7 @@ class WorkOptions:
 def _size(text: str, name: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d+)[xX×](\d+)", text)
     if not match:
-        raise InputError(f"{name} is {text!r}, expected width x height such as 512x512")
+        raise InputError(f"{name} is {text!r}, expected width x height such as 512x512; correct it")
     return int(match[1]), int(match[2])
 
 
@@ -489,5 +491,5 @@ def _preparation_as_in(pictures: PictureOptions, description: Description, locat
     prepared = preparation_of(description)
     requested = pictures.preparation(prepared.seed)
     if requested.describe() not in (prepared.describe(), UNPREPARED.describe()):
-        raise InputError(f"--max-side, --crop and --crops must be as for {location}; omit them")
+        raise InputError(f"--max-side, --crop and --crops differ from {location}, expected the same; omit them")
     return prepared

@@ -44,7 +44,7 @@ Words = npt.NDArray[np.uint32]
 def key_of(seed: int) -> tuple[int, int]:
     """Return the low and the high word of a seed."""
     if not 0 <= seed < 1 << 64:
-        raise InputError(f"the seed is {seed}, expected an integer from 0 to 2^64 - 1")
+        raise InputError(f"the seed is {seed}, expected an integer from 0 to 2^64 - 1; correct it")
     return seed & _WORD, seed >> 32
 
 

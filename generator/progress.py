@@ -10,6 +10,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, Final
 
 from foundation.console import shows_progress
+from foundation.errors import counted
 from foundation.secret_texts import printable
 
 if TYPE_CHECKING:
@@ -85,7 +86,10 @@ class _ImageCounter:
     def _report_reused(self) -> None:
         # Unfinished shards are resumed one after another, so that the number may rise during the run.
         if self._reused > self._reported:
-            self._print(f"{self._reused} images exist from an earlier run" + (" in total" if self._reported else ""))
+            self._print(
+                f"{counted(self._reused, 'image exists', 'images exist')} from an earlier run"
+                + (" in total" if self._reported else "")
+            )
             self._reported = self._reused
 
     def _rate(self) -> float:

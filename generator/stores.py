@@ -56,7 +56,7 @@ def local_path(location: str | Path) -> Path:
     if text and path.name in ("", ".."):
         path = path.resolve()
     if not path.name:
-        raise InputError(f"{str(location)!r} is not a folder name, expected a name such as dataset; give one")
+        raise InputError(f"{str(location)!r} is not a folder name, expected a name such as images; give one")
     return path
 
 

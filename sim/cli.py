@@ -65,7 +65,7 @@ def projector(
     if (pjlink is None) == (serial is None):
         raise ConfigurationError("expected exactly one of --pjlink PORT and --serial LANGUAGE; give one of them")
     if pjlink is None and password is not None:
-        raise ConfigurationError("--password is given, but --serial has no password; leave it out")
+        raise ConfigurationError("--password is given, but --serial has no password; omit it")
     if password is not None and not 1 <= len(password) <= MAX_PASSWORD:
         raise InputError(
             f"the password has {len(password)} characters, expected 1 to {MAX_PASSWORD} (PJLink); choose another"
@@ -133,7 +133,7 @@ def camera(
     from sim.world.world import REFERENCE_EXPOSURE, World, read_room
 
     if model not in EOS_BODIES:
-        raise ConfigurationError(f"--model is {model!r}, expected one of {', '.join(sorted(EOS_BODIES))}")
+        raise ConfigurationError(f"--model is {model!r}, expected one of {', '.join(sorted(EOS_BODIES))}; correct it")
     if watch_screen is None and watch_projector is not None:
         raise ConfigurationError("--watch-projector is given without --watch-screen; give both")
     changes = dict(_setting("--room", text) for text in room or ())
@@ -182,7 +182,7 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
         world.signal(WHITE, REFERENCE_EXPOSURE)
 
         def gather(number: int, seconds: float) -> tuple[NDArray[np.float32], float]:
-            print(f"exposure {number} begins, {seconds:g} s", flush=True)
+            print(f"exposure {number} starts, {seconds:g} s", flush=True)
             projected = beam.measure_exposure(seconds, lambda: print(f"exposure {number} half over", flush=True))
             dark = f"; no light: {beam.trouble}" if beam.trouble else ""
             print(f"exposure {number} ends: {projected}{dark}", flush=True)
@@ -194,7 +194,7 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
 def _print(context: typer.Context, chart: Path) -> Print:
     read: Callable[[Path], Print] | None = context.obj
     if read is None:
-        raise ConfigurationError(f"--chart {chart} cannot be read by sim.cli alone; use the program sim")
+        raise ConfigurationError(f"--chart {chart} cannot be read by sim.cli; use the program sim")
     return read(chart)
 
 
@@ -202,7 +202,7 @@ def _setting(option: str, text: str) -> tuple[str, Any]:
     # Values are in TOML syntax; texts may be without quotes.
     name, equals, value = text.partition("=")
     if not name or not equals:
-        raise InputError(f"{option} is {text!r}, expected NAME=VALUE, such as waviness_mm=1.5")
+        raise InputError(f"{option} is {text!r}, expected NAME=VALUE, such as waviness_mm=1.5; correct it")
     try:
         return name, tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
@@ -226,7 +226,7 @@ def _host_and_port(text: str) -> tuple[str, int]:
 
     host, _, port = text.rpartition(":")
     if not host or not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:
-        raise InputError(f"the address is {text!r}, expected HOST:PORT, such as 127.0.0.1:4352")
+        raise InputError(f"the address is {text!r}, expected HOST:PORT, such as 127.0.0.1:4352; correct it")
     return host, int(port)
 
 

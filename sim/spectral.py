@@ -90,7 +90,7 @@ def require_grid(wavelengths_nm: _Array, where: str) -> None:
         widest = int(np.flatnonzero(is_visible)[steps[is_visible].argmax()])
         raise FormatError(
             f"{where}: a gap from {wavelengths_nm[widest]:g} to {wavelengths_nm[widest + 1]:g} nm, "
-            f"{WIDEST_STEP_NM:g} nm at most expected; measure the wavelengths between"
+            f"expected at most {WIDEST_STEP_NM:g} nm; measure the wavelengths between"
         )
 
 
@@ -257,8 +257,8 @@ def read_sensitivities(name: str, other_names: Sequence[str] = ()) -> Sensitivit
         names = [*known_sensitivities(), *other_names]
         near = f"{nearest_names(name, names)} ".lstrip()
         raise InputError(
-            f"no camera {name!r}: {_reading_problem(error)}; {near}expected one of "
-            f"{', '.join(names)}, or a file of spectral sensitivities; choose one"
+            f"no camera {name!r}: {_reading_problem(error)}; {near}choose one of "
+            f"{', '.join(names)}, or a file of spectral sensitivities"
         ) from error
     return parse_sensitivities(data, path.name.removesuffix(SUFFIX).removesuffix(".json"), str(path))
 
@@ -272,14 +272,16 @@ def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:
     try:
         document = _Document.model_validate(json.loads(data, object_pairs_hook=_unique_keys))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise FormatError(f"{where} is not JSON: {error}; expected a file in the format of rawtoaces-data") from error
+        raise FormatError(
+            f"{where} is not JSON: {error}, expected the format of rawtoaces-data; give another file"
+        ) from error
     except _DuplicateKeyError as error:
         raise FormatError(f"{where}: {error.args[0]!r} occurs twice, expected once; delete one") from error
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"])) or "document"
         raise FormatError(
-            f"{where}: {key}: {first['msg']}; expected the format of rawtoaces-data: spectral_data with units, "
+            f"{where}: {key}: {first['msg']}, expected the format of rawtoaces-data; correct spectral_data with units, "
             "index.main and data.main"
         ) from error
     spectra = document.spectral_data
@@ -334,8 +336,8 @@ def _require_camera(wavelengths: _Array, curves: _Array, where: str) -> None:
     if curves.min() < 0:
         row, channel = np.unravel_index(int(curves.argmin()), curves.shape)
         raise FormatError(
-            f"{where}: {_CHANNELS[channel]} is {curves[row, channel]:g} at {wavelengths[row]:g} nm, 0 or more "
-            "expected; replace negative values of measurement noise by 0"
+            f"{where}: {_CHANNELS[channel]} is {curves[row, channel]:g} at {wavelengths[row]:g} nm, expected 0 or "
+            "more; replace negative values of measurement noise by 0"
         )
     peak = curves.max(axis=0)
     if peak.min() <= 0:
@@ -345,7 +347,7 @@ def _require_camera(wavelengths: _Array, curves: _Array, where: str) -> None:
         if edge_share.max() > EDGE_SHARE:
             raise FormatError(
                 f"{where}: {_CHANNELS[int(edge_share.argmax())]} has {edge_share.max():.0%} of its peak at the end of "
-                f"its range, {wavelengths[edge]:g} nm, {EDGE_SHARE:.0%} at most expected; add the missing wavelengths"
+                f"its range, {wavelengths[edge]:g} nm, expected at most {EDGE_SHARE:.0%}; add the missing wavelengths"
             )
 
 

@@ -14,6 +14,7 @@ import typer
 
 from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, orderly_end, progress, with_json
+from foundation.errors import counted
 from sim import cli as devices
 from sim.cli import app
 
@@ -77,7 +78,7 @@ def table(
     output.add(table=out, lights=result.lights, colours=result.cells, samples=task.window**2, unfit=result.unfit)
     print(
         f"{out}: computed, {result.lights} illuminants, {result.cells} colours, {task.window**2} samples each; "
-        f"{result.unfit} patches unfit for use"
+        f"{counted(result.unfit, 'unfit patch', 'unfit patches')}"
     )
 
 

@@ -92,7 +92,7 @@ def read_lights(text: str) -> LightSpectra:
             data = path.read_bytes()
         except OSError as error:
             raise InputError(
-                f"cannot read spectra {path}: {error.strerror}; name a CSV file or published illuminants"
+                f"cannot read spectra {path}: {error.strerror}; give a CSV file or published illuminants"
             ) from error
         lights = parse_spectra(data, str(path))
         source: dict[str, Any] = {"from": "file", "file": path.name, "sha256": sha256_of(data)}
@@ -102,7 +102,7 @@ def read_lights(text: str) -> LightSpectra:
     names = [light.name for light in lights]
     duplicate = next((name for name in names if names.count(name) > 1), None)
     if duplicate is not None:
-        raise InputError(f"--lights {text}: {duplicate!r} occurs more than once; name each illuminant once")
+        raise InputError(f"--lights {text}: {duplicate!r} occurs more than once; give each illuminant once")
     return LightSpectra(lights, source)
 
 
@@ -134,7 +134,7 @@ def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
                 raise ValueError(f"{len(values)} numbers")
         except ValueError as error:
             raise FormatError(
-                f"{where}, line {number + 2}: {len(headings)} numbers expected, one for each heading; correct it"
+                f"{where}, line {number + 2}: expected {len(headings)} numbers, one for each heading; correct it"
             ) from error
         table[number] = values
     if not np.isfinite(table).all():
@@ -145,7 +145,7 @@ def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
         if table[:, column].min() < 0:
             row = int(table[:, column].argmin())
             raise FormatError(
-                f"{where}: {name!r} is {table[row, column]:g} at {table[row, 0]:g} nm, 0 or more expected; "
+                f"{where}: {name!r} is {table[row, column]:g} at {table[row, 0]:g} nm, expected 0 or more; "
                 "replace negative values of measurement noise by 0"
             )
     powers = resampled(table[:, 0], table[:, 1:], WAVELENGTHS_NM)
@@ -169,7 +169,7 @@ def table_illuminants(lights: Sequence[LightSpectrum]) -> tuple[Illuminant, ...]
 def _light(name: str, power: _Array, cct_k: float | None, where: str) -> LightSpectrum:
     low, high = np.searchsorted(WAVELENGTHS_NM, [400, 700])
     if not power[low : high + 1].max() > 0:
-        raise FormatError(f"{where}: {name!r} has no power from 400 to 700 nm; correct it or leave it out")
+        raise FormatError(f"{where}: {name!r} has no power from 400 to 700 nm; correct or omit it")
     return LightSpectrum(name, power / power.max(), cct_k)
 
 
@@ -185,7 +185,7 @@ def _published_lights(name: str, text: str) -> Iterable[LightSpectrum]:
             if not DAYLIGHT_K[0] <= cct_k <= DAYLIGHT_K[1]:
                 raise InputError(
                     f"--lights {text}: daylight of {cct_k:g} K, expected {DAYLIGHT_K[0]:g} to "
-                    f"{DAYLIGHT_K[1]:g} K, as the CIE defines it; name a black body, {cct_k:g}K"
+                    f"{DAYLIGHT_K[1]:g} K, as the CIE defines it; give a black body, {cct_k:g}K"
                 )
             yield _as_light(f"daylight {cct_k:g}K", daylight(cct_k))
     else:
@@ -206,13 +206,13 @@ def _matching_names(name: str, published: list[str], text: str) -> list[str]:
         hint = f"a range of black bodies needs a step: {span[1]}:{span[2]}:500K"
     else:
         hint = nearest_names(name, [*published, *ILLUMINANT_SETS], 3) or "use a name such as D65, FL2, LED-B3, cie-led"
-    raise InputError(f"--lights {text}: no file and no published illuminant {name!r}; {hint}")
+    raise InputError(f"--lights {text}: {name!r} is not a file or a published illuminant; {hint}")
 
 
 def _as_light(name: str, spectrum: PublishedSpectrum, cct_k: float | None = None) -> LightSpectrum:
     require_grid(spectrum.wavelengths_nm, name)
     if spectrum.power.min() < 0:
-        raise FormatError(f"{name!r} has published values below 0, expected 0 or more; name another illuminant")
+        raise FormatError(f"{name!r} has published values below 0, expected 0 or more; give another illuminant")
     power = resampled(spectrum.wavelengths_nm, spectrum.power[:, None], WAVELENGTHS_NM)[:, 0]
     return _light(name, power, cct_k, "published spectra")
 

@@ -75,7 +75,7 @@ def load_settings(path: Path | None) -> TableSettings:
     """Return the settings of a file; the defaults if `path` is None."""
     if path is None:
         return TableSettings()
-    text = read_text(path, "name a TOML file", "settings")
+    text = read_text(path, "give a TOML file", "settings")
     return parse_settings(parse_toml(text, str(path)), str(path))
 
 
@@ -93,7 +93,7 @@ def table_room(settings: TableSettings, where: str) -> Room:
     if unused:
         raise ConfigurationError(
             f"{where}: room.{unused[0]} has no effect on a computed LUT, which has no neighbouring patches and no "
-            "time; leave it out, or take a session in the simulated laboratory with acquire run"
+            "time; omit it, or take a session in the simulated laboratory with acquire run"
         )
     names = [field.name for field in fields(Room) if field.name not in ("seed", *UNUSED_ROOM_FIELDS)]
     return from_settings(Room, settings.room, where, "room", names, seed=settings.seed, lamp_drift_per_hour=0.0)
@@ -142,7 +142,7 @@ def citation_record(settings: TableSettings, where: str) -> OriginRecord | None:
     devices = citation.model_fields_set & {"lens", "projector", "camera_serial"}
     if devices:
         raise ConfigurationError(
-            f"{where}: citation.{min(devices)} has no effect on a computed LUT, since no device was used; leave it out"
+            f"{where}: citation.{min(devices)} has no effect on a computed LUT, because no device was used; omit it"
         )
     if citation == CitationSettings():
         return None

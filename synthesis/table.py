@@ -122,8 +122,8 @@ def _require_unclipped(whites: _Array, frame_name: str) -> None:
     usable = int(np.isfinite(whites).all(axis=1).sum())
     if usable < MIN_REFERENCES:
         raise QualityError(
-            f"{frame_name}: {usable} of {len(whites)} white references are unclipped, {MIN_REFERENCES} expected; "
-            "expose less: reduce room.white_level_share in the settings, or exposure.shutter_s with the projector"
+            f"{frame_name}: {usable} of {len(whites)} references are unclipped, expected {MIN_REFERENCES} or more; "
+            "expose less: reduce room.white_level_share, or with the projector exposure.shutter_s, in the settings"
         )
 
 
@@ -266,6 +266,6 @@ def _require_disk_space(out: Path, needed: int) -> None:
     free_bytes = shutil.disk_usage(folder).free
     if free_bytes < needed:
         raise StorageError(
-            f"{out}: the LUT needs {needed / 1e9:.2f} GB, the disk has {free_bytes / 1e9:.2f} GB left; free space, or "
+            f"{out}: the LUT needs {needed / 1e9:.2f} GB, the disk has {free_bytes / 1e9:.2f} GB free; free space or "
             "choose another disk"
         )

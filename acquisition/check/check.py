@@ -163,8 +163,8 @@ def check_lab(
 def _require_space(folder: Path, needed_bytes: int) -> None:
     if (free_bytes := free_bytes_at(folder)) < needed_bytes:
         raise StorageError(
-            f"{bytes_text(free_bytes)} free at {folder}, {bytes_text(needed_bytes, up=True)} needed for the frames "
-            "of a check; delete other files"
+            f"{bytes_text(free_bytes)} free at {folder}, expected {bytes_text(needed_bytes, up=True)} for the frames "
+            "of a check; free space, or give settings on another disk"
         )
 
 
@@ -238,7 +238,7 @@ def _figure_findings(trial: Trial, settings: LabSettings) -> list[Finding]:
         value / 100,
         LEAK_SHARE.unit,
         tolerable=(None, allowed / 100),
-        reason=f"at most {allowed:g} % expected (judge.dark_percent): acquire run would refuse the frame",
+        reason=f"at most {allowed:g} % allowed (judge.dark_percent): acquire run would refuse the frame",
         remedy=LEAK_SHARE.remedy,
     )
     return [*(finding for finding in findings if finding.name != LEAK_SHARE.name), fault]
@@ -273,7 +273,7 @@ def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
         judge_value(
             EVENNESS,
             float(lost.max()),
-            f"the darkest place of the chart has {100 * lost.max():.0f} % less light than the brightest",
+            f"the darkest position of the chart has {100 * lost.max():.0f} % less light than the brightest",
             details={"falloff": lost.tolist()},
         ),
     ]
@@ -306,7 +306,7 @@ def _make_devices_ready(
     worn_parts = ", ".join(fault.part for fault in projector.faults() if fault.severity is Severity.WARNING)
     if worn_parts:
         warning = f"the projector reports a warning about its {worn_parts}"
-        findings.append(Finding("projector", "remark", warning, remedy="look at its display before the session"))
+        findings.append(Finding("projector", "remark", warning, remedy="read its display before the session"))
     return lines, findings
 
 

@@ -287,7 +287,7 @@ def judge_exposure(
         return finding
     if not _is_suitable(first):
         reason = (
-            f"{100 * SUITABLE[0]:.0f} to {100 * SUITABLE[1]:.0f} % expected: above, places clip; below, noise grows"
+            f"{100 * SUITABLE[0]:.0f} to {100 * SUITABLE[1]:.0f} % expected: above, patches clip; below, noise grows"
         )
         return replace(finding, grade="remark", reason=reason, remedy=remedy)
     if not saturation.measured:

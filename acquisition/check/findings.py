@@ -120,7 +120,7 @@ def judge_value(
     """Judge a value by its limit; by default the sentence has the title and the remedy of the limit."""
     grade, (good, tolerable) = _GRADES[limit.outcome(value)], limit.ranges
     is_good = grade == "good"
-    expected = f", {limit.expected} expected" if is_good else ""
+    expected = f", expected {limit.expected}" if is_good else ""
     return Finding(
         limit.name,
         grade,

@@ -62,14 +62,14 @@ from experiment.measures.exposure import Exposure
 from experiment.measures.frame import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured, measure
 from experiment.session.records import REFERENCES, Check, Judgement, SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
-from foundation.errors import FormatError, RegistrationError
+from foundation.errors import FormatError, RegistrationError, counted
 from foundation.robust import robust_sigma
 
 _BEFORE_RESTART = "this frame was exposed before earlier frames proved inconsistent; those frames are repeated first"
 
 _UNPREDICTABLE = (
-    "this illuminant cannot be predicted: an accepted black frame and one of each primary are needed; see why those "
-    "were refused"
+    "this illuminant cannot be predicted, expected accepted frames of black and of each primary; remove the causes of "
+    "their refusal"
 )
 
 
@@ -263,11 +263,11 @@ def _judge_basis(state: JudgeState, following: JudgeState) -> Check | None:
     if all(check.passed for check in checks):
         return None
     uneven = next((check for check in checks if check.name == "uniformity"), Check(UNIFORMITY.name))
-    text = "" if uneven.passed else f" by {uneven.value} %, limit {uneven.high} %"
+    text = "" if uneven.passed else f" by {uneven.value} %, at most {uneven.high} % allowed"
     return replace(
         uneven,
         reason=f"red + green + blue differ from the white or grey frame before them{text}; somebody may have stood in "
-        "front of the chart, or a window may have covered the picture. These frames are repeated",
+        "front of the chart, or a window may have covered the projected image. These frames are repeated",
     )
 
 
@@ -343,7 +343,7 @@ UNKNOWN_PLACE: npt.NDArray[np.float64] = np.full(2, np.nan)  # Position of a cha
 
 _UNRECOGNISED = (
     "the chart was not detected at its last position: it is covered, out of focus, or has moved by more than its tags "
-    "can show; look at the picture, and restore the positions of camera and chart"
+    "can show; check the frame, and restore the positions of camera and chart"
 )
 
 
@@ -407,7 +407,7 @@ def _judge_movement(
         blurred = (
             f"the frame is {'softer' if softer > 0 else 'sharper'} than the first white frame by a blur of "
             f"{abs(softer):.2f} px, at most {judge.blur_px if softer > 0 else -low:g} px allowed; check the focus, "
-            "switch off autofocus and stabilisation, and look for vibrations"
+            "switch off autofocus and stabilisation, and check for vibrations"
         )
     return [*checks, Check("blur", round(softer, 3), low, judge.blur_px, "px", blurred)], position
 
@@ -562,7 +562,7 @@ def judge_first_frames(state: JudgeState, step: SessionStep, cause: Check | None
     return replace(
         check,
         reason=f"{reason}: they were taken {state.restarts + 1} times and still disagree. Make sure that lamp, room "
-        "light and focus are steady; they are repeated after the pause, or when the command is run again",
+        "light and focus are steady; they are repeated after the pause, or when the same command is run again",
     )
 
 
@@ -891,7 +891,7 @@ class _LightComparison:
         dimmed = "brightness or contrast was changed, power saving is on, or " if darker else ""
         return (
             f"the illuminant is not the ordered {_codes_text(self.codes)}: it has {self._amounts_text()} of the full "
-            f"primaries; check whether {dimmed}a window, a screen saver or a picture mode changes the picture"
+            f"primaries; check whether {dimmed}a window, a screen saver or a picture mode changes the projected image"
         )
 
     def _other_reason(self, squared: float) -> str:
@@ -911,10 +911,10 @@ class _LightComparison:
         if best is None or squared - best[0] < limits.OTHER_ADVANTAGE or best[0] > limits.LIGHT_SIGMAS**2:
             return ""
         # Faint coloured light can make an illuminant look like its neighbour.
-        causes = "the picture is late, or other light falls on the chart" if self._coloured_light() else ""
+        causes = "the projected image is late, or other light falls on the chart" if self._coloured_light() else ""
         return (
             f"the frame shows another illuminant, {_codes_text(best[1])}, but {_codes_text(self.codes)} was ordered; "
-            f"check whether another program draws on the screen, {causes or 'or the picture is late'}"
+            f"check whether another program draws on the screen, {causes or 'or the projected image is late'}"
         )
 
     def _nearest(self, plan: Sequence[Codes]) -> list[Codes]:
@@ -968,11 +968,11 @@ def _ambient_reason(added: float) -> str:
 
 def _brightness_reason(brightness: float, room: float) -> str:
     percent = 100 * float(np.expm1(brightness))
-    weaker, stronger = ("weaker", "make sure that nobody stands in the light"), ("stronger", "darken the room")
+    weaker, stronger = ("weaker", "keep people out of the light"), ("stronger", "darken the room")
     sign, remedy = weaker if percent < 0 else stronger
     return (
         f"the light is {abs(percent):.1f} % {sign} than predicted and has the right colour, at most {100 * room:.1f} % "
-        "allowed; check the lamp and its power mode, the brightness of the picture, shutter and aperture, and "
+        "allowed; check the lamp and its power mode, the brightness of the projected image, shutter and aperture, and "
         f"{remedy}"
     )
 
@@ -1104,7 +1104,7 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
         if soft is not None and _deviation(soft) < _EXPLAINED * _deviation(rest) and _deviation(rest) > _BLURRED:
             reason = (
                 f"the frame is out of focus or shaken: its rows match with an additional blur of {sigma:g} px; check "
-                "the focus, switch off autofocus, and look for vibrations"
+                "the focus, switch off autofocus, and check for vibrations"
             )
             return [*checks, Check("blur", sigma, None, None, "px", reason)]
     # Rows of other places are brighter and darker alternately; a shadow or other light has one sign.
@@ -1113,14 +1113,14 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
     ragged = _is_ragged(rest, is_wrong)
     if uneven and min(brighter, 1 - brighter) < _BY_TURNS and not ragged:
         return checks
-    cause = "the file was damaged in transfer: check the cable and the memory card"
+    cause = "the file was damaged during transfer: check the cable and the memory card"
     if uneven and not ragged:
         # A drawing on the screen has both signs, too, but is continuous from row to row.
-        cause = f"look at the picture: a screen saver or a window covers it, or {cause}"
+        cause = f"check the frame: a screen saver or a window covers the projected image, or {cause}"
     rows = np.flatnonzero(is_wrong.reshape(-1, SEGMENTS).any(axis=1))
     reason = (
-        f"{len(rows)} rows of blocks, from row {2 * int(rows[0])} of the frame to {2 * int(rows[-1]) + 1}, do not have "
-        f"the expected content; {cause}"
+        f"{counted(len(rows), 'row')} of blocks, from row {2 * int(rows[0])} of the frame to {2 * int(rows[-1]) + 1}, "
+        f"do not have the expected content; {cause}"
     )
     return [Check(ROWS.name, float(count), None, float(ROWS.accept), "", reason)]
 
@@ -1162,23 +1162,25 @@ def _uneven_reason(rest: Residuals, deviating: npt.NDArray[np.bool_], late: floa
     if late:
         return (
             f"{amount} still showed the previous illuminant for {max(late, 0.01):.0%} of the exposure: only part of "
-            "the picture had changed, or a window of that colour covers it; increase sequence.settle_s, and close "
-            "other programs that draw on the screen"
+            "the projected image had changed, or a window of that colour covers it; increase sequence.settle_s, and "
+            "close other programs that draw on the screen"
         )
     if share > _WHOLE_FRAME:
         return (
             f"{share:.0%} of the frame differ from the sum of the primaries; check whether a screen saver or another "
-            "program draws on the screen, the picture changed during the exposure, or other light falls on the chart"
+            "program draws on the screen, the projected image changed during the exposure, or other light falls on "
+            "the chart"
         )
     if median < _DARKER:
         return (
-            f"{amount} are {-median:.0%} darker than the rest; check whether somebody or something stands in front of "
-            "the chart or the projector, a window covers the picture, or only part of the picture has changed"
+            f"{amount} are {-median:.0%} darker than the rest; check whether a person or an object is in front of "
+            "the chart or the projector, a window covers the projected image, or only part of the projected image has "
+            "changed"
         )
     passed = "somebody walked past, " if median < 0 else ""
     return (
-        f"{amount} are lit differently from the rest, by {median:+.0%}; check whether {passed}only part of the picture "
-        "has changed, a window or a screen saver covers it, or other light falls on the chart"
+        f"{amount} are lit differently from the rest, by {median:+.0%}; check whether {passed}only part of the "
+        "projected image has changed, a window or a screen saver covers it, or other light falls on the chart"
     )
 
 

@@ -353,7 +353,7 @@ def disagreement(mosaic: Mosaic, settings: ExposureSettings) -> str | None:
     ]
     if not differing:
         return None
-    return f"the file states {', '.join(differing)}; check the dials of the camera"
+    return f"the file records {', '.join(differing)}; check the dials of the camera"
 
 
 def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str | None:
@@ -373,9 +373,9 @@ def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str |
     # Response frames measure the tone curve of the projector: the darkest greys are dark on purpose.
     if kind != "response" and exposure.brightest_dn < limits.too_dark_dn:
         return (
-            f"the brightest photosites are {exposure.brightest_dn:.0f} counts above black, "
-            f"at least {limits.too_dark_dn:g} expected; make sure that the projector is on, its picture is not muted "
-            "and the lens cap is off, or start a new session with a longer exposure"
+            f"the brightest photosites are {exposure.brightest_dn:.0f} counts above black, at least "
+            f"{limits.too_dark_dn:g} counts allowed; make sure that the projector is on, its image is not muted and "
+            "the lens cap is off, or start a new session with a longer exposure"
         )
     return None
 

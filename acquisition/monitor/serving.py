@@ -20,7 +20,7 @@ def open_monitor(folder: Path, port: int, host: str = "127.0.0.1") -> MonitorSer
         read_session(folder)
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FormatError(
-            f"{folder} is not a session, because {JOURNAL_FILE} is missing; name a folder made by acquire run or "
+            f"{folder} is not a session, because {JOURNAL_FILE} is missing; give a folder made by acquire run or "
             "import, or a folder that does not exist yet"
         )
     return MonitorServer(SessionWatch(folder), host, port)
@@ -56,6 +56,6 @@ class MonitorServer(LocalServer):
                 data = self.watch.picture(int(match[1]))
                 # Pictures can be cached: the page adds a version to their addresses.
                 headers = {"Cache-Control": "private, max-age=86400"}
-                return Response("image/jpeg", data, headers) if data else Refusal(404, "this frame has no picture")
+                return Response("image/jpeg", data, headers) if data else Refusal(404, "this frame has no preview")
             case _:
-                return Refusal(404, "available are /, /state.json, /status.json and /frame/ATTEMPT.jpg")
+                return Refusal(404, "unknown path, expected /, /state.json, /status.json or /frame/ATTEMPT.jpg")

@@ -72,7 +72,7 @@ CAUSES = ("the camera", "the screen", "the projector", "the disk", "the frames")
 # Free space below which a disk is full before the first frame: a row of the journal has 100 kB.
 LEAST_FREE_BYTES = 1 << 20
 
-LOOK = "look at the camera, its cable and the computer"  # Remedy if a run reports nothing
+LOOK = "check the camera, its cable and the computer"  # Remedy if a run reports nothing
 
 # Largest difference, s, between the clocks of lab and computer at which the end is shown as a time of day. The time of
 # a simulated lab passes differently, and an older attempt cannot predict the end.
@@ -285,9 +285,9 @@ def head_of(
     if state in AT_WORK and heartbeat is not None:
         if is_stopped:
             pid = heartbeat.process.pid
-            state, sentence = "silent", f"its process {pid} was stopped by a signal; resume it by kill -CONT {pid}"
+            state, sentence = "silent", f"its process {pid} was stopped by a signal; resume it with kill -CONT {pid}"
         elif _is_full(view, free_bytes) and (state, _cause(sentence)) != ("paused", "the disk"):
-            state, sentence = "late", "the disk is full; delete files, then the run resumes automatically"
+            state, sentence = "late", "the disk is full; free space, then the run resumes automatically"
     judged = [attempt for attempt in attempts if attempt.verdict is not None]
     remaining = time_left((TimedAttempt(view.seconds, view.verdict in (ACCEPTED, VOIDED)) for view in judged), missing)
     is_lab_time_real = (
@@ -338,9 +338,12 @@ def _state_of(
         return "complete", f"complete, {total} frames; next: build-lut {shlex.quote(view.path_text)} LUT/"
     if is_over and view.lost:
         files = first_few(list(view.lost.values()), 3)
-        return "incomplete", f"{files}: deleted or truncated; restore from a copy, or {AGAIN} to repeat the frames"
+        return "incomplete", f"{files}: deleted or truncated; restore them from a copy, or {AGAIN} to repeat the frames"
     if heartbeat is None:
-        return "unknown", f"{missing} of {total} frames are missing, and the journal has no sign of life of a run"
+        return (
+            "unknown",
+            f"{missing} of {total} frames are missing, and the journal has no sign of life of a run; {AGAIN}",
+        )
     if is_copy and location is not None:
         return "copy", heartbeat.sentence_of_copy(location, process_alive)
     if heartbeat.is_dead(now, process_alive):
@@ -354,7 +357,7 @@ def _state_of(
     if heartbeat.state == "running" and frame_s is not None:
         due_s = BEAT_S + LATE_FRAMES * frame_s + LATE_S
         if (now - heartbeat.at).total_seconds() > due_s:
-            return "late", f"late since {since}: no frame came, expected after {frame_s:.1f} s; {LOOK}"
+            return "late", f"late since {since}: no frame was taken, expected after {frame_s:.1f} s; {LOOK}"
     return heartbeat.state, heartbeat.sentence
 
 
@@ -670,7 +673,9 @@ def write_session_report(folder: Path, path: Path | None = None) -> Path:
     watch = SessionWatch(folder)
     state, view = watch.state(), watch.view()
     if state is None or view is None:
-        raise FormatError("the session was deleted while its report was written", about=folder, remedy="name a session")
+        raise FormatError(
+            "the session was deleted while its report was written", about=folder, remedy="give another session"
+        )
     now = datetime.now(UTC)
     head = _ended(view).head(now)
     state["head"] = _head_json(head)

@@ -37,6 +37,7 @@ from experiment.session.records import duration_text
 from foundation import errors
 from foundation.clock import Clock, elapsed_s
 from foundation.errors import (
+    RUN_AGAIN,
     ConfigurationError,
     CropError,
     DeviceError,
@@ -93,7 +94,7 @@ def await_health(projector: Projector, sequence: SequenceSettings, retry: RetryP
 def reported_error(projector: Projector) -> DeviceFault | None:
     """Return the errors that a projector reports, as one fault; None if it reports none."""
     part_names = ", ".join(fault.part for fault in projector.faults() if fault.severity is Severity.ERROR)
-    remedy = "look at its display and have it repaired"
+    remedy = "read its display, and have it repaired"
     return DeviceFault(f"the projector reports an error of its {part_names}", remedy=remedy) if part_names else None
 
 
@@ -101,13 +102,13 @@ def _power_fault(projector: Projector) -> DeviceFault | None:
     if (power := projector.power()) is Power.ON:
         return None
     remedy = "the run waits for it" if power is Power.WARMING else "switch it on"
-    return DeviceFault(f"the projector is in {power.value} during the session, but must be on", remedy=remedy)
+    return DeviceFault(f"the projector is in {power.value} during the session, expected on", remedy=remedy)
 
 
 def _mute_fault(projector: Projector) -> DeviceFault | None:
     if not projector.muted():
         return None
-    return DeviceFault("the projector's picture is muted", remedy="release mute on its remote control")
+    return DeviceFault("the projected image is muted", remedy="release mute on its remote control")
 
 
 def _picture_fault(projector: Projector) -> DeviceFault | None:
@@ -197,7 +198,7 @@ def _light(projector: Projector, retry: RetryPolicy) -> bool:
             state = "does not answer" if power is None else f"is still in {power.value}"
             start = "it was switched on" if switched else "the first question"
             raise DeviceFault(
-                f"the projector {state} {POWER_LIMIT_S:g} s after {start}", remedy="look at its lamp and its display"
+                f"the projector {state} {POWER_LIMIT_S:g} s after {start}", remedy="check its lamp and its display"
             )
         state = "does not answer yet" if power is None else f"is in {power.value}"
         retry.wait(1.0, "waiting", lambda state=state: f"waiting for the lamp; the projector {state}")
@@ -243,7 +244,7 @@ def _warm_up(projector: Projector, sequence: SequenceSettings, retry: RetryPolic
 def _stayed_lit(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> bool:
     until = retry.clock.monotonic() + sequence.warm_up_s
     wait = duration_text(sequence.warm_up_s)
-    retry.report("warming up", f"the lamp was just lit; the run waits {wait} until its colour is steady")
+    retry.report("warming up", f"the lamp was just switched on; the run waits {wait} until its colour is steady")
 
     def countdown() -> str:
         return f"the lamp is warming up, {duration_text(max(until - retry.clock.monotonic(), 0))} left"
@@ -300,13 +301,13 @@ def _set_lamp(projector: Projector, goes_out: bool, clock: Clock) -> str:
     if power is not Power.ON and power is not Power.WARMING:
         return f"it is already off: the projector is in {power.value}"
     if not goes_out:
-        return f"it burns on, so that the next run needs no warm-up; otherwise {_BY_HAND}"
+        return f"it stays on, so that the next run needs no warm-up; otherwise {_BY_HAND}"
     projector.switch_off()
     until = clock.monotonic() + OBEYS_S
     while (power := projector.power()) is Power.ON and clock.monotonic() < until:
         clock.sleep(LOOK_S)
     if power is Power.ON:
-        return f"it still burns {OBEYS_S:g} s after the command to switch it off; {_BY_HAND}"
+        return f"it is still on {OBEYS_S:g} s after the command to switch it off; {_BY_HAND}"
     return "it was switched off"
 
 
@@ -346,7 +347,7 @@ class LightNotShown:
 
     def show(self, colour: Colour) -> None:
         """Refuse to show a colour."""
-        raise DeviceRefused(f"{tuple(colour)} cannot be shown: the display is closed in a dry run")
+        raise DeviceRefused(f"{tuple(colour)} cannot be shown: the display is closed in a dry run; omit --dry-run")
 
     def close(self) -> None:
         """Do nothing."""
@@ -427,10 +428,10 @@ def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> No
     nearest = " or ".join(f"{time:.4g}" for time in (shorter, longer) if time is not None)
     unit, source, key = "turns", "the colour wheel", "colour_wheel_hz"
     if not projector.colour_wheel_hz:
-        unit, source, key = "pictures", "the projector", "refresh_hz"
+        unit, source, key = "images", "the projector", "refresh_hz"
     raise ConfigurationError(
         f"camera.shutter_s = {shutter:g} s is {shutter / period:.2f} {unit} of {source} ({1 / period:g} per second), "
-        f"but a frame must hold whole {unit}",
+        f"expected whole {unit}",
         remedy=f"set it to {nearest or f'a multiple of {period:.4g}'} s, preferably 0.5 s or more, or correct "
         f"lab.projector.{key}",
         value=shutter,
@@ -642,13 +643,13 @@ class Pause:
             return first
         # The first fault is reported without its remedy, because only the remedy of the last fault can help.
         cause, current = first.without_remedy(), fault.while_waiting()
-        sentence = current if _kind(cause) in _kind(current) else f"{cause}; at last: {current}"
+        sentence = current if _kind(cause) in _kind(current) else f"{cause}; last fault: {current}"
         waited = duration_text(self._policy.limit_s)
         if self._history.pauses:
             waited += f", in {self._history.pauses + 1} pauses with few frames between them,"
         return _family(first)(
             _with_name(self._name, sentence),
-            remedy=f"the run waited {waited} and ended: remove the cause, and run the same command again",
+            remedy=f"the run waited {waited} and ended: remove the cause, {RUN_AGAIN}",
         )
 
 
@@ -766,7 +767,7 @@ class RunWatch:
             expected = duration_text(late.expected_s) if late.expected_s >= 1 else f"{late.expected_s:.1g} s"
             since = f"{started.astimezone():%Y-%m-%d %H:%M:%S}"
             self._on_late(
-                f"late since {since}: {late.device} {late.doing}, expected duration {expected}; look at "
+                f"late since {since}: {late.device} {late.doing}, expected duration {expected}; check "
                 f"{late.device} and its connection",
                 started,
             )

@@ -61,9 +61,9 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illuminant, ..
     Only `kind`, `illumination` and `file` must be filled. Rows of the kind ``response`` are ignored: only a running
     session needs them, and the list does not state their codes.
     """
-    rows = read_csv(path, "name a CSV file in UTF-8", "the list of frames")[1]
+    rows = read_csv(path, "give a CSV file in UTF-8", "the list of frames")[1]
     if not rows or any(column not in rows[0] for column in FRAME_COLUMNS[:3]):
-        raise FormatError(f"no frames under the expected columns {','.join(FRAME_COLUMNS)}", about=path)
+        raise FormatError(f"no frames, expected rows with the columns {','.join(FRAME_COLUMNS)}; add them", about=path)
     lights = load_illuminants(path.parent / "illuminations.csv")
     frames = [
         _listed(row, f"{path}, line {number}", path.parent, len(lights))
@@ -79,7 +79,7 @@ def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int
 
     kind = cell("kind")
     if kind not in ("light", "white", "dark"):
-        raise FormatError(f"kind is {kind!r}, expected light, white or dark", about=where, value=kind)
+        raise FormatError(f"kind is {kind!r}, expected light, white or dark; correct it", about=where, value=kind)
     file = folder / cell("file")
     if not cell("file") or not file.is_file():
         raise FormatError(
@@ -93,14 +93,14 @@ def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int
     except ValueError as error:
         raise FormatError(str(error), about=where) from error
     if illumination is not None and not 0 <= illumination < lights:
-        problem = f"illumination is {illumination}, expected 0 … {lights - 1} as in illuminations.csv"
+        problem = f"illumination is {illumination}, expected 0 … {lights - 1} as in illuminations.csv; correct it"
         raise FormatError(problem, about=where, value=illumination)
     if not 0 <= exposure_s < math.inf:
-        problem = f"exposure_s is {exposure_s:g}, expected seconds, or nothing if it is unknown"
+        problem = f"exposure_s is {exposure_s:g}, expected seconds, or nothing if it is unknown; correct it"
         raise FormatError(problem, about=where, value=exposure_s)
     verdict = cell("verdict")
     if verdict not in ("", ACCEPTED, REFUSED) and not verdict.startswith(f"{REFUSED}: "):
-        problem = f"verdict is {verdict!r}, expected {ACCEPTED}, {REFUSED}: REASON, or nothing"
+        problem = f"verdict is {verdict!r}, expected {ACCEPTED}, {REFUSED}: REASON, or nothing; correct it"
         raise FormatError(problem, about=where, value=verdict)
     if not taken_at.tzinfo:
         taken_at = taken_at.replace(tzinfo=UTC)
@@ -116,7 +116,7 @@ def import_session(
     loaded = load_chart(chart)
     for frame in frames:
         if frame.sha256 and file_sha256(frame.path) != frame.sha256:
-            problem = f"the SHA-256 of {frame.path} differs from the one in {frame_list}"
+            problem = f"the SHA-256 of {frame.path} differs from its value in {frame_list}"
             raise FormatError(problem, remedy="copy the file again", value=frame.path)
     settings = LabSettings(rig="imported", chart=chart, illuminations=frame_list.parent / "illuminations.csv")
     steps = [_step(number, frame, lights) for number, frame in enumerate(frames)]

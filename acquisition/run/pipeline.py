@@ -51,7 +51,7 @@ from experiment.session.records import (
 )
 from foundation.clock import SteadyClock
 from foundation.console import EndRequest
-from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted, first_few
+from foundation.errors import RUN_AGAIN, CropError, DeviceError, QualityError, StorageError, counted, first_few
 from foundation.files import write_atomic
 
 # Frames without a verdict when the next is exposed. A frame is judged during the next exposure and download, which take
@@ -309,7 +309,7 @@ class Pipeline:
     def _projector_check(self, step: SessionStep) -> tuple[Check, ...]:
         if self._health is None:
             return ()
-        with self._job.watch.step("the projector", "is asked for its health", SHOW_S, "health"):
+        with self._job.watch.step("the projector", "is queried for its health", SHOW_S, "health"):
             fault = self._health.fault(thorough=step.kind == "dark")
         return (Check("projector", reason="" if fault is None else str(fault)),)
 
@@ -398,7 +398,9 @@ def _download(job: Job, frame: Exposed) -> Callable[[], ReceivedFile]:
         size = incoming.stream.seek(0, 2)
         if size != captured.size or size == 0:
             # Checked before the file is completed, because the camera may still have the frame.
-            raise DeviceError(f"{captured.name}: {size} bytes arrived, {captured.size} expected by the camera")
+            raise DeviceError(
+                f"{captured.name}: {size} bytes arrived, expected {captured.size} as announced by the camera"
+            )
     except BaseException:
         with incoming:
             raise
@@ -443,8 +445,8 @@ class Verdicts:
         if self.is_spent:
             raise QualityError(
                 f"refused and voided frames of this run take {self._unused_bytes / 1e9:.3g} GB of the disk, at most "
-                f"{self._budget_gb:g} GB allowed (sequence.refused_gb); acquire status lists the causes: remove them, "
-                "and run the same command again, with a new budget"
+                f"{self._budget_gb:g} GB allowed (sequence.refused_gb); remove the causes, which acquire status lists, "
+                f"{RUN_AGAIN}, with a new budget"
             )
 
     def take_in(self, frame: Exposed, saved: Saved, under_way: Sequence[Exposed]) -> None:
@@ -463,7 +465,9 @@ class Verdicts:
         if saved.preview_fault and not self._lacks_previews:
             self._lacks_previews = True
             job.retry.report(
-                "preview", f"{saved.preview_fault}; frames are accepted without, later faults not reported"
+                "preview",
+                f"{saved.preview_fault}; frames are accepted without previews, and later faults of this kind are not "
+                "reported",
             )
         voided = self._voided_ahead.pop(frame.number, "")
         if judgement.accepted and voided:
@@ -638,7 +642,7 @@ def _accepted_changes(
     moved_px = values.get("movement", 0.0)
     if moved_px > judge.moved_px:
         sentence = (
-            f"{step_name(step)}: the chart has moved by {moved_px:.2f} px, at most {judge.moved_px:g} px expected; the "
+            f"{step_name(step)}: the chart has moved by {moved_px:.2f} px, at most {judge.moved_px:g} px allowed; the "
             "run continues at the new position, and build-lut shifts its grid with a remark. Fasten camera and chart; "
             "for one position in all frames, start a new session"
         )
@@ -657,7 +661,7 @@ def _accepted_changes(
     room_percent = values.get(LEAK_SHARE.name, 0.0)
     if room_percent > ROOM_LIGHT_PERCENT and step.number == min(row.number for row in steps if row.kind == step.kind):
         sentence = (
-            f"{step_name(step)}: black has {room_percent:.1f} % of white, at most {ROOM_LIGHT_PERCENT:g} % expected; "
+            f"{step_name(step)}: black has {room_percent:.1f} % of white, at most {ROOM_LIGHT_PERCENT:g} % allowed; "
             "switch off other lamps. Otherwise build-lut adds a remark, and --subtract-dark subtracts this light"
         )
         events.append((DOUBT, sentence))

@@ -143,19 +143,19 @@ def require_same(session: Session, settings: LabSettings) -> None:
         if old != new:
             raise ConfigurationError(
                 f"{settings.file} has {key} = {new!r}, but {session.folder} was started with {old!r}",
-                remedy="restore the old value, or name a new session folder",
+                remedy="restore the old value, or give a new session folder",
                 value=new,
                 expected=old,
             )
     if load_chart(settings.chart).sha256 != session.chart.sha256:
         raise ConfigurationError(
             f"{session.folder} was started with another chart than {settings.chart}",
-            remedy="name the first chart, or a new session folder",
+            remedy="give the first chart, or a new session folder",
         )
     if load_illuminants(settings.illuminations) != session.illuminations:
         raise ConfigurationError(
             f"{session.folder} was started with other illuminants than {settings.illuminations}",
-            remedy="name the first file, or a new session folder",
+            remedy="give the first file, or a new session folder",
         )
 
 
@@ -240,7 +240,7 @@ def frame_bytes(largest: int | None, model: str, simulated: int | None = None) -
         return Estimate(simulated, "size of the simulated files", True)
     megapixels = MEGAPIXELS.get(model.removeprefix("Canon ").removeprefix("NIKON "))
     if megapixels is None:
-        cause = f"the size of a frame of {model} is unknown" if model else "the camera could not be asked"
+        cause = f"the size of a frame of {model} is unknown" if model else "the camera could not be queried"
         return Estimate(UNKNOWN_BYTES, f"assumed: {cause}; acquire check measures it", False)
     density = LOOSE_BYTES_PER_PIXEL if model.startswith(("ILCE", "CroP ")) else BYTES_PER_PIXEL
     return Estimate(megapixels * 1e6 * density, f"{megapixels:.1f} million photosites, {density:g} bytes each", True)
@@ -265,7 +265,7 @@ def free_bytes_at(folder: Path) -> int:
             raise storage_error(folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
         return shutil.disk_usage(existing).free
     except OSError as error:
-        raise storage_error(folder, error, "look at") from error
+        raise storage_error(folder, error, "read") from error
 
 
 def bytes_text(number: float, up: bool = False) -> str:
@@ -286,13 +286,13 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Answers:
-    """Answers of the devices; None or empty if they could not be asked, or do not report it.
+    """Answers of the devices; None or empty if they could not be queried, or do not report it.
 
     - `offered_s`: shutter times that the camera offers, s.
     - `projector`: name and state, in words.
     - `lit`: whether its lamp burns.
     - `warnings`: settings that change the colours on the screen, each with its remedy.
-    - `unasked`: what could not be asked, and why.
+    - `unasked`: what could not be checked, and why.
     - `faults`: what would end the run.
     """
 
@@ -331,7 +331,7 @@ def ask(devices: Devices) -> Answers:
             supplies = answer("camera", camera.supplies, None)
         if supplies is None or (supplies.battery is None and not supplies.mains):
             unasked.append("battery: the camera does not report it; make sure that it runs on mains power")
-        unasked.append("ISO speed and aperture: the run sets and verifies them before it lights the lamp")
+        unasked.append("ISO speed and aperture: the run sets and verifies them before it switches the lamp on")
     state, lit = "", None
     if projector is not None:
         state, lit = answer("projector", lambda: projector_state(projector), ("", None))
@@ -353,7 +353,7 @@ def projector_state(projector: Projector) -> tuple[str, bool | None]:
     hours = ", ".join(f"{lamp.hours} h" for lamp in projector.lamps())
     power = projector.power()
     lit = power is Power.ON
-    state = "its lamp burns and is assumed to be warm" if lit else f"in {power.value}: it will be switched on"
+    state = "its lamp is on and assumed to be warm" if lit else f"in {power.value}: it will be switched on"
     return f"{name}{f', lamp {hours}' if hours else ''}, {state}", lit
 
 
@@ -404,7 +404,7 @@ class RunPlan:
         """Raise all faults as one error."""
         if self.faults:
             first, *more_faults = self.faults
-            raise type(first)("; moreover, ".join([str(first), *map(str, more_faults)]))
+            raise type(first)("; in addition, ".join([str(first), *map(str, more_faults)]))
 
 
 def make_plan(
@@ -455,7 +455,7 @@ def settings_doubts(settings: LabSettings) -> tuple[str, ...]:
         )
     if settings.rig == "lab" and has_lamp_control(settings) and warm_up_s < SHORT_WARM_UP_S:
         doubts.append(
-            f"sequence.warm_up_s = {warm_up_s:g} s, at least {SHORT_WARM_UP_S:g} s expected for a lamp; ignore this "
+            f"sequence.warm_up_s = {warm_up_s:g} s, expected at least {SHORT_WARM_UP_S:g} s for a lamp; ignore this "
             "for a laser or LEDs"
         )
     return tuple(doubts)
@@ -472,7 +472,7 @@ def _target_doubt(key: str, target: str) -> str:
         return ""
     label = target_label(target)
     if is_address(target):
-        return f"{key}: the command {label} does not exist; if it is an address, begin it with https://"
+        return f"{key}: the command {label} does not exist; if it is an address, start it with https://"
     if Path(command[0]).is_file():
         return f"{key}: {command[0]} is not executable; run chmod +x {shlex.quote(command[0])}"
     return f"{key}: the command {label} does not exist; give its full path, or a URL with https://"
@@ -509,7 +509,7 @@ def _disk_fault(work: Work, size: Estimate, free_bytes: int) -> StorageError | s
         return None
     sentence = (
         f"the disk of {work.folder} has {bytes_text(free_bytes)} free, but the run needs {bytes_text(needed)}: "
-        f"{bytes_text(missing, up=True)} are missing; delete files, or name a session folder on another disk"
+        f"{bytes_text(missing, up=True)} are missing; free space, or give a session folder on another disk"
     )
     return StorageError(sentence) if size.sure else f"{sentence} (the size of a frame is {size.basis})"
 
@@ -542,7 +542,9 @@ def _battery_fault(work: Work, answers: Answers) -> CropError | str | None:
     frames = counted(work.remaining, "frame is", "frames are")
     if supplies.battery <= LOW_BATTERY:
         return DeviceFault(f"{state}, and {frames} to be taken; connect a mains adapter, or charge the battery")
-    return f"{state}, and {frames} to be taken, but a charge lasts for some hundred frames; connect a mains adapter"
+    return (
+        f"{state}, and {frames} to be taken, but a charge is enough for a few hundred frames; connect a mains adapter"
+    )
 
 
 def _card_fault(work: Work, answers: Answers, size: float) -> CropError | None:
@@ -574,13 +576,13 @@ def plan_lines(plan: RunPlan) -> tuple[str, ...]:
         ("camera", _camera_text(answers)),
         (
             "projector",
-            answers.projector or ("could not be asked" if has_lamp_control(settings) else "not controlled"),
+            answers.projector or ("could not be queried" if has_lamp_control(settings) else "not controlled"),
         ),
     ]
     for name, (_, target) in zip(("notices", "alive"), _targets(settings), strict=True):
         if target:
             lines.append((name, f"to {target_label(target)}"))
-    lines += [("not asked", sentence) for sentence in answers.unasked]
+    lines += [("not checked", sentence) for sentence in answers.unasked]
     lines += [("doubt", sentence) for sentence in plan.doubts]
     return tuple(f"{name:<11} {text}" for name, text in lines)
 
@@ -599,7 +601,7 @@ def _exposure_text(plan: RunPlan) -> str:
 def _time_text(plan: RunPlan, count: str) -> str:
     if not plan.work.remaining:
         return "all frames are complete"
-    condition = "" if plan.answers.lit is not None else " unless it already burns"
+    condition = "" if plan.answers.lit is not None else " unless it is already on"
     warm_up = f", after {duration_text(plan.warm_up_s)} to warm up the lamp{condition}" if plan.warm_up_s else ""
     frame_s = f"{plan.frame_s.value:.2f} s each ({plan.frame_s.basis})"
     return f"{duration_text(plan.time_s)}: {count}, {frame_s}{warm_up}"
@@ -617,7 +619,7 @@ def _disk_text(plan: RunPlan, count: str) -> str:
 
 def _camera_text(answers: Answers) -> str:
     if answers.camera is None:
-        return "could not be asked"
+        return "could not be queried"
     text = answers.camera.name
     if answers.camera.serial:
         text += f", serial number {answers.camera.serial}"

@@ -164,8 +164,8 @@ class Notices:
             except subprocess.TimeoutExpired:
                 with suppress(OSError):
                     os.killpg(process.pid, signal.SIGKILL)
-                return f"it did not end within {LIMIT_S:g} s"
-        return f"it ended with {process.returncode}, 0 expected" if process.returncode else ""
+                return f"it has not ended within {LIMIT_S:g} s"
+        return f"it ended with {process.returncode}, expected 0" if process.returncode else ""
 
     def _posted(self, event: str, message: str, body: bytes) -> str:
         url = urlsplit(self._target)
@@ -683,7 +683,7 @@ def _make_ready(job: Job) -> None:
         make_ready(devices.projector, settings.sequence, job.retry)
 
 
-STARTING = "a run starts: it checks its frames and opens its devices"  # Sign of life of a run before its first frame
+STARTING = "the run starts: it checks its frames and opens its devices"  # Sign of life of a run before its first frame
 
 
 # Reports that a run is alive; its argument is the reason of a wait, or "" if frames are taken.

@@ -62,7 +62,7 @@ STAIN = Cause(
 )
 SHADOW = Cause(
     "shadow or fold",
-    "a shadow, a fold or grey dirt on the print, which darkens all colours alike in all frames",
+    "a shadow, a fold or grey dirt on the print, which darkens all colours equally in all frames",
     "remove the object that blocks the light, hang the print flatter, and clean it",
     "session",
 )
@@ -75,20 +75,20 @@ FALL_OFF = Cause(
 CURL = Cause(
     "curled print",
     "a curled or folded print; its shape there could not be measured",
-    "hang the print flatter, on a board or fixed at all corners",
+    "hang the print flatter, on a board or fastened at all corners",
     "session",
 )
 SPREAD = Cause(
     "soft lens",
     "a lens that spreads light over several patches, so that neighbouring colours mix at the rims",
-    "focus on the print, stop down to f/8, clean the lens, bring the camera nearer, or use a smaller window "
+    "focus on the print, stop down to f/8, clean the lens, move the camera closer, or use a smaller window "
     "(build-lut --window)",
     "session",
 )
 BUMP = Cause(
     "bump",
     "a push of the print or the camera",
-    "fix camera and print, and keep people away; the sampling grid followed the movement",
+    "fasten camera and print, and keep people away; the sampling grid followed the movement",
     "nothing",
 )
 DEFOCUS = Cause(
@@ -99,7 +99,7 @@ DEFOCUS = Cause(
 )
 ANOTHER_PRINT = Cause(
     "another print",
-    "another print, whose patches differ from chart.json",
+    "another print: its patches differ from chart.json",
     "give the chart.json of this print, and keep it in place until the session ends",
     "frames",
 )
@@ -118,7 +118,7 @@ OTHER_CAMERA = Cause(
 OTHER_EXPOSURE = Cause(
     "other exposure",
     "frames with another recorded exposure than the other frames or the session's settings",
-    "expose all frames alike in manual mode: shutter, aperture and ISO speed",
+    "take all frames with one exposure in manual mode: shutter, aperture and ISO speed",
     "frames",
 )
 ROOM_LIGHT = Cause(
@@ -370,7 +370,7 @@ RULES: tuple[Rule, ...] = (
         WRONG_NAME,
         LIGHT,
         (Condition("named_right", 0, 0), Condition("exposure", 0.97, 1.03)),
-        "its white does not fit its own codes, but fits those of another illuminant",
+        "its white does not fit its own codes, but the codes of another illuminant",
     ),
     Rule(
         ROOM_LIGHT,
@@ -431,7 +431,7 @@ RULES: tuple[Rule, ...] = (
         BUMP,
         _subjects("movement"),
         (Condition("anew", 1e-9, 1), Condition("moved_px", 0.5, _INFINITY), Condition("softer", -_INFINITY, 0.003)),
-        "the tags are elsewhere than before, and as sharp",
+        "the tags are at other positions than before, and as sharp",
     ),
     Rule(
         OBJECT_IN_FRAME,
@@ -554,7 +554,7 @@ RULES: tuple[Rule, ...] = (
             Condition("tint", 0, 0.25),
             Condition("share", 0, 0.5),
         ),
-        "a position is darker in all frames, in proportion to its light, in all colours alike",
+        "a position is darker in all frames, in proportion to its light, equally in all colours",
     ),
     Rule(
         REFLECTION,

@@ -30,7 +30,7 @@ from experiment.session.folder import Session
 from experiment.session.journal import JOURNAL_FILE
 from foundation.colorimetry import angles_deg
 from foundation.compiled import ordered_map, processor_count
-from foundation.errors import FormatError, first_few
+from foundation.errors import FormatError, counted, first_few
 from foundation.files import write_atomic
 
 _Array = npt.NDArray[np.float64]
@@ -134,7 +134,10 @@ def compare(
         )
     pairs = light_pairs(first.illuminations, second.illuminations)
     if not pairs:
-        raise FormatError(f"{first.folder}, {second.folder}: 0 common illuminants, expected at least 1; use one plan")
+        raise FormatError(
+            f"{first.folder}, {second.folder}: 0 common illuminants, expected at least 1; give LUTs of one "
+            "illuminations.csv"
+        )
     cells, cell_score = _compare_cells(first, second, pairs, progress)
     lights = _compare_lights(first, second, pairs, cell_score)
     answers = _colour_answer(lights), _brightness_answer(lights), _cells_answer(lights, cells)
@@ -214,13 +217,13 @@ def _answer(name: str, text: str, *faults: str) -> NoiseAnswer:
     return NoiseAnswer(name, not any(faults), "; ".join(filter(None, (text, *faults))))
 
 
-def _listed(numbers: _Numbers, description: str) -> str:
-    return f"{len(numbers)} {description}: {first_few(numbers.tolist())}" if len(numbers) else ""
+def _listed(numbers: _Numbers, description: str, noun: str = "illuminant", plural: str | None = None) -> str:
+    return f"{counted(len(numbers), noun, plural)} {description}: {first_few(numbers.tolist())}" if len(numbers) else ""
 
 
 def _colour_answer(lights: LightDifferences) -> NoiseAnswer:
     text = f"angle between whites {np.median(lights.angle_deg):.4f}° (median), {lights.angle_deg.max():.4f}° (maximum)"
-    return _answer("colour of lights", text, _listed(differing_lights(lights), "illuminants exceed noise"))
+    return _answer("colour of illuminants", text, _listed(differing_lights(lights), "beyond noise"))
 
 
 def _brightness_answer(lights: LightDifferences) -> NoiseAnswer:
@@ -234,7 +237,7 @@ def _brightness_answer(lights: LightDifferences) -> NoiseAnswer:
         f"{100 * brightness.min():+.3f} to {100 * brightness.max():+.3f} % over all illuminants"
     )
     differing = _is_significant(lights.brightness_p) & (np.abs(brightness) > BRIGHTNESS_FLOOR)
-    return _answer("brightness of lights", text, _listed(lights.one[differing], "illuminants exceed noise"))
+    return _answer("brightness of illuminants", text, _listed(lights.one[differing], "beyond noise"))
 
 
 def _cells_answer(lights: LightDifferences, cells: CellDifferences) -> NoiseAnswer:
@@ -243,8 +246,8 @@ def _cells_answer(lights: LightDifferences, cells: CellDifferences) -> NoiseAnsw
         "cells",
         f"{100 * cells.rms:.3f} % RMS, expected from noise {100 * cells.rms_by_noise:.3f} %",
         f"{cells.score:.3f} times the noise" if cells.score > CELL_SCORE else "",
-        _listed(differing, f"illuminants exceed {LIGHT_SCORE:g} times the noise"),
-        _listed(differing_cells(cells), "patches differ under all illuminants"),
+        _listed(differing, f"beyond {LIGHT_SCORE:g} times the noise"),
+        _listed(differing_cells(cells), "with differences under all illuminants", "patch", "patches"),
     )
 
 
@@ -275,7 +278,9 @@ def _compare_cells(
         progress(number + 1, len(pairs))
     count, total = sums[0], sums[0].sum()
     if not total:
-        raise FormatError(f"0 patches exceed {MIN_COUNTS:g} counts in both LUTs; compare longer exposures")
+        raise FormatError(
+            f"0 patches exceed {MIN_COUNTS:g} counts in both LUTs, expected some; compare longer exposures"
+        )
     with np.errstate(divide="ignore", invalid="ignore"):
         mean, error = sums[1] / count, np.sqrt(sums[3]) / count
         offset = sums[1].sum(axis=0) / count.sum(axis=0)

@@ -197,4 +197,5 @@ def format_value(value: float, unit: str) -> str:
         return f"{100 * value:.3g} %"
     if unit == "°":
         return f"{value:.2g}°"
-    return f"{value:.3g} {unit}".strip() if abs(value) < _INTEGER_FROM else f"{value:.0f} {unit}".strip()
+    number = f"{value:.3g}" if abs(value) < _INTEGER_FROM else f"{value:.0f}"
+    return f"{number} {unit.removesuffix('s') if number == '1' else unit}".strip()

@@ -51,7 +51,7 @@ def _tags_row(table: TableMeasurements) -> SummaryRow:
 TAGS_FOUND = Figure(
     "tags_found", "Detected tags", "geometry", "share", "at least", 1.0, MIN_TAG_SHARE,
     why="near a missing tag, registration uses the patches alone", source=JUDGEMENT,
-    remedy="bring the whole chart into the picture, and uncover it", measure=_tag_fraction, of_one_frame="known",
+    remedy="bring the whole chart into the frame, and uncover it", measure=_tag_fraction, of_one_frame="known",
     cause=Explanation("chart", chart_evidence), drawing="chart", lines=(Line(30, _tags_row),),
 )  # fmt: skip
 
@@ -65,7 +65,7 @@ CELL_PX = Figure(
     "cell_px", "Shorter side of a patch", "geometry", "px", "at least", 8.6, MIN_CELL_PX,
     why="the 25 pixels reach 3.25 px from a patch's centre, rounding and registration included",
     source="geometry: half of 5 px, 0.5 px rounding, 0.25 px registration; at 8.6 px and a blur of 0.7 px the bleed "
-    "is 1.3 %", remedy="move the camera nearer or use a longer lens",
+    "is 1.3 %", remedy="move the camera closer or use a longer lens",
     measure=lambda table: table.registration.cell_px, of_one_frame="known",
     drawing="chart", lines=(Line(40, _cell_row),),
 )  # fmt: skip
@@ -93,7 +93,7 @@ BLEED = Figure(
     why="the lens's blur mixes neighbouring patches into the outermost pixels of the window",
     source="normal integral beyond the patch's edge at 0.75 px misplacement: for a sharp lens 0.2 % at 10 px per "
     "patch and 0.6 % at 8.6 px; a thirtieth of it in a patch mean, included in its uncertainty",
-    remedy="focus on the print, stop down to f/8, move the camera nearer, or use a smaller window (build-lut "
+    remedy="focus on the print, stop down to f/8, move the camera closer, or use a smaller window (build-lut "
     "--window)", measure=_worst_sample_bleed, of_one_frame="known", drawing="chart",
     lines=(
         Line(50, _window_row),
@@ -224,7 +224,7 @@ def _agreement_row(table: TableMeasurements) -> SummaryRow:
 
 AGREEMENT = Figure(
     "agreement", "Correlation of patches and chart", "geometry", "", "at least", 0.97, MIN_AGREEMENT,
-    why="the colours differ from those of the chart",
+    why="the colours differ from the chart",
     source=SIMULATED + ": at least 0.99; about 0 for another order of the patches",
     remedy="give the chart.json of this print, and print without colour management",
     measure=lambda table: table.registration.agreement, of_one_frame="known",

@@ -42,14 +42,14 @@ _FrameValue = Callable[["TableMeasurements", "FrameMeasurements"], float]
 
 # Remedy for each kind of unfit patch (`calibration.pipeline.collecting`).
 _UNFIT_REMEDIES = {
-    "outside": "bring the whole chart into the picture",
+    "outside": "bring the whole chart into the frame",
     "clipped": "expose less",
     "covered": "uncover the chart",
     "hot": "let the camera cool",
     "dead": "have the camera's pixels remapped",
     "stained": "clean the print or print it again, and light it evenly",
     "disturbed": "keep the space between lamp, print and camera free",
-    "unlike": "look at the patch in the frame of that illuminant",
+    "unlike": "check the patch in the frame of that illuminant",
     "misplaced": "hang the print flatter",
     "lit": "turn the print or the projector until the print mirrors no lamp, window or bright wall",
     "uneven": "focus on the print, and keep the camera still",
@@ -66,7 +66,7 @@ def _unfit_detail(table: TableMeasurements) -> tuple[str, str] | None:
     if not table.cells.unfit:
         return None
     kind, count = Counter(cell.kind for cell in table.cells.unfit).most_common(1)[0]
-    return f", {count} of them {kind}", _UNFIT_REMEDIES.get(kind, "see the patches in the report")
+    return f", {count} of them {kind}", _UNFIT_REMEDIES.get(kind, "check the patches in the report")
 
 
 def _unfit_row(table: TableMeasurements) -> SummaryRow:
@@ -99,8 +99,8 @@ ADDED_LIGHT = Figure(
     "added_light", "Light added to a large part of the print, relative to paper white", "radiometry", "share",
     "at most", 0.004, 0.01,
     why="it is equal on dark and bright patches, and extends beyond the patches listed as unfit",
-    source=SIMULATED + ": 0 in healthy rooms; added light of 1 % of paper white makes a patch with 10 % of paper white "
-    "10 % brighter; a reflection of 3 % causes errors of 57 %",
+    source=SIMULATED + ": 0 in healthy rooms; 1 % of paper white makes patches of 10 % of paper white 10 % brighter, "
+    "and patches of 3 % 30 % brighter; a reflection of 3 % causes errors of 57 %",
     remedy="turn the print or the projector until it shows no reflection, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
@@ -195,14 +195,17 @@ def _reregistered_count(table: TableMeasurements) -> int:
 def _movement_row(table: TableMeasurements) -> SummaryRow | None:
     if len(table.frames) < 2:
         return None
-    moved, note = f"{table.largest_shift_px:.3f} px at most", f"{_reregistered_count(table)} frames registered again"
+    moved, note = (
+        f"{table.largest_shift_px:.3f} px at most",
+        f"{counted(_reregistered_count(table), 'frame')} registered again",
+    )
     return SummaryRow("Movement of the chart", moved, note, brief=True)
 
 
 REREGISTERED_FRAMES = Figure(
     "reregistered_frames", "Frames registered again", "geometry", "", "at most", 0, None,
     why="the chart or the camera moved between frames; the sampling grid followed", source=JUDGEMENT,
-    remedy="fix camera and print, and keep people away",
+    remedy="fasten camera and print, and keep people away",
     measure=lambda table: float(_reregistered_count(table)), of_one_frame="bounded",
     cause=Explanation("movement", movement_evidence), drawing="course", lines=(Line(120, _movement_row),),
 )  # fmt: skip

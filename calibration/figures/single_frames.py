@@ -16,9 +16,9 @@ EVENNESS: Final = Limit(
 )  # fmt: skip
 
 TURN: Final = Limit(
-    "turn", "Angle between the rows of the chart and of the frame", "geometry", "°", "at most", 5.0, None,
-    why="sampling windows are aligned with the rows of the frame, and their corners approach the neighbouring patches",
-    source="geometry: 5 px of samples in a patch of 10 px", remedy="turn the camera until the rows are parallel",
+    "turn", "Angle between the rows of the chart and of the image", "geometry", "°", "at most", 5.0, None,
+    why="sampling windows are aligned with the rows of the image, and their corners approach the neighbouring patches",
+    source="geometry: 5 px of samples in a patch of 10 px", remedy="turn the camera until the rows are level",
 )  # fmt: skip
 
 KEYSTONE: Final = Limit(
@@ -69,16 +69,15 @@ REPEATED: Final = Limit(
 
 UNIFORMITY: Final = Limit(
     "uniformity", "Deviation of the worst tile from the whole frame's light", "light", "share", "at most", 0.02, 0.02,
-    why="an object stands in front of the chart, or only part of the projected image shows the planned illuminant",
+    why="an object is in front of the chart, or only part of the projected image shows the planned illuminant",
     source="the uniformity of an LCD changes by 2 % between codes; a moving arc changes the illumination field by less",
-    remedy="look at the chart and at the projected image",
+    remedy="check the chart and the projected image",
 )  # fmt: skip
 
 ROWS: Final = Limit(
     "rows", "Strips of rows with unexpected content", "devices", "", "at most", 3, 3,
-    why="the file was damaged during transfer, or an object covers part of the frame",
-    source="an insect in front of the chart covers as many",
-    remedy="check the cable and the memory card, and look at the frame",
+    why="the file was damaged during transfer, or an object covers part of the chart", source="a fly covers as many",
+    remedy="check the cable, the memory card and the frame",
 )  # fmt: skip
 
 # Measured by the live judge only, in addition to the limits in LAB.toml.

@@ -52,7 +52,7 @@ def _transfer_row(table: TableMeasurements) -> SummaryRow:
     transfer = table.sensor.transfer
     gain = " / ".join(f"{value:.2f}" for value in transfer.gain_e.tolist())
     read_noise = " / ".join(f"{value:.1f}" for value in transfer.read_noise.tolist())
-    note = f"R, G, B of half-size pixels; {int(transfer.noisy.sum())} patches are noisier than the curve"
+    note = f"R, G, B of half-size pixels; patches noisier than the curve: {int(transfer.noisy.sum())}"
     return SummaryRow("Photon transfer", f"{gain} e⁻ per count, {read_noise} counts of read noise", note)
 
 
@@ -77,7 +77,7 @@ def _fewest_references_text(table: TableMeasurements, accepted: float) -> str:
 REFERENCES_USED = Figure(
     "references_used", "Used white references, worst frame", "truth", "share", "at least", 0.9, 0.3,
     why="flat field and ground truth are based on few positions", source=JUDGEMENT,
-    remedy="uncover the print, bring all of it into the picture, and expose so that bare paper stays below saturation",
+    remedy="uncover the print, bring all of it into the frame, and expose so that bare paper stays below saturation",
     measure=_fraction_of_references, of_one_frame="bounded", where=_fewest_references_text, drawing="course",
 )  # fmt: skip
 

@@ -154,8 +154,8 @@ def build(
     if selected.lights_without:
         raise FormatError(
             f"{session.folder}: {len(selected.lights_without)} of {len(session.illuminations)} illuminants have no "
-            f"accepted frame: {first_few(selected.lights_without)}; all are expected. Finish the session with acquire "
-            "run, or add the available frames with build-lut --append"
+            f"accepted frame, expected one each: {first_few(selected.lights_without)}; complete the session with "
+            "acquire run, or add the available frames with build-lut --append"
         )
     _require_dark_frames(session, options)
     _require_white_frames(selected, session, options)
@@ -228,7 +228,7 @@ def check(
         baseline = baseline_of(session.chart, first, replace(options, subtract_dark=False))
     except RegistrationError as error:
         if picture is None:
-            raise RegistrationError(f"{error}; use --picture PNG to see the frame") from error
+            raise RegistrationError(f"{error}; use --picture PNG to save the frame") from error
         write_atomic(picture, annotated_png(first.mosaic, session.chart, None))
         raise RegistrationError(f"{error}; see {picture}") from error
     if picture is not None:
@@ -435,7 +435,7 @@ def _refusal_error(result: BuildResult, out: Path, folder: Path) -> QualityError
     hint = f"; see {report_folder / saved[0]}" if saved else ""
     figures = result.figures
     return QualityError(
-        f"{figures.session.folder}: the LUT is refused. {refusal(result.verdict, figures, reported=bool(saved))}{hint}"
+        f"{figures.session.folder}: the LUT is refused: {refusal(result.verdict, figures, reported=bool(saved))}{hint}"
     )
 
 
@@ -447,8 +447,8 @@ def refused_folder(out: Path) -> Path:
 def _require_dark_frames(session: Session, options: BuildOptions) -> None:
     if options.subtract_dark and not any(record.kind == "dark" and record.accepted for record in session.frames()):
         raise FormatError(
-            f"{session.folder} has no accepted dark frame; --subtract-dark needs at least 1. Take the session with "
-            "acquire run, which takes dark frames, or build the LUT without --subtract-dark"
+            f"{session.folder} has 0 accepted dark frames, expected at least 1 for --subtract-dark; take the session "
+            "with acquire run, which takes dark frames, or build the LUT without --subtract-dark"
         )
 
 
@@ -456,9 +456,9 @@ def _require_white_frames(selected: SelectedFrames, session: Session, options: B
     count = sum(record.kind == "white" for record in selected.records)
     if options.correct_drift and count < LEAST_WHITES:
         raise FormatError(
-            f"{session.folder} has {counted(count, 'accepted white frame')}; --correct-drift needs at least "
-            f"{LEAST_WHITES}. Take the session with acquire run, which takes one every sequence.reference_every "
-            "illuminants, or build the LUT without --correct-drift"
+            f"{session.folder} has {counted(count, 'accepted white frame')}, expected at least "
+            f"{LEAST_WHITES} for --correct-drift; take the session with acquire run, which takes one every "
+            "sequence.reference_every illuminants, or build the LUT without --correct-drift"
         )
 
 

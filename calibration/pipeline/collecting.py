@@ -233,11 +233,13 @@ class Accumulator:
         for colour in range(self.baseline.chart.colour_count):
             cause = ""
             if self.outside[colour]:
-                cause = f"outside: some of its {samples} pixels are outside the frame; move the chart into the picture"
+                cause = (
+                    f"outside: some of its {samples} pixels are outside the frame; bring the whole chart into the frame"
+                )
             elif self.highest[colour] >= limit:
                 light = int(self.highest_at[colour])
                 under = f"illuminant {light}" if light >= 0 else "white"
-                cause = f"clipped: {int(self.highest[colour])} counts under {under}, less than {limit:.0f} expected"
+                cause = f"clipped: {int(self.highest[colour])} counts under {under}, expected less than {limit:.0f}"
             elif self.covered[colour]:
                 cause = "covered: it does not match the chart (covered, damaged, or another print)"
             elif self.place_error[colour] > MAX_PLACE_ERROR_PX:

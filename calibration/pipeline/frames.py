@@ -44,8 +44,8 @@ class BuildOptions:
     def __post_init__(self) -> None:
         if self.window not in WINDOWS:
             raise InputError(
-                f"window = {self.window} px; expected {', '.join(map(str, WINDOWS[:-1]))} or {WINDOWS[-1]} px. A "
-                "window has a central pixel, and patches are about 10 px wide; use 5 px if in doubt"
+                f"window = {self.window} px, expected {', '.join(map(str, WINDOWS[:-1]))} or {WINDOWS[-1]} px, "
+                "because a window has a central pixel, and patches are about 10 px wide; use 5 px if in doubt"
             )
 
     @property
@@ -101,7 +101,8 @@ def select_frames(session: Session) -> SelectedFrames:
     accepted = [record for record in session.frames() if record.accepted]
     if not any(record.kind in ("white", "light") for record in accepted):
         raise FormatError(
-            f"{session.folder} has 0 accepted light or white frames, at least 1 expected; run acquire run"
+            f"{session.folder} has 0 accepted light or white frames, expected at least 1; take the session with "
+            "acquire run"
         )
     last = _last_of_each_light(session, accepted)
     reference_frames = [record for record in accepted if record.kind in ("white", "dark")]
@@ -173,7 +174,11 @@ def stated_origin(session: Session) -> StatedOrigin:
     except (CropError, ValidationError, ValueError, KeyError, RecursionError) as error:
         if isinstance(error, CropError | tomllib.TOMLDecodeError):
             why = error if isinstance(error, CropError) else f"{session.folder / 'session.toml'} is not TOML: {error}"
-            _log.warning("%s; the LUT will not contain origin, authors, exposure and licence; correct it first", why)
+            _log.warning(
+                "%s; the LUT will not contain origin, authors, exposure and licence; correct it, and build the LUT "
+                "again",
+                why,
+            )
         return StatedOrigin(CitationSettings(), None, None, session.journal.records())
     return StatedOrigin(citation, rig, settings, session.journal.records())
 

@@ -46,7 +46,7 @@ from experiment.framing.pictures import REREGISTER_PX, Shift
 from experiment.lights import Illuminant
 from experiment.measures.sensor import HIGHEST, LOWEST, deviations
 from foundation.colorimetry import angles_deg
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, counted
 
 _Array = npt.NDArray[np.float64]
 
@@ -221,8 +221,8 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
         ) from error
     if len(paths) < MIN_EXPOSURES:
         raise InputError(
-            f"{folder} contains {len(paths)} files, expected at least {MIN_EXPOSURES}. Take raw files of the chart "
-            "with different exposure times, preferably 8, from dim to almost saturated"
+            f"{folder} contains {counted(len(paths), 'file')}, expected at least {MIN_EXPOSURES}; take raw files of "
+            "the chart with different exposure times, preferably 8, from dim to almost saturated"
         )
     means_by_file: list[_Array] = []
     times: list[float] = []
@@ -236,8 +236,8 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
         settings.append((mosaic.iso, mosaic.aperture))
         if settings[-1] != settings[0]:
             raise FormatError(
-                f"{path} was taken with ISO {mosaic.iso}, f/{mosaic.aperture}, {paths[0].name} with ISO "
-                f"{settings[0][0]}, f/{settings[0][1]}; take the series again and change only the exposure time"
+                f"{path} was taken with ISO {mosaic.iso}, f/{mosaic.aperture}, expected ISO {settings[0][0]}, "
+                f"f/{settings[0][1]} as in {paths[0].name}; take the series again and change only the exposure time"
             )
         black = frame_black(mosaic)
         limit = mosaic.saturation()
@@ -263,7 +263,7 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
 
 def _require_in_place(shift: Shift, path: Path) -> None:
     if shift.gauges == 0 or shift.largest_px > REREGISTER_PX:
-        fault = f"it has moved by {shift.largest_px:.2f} px, at most {REREGISTER_PX:g} px expected"
+        fault = f"it has moved by {shift.largest_px:.2f} px, expected at most {REREGISTER_PX:g} px"
         if shift.gauges == 0:
             fault = "its tags, or the outline of its patches, are not visible"
         raise FormatError(

@@ -158,7 +158,7 @@ def superposition(
     """
     patches, needed = int(usable.sum()), max(_LEAST_PATCHES, 2 * predictors.shape[1])
     if patches < needed:
-        why = f"the chart has {patches} usable patches, minimum {needed}, with any illuminants"
+        why = f"the chart has {patches} usable patches, expected at least {needed}, with any illuminants"
         return Superposition.usual(full, Unmeasured(why, f"use a chart with more colours, or {_SERIES}"))
     levels, predictors = np.stack([together, *alone])[:, usable], predictors[usable]
     hats, size = _hats(levels / full), _AMOUNTS + len(NODES)

@@ -48,15 +48,15 @@ def noise_curve(lut: Lut) -> PhotonTransfer | None:
     cells = sum(map(len, means))
     if cells < _FEWEST:
         raise InputError(
-            f"the noise of {lut.folder} cannot be measured: {cells} patches have only samples above 0, at "
-            f"least {_FEWEST} expected; omit --iso, --exposure and --gradient, or use another LUT"
+            f"the noise of {lut.folder} cannot be measured: {cells} patches have several samples above 0, expected "
+            f"at least {_FEWEST}; omit --iso, --exposure and --gradient, or use another LUT"
         )
     curve = photon_transfer(np.concatenate(means), np.concatenate(variances), count)
     has_noise = np.concatenate(variances).max() > 0
     if has_noise and not curve.misfit.max() <= _MISFIT:
         raise InputError(
             f"the samples of {lut.folder} do not follow the photon-transfer curve: their variances differ by "
-            f"{curve.misfit.max():.0%} RMS, limit {_MISFIT:.0%}; omit --iso, --exposure and --gradient, or use "
-            "another LUT"
+            f"{curve.misfit.max():.0%} RMS, expected at most {_MISFIT:.0%}; omit --iso, --exposure and --gradient, or "
+            "use another LUT"
         )
     return curve if has_noise else None

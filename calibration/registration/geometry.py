@@ -39,7 +39,7 @@ _FOCAL_RADII = 2.2
 _HEIGHT_STEP = 1e-3
 
 _ON_ONE_LINE = (
-    "the detected marks of the chart lie on one line; marks spread over the sheet are expected. Bring the whole chart "
+    "the detected marks of the chart lie on one line, expected marks all over the sheet; bring the whole chart "
     "into the frame, and uncover it"
 )
 

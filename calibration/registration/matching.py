@@ -419,7 +419,8 @@ class Matcher:
             located = find_blocks(raster, template, image, is_inside, block * elements, reach, block**2)
             if not len(located.score):
                 raise RegistrationError(
-                    f"{frame_name}: no block of patches lies inside the frame; bring the whole chart into the frame"
+                    f"{frame_name}: no block of patches is inside the frame, expected all; bring the whole chart into "
+                    "the frame"
                 )
             centre = located.centres_mm
             best_score = max(best_score, float(np.median(located.score)))
@@ -432,7 +433,7 @@ class Matcher:
             self.colours = self._fit_colours()
         if best_score < _LEAST_BLOCK_SCORE:
             raise not_this_chart(
-                frame_name, f"the correlation of blocks is {best_score:.2f}, minimum {_LEAST_BLOCK_SCORE:g}"
+                frame_name, f"the correlation of blocks is {best_score:.2f}, expected at least {_LEAST_BLOCK_SCORE:g}"
             )
 
     def follow(self, sigma_cells: float) -> None:

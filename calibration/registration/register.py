@@ -209,7 +209,8 @@ def register(
     if lens_rms > MAX_TAG_RESIDUAL_PX:
         raise RegistrationError(
             f"{frame_name}: the {'tags' if chart.tags else 'edges of the field'} deviate by {lens_rms:.1f} px RMS "
-            f"from a plane, limit {MAX_TAG_RESIDUAL_PX:g} px; hang the print flat, and check that chart.json matches it"
+            f"from a plane, expected at most {MAX_TAG_RESIDUAL_PX:g} px; hang the print flat, and check that "
+            "chart.json matches it"
         )
     if chart.tags:
         # A small residual shows that the corners are more precise than usual. Waves of the sheet would hide it.
@@ -327,13 +328,14 @@ def _cell_px(lens: Lens, chart: Chart) -> float:
 def _require_size_and_focus(cell_px: float, blur: float, frame_name: str) -> None:
     if cell_px < MIN_CELL_PX:
         raise RegistrationError(
-            f"{frame_name}: a patch is {cell_px:.1f} px wide, minimum {MIN_CELL_PX:g} px for its 25 samples; "
+            f"{frame_name}: a patch is {cell_px:.1f} px wide, expected at least {MIN_CELL_PX:g} px for its 25 samples; "
             "move the camera closer"
         )
     limit = largest_blur_px(cell_px)
     if not blur <= limit:
         raise RegistrationError(
-            f"{frame_name} is out of focus: the blur of edges is σ = {blur:.2f} px, limit {limit:.2f} px for patches "
+            f"{frame_name} is out of focus: the blur of edges is σ = {blur:.2f} px, expected at most {limit:.2f} px "
+            "for patches "
             f"of {cell_px:.1f} px; focus on the print, use a smaller aperture, and avoid movement of the camera"
         )
 
@@ -376,16 +378,17 @@ def _judge(registration: Registration, minimum_agreement: float, frame_name: str
     blocks = registration.blocks
     if registration.agreement < minimum_agreement:
         raise not_this_chart(
-            frame_name, f"their correlation is {registration.agreement:.2f}, minimum {minimum_agreement:g}"
+            frame_name, f"their correlation is {registration.agreement:.2f}, expected at least {minimum_agreement:g}"
         )
     good_share = float(blocks.good.mean())
     if good_share < MIN_GOOD_BLOCKS:
         raise not_this_chart(
-            frame_name, f"{good_share:.0%} of the blocks of patches match the chart, minimum {MIN_GOOD_BLOCKS:.0%}"
+            frame_name,
+            f"{good_share:.0%} of the blocks of patches match the chart, expected at least {MIN_GOOD_BLOCKS:.0%}",
         )
     limit = MAX_BLOCK_RESIDUAL_PX * registration.clearance
     if registration.block_rms_px > limit:
         raise RegistrationError(
-            f"{frame_name}: the residual of the blocks of patches is {registration.block_rms_px:.2f} px RMS, limit "
-            f"{limit:.2g} px; hang the print flatter"
+            f"{frame_name}: the residual of the blocks of patches is {registration.block_rms_px:.2f} px RMS, expected "
+            f"at most {limit:.2g} px; hang the print flatter"
         )

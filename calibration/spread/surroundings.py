@@ -80,7 +80,7 @@ def unsuitable(chart: Chart) -> str:
     if not chart.tags:
         return "the chart has no tags, so its colours are in a smooth order, and neighbours are too similar"
     if chart.bits < LEAST_BITS:
-        return f"the chart has {chart.colour_count} patches, minimum {8**LEAST_BITS} to average noise"
+        return f"the chart has {chart.colour_count} patches, expected at least {8**LEAST_BITS} to average noise"
     return "" if _fits_grid(chart) else "patches and references are not on a common grid of slots of their size"
 
 

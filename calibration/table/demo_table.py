@@ -44,7 +44,7 @@ def table_folder(folder_or_demo: Path) -> Path:
     demo_folder = cache / f"demo-{key}"
     if not (demo_folder / "lut.json").is_file():
         _make(demo_folder)
-    print(f"{DEMO} {demo_folder}: a computed table of {CAMERA}, {8**BITS} colours under {LIGHTS}; see sim table --help")
+    print(f"{DEMO} {demo_folder}: a computed LUT of {CAMERA}, {8**BITS} colours under {LIGHTS}; see sim table --help")
     return demo_folder
 
 

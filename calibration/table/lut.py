@@ -164,12 +164,12 @@ def parse_provenance(text: bytes, path: Path) -> Provenance:
     try:
         head = _Head.model_validate_json(text)
     except ValidationError as error:
-        raise FormatError(f"{path} is damaged: a JSON object was expected; build the LUT again") from error
+        raise FormatError(f"{path} is damaged, expected a JSON object; build the LUT again") from error
     if head.format != FORMAT:
-        raise FormatError(f"{path} has format {head.format!r}, expected {FORMAT!r}; name a folder made by build-lut")
+        raise FormatError(f"{path} has format {head.format!r}, expected {FORMAT!r}; give a folder made by build-lut")
     if head.version != VERSION:
         raise FormatError(
-            f"{path.parent} is a table of version {head.version!r}, this software reads version {VERSION}; "
+            f"{path.parent} is a LUT of version {head.version!r}, expected {VERSION}; "
             "build it again from its session with build-lut, or install the software that wrote it"
         )
     provenance = from_json(Provenance, text, path, "restore it from a copy")
@@ -208,7 +208,7 @@ def load_frames(path: Path) -> tuple[SourceFrame, ...]:
         )
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise FormatError(
-            f"{path} is damaged: columns {','.join(FRAME_FIELDS)} expected; build the LUT again"
+            f"{path} is damaged, expected columns {','.join(FRAME_FIELDS)}; build the LUT again"
         ) from error
 
 
@@ -234,12 +234,14 @@ def map_samples(path: Path, lights: int, bits: int) -> npt.NDArray[np.uint16]:
     is_plain = dtype == np.dtype("<u2") and not columns_first and len(shape) == 4
     if not is_plain or shape[:2] != (lights, 8**bits) or not 0 < shape[2] <= MOST_SAMPLES or shape[3] != 3:
         raise FormatError(
-            f"{path} holds {dtype} {shape}, expected uint16 ({lights}, {8**bits}, samples, 3) of 1 to {MOST_SAMPLES} "
+            f"{path} has {dtype} {shape}, expected uint16 ({lights}, {8**bits}, samples, 3) of 1 to {MOST_SAMPLES} "
             "samples; build the LUT again"
         )
     expected = offset + math.prod(shape) * 2
     if size != expected:
-        raise FormatError(f"{path} has {size} bytes, {expected} expected; restore it from a copy, or build it again")
+        raise FormatError(
+            f"{path} has {size} bytes, expected {expected}; restore it from a copy, or build the LUT again"
+        )
     return np.memmap(path, dtype, "r", offset, shape)
 
 
@@ -279,7 +281,9 @@ def parse_sums(text: str, path: Path) -> dict[str, str]:
     for number, line in enumerate(text.splitlines(), 1):
         match = _LINE.fullmatch(line)
         if match is None or match[2] in hashes:
-            raise FormatError(f"{path}, line {number}: expected a hash, two blanks and a unique name; {RESTORE}")
+            raise FormatError(
+                f"{path}, line {number}: {line[:80]!r}, expected a hash, two blanks and a unique name; {RESTORE}"
+            )
         hashes[match[2]] = match[1]
     missing = {PROVENANCE, ILLUMINATIONS, SAMPLES} - hashes.keys()
     if missing:
@@ -432,7 +436,7 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
     Raises
     ------
     FormatError
-        If the folder is no LUT, its version is unknown, its files disagree, or a file has changed since the build.
+        If the folder is not a LUT, its version is unknown, its files disagree, or a file has changed since the build.
     """
     path = folder / PROVENANCE
     require_plain_table(folder)
@@ -440,9 +444,9 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
         text = path.read_bytes()
     except OSError as error:
         if (partial_path(folder) / SAMPLES).is_file():
-            raise FormatError(f"{folder} is not finished; finish it with build-lut SESSION {folder}") from error
+            raise FormatError(f"{folder} is not complete; complete it with build-lut SESSION {folder}") from error
         raise FormatError(
-            f"{folder} is no LUT: cannot read {PROVENANCE} ({error.strerror}); make one with build-lut"
+            f"{folder} is not a LUT: cannot read {PROVENANCE} ({error.strerror}); make one with build-lut"
         ) from error
     provenance = parse_provenance(text, path)
     lights = load_illuminants(folder / ILLUMINATIONS, computed=True)
@@ -457,7 +461,7 @@ def _load_uncertainty(path: Path, count: int) -> npt.NDArray[np.float64]:
         rows = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8")))
         expanded = np.array([float(row[EXPANDED]) for row in rows])
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{path} is damaged: numbers under {EXPANDED} expected; {RESTORE}") from error
+        raise FormatError(f"{path} is damaged, expected numbers under {EXPANDED}; {RESTORE}") from error
     if len(expanded) != count or not np.isfinite(expanded).all() or (expanded < 0).any():
         raise FormatError(f"{path} has {len(expanded)} rows, expected {count} of finite numbers ≥ 0; {RESTORE}")
     return expanded
@@ -468,13 +472,17 @@ def _load_white(path: Path) -> npt.NDArray[np.float64]:
     try:
         white = np.array([[float(row[column]) for column in WHITE_COLUMNS] for row in rows])
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{path}: expected numbers under {','.join(WHITE_COLUMNS)}; build the LUT again") from error
+        raise FormatError(
+            f"{path} is damaged, expected numbers under {','.join(WHITE_COLUMNS)}; build the LUT again"
+        ) from error
     if not ((white > 0).all() and (white < MOST_WHITE).all()):
-        raise FormatError(f"{path}: a ground truth is outside of 0 … {MOST_WHITE}; build the LUT again")
+        raise FormatError(f"{path}: a ground truth is out of range, expected 0 to {MOST_WHITE}; build the LUT again")
     return white
 
 
 def require_lut(value: object) -> None:
     """Raise `InputError` if a value is not a `Lut`, such as a path or an image."""
     if not isinstance(value, Lut):
-        raise InputError(f"the first argument is {value_text(value)}, expected a Lut, as returned by open_lut(FOLDER)")
+        raise InputError(
+            f"the first argument is {value_text(value)}, expected a Lut, as returned by open_lut(FOLDER); give one"
+        )

@@ -62,7 +62,7 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
     return [
         *origin,
         ("Camera", source.camera),
-        ("Lights", f"{len(lights)}: {kinds}"),
+        ("Illuminants", f"{len(lights)}: {kinds}"),
         ("Colours", f"{8**source.bits} ({source.bits} bits a channel), {lut.samples.shape[2]} samples each"),
         ("Size", f"{lut.samples.nbytes / 1e9:.2f} GB of samples"),
         (
@@ -72,7 +72,7 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
         ("Chromaticities", chromaticities),
         ("Uncertainty", _uncertainty(lut)),
         (
-            "Cells unfit",
+            "Unfit patches",
             f"{len(source.unfit)} of {8**source.bits}"
             + "".join(f", {count} {cause}" for cause, count in sorted(causes.items())),
         ),
@@ -83,8 +83,8 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
         ("Session", session),
         ("Chart", source.chart_sha256),
         ("Samples", source.samples_sha256 or ""),
-        ("Hashes", f"every file, in {SUMS}, whose own names the LUT"),
-        ("Table", lut.sha256),
+        ("Hashes", f"of every file, in {SUMS}; its own hash identifies the LUT"),
+        ("LUT", lut.sha256),
     ]
 
 
@@ -107,7 +107,7 @@ def find_faults(lut: Lut, progress: Callable[[int, int], None] | None = None) ->
     file_hash, lights = samples_sha256(lut.folder / SAMPLES, lut.samples, progress)
     recorded = lut.provenance.lights_sha256
     if len(recorded) != len(lights):
-        return [*faults, f"{PROVENANCE} has hashes of {len(recorded)} illuminants, the LUT has {len(lights)}"]
+        return [*faults, f"{PROVENANCE} has hashes of {len(recorded)} illuminants, expected {len(lights)}"]
     changed = [light for light, (new, old) in enumerate(zip(lights, recorded, strict=True)) if new != old]
     if changed:
         indices = first_few(changed, 20)
@@ -144,5 +144,5 @@ def require_match(first: Lut, second: Lut) -> None:
     if differences:
         raise FormatError(
             f"{first.folder} and {second.folder} do not correspond: {'; '.join(differences)}; "
-            "name two tables of one chart.json and one illuminations.csv"
+            "give two LUTs of one chart.json and one illuminations.csv"
         )

@@ -45,7 +45,7 @@ from calibration.table.lut import (
     require_listed,
 )
 from experiment.lights import load_illuminants
-from foundation.errors import CropError, FormatError, InputError, StorageError
+from foundation.errors import RUN_AGAIN, CropError, FormatError, InputError, StorageError
 from foundation.files import file_sha256, parse_json_object, require_plain_tree, storage_error, write_atomic
 from foundation.folders import atomic_folder, require_free
 
@@ -89,7 +89,9 @@ def table_texts(attributes: dict[str, Any], url: str) -> dict[str, str]:
     texts: dict[str, str] = {}
     for name, text in cast("dict[str, Any]", files).items():
         if name not in TEXTS or not isinstance(text, str) or len(text) > MOST_BYTES[name]:
-            raise FormatError(f"{url} holds {name!r}, no file of a LUT or too large; publish the LUT again")
+            raise FormatError(
+                f"{url} contains {name!r}, which is not a file of a LUT or too large; publish the LUT again"
+            )
         texts[name] = text
     missing = {PROVENANCE, ILLUMINATIONS, SUMS} - texts.keys()
     if missing:
@@ -157,7 +159,7 @@ def require_room(folder: Path, size: int, url: str) -> None:
     if size > free_bytes:
         raise StorageError(
             f"the samples of {url} need {size / 1e9:.1f} GB, but {free_bytes / 1e9:.1f} GB are free at "
-            f"{folder.parent}; free space or choose another disk, then run the same command again"
+            f"{folder.parent}; free space or choose another disk, {RUN_AGAIN}"
         )
 
 
@@ -177,7 +179,7 @@ def read_metadata(url: str) -> dict[str, Any] | None:
         # Each kind of store has its own errors.
         raise InputError(f"cannot read {url}: {error_text(error)}; check the address") from error
     if len(data) > _MOST_METADATA:
-        raise FormatError(f"{url}: {_METADATA} has more than {_MOST_METADATA} bytes, the limit; check the address")
+        raise FormatError(f"{url}: {_METADATA} has more than {_MOST_METADATA} bytes, expected fewer; check the address")
     return parse_json_object(data, f"{_METADATA} of {url}")
 
 
@@ -241,12 +243,12 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
     """
     zarr = _zarr()
     if expect is not None and not HASH.fullmatch(expect):
-        raise InputError(f"{expect!r} is no hash of a LUT; give the 64 digits in the line Table of build-lut info")
+        raise InputError(f"{expect!r} is not the hash of a LUT; give the 64 digits in the line LUT of build-lut info")
     require_free(folder, "the LUT")
     metadata = read_metadata(url)
     attributes = table_attributes(metadata)
     if metadata is None or attributes is None or attributes.get("whole") is not True:
-        raise FormatError(f"{url} holds no complete LUT; check the address, or publish the LUT again")
+        raise FormatError(f"{url} is not a complete LUT; check the address, or publish the LUT again")
     if attributes.get("version") != VERSION:
         raise FormatError(f"{url} has version {attributes.get('version')!r}, expected {VERSION}; update this software")
     files = table_texts(attributes, url)
@@ -294,7 +296,9 @@ def _light(array: Any, light: int, shape: tuple[int, int, int, int], url: str) -
             raise ValueError(f"its shape is {samples.shape}, expected {shape[1:]}")
     except Exception as error:
         # Each kind of store has its own errors, and damaged chunks raise errors of the codec.
-        raise FormatError(f"cannot read illuminant {light} of {url}: {error_text(error)}; publish it again") from error
+        raise FormatError(
+            f"cannot read illuminant {light} of {url}: {error_text(error)}; publish the LUT again"
+        ) from error
     return samples
 
 
@@ -303,11 +307,11 @@ def _require_free(url: str) -> None:
 
     attributes = table_attributes(read_metadata(url))
     if attributes is not None and attributes.get("whole"):
-        raise InputError(f"{url} already holds a LUT; give another address, or remove it")
+        raise InputError(f"{url} already has a LUT; give another address, or remove it")
     if attributes is None:
         files, root = url_to_fs(url)
         if files.exists(root) and files.find(root):
-            raise InputError(f"{url} already holds other files; give another address, or remove them")
+            raise InputError(f"{url} already has other files; give another address, or remove them")
 
 
 def _zarr() -> Any:

@@ -87,8 +87,8 @@ def choose_display(displays: tuple[Display, ...], selection: str | int | None = 
         x_positions = [display.x for display in displays]
         if len(set(x_positions)) < 2:
             raise ConfigurationError(
-                f"display {selection!r} requires two displays side by side; present: {present}; "
-                "connect the projector and extend the desktop to it"
+                f"display {selection!r} requires two displays side by side (present: {present})",
+                remedy="connect the projector and extend the desktop to it",
             )
         x_position = min(x_positions) if selection == "left" else max(x_positions)
         matches = [display for display in displays if display.x == x_position]
@@ -102,9 +102,10 @@ def choose_display(displays: tuple[Display, ...], selection: str | int | None = 
         return matches[0]
     subject = "display (not set)" if selection is None else f"display {selection!r}"
     if matches:
-        raise ConfigurationError(f"{subject}: {len(matches)} match; set a position such as +1920+0; present: {present}")
+        raise ConfigurationError(f"{subject}: {len(matches)} match, expected 1; set one of these positions: {present}")
     raise ConfigurationError(
-        f"{subject} is not connected; present: {present}; connect and switch on the projector, or set another display"
+        f"{subject} is not connected (present: {present})",
+        remedy="connect and switch on the projector, or set another display",
     )
 
 
@@ -120,8 +121,8 @@ def running_glfw() -> Generator[ModuleType]:
             glfw.init()
         except glfw.GLFWError as error:
             raise DeviceError(
-                f"no desktop is available ({_server_state()}); log in to the machine with the projector and run this "
-                "there; on Linux set DISPLAY, and XAUTHORITY in a shell outside the desktop"
+                f"no desktop is available ({_server_state()}); log in to the computer with the projector and run this "
+                "there, and on Linux set DISPLAY, and XAUTHORITY in a shell outside the desktop"
             ) from error
         if sys.platform == "linux":
             outlive(glfw.get_x11_display())
@@ -221,7 +222,7 @@ _DIGITS: Final = (
     "111100111001111", "111100111101111", "111001001001001", "111101111101111", "111101111001111",
 )  # fmt: skip
 
-_COVER_REMEDY: Final = "look for a window or notification in front, desktop scaling, or a colour filter"
+_COVER_REMEDY: Final = "check for a window or notification in front, desktop scaling, or a colour filter"
 
 
 class FullScreen:
@@ -396,8 +397,8 @@ class FullScreen:
         if not self._is_full():
             present = "; ".join(str(display) for display, _ in self._displays_now()) or "none"
             raise DeviceError(
-                f"the window does not fill display {self.display}; present displays: {present}; check its cable, and "
-                "restore the desktop's display settings"
+                f"the window does not fill display {self.display} (present displays: {present})",
+                remedy="check its cable, and restore the desktop's display settings",
             )
 
     def _displays_now(self) -> list[tuple[Display, Any]]:
@@ -485,7 +486,7 @@ class FullScreen:
             own: int = self._glfw.get_x11_window(self._window)
             cover = self._screen.cover(self.display.x + column, self.display.y + row, own)
         if cover is not None:
-            return f"in front of it lies {cover}: close it, and switch such windows and notifications off"
+            return f"{cover} covers it: close it, and switch such windows and notifications off"
         return _COVER_REMEDY
 
     def _require_usable(self) -> None:
@@ -526,9 +527,7 @@ def _find_warnings(glfw: Any, display: Display, monitor: Any, screen: XScreen | 
             "management for this display"
         )
     if screen is not None and (screen.has_extension("XWAYLAND") or display.name.startswith("XWAYLAND")):
-        warnings.append(
-            "the desktop is Wayland, whose compositor may scale or tint without notice: log in to an X session (Xorg)"
-        )
+        warnings.append("the desktop is Wayland, which may scale or tint without notice: log in to an X session (Xorg)")
     if screen is not None and not screen.stays_awake:
         warnings.append("power saving may darken the display: install libxcb-screensaver0, or disable it (xset -dpms)")
     if screen is not None and screen.has_root_property(_profile_property(glfw, monitor)):

@@ -232,7 +232,7 @@ class XScreen:
             size: int = self._xcb.xcb_get_image_data_length(reply.address)
             depth = reply.read(1, 1)[0]
             if depth not in (24, 32) or size != 4 * width * height:
-                raise DeviceError(f"the X screen has a depth of {depth} bits, 24 expected; set 24 for unchanged codes")
+                raise DeviceError(f"the X screen has a depth of {depth} bits, expected 24; set 24 for unchanged codes")
             raw = (ctypes.c_uint8 * size).from_address(self._xcb.xcb_get_image_data(reply.address))
             if self._pixels.shape != (height, width):
                 self._pixels = np.empty((height, width), np.uint32)

@@ -83,7 +83,7 @@ class PeerLink:
                 raise LinkClosed("the simulated device closed the connection; open a new one")
             if not timeout:
                 return b""
-            raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s")
+            raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s; open a new connection")
         data = bytes(self._incoming[:limit])
         del self._incoming[:limit]
         return data
@@ -223,7 +223,7 @@ class Exchange:
         remaining = wait
         while (parsed := parse(self._received)) is None:
             if len(self._received) > MAX_MESSAGE:
-                sent = f"sent {len(self._received)} bytes without the end of a message, at most {MAX_MESSAGE} expected"
+                sent = f"sent {len(self._received)} bytes without the end of a message, expected at most {MAX_MESSAGE}"
                 raise ProtocolError(f"{self._label} {sent}; {self._endless_remedy}")
             if remaining < 0:
                 raise self._timeout_error(wait)

@@ -35,7 +35,7 @@ class TcpLink:
             return cls(socket.create_connection((host, port), timeout), address)
         except TimeoutError as error:
             raise LinkTimeout(
-                f"{address} does not reply within {timeout:g} s; check address and cable, and that the device is on"
+                f"{address} has not answered within {timeout:g} s; check address and cable, and that the device is on"
             ) from error
         except socket.gaierror as error:
             raise LinkClosed(
@@ -230,7 +230,9 @@ class UdpSocket(ClosedAtEnd):
             self._socket.settimeout(max(timeout, 0.0))
             data, (sender, sender_port, *_) = self._socket.recvfrom(MAX_DATAGRAM)
         except (TimeoutError, BlockingIOError) as error:
-            raise LinkTimeout(f"no datagram arrived at {host}:{port} within {timeout:g} s") from error
+            raise LinkTimeout(
+                f"no datagram arrived at {host}:{port} within {timeout:g} s; check the network"
+            ) from error
         except OSError as error:
             raise LinkClosed(f"cannot receive datagrams at {host}:{port}: {error}; open the port again") from error
         return data, (sender, sender_port)

@@ -12,7 +12,7 @@ import errno
 import serial
 from serial.tools import list_ports
 
-from foundation.errors import ConfigurationError, DeviceRefused, LinkClosed, LinkError, LinkTimeout
+from foundation.errors import RUN_AGAIN, ConfigurationError, DeviceRefused, LinkClosed, LinkError, LinkTimeout
 
 
 class SerialLink:
@@ -84,11 +84,11 @@ def _open_error(error: OSError, device: str) -> LinkError | DeviceRefused:
             f"sudo usermod -aG dialout $USER (on Arch: uucp) and log in again"
         )
     if error.errno in (errno.EBUSY, errno.EAGAIN):
-        return DeviceRefused(f"{device} is in use by another program; close it and try again")
+        return DeviceRefused(f"{device} is in use by another program; close that program, {RUN_AGAIN}")
     if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         present_ports = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"
         return LinkClosed(
-            f"serial port {device} does not exist; present: {present_ports}. Plug the adapter in, or set one of these"
+            f"serial port {device} does not exist (present: {present_ports}); plug the adapter in, or set one of these"
         )
     return LinkClosed(f"{device} cannot be opened: {error}; check that it is a serial port")
 

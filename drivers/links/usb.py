@@ -97,7 +97,7 @@ _PERMISSION_REMEDY = (
     "plug the camera in again"
 )
 _BUSY_REMEDY = (
-    ", e.g. the photo monitor of the desktop; close photo programs, and on Linux run: "
+    ", such as the photo monitor of the desktop; close photo programs, and on Linux run: "
     "systemctl --user stop gvfs-gphoto2-volume-monitor.service (on macOS: killall ptpcamerad)"
 )
 
@@ -160,10 +160,12 @@ def open_usb(
     if not matching:
         if read_error is not None:
             raise read_error
-        raise LinkClosed(_no_camera_message(vendor, serial, port, other_devices))
+        fault = _no_camera_message(vendor, serial, port, other_devices)
+        raise LinkClosed(fault, remedy="switch the camera on, check cable and sleep timer")
     if len(matching) > 1:
         choice = "; ".join(str(description) for _, description in matching)
-        raise InputError(f"{len(matching)} cameras on USB match, 1 expected: {choice}; set a serial number or port")
+        fault = f"{len(matching)} cameras on USB match, expected 1: {choice}"
+        raise InputError(fault, remedy="set a serial number or port")
     return OpenUsbDevice(*matching[0])
 
 
@@ -298,7 +300,7 @@ class OpenUsbDevice:
                 case errno.EPIPE:
                     fault = PipeStalled(f"{label} halted the pipe; clear the halt")
                 case errno.EBUSY:
-                    fault = DeviceRefused(f"{label} is held by another program{_BUSY_REMEDY}")
+                    fault = DeviceRefused(f"{label} is in use by another program{_BUSY_REMEDY}")
                 case errno.EACCES | errno.EPERM:
                     fault = DeviceRefused(f"{label} {_PERMISSION_REMEDY}")
                 case errno.EOVERFLOW:
@@ -401,7 +403,7 @@ def _no_camera_message(vendor: int | None, serial: str | None, port: str | None,
     ]
     expected = ", ".join(text for text in properties if text) or "PTP"
     present = "; ".join(str(device) for device in devices) or "none"
-    return f"no camera with {expected} on USB; present: {present}; switch the camera on, check cable and sleep timer"
+    return f"no camera with {expected} on USB (present: {present})"
 
 
 def _milliseconds(timeout: float) -> int:

@@ -79,7 +79,7 @@ class FailReason(IntEnum):
 
 def _encode_guid(guid: bytes) -> bytes:
     if len(guid) != GUID_LENGTH:
-        raise ValueError(f"a GUID of {len(guid)} bytes; {GUID_LENGTH} expected")
+        raise ValueError(f"a GUID of {len(guid)} bytes, expected {GUID_LENGTH}")
     return guid
 
 
@@ -300,7 +300,7 @@ class PacketCutter:
         length, packet_type = _HEADER.unpack_from(self._buffer, self._position)
         if packet_type not in _PACKETS and self._buffer[self._position : self._position + 5].upper() in _HTTP_STARTS:
             raise ProtocolError(
-                "an HTTP server answers, a camera was expected; set the camera's address, and "
+                "an HTTP server answers, expected a camera; set the camera's address, and "
                 f"port {PORT} unless its menu shows another"
             )
         _check_length(packet_type, length)
@@ -345,11 +345,11 @@ def _decode(packet_type: int, data: bytes) -> Packet:
 
 def _check_length(packet_type: int, length: int) -> None:
     if packet_type not in _PACKETS:
-        raise _stream_error(f"a packet of type {packet_type} and {length} bytes, types 1 to 14 expected")
+        raise _stream_error(f"a packet of type {packet_type} and {length} bytes, expected types 1 to 14")
     shortest, longest = (_DATA_HEADER.size, 0xFFFFFFFF) if packet_type in _DATA_TYPES else (HEADER_LENGTH, MAX_PACKET)
     if not shortest <= length <= longest:
         name = PacketType(packet_type).name
-        raise _stream_error(f"a {name} packet of {length} bytes, {shortest} to {longest} expected")
+        raise _stream_error(f"a {name} packet of {length} bytes, expected {shortest} to {longest}")
 
 
 def _stream_error(fault: str) -> ProtocolError:
@@ -574,20 +574,22 @@ class IpTransport(CableTransport):
         try:
             answer = channel.next(CONNECT_S)
         except ProtocolError as error:
-            raise ProtocolError(f"{self._address} sent no valid PTP/IP reply: {error}") from error
+            raise ProtocolError(
+                f"{self._address} sent no valid PTP/IP reply: {error}; check that a camera answers at this port"
+            ) from error
         if isinstance(answer, expected):
             return answer
         if not isinstance(answer, InitFail):
             raise ProtocolError(
                 f"{self._address} answers a greeting with {type(answer).__name__}, expected {expected.__name__}; "
-                f"check that a camera listens at this port"
+                f"check that a camera answers at this port"
             )
-        reason = _REFUSALS.get(answer.reason, f"reports reason {answer.reason}: switch it off and on")
-        raise DeviceRefused(f"{self._address} refuses the connection; it {reason}")
+        reason = _REFUSALS.get(answer.reason, f"reports reason {answer.reason}; switch it off and on")
+        raise DeviceRefused(f"{self._address} refuses the connection: it {reason}")
 
 
 # Text of each refusal, with its remedy.
 _REFUSALS: dict[int, str] = {
-    FailReason.REJECTED: "is not paired with this computer: pair it again in the camera's wireless menu",
-    FailReason.BUSY: "is in use by another program or computer: disconnect the other, or switch the camera off and on",
+    FailReason.REJECTED: "is not paired with this computer; pair it again in the camera's wireless menu",
+    FailReason.BUSY: "is in use by another program or computer; disconnect the other, or switch the camera off and on",
 }

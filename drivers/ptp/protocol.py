@@ -29,7 +29,16 @@ from typing import Annotated, Any, ClassVar, Protocol, Self, get_origin, get_typ
 
 from drivers.ptp.codes import DataType, EventCode, Operation, ResponseCode
 from foundation.clock import Clock
-from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
+from foundation.errors import (
+    RUN_AGAIN,
+    DeviceError,
+    DeviceRefused,
+    LinkClosed,
+    LinkError,
+    LinkTimeout,
+    ProtocolError,
+    counted,
+)
 
 
 def describe(kind: type[IntEnum], code: int) -> str:
@@ -45,7 +54,7 @@ class Cursor:
 
     def __init__(self, data: bytes, name: str, limit: int | None = None) -> None:
         if limit is not None and len(data) > limit:
-            raise ProtocolError(f"{name} has {len(data)} bytes; at most {limit} expected")
+            raise ProtocolError(f"{name} has {len(data)} bytes, expected at most {limit}")
         self._data = bytes(data)
         self.name = name
         self.position = 0
@@ -59,13 +68,15 @@ class Cursor:
     def fault(self, field: str, expected: str, value: object, position: int | None = None) -> ProtocolError:
         """Return the error for a wrong field: the last one read, or the one at `position`."""
         start = self._field_position if position is None else position
-        return ProtocolError(f"{self.name}: {field} at byte {start} is {value}; expected {expected}")
+        return ProtocolError(f"{self.name}: {field} at byte {start} is {value}, expected {expected}")
 
     def take(self, count: int, field: str) -> bytes:
         """Return the next `count` bytes."""
         start, end = self.position, self.position + count
         if end > len(self._data):
-            raise ProtocolError(f"{self.name}: {field} at byte {start} requires {count} bytes; {self.remaining} follow")
+            raise ProtocolError(
+                f"{self.name}: {field} at byte {start} has {counted(self.remaining, 'byte')}, expected {count}"
+            )
         self._field_position, self.position = start, end
         return self._data[start:end]
 
@@ -97,8 +108,8 @@ class Cursor:
         """Return `count` integers of `size` bytes."""
         if count * size > self.remaining:
             raise ProtocolError(
-                f"{self.name}: {field} at byte {self.position} announces {count} items of {size} bytes; "
-                f"only {self.remaining} bytes follow"
+                f"{self.name}: {field} at byte {self.position} announces {count} items of {size} bytes, "
+                f"but only {self.remaining} bytes follow"
             )
         octets = self.take(count * size, field)
         return tuple(
@@ -146,7 +157,7 @@ def encode_string(text: str) -> bytes:
     octets = text.encode("utf-16-le")
     units = len(octets) // 2
     if units > _MAX_STRING_UNITS or "\0" in text:
-        raise ValueError(f"{text[:40]!r} has {units} UTF-16 units; at most {_MAX_STRING_UNITS} and no NUL expected")
+        raise ValueError(f"{text[:40]!r} has {units} UTF-16 units, expected at most {_MAX_STRING_UNITS} and no NUL")
     return bytes([units + 1]) + octets + b"\0\0"
 
 
@@ -385,7 +396,7 @@ class OperationDeclined(DeviceRefused):
 
 
 _REMEDIES: dict[int, str] = {
-    ResponseCode.STORE_FULL: "; its card is full: empty or replace it",
+    ResponseCode.STORE_FULL: "; its card is full: empty it or insert another",
     ResponseCode.STORE_READ_ONLY: "; its card is read-only: unlock it",
     ResponseCode.EOS_LOW_BATTERY: "; its battery is empty: replace it, or connect a mains adapter",
 }
@@ -484,7 +495,7 @@ class PtpSession:
             yield True
 
     def _declined_error(self, request: PtpRequest, code: int) -> OperationDeclined:
-        remedy = "; wait until it is idle, and try again" if code in TRANSIENT else _REMEDIES.get(code, "")
+        remedy = f"; wait until it is idle, {RUN_AGAIN}" if code in TRANSIENT else _REMEDIES.get(code, "")
         return OperationDeclined(f"{self.label} answers {describe(ResponseCode, code)} to {request}{remedy}", code)
 
 
@@ -502,7 +513,7 @@ def _read_parameters(cursor: Cursor, field: str) -> tuple[int, ...]:
 
 def _encode_parameters(parameters: tuple[int, ...]) -> bytes:
     if len(parameters) > MAX_PARAMETERS:
-        raise ValueError(f"{len(parameters)} parameters; at most {MAX_PARAMETERS} expected")
+        raise ValueError(f"{len(parameters)} parameters, expected at most {MAX_PARAMETERS}")
     return b"".join(encode_integer(parameter, 4) for parameter in parameters)
 
 
@@ -692,7 +703,7 @@ class Reception:
 
     def _too_long_error(self, length: int) -> ProtocolError:
         return ProtocolError(
-            f"{self.label} sends {length} bytes or more with {self.request}; at most {MAX_COLLECTED} expected"
+            f"{self.label} sends {length} bytes or more with {self.request}, expected at most {MAX_COLLECTED}; reset it"
         )
 
 

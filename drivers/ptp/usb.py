@@ -117,7 +117,7 @@ class ContainerReader:
         length, container_type, code, transaction = _HEADER.unpack_from(self._buffer)
         if container_type == ContainerType.DATA:
             if length < HEADER_LENGTH:
-                raise _stream_error(f"a data container of {length} bytes, {HEADER_LENGTH} or more expected")
+                raise _stream_error(f"a data container of {length} bytes, expected {HEADER_LENGTH} or more")
             self._start_data(messages, code, transaction, length, piece)
             return bool(self._in_data or self._buffer)
         _check_length(container_type, length)
@@ -371,7 +371,7 @@ class UsbTransport(CableTransport):
                     case PtpResponse() as response:
                         return reception.end(response)
                     case _:
-                        raise ProtocolError(f"{self.label} sent {message}, a response was expected; reset it")
+                        raise ProtocolError(f"{self.label} sent {message}, expected a response; reset it")
 
     def _read_limit(self, remaining: int | None, is_open_ended: bool) -> int:
         packet_size = self._pipes.packet_size

@@ -96,7 +96,7 @@ class FrameOrigin:
     def exposure_text(self) -> str:
         """The exposure as text, such as ``1/60 s, ISO 100, f/8``."""
         if self.shutter_s is None or self.iso is None:
-            return "no exposure stated"
+            return "no exposure recorded"
         shutter = f"{self.shutter_s:.3g} s" if self.shutter_s >= 0.3 else f"1/{1 / max(self.shutter_s, 1e-6):.0f} s"
         return f"{shutter}, ISO {self.iso}" + (f", f/{self.aperture:.3g}" if self.aperture else "")
 
@@ -420,7 +420,7 @@ def check_frames(data: bytes | memoryview, frames: Sequence[StoredFrame]) -> Seq
         raise RawDamaged("it describes no sensor pixels")
     for frame in frames:
         if not (0 < frame.rows < 1 << 16 and 0 < frame.columns < 1 << 16):
-            raise RawDamaged(f"it states a sensor of {frame.columns}×{frame.rows} px, 1 to 65535 px expected")
+            raise RawDamaged(f"it records a sensor of {frame.columns}×{frame.rows} px, expected 1 to 65535 px")
         extents = sorted(frame.extents)
         for offset, size in extents:
             if size <= 0 or offset + size > len(data):
@@ -431,8 +431,8 @@ def check_frames(data: bytes | memoryview, frames: Sequence[StoredFrame]) -> Seq
         size, photosites = sum(size for _, size in extents), frame.rows * frame.columns
         if 8 * size < photosites * frame.least_bits:
             raise RawDamaged(
-                f"it has {size} bytes for {photosites} photosites, at least {frame.least_bits:.3g} bits per photosite "
-                "expected"
+                f"it has {size} bytes for {photosites} photosites, expected at least {frame.least_bits:.3g} bits per "
+                "photosite"
             )
     return frames
 
@@ -456,7 +456,7 @@ def _tiff_frames(data: bytes | memoryview, directories: Sequence[Directory]) -> 
         if interpretation not in interpretations or (is_dng and directory.first(TiffTag.NEW_SUBFILE_TYPE)):
             continue
         if not is_dng and not maker.casefold().startswith(_MAKERS):
-            raise RawUnsupported(f"it is from {maker or 'an unnamed maker'}, whose layout cannot be checked")
+            raise RawUnsupported(f"the layout of files by {maker or 'an unnamed maker'} cannot be checked")
         for tones in (directory.integers(tag) for tag in _TONES):
             if tones and (list(tones) != sorted(tones) or tones[0] == tones[-1]):
                 raise RawDamaged("its linearisation table does not rise")
@@ -472,7 +472,7 @@ def _read_extents(directory: Directory) -> tuple[Extent, ...]:
     )
     offsets, sizes = directory.integers(offsets_tag), directory.integers(sizes_tag)
     if len(offsets) != len(sizes):
-        raise RawDamaged(f"it states {len(offsets)} offsets and {len(sizes)} sizes, equal numbers expected")
+        raise RawDamaged(f"it lists {len(offsets)} offsets and {len(sizes)} sizes, expected equal numbers")
     return tuple(zip(offsets, sizes, strict=True))
 
 
@@ -487,23 +487,23 @@ def _dng_frame(data: bytes | memoryview, directory: Directory, extents: tuple[Ex
         max(directory.integers(TiffTag.BITS_PER_SAMPLE), default=0),
     )
     if directory.first(TiffTag.SAMPLES_PER_PIXEL) > 1:
-        raise NotBayer(f"it has {directory.first(TiffTag.SAMPLES_PER_PIXEL)} samples per pixel, 1 expected")
+        raise NotBayer(f"it has {directory.first(TiffTag.SAMPLES_PER_PIXEL)} samples per pixel, expected 1")
     if compression not in (_UNCOMPRESSED, _JPEG, _LOSSY_JPEG):
         name = _UNSUPPORTED.get(compression, f"number {compression}")
         raise RawUnsupported(f"its compression is {name}, which is not supported")
     # A linearisation table may give any count.
     count_bits = 16 if any(directory.integers(tag) for tag in _TONES) else min(bits, 16)
     if not 8 <= bits <= 16 or directory.first(TiffTag.SAMPLE_FORMAT) > 1:
-        raise RawUnsupported(f"its photosites have {bits} bits or are not integers, integers of 8 to 16 bits expected")
+        raise RawUnsupported(f"its photosites have {bits} bits or are not integers, expected integers of 8 to 16 bits")
     is_tiled = bool(directory.integers(TiffTag.TILE_OFFSETS))
     part_height = directory.first(TiffTag.TILE_LENGTH if is_tiled else TiffTag.ROWS_PER_STRIP)
     part_width = directory.first(TiffTag.TILE_WIDTH) if is_tiled else columns
     part_height = part_height if is_tiled else min(part_height or rows, rows)
     if part_height <= 0 or part_width <= 0:
-        raise RawDamaged(f"its strips or tiles have {part_width}×{part_height} px, at least 1×1 expected")
+        raise RawDamaged(f"its strips or tiles have {part_width}×{part_height} px, expected at least 1×1 px")
     across, down = -(-columns // part_width), -(-rows // part_height)
     if len(extents) != across * down:
-        raise RawDamaged(f"its pixels have {len(extents)} strips or tiles, {across * down} expected")
+        raise RawDamaged(f"its pixels have {len(extents)} strips or tiles, expected {across * down}")
     if compression == _UNCOMPRESSED:
         if not is_tiled and not _are_contiguous(extents):
             raise RawUnsupported("its strips are not contiguous")
@@ -542,7 +542,7 @@ def _cr2_frame(data: bytes | memoryview, directory: Directory) -> StoredFrame | 
     slice_count, slice_width, last_width = (*directory.integers(TiffTag.CR2_SLICES), 0, 0, 0)[:3]
     width = slice_count * slice_width + last_width
     if components % 2 == 0 and slice_count and width != columns:
-        raise RawDamaged(f"its {slice_count + 1} slices have {width} columns, {columns} expected")
+        raise RawDamaged(f"its {slice_count + 1} slices have {width} columns, expected {columns}")
     if components % 2 == 0 and columns > 4 * rows:
         rows, columns = 2 * rows, columns // 2
     return StoredFrame(rows, columns, ((offset, size),), _LOSSLESS_BITS, bits, lossless=True, directory=directory)
@@ -556,7 +556,7 @@ def _maker_frame(data: bytes | memoryview, directory: Directory, extents: tuple[
     size, least_bits, spare_rows = sum(size for _, size in extents), LEAST_BITS, 0
     if compression == _UNCOMPRESSED:
         if not 8 <= bits <= 16:
-            raise RawDamaged(f"its photosites have {bits} bits, 8 to 16 expected")
+            raise RawDamaged(f"its photosites have {bits} bits, expected 8 to 16")
         if not _are_contiguous(extents):
             raise RawUnsupported("its strips are not contiguous")
         is_grey = directory.first(TiffTag.PHOTOMETRIC_INTERPRETATION) != CFA
@@ -599,7 +599,7 @@ def _mosaic_from_libraw(path: Path, raw: RawPy, data: bytes | memoryview, conten
     sensor.setflags(write=False)
     # LibRaw leaves its memory unset where it decodes nothing.
     if stored.bits < 16 and int(sensor.max()) >> stored.bits:
-        raise _unreadable_error(path, f"its counts reach {sensor.max()}, at most {stored.bits} bits expected")
+        raise _unreadable_error(path, f"its counts reach {sensor.max()}, expected at most {stored.bits} bits")
     libraw_area = Area(sizes.top_margin, sizes.left_margin, sizes.height, sizes.width)
     rows, columns = sensor.shape
     if (
@@ -674,7 +674,7 @@ def _read_bytes(path: Path) -> memoryview:
     except FileNotFoundError as error:
         raise FormatError(f"raw file {path} does not exist; check the name") from error
     except IsADirectoryError as error:
-        raise FormatError(f"{path} is a folder, a raw file was expected; give one file") from error
+        raise FormatError(f"{path} is a folder, expected a raw file; give one file") from error
     except OSError as error:
         raise FormatError(
             f"cannot read {path}: {error.strerror or error}; check its permissions and the disk"
@@ -762,21 +762,21 @@ def _intersection(first: Area, second: Area) -> Area:
 
 def _unreadable_error(path: Path, reason: str) -> FormatError:
     return FormatError(
-        f"{path} cannot be read as a raw file: {reason}; expected a camera's complete raw file such as CR2 or DNG: "
+        f"{path} cannot be read as a raw file: {reason}, expected a camera's complete raw file such as CR2 or DNG; "
         "copy it from the camera again, or repeat the frame"
     )
 
 
 def _unsupported_error(path: Path, reason: str) -> FormatError:
     return FormatError(
-        f"{path} cannot be read as a raw file: {reason}; expected a camera's own raw file such as CR2, CR3 or NEF, "
-        "or a DNG with lossless JPEG (from Adobe's DNG Converter or dnglab): convert it to such a DNG"
+        f"{path} cannot be read as a raw file: {reason}, expected a camera's own raw file such as CR2, CR3 or NEF, "
+        "or a DNG with lossless JPEG (from Adobe's DNG Converter or dnglab); convert it to such a DNG"
     )
 
 
 def _not_bayer_error(path: Path, reason: str) -> FormatError:
     return FormatError(
-        f"{path} is not from a Bayer sensor: {reason}; expected a 2×2 pattern of red, green, green and blue: "
+        f"{path} is not from a Bayer sensor: {reason}, expected a 2×2 pattern of red, green, green and blue; "
         "use a camera with a Bayer sensor, and its full raw format"
     )
 
@@ -922,12 +922,12 @@ _LARGEST = 65535  # Largest count; bits of ones
 def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, bits: int) -> None:
     """Refuse levels that are impossible for `bits`; `black`: (2, 2) counts."""
     if not 0 < white_level <= 1 << bits:
-        raise _unreadable_error(path, f"its white level is {white_level:g}, 1 to {1 << bits} expected for {bits} bits")
+        raise _unreadable_error(path, f"its white level is {white_level:g}, expected 1 to {1 << bits} for {bits} bits")
     # Mean deltas may reduce a black level of 0 by a fraction of a count.
     if not -1 < black.min() <= black.max() < white_level:
         raise _unreadable_error(
             path,
-            f"its black level is {black.min():g} to {black.max():g}, 0 to its white level of {white_level:g} expected",
+            f"its black level is {black.min():g} to {black.max():g}, expected 0 to its white level of {white_level:g}",
         )
 
 

@@ -178,7 +178,7 @@ def _boxes(
     while end - start >= 8:
         budget[0] -= 1
         if budget[0] < 0:
-            raise RawDamaged(f"it has more than {MAX_BOXES} boxes, about 100 expected")
+            raise RawDamaged(f"it has more than {MAX_BOXES} boxes, expected about 100")
         size, box_type = struct.unpack_from(">I4s", data, start)
         header_size = 8
         if size == 1 and end - start >= 16:
@@ -194,7 +194,7 @@ def _boxes(
         yield _Box(box_type, start + header_size, start + size)
         start += size
     if is_file and start != end:
-        raise RawDamaged(f"{end - start} bytes follow its last box, 0 or at least 8 expected")
+        raise RawDamaged(f"{end - start} bytes follow its last box, expected 0 or at least 8")
 
 
 def _directories(content: bytes | memoryview) -> tuple[Directory, ...]:
@@ -232,7 +232,7 @@ def _track_frames(data: bytes | memoryview, table: _Box, entry: _Box, budget: li
         common_length, count = struct.unpack_from(">II", stsz, 4)
         (chunks,) = struct.unpack_from(">I", co64, 4)
         if not 0 < count == chunks <= _MOST_SAMPLES:
-            raise RawDamaged(f"a track of its pixels has {count} samples in {chunks} chunks, equal numbers expected")
+            raise RawDamaged(f"a track of its pixels has {count} samples in {chunks} chunks, expected equal numbers")
         lengths = (common_length,) * count if common_length else struct.unpack_from(f">{count}I", stsz, 12)
         offsets = struct.unpack_from(f">{count}Q", co64, 8)
     except struct.error as error:

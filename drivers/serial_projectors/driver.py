@@ -19,13 +19,13 @@ from drivers.serial_projectors.language import (
     refusal_kind,
 )
 from foundation.clock import SYSTEM_CLOCK, Clock
-from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
+from foundation.errors import RUN_AGAIN, DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
 
 _CABLE_REMEDY = (
     "check the cable (straight or null-modem, see its manual), the speed, and that control in standby is enabled"
 )
-_WAIT_REMEDY = "wait until it is on and try again"
-_MANUAL_REMEDY = "use its remote control, or try again when it is on"
+_WAIT_REMEDY = f"wait until it is on, {RUN_AGAIN}"
+_MANUAL_REMEDY = "use its remote control, or wait until it is on"
 
 
 class _Unknown(DeviceRefused):
@@ -107,7 +107,7 @@ class LineProjector(Projector):
         """Start to switch on; refused during cooling."""
         power = self.power()
         if power is Power.COOLING:
-            raise DeviceRefused(f"{self.label} is cooling down; wait until it is in standby and try again")
+            raise DeviceRefused(f"{self.label} is cooling down; wait until it is in standby, {RUN_AGAIN}")
         if power is Power.STANDBY:
             self._switch(self._language.power.on, Power.WARMING)
 
@@ -115,7 +115,7 @@ class LineProjector(Projector):
         """Start to switch off; refused during warm-up."""
         power = self.power()
         if power is Power.WARMING:
-            raise DeviceRefused(f"{self.label} is warming up; wait until it is on and try again")
+            raise DeviceRefused(f"{self.label} is warming up; {_WAIT_REMEDY}")
         if power is Power.ON:
             self._switch(self._language.power.off, Power.COOLING)
 
@@ -224,7 +224,7 @@ class LineProjector(Projector):
                 )
             return
         self._switching_to = None
-        self._require_accepted(command, reply, "check its indicators and try again")
+        self._require_accepted(command, reply, f"check its indicators, {RUN_AGAIN}")
 
     def _query_text(self, query: TextQuestion | None) -> str:
         if query is None:
@@ -299,7 +299,7 @@ class LineProjector(Projector):
         if self._handshake is not None:
             state = exchange.open_with(self._handshake.send.encode("ascii"), handshake_parser(self._handshake))
             if state != self._handshake.accepted.upper():
-                reason = self._handshake.refusals.get(state, "check the network settings in the projector's menu")
+                reason = self._handshake.refusals.get(state, "unknown reason; check the network settings of its menu")
                 raise DeviceRefused(f"{self.label} refuses the connection with 0x{state}: {reason}")
         elif line.wake:
             try:
@@ -311,4 +311,4 @@ class LineProjector(Projector):
         return b""
 
     def _unexpected(self, query: str, answer: str, expected: str) -> ProtocolError:
-        return ProtocolError(f"{self.label} answers {answer!r} to {query}; expected {expected}")
+        return ProtocolError(f"{self.label} answers {answer!r} to {query}, expected {expected}")

@@ -372,10 +372,10 @@ def load_language(named: str) -> Language:
     path, languages = Path(named), built_in_languages()
     if not named.lower().endswith(FILE_ENDING):
         if named.lower() not in languages:
-            hint = f"{near} " if (near := nearest_names(named, languages)) else ""
+            near = nearest_names(named, languages)
             raise ConfigurationError(
-                f"projector language {named!r} does not exist; {hint}expected {', '.join(languages)}, "
-                f"or the path of a file that ends with {FILE_ENDING}"
+                f"projector language {named!r} does not exist, expected {', '.join(languages)}, "
+                f"or the path of a file that ends with {FILE_ENDING}; {near or 'correct it'}"
             )
         path = FOLDER / f"{named.lower()}{FILE_ENDING}"
     text = read_text(path, "write one as described in docs/reference/language-files.md", "language file")

@@ -100,7 +100,7 @@ def _pairs(
         pairs = [(name, name) for name in run_a if name in run_b]
     if not pairs:
         methods = " and ".join(f"{name} has {', '.join(run)}" for name, run in zip(locations, runs, strict=True))
-        raise InputError(f"{methods}, expected two to compare; name one of each run: --method FIRST=SECOND")
+        raise InputError(f"{methods}, expected two to compare; give one of each run: --method FIRST=SECOND")
     suffixes = ["", ""] if len(runs) == 1 else [f" ({location})" for location in locations]
     return [match(run_a[a], run_b[b], (a + suffixes[0], b + suffixes[1]), error) for a, b in dict.fromkeys(pairs)]
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from evaluation.scene import SceneSet
 
-HELP = f"""Cross-validate learned methods: train on all folds but one and estimate the images of that one, in turn.
+HELP = f"""Cross-validate learned methods: train on all folds but one and estimate the images of that fold, in turn.
 
 METHOD is {LEARNERS_HELP}, all, or your own class with fit(scenes, seed), as module:Class or file.py:Class. Separate
 several methods by commas. The constant illuminant (median of the training illuminants) is always added: a method that

@@ -92,7 +92,7 @@ def reading_options(texts: Sequence[str]) -> tuple[str | None, DataOptions]:
         key, separator, value = text.partition("=")
         if key not in keys:
             question = nearest_names(key, keys)
-            raise InputError(f"--read {text}: {question} expected one of {', '.join(keys)}; correct it")
+            raise InputError(f"--read {text}: expected one of {', '.join(keys)}; {question or 'correct it'}")
         if key in values:
             raise InputError(f"--read {text}: {key} is given twice, expected once; omit one")
         if (key == "partial") == bool(separator):
@@ -124,7 +124,7 @@ def choose_methods(texts: Iterable[str]) -> list[Method]:
     >>> choose_methods(["gray-world", "gray-world"])
     Traceback (most recent call last):
         ...
-    foundation.errors.InputError: the method gray-world is named twice, expected once; omit one
+    foundation.errors.InputError: the method gray-world is given twice, expected once; omit one
     """
     from evaluation.methods.standard import STANDARD, standard_methods
 
@@ -155,7 +155,7 @@ def _distinct_names(texts: Iterable[str]) -> list[str]:
     names = [text.strip() for text in texts]
     repeated = next((text for index, text in enumerate(names) if text in names[:index]), None)
     if repeated is not None:
-        raise InputError(f"the method {repeated} is named twice, expected once; omit one")
+        raise InputError(f"the method {repeated} is given twice, expected once; omit one")
     return names
 
 
@@ -197,7 +197,9 @@ def _method(text: str) -> Method:
         )
     method = _load_named(text)
     if not callable(getattr(method, "estimate", None)):
-        raise InputError(f"{text} has no method estimate(image, saturation, mask), expected one; train it: evaluate cv")
+        raise InputError(
+            f"{text} has no method estimate(image, saturation, mask), expected one; train it with evaluate cv"
+        )
     return cast("Method", method)
 
 
@@ -210,10 +212,10 @@ def _learner(text: str) -> Learner:
         return learners[text]
     expected = f"expected {', '.join(learners)}, module:Class or file.py:Class"
     if text in standard_methods() or text.endswith(".npz"):
-        raise InputError(f"{text} cannot be trained; {expected}")
+        raise InputError(f"{text} cannot be trained, {expected}; give one of these")
     if ":" not in text:
         question = nearest_names(text, learners)
-        raise InputError(f"{text!r} is not a learned method; {f'{question} ' if question else ''}{expected}")
+        raise InputError(f"{text!r} is not a learned method, {expected}; {question or 'give one of these'}")
     learner = _load_named(text)
     if not callable(getattr(learner, "fit", None)):
         raise InputError(f"{text} has no method fit(scenes, seed), expected one; use evaluate run")

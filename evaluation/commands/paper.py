@@ -41,7 +41,7 @@ the results with full look-up tables (LUT) of both cameras.
 app = new_app(no_args_is_help=True)
 
 # Arguments and options that several commands share.
-Luts = Annotated[list[Path], argument("LUT", "Folders of look-up tables (LUT); demo: for a small computed one.")]
+Luts = Annotated[list[Path], argument("LUT", "Folders of look-up tables (LUT); demo: for a small computed LUT.")]
 ErrorOption = Annotated[AngularError, typer.Option(help="Angular error to print.")]
 Out = Annotated[Path | None, option("FOLDER", "Write page, tables and figures here.")]
 Workers = Annotated[int | None, thread_option()]
@@ -71,7 +71,7 @@ def table1(
         str,
         option(
             "PLACE",
-            "Scenes: a folder of photographs, or a real data set, whose raw images are developed to sRGB with their "
+            "Scenes: a folder of photographs, or a real data set; its raw images are developed to sRGB with their "
             "ground truths.",
         ),
     ],
@@ -79,8 +79,8 @@ def table1(
         str,
         option(
             "TRUTHS",
-            "Ground truths whose nearest illuminants are one choice: FILE.csv, FILE.csv#START for rows whose names "
-            "begin with START, or a data set.",
+            "Ground truths for the choice of nearest illuminants: FILE.csv, FILE.csv#START for rows with names that "
+            "start with START, or a data set.",
         ),
     ],
     matrix: Annotated[
@@ -211,7 +211,7 @@ def bits(
     *,
     output: JsonOutput,
 ) -> None:
-    """Run methods on images whose colours were reduced."""
+    """Run methods on images with reduced colours."""
     from evaluation.experiments.paper.colour_reduction import paper_methods, remove_bits
     from evaluation.experiments.paper.reporting import bits_report
 
@@ -318,11 +318,11 @@ def _pictures(location: str, matrix: str) -> tuple[Sequence[Source], str, str]:
         layout = None
     if layout is None:
         if colour_matrix is not None:
-            raise InputError(f"--matrix {matrix} needs a data set of raw images, {location} is none; omit --matrix")
+            raise InputError(f"--matrix {matrix} needs a data set of raw images, {location} is not one; omit --matrix")
         pictures = find_pictures(location)
         return pictures, f"{len(pictures)} of {location}", Path(location).resolve().name
     if layout == "generated":
-        raise InputError(f"{location} was made by generate, expected photographs or real raw images; use those")
+        raise InputError(f"{location} was made by generate, expected photographs or real raw images; give others")
     data = open_scenes(location, layout)
     matrix_text = f"with the colour matrix of {colour_matrix.name}" if colour_matrix else "without a colour matrix"
     text = f"{len(data.scenes)} of {data.name}, developed to sRGB {matrix_text}"

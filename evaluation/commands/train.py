@@ -51,7 +51,7 @@ def train(
 
     learners = choose_learners([method])
     if len(learners) != 1:
-        raise InputError(f"METHOD is {method}, {len(learners)} methods, expected one for a model file; name one")
+        raise InputError(f"METHOD is {method}, {len(learners)} methods, expected one for a model file; give one")
     (learner,) = learners
     if not isinstance(learner, FeatureLearner):
         raise InputError(
@@ -65,7 +65,9 @@ def train(
     base_model = None if adapt is None else load_model(adapt)
     if base_model is not None:
         if base_model.learner.key != learner.key:
-            raise InputError(f"{adapt} is a model of {base_model.learner.key}, expected {method}; name one of {method}")
+            raise InputError(
+                f"{adapt} is a model of {base_model.learner.key}, expected {method}; give a model of {method}"
+            )
         # Its settings apply, which may differ from the present defaults.
         learner = base_model.learner
     data_set = open_data(data, read)

@@ -135,7 +135,7 @@ class ErrorSample:
         if not values.size or not np.isfinite(values).all():
             raise InputError(
                 f"{values.size} errors, {int((~np.isfinite(values)).sum())} of them NaN or infinite, expected one "
-                "finite error for each image; leave out images without one"
+                "finite error for each image; omit images without an error"
             )
         order = np.argsort(values, kind="stable")
         return cls(order, values[order])
@@ -207,7 +207,7 @@ def compare_paired(
     images = len(sample_a.order)
     if images != len(sample_b.order) or (groups is not None and images != len(groups)):
         raise InputError(
-            f"{images} errors of one method, {len(sample_b.order)} of the other and {len(groups or ())} groups; "
+            f"{images} errors of one method, {len(sample_b.order)} of the other and {len(groups or ())} groups, "
             "expected the same images in the same order; match them by name first"
         )
 

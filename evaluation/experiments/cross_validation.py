@@ -183,7 +183,9 @@ def cross_validate(
     truths_of(scenes)
     fold_count = len(np.unique(folds))
     if not learners or fold_count < 2:
-        raise InputError(f"{len(learners)} methods in {fold_count} folds, expected ≥ 1 method and ≥ 2 folds; add some")
+        raise InputError(
+            f"{len(learners)} methods in {fold_count} folds, expected at least 1 method and 2 folds; add some"
+        )
     for learner in learners:
         require_installed(learner)
     require_groups_together(scenes, folds)

@@ -24,7 +24,7 @@ from evaluation.metrics import MapError, measure_map
 from evaluation.results.result import Result, SceneAnswer, collect_results, read_estimate
 from evaluation.scene import MixedScene, Scene, report_progress
 from foundation.compiled import ordered_map
-from foundation.errors import CropError, FormatError, InputError
+from foundation.errors import RUN_AGAIN, CropError, FormatError, InputError
 
 # Folder of this package: code outside it that is not an installed library is the user's.
 _PACKAGE_FOLDER = Path(__file__).parents[1]
@@ -75,7 +75,7 @@ def evaluate(
 def require_truths(scenes: Sequence[Scene], methods: Sequence[object]) -> npt.NDArray[np.float64]:
     """Return the ground truths (N, 3) float64 of scenes, camera RGB of any length; refuse invalid ones."""
     if not scenes or not methods:
-        raise InputError(f"{len(methods)} methods on {len(scenes)} images, expected at least one of each; name some")
+        raise InputError(f"{len(methods)} methods on {len(scenes)} images, expected at least one of each; give some")
     return np.stack([_checked_truth(scene) for scene in scenes])
 
 
@@ -159,7 +159,7 @@ def fit_copy(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
         raise
     except (Exception, SystemExit) as error:
         raise InputError(
-            f"{learner.name} failed in training on {len(scenes)} images: {_reason(error)}; correct it and run again"
+            f"{learner.name} failed in training on {len(scenes)} images: {_reason(error)}; correct it, {RUN_AGAIN}"
         ) from error
     if not callable(getattr(method, "estimate", None)):
         raise InputError(
@@ -214,8 +214,8 @@ def _reason(error: BaseException) -> str:
 def _remedy(method: object) -> str:
     if callable(getattr(method, "fit", None)):
         # A class with `fit` fails here most often because it was not trained.
-        return "if it must be trained first, use evaluate cv; else correct it and run again"
-    return "correct it and run again"
+        return f"if it must be trained first, use evaluate cv, otherwise correct it, {RUN_AGAIN}"
+    return f"correct it, {RUN_AGAIN}"
 
 
 def _checked_truth(scene: Scene) -> npt.NDArray[np.float64]:

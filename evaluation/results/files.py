@@ -61,7 +61,7 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
     path = Path(location)
     if path.is_dir():
         path = path / ERRORS_FILE
-    text = read_text(path, f"name a results folder of evaluate run, or the {ERRORS_FILE} in it")
+    text = read_text(path, f"give a results folder of evaluate run, or the {ERRORS_FILE} in it")
     rows = csv.DictReader(text.splitlines())
     columns = rows.fieldnames or []
     missing = [name for name in ("image", "method", *_NUMBER_COLUMNS, "guessed") if name not in columns]
@@ -89,7 +89,9 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
             raise FormatError(f"{line_name}: guessed is {row['guessed']!r}, expected 0 or 1; correct it")
         images = lines_by_method.setdefault(row["method"] or "", {})
         if row["image"] in images:
-            raise FormatError(f"{line_name} has {row['method']} on {row['image']} twice, expected once; delete one")
+            raise FormatError(
+                f"{line_name} has {row['method']} on {row['image']} again, expected once; remove this line"
+            )
         images[row["image"]] = numbers, row["guessed"] == "1", row.get("group") or ""
     if not lines_by_method:
         raise FormatError(f"{path} has no errors, expected a line for each image and method; run the methods again")
@@ -210,7 +212,7 @@ class GivenEstimates:
 
 def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -> GivenEstimates:
     """Return the estimates of a file for the images of a data set; every image needs exactly one line."""
-    text = read_text(path, f"name a CSV file of estimates, {_ESTIMATES_TEXT}")
+    text = read_text(path, f"give a CSV file of estimates, {_ESTIMATES_TEXT}")
     by_stem = _by_stem(images)
     image_names = set(images)
     lights: dict[str, npt.NDArray[np.float64]] = {}
@@ -230,7 +232,7 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
         f"{counted(len(faulty_images), singular, plural)} ({first_few(faulty_images)})"
         for faulty_images, singular, plural in (
             (missing, "image of the data set has no line", "images of the data set have no line"),
-            (unknown, "line names no image of the data set", "lines name no image of the data set"),
+            (unknown, "line has an unknown image", "lines have unknown images"),
             (list(repeated), "image has more than one line", "images have more than one line"),
         )
         if faulty_images
@@ -262,7 +264,7 @@ def _parse_estimates(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.fl
     heads = [head.strip().lower() for head in heads]
     if any(heads.count(column) != 1 for column in _ESTIMATES_COLUMNS):
         raise FormatError(
-            f"{path} begins with {separator.join(heads)[:60]!r}, expected {_ESTIMATES_TEXT}, each once; "
+            f"{path} starts with {separator.join(heads)[:60]!r}, expected {_ESTIMATES_TEXT}, each once; "
             "correct its first line"
         )
     column_indices = [heads.index(column) for column in _ESTIMATES_COLUMNS]

@@ -158,9 +158,9 @@ def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, s
         that fits, a multiple of 5 pixels at 600 dpi.
     """
     if not 1 <= bits <= 5:
-        raise InputError(f"{bits} bits a channel are given; a chart has 1 to 5 bits")
+        raise InputError(f"{bits} bits per channel are given, expected 1 to 5; give another number")
     if seed < 0:
-        raise InputError(f"the seed is {seed}; give a whole number of 0 or more")
+        raise InputError(f"the seed is {seed}, expected a whole number of 0 or more; give another one")
     grid, page_mm = _choose_grid(bits, page)
     rng = np.random.default_rng(seed)
     is_free = np.ones((grid.rows, grid.columns), dtype=np.bool_)
@@ -231,7 +231,7 @@ def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) ->
         4.57 × 6.43 mm.
     """
     if bits not in PAPER_BLOCKS:
-        raise InputError(f"{bits} bits a channel are given; a chart has 1 to 5 bits")
+        raise InputError(f"{bits} bits per channel are given, expected 1 to 5; give another number")
     page_mm = _page_mm("A0" if page is None else page)
     margin_px = math.ceil(MARGIN_MM / PX_MM)
     page_px = [math.floor(side / PX_MM) for side in page_mm]
@@ -280,15 +280,15 @@ def _page_mm(page: str | tuple[float, float]) -> tuple[float, float]:
         size = A_SERIES_MM.get(page.strip().upper())
         if size is None:
             raise InputError(
-                f"page {page!r} is not known; give one of {', '.join(A_SERIES_MM)}, or width and height in mm"
+                f"the page is {page!r}, expected one of {', '.join(A_SERIES_MM)}, or width and height in mm; correct it"
             )
         return float(size[0]), float(size[1])
     width, height = page
     if not (math.isfinite(width) and math.isfinite(height) and width > 0 and height > 0):
-        raise InputError(f"a page of {width:g} × {height:g} mm cannot be printed; give width and height above 0")
+        raise InputError(f"a page of {width:g} × {height:g} mm is given, expected sides above 0 mm; give others")
     if max(width, height) > LARGEST_PAGE_MM:
         raise InputError(
-            f"a page of {width:g} × {height:g} mm is given, at most {LARGEST_PAGE_MM:g} mm a side are expected; "
+            f"a page of {width:g} × {height:g} mm is given, expected at most {LARGEST_PAGE_MM:g} mm per side; "
             "give width and height in mm"
         )
     return float(width), float(height)

@@ -116,12 +116,12 @@ def tag_modules(tag: Tag) -> npt.NDArray[np.bool_]:
     import cv2
 
     if tag.family != TAG_FAMILY:
-        raise InputError(f"tag {tag.id} has family {tag.family}, {TAG_FAMILY} expected; run acquire chart again")
+        raise InputError(f"tag {tag.id} has family {tag.family}, expected {TAG_FAMILY}; use a chart of acquire chart")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     if not 0 <= tag.id < len(dictionary.bytesList):
         raise InputError(
-            f"tag id {tag.id} does not exist, 0 to {len(dictionary.bytesList) - 1} expected for family {TAG_FAMILY}; "
-            "run acquire chart again"
+            f"tag id {tag.id} does not exist, expected 0 to {len(dictionary.bytesList) - 1} for family {TAG_FAMILY}; "
+            "use a chart of acquire chart"
         )
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, tag.id, TAG_MODULES)) > 127
 
@@ -131,7 +131,7 @@ def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.u
     right, bottom = tag.corners_mm[2]
     upright = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
     if not (right > left and bottom > top and np.allclose(tag.corners_mm, upright, atol=1e-3)):
-        raise InputError(f"tag {tag.id} is rotated, but only upright tags can be printed; run acquire chart again")
+        raise InputError(f"tag {tag.id} is rotated, expected an upright tag; use a chart of acquire chart")
     size = np.array([right - left, bottom - top]) / TAG_MODULES
     rim = np.array([left, top, right, bottom]) + np.concatenate([-size, size])
     rows, columns = np.nonzero(tag_modules(tag))
@@ -196,7 +196,7 @@ def _require_whole_pixels(chart: Chart, dpi: int) -> None:
         pixels = length * dpi / MM_PER_INCH
         if dpi < 1 or round(pixels) < 1 or abs(pixels - round(pixels)) > 1e-3:
             raise InputError(
-                f"at {dpi} dpi a length of {length:.3f} mm is {pixels:.2f} pixels, a whole number is expected; "
+                f"at {dpi} dpi a length of {length:.3f} mm is {pixels:.2f} pixels, expected a whole number; "
                 f"choose {_whole_pixel_resolutions(lengths)} dpi, or print the PDF"
             )
 
@@ -276,7 +276,7 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     from scipy import sparse
 
     if width_px < 1:
-        raise InputError(f"the preview has a width of {width_px} pixels, 1 or more expected; enlarge it")
+        raise InputError(f"a preview of {width_px} pixels is requested, expected 1 or more; give a larger width")
     height_px = max(1, round(width_px * chart.page_mm[1] / chart.page_mm[0]))
     fine_size = (width_px * _SUPERSAMPLING, height_px * _SUPERSAMPLING)
     bands = list(_bands(drawing(chart), fine_size[0] / chart.page_mm[0], fine_size))

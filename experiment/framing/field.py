@@ -171,8 +171,8 @@ def find_field(
     white = max(paper_level(plane) for plane in planes)
     if white < MIN_SIGNAL:
         raise RegistrationError(
-            f"{image_name} is dark: its brightest parts are {max(white, 0.0):.0f} counts above black, at least "
-            f"{MIN_SIGNAL:.0f} expected; switch the projector on, open its shutter, or expose longer"
+            f"{image_name} is dark: its brightest parts are {max(white, 0.0):.0f} counts above black, expected at "
+            f"least {MIN_SIGNAL:.0f} counts; switch the projector on, open its shutter, or expose longer"
         )
     if near_px is not None:
         return _find_near_field(planes, chart, np.asarray(near_px, dtype=np.float64), image_name)
@@ -218,7 +218,7 @@ def _find_given_field(picture: PreparedImage, chart: Chart, corners_px: _Points,
     if 1 - misfits[best_turn][1] < MIN_EXPLAINED or not fits_other_turn:
         raise RegistrationError(
             f"{image_name}: within the given corners {given_corners}, the chart's colours explain "
-            f"{max(explained, 0):.0%} of the variation, at least {MIN_EXPLAINED:.0%} expected; give the corners of the "
+            f"{max(explained, 0):.0%} of the variation, expected at least {MIN_EXPLAINED:.0%}; give the corners of the "
             "patch area (not of the sheet) clockwise from the printed top-left, and the chart.json of this print"
         )
     if best_turn >= MIRRORED:
@@ -348,7 +348,8 @@ def parse_corners(texts: Sequence[str]) -> Corners:
     """Return four corners (x, y), half-size px, from four texts X,Y in raw pixels."""
     if len(texts) != 4:
         raise InputError(
-            f"{len(texts)} corners are given, {' '.join(texts)}; 4 are expected, X,Y each, in pixels of the raw file"
+            f"{len(texts)} corners are given, {' '.join(texts)}, expected 4, X,Y each, in pixels of the raw file; "
+            "correct --corners"
         )
     corners: list[tuple[float, float]] = []
     for text in texts:
@@ -357,7 +358,7 @@ def parse_corners(texts: Sequence[str]) -> Corners:
         except ValueError:
             x = y = math.nan
         if not (math.isfinite(x) and math.isfinite(y)):
-            raise InputError(f"{text!r} is not a corner; two numbers X,Y are expected, in pixels of the raw file")
+            raise InputError(f"{text!r} is not a corner, expected X,Y in pixels of the raw file; correct --corners")
         corners.append(((x - 0.5) / 2, (y - 0.5) / 2))
     require_corners(np.array(corners))
     return tuple(corners)
@@ -390,8 +391,8 @@ def require_corners(corners_px: _Points, shape: tuple[int, int] | None = None) -
     shortest = 2 * float(np.linalg.norm(corners_px - np.roll(corners_px, 1, axis=0), axis=1).min())
     if shortest < LEAST_SIDE_PX:
         raise InputError(
-            f"the given corners {given_corners} are {shortest:.0f} pixels apart, at least {LEAST_SIDE_PX} "
-            "pixels expected; give the corners of the whole patch area"
+            f"the given corners {given_corners} are {shortest:.0f} pixels apart, expected at least {LEAST_SIDE_PX} "
+            "pixels; give the corners of the whole patch area"
         )
 
 

@@ -116,7 +116,7 @@ def find_chart(
         return _find_field(frame, chart, image_name, corners, near)
     if len(chart.tags) < MIN_TAGS:
         raise RegistrationError(
-            f"{image_name}: the chart has {len(chart.tags)} tags, at least {MIN_TAGS} are expected; "
+            f"{image_name}: the chart has {len(chart.tags)} tags, expected at least {MIN_TAGS}; "
             "print a chart made by acquire chart"
         )
     # One linear plane: a square root moves the corners of a tag by a quarter pixel, a sum of the planes under deep red
@@ -145,12 +145,12 @@ def find_chart(
     if len(tags) < MIN_TAG_SHARE * len(ids):
         is_small = module < MIN_MODULE_PX
         raise RegistrationError(
-            f"{image_name}: {len(tags)} of {expected_tags} detected, at least "
-            f"{int(np.ceil(MIN_TAG_SHARE * len(ids)))} expected; missing: {_first_ids(missing_ids)}; "
+            f"{image_name}: {len(tags)} of {expected_tags} detected, expected at least "
+            f"{int(np.ceil(MIN_TAG_SHARE * len(ids)))} (missing: {_first_ids(missing_ids)}); "
             + (
-                f"a tag module is {module:.1f} px, at least {MIN_MODULE_PX:g} px expected: move the camera closer"
+                f"move the camera closer: a tag module is {module:.1f} px, expected at least {MIN_MODULE_PX:g} px"
                 if is_small
-                else "uncover the chart, light all of it, and bring all of it into the image and into focus"
+                else "uncover the chart, light all of it, and bring all of it into the frame and into focus"
             )
         )
     residual = project(homography, chart_points[fits]) - frame_points[fits]
@@ -187,8 +187,8 @@ def _missing_tags_error(
     white = paper_level(plane)
     if white < MIN_SIGNAL:
         return RegistrationError(
-            f"{image_name} is dark: its brightest parts are {max(white, 0.0):.0f} counts above black, at least "
-            f"{MIN_SIGNAL:.0f} expected; switch the projector on, open its shutter, or expose longer"
+            f"{image_name} is dark: its brightest parts are {max(white, 0.0):.0f} counts above black, expected at "
+            f"least {MIN_SIGNAL:.0f} counts; switch the projector on, open its shutter, or expose longer"
         )
     mirrored = np.ascontiguousarray(plane.values[:, ::-1])
     if len(detect_tags(Plane(plane.channel, mirrored, (0.0, 0.0)))) > max(1, len(detected)):
@@ -201,16 +201,16 @@ def _missing_tags_error(
     if len(magnified) > max(1, len(detected)):
         module = min(tag.side_px for tag in magnified) / 2 / TAG_MODULES
         return RegistrationError(
-            f"{image_name}: the tags are too small: a module is {module:.1f} px, at least {MIN_MODULE_PX:g} px "
-            "expected; move the camera closer or use a longer lens"
+            f"{image_name}: the tags are too small: a module is {module:.1f} px, expected at least {MIN_MODULE_PX:g} "
+            "px; move the camera closer or use a longer lens"
         )
     if detected and not tags:
         return RegistrationError(
-            f"{image_name}: tags {_first_ids([tag.id for tag in detected])} detected, {expected} expected; "
+            f"{image_name}: tags {_first_ids([tag.id for tag in detected])} detected, expected {expected}; "
             "this is another chart: give the chart.json of the print in front of the camera"
         )
     return RegistrationError(
-        f"{image_name}: {len(tags) or 'none'} of the {expected} detected; "
+        f"{image_name}: {len(tags)} of the {expected} detected; "
         "point the camera at the chart, focus it, and light all of it"
     )
 

@@ -173,8 +173,9 @@ class PaperReader:
         is_usable = np.isfinite(levels).all(axis=1)
         if is_usable.sum() < MIN_REFERENCES:
             raise QualityError(
-                f"{frame_name}: {int(is_usable.sum())} white references are usable, at least {MIN_REFERENCES} "
-                "expected; uncover the chart, bring all of it into the image, and expose so that paper is not saturated"
+                f"{frame_name}: {int(is_usable.sum())} white references are usable, expected at least "
+                f"{MIN_REFERENCES}; uncover the chart, bring all of it into the frame, and expose so that paper is "
+                "not saturated"
             )
         basis, values, base = self._at_places[is_usable], levels[is_usable], self._base_at_places[is_usable]
         shape, means = self._base_at_centres.copy(), self._means

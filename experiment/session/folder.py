@@ -192,7 +192,7 @@ class Session:
         path, remedy = self.folder / "session.toml", "restore it from a copy"
         text = read_text(path, remedy, "the session's settings")
         if not text.strip():
-            raise FormatError("empty; the settings of the session are expected", about=path, remedy=remedy)
+            raise FormatError("empty, expected the settings of the session", about=path, remedy=remedy)
         return text
 
     def receive(self, stem: str, fill: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
@@ -328,7 +328,7 @@ def _own_copy(load: Callable[[Path], _Loaded], path: Path, content: str) -> _Loa
 
 def busy_message(folder: Path) -> str:
     """Return the message for a session that another program takes."""
-    return f"another program takes the session {folder}; wait for its end, or follow it with acquire status"
+    return f"another program is using the session {folder}; wait until it has ended, or follow it with acquire status"
 
 
 def journal_path(folder: Path) -> Path:
@@ -353,7 +353,8 @@ def _require_mounted(folder: Path) -> None:
     if os.path.isdir(folder / "frames"):  # noqa: PTH112 - a fault of the disk is reported later
         raise FormatError(
             f"{folder} is not a session but has frames/: it is part of one, or remained under the mount point of a "
-            "disk; mount the disk of the session, or give another folder; keep these files until you know their origin",
+            "disk; mount the disk of the session, or give another folder, and keep these files until their origin is "
+            "clear",
         )
 
 

@@ -182,7 +182,7 @@ class Heartbeat:
         if alive:
             return (
                 f"copied from {origin} at {moment} or later, and the run there continues; use that folder, because "
-                "this copy gets none of its frames"
+                "this copy gets no new frames"
             )
         return (
             f"copied from {origin} at {moment} or later, during a run that has ended; acquire status "

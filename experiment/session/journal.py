@@ -124,8 +124,8 @@ class IncomingFile:
             size = self.stream.seek(0, 2)
             if size != captured.size or size == 0:
                 raise DeviceError(
-                    f"{captured.name}: {size} bytes arrived, {captured.size} expected by the camera; the frame is "
-                    "repeated"
+                    f"{captured.name}: {size} bytes arrived, expected {captured.size} as announced by the camera; the "
+                    "frame is repeated"
                 )
             self.stream.seek(0)
             sha256 = stream_sha256(self.stream)
@@ -688,7 +688,7 @@ class _JournalGuard:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
-            raise storage_error(path, error, "look at") from error
+            raise storage_error(path, error, "read") from error
         return _FileState((stat.st_dev, stat.st_ino), stat.st_size, stat.st_mtime_ns)
 
     def _raise_lost(self, file: Path, change: str) -> None:
@@ -723,7 +723,9 @@ class _LockRetry:
                 if not is_busy(error) or time.monotonic() - started >= self._seconds:
                     raise
                 if not announced:
-                    self._announce(f"another program holds {self._path}; the run continues when it is free")
+                    self._announce(
+                        f"another program is using {self._path}; the run resumes automatically when it is free"
+                    )
                     announced = True
 
 
@@ -852,7 +854,7 @@ class _Ledger:
         try:
             exists = path.is_file()
         except OSError as error:
-            raise storage_error(path, error, "look at") from error
+            raise storage_error(path, error, "read") from error
         if not exists or not self._has_facts(rows):
             write_atomic(path, _ledger_lines(rows))
         self._handle, self._end = self._open_file()

@@ -24,7 +24,7 @@ from typing import Final, Literal, Protocol, TypeVar
 from urllib.parse import quote
 
 from experiment.session.heartbeat import file_system_of
-from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError
+from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError, counted
 from foundation.files import (
     disk_remedy,
     is_inside_name,
@@ -145,7 +145,7 @@ def create_file(path: Path) -> sqlite3.Connection:
         connection = connect(path, "rwc")
         _make_tables(connection)
     except sqlite3.DatabaseError as error:
-        raise StorageError(f"cannot write {path}: {error}; free some space or choose another disk") from error
+        raise StorageError(f"cannot write {path}: {error}; free space or choose another disk") from error
     return connection
 
 
@@ -336,8 +336,7 @@ def _require_journal(path: Path, connection: sqlite3.Connection) -> None:
             raise FormatError(f"{path} is damaged: it is empty; {restore_remedy(path)}")
         if version != JOURNAL_VERSION:
             raise FormatError(
-                f"{path} has version {version}, this software reads version {JOURNAL_VERSION}; use the software that "
-                "wrote the file"
+                f"{path} has version {version}, expected {JOURNAL_VERSION}; use the software that wrote the file"
             )
         if missing := _COLUMNS.keys() - tables:
             raise FormatError(
@@ -357,7 +356,7 @@ def reading_fault(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
         is_missing = isinstance(error, FileNotFoundError)
         return reading_error(path, error, restore_remedy(path) if is_missing else "check its permissions")
     if is_busy(error):
-        return FormatError(f"cannot read {path}: {error}; end the other program that holds it")
+        return FormatError(f"cannot read {path}: {error}; end the other program that is using it")
     code = _primary_code(error)
     fault = _disk_fault(path)
     # If permissions are missing, the disk is not at fault.
@@ -378,13 +377,12 @@ def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | Inp
     """Return the error for a journal that cannot be written, with a remedy; the disk is tested."""
     if is_busy(error):
         return BusyJournalError(
-            f"cannot write {path}: {error}; end the other program that holds the session, then run the same command "
-            "again"
+            f"cannot write {path}: {error}; end the other program that is using the session, {RUN_AGAIN}"
         )
     if (fault := _disk_fault(path)) is not None:
         return storage_error(path, fault)
     if _primary_code(error) == sqlite3.SQLITE_FULL:
-        remedy = "free some space"
+        remedy = "free space or choose another disk"
     elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
         remedy = "check that the folder is writable and the disk is connected"
     elif _is_damage(error) and not _is_sound(path):
@@ -532,7 +530,7 @@ def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
         # SQLite creates an index for each primary key, without a text.
         if not (is_plain or (kind == "index" and sql is None)):
             raise FormatError(
-                f"{path} has the {kind} {str(name)[:80]!r}, which is not part of a journal; {_DAMAGED}; "
+                f"{path} has the {kind} {str(name)[:80]!r}, which is not part of a journal: {_DAMAGED}; "
                 f"{restore_remedy(path)}"
             )
 
@@ -544,17 +542,18 @@ def require_sound_rows(path: Path, connection: sqlite3.Connection) -> None:
         missing = _COLUMNS[table].keys() - columns.keys()
         if missing or any(columns.values()):
             raise FormatError(
-                f"{path}: the table {table} has other columns than a journal; {_DAMAGED}; {restore_remedy(path)}"
+                f"{path}: the table {table} has other columns than a journal: {_DAMAGED}; {restore_remedy(path)}"
             )
         row_condition = " AND ".join([f"({condition.format(column)})" for column, condition in _COLUMNS[table].items()])
         joint_condition = _JOINT_CONDITIONS.get(table, "1")
         query = f"SELECT COUNT(*) FROM {table} WHERE ({row_condition} AND {joint_condition}) IS NOT TRUE"
         if bad_rows := connection.execute(query).fetchone()[0]:
             raise FormatError(
-                f"{path}: {bad_rows} rows of {table} have values that no run writes; {_DAMAGED}; {restore_remedy(path)}"
+                f"{path}: {counted(bad_rows, 'row')} of {table} with values that no run writes: {_DAMAGED}; "
+                f"{restore_remedy(path)}"
             )
     for (file,) in connection.execute("SELECT file FROM attempts"):
         if not is_inside_name(file):
             raise FormatError(
-                f"{path} has the file {file[:200]!r}, which is outside the session; {_DAMAGED}; {restore_remedy(path)}"
+                f"{path} has the file {file[:200]!r}, which is outside the session: {_DAMAGED}; {restore_remedy(path)}"
             )

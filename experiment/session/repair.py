@@ -83,7 +83,7 @@ def _fault(folder: Path, frame: AcceptedFile) -> str | OSError:
     try:
         size = path.stat().st_size
         if size != frame.size:
-            return f"{frame.file} has {size} bytes, {frame.size} expected; the frame is repeated"
+            return f"{frame.file} has {size} bytes, expected {frame.size}; the frame is repeated"
         changed = file_sha256(path) != frame.sha256
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
         return f"{frame.file} is missing; the frame is repeated"
@@ -119,7 +119,7 @@ def parse_lights(text: str, valid_numbers: Collection[int]) -> tuple[int, ...]:
             )
         first, last = int(match[1]), int(match[2] or match[1])
         if last < first:
-            raise InputError(f"--retake {text!r}: {item.strip()} is a falling range; write {last}-{first}")
+            raise InputError(f"--retake {text!r}: {item.strip()} is a reversed range; write {last}-{first}")
         unknown = next((light for light in (first, last) if light not in valid_numbers), None)
         if unknown is not None:
             raise InputError(
@@ -166,7 +166,7 @@ def newest_report(session: Path, attempts: Mapping[str, int]) -> RefusedFrames:
                 reports.append((newest, path.stat().st_mtime_ns, refused))
     if not reports:
         raise FormatError(
-            f"{home.parent} has no report of build-lut on {session}; build the look-up table there "
+            f"{home.parent} has no report of build-lut on {session}; build the LUT there "
             f"(build-lut {session} {session}-lut), or give numbers of illuminants, as in --retake 12,40-44"
         )
     return max(reports, key=lambda entry: entry[:2])[2]

@@ -29,7 +29,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from foundation.errors import CropError, DeviceError, FormatError, InputError
+from foundation.errors import RUN_AGAIN, CropError, DeviceError, FormatError, InputError
 from foundation.files import partial_path, storage_error
 from foundation.folders import clear_folder, locked_folder, require_free
 from generator.dataset.plan import DatasetOptions, Plan
@@ -91,7 +91,7 @@ class Workers:
 
     def __post_init__(self) -> None:
         if self.count < 1:
-            raise InputError(f"the number of workers is {self.count}, expected 1 or more")
+            raise InputError(f"the number of workers is {self.count}, expected 1 or more; correct it")
         parse_engine(self.engine)
 
     @property
@@ -111,7 +111,9 @@ def parse_engine(text: str) -> str | None:
         return ""
     match = re.fullmatch(r"dask://([^/\s]+:\d+)/?", text)
     if not match:
-        raise InputError(f"the engine is {text!r}, expected local, dask, or dask://HOST:PORT of a Dask scheduler")
+        raise InputError(
+            f"the engine is {text!r}, expected local, dask, or dask://HOST:PORT of a Dask scheduler; correct it"
+        )
     return f"tcp://{match[1]}"
 
 
@@ -119,7 +121,7 @@ def parse_share(text: str) -> tuple[int, int]:
     """Return (i, n) of a text such as `3/16`, which means share i of n, with i from 0."""
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip(), re.ASCII)
     if not match or not int(match[1]) < int(match[2]):
-        raise InputError(f"the share is {text!r}, expected I/N with I from 0 to N - 1, such as 0/16")
+        raise InputError(f"the share is {text!r}, expected I/N with I from 0 to N - 1, such as 0/16; correct it")
     return int(match[1]), int(match[2])
 
 
@@ -208,7 +210,7 @@ def _by_dask(
                 if attempts[shard] >= ATTEMPTS:
                     raise DeviceError(
                         f"{4 * ATTEMPTS} workers died while they made shard {shard}; give the workers more memory or "
-                        "make shards smaller, then run the same command again to resume"
+                        f"make shards smaller, {RUN_AGAIN}"
                     ) from error
                 retry = submit(shard)
                 running[retry] = shard
@@ -220,7 +222,7 @@ def _by_dask(
                 if future.status in ("cancelled", "lost"):
                     raise DeviceError(
                         f"the connection to the Dask cluster {address or 'of this machine'} was lost; start it again, "
-                        "then run the same command again to resume"
+                        f"{RUN_AGAIN}"
                     ) from error
                 raise
             for skipped in result.skipped:
@@ -263,8 +265,8 @@ def _client(address: str, workers: int) -> Generator[distributed.Client]:
         )
     except RuntimeError as error:
         raise DeviceError(
-            f"the Dask cluster of this machine cannot be started ({error}), because a worker died; run the same "
-            "command again to resume, or use fewer --workers"
+            f"the Dask cluster of this machine cannot be started ({error}), because a worker died; use "
+            f"fewer --workers, {RUN_AGAIN}"
         ) from error
     with cluster, Client(cluster, set_as_default=False) as client:
         yield client
@@ -413,7 +415,7 @@ def make_share(
     """
     index, count = share
     if not 0 <= index < count:
-        raise InputError(f"the share is {index} of {count}, expected 0 to {count - 1}")
+        raise InputError(f"the share is {index} of {count}, expected 0 to {count - 1}; correct it")
     with open_workplace(out, plan.identity(), alone=False) as workplace:
         _make_missing(plan, workplace, range(index, plan.shards, count), workers or Workers(), callbacks)
         return workplace.count_done(), plan.shards
@@ -479,7 +481,7 @@ def open_workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) 
     require_free(path, "the data set")
     # Absolute, because a worker may run in another folder.
     folder = partial_path(path).absolute()
-    busy = f"{path} is being made by another program; wait until it ends, or choose another location"
+    busy = f"{path} is being made by another program; wait until it has ended, or choose another location"
     has_plan = None if alone else (folder / "plan" / PLAN).is_file
     with locked_folder(folder, busy, share_if=has_plan, target=path) as lock:
         notes = LocalStore(folder / "plan")

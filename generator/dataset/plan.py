@@ -139,17 +139,21 @@ class DatasetOptions:
             ("rendering", self.rendering, get_args(Rendering)),
         ):
             if value not in choices:
-                raise InputError(f"the {option_name} of a data set is {value!r}, expected one of {', '.join(choices)}")
+                raise InputError(
+                    f"the {option_name} of a data set is {value!r}, expected one of {', '.join(choices)}; correct it"
+                )
         if self.rendering == "codes" and self.matrix is not None:
             raise InputError("a colour matrix needs colorimetric rendering, but rendering is codes; omit the matrix")
         if self.shard_images < 1:
-            raise InputError(f"shard_images is {self.shard_images}, expected 1 or more")
+            raise InputError(f"shard_images is {self.shard_images}, expected 1 or more; correct it")
         if self.crops < 1:
-            raise InputError(f"crops is {self.crops}, expected 1 or more")
+            raise InputError(f"crops is {self.crops}, expected 1 or more; correct it")
         split = self.split
         if split is not None and not (len(split) == 3 and min(split) >= 0 and abs(sum(split) - 1) < _ROUNDED):
             shares = ",".join(f"{share:g}" for share in split)
-            raise InputError(f"the split is {shares}, expected three shares ≥ 0 with the sum 1 as in 0.8,0.1,0.1")
+            raise InputError(
+                f"the split is {shares}, expected three shares ≥ 0 with the sum 1 as in 0.8,0.1,0.1; correct it"
+            )
 
 
 _ROUNDED: Final = 1e-6  # Allowed difference of a sum of shares from 1
@@ -167,7 +171,9 @@ def parse_split(text: str) -> tuple[float, float, float]:
     if len(shares) == 2:
         shares.insert(1, 0.0)
     if len(shares) != 3 or not min(shares) >= 0 or not 0 < sum(shares) < float("inf"):
-        raise InputError(f"the split is {text!r}, expected shares of train, validation and test such as 0.8,0.1,0.1")
+        raise InputError(
+            f"the split is {text!r}, expected shares of train, validation and test such as 0.8,0.1,0.1; correct it"
+        )
     total = sum(shares)
     is_whole = total >= 1 and all(share == int(share) for share in shares)
     if not (is_whole or abs(total - 1) < _ROUNDED or abs(total - 100) < 100 * _ROUNDED):
@@ -209,8 +215,8 @@ class Plan:
         key_of(self.seed)
         if not self.sources or not self.choice.lights_each:
             raise InputError(
-                f"the plan has {len(self.sources)} pictures and {self.choice.lights_each} illuminants for each, "
-                "expected at least 1 of both; add pictures or illuminants"
+                f"the plan has {len(self.sources)} pictures and {self.choice.lights_each} illuminants, expected 1 or "
+                "more of each; add some"
             )
         if self.total > 1 << 32:
             raise InputError(f"the plan has {self.total} images, expected at most 2^32; make several data sets")

@@ -74,13 +74,13 @@ def read_entries(store: Store, description: Description) -> Iterator[Entry]:
             source, labels, whites = _read_rows(name, group)
             number = _number(image or "")
             if image is None or number <= last:
-                raise FormatError(f"{name}: the image {image!r} is not in order; make the data set again")
+                raise FormatError(f"{name}: the image {image!r} is not in its order; make the data set again")
             last = number
             truth = _truth(store, next(truths, ""), count, image, whites)
             yield Entry(image, source, labels, whites, truth, split_of_image.get(number))
         if count != description.images:
             raise FormatError(
-                f"{name} has rows of {count} images, expected {description.images} as in {DESCRIPTION}; generate the "
+                f"{name} has rows of {count} images, expected {description.images} as in {DESCRIPTION}; make the "
                 "data set again"
             )
         extra_lines = sum(1 for line in truths if line.strip())
@@ -213,7 +213,11 @@ def _listed_files(lines: Iterator[bytes], listed_names: set[str]) -> Iterator[tu
     for number, line in enumerate(lines, start=1):
         digest, _, name = line.decode("utf-8", "replace").rstrip("\n").partition("  ")
         if not _LINE.fullmatch(digest) or not is_inside_name(name):
-            yield "", "", f"{SUMS}, line {number}: expected a hash, two spaces and a name inside the data set"
+            yield (
+                "",
+                "",
+                f"{SUMS}, line {number} is damaged, expected a hash, two spaces and a name inside the data set",
+            )
         elif name in listed_names:
             # Each file is read once only, even if a malicious list repeats it a million times.
             yield "", "", f"{SUMS}, line {number}: {name} is listed twice"
@@ -433,8 +437,8 @@ def load_description(store: Store) -> Description:
     except ValidationError as error:
         first = error.errors()[0]
         raise FormatError(
-            f"{name} is invalid: {'.'.join(map(str, first['loc']))}: {first['msg']}; expected {FORMAT} of version "
-            f"{VERSION}, make the data set again"
+            f"{name} is invalid: {'.'.join(map(str, first['loc']))}: {first['msg']}, expected {FORMAT} of version "
+            f"{VERSION}; make the data set again"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise FormatError(f"{name} is damaged ({type(error).__name__}: {error}); make the data set again") from error

@@ -212,8 +212,7 @@ def _require_single(dataset: Dataset, tinted: bool) -> None:
     if mixed:
         raise InputError(
             f"{len(mixed)} images of {dataset.store.location}, such as {mixed[0]}, mix spectra with separate "
-            "exposures, expected single illuminants; make the first data set with --light, --random or "
-            "--nearest"
+            "exposures, expected single illuminants; make the first data set with --light, --random or --nearest"
         )
 
 
@@ -233,7 +232,7 @@ def _masks_of(dataset: Dataset) -> GivenMaskPlan | None:
     if is_remote(location) or folder is None:
         remedy = "make it with --layout folder" if folder is None else "copy it to this machine"
         raise InputError(
-            f"{location} has several illuminants in an image and the layout {dataset.layout}; expected masks in a "
-            f"local folder: {remedy}"
+            f"{location} has several illuminants in an image and the layout {dataset.layout}, expected masks in a "
+            f"local folder; {remedy}"
         )
     return find_masks(local_path(location) / folder, together)

@@ -676,8 +676,8 @@ def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
                 sums.write(f"{file.sha256}  {file.name}\n".encode())
         if not counts["images"]:
             raise NothingMadeError(
-                f"0 of {identity['sources']['count']} pictures can be used, expected 1 or more; the reasons are listed "
-                "above. Give other pictures, or a smaller crop if they are too small"
+                f"0 of {identity['sources']['count']} pictures can be used, for the reasons listed above, "
+                "expected 1 or more; give other pictures, or a smaller crop if they are too small"
             )
         description = Description(
             software=software(),
@@ -811,7 +811,9 @@ class Workplace:
         """Return the record of a complete shard."""
         piece = self.pieces(shard).get(_SHARD_PIECE)
         if piece is None:
-            raise FormatError(f"{self.notes.location}/{self._record_name(shard)} is damaged; run the command again")
+            raise FormatError(
+                f"{self.notes.location}/{self._record_name(shard)} is damaged; run the same command again"
+            )
         return _record_in(piece, ShardRecord)
 
     def commit(self, record: ShardRecord) -> None:

@@ -163,7 +163,10 @@ class Explorer:
         """Return the codes of one pixel, and mean and standard deviation of its counts over many samples."""
         picture = self._scene(number).picture
         if not (0 <= y < picture.shape[0] and 0 <= x < picture.shape[1]):
-            raise InputError(f"the pixel {x}, {y} is outside the picture, {picture.shape[1]}x{picture.shape[0]} px")
+            raise InputError(
+                f"the pixel {x}, {y} is outside the picture, expected less than {picture.shape[1]}, "
+                f"{picture.shape[0]}; correct it"
+            )
         field = np.broadcast_to(picture[y, x], (_DRAWS, _DRAWS, 3)).copy()
         drawn = self._photograph(field, self._mixture(light), rendering, 1).reshape(-1, 3).astype(np.float64)
         mean, deviation = drawn.mean(axis=0), drawn.std(axis=0, ddof=1)
@@ -307,7 +310,7 @@ def _json(value: Any) -> Response:
 def _number(query: Mapping[str, str], name: str) -> int:
     text = query.get(name, "")
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise InputError(f"{name} is {text[:40]!r}, expected an integer ≥ 0")
+        raise InputError(f"{name} is {text[:40]!r}, expected an integer ≥ 0; correct it")
     return int(text)
 
 
@@ -316,7 +319,7 @@ def _rendering(query: Mapping[str, str]) -> Rendering:
     for name in get_args(Rendering):
         if text == name:
             return name
-    raise InputError(f"the rendering is {text[:40]!r}, expected one of {', '.join(get_args(Rendering))}")
+    raise InputError(f"the rendering is {text[:40]!r}, expected one of {', '.join(get_args(Rendering))}; correct it")
 
 
 # Sample pictures: shaded balls, patches with greys, and random colours. They are computed, so that the package needs no

@@ -99,12 +99,12 @@ class DrawnLights:
 
     def __post_init__(self) -> None:
         if self.lights_each < 1:
-            raise InputError(f"illuminants of each picture: {self.lights_each}, expected 1 or more")
+            raise InputError(f"illuminants of each picture: {self.lights_each}, expected 1 or more; correct it")
         within = np.mean([self._batch(trial, 0, 0)[1].mean() for trial in range(128)])
         if within < _LEAST_WITHIN:
             raise InputError(
                 f"{within:.1%} of the distribution is in the gamut of {self.gamut.table}, expected {_LEAST_WITHIN:.1%} "
-                f"or more; choose a distribution nearer to the illuminants, whose mean is "
+                f"or more; choose a distribution nearer to the illuminants, with the mean "
                 "r={:.3f}, b={:.3f}".format(*self.gamut.rb.mean(axis=0))
             )
 
@@ -202,7 +202,7 @@ def light_numbers(text: str, total: int) -> tuple[int, ...]:
         first = int(match[1])
         last = int(match[2]) if match[2] else first
         if max(first, last) >= total:
-            raise InputError(f"the LUT has no illuminant {max(first, last)}, expected 0 to {total - 1}")
+            raise InputError(f"the LUT has no illuminant {max(first, last)}, expected 0 to {total - 1}; correct it")
         if last < first:
             raise InputError(f"the range {entry.strip()!r} is reversed; write {last}-{first}")
         lights.update(dict.fromkeys(range(first, last + 1)))
@@ -273,7 +273,7 @@ def light_of(light: int | str | Mixture, lut: Lut) -> Mixture:
 def listed_lights(lights: Iterable[int | str | Mixture] | str | float | Mixture, lut: Lut) -> ListedLights:
     """Return the choice of the same illuminants for every picture, each given as for `light_of`."""
     if isinstance(lights, str | int | float | Mixture):
-        raise InputError(f"lights is {value_text(lights)}, expected a list such as [0, 3] or ['D65']")
+        raise InputError(f"lights is {value_text(lights)}, expected a list such as [0, 3] or ['D65']; correct it")
     # Numbers stay numbers, so that `describe` gives the same record as for the command.
     return ListedLights(
         tuple(light_of(light, lut) if isinstance(light, str | Mixture) else valid_light(lut, light) for light in lights)
@@ -308,8 +308,8 @@ def matched_lights(
     if len(far) > _MOST_FAR * len(truths) or choice.largest_deg > _MOST_DEG:
         raise InputError(
             f"{len(far)} of the {len(truths)} ground truths of {file} are more than {_FAR_DEG:g} degrees outside the "
-            f"gamut of {gamut.table}, at most {choice.largest_deg:.2f} degrees, the first in line {far[0]}; expected "
-            f"{_MOST_FAR:.0%} or less, and none beyond {_MOST_DEG:g} degrees. Check that the channels are in the order "
+            f"gamut of {gamut.table}, at most {choice.largest_deg:.2f} degrees, the first in line {far[0]}, expected "
+            f"{_MOST_FAR:.0%} or less, and 0 beyond {_MOST_DEG:g} degrees; check that the channels are in the order "
             "R, G, B and that the file belongs to the camera of the LUT, or use a LUT with a wider gamut"
         )
     return choice

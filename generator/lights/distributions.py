@@ -46,7 +46,7 @@ def ground_truths_by_line(path: Path) -> dict[int, list[float]]:
     A CSV file has the columns `GT_R,GT_G,GT_B` or `r,g,b`; others are ignored. Otherwise each line has three numbers,
     separated by blanks or commas, as in `gt.txt` and Cube+. Raises FormatError.
     """
-    lines = read_text(path, "name a text file", "ground truths").splitlines()
+    lines = read_text(path, "give a text file", "ground truths").splitlines()
     numbered = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
     if not numbered:
         raise FormatError(f"{path} is empty, expected three numbers in each line; choose another file")

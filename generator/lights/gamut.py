@@ -102,7 +102,9 @@ class Gamut:
         """
         light = np.asarray(rgb, dtype=np.float64)
         if light.shape != (3,) or not np.isfinite(light).all() or light.min() < 0 or light.max() <= 0:
-            raise InputError(f"{light.tolist()} is not an illuminant, expected three numbers ≥ 0 with a sum above 0")
+            raise InputError(
+                f"{light.tolist()} is not an illuminant, expected three numbers ≥ 0 with a sum above 0; correct it"
+            )
         target = _unit(light)
         nearest = self._nearest_light(target)
         if nearest.angle <= TOLERANCE_DEG:

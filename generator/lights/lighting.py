@@ -63,11 +63,13 @@ class Mixture:
         ascending = all(low < high for low, high in zip(self.lights, self.lights[1:], strict=False))
         if not self.lights or len(self.lights) != len(self.weights) or not ascending or self.lights[0] < 0:
             raise InputError(
-                f"illuminants {self.lights} with weights {self.weights} are not a mixture; expected ascending numbers "
-                "and one weight for each"
+                f"illuminants {self.lights} with weights {self.weights} are not a mixture, expected ascending numbers "
+                "and one weight for each; correct them"
             )
         if not all(0 < weight < np.inf for weight in self.weights) or abs(sum(self.weights) - 1) > 1e-6:
-            raise InputError(f"the weights of a mixture are {self.weights}, expected numbers above 0 with the sum 1")
+            raise InputError(
+                f"the weights of a mixture are {self.weights}, expected numbers above 0 with the sum 1; correct them"
+            )
         billionths = [max(1, round(weight * _BILLION)) for weight in self.weights]
         billionths[billionths.index(max(billionths))] += _BILLION - sum(billionths)
         object.__setattr__(self, "weights", tuple(count / _BILLION for count in billionths))
@@ -144,8 +146,8 @@ class Lighting:
     def __post_init__(self) -> None:
         if not self.mixtures or (self.masks is None) != (len(self.mixtures) == 1):
             raise InputError(
-                f"{len(self.mixtures)} illuminants with{'out' if self.masks is None else ''} masks; expected one "
-                "without, or several with masks"
+                f"{len(self.mixtures)} illuminants with{'out' if self.masks is None else ''} masks, expected one "
+                "without, or several with masks; correct them"
             )
 
     def weights_of(self, height: int, width: int) -> npt.NDArray[np.float32]:
@@ -212,7 +214,7 @@ class RandomLights:
         if not 1 <= self.lights_each <= self.total:
             raise InputError(
                 f"the number of random illuminants of each picture is {self.lights_each}, expected 1 to {self.total}, "
-                "the number in the LUT"
+                "the number in the LUT; correct it"
             )
 
     def lightings_of(self, position: int) -> tuple[Lighting, ...]:

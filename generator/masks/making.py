@@ -412,8 +412,8 @@ class GivenMasks:
         names = ", ".join(file.name for file in self.files)
         if len(masks) not in (lights, lights - 1):
             raise FormatError(
-                f"{names} in {self.files[0].parent} have {len(masks)} masks; {lights} illuminants need {lights}, or "
-                f"{lights - 1} without the first; add or remove masks"
+                f"{names} in {self.files[0].parent} have {len(masks)} masks, expected {lights} for {lights} "
+                f"illuminants, or {lights - 1} without the first; add or remove masks"
             )
         total = np.sum(masks, axis=0, dtype=np.float32)
         if len(masks) == lights:
@@ -581,7 +581,7 @@ def parse_shape(text: str) -> Shape:
     """Return the shape of computed masks that a text specifies; see `parse_masks`."""
     name, _, rest = text.strip().partition(":")
     if name not in _OPTIONS:
-        raise InputError(f"{name!r} is not a shape of masks, expected one of {', '.join(_OPTIONS)}")
+        raise InputError(f"{name!r} is not a shape of masks, expected one of {', '.join(_OPTIONS)}; correct it")
     numbers = parse_numbers(rest, _OPTIONS[name], f"the masks {name}")
     counts = {key: _integer(numbers[key], key, name) for key in ("count", "columns", "rows") if key in numbers}
     match name:
@@ -600,5 +600,5 @@ def parse_shape(text: str) -> Shape:
 
 def _integer(number: float, name: str, shape_name: str) -> int:
     if number != int(number):
-        raise InputError(f"{name}={number:g} of the masks {shape_name} is invalid, expected an integer")
+        raise InputError(f"{name}={number:g} of the masks {shape_name} is invalid, expected an integer; correct it")
     return int(number)

@@ -68,7 +68,7 @@ class PtpIpService:
                 case _:
                     _send(channel, InitFail(FailReason.UNSPECIFIED))
         except ProtocolError as error:
-            raise LinkClosed(f"the bytes are not PTP/IP packets: {error}") from error
+            raise LinkClosed(f"the bytes are not PTP/IP packets: {error}; open a new connection") from error
 
     def _serve_commands(self, channel: Channel) -> None:
         initiator = _Initiator(next(self._numbers), channel)

@@ -57,9 +57,9 @@ def write_dng(
     seconds.
     """
     if counts.shape != body.sensor:
-        raise ValueError(f"counts are {counts.shape}; the sensor of the {body.model} is {body.sensor}")
+        raise ValueError(f"counts are {counts.shape}, expected {body.sensor} as of the sensor of the {body.model}")
     if taken_at.tzinfo is None:
-        raise ValueError(f"the date {taken_at} has no time zone, expected one")
+        raise ValueError(f"the date {taken_at} has no time zone, expected a time with one")
     rows, columns = body.sensor
     stamp = text(taken_at.astimezone(UTC).strftime("%Y:%m:%d %H:%M:%S"))
     exif: Tags = {
@@ -255,4 +255,6 @@ def _accept(settings: ExposureSettings) -> None:
         ("shutter_s", settings.shutter_s, 1 / 8000, 30.0),
     ):
         if value is not None and not low <= value <= high:
-            raise DeviceRefused(f"{name} is {value:g}, expected {low:g} to {high:g} on the simulated camera")
+            raise DeviceRefused(
+                f"{name} is {value:g}, expected {low:g} to {high:g} on the simulated camera; correct it"
+            )

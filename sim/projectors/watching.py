@@ -55,7 +55,8 @@ class ScreenPlace:
         match = _PLACE.fullmatch(text)
         if not text or match is None:
             raise InputError(
-                f"the screen is {text!r}, expected DISPLAY, WIDTHxHEIGHT+X+Y or both, such as :1,640x360+0+0"
+                f"the screen is {text!r}, expected DISPLAY, WIDTHxHEIGHT+X+Y or both, such as :1,640x360+0+0; correct "
+                "it"
             )
         display, region = match["display"], match["region"]
         if region is None:

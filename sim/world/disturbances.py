@@ -418,7 +418,7 @@ def _message(fault: ErrorDetails) -> str:
     messages["missing"] = " is missing; add it"
     for words, expected in _EXPECTED.items():
         if fault["type"].startswith(words):
-            return f"{value}: {expected} is expected; correct it"
+            return f"{value}: expected {expected}; correct it"
     return messages.get(fault["type"], f"{value}: {fault['msg'].removeprefix('Value error, ')}; correct it")
 
 

@@ -63,7 +63,7 @@ class Body:
             if min(area) < 0 or area.top + area.height > rows or area.left + area.width > columns:
                 raise ValueError(f"{self.model}: {area} is outside the sensor of {columns}×{rows} photosites")
         if sorted(self.pattern) != ["B", "G", "G", "R"]:
-            raise ValueError(f"{self.model}: pattern is {self.pattern!r}; one R, two G and one B are expected")
+            raise ValueError(f"{self.model}: the pattern is {self.pattern!r}, expected one R, two G and one B")
 
     @property
     def camera(self) -> str:
@@ -266,10 +266,13 @@ def _checked_pixels(pixels: Any, where: str, key: str) -> tuple[int, int]:
         width, height = TypeAdapter(tuple[int, int]).validate_python(pixels)
     except ValidationError as error:
         raise ConfigurationError(
-            f"{where}: {key}.pixels = {pixels!r}: two whole numbers expected, columns and rows, such as [5184, 3456]"
+            f"{where}: {key}.pixels = {pixels!r}: expected two whole numbers, columns and rows, such as [5184, 3456]; "
+            "correct it"
         ) from error
     if min(width, height) < 16:
-        raise ConfigurationError(f"{where}: {key}.pixels = {pixels!r}: at least 16 columns and rows expected")
+        raise ConfigurationError(
+            f"{where}: {key}.pixels = {pixels!r}: expected at least 16 columns and rows; correct it"
+        )
     return width, height
 
 
@@ -278,7 +281,7 @@ def _require_sensor(body: Body, where: str, key: str) -> None:
     limits = (
         ("bits", body.bits, 8 <= body.bits <= 16, "8 to 16"),
         ("black", body.black, 0 <= body.black < body.saturation, f"0 to below saturation, {body.saturation}"),
-        ("saturation", body.saturation, body.saturation <= top, f"{top} at most with {body.bits} bits"),
+        ("saturation", body.saturation, body.saturation <= top, f"at most {top} with {body.bits} bits"),
         ("electrons_per_dn", body.electrons_per_dn, body.electrons_per_dn > 0, "more than 0"),
         ("read_noise_dn", body.read_noise_dn, body.read_noise_dn >= 0, "0 or more"),
         (
@@ -290,7 +293,7 @@ def _require_sensor(body: Body, where: str, key: str) -> None:
     )
     for name, value, allowed, expected in limits:
         if not allowed:
-            raise ConfigurationError(f"{where}: {key}.{name} is {value:g}; {expected} expected")
+            raise ConfigurationError(f"{where}: {key}.{name} is {value:g}, expected {expected}; correct it")
 
 
 @compiled

@@ -202,21 +202,21 @@ class Room:
 
     def __post_init__(self) -> None:
         if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}; 0 or more is expected")
+            raise ValueError(f"seed is {self.seed}, expected 0 or more")
         for name in ("fill", "focal_diagonals", "white_level_share", "shoulder_px"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; more than 0 is expected")
+                raise ValueError(f"{name} is {getattr(self, name)}, expected more than 0")
         for name in (
             "vignetting", "projector_falloff", "black_leak", "ambient", "stain_depth", "shoulder_share", "veil",
         ):  # fmt: skip
             if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; 0 to below 1 is expected")
+                raise ValueError(f"{name} is {getattr(self, name)}, expected 0 to below 1")
         for name in (
             "waviness_mm", "wave_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz",
             "shutter_jitter_s", "stain_mm", "fold_mm", "hot_per_million", "hot_dn_per_s",
         ):  # fmt: skip
             if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is expected")
+                raise ValueError(f"{name} is {getattr(self, name)}, expected 0 or more")
 
 
 def read_room(seed: int, changes: Mapping[str, Any], where: str, key: str) -> Room:

@@ -126,10 +126,10 @@ def test_entry_lists_missing_fields() -> None:
     assert "author = {Knuth, Donald and {A \\& B Institute}}" in entry
     assert "@misc{knuth-canoneos550d-2026-abababab," in entry
     assert "year = {2026}" in entry
-    assert entry.startswith("% not recorded by the table: url, licence\n")
+    assert entry.startswith("% not recorded by the LUT: url, licence\n")
     older = bibtex("Canon EOS 550D", 707, "croplab 0.1.0", "ab" * 32, None)
     assert "author =" not in older
-    assert "% not recorded by the table: author, year, url, licence" in older
+    assert "% not recorded by the LUT: author, year, url, licence" in older
 
 
 def test_escapes_tex_commands() -> None:

@@ -631,7 +631,7 @@ def test_calls_end_within_their_time_limits(fault: str) -> None:
         "busy": "answers DEVICE_BUSY",
         "silent": "sent nothing for 20 s; no connection for",
         "gone": "no camera on USB; no connection for",
-        "never announced": "announced no frame in time, and its memory holds none",
+        "never announced": "announced no frame in time, and its memory has none",
     }[fault]
     with pytest.raises(DeviceError, match=rf"^(Canon Digital Camera .* at USB port 1-1 )?{cause}"):
         lab.camera.expose()
@@ -802,7 +802,7 @@ def test_accepts_present_values_without_lists(lab: Lab) -> None:
     lab.take(attempts=1)
     assert lab.film.settings == [SETTINGS]
     assert lab.camera.shutter_speeds() == ()
-    with pytest.raises(DeviceRefused, match=r"ISO speed 200 is not offered; nearest: 100$"):
+    with pytest.raises(DeviceRefused, match=r"ISO speed 200 is not offered; set one of the nearest: 100$"):
         lab.camera.configure(replace(SETTINGS, iso=200))
 
 
@@ -875,7 +875,7 @@ def test_waits_for_a_busy_body_on_the_same_connection(lab: Lab) -> None:
 def test_refuses_bodies_with_another_remote_mode(model: str) -> None:
     lab = Lab(replace(EOS_550D, info=replace(EOS_550D.info, model=f"Canon {model}")))
     recorder = record_requests(lab)
-    with pytest.raises(DeviceRefused, match=rf'{model}; .*remote mode.*connection = "gphoto2"'):
+    with pytest.raises(DeviceRefused, match=rf'{model}, .*remote mode.*connection = "gphoto2"'):
         lab.camera.identity()
     assert not recorder.parameters(Operation.EOS_SET_REMOTE_MODE)
 
@@ -1090,10 +1090,10 @@ def test_refuses_too_many_records(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("octets", "reason"),
     [
-        ("10000000 89c10000 03d10000 68000000 08", "the size of a record at byte 16 requires 4 bytes; 1 follow"),
-        ("07000000 89c10000", "the size of a record at byte 0 is 7; expected at least 8"),
+        ("10000000 89c10000 03d10000 68000000 08", "the size of a record at byte 16 has 1 byte, expected 4"),
+        ("07000000 89c10000", "the size of a record at byte 0 is 7, expected at least 8"),
         ("00000000 00000000 01", "expected at least 8"),
-        ("ffffffff 89c10000 03d10000", r"PROPERTY_CHANGED \(0xc189\) at byte 8 requires 4294967287 bytes"),
+        ("ffffffff 89c10000 03d10000", r"PROPERTY_CHANGED \(0xc189\) at byte 8 has 4 bytes, expected 4294967287"),
         ("0a000000 89c10000 03d1 08000000 00000000", "record 0 at byte 0: PROPERTY_CHANGED"),
         (
             "18000000 8ac10000 01d10000 03000000 ffffff7f 00000000 08000000 00000000",
@@ -1187,7 +1187,7 @@ def test_list_of_the_body_selects_half_or_third_stops() -> None:
 
 
 def test_refuses_values_between_steps() -> None:
-    with pytest.raises(InputError, match=r"^aperture 7\.5 is not offered; nearest: 6\.3, 7\.1, 8, 9$"):
+    with pytest.raises(InputError, match=r"^aperture 7\.5 is not offered; set one of the nearest: 6\.3, 7\.1, 8, 9$"):
         APERTURE.code(7.5, APERTURES_60D)
     with pytest.raises(InputError, match=r"2\.8.*3\.5, 4, 4\.5, 5"):
         APERTURE.code(2.8, APERTURES_60D)

@@ -142,7 +142,7 @@ def test_check_reports_changes_of_light(
     printed = capsys.readouterr()
     assert "gamma ramp is not straight" in printed.out
     assert "tags" in printed.out
-    assert "warming up: the lamp was just lit; the run waits 20 min 00 s" in printed.err
+    assert "warming up: the lamp was just switched on; the run waits 20 min 00 s" in printed.err
 
 
 @pytest.mark.parametrize("language_name", ["epson", "languages/lantern.toml"])

@@ -128,7 +128,7 @@ def test_reports_missing_serial_port(bench: Bench, camera: str) -> None:
         f'{camera}[lab.projector]\ncontrol = "serial"\nlanguage = "benq"\ndevice = "/dev/ttyCROP9"\n'
     )
     assert code == 3
-    assert message.startswith("projector: serial port /dev/ttyCROP9 does not exist; present: ")
+    assert message.startswith("projector: serial port /dev/ttyCROP9 does not exist (present: ")
 
 
 def test_reports_wrong_language(bench: Bench, camera: str) -> None:
@@ -169,7 +169,7 @@ def test_reports_missing_display_and_camera(bench: Bench) -> None:
     assert code == 3
     assert "display 'HDMI-1' is not connected" in message
     assert str(DESK) in message
-    assert "no camera with vendor 04a9 on USB; present: none" in message
+    assert "no camera with vendor 04a9 on USB (present: none)" in message
 
 
 def test_refuses_ambiguous_cameras(bench: Bench) -> None:
@@ -177,7 +177,7 @@ def test_refuses_ambiguous_cameras(bench: Bench) -> None:
     bench.plug("2")
     code, message = bench.messages_of("")
     assert code == 2
-    assert "2 cameras on USB match, 1 expected: " in message
+    assert "2 cameras on USB match, expected 1: " in message
     assert "set a serial number or port" in message
 
 

@@ -90,7 +90,9 @@ def test_ctrl_c_at_every_frame_keeps_frames(lab: Path, undisturbed: Path, frame_
     assert frame_hashes(interrupted) == frame_hashes(undisturbed)
 
 
-@pytest.mark.parametrize(("text", "expected"), [(None, "No such file"), ("garbage", "illuminants in the columns")])
+@pytest.mark.parametrize(
+    ("text", "expected"), [(None, "No such file"), ("garbage", "has no illuminants, expected columns")]
+)
 def test_check_reads_illuminants(
     lab: Path, text: str | None, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -131,7 +133,7 @@ def test_sigterm_closes_devices(lab: Path, monkeypatch: pytest.MonkeyPatch, caps
     with monkeypatch.context() as patched:
         patched.setattr(Journal, "commit", commit_and_terminate)
         assert run("run", lab, session) == 130
-    assert "interrupted; run the same command again to continue" in capsys.readouterr().err
+    assert "interrupted; run the same command again" in capsys.readouterr().err
     assert set(closed) == {"camera", "projector", "journal"}
     assert signal.getsignal(signal.SIGTERM) == handler
     assert run("run", lab, session) == 0

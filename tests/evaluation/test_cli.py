@@ -48,7 +48,7 @@ def test_counts_images_without_usable_pixel(
     ("arguments", "message"),
     [
         (("lut",), "has no supported layout"),
-        (("made", "--out", "lut"), "lut already exists; name another place for the results"),
+        (("made", "--out", "lut"), "lut already exists; choose another place for the results"),
         (("made", "--method", "none.npz"), "none.npz"),
         (("made", "--method", "lut/illuminations.csv"), "expected image,r,g,b"),
     ],

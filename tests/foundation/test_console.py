@@ -85,7 +85,7 @@ def test_interruption_exits_with_130(capsys: pytest.CaptureFixture[str]) -> None
         raise KeyboardInterrupt
 
     assert run(interrupt) == 130
-    assert capsys.readouterr().err == "error: interrupted; run the same command again to continue\n"
+    assert capsys.readouterr().err == "error: interrupted; run the same command again\n"
     assert run(interrupt, is_resumable=False) == 130
     assert capsys.readouterr().err == "error: interrupted; no results were kept\n"
 
@@ -94,7 +94,7 @@ def test_interruption_exits_with_130(capsys: pytest.CaptureFixture[str]) -> None
     ("number", "beginning"),
     [
         (errno.ENOSPC, "cannot write /disk/samples.npy: No space left on device; free space or"),
-        (errno.EIO, "cannot use /disk/samples.npy: Input/output error; the disk fails: look at the output of dmesg"),
+        (errno.EIO, "cannot use /disk/samples.npy: Input/output error; the disk fails: read the output of dmesg"),
     ],
 )
 def test_disk_error_exits_with_5(number: int, beginning: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -110,7 +110,7 @@ def test_disk_error_exits_with_5(number: int, beginning: str, capsys: pytest.Cap
     [
         (errno.EACCES, "ask its owner for permission, or choose another path"),
         (errno.EPERM, "ask its owner for permission, or choose another path"),
-        (errno.EISDIR, "it is a folder; name a file"),
+        (errno.EISDIR, "it is a folder; give a file"),
         (errno.ENOTDIR, "a part of that path is a file, not a folder; choose another path"),
         (errno.ENAMETOOLONG, "choose a shorter name"),
         (errno.ELOOP, "its links form a circle; give the path without links"),

@@ -144,7 +144,7 @@ def test_contact_sheet_is_made_after_failure(
 def test_completes_and_verifies_shares(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
     options = ("--sources", "pictures", "--light", "all", "--shard-images", "3", "--rendering", "codes")
     assert generate("lut", "out", *options, "--shard", "1/2") == 0
-    assert "1 of 3 shards of out are done; run the command for the other shares" in capsys.readouterr().out
+    assert "1 of 3 shards of out are done; run the same command with the other shares" in capsys.readouterr().out
     assert generate("lut", "out", *options, "--shard", "0/2") == 0
     assert "3 of 3 shards of out are done; run the same command without --shard" in capsys.readouterr().out
     assert generate("lut", "out", *options) == 0

@@ -46,7 +46,7 @@ def _report_four_images() -> None:
 def test_writes_lines_to_a_file(capsys: pytest.CaptureFixture[str]) -> None:
     _report_four_images()
     lines = capsys.readouterr().err.splitlines()
-    assert lines[:2] == ["1 images exist from an earlier run", "skipped bad\\x1b[2J.png: it is no picture"]
+    assert lines[:2] == ["1 image exists from an earlier run", "skipped bad\\x1b[2J.png: it is no picture"]
     assert lines[2].startswith("images 2/2 ")
     assert len(lines) == 3
 

@@ -26,9 +26,7 @@ def test_computes_a_lut(settings: str, tmp_path: Path, capsys: pytest.CaptureFix
     Path(settings).write_text("seed = 4\n[room]\npaper = 'matt'\nhot_per_million = 5.0\n" + SMALL)
     options = ["--camera", "Canon_EOS-1Ds_Mark_III", "--lights", "D65,A"]
     assert main(["table", str(out), "--settings", settings, *options]) == 0
-    assert capsys.readouterr().out == (
-        f"{out}: computed, 2 illuminants, 8 colours, 25 samples each; 0 patches unfit for use\n"
-    )
+    assert capsys.readouterr().out == (f"{out}: computed, 2 illuminants, 8 colours, 25 samples each; 0 unfit patches\n")
     computed = open_lut(out).provenance.computed
     assert computed is not None
     assert (computed["seed"], computed["room"]["paper"], computed["room"]["hot_per_million"]) == (4, "matt", 5)

@@ -81,7 +81,7 @@ function drawClock() {
   if (silent)
     $("offline").textContent =
       `acquire monitor has not answered since ${timeText(answeredAt)}; this page is out of date. ` +
-      "The run itself may be active: look at its terminal, or start acquire monitor again.";
+      "The run itself may be active: check its terminal, or start acquire monitor again.";
 }
 
 /** Draw the icon of the tab: a ring for the progress, in the colour of the state. */

@@ -312,8 +312,8 @@ function drawPicture(frame) {
   without.textContent = !frame
     ? "No frame yet"
     : frame.preview
-      ? "This report does not include the picture"
-      : "This frame has no picture";
+      ? "This report does not include the preview"
+      : "This frame has no preview";
   if (source === null) {
     picture.removeAttribute("src");
     return;
@@ -362,7 +362,7 @@ function legend() {
   );
   $("lights-note").textContent =
     "Each illuminant at r = R/(R+G+B), b = B/(R+G+B), in its own colour. " +
-    "If a mark lies at another place in the measured plane, the frame shows another illuminant than ordered.";
+    "If a mark is at another position in the measured plane, the frame shows another illuminant than ordered.";
 }
 
 function planeIn(id, label) {

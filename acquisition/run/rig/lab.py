@@ -145,7 +145,7 @@ def _line_projector(cable: ProjectorCable, clock: Clock, file: str) -> LineProje
         raise ConfigurationError(
             "lab.projector.language is missing",
             about=file,
-            remedy=f"name one of {', '.join(built_in_languages())}, or a language file",
+            remedy=f"set one of {', '.join(built_in_languages())}, or a language file",
             value="lab.projector.language",
         )
     language = load_language(cable.language)
@@ -154,7 +154,7 @@ def _line_projector(cable: ProjectorCable, clock: Clock, file: str) -> LineProje
             raise ConfigurationError(
                 f"lab.projector.host is given, but {language.maker} projectors have only a serial port",
                 about=file,
-                remedy="name lab.projector.device; acquire devices lists the serial ports",
+                remedy="set lab.projector.device; acquire devices lists the serial ports",
             )
         host, port = cable.host, cable.port or language.network.port
         label = f"the projector at {host}:{port}"

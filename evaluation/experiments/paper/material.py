@@ -131,7 +131,10 @@ def lights_at_random(lut: Lut, count: int, seed: int) -> ChosenLights:
 def render_scenes(lut: Lut, sources: Sequence[Source], lights: ChosenLights, seed: int) -> tuple[RenderedScene, ...]:
     """Return the scenes of the pictures under the chosen illuminants."""
     if len(sources) != len(lights.numbers):
-        raise InputError(f"{len(sources)} pictures have {len(lights.numbers)} illuminants; choose one for each")
+        raise InputError(
+            f"{len(sources)} pictures have {len(lights.numbers)} illuminants, expected equal numbers; choose one for "
+            "each"
+        )
     pairs = zip(sources, lights.numbers, strict=True)
     return tuple(RenderedScene(lut, source, light, number, seed) for number, (source, light) in enumerate(pairs))
 
@@ -246,7 +249,7 @@ def read_truths(location: str) -> Truths:
         )
     is_chosen = np.array([name.startswith(prefix) for name in names])
     if not is_chosen.any():
-        raise InputError(f"no row of {file} begins with {prefix!r}, expected a prefix such as {names[0]!r}; correct it")
+        raise InputError(f"no row of {file} starts with {prefix!r}, expected a prefix such as {names[0]!r}; correct it")
     return Truths(prefix.strip("/_"), lights[is_chosen], tuple(name for name in names if name.startswith(prefix)))
 
 

@@ -257,7 +257,7 @@ def bits_report(bits_result: BitsResult, metric: ErrorKind, name: str, condition
     caption = "Medians against the number of bits of each sRGB code set to zero; dotted: unchanged linear images."
     files = {"bits.svg": standalone_svg(plot), **_table_files("bits", table)}
     elements = (*map(pages.paragraph, conditions), pages.figure(plot, caption), table_part(table))
-    return PaperReport("The effect of colour reduction on illumination estimation", (table,), elements, files)
+    return PaperReport("The effect of colour reduction on illuminant estimation", (table,), elements, files)
 
 
 def reduction_report(picture: npt.NDArray[np.uint8], name: str) -> PaperReport:

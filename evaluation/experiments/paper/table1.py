@@ -144,7 +144,7 @@ def settings(
     """
     count = len(pictures)
     if not count:
-        raise InputError("there are 0 pictures, expected at least one; name some")
+        raise InputError("there are 0 pictures, expected at least 1; give some")
     sets: dict[str, Sequence[Source]] = {
         names[0]: [ScaledSource(picture, side) for picture in pictures],
         "Random": random_scenes(count, side, side, seed),
@@ -295,7 +295,7 @@ def table2(
     """Return the results of each learner, trained on real and on generated images; `folds`: (N,) int64."""
     if not generated or not learners:
         raise InputError(
-            f"{len(learners)} learners and {len(generated)} generated images, expected at least one each; name some"
+            f"{len(learners)} learners and {len(generated)} generated images, expected at least one each; give some"
         )
     learner_list = list(learners.values())
     cross_validated = cross_validate(real, learner_list, folds, seed, workers, on_scene)

@@ -194,7 +194,7 @@ def naive_ratios_table(figures: TransferFigures, name: str) -> Table | None:
     if not figures.to_naive:
         return None
     return _ratios_table(
-        f"{name}: errors with generated images relative to those with the same pictures and illuminants without a LUT",
+        f"{name}: errors with generated images relative to errors with the same pictures and illuminants without a LUT",
         [(ratio, ratio.base.training) for ratio in figures.to_naive],
         "Paired by test image. Below 1: the LUT improves this method.",
         "In parts of",

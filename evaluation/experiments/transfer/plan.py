@@ -163,9 +163,7 @@ def find_source_pictures(dataset: Dataset, folder: Path | str) -> tuple[Mapping[
             return file_sha256(files[name])
         except OSError as error:
             reason = os.strerror(error.errno or 0)
-            raise InputError(
-                f"cannot read {files[name]}: {reason}, a readable file expected; change its permissions, or use a copy"
-            ) from error
+            raise InputError(f"cannot read {files[name]}: {reason}; give another folder") from error
 
     @cache
     def by_hash() -> Mapping[str, Path]:

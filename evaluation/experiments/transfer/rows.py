@@ -253,7 +253,7 @@ class _RealSubsets:
         """Return the method fitted to a set with this seed, adapted to real images with indices (N,) int64."""
         method = fitted[seed]
         if not isinstance(learner, FeatureLearner) or not isinstance(method, LearnedMethod):
-            raise TypeError(f"{learner.name} cannot be adapted, because it has no features")
+            raise TypeError(f"{learner.name} cannot be adapted, expected a method with features")
         return adapt(method, self._learned(learner, number, indices, seed))
 
     def _learned(self, learner: FeatureLearner, number: int, indices: Indices, seed: int) -> LocalFit:

@@ -13,7 +13,7 @@ async function ask(address, options) {
   try {
     answer = await fetch(address, options);
   } catch {
-    throw new Error("The program does not answer; check that generate explore still runs.");
+    throw new Error("The program does not answer; check that generate explore is running.");
   }
   if (!answer.ok) throw new Error((await answer.text()).trim());
   return answer;

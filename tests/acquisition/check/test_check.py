@@ -193,7 +193,7 @@ def test_removes_trial_frames_after_error(check: Check, folder: Path, monkeypatc
         return 10_000
 
     monkeypatch.setattr(check_module, "free_bytes_at", free)
-    with pytest.raises(StorageError, match=r"0\.0 MB free at .* needed for the frames of a check") as caught:
+    with pytest.raises(StorageError, match=r"0\.0 MB free at .* for the frames of a check") as caught:
         check(1)
     assert caught.value.exit_code == 5
     (hidden,) = new_files[-1] - {folder / "LAB.toml"}

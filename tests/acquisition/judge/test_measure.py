@@ -46,7 +46,7 @@ def mosaic_of(tmp_path: Path, level: int, clipped: int = 0) -> Mosaic:
         (0.001, 8000, "light", None),
         (0.0011, 8000, "light", "0.1% of the photosites are clipped, at most 0.1 % allowed"),
         (0.031, 8000, "white", "3.1% of the photosites are clipped"),
-        (0.0, 99, "light", "are 99 counts above black, at least 100 expected"),
+        (0.0, 99, "light", "are 99 counts above black, at least 100 counts allowed"),
         (0.0, 100, "white", None),
         (0.0, 8, "dark", None),
         (0.0, 0.06 * RANGE, "dark", "6.0% of saturation, at most 5 % allowed"),
@@ -91,7 +91,7 @@ def test_accepts_rounded_exposure_values(
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        ({"shutter_s": 0.4}, "the file states shutter time in s 0.4 instead of 0.5"),
+        ({"shutter_s": 0.4}, "the file records shutter time in s 0.4 instead of 0.5"),
         ({"shutter_s": 0.6}, "shutter time in s 0.6 instead of 0.5"),
         ({"aperture": 9.0}, "aperture 9 instead of 8"),
         ({"iso": 125}, "ISO speed 125 instead of 100"),

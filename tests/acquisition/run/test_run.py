@@ -540,9 +540,8 @@ class TestCommand:
     def test_passes_json_and_variables(self, tmp_path: Path) -> None:
         out = tmp_path / "got"
         program = (
-            "import json, os, sys; body = json.load(sys.stdin);"
-            "open(sys.argv[1], 'a').write(repr((body['message'], os.environ['CROP_EVENT'], os.environ['CROP_MESSAGE'],"
-            "os.environ['CROP_SESSION'])) + '\\n')"
+            "import json, os, sys; body = json.load(sys.stdin);open(sys.argv[1], 'a').write(repr((body['message'], "
+            "os.environ['CROP_EVENT'], os.environ['CROP_MESSAGE'],os.environ['CROP_SESSION'])) + '\\n')"
         )
         assert notices(shlex.join([sys.executable, "-c", program, str(out)]), "paused", "resumed") == []
         said = "the screen is covered – 3 °C"
@@ -552,7 +551,7 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("target", "label", "why"),
         [
-            ("false s3cret", "false …", "it ended with 1, 0 expected"),
+            ("false s3cret", "false …", "it ended with 1, expected 0"),
             ("/nowhere/notify s3cret", "/nowhere/notify …", "No such file or directory"),
             ("true s3cret", "", ""),
         ],

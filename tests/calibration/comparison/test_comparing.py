@@ -137,7 +137,7 @@ def test_names_light_of_another_colour(one: Lut, tmp_path: Path) -> None:
     gain[5] = (1.0015, 1, 0.9985)
     result = compare(one, written(tmp_path / "other", 20, gain=gain))
     assert [each.same_within_noise for each in result.answers] == [False, True, True]
-    assert answer(result, "colour of lights").said.endswith("1 illuminants exceed noise: 5")
+    assert answer(result, "colour of illuminants").said.endswith("1 illuminant beyond noise: 5")
     assert result.lights.angle_deg[5] == pytest.approx(0.07, abs=0.04)
 
 
@@ -147,7 +147,7 @@ def test_names_stained_cells(one: Lut, tmp_path: Path) -> None:
 
     result = compare(one, written(tmp_path / "other", 20, cells=stained))
     assert [each.same_within_noise for each in result.answers] == [True, True, False]
-    assert "2 patches differ under all illuminants" in answer(result, "cells").said
+    assert "2 patches with differences under all illuminants" in answer(result, "cells").said
     assert sorted(comparison_json(result)["differing_cells"]) == [200, 201]
     assert result.cells.mean[200, 2] == pytest.approx(-0.05, abs=0.01)
 
@@ -160,7 +160,7 @@ def test_detects_shadow_in_one_frame(one: Lut, tmp_path: Path) -> None:
 
     result = compare(one, written(tmp_path / "other", 20, cells=shaded))
     assert not answer(result, "cells").same_within_noise
-    assert "1 illuminants exceed 1.3 times the noise: 7" in answer(result, "cells").said
+    assert "1 illuminant beyond 1.3 times the noise: 7" in answer(result, "cells").said
 
 
 def test_detects_paler_cells(one: Lut, tmp_path: Path) -> None:

@@ -1506,7 +1506,7 @@ def test_a_bump_is_followed_and_reported(plain: Lab, tmp_path: Path, by: tuple[f
     assert worst_error(plain, tmp_path / "lut") < 0.05
     assert min(figures.shift.gauges for figures in result.figures.frames) >= 16
     if anew:
-        assert "1 frames registered again" in (tmp_path / "lut" / "report.html").read_text()
+        assert "1 frame registered again" in (tmp_path / "lut" / "report.html").read_text()
     remarks = [row.figure.name for row in result.verdict.remarks]
     assert ("reregistered_frames" in remarks) == bool(anew)
     if anew:

@@ -264,15 +264,15 @@ def expect_refusal(text: str) -> AbstractContextManager[object]:
     ("values", "minimum_agreement", "message"),
     [
         ({"agreement": 0.8}, 0.8, ""),
-        ({"agreement": 0.79}, 0.8, "correlation is 0.79, minimum 0.8"),
+        ({"agreement": 0.79}, 0.8, "correlation is 0.79, expected at least 0.8"),
         # Blocks need a correlation of 0.5, and three of four blocks are needed.
         ({"scores": [0.5] * 6 + [0.49] * 2}, 0.8, ""),
         ({"scores": [0.5] * 5 + [0.49] * 3}, 0.8, "62% of the blocks"),
         ({"residual": 0.499}, 0.8, ""),
-        ({"residual": 0.51}, 0.8, "0.51 px RMS, limit 0.5"),
+        ({"residual": 0.51}, 0.8, "0.51 px RMS, expected at most 0.5"),
         # Samples of patches of 17 px are three times as far from the edges.
         ({"residual": 1.49, "cell_px": 17.0}, 0.8, ""),
-        ({"residual": 1.51, "cell_px": 17.0}, 0.8, "limit 1.5"),
+        ({"residual": 1.51, "cell_px": 17.0}, 0.8, "at most 1.5"),
     ],
 )
 def test_refuses_registration_beyond_limits(values: dict[str, Any], minimum_agreement: float, message: str) -> None:
@@ -287,7 +287,7 @@ def test_refuses_blur_and_size_beyond_limits(cell_px: float, blur: float, messag
     with expect_refusal(message):
         registering._require_size_and_focus(cell_px, blur, "it")
     minimum = registering.MIN_CELL_PX
-    with expect_refusal(f"minimum {minimum:g} px"):
+    with expect_refusal(f"at least {minimum:g} px"):
         registering._require_size_and_focus(minimum - 0.01, 0.5, "it")
     registering._require_size_and_focus(minimum, 0.5, "it")
 

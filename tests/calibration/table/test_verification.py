@@ -147,7 +147,7 @@ def test_refuses_samples_of_wrong_size_without_check(tmp_path: Path) -> None:
         (delete("samples.npy"), "samples.npy"),
         (delete("illuminations.csv"), "illuminations"),
         (clear_has_sums, "SHA256SUMS"),
-        (append_bytes, "6130 bytes, 6128"),
+        (append_bytes, "6130 bytes, expected 6128"),
     ],
 )
 def test_refuses_changed_small_files(tmp_path: Path, change: Callable[[Path], None], fault: str) -> None:

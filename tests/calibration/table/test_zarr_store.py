@@ -185,7 +185,7 @@ def test_compares_expected_hash(lut: Lut, tmp_path: Path, capsys: pytest.Capture
     assert main(["info", str(lut.folder)]) == 0
     assert f"Table:           {lut.sha256}" in capsys.readouterr().out
     assert main(["fetch", url, str(tmp_path / "expected"), "--expect", lut.sha256]) == 0
-    assert "it is the table expected" in capsys.readouterr().out
+    assert "it is the expected LUT" in capsys.readouterr().out
     assert main(["fetch", url, str(tmp_path / "unknown")]) == 0
     printed = capsys.readouterr().out
     assert f"its hash, {lut.sha256}: compare it" in printed

@@ -220,7 +220,7 @@ def test_detects_a_disconnected_display(outputs: str) -> None:
         subprocess.run([xrandr, "--output", "DUMMY1", "--off"], check=True)
         for use in (presenter.show, presenter.verify):
             with pytest.raises(
-                DeviceError, match=r"does not fill display 2: DUMMY1.*; present displays: 1: DUMMY0|no area of 480"
+                DeviceError, match=r"does not fill display 2: DUMMY1.*present displays: 1: DUMMY0|no area of 480"
             ):
                 use(Colour(9, 9, 9))
         subprocess.run([xrandr, "--output", "DUMMY1", "--mode", "480x270", "--right-of", "DUMMY0"], check=True)
@@ -317,13 +317,10 @@ def test_refuses_a_display_in_use_by_another_process(virtual: VirtualScreen) -> 
 
 def test_process_survives_the_end_of_the_server(tmp_path: Path) -> None:
     program = (
-        "from foundation.errors import DeviceError; from drivers.display.fullscreen import FullScreen\n"
-        "from drivers.presenter import WHITE\n"
-        "screen = FullScreen(); screen.show(WHITE); print('lit', flush=True); input()\n"
-        "for _ in range(2):\n"
-        "    try: screen.show(WHITE)\n"
-        "    except DeviceError as error: print(error, flush=True)\n"
-        "screen.close()"
+        "from foundation.errors import DeviceError; from drivers.display.fullscreen import FullScreen\nfrom "
+        "drivers.presenter import WHITE\nscreen = FullScreen(); screen.show(WHITE); print('lit', flush=True); "
+        "input()\nfor _ in range(2):\n    try: screen.show(WHITE)\n    except DeviceError as error: print(error, "
+        "flush=True)\nscreen.close()"
     )
     with contextlib.ExitStack() as served:
         server = served.enter_context(virtual_screen(tmp_path, "320x200"))
@@ -523,10 +520,10 @@ def test_selects_a_display_by_each_property(
         ((DESK, BEAMER), "HDMI-2", "display 'HDMI-2' is not connected"),
         ((DESK, BEAMER), "+1920+0", "not connected"),
         ((DESK, BEAMER), 3, "display 3 is not connected"),
-        ((DESK, ABOVE), "DP-1", "display 'DP-1': 2 match; set a position"),
+        ((DESK, ABOVE), "DP-1", "display 'DP-1': 2 match, expected 1; set one of these positions"),
         ((DESK,), "right", "two displays side by side"),
         ((DESK, ABOVE), "left", "two displays side by side"),
-        ((), None, "not connected; present: none"),
+        ((), None, r"not connected \(present: none\)"),
     ],
 )
 def test_refuses_an_ambiguous_or_missing_display(

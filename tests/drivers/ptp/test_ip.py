@@ -108,7 +108,7 @@ def test_packets_do_not_depend_on_splitting(packets: list[Packet], cuts: list[in
     [
         ("08000000 00000000", "type 0"),
         ("08000000 0f000000", "type 15"),
-        ("07000000 0d000000", "PING packet of 7 bytes, 8 to 4096"),
+        ("07000000 0d000000", "PING packet of 7 bytes, expected 8 to 4096"),
         ("01100000 0d000000", "PING packet of 4097 bytes"),
         ("ffffffff 01000000", "INIT_COMMAND_REQUEST packet of 4294967295 bytes"),
         ("0b000000 0a000000", "DATA packet of 11 bytes"),

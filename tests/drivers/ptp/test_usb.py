@@ -286,7 +286,7 @@ def test_refuses_endless_empty_packets() -> None:
     [
         ((data(100, bytes(88))[:4] + bytes.fromhex("0200 1691 06000000") + bytes(88), OK), "transaction 6"),
         ((data(13, b"a"), data(13, b"a"), OK), "second data phase"),
-        ((bytes.fromhex("0c000000 0400 0120 05000000"),), "a response was expected"),
+        ((bytes.fromhex("0c000000 0400 0120 05000000"),), "expected a response"),
         ((b"garbage that is no container at all",), "container"),
     ],
 )

@@ -440,7 +440,7 @@ def test_accepts_layouts_of_real_cameras(model: str) -> None:
         ({324: longs(0xFFFFFFFF), 325: longs(9), 322: longs(2 * SIDE), 323: longs(SIDE)}, "the file has|9 bytes"),
         ({324: longs(600, 700), 325: longs(99999, 99999), 322: longs(SIDE), 323: longs(SIDE)}, "the file has|overlap"),
         ({324: longs(600, 900), 325: longs(200)}, "2 offsets and 1 sizes"),
-        ({278: longs(16)}, "1 strips or tiles, 8 expected"),
+        ({278: longs(16)}, "1 strips or tiles, expected 8"),
         ({258: shorts(0)}, "0 bits"),
         ({339: shorts(3)}, "not integers"),
         ({262: shorts(34892)}, "not from a Bayer sensor: its pixels have all colours"),

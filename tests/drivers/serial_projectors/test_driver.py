@@ -291,7 +291,7 @@ def test_epson_network_handshake() -> None:
     ("answer", "error_type", "reason"),
     [
         (WELCOME[:14] + b"\x41\x00", DeviceRefused, "0x41: a password is required"),
-        (WELCOME[:14] + b"\x7f\x00", DeviceRefused, "0x7F: check the network settings"),
+        (WELCOME[:14] + b"\x7f\x00", DeviceRefused, "0x7F: unknown reason; check the network settings"),
         (b"PJLINK 0\r", ProtocolError, "check the port"),
     ],
 )

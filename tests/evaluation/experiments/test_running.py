@@ -69,7 +69,7 @@ def test_missing_estimate_is_counted_and_grey(value: object, cause: str) -> None
     ],
 )
 def test_faulty_method_is_reported_by_name(value: object, message: str) -> None:
-    with pytest.raises(InputError, match=rf"^Stranger failed on wall 1\.png: .*{message}.*; correct it and run"):
+    with pytest.raises(InputError, match=rf"^Stranger failed on wall 1\.png: .*{message}.*; correct it, then run"):
         evaluate(walls(3), [FixedValues((1, 1, 1), value, (1, 1, 1))])
 
 

@@ -102,8 +102,8 @@ def test_refuses_ambiguous_name_without_extension(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "begins with '', expected image,r,g,b"),
-        ("name,red,green,blue\na,1,1,1", "begins with 'name,red,green,blue'"),
+        ("", "starts with '', expected image,r,g,b"),
+        ("name,red,green,blue\na,1,1,1", "starts with 'name,red,green,blue'"),
         ("image,r,g,b\na/one,1,1\n", "line 2: 3 fields, the first line has 4"),
         ("image,r,g,b\na/one,0,68,0,85,0,22\n", "line 2: 7 fields, the first line has 4"),
         ("image,r,g,b,r,g,b\na/one,1,1,1,2,2,2\n", "each once"),

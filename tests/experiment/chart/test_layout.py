@@ -142,7 +142,7 @@ def test_greys_are_stops_and_no_colours_of_the_chart() -> None:
         (2, (18.0, 500.0), 1, "A8"),
         (2, (0.0, 500.0), 1, "above 0"),
         (2, (float("nan"), 500.0), 1, "above 0"),
-        (2, "Letter", 1, "'Letter' is not known; give one of A0"),
+        (2, "Letter", 1, "the page is 'Letter', expected one of A0"),
         (5, (6000.0, 6000.0), 1, "family 36h11 has 587"),
     ],
 )

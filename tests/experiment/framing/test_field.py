@@ -200,7 +200,7 @@ def test_converts_raw_pixels_to_half_size_pixels() -> None:
         ((GOOD[0], GOOD[2], GOOD[1], GOOD[3]), "not a convex quadrilateral"),
         (("0,0", "1000,0", "500,100", "500,1000"), "not a convex quadrilateral"),
         (GOOD[::-1], "counter-clockwise"),
-        (("0,0", "1000,0", "1000,100", "0,100"), "at least 192 pixels expected"),
+        (("0,0", "1000,0", "1000,100", "0,100"), "expected at least 192 pixels"),
     ],
 )
 def test_refuses_texts_that_are_no_corners(given: Sequence[str], message: str) -> None:

@@ -72,7 +72,7 @@ def test_accepts_written_times(journal: sqlite3.Connection, zone: timezone, micr
     ],
 )
 def test_refuses_times_that_cannot_be_compared(journal: sqlite3.Connection, text: str) -> None:
-    with pytest.raises(FormatError, match="1 rows of events"):
+    with pytest.raises(FormatError, match="1 row of events"):
         require_time(journal, text)
 
 
@@ -83,7 +83,7 @@ def test_refuses_wrong_hashes(journal: sqlite3.Connection, text: str) -> None:
         " (0, 'white', 'frames/a.cr2', ?, ?, 0.5, 1, ?, 'accepted')",
         (*[time_text(datetime(2026, 1, 1, tzinfo=UTC))] * 2, text),
     )
-    with pytest.raises(FormatError, match="1 rows of attempts"):
+    with pytest.raises(FormatError, match="1 row of attempts"):
         require_sound_rows(Path("journal.sqlite"), journal)
 
 
@@ -155,7 +155,7 @@ def test_refuses_another_version(tmp_path: Path, version: int) -> None:
     with closing(sqlite3.connect(path)) as journal:
         journal.execute(f"PRAGMA user_version = {version}")
     for opened in (Journal.open, Journal.open_for_run):
-        with pytest.raises(FormatError, match=f"version {version}, this software reads version 2; use the software"):
+        with pytest.raises(FormatError, match=f"version {version}, expected 2; use the software"):
             opened(path)
 
 

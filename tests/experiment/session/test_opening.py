@@ -121,7 +121,7 @@ def test_waits_for_another_writer(path: Path, at_start: bool, monkeypatch: pytes
             if running:
                 journal.retry_locked(60, announce)
             journal.note(NOW, "written")
-    assert messages == [f"another program holds {path}; the run continues when it is free"]
+    assert messages == [f"another program is using {path}; the run resumes automatically when it is free"]
     assert event_names(path) == ["written"]
 
 
@@ -200,12 +200,10 @@ def test_reads_a_copied_journal(path: Path, tmp_path: Path, copied_suffixes: tup
 def test_reader_undoes_an_interrupted_commit_in_a_copy(path: Path) -> None:
     """The state of version 1 after a power cut: a hot rollback journal."""
     program = (
-        "import os, signal, sqlite3, sys\nconnection = sqlite3.connect(sys.argv[1], isolation_level=None)\n"
-        "connection.execute('PRAGMA cache_size = 1')\nconnection.execute('PRAGMA cache_spill = 1')\n"
-        "connection.execute('BEGIN IMMEDIATE')\n"
-        "for number in range(2000):\n"
-        "    connection.execute(\"INSERT INTO events (at, what, detail) VALUES ('x', 'lost', ?)\", ('a' * 200,))\n"
-        "os.kill(os.getpid(), signal.SIGKILL)"
+        "import os, signal, sqlite3, sys\nconnection = sqlite3.connect(sys.argv[1], "
+        "isolation_level=None)\nconnection.execute('PRAGMA cache_size = 1')\nconnection.execute('PRAGMA cache_spill = "
+        "1')\nconnection.execute('BEGIN IMMEDIATE')\nfor number in range(2000):\n    connection.execute(\"INSERT INTO "
+        "events (at, what, detail) VALUES ('x', 'lost', ?)\", ('a' * 200,))\nos.kill(os.getpid(), signal.SIGKILL)"
     )
     assert subprocess.run([sys.executable, "-c", program, str(path)], check=False).returncode == -9
     assert set(files(path)) == {"journal.sqlite", "journal.sqlite-journal"}

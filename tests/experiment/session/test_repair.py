@@ -156,7 +156,7 @@ def test_repeated_command_takes_nothing_twice(session: Session) -> None:
     [
         ("900", "illuminant 900.*0 … 4"),
         ("3-7", "no illuminant 7"),
-        ("4-2", r"4-2 is a falling range; write 2-4"),
+        ("4-2", r"4-2 is a reversed range; write 2-4"),
         ("white", "'white'"),
         ("²", "is not the number of an illuminant"),
         ("", "'' is not the number of an illuminant"),
