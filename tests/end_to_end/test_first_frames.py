@@ -110,7 +110,9 @@ def test_pauses_with_remedy_if_first_frames_never_agree(tmp_path: Path) -> None:
     flicker = [{"what": "lamp step", "percent": -10, "from_frame": n, "to_frame": n} for n in range(0, 400, 2)]
     outcome = run(tmp_path, *flicker)
     assert outcome.end != "complete"
-    remedies = [line for line in lines_of(outcome.messages, "refused") if "or when the same command is run again" in line]
+    remedies = [
+        line for line in lines_of(outcome.messages, "refused") if "or when the same command is run again" in line
+    ]
     assert remedies
     assert "one of the first frames (white, dark or a primary) may be wrong" in remedies[0]
     assert not any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in outcome.attempts)
