@@ -123,9 +123,9 @@ def main() -> None:
     pictures = batch.images.transpose(0, 2, 3, 1)
     for name in ("gray-world", "white-patch", "shades-of-gray", "gray-edge-1"):
         method = standard_methods()[name]
-        found[method.name] = np.stack([method.estimate(picture, 0.98) for picture in pictures])
+        estimates[method.name] = np.stack([method.estimate(picture, 0.98) for picture in pictures])
     print(
-        f"\n{len(tried)} crops of {len(trial)} unseen pictures under {len(held_out)} unseen illuminants, angle in "
+        f"\n{len(test_crops)} crops of {len(test)} unseen pictures under {len(held_out)} unseen illuminants, angle in "
         "degrees"
     )
     print(f"{'':24}{'mean':>8}{'median':>8}{'worst 25 %':>12}")

@@ -88,7 +88,7 @@ def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folde
     for origin, row in read_rows(path, COLUMNS):
         name = row["image"].strip()
         if not name or name in names:
-            problem = f"image {name!r} is open_folders twice, expected once" if name else "no image name, expected one"
+            problem = f"image {name!r} is listed twice, expected once" if name else "no image name, expected one"
             raise FormatError(f"{origin}: {problem}; correct the line")
         names.add(name)
         image = _find_image(folder, name, origin, indices)
@@ -231,7 +231,7 @@ def _ending(file: str) -> str:
 
 
 def _find_image(folder: Path, name: str, origin: str, indices: dict[str, _FolderIndex]) -> str | None:
-    """Return the path of a open_folders image, with or without ending in the table; None if it does not exist."""
+    """Return the path of a listed image, with or without ending in the table; None if it does not exist."""
     below, _, file = name.rpartition("/")
     if reason := _refusal_reason(file):
         raise FormatError(f"{origin}: {name} is {reason}")
@@ -293,7 +293,7 @@ def _unlisted_note(
         (beside_images if folder_path in folders else elsewhere).extend(
             file for file in files if file not in images and file not in masks
         )
-    # Masks need no row of their own; they are open_folders only if there are no other images.
+    # Masks need no row of their own; they are listed only if there are no other images.
     beside_images = [file for file in beside_images if not Path(file).stem.endswith(_MASK)] or beside_images
     # If the user gave one of several tables, it is a selection of images. Otherwise an image without a row is an error.
     is_selection = location.is_file() and len(_tables(root)) > 1

@@ -90,7 +90,7 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
         images = lines_by_method.setdefault(row["method"] or "", {})
         if row["image"] in images:
             raise FormatError(
-                f"{line_name} has {row['method']} on {row['image']} again, expected once; remove this line"
+                f"{line_name} has {row['method']} on {row['image']} twice, expected once; remove this line"
             )
         images[row["image"]] = numbers, row["guessed"] == "1", row.get("group") or ""
     if not lines_by_method:

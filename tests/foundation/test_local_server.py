@@ -144,7 +144,7 @@ def test_answers_viewers_despite_incomplete_requests() -> None:
             link.sendall(b"GET / HTTP/1.1\r\nX: "[: number % 3 * 9])
         viewer = held.enter_context(connect(server))
         assert request_on(viewer) == b"here"
-        # Whoever has request_on stays where more come who do not.
+        # Clients that have sent a request stay connected if more clients come.
         for _ in range(20):
             held.enter_context(connect(server))
         assert request_on(viewer) == b"here"
@@ -162,7 +162,7 @@ def test_ends_a_slow_request_at_its_time_limit() -> None:
 def test_keeps_a_connection_with_occasional_requests() -> None:
     with served(head_s=0.05) as server, connect(server) as link:
         assert request_on(link) == b"here"
-        # Nothing is request_on for longer than a head may take.
+        # No request is outstanding for longer than the time limit of its head.
         link.settimeout(0.2)
         with pytest.raises(TimeoutError):
             link.recv(1)

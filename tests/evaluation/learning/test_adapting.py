@@ -1,4 +1,4 @@
-"""Adaptation estimates_of all learned methods to local images."""
+"""Adaptation of all learned methods to local images."""
 
 from __future__ import annotations
 
