@@ -204,7 +204,7 @@ def draw_chromaticities(
     for axes, linear, title, coloured in (
         (panels[0], projected, "as projected", False),
         (panels[1], white, source, False),
-        (panels[2], white, f"{source}, in colour", True),
+        (panels[2], white, "the same, in colour", True),
     ):
         lit = linear.sum(axis=1) > 0
         r, _, b = (linear[lit] / linear[lit].sum(axis=1, keepdims=True)).T
