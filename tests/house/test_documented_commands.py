@@ -123,7 +123,7 @@ def test_tutorial_states_number_of_frames(tmp_path: Path) -> None:
     assert (int(counts[1]), int(counts[2])) == (len(steps), kinds["response"])
     assert (kinds["white"], kinds["dark"]) == (2, 2)
     assert f"complete, {len(steps)} frames;" in text
-    assert f"frames  {len(steps)} of {len(steps)}" in text
-    assert f"lights  {len(lights)} of {len(lights)}" in text
+    assert f"frames      {len(steps)} of {len(steps)}" in text
+    assert f"illuminants {len(lights)} of {len(lights)}" in text
     photographs = 4
     assert f"has {photographs * len(lights)} PNG files" in text
