@@ -97,6 +97,7 @@ def test_numbers_are_accepted_up_to_their_limits(
         (MINIMAL + "[camera]\nshutter_s = 0", "expected a number above 0"),
         (MINIMAL + '[sequence]\npatience_s = "for ever"', 'expected a number of seconds, or "forever"'),
         (MINIMAL + "[lab.projector]\npassword = 1234", 'password = …: expected a text, in quotation marks: "…"'),
+        (MINIMAL.replace('"c/chart.json"', "3"), 'chart = 3: expected a text, in quotation marks: "3"'),
         (MINIMAL + "[lab.camera]\nserial = 1234", 'serial = 1234: expected a text, in quotation marks: "1234"'),
         (
             MINIMAL + "[lab.light]\ndisplay = 1.5",

@@ -116,3 +116,9 @@ def test_policy_allows_only_own_script_and_style(tmp_path: Path, monkeypatch: py
 def test_refuses_other_data_than_pictures() -> None:
     with pytest.raises(ValueError, match="GIF89a"):
         pages.figure(b"GIF89a", "")
+
+
+def test_only_wide_figures_scroll() -> None:
+    svg = draw_svg(lambda figure: None, inches=(1, 1))
+    assert "<figure class='wide'>" in pages.figure(svg, "panels", wide=True)
+    assert "<figure>" in pages.figure(svg, "one panel")

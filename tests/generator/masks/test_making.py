@@ -43,6 +43,13 @@ def test_single_mask_is_of_second_light(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.rint(maps.astype(np.float64) * FULL).sum(axis=2), FULL)
 
 
+def test_limits_float_masks_to_weights(tmp_path: Path) -> None:
+    values = np.array([[-0.5, 0.25], [0.75, 1.5]], np.float32)
+    assert cv2.imwrite(str(tmp_path / "a.tif"), values, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
+    maps = find_masks(tmp_path, 2).maker(0).weights(2, 2, 2)
+    np.testing.assert_allclose(maps[..., 1], [[0, 0.25], [0.75, 1]], atol=1 / FULL)
+
+
 @pytest.mark.slow
 def test_normalises_masks_of_all_lights(tmp_path: Path) -> None:
     save_mask(tmp_path / "a_7.png", np.full((48, 64), 0.2))
