@@ -1524,7 +1524,8 @@ class CanonEos:
             if not is_new_connection:
                 raise  # the announcement may be lost; a new connection repeats it
             self._last_release = None
-            raise DeviceError(f"{error}, and its memory has none; expose again") from error
+            remedy = "switch it off and on, and expose again"
+            raise DeviceError(f"{error.without_remedy()}, and its memory has none", remedy=remedy) from error
         return release.announced
 
     def _receive_frame(self, body: EosBody, release: _Release, into: BinaryIO, start: int) -> PendingObject:

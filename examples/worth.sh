@@ -1,19 +1,4 @@
 #!/usr/bin/env bash
-<<<<<<< HEAD
-# Value of training on generated images for three real cameras: the figures of docs/transfer.md.
-#
-#   examples/worth.sh PICTURES ARCHIVES OUT [SEEDS]
-#
-# PICTURES  folder of sRGB photographs. The figures used BSDS500 (500) and imagenet-sample-images (1000); download them
-#           yourself, they are not part of this software.
-# ARCHIVES  folder with nus_canon_600d_64x64.npz, nus_canon_1ds_mk3_64x64.npz and intel_tau_5dsr_64x64.npz.
-# OUT       folder for LUTs (3.5 GB each), generated sets and results. Existing results are kept, so the script can resume.
-# SEEDS     number of seeds of learners, training images and folds; default 5.
-#
-# Environment: LEVERS selects renderings from those below (default: all). For each, naive rows use the same pictures and
-# illuminants; they take half of the time, and NAIVE=no omits them. LEARNERS lists the methods; log-chroma takes most of the
-# time. REAL=20,100,all also trains with that many real images of the tested part.
-=======
 # Measure the benefit of generated training images for three real cameras, with the settings of docs/how-to/transfer.md.
 #
 #   examples/worth.sh PICTURES ARCHIVES OUT [SEEDS]
@@ -27,7 +12,6 @@
 # Environment variables: LEVERS lists the renderings, by default all of them. NAIVE=no omits the naive rows, which take
 # half of the time. LEARNERS lists the methods; log-chroma takes most of the time. REAL=20,100,all adds rows with so many
 # real images of the other parts.
->>>>>>> r5
 set -euo pipefail
 pictures=$(realpath "$1") archives=$(realpath "$2") out=$3 seeds=${4:-5}
 here=$(realpath "$(dirname "$0")")
@@ -42,11 +26,7 @@ declare -A matrix=([600d]="Canon EOS 600D" [1ds]="Canon EOS-1Ds Mark III" [5dsr]
 declare -A relit=([600d]=1ds [1ds]=600d [5dsr]=1ds)
 learners=${LEARNERS:-regression-trees,kernel-ridge,log-chroma}
 
-<<<<<<< HEAD
-once() { # RESULT COMMAND...: run the command unless its result exists
-=======
 once() { # RESULT COMMAND...: run the command if its result does not exist
->>>>>>> r5
     [ -e "$1" ] || "${@:2}"
 }
 
@@ -64,11 +44,7 @@ for camera in 600d 1ds 5dsr; do
                 colorimetric) options=("${colorimetric[@]}") ;;
                 compensate) options=("${colorimetric[@]}" --black-point compensate) ;;
                 random) options=("${colorimetric[@]}" --black-point random) ;;
-<<<<<<< HEAD
-                *) echo "unknown lever $lever; expected codes, colorimetric, compensate or random" >&2; exit 2 ;;
-=======
                 *) echo "LEVERS contains $lever, expected codes, colorimetric, compensate or random; correct it" >&2; exit 2 ;;
->>>>>>> r5
             esac
             set=sets/$camera$test/$lever
             once "$set" generate "tables/$camera" "$set" --sources "$pictures" --max-side 160 --no-preview \

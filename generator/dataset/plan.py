@@ -89,7 +89,7 @@ class DatasetOptions:
     256
     >>> DatasetOptions(split=(0.8, 0.1, 0.2))
     Traceback (most recent call last):
-    foundation.errors.InputError: the split is 0.8,0.1,0.2, expected three shares ≥ 0 with the sum 1 as in 0.8,0.1,0.1
+    foundation.errors.InputError: the split is 0.8,0.1,0.2, expected three shares ≥ 0 with the sum 1 ...
     """
 
     form: Format = "png"

@@ -93,7 +93,7 @@ def test_append_prints_progress(session: Session, command: Command, tmp_path: Pa
     code, out, _ = command("--append", tmp_path / "session", tmp_path / "lut")
     assert code == 0
     assert f"{len(LIGHTS) - 1} of {len(LIGHTS)} illuminants" in out
-    assert command("info", tmp_path / "lut")[2].count("is not finished") == 1
+    assert command("info", tmp_path / "lut")[2].count("is not complete") == 1
 
 
 def _refuse(folder: Path, file: str) -> None:
@@ -134,8 +134,8 @@ def test_info_json_contains_entry(lut: Path, capsys: pytest.CaptureFixture[str])
         (["-v", "--check", "session"], "build-lut check"),
         (["--window", 4, "session", "lut"], "4 px"),
         (["nowhere", "lut"], "nowhere is not a session"),
-        (["info", "nowhere"], "nowhere is no LUT"),
-        (["compare", "a", "b"], "a is no LUT"),
+        (["info", "nowhere"], "nowhere is not a LUT"),
+        (["compare", "a", "b"], "a is not a LUT"),
     ],
 )
 def test_refuses_meaningless_options(

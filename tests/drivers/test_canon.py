@@ -629,8 +629,8 @@ def test_calls_end_within_their_time_limits(fault: str) -> None:
     start = lab.clock.monotonic()
     cause = {
         "busy": "answers DEVICE_BUSY",
-        "silent": "sent nothing for 20 s; no connection for",
-        "gone": "no camera on USB; no connection for",
+        "silent": "sent nothing for 20 s, no connection for",
+        "gone": "no camera on USB, no connection for",
         "never announced": "announced no frame in time, and its memory has none",
     }[fault]
     with pytest.raises(DeviceError, match=rf"^(Canon Digital Camera .* at USB port 1-1 )?{cause}"):

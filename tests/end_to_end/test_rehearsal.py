@@ -228,7 +228,7 @@ def test_faults_of_how_to_are_reported(rehearsal: Rehearsal, capsys: pytest.Capt
     rehearsal.camera.wait_for_line(r"exposure \d+ ends: .* lamp 1\.00")
     rehearsal.camera.wait_for_line(rf"exposure {_last(rehearsal.camera) + 3} half over")
     pop_up = rehearsal.start(message)
-    assert "in front of it lies “xmessage”" in session.wait_for_line("refused: .*in front of it lies")
+    assert "“xmessage”" in session.wait_for_line("refused: .* covers it")
     _end(pop_up.process)
     after_exposures(1)
     projector = PjLinkProjector(lambda: TcpLink.connect("127.0.0.1", port, 10.0), timeout=10.0)
@@ -246,7 +246,7 @@ def test_faults_of_how_to_are_reported(rehearsal: Rehearsal, capsys: pytest.Capt
         session.wait_for_line("(paused|retry|refused): .*the screen shows")
         rehearsal.run("xset -display :77 s reset")
         after_exposures(1)
-    patterns = ["in front of it lies “xmessage”", "the screen shows .* look for a window"]
+    patterns = ["“xmessage”.* covers it", "the screen shows .* look for a window"]
     cover_half_exposure(rehearsal, 1)
     if shutil.which("xcompmgr") is not None:
         rehearsal.start("DISPLAY=:77 xcompmgr")
@@ -278,7 +278,7 @@ def cover_half_exposure(rehearsal: Rehearsal, offset: int) -> None:
     Without a compositor its pixels stay on the screen; with one, they are only in the frame.
     """
     exposure = _last(rehearsal.camera) + offset
-    rehearsal.camera.wait_for_line(f"exposure {exposure} begins")
+    rehearsal.camera.wait_for_line(f"exposure {exposure} starts")
     with notification(rehearsal.replaced[":77"], (160, 20, 120, 90), 0xFF8800):
         rehearsal.camera.wait_for_line(f"exposure {exposure} half over")
     assert "not plain" in rehearsal.camera.wait_for_line(f"exposure {exposure} ends")
@@ -286,9 +286,9 @@ def cover_half_exposure(rehearsal: Rehearsal, offset: int) -> None:
 
 def _last(camera: Running) -> int:
     """Return the number of the exposure that started last."""
-    return int(re.findall(r"exposure (\d+) begins", camera.text)[-1])
+    return int(re.findall(r"exposure (\d+) starts", camera.text)[-1])
 
 
 def test_how_to_shows_output_of_programs() -> None:
-    assert "in front of it lies “xmessage”" in HOW_TO
+    assert "“xmessage”, 181×77 px at +230+160 covers it" in " ".join(HOW_TO.split())
     assert re.search(r"exposure \d+ ends: not plain picture, mean light [\d. ]+, lamp 1\.00", HOW_TO)

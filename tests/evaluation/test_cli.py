@@ -27,7 +27,7 @@ def test_reads_dataset_from_object_store(dataset: Path, capsys: pytest.CaptureFi
     assert title == "set: reproduction angular error of 16 images, degrees"
     assert same == table
     assert main(["memory://evaluated/nothing"]) == 2
-    assert "memory://evaluated/nothing is no dataset" in capsys.readouterr().err
+    assert "memory://evaluated/nothing is not a data set" in capsys.readouterr().err
 
 
 def test_counts_images_without_usable_pixel(

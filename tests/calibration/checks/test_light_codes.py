@@ -226,6 +226,6 @@ def test_refuses_two_illuminants_from_one_file(lab: Lab, tmp_path: Path) -> None
 
     with (
         take(lab, tmp_path / "session", LIGHTS[:3], frame=frame) as session,
-        pytest.raises(FormatError, match="lights 1 and 2"),
+        pytest.raises(FormatError, match="illuminants 1 and 2"),
     ):
         build(session, tmp_path / "lut")

@@ -250,5 +250,5 @@ def test_verifies_frames_of_table(session: Session, session_under_way: Session, 
     assert f"{first} cannot be read" in gone
     assert f"{second} has changed" in changed
     os.truncate(tmp_path / "lut" / "samples.npy", 1000)
-    with pytest.raises(FormatError, match=r"1000 bytes, 67328"):
+    with pytest.raises(FormatError, match=r"1000 bytes, expected 67328"):
         open_lut(tmp_path / "lut")

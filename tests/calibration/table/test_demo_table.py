@@ -47,7 +47,7 @@ def small(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
 def test_makes_lut_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = table_folder(Path("demo:"))
     assert first.is_relative_to(folder)
-    assert "computed table" in capsys.readouterr().out
+    assert "computed LUT" in capsys.readouterr().out
     time_ns = (first / "lut.json").stat().st_mtime_ns
     assert table_folder(Path("demo:")) == first
     assert (first / "lut.json").stat().st_mtime_ns == time_ns

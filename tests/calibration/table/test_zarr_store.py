@@ -181,9 +181,9 @@ def test_refuses_edited_ground_truth(lut: Lut, tmp_path: Path) -> None:
 def test_compares_expected_hash(lut: Lut, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     url = str(tmp_path / "published")
     assert main(["publish", str(lut.folder), url]) == 0
-    assert f"{LIGHTS} lights" in capsys.readouterr().out
+    assert f"{LIGHTS} illuminants" in capsys.readouterr().out
     assert main(["info", str(lut.folder)]) == 0
-    assert f"Table:           {lut.sha256}" in capsys.readouterr().out
+    assert f"LUT:             {lut.sha256}" in capsys.readouterr().out
     assert main(["fetch", url, str(tmp_path / "expected"), "--expect", lut.sha256]) == 0
     assert "it is the expected LUT" in capsys.readouterr().out
     assert main(["fetch", url, str(tmp_path / "unknown")]) == 0
@@ -211,11 +211,11 @@ CLAIMS: list[tuple[Change, str]] = [
     (lambda data: data["codecs"][0]["configuration"]["codecs"].append({"name": "numcodecs.bz2"}), "array of shape"),
     (lambda data: data["codecs"][0]["configuration"].update(chunk_shape=[LIGHTS, 64, 25, 3]), "array of shape"),
     (lambda data: data["attributes"].update(files=[1]), "has no files attribute"),
-    (lambda data: data["attributes"]["files"].update({"../x": "y"}), "no file of a LUT"),
+    (lambda data: data["attributes"]["files"].update({"../x": "y"}), "not a file of a LUT"),
     (lambda data: data["attributes"]["files"].pop("lut.json"), "lacks lut.json"),
     (lambda data: data["attributes"]["files"].pop("SHA256SUMS"), "lacks SHA256SUMS"),
     (lambda data: data["attributes"].update(head="AAAA"), "the header of the samples"),
-    (lambda data: data["attributes"].update(whole="no"), "holds no complete LUT"),
+    (lambda data: data["attributes"].update(whole="no"), "is not a complete LUT"),
     (lambda data: data["attributes"].update(version=[2]), r"has version \[2\]"),
 ]
 
@@ -249,7 +249,7 @@ def test_refuses_irregular_files_in_store(lut: Lut, tmp_path: Path, kind: str) -
         os.mkfifo(shard)
     else:
         shard.symlink_to(lut.folder / "samples.npy")
-    with pytest.raises(FormatError, match=f"{kind}, a regular file"):
+    with pytest.raises(FormatError, match=f"{kind}, expected a regular file"):
         fetch(str(tmp_path / "published"), tmp_path / "back")
 
 

@@ -144,7 +144,7 @@ def test_detects_a_changed_corner(screen: FullScreen, virtual: VirtualScreen) ->
     with messaging(virtual, "speck", "+639+359"):
         message = covered(screen, colour)
     assert "in 1 of 230400 pixels" in message
-    assert "within 1×1 px at +639+359; in front of it lies “speck” (Xmessage), " in message
+    assert "within 1×1 px at +639+359; “speck” (Xmessage), " in message
 
 
 def test_detects_another_colour_without_a_covering_window(screen: FullScreen) -> None:

@@ -121,12 +121,12 @@ def test_keeps_results_if_output_is_closed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("chromaticities", "nowhere"), "nowhere is no LUT"),
+        (("chromaticities", "nowhere"), "nowhere is not a LUT"),
         *(
             (("table1", "nowhere", "--pictures", ".", "--lights-like", "x.csv", option, given), message)
             for option, given, message in (
                 ("--sizes", "12,big", "side 'big' of an image"),
-                ("--sizes", "1,65535", "nowhere is no LUT"),
+                ("--sizes", "1,65535", "nowhere is not a LUT"),
             )
         ),
         (("bits", "nowhere.npz", "--out", "taken"), "taken already exists"),

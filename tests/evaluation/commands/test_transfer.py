@@ -103,7 +103,7 @@ def test_all_ignores_case(work_folder: Path, capsys: pytest.CaptureFixture[str])
     [
         (("--method", "magic"), "'magic'"),
         (("--method", "kernel-rdge"), "kernel-rdge"),
-        (("--method", "own.py:Map, ./own.py:Map"), "named twice"),
+        (("--method", "own.py:Map, ./own.py:Map"), "given twice"),
         (("made/../made",), "two training sets have the name made"),
         (("real.npz",), "real.npz is both training and test"),
         (("--naive", "lut"), "holds no picture"),

@@ -130,7 +130,7 @@ def test_greys_are_stops_and_no_colours_of_the_chart() -> None:
 @pytest.mark.parametrize(
     ("bits", "page", "seed", "message"),
     [
-        (0, None, 1, "1 to 5 bits"),
+        (0, None, 1, "expected 1 to 5"),
         (5, None, -1, "seed is -1"),
         (
             5,

@@ -141,7 +141,7 @@ def test_names_covered_tags(chart: Chart, white: Mosaic) -> None:
         x, y = tag.centre_px.astype(int)
         values[y - 20 : y + 20, x - 20 : x + 20] = 500
     hidden = ", ".join(str(tag.id) for tag in framing.tags[:2])
-    with pytest.raises(RegistrationError, match=rf"2 of 4.*{hidden}; uncover"):
+    with pytest.raises(RegistrationError, match=rf"2 of 4.*{hidden}\); uncover"):
         find_chart(Plane("G", values, plane.offset_px), chart)
 
 

@@ -590,7 +590,7 @@ def test_failed_rendering_is_reported_in_its_panel(tab: Tab, page: Explorer, mon
         network = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
         tab.call("Network.emulateNetworkConditions", offline=True, **network)
         tab.value("pick(2)")
-        tab.wait_for("document.getElementById('fault').textContent.includes('still runs')")
+        tab.wait_for("document.getElementById('fault').textContent.includes('is running')")
         tab.call("Network.emulateNetworkConditions", offline=False, **network)
         tab.open("about:blank")
         server.shutdown()

@@ -229,7 +229,7 @@ def test_events_have_the_documented_defaults() -> None:
         ({"what": "earthquake"}, "unknown event, expected one of frozen screen, pop-up, half-changed"),
         ({"from_frame": 3}, "has no event name; add what, one of frozen screen"),
         ({"what": "bump", "px": "far"}, "simulated.events[0].px = 'far': expected a number"),
-        ({"what": "bump", "px": 1, "from_frame": 1.5}, "simulated.events[0].from_frame = 1.5: a whole number"),
+        ({"what": "bump", "px": 1, "from_frame": 1.5}, "simulated.events[0].from_frame = 1.5: expected a whole number"),
         ("bump", "simulated.events[0] = 'bump'"),
         ({"what": "bump", "size": 3}, "simulated.events[0].size"),
         ({"what": "pop-up", "colour": [1, 2]}, "simulated.events[0].colour"),
