@@ -246,7 +246,7 @@ def test_faults_of_how_to_are_reported(rehearsal: Rehearsal, capsys: pytest.Capt
         session.wait_for_line("(paused|retry|refused): .*the screen shows")
         rehearsal.run("xset -display :77 s reset")
         after_exposures(1)
-    patterns = ["“xmessage”.* covers it", "the screen shows .* look for a window"]
+    patterns = ["“xmessage”.* covers it", "the screen shows .*check for a window"]
     cover_half_exposure(rehearsal, 1)
     if shutil.which("xcompmgr") is not None:
         rehearsal.start("DISPLAY=:77 xcompmgr")
