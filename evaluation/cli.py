@@ -1,4 +1,4 @@
-"""The command `evaluate`: methods on data sets, and the experiments of the paper."""
+"""The command `evaluate`: evaluate methods on data sets, and repeat the experiments of the paper."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 app = new_app(
-    f"""Evaluate methods of illuminant estimation.
+    f"""Evaluate methods of illumination estimation.
 
 `evaluate DATA` is short for `evaluate run DATA`.
 

@@ -47,7 +47,7 @@ EXIT_CODES = (
     "5 the disk is full or read-only; 130 interrupted."
 )
 
-# Printed instead of the errors that it causes: all relative paths depend on that folder.
+# Message if the current folder was deleted. It replaces other errors, because all relative paths need this folder.
 _NO_FOLDER = f"the current folder does not exist any more; change to an existing one (cd), {RUN_AGAIN}"
 _WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
@@ -79,7 +79,7 @@ def run(command: Callable[[], object], *, is_resumable: bool = True, pause_gc: b
         # Errors of the last output are handled here; otherwise they would occur at the end of the interpreter.
         sys.stdout.flush()
     except OSError as error:
-        print_error(f"cannot print: {error.strerror}; redirect the output, {RUN_AGAIN}")
+        print_error(f"cannot print: {error.strerror}; redirect the output to another file and run again")
         _discard_output(sys.stdout.fileno())
         return code or StorageError.exit_code
     return code
@@ -106,7 +106,10 @@ _OUTPUTS = {1: "standard output", 2: "standard error"}
 
 
 class _Output(FileIO):
-    """Output that discards everything after its reader has ended (head, a closed pager); other errors have its name."""
+    """Output stream that discards all text after its reader has ended (head, a closed pager).
+
+    Other errors of writing get the name of the stream.
+    """
 
     def write(self, data: ReadableBuffer) -> int:
         """Write bytes; return their number."""
@@ -226,7 +229,10 @@ class EndRequest:
 
     @contextmanager
     def postponed(self, message: str) -> Generator[None]:
-        """Postpone the first request in a block, which checks `is_requested` and ends early; print `message` then."""
+        """Postpone the first request in a block, and print `message` when it comes.
+
+        The block must check `is_requested` and end early.
+        """
         outer, self._message = self._message, message
         try:
             yield
@@ -235,7 +241,7 @@ class EndRequest:
 
     @contextmanager
     def at_once(self) -> Generator[None]:
-        """End this part of a `postponed` block at the first request; it has nothing to complete."""
+        """End a part of a `postponed` block at the first request, because this part has nothing to complete."""
         outer, self._message = self._message, ""
         try:
             if self.is_requested:
@@ -420,7 +426,7 @@ def _apply_style(command: Any) -> None:
 
 
 def _type_name(parameter: Any) -> str:
-    # The attributes depend on the version of typer. The name of a choice is empty.
+    # The attributes depend on the version of typer. The result for a choice of words is an empty text.
     descriptor = getattr(parameter, "type_descriptor", None)
     if descriptor is None:
         name = str(parameter.type.name)
@@ -452,7 +458,7 @@ class StyledCommand(_Styled, TyperCommand):
         try:
             return super().make_context(*arguments, **keywords)
         except typer.BadParameter as error:
-            # Prefix of pydantic.
+            # Remove the prefix that pydantic adds.
             error.message = error.message.removeprefix("Value error, ")
             raise
 
@@ -523,7 +529,7 @@ class MainCommand(StyledCommand):
         super().__init__(*arguments, **keywords)
         lines = [f"{self.name} {name}: {command.help.partition('.')[0]}." for name, command in self.commands.items()]
         first = next(iter(self.commands))
-        heading = f"Subcommands in place of the first argument, each with --help; write ./{first} for such a folder:"
+        heading = f"Subcommands, each with --help; for a folder with the name of a subcommand, write ./{first}:"
         self.help = "\n\n".join((self.help or "", heading, *lines))
 
     @cached_property
@@ -612,7 +618,7 @@ def option(metavar: str | None, text: str, *names: str, panel: str | None = None
 
 
 def with_option_groups(function: Callable[..., None]) -> Callable[..., None]:
-    """Replace each parameter of a command that is a group of options by these options.
+    """Replace each parameter of a command that is a group of options by the options of the group.
 
     A group is a frozen dataclass. Its fields are ``Annotated`` with ``Option`` or ``Argument`` of typer and have
     defaults; their names are unique within the command.

@@ -1,4 +1,4 @@
-"""Parse numbers, and options of the form ``name=number,name=number`` such as those of masks and distributions."""
+"""Parse numbers, and options of the form ``name=number,name=number``, for example for masks and distributions."""
 
 from __future__ import annotations
 
@@ -27,9 +27,8 @@ def parse_numbers(text: str, allowed: Mapping[str, Range], subject: str) -> dict
         match = re.fullmatch(r"\s*(\w+)\s*=\s*(\S+)\s*", entry)
         name = match[1].lower() if match else ""
         if not match or name not in allowed:
-            raise InputError(
-                f"{entry.strip()!r} is not an option of {subject}, expected {', '.join(allowed) or 'none'}; correct it"
-            )
+            expected = f"NAME=NUMBER with the name {' or '.join(allowed)}" if allowed else "no option"
+            raise InputError(f"{entry.strip()!r} is not an option of {subject}, expected {expected}; correct it")
         if name in numbers:
             raise InputError(f"{name} is given twice for {subject}, expected once; remove one")
         low, high = allowed[name]

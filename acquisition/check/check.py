@@ -63,8 +63,8 @@ from experiment.session.folder import Session
 from foundation.errors import RegistrationError, StorageError, counted
 from foundation.files import write_atomic
 
-# White level at the shutter time of the settings, as a share of saturation, at which trial frames are taken with it.
-# Outside, they are taken at the best tried time.
+# Range of the level of white, as a share of saturation, in which trial frames are taken with the shutter time of the
+# settings. Outside this range, they are taken with the best tried shutter time.
 USABLE = (0.3, 0.9)
 
 _Array = npt.NDArray[np.float64]
@@ -74,9 +74,10 @@ _Array = npt.NDArray[np.float64]
 class TriedExposures:
     """White frames at the tried shutter times.
 
-    - `first`: white at the shutter time of the settings.
-    - `trials`: tried shutter times, the setting first.
+    - `first`: white frame at the shutter time of the settings.
+    - `trials`: tried shutter times; the first is the setting.
     - `times_s`: shutter times that can be set, s.
+    - `saturation`: measured saturation level.
     """
 
     first: Shot
@@ -88,8 +89,8 @@ class TriedExposures:
     def used_s(self) -> float:
         """Shutter time of the trial frames, s."""
         first = self.trials[0]
-        usable = USABLE[0] <= first.highest <= USABLE[1] and not first.clipped
-        return first.shutter_s if usable else best_trial(self.trials).shutter_s
+        is_usable = USABLE[0] <= first.highest <= USABLE[1] and not first.clipped
+        return first.shutter_s if is_usable else best_trial(self.trials).shutter_s
 
 
 def check_lab(
@@ -115,7 +116,7 @@ def check_lab(
     with tempfile.TemporaryDirectory(prefix=".check.", dir=lab_folder) as name:
         scratch = Path(name)
         with open_rig(settings, chart) as devices:
-            described, screen = _make_devices_ready(devices, settings, announce)
+            device_lines, screen = _make_devices_ready(devices, settings, announce)
             camera = Photographer(devices, settings, scratch)
             exposure = _try_exposures(camera, settings, chart, devices.camera.shutter_speeds(), announce)
             announce("taking trial frames: white, dark, primaries, grey")
@@ -135,10 +136,11 @@ def check_lab(
         announce("measuring the trial frames")
         with session:
             trial = measure_trial(session, exposure.saturation, corners, series)
-    lines += described
+    lines += device_lines
     if exposure.used_s != exposure.first.shutter_s:
         lines.append(
-            f"frames      exposed {exposure.used_s:.4g} s, because white is clipped or dark at the time of the settings"
+            f"frames      exposed for {exposure.used_s:.4g} s, because white is clipped or dark at the shutter time of "
+            "the settings"
         )
     findings = [
         *_exposure_findings(exposure, settings),
@@ -152,9 +154,9 @@ def check_lab(
         *supplies,
     ]
     values = {row.figure.name: row.value for row in trial.verdict.rows}
-    first_s = exposure.used_s if exposure.used_s != exposure.first.shutter_s else None
-    outcome = None if trial.table is None or first_s is not None else trial.verdict.outcome
-    report = CheckReport(tuple(lines), tuple(findings), outcome, values, trial.not_known, first_s)
+    other_shutter_s = exposure.used_s if exposure.used_s != exposure.first.shutter_s else None
+    outcome = None if trial.table is None or other_shutter_s is not None else trial.verdict.outcome
+    report = CheckReport(tuple(lines), tuple(findings), outcome, values, trial.not_known, other_shutter_s)
     if picture is not None:
         write_atomic(picture, check_png(trial, chart, report))
     return report
@@ -182,7 +184,7 @@ def _try_exposures(
         return TriedExposures(first, (measure_level(first, saturation, _paper(first, chart)),), (), saturation)
     # The camera accepted the time of the settings even if it is not in its list.
     times = fitting_times(sorted({*offered_s, settings.camera.shutter_s}) if offered_s else (), period_s(settings))
-    announce("measuring the saturation level with longer and longer frames of white")
+    announce("measuring the saturation level with white frames of increasing shutter time")
     saturation = measure_saturation(first, lambda seconds: camera.take(WHITE, seconds), times)
 
     def level(shot: Shot) -> TriedTime:
@@ -234,7 +236,7 @@ def _figure_findings(trial: Trial, settings: LabSettings) -> list[Finding]:
     fault = Finding(
         LEAK_SHARE.name,
         "fault",
-        f"the dark frame has {value:.1f} % of white (mean, or the brightest 6 % of the frame)",
+        f"the dark frame has {value:.1f} % of the level of white (mean, or brightest 6 % of the frame)",
         value / 100,
         LEAK_SHARE.unit,
         tolerable=(None, allowed / 100),
@@ -266,15 +268,15 @@ def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
     turned = f", in addition to a harmless turn by {90 * quarters}°" if quarters else ""
     across, down = keystone(project(framing.homography, [(0, 0), (width, 0), (width, height), (0, height)]))
     tilt = f"the chart is turned by {tilt_deg:+.1f}° in the image{turned}"
-    lost = falloff(table.frames[0].paper.field.at(chart.centres_mm))
+    falloff_rgb = falloff(table.frames[0].paper.field.at(chart.centres_mm))
     return [
         judge_value(TURN, abs(tilt_deg), tilt, details={"turned": quarters}),
         judge_value(KEYSTONE, max(across, down), details={"across": across, "down": down}),
         judge_value(
             EVENNESS,
-            float(lost.max()),
-            f"the darkest position of the chart has {100 * lost.max():.0f} % less light than the brightest",
-            details={"falloff": lost.tolist()},
+            float(falloff_rgb.max()),
+            f"the darkest position on the chart has {100 * falloff_rgb.max():.0f} % less light than the brightest",
+            details={"falloff": falloff_rgb.tolist()},
         ),
     ]
 
@@ -298,10 +300,10 @@ def _make_devices_ready(
         lines.append("projector   not controlled: switch its lamp on and off by hand")
         return lines, findings
     state, _ = projector_state(projector)
-    patience = RetryPolicy(
+    retry_policy = RetryPolicy(
         devices.clock, 0, lambda event, sentence: announce(f"{event}: {sentence}"), lambda: keep_awake(devices.camera)
     )
-    make_ready(projector, settings.sequence, patience)
+    make_ready(projector, settings.sequence, retry_policy)
     lines.append(f"projector   {state}; it stays on after the check")
     worn_parts = ", ".join(fault.part for fault in projector.faults() if fault.severity is Severity.WARNING)
     if worn_parts:

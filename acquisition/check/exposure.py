@@ -157,7 +157,7 @@ def fitting_times(offered_s: Sequence[float], period_s: float | None) -> list[fl
 
 
 def measure_saturation(first: Shot, take: Callable[[float], Shot], times_s: Sequence[float]) -> Saturation:
-    """Measure the saturation level with longer and longer frames of white.
+    """Measure the saturation level with white frames of increasing shutter time.
 
     `take`: takes a frame of white at a shutter time, s.
     """

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from drivers.display.x11 import XScreen, is_dark, is_lost, outlive
+from drivers.display.x11 import XScreen, is_dark, is_lost, survive_server_end
 from drivers.presenter import BLACK, Colour
 from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import RUN_AGAIN, ConfigurationError, DeviceError
@@ -125,7 +125,7 @@ def running_glfw() -> Generator[ModuleType]:
                 "there, and on Linux set DISPLAY, and XAUTHORITY in a shell outside the desktop"
             ) from error
         if sys.platform == "linux":
-            outlive(glfw.get_x11_display())
+            survive_server_end(glfw.get_x11_display())
     _user_count += 1
     try:
         yield glfw

@@ -1,9 +1,9 @@
-"""Screen content of an X server and covering windows; suspends the screen saver, and detects the end of the server.
+"""Read the screen of an X server, detect covering windows and the end of the server, and suspend the screen saver.
 
-The connection is separate, so that the screen is read as the server shows it. It uses libxcb, which returns errors;
-Xlib, required for the window, ends the process if the server ends, which `outlive` prevents. Windows may disappear at
-any time, so a missing reply is treated as a missing window. Window managers put frames around windows; therefore names
-are searched in descendants.
+The screen is read over a connection of its own, not over the connection of our window, so that it is read as the server
+shows it. This connection uses libxcb, which returns errors. Our window requires Xlib, which ends the process if the
+server ends; `survive_server_end` prevents this. Windows may disappear at any time, so a missing reply is treated as a
+missing window. Window managers put frames around windows; therefore names are searched in descendants.
 
 Sources: X Window System Protocol, GetImage, QueryExtension, QueryTree, GetWindowAttributes, GetGeometry and
 GetProperty; MIT-SCREEN-SAVER extension 1.1, Suspend; DPMS extension 1.2; Xlib, XSetIOErrorHandler(3) and
@@ -40,7 +40,7 @@ _ALL_PLANES = 0xFFFFFFFF  # Plane mask of GetImage: every bit of a pixel
 _DPMS_ON = 0  # Power level of an active display (DPMS extension 1.2, DPMSInfo; 1 standby, 2 suspend, 3 off)
 
 
-_lost: set[int] = set()
+_lost_displays: set[int] = set()  # Addresses of Xlib connections whose server has ended
 
 
 @ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
@@ -51,10 +51,10 @@ def _ignore_loss(display: int | None) -> int:
 
 @ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 def _record_loss(display: int | None, data: int | None) -> None:
-    _lost.add(display or 0)
+    _lost_displays.add(display or 0)
 
 
-def outlive(display: int) -> None:
+def survive_server_end(display: int) -> None:
     """Keep the process alive if the server of an Xlib connection ends; not possible with old libraries."""
     with contextlib.suppress(OSError, AttributeError):
         xlib = ctypes.CDLL("libX11.so.6")
@@ -64,16 +64,16 @@ def outlive(display: int) -> None:
         set_exit_handler(display, ctypes.cast(_record_loss, ctypes.c_void_p), None)
         xlib.XSetIOErrorHandler(_ignore_loss)
         # A new connection may have the address of a lost one.
-        _lost.discard(display)
+        _lost_displays.discard(display)
 
 
 def is_lost(display: int) -> bool:
-    """Return whether the server of an Xlib connection has ended, after `outlive`."""
-    return display in _lost
+    """Return whether the server of an Xlib connection has ended, if `survive_server_end` was called."""
+    return display in _lost_displays
 
 
 def is_dark(display: int) -> bool:
-    """Return whether power saving keeps the displays of an Xlib connection dark; False if it is unknown."""
+    """Return whether power saving keeps the displays of an Xlib connection dark; False if this cannot be determined."""
     with contextlib.suppress(OSError, AttributeError):
         extension = ctypes.CDLL("libXext.so.6")
         event_base, error_base = ctypes.c_int(), ctypes.c_int()
@@ -248,11 +248,11 @@ class XScreen:
         """Return whether the root window has a property that is not empty."""
         return self._property(self._root, name) != b""
 
-    def cover(self, x: int, y: int, own: int) -> Cover | None:
-        """Return the topmost visible window at a position; None if it is `own`, or if there is none."""
+    def cover(self, x: int, y: int, own_window: int) -> Cover | None:
+        """Return the topmost visible window at a position; None if it is `own_window`, or if there is none."""
         if self._connection is None:
             return None
-        own_top = self._top_window(own)
+        own_top = self._top_window(own_window)
         for window in reversed(self._query_tree(self._root)[1]):
             if window == own_top:
                 return None

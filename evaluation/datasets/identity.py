@@ -27,8 +27,9 @@ from generator.dataset.reader import Dataset
 def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:
     """Return two hashes of each scene, (N, 2) uint64, each the first 64 bits of a SHA-256.
 
-    The first is of the image: its name and ground truth, or the source picture of a generated image. The second is of
-    the name; it links a generated image with the photograph that is its source.
+    The first hash identifies the image: by its name and ground truth, or by its source picture if it was generated. The
+    second is of the name; `find_training_images` uses it to link a generated image with the photograph it was made
+    from.
     """
     cache: dict[int, Mapping[str, str]] = {}
     rows: list[tuple[int, int]] = []
@@ -44,23 +45,26 @@ def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:
     return np.array(rows, dtype=np.uint64).reshape(-1, 2)
 
 
-def find_training_images(scenes: Sequence[Scene], trained: npt.NDArray[np.uint64]) -> tuple[str, ...]:
-    """Return the names of the scenes that occur in `trained`, the `identities` (N, 2) uint64 of other scenes."""
-    images = {int(number) for number in trained[:, 0]}
-    names = {int(number) for number in trained[:, 1]}
-    names_found: list[str] = []
+def find_training_images(scenes: Sequence[Scene], training_identities: npt.NDArray[np.uint64]) -> tuple[str, ...]:
+    """Return the names of the scenes that occur in `training_identities`, the `identities` of other scenes."""
+    images = {int(number) for number in training_identities[:, 0]}
+    names = {int(number) for number in training_identities[:, 1]}
+    recognised_names: list[str] = []
     for scene, (image_number, _) in zip(scenes, identities(scenes).tolist(), strict=True):
         if isinstance(scene, GeneratedScene):
             counterpart = _hash("real", _stem(scene.entry.source))
         else:
             counterpart = _hash("generated", _stem(scene.name))
         if image_number in images or counterpart in names:
-            names_found.append(scene.name)
-    return tuple(names_found)
+            recognised_names.append(scene.name)
+    return tuple(recognised_names)
 
 
 def source_digests(dataset: Dataset, cache: dict[int, Mapping[str, str]]) -> Mapping[str, str]:
-    """Return the SHA-256 of each source picture by name, or its seed if it was drawn; `cache` is a cache."""
+    """Return the SHA-256 of each source picture by name, or its name and seed if it is random.
+
+    `cache`: results of earlier calls by the id of the data set; it is filled here.
+    """
     if id(dataset) not in cache:
         seed = dataset.description.seed
         cache[id(dataset)] = {item.name: item.sha256 or f"{item.name} of seed {seed}" for item in dataset.sources}

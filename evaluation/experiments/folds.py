@@ -97,7 +97,7 @@ def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.
     if groups is None:
         names = [scene.name for scene in scenes]
         copy_names = tuple(names[first] for first in first_copies(scenes))
-        # Without copies, images are numbered: names would be drawn in another order than numbers.
+        # Without copies, `draw_folds` draws from the indices of the images; from their names it would draw other folds.
         groups = copy_names if len(set(copy_names)) < len(copy_names) else None
     return draw_folds(len(scenes), folds, seed, groups)
 
@@ -107,9 +107,9 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
 
     Folds may be any words or numbers; they are numbered in sorted order. Missing and unknown images are refused.
     """
-    columns, rows = read_csv(path, "expected CSV, image,fold a line", "folds from")
+    columns, rows = read_csv(path, "use a CSV file with the columns image,fold", "folds from")
     if not {"image", "fold"} <= set(columns):
-        column_text = ",".join(columns) or "of an empty file"
+        column_text = ",".join(columns) or "none"
         raise FormatError(f"{path} has the columns {column_text}, expected image,fold; correct its first line")
     fold_texts = {row["image"]: row["fold"].strip() for row in rows}
     repeated = [image for image, count in Counter(row["image"] for row in rows).items() if count > 1]

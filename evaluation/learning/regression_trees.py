@@ -2,8 +2,9 @@
 
 D. Cheng, B. Price, S. Cohen, M. S. Brown, "Effective learning-based illuminant estimation using simple features", CVPR
 2015. Features are the chromaticities (r, g) of the mean colour, the brightest colour, the dominant colour (mode of an
-RGB histogram) and the mode of the colour palette. Each feature has an ensemble of trees; each tree has higher weights
-for one window of the training illuminants sorted by r. Estimates on which features agree are used (section 3).
+RGB histogram) and the mode of the colour palette. Each feature has an ensemble of trees. Training images are sorted
+by the r of their illuminant; in the training of each tree, one window of them has a higher weight. Estimates on which
+features agree are used (section 3).
 
 Constants are from OpenCV (`xphoto::LearningBasedWB` and its training script): 64³ bins, a palette of 300 colours, the
 kernel max(0, 1 − d² / 0.1²), trees of depth 4, 20 windows of 2⌈N / 21⌉ images with weight 20, and agreement within
@@ -42,7 +43,7 @@ class RegressionTrees(FeatureLearner):
     - `bandwidth`: radius of the kernel for the mode of the palette, in chromaticity.
     - `windows`: windows of the sorted training illuminants, each with its own trees.
     - `depth`: depth of each tree.
-    - `agreement`: largest distance in chromaticity of features that agree.
+    - `agreement`: largest distance between the estimates of features that agree, in chromaticity.
     """
 
     key: ClassVar[str] = "regression-trees"

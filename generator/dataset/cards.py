@@ -255,7 +255,7 @@ def _front_matter(description: Description) -> str:
 def _configs(description: Description) -> str:
     layout = LAYOUTS[option(description, "layout")]
     # With single files, the Hub reads the rows of the table of ground truths.
-    if not layout.is_of_the_hub:
+    if not layout.hub_reads_images:
         files = "  - split: train\n    path: ground_truth.csv\n"
     else:
         files = "".join(
@@ -269,7 +269,7 @@ def _configs(description: Description) -> str:
 def _reading(description: Description) -> str:
     layout = LAYOUTS[option(description, "layout")]
     if isinstance(layout, JoinedLayout):
-        return layout.reading
+        return layout.reading_help
     names = layout.patterns(description.parts, suffix_of(option(description, "format")))
     files = " and ".join(f"`{name.replace('*', 'NNNNNN')}`" for name in names)
     return (

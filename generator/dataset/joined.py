@@ -74,7 +74,7 @@ class JoinedWriter:
         self._open: dict[str, tuple[_Container, HashingWriter]] = {}
 
     def store(self, sample: Sample) -> Sample:
-        """Return the sample with computed bytes; `append` writes them, because the file is sequential."""
+        """Return the sample with its bytes in memory; `append` writes them, because the file is sequential."""
         return replace(sample, files=tuple((role, ending, (join_pieces(data),)) for role, ending, data in sample.files))
 
     def append(self, sample: Sample) -> None:
@@ -165,10 +165,11 @@ _GROUP_BYTES: Final = 4 << 20
 
 _GROUP_ROWS: Final = 64  # Largest number of rows in a group, for the same reason if images are small
 
-# Limits for reading foreign files, to bound the memory. Longest text in the metadata in bytes; ours have some kB.
+# The next three limits bound the memory for reading foreign files.
+# Longest text in the metadata, bytes; our files have some kB.
 _MOST_TEXT_BYTES: Final = 64 << 20
 
-_MOST_LIST_ITEMS: Final = 1 << 20  # Longest list in the metadata; ours have some hundred columns and groups
+_MOST_LIST_ITEMS: Final = 1 << 20  # Longest list in the metadata; our files have some hundred columns and groups
 
 _MOST_ROWS: Final = 1 << 16  # Largest number of rows in a group; a thousand times `_GROUP_ROWS`
 
@@ -262,12 +263,12 @@ class _Parquet:
 
 
 def _cell_of(file: str) -> tuple[str, int | None]:
-    # The column of a file that is named as in a tar file, and its index if the column has a list.
+    # Returns the column of a file with a name as in a tar file, and the index in its list if the column has lists.
     infix = file.split(".")[1:-1]
     if not infix:
         return "image", None
-    name, several, index = infix[0].partition("masks_")
-    return ("masks", int(index)) if several else (name, None)
+    name, mask_prefix, index = infix[0].partition("masks_")
+    return ("masks", int(index)) if mask_prefix else (name, None)
 
 
 def _read_parquet(stream: BinaryIO, file: str) -> bytes | None:
@@ -283,14 +284,17 @@ def _read_parquet(stream: BinaryIO, file: str) -> bytes | None:
         # Our files are not compressed, so a group that declares more bytes than the file is damaged or foreign.
         row_group = table.metadata.row_group(group)
         if not (0 <= row_group.num_rows <= _MOST_ROWS and 0 <= row_group.total_byte_size <= 2 * size + 65536):
-            raise ValueError(f"a group declares {row_group.num_rows} rows of {row_group.total_byte_size} bytes")
+            raise ValueError(
+                f"a group declares {row_group.num_rows} rows of {row_group.total_byte_size} bytes, expected at most "
+                f"{_MOST_ROWS} rows of {2 * size + 65536} bytes"
+            )
         numbers = table.read_row_group(group, ["number"]).column("number").to_pylist()
         if number in numbers:
             cells = table.read_row_group(group, [column]).column(column).to_pylist()
             cell = cells[numbers.index(number)]
             data = (cell if index is None else cell[index])["bytes"]
             if not isinstance(data, bytes):
-                raise ValueError(f"{file} has no bytes")
+                raise ValueError(f"{file} has no bytes, expected some")
             return data
     return None
 
@@ -312,8 +316,8 @@ class JoinedLayout:
     # Returns the bytes of a file named as in a tar file (``000123.masks_0.png``), or None; raises if damaged.
     read: Callable[[BinaryIO, str], bytes | None]
     library: str  # required Python library, or ""
-    is_of_the_hub: bool  # `load_dataset` of Hugging Face reads the images; else it reads the table of ground truths
-    reading: str  # text of the card: how to read images with all bits
+    hub_reads_images: bool  # whether `load_dataset` reads the images; else it reads the table of ground truths
+    reading_help: str  # text of the card: how to read images with all bits
 
     def open_writer(self, store: Store, shard: int, extras: Extras) -> JoinedWriter:
         """Return the writer of a shard."""
@@ -360,15 +364,15 @@ JOINED: Final[Mapping[str, JoinedLayout]] = {
         start=lambda stream, _: _Tar(stream),
         read=_read_tar,
         library="",
-        is_of_the_hub=True,
-        reading=_HUB_READING,
+        hub_reads_images=True,
+        reading_help=_HUB_READING,
     ),
     "parquet": JoinedLayout(
         ending="parquet",
-        start=lambda stream, beside: _Parquet(stream, _schema(*beside)),
+        start=lambda stream, extras: _Parquet(stream, _schema(*extras)),
         read=_read_parquet,
         library="pyarrow",
-        is_of_the_hub=True,
-        reading=_HUB_READING,
+        hub_reads_images=True,
+        reading_help=_HUB_READING,
     ),
 }

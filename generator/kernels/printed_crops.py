@@ -1,4 +1,4 @@
-"""Draw training crops by colour, each with its own window, scale and mirroring; `printing.py` has the rule."""
+"""Draw training crops by colour, each with its own window, scale and mirroring; `printing.py` has the formula."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _print_crops(
     pitches: Any,
     scales: int,
 ) -> None:
-    # Columns of `plan` (N, 9) int64: source, pitch, x, y, flip, means, bases, first and last member.
+    # Columns of `plan` (N, 9) int64: source, pitch, x, y, flip, means, bases, first member and end.
     member_samples, roots, owners = members
     for item in range(first, end):
         source, pitch, x, y, flip, means, bases, begin, stop = plan[item]
@@ -83,7 +83,7 @@ def draw_printed_crops(
     width, height = windows[0, 2:].tolist()
     check_out(out, (len(pictures), 3, height, width), np.float32)
     count = len(pictures)
-    # Most batches contain an illuminant more than once.
+    # Each illuminant is prepared once, because most batches contain some of them more than once.
     distinct_lights = {id(light): light for light in lights}
     members, shared = PrintedMembers(samples, list(distinct_lights.values())), SharedTables(samples, cells)
     light_columns = {

@@ -70,9 +70,10 @@ def random_positions(
 
     Candidate n is computed from the first two words of Philox with counter (a + n mod 2³², b, number, 6). a, b and
     number are the first three words of the SHA-256 of the name of the picture. The first crop is at candidate 0, or at
-    `first`. Each further crop is at the one of the next 8 candidates that overlaps least with the existing crops (the
-    first of equal ones), as in best-candidate sampling (D. Mitchell, "Spectrally optimal sampling for distribution ray
-    tracing", SIGGRAPH 1991). If all 8 are taken, it is at the first free position after them, row by row.
+    `first`. For each further crop, the next 8 candidates are compared: the one with the least overlap with existing
+    crops is used, or the first of several equal ones. This is best-candidate sampling (D. Mitchell, "Spectrally optimal
+    sampling for distribution ray tracing", SIGGRAPH 1991). If all 8 positions are taken, the first free position after
+    the last of them is used, row by row.
 
     `starts`: numbers of columns and rows at which a crop can begin, with a product of at least `count`. `size`: width
     and height of a crop, px. `first`: column and row of the first crop, px; None for a random position.
@@ -159,7 +160,7 @@ class Preparation:
         return self.crop_at or ("centre" if self.crops == 1 else "random")
 
     def describe(self) -> dict[str, Any]:
-        """Return the set options as a JSON object."""
+        """Return the options as a JSON object, without unused ones."""
         options: dict[str, Any] = {"profiles": "honour"}
         if self.max_side is not None:
             options["max_side"] = self.max_side
@@ -202,7 +203,12 @@ class SourcePicture:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _FileValues:
-    """Values of a file: `light` (H, W, 3), 0 … 255, or linear 0 … 1 in float64; `alpha` (H, W), 0 … 1."""
+    """Values of a file.
+
+    - `light`: (H, W, 3), codes 0 … 255, or linear values 0 … 1 in float64.
+    - `alpha`: (H, W), 0 … 1; None without transparency.
+    - `is_associated`: whether the colours are multiplied by alpha already.
+    """
 
     light: npt.NDArray[Any]
     alpha: npt.NDArray[np.float64] | None
@@ -210,7 +216,7 @@ class _FileValues:
     is_linear: bool
     orientation: int
     icc: bytes | None
-    adobe_rgb: bool = False
+    is_adobe_rgb: bool = False
 
 
 def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
@@ -273,7 +279,7 @@ def open_picture(
         codes = (light if light.dtype == np.uint8 else np.rint(np.clip(light, 0, 255))).astype(np.uint8, copy=False)
     if values.is_linear:
         treatment = "linear light, encoded as sRGB"
-    elif values.icc is None and not values.adobe_rgb:
+    elif values.icc is None and not values.is_adobe_rgb:
         treatment = "none, taken as sRGB"
     elif values.icc is not None:
         codes, treatment = to_srgb(codes, values.icc)
@@ -298,7 +304,7 @@ def _read(path: Path, data: bytes | None, most_pixels: int) -> _FileValues:
     with _named_in_text(path) as name:
         values = _read_named(path, name, data, most_pixels)
     # OpenImageIO silently drops a profile that it cannot use. An empty profile is treated as damaged.
-    profile_was_dropped = has_profile and values.icc is None and not values.adobe_rgb
+    profile_was_dropped = has_profile and values.icc is None and not values.is_adobe_rgb
     return replace(values, icc=b"") if profile_was_dropped else values
 
 
@@ -342,7 +348,7 @@ def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> 
     try:
         spec = stream.spec()
         if spec.deep or spec.depth > 1 or spec.nchannels < 1:
-            raise FormatError(f"cannot read {path}: it is not a flat picture; use another, or convert it to PNG")
+            raise FormatError(f"cannot read {path}: it is a deep or 3D picture, expected a flat one; convert it to PNG")
         if spec.width * spec.height > most_pixels:
             raise FormatError(
                 f"cannot read {path}: {spec.width}x{spec.height} px, at most {most_pixels} pixels allowed; reduce it"
@@ -391,8 +397,8 @@ def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> 
         # A colour brighter than its alpha was not multiplied by it, whatever the format usually does.
         is_associated = is_associated and not bool(np.any(values > 255.0 * alpha[..., None] + 1.0))
     profile = None if icc is None else np.asarray(icc, dtype=np.uint8).tobytes()
-    adobe_rgb = is_uncalibrated and profile is None and _interoperability(path) == "R03"
-    return _FileValues(values, alpha, is_associated, is_linear, orientation, profile, adobe_rgb)
+    is_adobe_rgb = is_uncalibrated and profile is None and _interoperability(path) == "R03"
+    return _FileValues(values, alpha, is_associated, is_linear, orientation, profile, is_adobe_rgb)
 
 
 @contextmanager
@@ -424,7 +430,7 @@ def _interoperability(path: Path) -> str:
 
 
 def _jpeg(data: bytes) -> npt.NDArray[np.uint8] | None:
-    # A usual colour JPEG takes half the time of OpenImageIO.
+    # simplejpeg decodes a usual colour JPEG in half the time of OpenImageIO.
     import simplejpeg
 
     try:
@@ -473,7 +479,7 @@ def _crops(picture: Picture, preparation: Preparation, path: Path, name: str) ->
         if preparation.crops > starts[0] * starts[1]:
             raise FormatError(
                 f"cannot cut {preparation.crops} different crops of {wide}x{high} px from {path}: its "
-                f"{width}x{height} px have {starts[0] * starts[1]}; use fewer or smaller crops"
+                f"{width}x{height} px allow only {starts[0] * starts[1]}; use fewer or smaller crops"
             )
         first = centre if preparation.first_crop_at == "centre" else None
         positions = random_positions(starts, (wide, high), preparation.crops, preparation.seed, name, first)
@@ -527,7 +533,7 @@ class Source(Protocol):
         ...
 
     def to_json(self) -> dict[str, Any]:
-        """Return how the picture is made or read, as a JSON object without the location of a file."""
+        """Return the parameters of the picture as a JSON object, without the location of a file."""
         ...
 
 
@@ -537,7 +543,7 @@ class PictureFile:
 
     - `root`: path or URL of the searched folder; the file itself if it was named directly.
     - `relative_path`: path below the root with forward slashes; empty if the file was named directly.
-    - `preparation`: its preparation.
+    - `preparation`: requested size and crops.
     """
 
     root: str
@@ -701,7 +707,7 @@ def find_pictures(
         # Absolute, because a worker may have another working folder.
         root = str(location) if is_url else os.path.abspath(local_path(location))  # noqa: PTH100  keeps links
         if not is_url and not os.path.lexists(root):
-            raise InputError(f"there is no {location}; name a picture or a folder of pictures")
+            raise InputError(f"{location} does not exist; name a picture or a folder of pictures")
         if not is_url and Path(root).exists() and not (Path(root).is_dir() or Path(root).is_file()):
             raise InputError(f"{location} is a device or a pipe; name a picture or a folder of pictures")
         if not is_url and not Path(root).is_dir():
@@ -714,7 +720,7 @@ def find_pictures(
         warning = search.warning_text(masked(root))
         if len(pictures) == previous_count:
             expected = f"expected files with one of the suffixes {' '.join(sorted(SUFFIXES))}"
-            raise InputError(warning or f"{root} holds no picture; {expected}")
+            raise InputError(warning or f"{root} contains no picture, {expected}; name another folder")
         if warning:
             _log.warning(warning)
     if len(location_list) > 1:
@@ -760,7 +766,7 @@ class _Search:
         self._searched.append(target)
         return True
 
-    def pass_over(self, name: str) -> None:
+    def skip(self, name: str) -> None:
         """Count a picture that cannot be read."""
         self._unreadable_count += 1
         self._first_unreadable = self._first_unreadable or name
@@ -807,13 +813,13 @@ def _below_folder(folder: str, search: _Search, prefix: str = "") -> Iterator[st
             if name not in linked_folders or search.follows(path):
                 yield from _below_folder(path, search, prefix + name)
         elif _is_unreadable(name):
-            search.pass_over(prefix + name)
+            search.skip(prefix + name)
         else:
             yield prefix + name
 
 
 def _entry_is(query: Callable[[], bool]) -> bool:
-    # For a link, the property of its target; a circle of links has none.
+    # For a link, the query is about its target. A circle of links has no target, so the answer is False.
     try:
         return query()
     except OSError as error:
@@ -839,5 +845,5 @@ def _below_url(url: str, search: _Search) -> list[str]:
         if not any(component.startswith(".") for component in path.parts) and datasets.isdisjoint(path.parents)
     )
     for name in filter(_is_unreadable, names):
-        search.pass_over(name)
+        search.skip(name)
     return list(filter(_is_picture, names))

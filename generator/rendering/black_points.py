@@ -6,13 +6,13 @@ sample x, channel by channel::
 
     y = (x - v b) / (1 - v b / W)
 
-W is unchanged, so the ground truth is the same. With v = 1 the mean of black becomes 0. Signal and noise are stretched
-alike, by 1 / (1 - v b / W), a few percent. Saturated samples stay saturated: if W exceeds the saturation level, the
-saturation level is used for it.
+W is unchanged, so the ground truth is the same. With v = 1 the mean of black becomes 0. Signal and noise are multiplied
+by the same factor 1 / (1 - v b / W), which is a few percent above 1. If W exceeds the saturation level, the saturation
+level is used instead of W, so that saturated samples stay saturated.
 
-If images are rendered by codes, b is the black patch with its tint. If they are rendered by colour, black was mapped
-to the darkest grey that the print shows, and b is that grey of the image's illuminant. A share of 1 then reverses the
-mapping, and greys stay grey.
+If images are rendered by codes, b is the mean of the black patch, including its tint. If they are rendered by colour,
+black was mapped to the darkest grey of the print, and b is this grey under the illuminant of the image. A share of 1
+then reverses the mapping, and greys stay grey.
 
 If several illuminants are mixed, the black of each is subtracted before mixing. Subtraction after mixing gives the same
 result if b / W is equal for all of them; for b / W of 0.03 and 0.045 it differs by less than 0.0005 of white.
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from generator.lights.lighting import Mixture
 
-# Default of the largest random share. Of the shares tried in earlier work, learned methods were most accurate on real
-# photographs with it (docs/transfer.md). It is below 1 because real scenes have some stray light, too.
+# Default of the largest random share. Of all shares tried in earlier work, it gave the lowest errors of learned methods
+# on real photographs (docs/transfer.md). It is below 1 because real scenes have some stray light, too.
 LARGEST_SHARE: Final = 0.97
 
-_BISECTIONS: Final = 40  # Bisection steps for the offset of samples above 0: resolution 2⁻²⁴ counts
+_BISECTIONS: Final = 40  # Bisection steps for the offset in `_lowering`: resolution 2⁻²⁴ counts
 
 _Array = npt.NDArray[np.float64]
 
@@ -69,7 +69,8 @@ class BlackPoint:
     def __post_init__(self) -> None:
         if not 0 < self.largest_share <= 1:
             raise InputError(
-                f"the largest share of the print's black is {self.largest_share:g}, expected a number > 0 and ≤ 1"
+                f"the largest share of the print's black is {self.largest_share:g}, expected a number > 0 and ≤ 1; "
+                "correct it"
             )
 
     @property
@@ -79,7 +80,7 @@ class BlackPoint:
 
     def share(self, seed: int, image: int) -> float:
         """Return the share of the print's black that is subtracted from an image, 0 … 1."""
-        # Words are drawn only if needed: they take as long as all other bookkeeping of a small image.
+        # Random words are drawn only if needed: they take as long as all other bookkeeping of a small image.
         words = philox.words(seed, 0, 0, image, philox.VEILS)[0] if self.kind == "random" else np.zeros((), np.uint32)
         return float(self.shares(words))
 
@@ -100,7 +101,10 @@ def parse_black_point(text: str) -> BlackPoint:
             return BlackPoint(kind)
     match = re.fullmatch(r"random(?::(\d*\.?\d+))?", text, re.ASCII)
     if not match:
-        raise InputError(f"the black point is {text!r}, expected keep, compensate, random, or random:MAX such as 0.97")
+        raise InputError(
+            f"the black point is {text!r}, expected keep, compensate, random, or random:MAX such as random:0.97; "
+            "correct it"
+        )
     return BlackPoint("random", float(match[1] or LARGEST_SHARE))
 
 
@@ -129,7 +133,7 @@ def black_cell_counts(lut: Lut, light: Mixture) -> _Array:
 
 
 def black_subtraction(lut: Lut, light: Mixture, share: float, grey: float | None = None) -> BlackSubtraction:
-    """Return what to subtract from samples to remove a share of the print's black.
+    """Return the subtraction that removes a share of the print's black from samples.
 
     `share`: 0 … 1. `grey`: grey to which black was mapped, relative to white, for images rendered by colour
     (`ColorimetricRendering.black`); None for the black patch.
@@ -166,7 +170,8 @@ def subtract_black(
 @compiled
 def _lowering(values: Any, count: int) -> float:
     # Offset by which values are lowered before clipping at 0, so that clipping keeps the mean of all. Clipping alone
-    # would make black too bright by 0.4 σ, since counts have no sign. A patch darker than what is subtracted becomes 0.
+    # would make black too bright by 0.4 σ, since counts have no sign. A patch whose mean is not above the subtracted
+    # counts becomes 0.
     total, upper = 0.0, 0.0
     for i in range(count):
         total += values[i]

@@ -177,8 +177,8 @@ def _stops(scale: canon.Scale, first: int, last: int, thirds: bool = True) -> tu
     return tuple(step.code for step in scale.steps if first <= step.code <= last and step.code % 8 in fractions)
 
 
-_WHEEL = tuple(range(2500, 10001, 100))
-_SHIFT = tuple(number & 0xFFFFFFFF for number in range(-9, 10))
+_TEMPERATURES_K = tuple(range(2500, 10001, 100))
+_WHITE_SHIFTS = tuple(number & 0xFFFFFFFF for number in range(-9, 10))
 
 
 def _thirds(first: int, last: int) -> tuple[int, ...]:
@@ -225,7 +225,7 @@ def _properties(body: _Choices) -> tuple[PropertySpec, ...]:
         return PropertySpec(code, number(value))
 
     style = structure(0, 3, 0, 0, 0, 0)
-    own_style = structure(0x81, 0, 3, 0, 0, 0, 0)
+    user_style = structure(0x81, 0, 3, 0, 0, 0, 0)
     lockup = (listed(Property.EOS_MIRROR_UP_SETTING, 0, (0, 1)),) if body.mirror_lockup_in_menu else ()
     return (
         fixed(Property.EOS_AE_MODE, AeMode.MANUAL),
@@ -234,8 +234,8 @@ def _properties(body: _Choices) -> tuple[PropertySpec, ...]:
         listed(Property.EOS_METERING_MODE, 3, (3, 4, 1, 5)),
         listed(Property.EOS_WHITE_BALANCE, WhiteBalance.AUTO, body.white_balance),
         listed(Property.EOS_COLOUR_TEMPERATURE, 5200, body.temperatures),
-        listed(0xD10B, 0, _SHIFT),
-        listed(0xD10C, 0, _SHIFT),
+        listed(0xD10B, 0, _WHITE_SHIFTS),
+        listed(0xD10C, 0, _WHITE_SHIFTS),
         listed(0xD10D, 0, (0, 1, 2, 3)),
         listed(0xD10E, 0, (0, 1, 2, 3)),
         listed(Property.EOS_COLOUR_SPACE, 1, (1, 2)),
@@ -257,7 +257,7 @@ def _properties(body: _Choices) -> tuple[PropertySpec, ...]:
         PropertySpec(Property.EOS_IMAGE_FORMAT, RAW_ONLY.encode(), LIST, formats=body.formats),
         PropertySpec(Property.EOS_IMAGE_FORMAT_SD, RAW_ONLY.encode(), LIST, formats=body.formats),
         *(PropertySpec(code, style, FREE) for code in range(0xD150, 0xD156)),
-        *(PropertySpec(code, own_style, FREE) for code in range(0xD160, 0xD163)),
+        *(PropertySpec(code, user_style, FREE) for code in range(0xD160, 0xD163)),
         *(PropertySpec(code, None, FREE) for code in range(0xD170, 0xD173)),
         listed(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.CARD, ()),
         *lockup,
@@ -318,9 +318,9 @@ _CHOICES_550D = _Choices(
     lens="EF-S18-55mm f/3.5-5.6 IS",
 )
 
-# An EOS 550D as it leaves the factory: third stops, no highlight priority, off after 30 s, as is generally known. Of
-# the 60D are vendor extension id, operations, events, third-stop apertures, white balance shifts, structures, order,
-# capture destinations 2, 4, 6, and that camera time and counters are reported.
+# An EOS 550D with factory settings, which are generally known: third stops, no highlight priority, power off after
+# 30 s. Taken from the 60D: vendor extension id, operations, events, third-stop apertures, white balance shifts,
+# structures, order, capture destinations 2, 4, 6, and the reports of camera time and counters.
 EOS_550D = EosModel(
     info=_device_info("Canon EOS 550D", "3-1.0.9", "Canon Inc.", 200),
     usb=(VENDOR_CANON_USB, 0x31EA),
@@ -333,7 +333,8 @@ EOS_550D = EosModel(
     shots_per_charge=440,
 )
 
-# The EOS 550D of the user who listed its settings: half stops, no ISO 100 (probably highlight priority), f/4 at most.
+# The EOS 550D of the user who listed its settings: half stops, no ISO 100 (probably highlight priority), and a
+# largest aperture of f/4.
 EOS_550D_AS_LISTED = replace(
     EOS_550D,
     properties=_properties(
@@ -347,11 +348,11 @@ EOS_550D_AS_LISTED = replace(
 
 _JPEGS_6D2 = _jpegs((0, True), (1, True), (14, True), (15, False))
 
-# An EOS 6D Mark II; bulb is on its dial, not in its list. mRAW and sRAW are listed, but frames come in full size. Of
-# the 60D are vendor extension id, operations, events, structures, order, nine focus points where it has 45, capture
-# destinations 2, 4, 6, and that objects are announced by the records of 32 bits. Shutter times and apertures are
-# third stops of the body and the lens that its owner listed; mirror lockup as property 0xd13a is named by libgphoto2,
-# and in no listing of this body.
+# An EOS 6D Mark II. Bulb is on its dial, not in its list. mRAW and sRAW are listed, but frames have full size. Taken
+# from the 60D: vendor extension id, operations, events, structures, order, nine focus points (the 6D Mark II has 45),
+# capture destinations 2, 4, 6, and object events of 32 bits. Shutter times and apertures are third stops, within the
+# range of a body and lens that a user listed. Mirror lockup as property 0xd13a is from libgphoto2; the user's list does
+# not contain it.
 EOS_6D_MARK_II = EosModel(
     info=_device_info("Canon EOS 6D Mark II", "3-1.0.2", "Canon.Inc", 100),
     usb=(VENDOR_CANON_USB, 0x32CA),
@@ -379,7 +380,7 @@ EOS_6D_MARK_II = EosModel(
             bracketing=_thirds(0, 3),
             compensation=_thirds(-5, 5),
             outputs=tuple(range(12)),
-            temperatures=_WHEEL,
+            temperatures=_TEMPERATURES_K,
             auto_power_off_s=60,
             lens="EF50mm f/1.8 STM",
             mirror_lockup_in_menu=True,

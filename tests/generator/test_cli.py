@@ -187,7 +187,7 @@ def test_complete_run_reuses_shares(generate: Generate, capsys: pytest.CaptureFi
     ("arguments", "message"),
     [
         (("lut", "out"), "there are no source pictures"),
-        (("lut", "out", "--sources", "nowhere"), "there is no nowhere"),
+        (("lut", "out", "--sources", "nowhere"), "nowhere does not exist"),
         (("lut", "pictures", "--sources", "pictures"), "pictures already exists"),
         (("pictures", "out", "--sources", "pictures"), "lut.json"),
         (("lut", "out", "--sources", "pictures", "--nearest", "none.csv"), "cannot read ground truths none.csv"),

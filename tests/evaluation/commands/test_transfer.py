@@ -106,7 +106,7 @@ def test_all_ignores_case(work_folder: Path, capsys: pytest.CaptureFixture[str])
         (("--method", "own.py:Map, ./own.py:Map"), "given twice"),
         (("made/../made",), "two training sets have the name made"),
         (("real.npz",), "real.npz is both training and test"),
-        (("--naive", "lut"), "holds no picture"),
+        (("--naive", "lut"), "contains no picture"),
         (("--out", "lut"), "lut already exists; choose another place for the results"),
         (("--real", "20,many"), "--real is '20,many', expected numbers of real images"),
     ],

@@ -317,7 +317,7 @@ def test_command_prints_address_and_stops_with_ctrl_c(
     assert printed.err == ""
     assert main(["-q", "explore", "lut", "--sources", "cat.png", "--port", "0"]) == 0
     assert main(["explore", "lut", "--sources", "dog.png"]) == 2
-    assert "there is no dog.png" in capsys.readouterr().err
+    assert "dog.png does not exist" in capsys.readouterr().err
     assert main(["explore", "nothing"]) == 2
     assert main(["explore"]) == 2
 
