@@ -6,7 +6,7 @@ against it at gauges: the tags of the chart or, without a chart, the places with
 
 Format of the bytes (version 1): a zip archive of arrays as `numpy.savez` writes it, without pickled objects. `facts` is
 UTF-8 JSON as uint8; `tiles` (T, 3) float32; `strips` (S, 3) float32 or empty; the names of an anchor's arrays begin
-with `anchor_`. Samples of noise are not stored, because the digest identifies a frame. Bytes of another version are
+with `anchor_`. Samples of noise are not stored; the digest suffices to recognise a frame. Bytes of another version are
 ignored: the judge then starts without earlier frames.
 
 Positions are in 2×2 blocks of the mosaic ("half-size pixels"). T = 384 tiles, S strips of rows (four in a row of
@@ -58,7 +58,7 @@ _TEXTURES = (4, 2)  # Textured places along width and height: as many as gauges 
 # move it as far.
 _PAPER_REACH_PX = 4
 
-# Level of paper, as a share of the brightest references: the flat field falls off to about this.
+# Smallest level of paper, as a share of the brightest references: about the fall-off of the flat field.
 _PAPER_LEVEL = 0.7
 
 # Side of the square with the largest mean inside a reference of 10 px. The brightest of 3×3 px would be a place with
@@ -72,7 +72,7 @@ _MOST_PAPER = 300  # White references to measure: their mean is accurate to 0.1 
 class Anchor:
     """Position of the chart in a white frame.
 
-    - `framing`: its tags, or textured places in their stead.
+    - `framing`: its tags, or textured places instead.
     - `gauges`: counts above black of each channel around the tags; 0 elsewhere.
     - `paper`: (N, 2) int64, columns and rows of blocks on white paper.
     - `of_chart`: whether the chart was detected; if not, the places are only textured.
@@ -175,7 +175,7 @@ def _paper(values: npt.NDArray[np.float32], places: _Array) -> npt.NDArray[np.in
 def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
     """Return (N, 2) centres of the brightest 3×3 neighbourhoods in a grid of regions.
 
-    Their noise is high in this frame: without a chart, a drift of white of a few tenths of a percent is no evidence.
+    Their noise is high in this frame: without a chart, a drift of white by some tenths of a percent is no fault.
     """
     smooth = cv2.blur(values, (3, 3))
     height, width = smooth.shape
@@ -220,7 +220,7 @@ VERSION = 1  # Version of the byte format
 class Frame:
     """Measurements of a frame.
 
-    - `measured`: its light; `strips` may be empty if they were not stored.
+    - `measured`: measurements of its light; `strips` is empty if they were not stored.
     - `paper`: (3,) float64, RGB counts of white paper above black; NaN without white references.
     - `moved_px`: (2,) displacement of the chart from the anchor, half-size px right and down; NaN if not measured.
     - `anchor`: position of the chart, if later frames are compared with this frame.
@@ -331,16 +331,16 @@ def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
     return anchor
 
 
-# Largest difference between the exposure in a file and the one set, stops. Nominal values are rounded, and files state
-# either: 0.3 s means 0.354 s on a dial of half stops, which is 0.24 stops. A dial turned by a third of a stop differs
-# by 0.2 to 0.5 stops in the file, so that most such turns are detected, and every larger one.
+# Largest difference between the exposure in a file and the one set, stops. Nominal values are rounded, and files
+# contain the nominal or the exact value: 0.3 s means 0.354 s on a dial of half stops, which is 0.24 stops. A third of a
+# stop on a dial differs by 0.2 to 0.5 stops in the file, so most of these turns are detected, and all larger ones.
 EXPOSURE_TOLERANCE_STOPS = 0.25
 
 
 def disagreement(mosaic: Mosaic, settings: ExposureSettings) -> str | None:
     """Return how the exposure in a raw file differs from the settings, or None if it does not.
 
-    A value that the file does not state is ignored, and so is 0, the aperture of a lens without contacts.
+    A missing value is ignored, and so is 0, the aperture of a lens without contacts.
     """
     differing = [
         f"{name} {value:g} instead of {'none' if setting is None else f'{setting:g}'}"
@@ -353,7 +353,7 @@ def disagreement(mosaic: Mosaic, settings: ExposureSettings) -> str | None:
     ]
     if not differing:
         return None
-    return f"the file records {', '.join(differing)}; check the dials of the camera"
+    return f"the file has {', '.join(differing)}; check the dials of the camera"
 
 
 def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str | None:
@@ -401,7 +401,7 @@ def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None
 
 
 class ExposureJudge:
-    """A `experiment.session.records.FrameJudge` that judges only the exposure of each frame."""
+    """An `experiment.session.records.FrameJudge` that judges only the exposure of each frame."""
 
     def __init__(self, settings: LabSettings) -> None:
         self._settings = settings

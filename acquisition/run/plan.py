@@ -1,8 +1,8 @@
 """Plan of a run: its frames, time and space, and faults that would end it.
 
-The plan is made before anything moves, from files (`Work`), estimates of size and time (`Estimate`), and answers of the
-devices (`Answers`), which are not changed by the questions. A dry run prints it (`plan_lines`), a run requires it. A
-fault would end the run and has a remedy; a doubt is a warning.
+The plan is made before a device is used, from files (`Work`), estimates of size and time (`Estimate`), and answers of
+the devices (`Answers`). The queries do not change the devices. A dry run prints the plan (`plan_lines`), a run requires
+it. A fault would end the run and has a remedy; a doubt is a warning.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ KNOWN_AFTER: Final = 5  # Frames after which their measured times and sizes repl
 
 @dataclass(frozen=True)
 class Work:
-    """Work of a run, from files alone.
+    """Frames of a run with chart and illuminants, as read from files.
 
     - `new`: whether the session does not exist yet.
     - `done`: numbers of the steps with an accepted frame.
@@ -150,12 +150,12 @@ def require_same(session: Session, settings: LabSettings) -> None:
     if load_chart(settings.chart).sha256 != session.chart.sha256:
         raise ConfigurationError(
             f"{session.folder} was started with another chart than {settings.chart}",
-            remedy="give the first chart, or a new session folder",
+            remedy="give the chart of the session (its chart.json), or a new session folder",
         )
     if load_illuminants(settings.illuminations) != session.illuminations:
         raise ConfigurationError(
             f"{session.folder} was started with other illuminants than {settings.illuminations}",
-            remedy="give the first file, or a new session folder",
+            remedy="give the illuminants of the session (its illuminations.csv), or a new session folder",
         )
 
 
@@ -177,19 +177,19 @@ def order_of(steps: Sequence[SessionStep], settings: LabSettings) -> str:
         return f"shuffled by seed {sequence.seed}"
     if indices == sorted(indices):
         return "as listed" + (
-            f", as at the start of the session; {settings.file} has shuffled" * (sequence.order != "listed")
+            f", kept from the start of the session; {settings.file} has shuffled" * (sequence.order != "listed")
         )
     if indices == shuffled:
-        return f"shuffled by seed {sequence.seed}, as at the start of the session; {settings.file} has listed"
-    return "shuffled by another seed, as at the start of the session"
+        return f"shuffled by seed {sequence.seed}, kept from the start of the session; {settings.file} has listed"
+    return "shuffled by another seed, kept from the start of the session"
 
 
-# Share of repeated frames for which there must be space: chosen; disturbances during one hour of a run.
+# Share of repeated frames for which space is required (judgement): disturbances during one hour of a run.
 RETAKEN_SHARE: Final = 0.1
 EXTRA_BYTES: Final = 150_000  # Per frame: a preview of 640 px, and its rows in the journal
 # Reserve for other users of the disk, and for file systems that are slow when they are full.
 SPARE_BYTES: Final = 500_000_000
-# Lossless raw files of 14 bits: 1.34 at ISO 100 (EOS 550D, 25 MB; EOS 6D Mark II, 36 MB), more with noise.
+# Assumed for lossless 14-bit raw files: measured 1.34 at ISO 100 (EOS 550D, EOS 6D Mark II), and more with noise.
 BYTES_PER_PIXEL: Final = 1.5
 # Cameras that may write each photosite in 16 bits (Sony), and the simulated cameras, which do.
 LOOSE_BYTES_PER_PIXEL: Final = 2.0
@@ -221,7 +221,7 @@ MEGAPIXELS: Final = {model: size for size, models in _MODELS for model in models
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value, its basis in words, and whether it is more than a guess."""
+    """A value, its basis in words, and whether it is more than an assumption."""
 
     value: float
     basis: str
@@ -231,8 +231,8 @@ class Estimate:
 def frame_bytes(largest: int | None, model: str, simulated: int | None = None) -> Estimate:
     """Return the size of a raw file, bytes.
 
-    `largest`: largest file of the session; None if it has none. `model`: as the camera reports it; "" if it could not
-    be asked. `simulated`: size of simulated files; None for a real camera.
+    `largest`: largest file of the session; None if it has none. `model`: as the camera reports it; "" if the
+    camera did not answer. `simulated`: size of simulated files; None for a real camera.
     """
     if largest is not None:
         return Estimate(largest, "the largest file of the session", True)
@@ -240,7 +240,7 @@ def frame_bytes(largest: int | None, model: str, simulated: int | None = None) -
         return Estimate(simulated, "size of the simulated files", True)
     megapixels = MEGAPIXELS.get(model.removeprefix("Canon ").removeprefix("NIKON "))
     if megapixels is None:
-        cause = f"the size of a frame of {model} is unknown" if model else "the camera could not be queried"
+        cause = f"the size of a frame of {model} is unknown" if model else "the camera did not answer"
         return Estimate(UNKNOWN_BYTES, f"assumed: {cause}; acquire check measures it", False)
     density = LOOSE_BYTES_PER_PIXEL if model.startswith(("ILCE", "CroP ")) else BYTES_PER_PIXEL
     return Estimate(megapixels * 1e6 * density, f"{megapixels:.1f} million photosites, {density:g} bytes each", True)
@@ -286,14 +286,14 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Answers:
-    """Answers of the devices; None or empty if they could not be queried, or do not report it.
+    """Answers of the devices; None or empty if a device did not answer, or does not report the value.
 
     - `offered_s`: shutter times that the camera offers, s.
     - `projector`: name and state, in words.
     - `lit`: whether its lamp burns.
     - `warnings`: settings that change the colours on the screen, each with its remedy.
-    - `unasked`: what could not be checked, and why.
-    - `faults`: what would end the run.
+    - `unasked`: values that are not reported or not queried, each with the reason.
+    - `faults`: faults that would end the run.
     """
 
     camera: CameraIdentity | None = None
@@ -307,7 +307,7 @@ class Answers:
 
 
 def ask(devices: Devices) -> Answers:
-    """Ask open devices for all that a plan needs; a device that does not answer is a fault."""
+    """Query the values of a plan from open devices; a device that does not answer is a fault."""
     faults: list[CropError] = []
     unasked: list[str] = []
 
@@ -322,7 +322,7 @@ def ask(devices: Devices) -> Answers:
     identity = answer("camera", camera.identity, None)
     offered: tuple[float, ...] = ()
     supplies: Supplies | None = None
-    # A camera out of reach is asked only once, because each question would time out.
+    # A camera that does not answer is queried only once, because each query would time out.
     if identity is not None:
         offered = answer("camera", camera.shutter_speeds, ())
         if not offered:
@@ -362,8 +362,8 @@ DOWNLOAD_BYTES_PER_S: Final = 25e6
 # Assumed time per frame in addition to exposure and transfer, s: release, mirror, read-back of the screen, journal.
 STEP_S: Final = 0.4
 LIGHTING_S: Final = 60.0  # Assumed time to light the lamp, s; makers state 30 to 40 s, and up to 130 s
-# Charge at which a long series needs mains power: cameras report in steps of a quarter, and refuse to release soon
-# after.
+# Charge at which a long series needs mains power: cameras report it in steps of a quarter, and soon below this step
+# they release no more frames.
 LOW_BATTERY: Final = 0.25
 FEW_FRAMES: Final = 50  # Frames that are taken even with a low battery
 # Largest relative difference of a shutter time from one that the camera offers; drivers accept no more.
@@ -377,7 +377,8 @@ class RunPlan:
     - `frame_bytes`, `frame_s`: size of a raw file, bytes, and time of a frame, s.
     - `warm_up_s`: warm-up of the lamp before the first frame, s; 0 if it is known to burn.
     - `free_bytes`: free space on the disk of the session.
-    - `faults`, `doubts`: what would end the run, each with its remedy; warnings.
+    - `faults`: faults that would end the run, each with its remedy.
+    - `doubts`: warnings.
     """
 
     settings: LabSettings
@@ -438,10 +439,10 @@ def make_plan(
     )
 
 
-# Settling time, s, above which seconds may have been confused with milliseconds: chosen, many times what projectors
-# need.
+# Settling time, s, above which seconds may have been confused with milliseconds (judgement): many times the settling
+# time of projectors.
 LONG_SETTLE_S: Final = 10.0
-# Warm-up, s, below which a lamp is not steady: chosen; makers recommend 10 to 30 minutes.
+# Warm-up, s, below which a lamp is not steady (judgement): makers recommend 10 to 30 minutes.
 SHORT_WARM_UP_S: Final = 300.0
 
 
@@ -576,7 +577,7 @@ def plan_lines(plan: RunPlan) -> tuple[str, ...]:
         ("camera", _camera_text(answers)),
         (
             "projector",
-            answers.projector or ("could not be queried" if has_lamp_control(settings) else "not controlled"),
+            answers.projector or ("did not answer" if has_lamp_control(settings) else "not controlled"),
         ),
     ]
     for name, (_, target) in zip(("notices", "alive"), _targets(settings), strict=True):
@@ -601,7 +602,7 @@ def _exposure_text(plan: RunPlan) -> str:
 def _time_text(plan: RunPlan, count: str) -> str:
     if not plan.work.remaining:
         return "all frames are complete"
-    condition = "" if plan.answers.lit is not None else " unless it is already on"
+    condition = "" if plan.answers.lit is not None else ", unless it is already on"
     warm_up = f", after {duration_text(plan.warm_up_s)} to warm up the lamp{condition}" if plan.warm_up_s else ""
     frame_s = f"{plan.frame_s.value:.2f} s each ({plan.frame_s.basis})"
     return f"{duration_text(plan.time_s)}: {count}, {frame_s}{warm_up}"
@@ -619,7 +620,7 @@ def _disk_text(plan: RunPlan, count: str) -> str:
 
 def _camera_text(answers: Answers) -> str:
     if answers.camera is None:
-        return "could not be queried"
+        return "did not answer"
     text = answers.camera.name
     if answers.camera.serial:
         text += f", serial number {answers.camera.serial}"
@@ -671,7 +672,7 @@ def dry_run(settings: LabSettings, folder: Path, retake: str | None = None) -> R
 
 
 def require_plan(settings: LabSettings, folder: Path, session: Session | None, devices: Devices) -> None:
-    """Refuse a run that could not be completed; its devices are open and have not moved.
+    """Refuse a run that could not be completed; its devices are open and were not used yet.
 
     `session`: the resumed session; None for a new one in `folder`.
     """

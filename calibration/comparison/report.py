@@ -58,11 +58,11 @@ def comparison_json(comparison: TableComparison) -> dict[str, Any]:
 
 
 def draw_lights(figure: Any, lights: LightDifferences) -> None:
-    """Draw angle, brightness and patch difference of every illuminant, with the limits of sameness."""
+    """Draw angle, brightness and patch difference of every illuminant, with the limits for equal LUTs."""
     figure.set_size_inches(10, 3.1)
     panels = (
         (lights.angle_deg, ANGLE_FLOOR_DEG, "angle between whites, °"),
-        (100 * lights.brightness, 0, "brightness, B over A, %"),
+        (100 * lights.brightness, 0, "brightness, B / A − 1, %"),
         (lights.cell_score, CELL_SCORE, "patches, RMS in units of noise"),
     )
     for axes, (values, line, title) in zip(figure.subplots(1, 3), panels, strict=True):
@@ -80,7 +80,7 @@ def draw_map(figure: Any, chart: Chart, cells: CellDifferences) -> None:
     reach = max(0.5, float(np.percentile(np.abs(largest), 99)))
     centres_mm, side_mm = chart.centres_mm[chart.cell_of_colour], float(np.mean(chart.cell_mm))
     image = draw_squares(axes, chart.page_mm, centres_mm, side_mm, largest, 8.2, cmap="RdBu", vmin=-reach, vmax=reach)
-    figure.colorbar(image, ax=axes, label="B over A, %", shrink=0.8, extend="both")
+    figure.colorbar(image, ax=axes, label="B / A − 1, %", shrink=0.8, extend="both")
 
 
 def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | None = None) -> None:
@@ -88,7 +88,7 @@ def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | N
     (first, second), cells, same = comparison.folders, comparison.cells, comparison.same_within_noise
     pictures = [figure(draw_png(draw_lights, comparison.lights), "Differences by illuminant.", wide=True)]
     if chart is not None:
-        caption = "Differences of patches on the print. Noise is fine grain; stains and shadows have shapes."
+        caption = "Differences of patches on the print. Noise appears as fine grain, stains and shadows as shapes."
         pictures.append(figure(draw_png(draw_map, chart, cells), caption, wide=True))
     answers = [(_ANSWERS[answer.same_within_noise], answer.name, answer.said) for answer in comparison.answers]
     outcome, sentence = ("accept", "The same within noise.") if same else ("remark", "The difference exceeds noise.")

@@ -1,7 +1,7 @@
 """Register the chart in a frame: the position of every point of the print.
 
-Tags, or the outline of the field of patches, give a homography and Brown's distortion. The patches themselves then
-measure the rest: the 35 tags cannot sample a wavy sheet. `register` returns a `Registration` or raises
+Tags, or the outline of the patch area, give a homography and Brown's distortion. The positions of the patches give the
+remaining deviations, because 35 tags are too few for a wavy sheet. `register` returns a `Registration` or raises
 `RegistrationError`; it never returns a registration of poor quality.
 
 Positions are half-size pixels with pixel centres at integers; points on the print are millimetres.
@@ -28,8 +28,8 @@ from experiment.framing.sharpness import blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import robust_sigma
 
-# Largest expanded uncertainty of a position, in patches of 10 px (`Registration.expanded_px`). With an error of 0.5 px
-# and a blur of 0.7 px, the outermost of the 25 samples receives 0.1 % of its light from the next patch
+# Largest expanded uncertainty of a position, scaled to patches of 10 px (`Registration.expanded_px`). With an error of
+# 0.5 px and a blur of 0.7 px, the outermost of the 25 samples receives 0.1 % of its light from the next patch
 # (`calibration.sampling`).
 MAX_PLACE_ERROR_PX = 0.5
 
@@ -39,13 +39,14 @@ CLEARANCE_PX = 1.75
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
-# RMS distance of the tags from homography and distortion. Waves of 6 mm and a curl of 10 mm give 2.3 px.
+# Largest RMS distance of the tags from homography and distortion. Waves of 6 mm and a curl of 10 mm give 2.3 px.
 MAX_TAG_RESIDUAL_PX = 8.0
 
 # Minimum correlation of patch colours with the prediction; another order of patches gives about 0.
 MIN_AGREEMENT = 0.8
 
-# Minimum for a chart without tags: the colour model can partly fit a cover of its smooth order. 0.99 is usual.
+# Minimum for a chart without tags. Its colours are in smooth order, so the colour model can partly fit even an object
+# that covers it. 0.99 is usual.
 MIN_PLAIN_AGREEMENT = 0.95
 
 MIN_GOOD_BLOCKS = 0.75  # Minimum share of blocks of patches that match the chart (judgement)
@@ -57,25 +58,25 @@ MAX_BLOCK_RESIDUAL_PX = 0.5
 # Maximum number of steps; each compares all patches. A flat print takes two or three, a curled one five.
 _GAUSS_NEWTON_STEPS = 8
 
-# The iteration ends when the RMS and the largest movement of a step are below these. At most half of them remains,
-# the error of the map itself. A curled rim converges last, invisible in the RMS.
+# The iteration ends when the RMS and the largest movement of a step are below these. The remaining error is at most
+# half as large, like the error of the map itself. A curled rim converges last, and the RMS does not show it.
 _SETTLED_PX, _SETTLED_CELL_PX = 0.015, 0.15
 
 # Standard uncertainty of a tag corner: measured 0.085 px under white, 0.20 px under a dim illuminant.
 _TAG_SIGMA_PX = 0.15
 
-_LEAST_TAG_SIGMA_PX = 0.03  # Lower bound of it: error of the detector in the sharpest frames
+_LEAST_TAG_SIGMA_PX = 0.03  # Lower bound of `_TAG_SIGMA_PX`: error of the detector in the sharpest frames
 
 _OUTLINE_SIGMA_PX = 0.1  # Standard uncertainty of an outline point, across the outline (judgement)
 
-# Outline points further from the run of their side than 5 standard deviations and than 1 px are outliers.
-_APART, _APART_PX = 5.0, 1.0
+# An outline point is an outlier if its distance from the curve of its side exceeds 5 standard deviations and 1 px.
+_OUTLIER_SIGMAS, _OUTLIER_PX = 5.0, 1.0
 
 # Blur, in patches, of the first steps for a chart without tags, from coarse to fine.
-_FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
+_COARSE_BLURS = (1.0, 1.0, 0.6)
 
-# The chart is refused if this number and share of the tested areas appear to be displaced by a patch. In correct
-# registrations of simulated rooms there is none.
+# The chart is refused if at least this number and this share of the tested areas appear to be displaced by one patch.
+# In correct registrations of simulated rooms there is none.
 _FEW_SLIPPED, _SLIPPED_SHARE = 2, 0.015
 
 
@@ -96,7 +97,7 @@ class Registration:
     # (N,) patches, in chart order, with a colour far from `colours`: covered, damaged or misprinted
     mismatched_cells: _Mask
     agreement: float  # correlation of patch colours with `colours`, −1 … 1; mean of the channels that receive light
-    blur_px: float  # σ of the edges of the tags or of the field
+    blur_px: float  # σ of the edges of the tags or of the patch area
     cell_px: float  # shorter side of the smallest patch, half-size px
     shift_px: tuple[float, float] = (0.0, 0.0)  # movement (dx, dy) since the registered frame
 
@@ -131,7 +132,7 @@ class Registration:
 
     @property
     def position_uncertainty_px(self) -> tuple[float, float]:
-        """Standard uncertainty of positions, px: median of the field, and 99th percentile of the outermost patches."""
+        """Standard uncertainty of positions, px: median of the chart, and 99th percentile of the outermost patches."""
         error = self.place_errors.error_px
         rim = np.concatenate([error[1], error[-2], error[:, 1], error[:, -2]])
         return float(np.median(error)), float(np.percentile(rim, 99))
@@ -178,7 +179,7 @@ def register(
     frame_name : str
         Name of the frame in error messages.
     corners : (4, 2) float, optional
-        For a chart without tags: corners of the field of patches in half-size px, clockwise from the printed top left,
+        For a chart without tags: corners of the patch area in half-size px, clockwise from the printed top left,
         accurate to 20 px.
     neighbour : Registration, optional
         Another frame of the session. A chart without tags is searched near its position there and needs no corners.
@@ -186,7 +187,7 @@ def register(
     Raises
     ------
     RegistrationError
-        If the chart cannot be found, is blurred, too small, not flat, or another chart.
+        If the chart is not detected, blurred, too small, not flat, or another chart.
     """
     black = frame_black(mosaic)
     framing = find_chart(mosaic, chart, frame_name, corners, None if neighbour is None else neighbour.framing)
@@ -208,7 +209,7 @@ def register(
     lens_rms = rms(residual)
     if lens_rms > MAX_TAG_RESIDUAL_PX:
         raise RegistrationError(
-            f"{frame_name}: the {'tags' if chart.tags else 'edges of the field'} deviate by {lens_rms:.1f} px RMS "
+            f"{frame_name}: the {'tags' if chart.tags else 'edges of the patch area'} deviate by {lens_rms:.1f} px RMS "
             f"from a plane, expected at most {MAX_TAG_RESIDUAL_PX:g} px; hang the print flat, and check that "
             "chart.json matches it"
         )
@@ -223,8 +224,8 @@ def register(
     if chart.tags:
         matcher.match_coarsely(frame_name)
     else:
-        for softness in _FOLLOWED_SOFTLY:
-            matcher.follow(softness)
+        for blur_cells in _COARSE_BLURS:
+            matcher.follow(blur_cells)
             matcher.refit_lens()
     for _ in range(_GAUSS_NEWTON_STEPS):
         rms_step_px, largest_step_px = matcher.step()
@@ -233,7 +234,7 @@ def register(
     registration = _registered(chart, framing, matcher, marks, lens_rms)
     _judge(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, frame_name)
     if not chart.tags:
-        _require_own_cells(matcher, registration.mismatched_cells, frame_name)
+        _refuse_displaced_areas(matcher, registration.mismatched_cells, frame_name)
     return registration
 
 
@@ -254,7 +255,7 @@ def _clear_edges(
     # Points without a clear edge in any channel are dropped.
     is_clear = np.asarray(heights.any(axis=0))
     edges_px, heights, normals = edges_px[:, is_clear], heights[:, is_clear], field.normals[is_clear]
-    # Half the step height doubles the error. The weights of the channels add up to 1: they see the same edge.
+    # Half the step height doubles the error. The weights of the channels add up to 1, as all contain the same edge.
     weight = heights**2 / (heights**2).sum(axis=0)
     information_across = np.einsum("ni,nj->nij", normals, normals) / _OUTLINE_SIGMA_PX**2
     marks = Anchors(field.outline_mm[is_clear], edges_px, weight[..., None, None] * information_across)
@@ -293,9 +294,9 @@ def _field_through_lens(field: DetectedField, frame_size: tuple[int, int]) -> tu
     is_kept = np.ones(len(field.outline_mm), dtype=np.bool_)
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
     for _ in range(2):
-        # Curled corners are pixels off a plane, and so are their neighbours: compare points with the run of their side.
+        # Curled corners and their neighbours deviate by pixels: compare points with the curve of their side.
         distance_px = field.curve_residual_px(residual)
-        is_inlier = distance_px <= max(_APART * robust_sigma(distance_px), _APART_PX)
+        is_inlier = distance_px <= max(_OUTLIER_SIGMAS * robust_sigma(distance_px), _OUTLIER_PX)
         is_kept[is_kept] = is_inlier
         field = replace(
             field,
@@ -307,12 +308,12 @@ def _field_through_lens(field: DetectedField, frame_size: tuple[int, int]) -> tu
     return field, is_kept, lens, residual
 
 
-def _require_own_cells(matcher: Matcher, mismatched_cells: _Mask, frame_name: str) -> None:
+def _refuse_displaced_areas(matcher: Matcher, mismatched_cells: _Mask, frame_name: str) -> None:
     slipped_mm, area_count = matcher.slipped(mismatched_cells)
     if len(slipped_mm) >= max(_FEW_SLIPPED, _SLIPPED_SHARE * area_count):
         x, y = slipped_mm[0]
         raise RegistrationError(
-            f"{frame_name}: {len(slipped_mm)} of {area_count} areas of the field match the neighbouring patches, "
+            f"{frame_name}: {len(slipped_mm)} of {area_count} areas of the chart match the neighbouring patches, "
             f"the first near ({x:.0f}, {y:.0f}) mm from the top-left corner of the sheet; uncover the print, hang it "
             "flatter, and check that chart.json describes the printed positions"
         )
@@ -367,7 +368,7 @@ def _registered(chart: Chart, framing: ChartPose, matcher: Matcher, marks: Ancho
 
 
 def _without_mismatched_cells(blocks: Blocks, mismatched_cells: _Mask, chart: Chart) -> Blocks:
-    # In a smooth order of colours neighbouring patches look alike in a wide window, covered or not.
+    # If colours are in smooth order, neighbouring patches look alike in a wide window, also if they are covered.
     block_of_cell = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm)[1])
     cell_count = np.maximum(np.bincount(block_of_cell, minlength=len(blocks.score)), 1)
     mismatched_share = np.bincount(block_of_cell, mismatched_cells, minlength=len(blocks.score)) / cell_count

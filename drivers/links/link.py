@@ -1,7 +1,7 @@
-"""A cable as three verbs with a time limit, and one request at a time over it.
+"""Interface of a connection with three methods (write, read, close), and one request at a time over it.
 
-Contract of every implementation: errors of the system become `LinkTimeout` and `LinkClosed` here and nowhere else.
-Bytes that the far side sent before it disconnected can still be read.
+Contract of every implementation of `Link`: it raises `LinkTimeout` or `LinkClosed` instead of errors of the operating
+system. Bytes that the far side sent before it disconnected can still be read.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class PeerLink:
         """Pass `data` to the peer."""
         if not self._open:
             raise LinkClosed("this end of the simulated cable was closed; open a new connection")
-        # As on a real cable, a disconnection is seen only by the next read.
+        # As on a real cable, only the next read reports a disconnection.
         if not self._peer.closed:
             self._incoming += self._peer.receive(data)
 
@@ -83,7 +83,7 @@ class PeerLink:
                 raise LinkClosed("the simulated device closed the connection; open a new one")
             if not timeout:
                 return b""
-            raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s; open a new connection")
+            raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s; repeat the request")
         data = bytes(self._incoming[:limit])
         del self._incoming[:limit]
         return data
@@ -95,7 +95,7 @@ class PeerLink:
 
 _log = logging.getLogger(__name__)
 
-# Default wait for a message that the device may have sent unasked, seconds.
+# Default wait for a message that the device may have sent without a request, seconds.
 POLL_S = 0.1
 
 # Longest message, bytes; all supported protocols stay far below it.

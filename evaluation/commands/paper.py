@@ -41,7 +41,7 @@ the results with full look-up tables (LUT) of both cameras.
 app = new_app(no_args_is_help=True)
 
 # Arguments and options that several commands share.
-Luts = Annotated[list[Path], argument("LUT", "Folders of look-up tables (LUT); demo: for a small computed LUT.")]
+Luts = Annotated[list[Path], argument("LUT", "Folders of look-up tables (LUT), or demo: for a small computed LUT.")]
 ErrorOption = Annotated[AngularError, typer.Option(help="Angular error to print.")]
 Out = Annotated[Path | None, option("FOLDER", "Write page, tables and figures here.")]
 Workers = Annotated[int | None, thread_option()]
@@ -49,14 +49,14 @@ Workers = Annotated[int | None, thread_option()]
 # Added to the conditions if pictures or ground truths are not those of the paper.
 _NOT_C1_NOTE = (
     "The paper uses C1, the 259 images of the Canon 1Ds Mark III of NUS, for pictures and ground truths. Its numbers "
-    "are shown only for data sets of C1 or random scenes under illuminants like those of C1 or random ones."
+    "are shown only if both scenes and illuminants are those of C1 or random."
 )
 
 _TABLE1_HELP = f"""Statistics-based methods on eight generated data sets (table 1).
 
-Reads LUTs, pictures and ground truths. Generates in memory two sets of scenes, the pictures and as many scenes of
-random codes, under two choices of illuminants for each LUT: nearest to the ground truths, and drawn at random. Prints
-the statistics of each method for each data set, followed by the published ones for C1 and random scenes. Writes files
+Reads LUTs, pictures and ground truths. Generates four data sets for each LUT in memory. The scenes are the pictures, or
+as many scenes of random codes. The illuminants are those nearest to the ground truths, or random ones. Prints the
+statistics of each method for each data set, followed by the published statistics for C1 and random scenes. Writes files
 only with --out.
 
 {EXIT_CODES}
@@ -79,8 +79,8 @@ def table1(
         str,
         option(
             "TRUTHS",
-            "Ground truths for the choice of nearest illuminants: FILE.csv, FILE.csv#START for rows with names that "
-            "start with START, or a data set.",
+            "Ground truths; the illuminants nearest to them are used: FILE.csv, FILE.csv#START for rows with names "
+            "that begin with START, or a data set.",
         ),
     ],
     matrix: Annotated[
@@ -100,7 +100,7 @@ def table1(
     *,
     output: JsonOutput,
 ) -> None:
-    """Run plain methods on eight generated data sets."""
+    """Run statistics-based methods on eight generated data sets."""
     from evaluation.experiments.paper.material import read_truths
     from evaluation.experiments.paper.published import cell_name
     from evaluation.experiments.paper.reporting import table1_report
@@ -150,7 +150,7 @@ def table2(
         str, option("LIST", "Learned methods, separated by commas: names, module:Class or file.py:Class.")
     ] = "smart-color-cat, regression-trees, color-beaver",
     unseen: Annotated[
-        bool, typer.Option("--unseen", help="Exclude generated images that show a picture of the test.")
+        bool, typer.Option("--unseen", help="Exclude generated images with a picture that is also a test image.")
     ] = False,
     error: ErrorOption = "reproduction",
     out: Out = None,
@@ -333,7 +333,7 @@ def _sides(text: str) -> list[int]:
     sides = [side.strip() for side in text.split(",") if side.strip()]
     for side in sides:
         if not side.isdigit() or not 1 <= int(side) <= 65535:
-            raise InputError(f"side {side!r} of an image: expected a whole number from 1 to 65535 px; correct it")
+            raise InputError(f"side {side!r} of an image: expected a whole number from 1 to 65535 px; correct --sizes")
     return [int(side) for side in sides]
 
 

@@ -114,9 +114,9 @@ def bounded_figures(
     return tuple(BoundedFigure(*map(float, row)) for row in rows)
 
 
-def _hazen(count: Indices, percent: float) -> tuple[Indices, Indices, Floats]:
+def _hazen_position(count: Indices, percent: float) -> tuple[Indices, Indices, Floats]:
     position: Floats = np.clip(np.multiply(count, percent / 100) - 0.5, 0, np.subtract(count, 1))
-    # A percentile lies between two order statistics; the fraction is the weight of the upper one
+    # By Hazen's definition. A percentile lies between two sorted errors; the fraction is the weight of the upper one.
     low: Indices = position.astype(np.int64)
     return low, np.minimum(low + 1, np.subtract(count, 1)), position - low
 
@@ -159,7 +159,7 @@ class ErrorSample:
         ascending: Indices = (cumulative_counts + offsets[:, None]).ravel()
 
         def quantile(percent: float) -> Floats:
-            low, high, weight = _hazen(totals, percent)
+            low, high, weight = _hazen_position(totals, percent)
             lower, upper = (
                 self.errors[np.searchsorted(ascending, offsets + position, side="right") - row * images]
                 for position in (low, high)
@@ -173,10 +173,10 @@ class ErrorSample:
         sum_below = np.where(worst_start >= 0, sums[row, worst_start], 0)
         count_below = np.where(worst_start >= 0, cumulative_counts[row, worst_start], 0)
         worst_mean = (sums[:, -1] - sum_below) / (totals - count_below)
-        five = np.stack([sums[:, -1] / totals, q2, (q1 + 2 * q2 + q3) / 4, best_mean, worst_mean], axis=-1)
+        first_five = np.stack([sums[:, -1] / totals, q2, (q1 + 2 * q2 + q3) / 4, best_mean, worst_mean], axis=-1)
         # If all errors are 0, rounding of sums may leave a small negative value.
-        non_negative = np.where(five < 0, np.nan, five)
-        return np.concatenate([five, np.prod(non_negative**0.2, axis=-1, keepdims=True)], axis=-1)
+        non_negative = np.where(first_five < 0, np.nan, first_five)
+        return np.concatenate([first_five, np.prod(non_negative**0.2, axis=-1, keepdims=True)], axis=-1)
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ class Result:
     - `guessed`: (N,) bool, True if the method returned no illuminant and grey replaces it.
     - `causes`: index of the image to the reason why the image, or some of its pixels, has no estimate; None if not
       recorded.
-    - `maps`: index of the image to its errors by pixel and region, ascending; None if no image has several illuminants,
-      or if none was measured.
+    - `maps`: index of the image to its errors by pixel and region, in ascending order of the index; None if no image
+      has several illuminants, or if none was measured.
     """
 
     method: str
@@ -43,8 +43,8 @@ class Result:
         Examples
         --------
         >>> result = Result("Mine", np.eye(3), {"recovery": np.array([1.0, 2.0, 3.0])}, np.zeros(3, bool), {2: "dark"})
-        >>> some = result.at(np.array([2, 0]))
-        >>> some.errors["recovery"], some.causes
+        >>> selected = result.at(np.array([2, 0]))
+        >>> selected.errors["recovery"], selected.causes
         (array([3., 1.]), {0: 'dark'})
         """
         causes = self.causes
@@ -73,7 +73,7 @@ class Result:
         return summarise(self.errors[metric])
 
 
-# Cause if a method of this suite returned no illuminant: the image is too small, clipped, black or uniform.
+# Cause if a method of this suite returned no illuminant, because the image is too small, clipped, black or uniform.
 NO_PIXEL = "no usable pixel"
 
 

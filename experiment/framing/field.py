@@ -25,7 +25,7 @@ from experiment.framing.homography import fit_homography, project
 from foundation.errors import InputError, RegistrationError
 from foundation.robust import biweight, huber_weights, robust_sigma
 
-# Counts above black that the brightest parts of the strongest plane need before a chart is searched.
+# Smallest level, counts above black, of the brightest parts of the brightest colour plane; a darker image is refused.
 MIN_SIGNAL = 12.0
 
 CORNER_REACH_PX = 24.0  # Largest distance of the outline from the given corners, half-size px
@@ -38,8 +38,8 @@ SIDE_POINTS = 160  # Points per side at which the edge is searched: many times t
 LEAST_SIDE_PX = 192
 
 
-# Smallest fraction of the variation between patches that the chart's colours explain; another order of patches explains
-# nothing.
+# Smallest fraction of the variation between patches that the chart's colours must explain. With another order of
+# patches, they explain nothing.
 MIN_EXPLAINED = 0.5
 
 # The residual of the given orientation must be less than this many times the residual of the best one.
@@ -49,7 +49,7 @@ MIRRORED = 4  # First mirrored orientation among the eight orientations of a rec
 
 _SMALL_WIDTH_PX = 640  # Width in px of the small image in which the level of paper is estimated
 
-# Signal of a channel relative to the strongest one, from which it is used for colours and for edges.
+# Smallest signal of a channel that is used for colours, and for edges, relative to the strongest channel.
 _LEAST_LIGHT, _MUCH_LIGHT = 0.03, 0.2
 
 _PROFILE_STEP_PX = 0.5  # Step of the profiles across an edge: half a half-size pixel, that is one photosite
@@ -76,8 +76,8 @@ _REFINED_PX = 1.5  # Largest correction of an edge, half-size px: beyond it, the
 
 _CLEAR_EDGE = 0.15  # Smallest step, relative to paper, that has a position accurate to 0.1 px
 
-# Order of the curve through the deviations of a side. It follows corners that curl by 6 px to 0.1 px, and not marks in
-# the margin along a twelfth of a side.
+# Order of the curve through the deviations of a side. It follows corners that curl by 6 px, with an error of 0.1 px. It
+# does not follow marks in the margin along a twelfth of a side.
 _SIDE_CURVE_ORDER = 8
 
 # Number of random patches for the comparison of colours: a hundred for each parameter of the fit.
@@ -90,7 +90,7 @@ Corners = tuple[tuple[float, float], ...]
 
 def paper_level(plane: Plane) -> float:
     """Return the level of the brightest parts of a plane, counts above black: 99.5th percentile of 4×4 means."""
-    # Means, because single pixels of a dark frame would count its noise as light.
+    # Means of 4×4, because single pixels of a dark frame would be bright by noise alone.
     height, width = plane.values.shape
     size = (max(1, width // 4), max(1, height // 4))
     return float(np.percentile(cv2.resize(plane.values, size, interpolation=cv2.INTER_AREA), 99.5))
@@ -348,8 +348,7 @@ def parse_corners(texts: Sequence[str]) -> Corners:
     """Return four corners (x, y), half-size px, from four texts X,Y in raw pixels."""
     if len(texts) != 4:
         raise InputError(
-            f"{len(texts)} corners are given, {' '.join(texts)}, expected 4, X,Y each, in pixels of the raw file; "
-            "correct --corners"
+            f"{len(texts)} corners are given, {' '.join(texts)}, 4 expected; give X,Y of each in pixels of the raw file"
         )
     corners: list[tuple[float, float]] = []
     for text in texts:
@@ -358,7 +357,7 @@ def parse_corners(texts: Sequence[str]) -> Corners:
         except ValueError:
             x = y = math.nan
         if not (math.isfinite(x) and math.isfinite(y)):
-            raise InputError(f"{text!r} is not a corner, expected X,Y in pixels of the raw file; correct --corners")
+            raise InputError(f"{text!r} is not a corner, X,Y expected; give two numbers, in pixels of the raw file")
         corners.append(((x - 0.5) / 2, (y - 0.5) / 2))
     require_corners(np.array(corners))
     return tuple(corners)
@@ -403,7 +402,7 @@ class PreparedImage:
     planes: tuple[Plane, ...]  # planes with enough light, slightly smoothed
     channels: tuple[int, ...]  # channel of each plane: 0, 1, 2
     levels: tuple[_Float, ...]  # estimated level of paper in each plane, on the small image
-    bright: tuple[bool, ...]  # whether each plane has enough light that its noise does not look darker than paper
+    bright: tuple[bool, ...]  # whether each plane has enough light to distinguish patches from the noise of paper
     shape: tuple[int, int]  # height and width, half-size px
     factor: int  # half-size pixels per pixel of the small image
 
@@ -580,7 +579,7 @@ def _steepest_rises(paleness: _Float, across: _Points, sigma_px: float) -> tuple
     rise = np.zeros_like(profile)
     rise[:, step:-step] = profile[:, 2 * step :] - profile[:, : -2 * step]
     level_beyond = np.roll(profile, -2 * step, axis=1)
-    # If there are several rises, as next to marks in the margin, the one closer to the expected position wins.
+    # If there are several rises, as next to marks in the margin, the weights prefer the expected position.
     weights = np.exp(-2 * (across / sigma_px) ** 2).astype(np.float32)
     coarse = (rise * weights * np.clip(level_beyond, 0, 1) ** 4).argmax(axis=1)
     row = np.arange(len(coarse))

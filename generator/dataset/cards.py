@@ -56,7 +56,7 @@ def summary_of(description: Description) -> str:
     """Return sentences on the content of the images."""
     table = description.table
     return (
-        f"{counted(description.images, 'image')} in linear camera RGB, as the raw sensor of the "
+        f"{counted(description.images, 'image')} in linear camera RGB, as the sensor of the "
         f"{one_line(table.camera)} would record them, each with the exact colour of its illuminant. Black is 0, the "
         f"saturation level is {table.white_level}; images are not white balanced. {kind_of(description)}"
     )
@@ -90,7 +90,7 @@ def truth_of(description: Description) -> str:
     """Return a sentence on the source of the ground truth."""
     if description.table.computed is not None:
         return "it is the response of the sensor model to bare paper under the spectrum of the illuminant."
-    return "it is the mean of the white references among the patches, under the same illuminant."
+    return "it is the mean of the white references of the chart, under the same illuminant."
 
 
 def pixels_of(description: Description) -> str:
@@ -99,12 +99,12 @@ def pixels_of(description: Description) -> str:
     if option(description, "rendering") is None:
         return (
             f"Each pixel is one of the {samples} samples of its colour in the LUT, drawn with the seed; for mixed "
-            "illuminants one sample of each is combined."
+            "illuminants, one sample for each illuminant is drawn, and they are mixed."
         )
     return (
         "Each pixel is the mean of its colour, interpolated between patches of the LUT, plus noise. The noise is the "
         f"deviation of one of the {samples} samples of the nearest patch from their mean, drawn with the seed and "
-        "scaled to the noise at that level; for mixed illuminants the deviations of each are combined."
+        "scaled to the noise at that level; for mixed illuminants, the deviations of all illuminants are combined."
     )
 
 

@@ -22,13 +22,13 @@ from generator.lights.lighting import parse_mixture
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_ROWS: Final = 12  # Sources of a sheet; with more, images on a full screen are too small
-MAX_COLUMNS: Final = 8  # Illuminants of a sheet, for the same reason
-# Images of a grid for each row of a sheet: a grid of 6×4 images fills a screen like 12 rows of 8 images.
+MAX_ROWS: Final = 12  # Largest number of sources on a sheet; more images would be too small on a full screen
+MAX_COLUMNS: Final = 8  # Largest number of illuminants on a sheet, for the same reason
+# Number of grid images that replace one row: a grid of 6×4 images fills a screen like 12 rows of 8 images.
 _GRID_IMAGES: Final = 2
 # Ratio of columns to rows of the grid, about that of screens and of most pictures.
 _GRID_ASPECT: Final = 1.5
-_NAME: Final = 26  # Characters of a name below an image of the grid; more would overlap the next name
+_NAME: Final = 26  # Largest number of characters of a name below an image; more would overlap the next name
 _PAPER: Final = "#16171a"
 _INK: Final = "#e8e6e1"
 _FAINT: Final = "#8d8f96"
@@ -76,7 +76,7 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     from matplotlib.patches import Circle
 
     record = dataset.description
-    # Counted by number of sources, because a source that was drawn several times appears with one name.
+    # Compared with the number of sources, not of names: a source that was drawn several times has one name.
     is_grid = record.images == record.sources
     grid = _grid(dataset.entries, max_rows, max_columns) if is_grid else _rows(dataset.entries, max_rows, max_columns)
     pictures = [[_load(dataset, entry) for entry in line] for line in grid]

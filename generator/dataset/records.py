@@ -18,12 +18,12 @@ from generator.stores import Pieces
 
 
 class SparseRecord(Record):
-    """A record that omits keys with default None while they are None, so that older files keep their bytes."""
+    """A record that omits keys with default None if their value is None, so that older files keep their bytes."""
 
     @model_serializer(mode="wrap")
     def _without_none(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        left_out = {name for name, field in type(self).model_fields.items() if field.default is None}
-        return {key: value for key, value in serialise(self).items() if value is not None or key not in left_out}
+        optional_names = {name for name, field in type(self).model_fields.items() if field.default is None}
+        return {key: value for key, value in serialise(self).items() if value is not None or key not in optional_names}
 
 
 FORMAT: Final = "crop.dataset"
@@ -167,8 +167,8 @@ class FinishedImage(Record):
 class RenderingSummary(Record):
     """Results of the rendering of a data set."""
 
-    outside: float | None = None  # mean share of pixels with colours that the print cannot show; None for codes
-    distance: float | None = None  # mean colour error over all pixels, degrees; None for codes
+    outside: float | None = None  # mean share of pixels outside of the print's gamut; None if rendered by codes
+    distance: float | None = None  # mean colour error over all pixels, degrees; None if rendered by codes
     black_taken: float = 0.0  # mean subtracted share of the black of the print
 
 
@@ -201,7 +201,7 @@ class Description(SparseRecord):
     splits: dict[str, int] = Field(default_factory=dict[str, int])  # images of each split
     lights: list[Light]  # used illuminants of the LUT, alone or mixed
     skipped: list[Skipped]
-    rendering: RenderingSummary | None = None  # None for codes with the black of the print kept
+    rendering: RenderingSummary | None = None  # None if rendered by codes without `--black-point`
 
     @property
     def parts(self) -> list[str]:

@@ -1,6 +1,6 @@
 """Read the ColorChecker data set of Gehler, in the linear 12-bit files of Shi and Funt: 568 images, two cameras.
 
-    8D5U5524.png …           86 images of a Canon EOS-1Ds ("1D"), 16-bit files of 12 bits, linear, black not subtracted
+    8D5U5524.png …           86 images of a Canon EOS-1Ds ("1D"), 12-bit values in 16-bit files, black not subtracted
     IMG_0281.png …           482 images of a Canon EOS 5D
     coordinates/NAME_macbeth.txt   size of the annotated image, then four corners of the chart: 1 2, 3 4
     ColorCheckerData.mat     REC_groundtruth (568, 3): recommended ground truth; REC_groundtruth.mat is read too
@@ -11,11 +11,11 @@ Subfolders are searched to a depth of three, so that the archives may be unpacke
 P. Gehler et al., "Bayesian color constancy revisited", CVPR 2008; L. Shi, B. Funt,
 www2.cs.sfu.ca/~colour/data/shi_gehler.
 G. Hemrit et al., "Rehabilitating the ColorChecker dataset for illuminant estimation" (CIC 26, 2018, arXiv:1805.12262)
-describe errors in the three earlier sets of ground truths, and recommend a new one (colorconstancy.com). Errors against
-Shi's ground truth are not comparable with it. Rows of both belong to the images in order of their names. Black levels
-and saturation: internal/GehlerShiSensor.m of github.com/google/ffcc. It calls the saturation 3580 of older papers not
-correct; some programs use black 1 for the 1D. Chart corners: internal/ReadImage.m there. Not verified against a real
-copy.
+describe errors in the three earlier sets of ground truths, and recommend a new set (colorconstancy.com). Errors against
+Shi's ground truth and against the new one are not comparable. In both, rows are in the order of the image names. Black
+levels and saturation: internal/GehlerShiSensor.m of github.com/google/ffcc. According to this file, the saturation 3580
+of older papers is not correct. Some programs use black 1 for the 1D. Chart corners: internal/ReadImage.m there. Not
+verified against a real copy.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def open_gehler_shi(location: str, options: DataOptions, scanned_folder: Folder 
     if missing:
         raise FormatError(
             f"{location} lacks {len(missing)} files of chart corners, first coordinates/{missing[0]}_macbeth.txt; "
-            "they are required to mask the charts: unpack the archive of measured illumination there"
+            "expected one for each image, to mask its chart; unpack the archive with the coordinates there"
         )
     rows = {name: index for index, name in enumerate(NAMES)}
     scenes = tuple(

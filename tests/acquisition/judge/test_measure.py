@@ -91,7 +91,7 @@ def test_accepts_rounded_exposure_values(
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        ({"shutter_s": 0.4}, "the file records shutter time in s 0.4 instead of 0.5"),
+        ({"shutter_s": 0.4}, "the file has shutter time in s 0.4 instead of 0.5"),
         ({"shutter_s": 0.6}, "shutter time in s 0.6 instead of 0.5"),
         ({"aperture": 9.0}, "aperture 9 instead of 8"),
         ({"iso": 125}, "ISO speed 125 instead of 100"),

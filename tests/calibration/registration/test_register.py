@@ -298,7 +298,7 @@ def test_refuses_blur_and_size_beyond_limits(cell_px: float, blur: float, messag
 def test_refuses_several_displaced_areas(slipped: int, area_count: int, is_refused: bool) -> None:
     matcher: Any = SimpleNamespace(slipped=lambda cells: (np.full((slipped, 2), 7.0), area_count))  # pyrefly: ignore[implicit-any-lambda]
     with expect_refusal("match the neighbouring patches" if is_refused else ""):
-        registering._require_own_cells(matcher, np.zeros(9, np.bool_), "it")
+        registering._refuse_displaced_areas(matcher, np.zeros(9, np.bool_), "it")
 
 
 def test_coverage_factor_is_two_or_three_without_tags() -> None:
