@@ -312,7 +312,7 @@ class JoinedLayout:
     # Returns the bytes of a file named as in a tar file (``000123.masks_0.png``), or None; raises if damaged.
     read: Callable[[BinaryIO, str], bytes | None]
     library: str  # required Python library, or ""
-    is_of_the_hub: bool  # `load_dataset` of Hugging Face reads the images; else it reads the table of ground truths
+    is_read_by_hugging_face: bool  # `load_dataset` of Hugging Face reads the images; else it reads the table of ground truths
     reading: str  # text of the card: how to read images with all bits
 
     def open_writer(self, store: Store, shard: int, extras: Extras) -> JoinedWriter:
@@ -360,7 +360,7 @@ JOINED: Final[Mapping[str, JoinedLayout]] = {
         start=lambda stream, _: _Tar(stream),
         read=_read_tar,
         library="",
-        is_of_the_hub=True,
+        is_read_by_hugging_face=True,
         reading=_HUB_READING,
     ),
     "parquet": JoinedLayout(
@@ -368,7 +368,7 @@ JOINED: Final[Mapping[str, JoinedLayout]] = {
         start=lambda stream, beside: _Parquet(stream, _schema(*beside)),
         read=_read_parquet,
         library="pyarrow",
-        is_of_the_hub=True,
+        is_read_by_hugging_face=True,
         reading=_HUB_READING,
     ),
 }
