@@ -312,7 +312,7 @@ class JoinedLayout:
     # Returns the bytes of a file named as in a tar file (``000123.masks_0.png``), or None; raises if damaged.
     read: Callable[[BinaryIO, str], bytes | None]
     library: str  # required Python library, or ""
-    is_read_by_hugging_face: bool  # `load_dataset` of Hugging Face reads the images; else it reads the table of ground truths
+    is_read_by_hugging_face: bool  # `load_dataset` reads the images; else it reads the table of ground truths
     reading: str  # text of the card: how to read images with all bits
 
     def open_writer(self, store: Store, shard: int, extras: Extras) -> JoinedWriter:

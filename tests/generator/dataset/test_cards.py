@@ -87,7 +87,9 @@ def test_hub_client_reads_card(data_set: Dataset) -> None:
     files = [entry for config in card_file.data.to_dict()["configs"] for entry in config["data_files"]]
     splits = data_set.description.splits
     split_names: set[Split] = {split for split, images in splits.items() if images}  # pyrefly: ignore[bad-assignment]
-    assert {entry["split"] for entry in files} == (split_names if LAYOUTS[data_set.layout].is_read_by_hugging_face else {"train"})
+    assert {entry["split"] for entry in files} == (
+        split_names if LAYOUTS[data_set.layout].is_read_by_hugging_face else {"train"}
+    )
     for entry in files:
         assert list(folder_of(data_set).glob(entry["path"])), entry
 
