@@ -519,7 +519,7 @@ def test_selects_a_display_by_each_property(
 @pytest.mark.parametrize(
     ("displays", "selection", "reason"),
     [
-        ((DESK, BEAMER), None, "display \\(not set\\): 2 match"),
+        ((DESK, BEAMER), None, "display \\(not set\\): 2 displays match"),
         ((DESK, BEAMER), "HDMI-2", "display 'HDMI-2' is not connected"),
         ((DESK, BEAMER), "+1920+0", "not connected"),
         ((DESK, BEAMER), 3, "display 3 is not connected"),
