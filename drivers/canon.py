@@ -1,14 +1,15 @@
 """A Canon EOS body as a `drivers.camera.Camera` over PTP, for hours of unattended exposures.
 
-`EosState` holds what the body reports, `EosBody` one connection, `CanonEos` the camera across connections. GetEvent
+`EosState` holds the reports of the body, `EosBody` one connection, `CanonEos` the camera across connections. GetEvent
 returns a chain of records: size with header (32 bits), type (32 bits), body. A record of size 8 and type 0 ends the
 chain; some bodies leave it out. The first reply after SetEventMode holds the whole state, later replies the changes.
 Property values are bytes: 32 bits for a number, text with a closing NUL, structures for a few. ``decode`` and
 ``encode`` are inverse on well-formed bytes. Records of unknown type or form are kept in `OtherRecord`; inconsistent
 records raise `ProtocolError`.
 
-Source: no public standard. Layouts and conversations were recorded from an EOS 60D and an EOS 400D; libgphoto2 2.5.34
-for their meaning and for the order of a release; ExifTool (CanonCustom::Functions2) for the number of mirror lockup.
+Sources: there is no public standard. Layouts and conversations were recorded from an EOS 60D and an EOS 400D. Their
+meaning and the order of a release are from libgphoto2 2.5.34, the number of mirror lockup from ExifTool
+(CanonCustom::Functions2).
 """
 
 from __future__ import annotations
@@ -286,7 +287,7 @@ class DeviceInfoEx:
 # Longest accepted reply to GetEvent, bytes; a body that is not polled for a day queues about 250 kB.
 MAX_EVENTS: Final = 4 << 20
 
-# Most records of one reply; about 8000 are queued in 12 h without polling (reports of libgphoto2 users).
+# Largest number of records of one reply; about 8000 are queued in 12 h without polling (reports of libgphoto2 users).
 MAX_RECORDS: Final = 1 << 16
 
 _HEADER_LENGTH: Final = 8  # Bytes of size and type of a record
@@ -401,12 +402,12 @@ _NOTICES: frozenset[int] = frozenset(
 
 
 def decode_events(data: bytes) -> tuple[Record, ...]:
-    """Return the records in a reply to GetEvent (0x9116) without the closing record; no bytes are no records."""
+    """Return the records in a reply to GetEvent (0x9116) without the closing record; none for an empty reply."""
     cursor = Cursor(data, "GetEvent", MAX_EVENTS)
     records: list[Record] = []
     while True:
         start = cursor.position
-        # A chain may end without its closing record or with NULs; no transport passes on part of a reply as all of it.
+        # A chain may end without its closing record or with NULs. Transports return only complete replies.
         if not any(data[start : start + _HEADER_LENGTH]) and not any(data[start:]):
             return tuple(records)
         if len(records) == MAX_RECORDS:
@@ -573,7 +574,7 @@ class Scale:
         nearest = steps if number is None else sorted(steps, key=lambda step: abs(math.log2(step.value / number)))[:4]
         labels = ", ".join(dict.fromkeys(step.label for step in sorted(nearest, key=lambda step: step.code)))
         return InputError(
-            f"{self.name} {setting} is not offered; set one of the nearest: {labels or 'the camera lists no value'}"
+            f"{self.name} {setting} is not offered; choose one of the nearest: {labels or 'none, the list is empty'}"
         )
 
 
@@ -619,7 +620,7 @@ SHUTTER = _scale(
     {0x00: "auto", 0x0C: "bulb", 0x04: "bulb"},
 )
 
-# Aperture as f-number (property 0xd101); also 0 for a lens without contacts.
+# Aperture as f-number (property 0xd101). Code 0 is also reported for a lens without contacts.
 APERTURE = _scale(
     "aperture",
     """
@@ -644,15 +645,15 @@ ISO = _scale(
 
 MIRROR_LOCKUP_FUNCTION = 0x060F  # Custom function of mirror lockup, on bodies that have it
 
-MAX_PROPERTIES = 1024  # Most stored properties; real bodies report 80 to 300
+MAX_PROPERTIES = 1024  # Largest number of stored properties; real bodies report 80 to 300
 # Longest stored property value, bytes; the longest known value, of focus points, has about 5000.
 MAX_VALUE = 1 << 14
 # Longest stored list of values; known lists have up to 31 (image formats) and 76 (colour temperatures).
 MAX_LIST = 1024
-_MAX_PENDING = 64  # Most stored objects; more than a body's memory can hold
+_MAX_PENDING = 64  # Largest number of stored objects; more than a body's memory can hold
 _NOT_RAW = (ObjectFormat.EXIF_JPEG, ObjectFormat.JFIF, ObjectFormat.MOV, ObjectFormat.MOV2)
 _NOT_RAW_SUFFIXES = (".jpg", ".jpeg", ".hif", ".mov", ".mp4")
-_SILENT_OR_PLAIN = (DriveMode.SINGLE, DriveMode.SINGLE_SILENT)
+_SINGLE_SHOOTING = (DriveMode.SINGLE, DriveMode.SINGLE_SILENT)
 _BATTERY_LOW = 0  # EOS_BATTERY_POWER of a low battery (libgphoto2)
 # Charge for each EOS_BATTERY_POWER (libgphoto2); other numbers are unknown.
 _BATTERY_LEVELS = {_BATTERY_LOW: 0.0, 5: 0.25, 1: 0.5, 4: 0.75, 2: 1.0}
@@ -783,7 +784,7 @@ def find_setting_faults(state: EosState) -> list[str]:
         faults.append(f"the mode dial is set to {_code_name(AeMode, mode)}: turn it to M")
     if focus is not None and focus != FocusMode.MANUAL:
         faults.append("autofocus is on: set the lens to MF and focus by hand")
-    if drive is not None and drive not in _SILENT_OR_PLAIN:
+    if drive is not None and drive not in _SINGLE_SHOOTING:
         faults.append(f"the drive mode is {_code_name(DriveMode, drive)}: set single shooting")
     if state.number(Property.EOS_MIRROR_UP_SETTING) or state.functions.get(MIRROR_LOCKUP_FUNCTION) == 1:
         faults.append("mirror lockup is on: switch it off")
@@ -834,7 +835,7 @@ def plan_settings(state: EosState, settings: ExposureSettings) -> dict[int, byte
 
 
 def shutter_speeds(state: EosState) -> tuple[float, ...]:
-    """Return the nominal shutter times that a body lists, seconds, rising; without bulb and unknown codes."""
+    """Return the nominal shutter times that a body lists, seconds, ascending; without bulb and unknown codes."""
     values = {step.code: step.value for step in SHUTTER.steps}
     return tuple(sorted({values[code] for code in state.lists.get(Property.EOS_SHUTTER_SPEED, ()) if code in values}))
 
@@ -857,7 +858,7 @@ def _raw_format(state: EosState) -> ImageFormat:
     if RAW_ONLY not in offered and not state.has_value(Property.EOS_IMAGE_FORMAT, RAW_ONLY.encode()):
         raws = ", ".join(str(item) for item in offered if any(file.is_raw for file in item.files))
         raise InputError(
-            f"image format {RAW_ONLY} alone is not offered (formats with raw: {raws or 'none'}); use another camera"
+            f"image format {RAW_ONLY} alone is not offered; formats with raw: {raws or 'none'}; use another camera"
         )
     return RAW_ONLY
 
@@ -878,7 +879,7 @@ def _code_name(code_type: type[AeMode] | type[DriveMode], value: int) -> str:
 
 PIECE_BYTES = 1 << 20  # Bytes of one request; 5 MiB have crashed newer bodies
 MAX_FRAME_BYTES = 256 << 20  # Largest accepted frame; raw files of EOS bodies stay far below
-# Most GetEvent requests of one drain. A few empty the queue, but some firmware repeats records without end.
+# Largest number of GetEvent requests of one drain. A few empty the queue, but some firmware repeats records endlessly.
 MAX_POLLS = 64
 KEEP_ALIVE_S = 10.0  # Interval of KeepDeviceOn requests, as in libgphoto2
 SETTLE_LIMIT_S = 5.0  # Time for a body to report a new value, or space for a frame
@@ -900,7 +901,7 @@ _WITHOUT_AF = 1  # Second parameter of RemoteReleaseOn: a release without autofo
 _HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
 # Pauses between polls, seconds, as in libgphoto2; the first are short, because most replies come at once.
 _PAUSES_S = (0.05, 0.1, 0.15, 0.2)
-# Requests of one piece, with the longest pause between them: 1 s for a transient fault, then the frame is repeated.
+# Largest number of requests of one piece, with the longest pause after each: a transient fault may last 1 s.
 _PIECE_TRIES = 5
 _FREE_TRIES = 3  # Requests to free an object; the next `make_ready` repeats them
 # Operations that return a part of an object, the preferred one first.
@@ -924,7 +925,7 @@ _NOT_PRESENT = (
     ResponseCode.INVALID_PARAMETER,
 )
 _SLOT_FILLED = 0xFFFF  # Bits of a storage number; 0 for an empty slot (ISO 15740, 5.2.1)
-_MAX_CARDS = 8  # Most cards to query; bodies have one or two
+_MAX_CARDS = 8  # Largest number of cards to query; bodies have one or two
 # Parameter of the response to RemoteRelease; 0 is success.
 _RELEASE_RESULTS = {
     1: "the autofocus failed; set the lens to MF",
@@ -937,8 +938,8 @@ _RELEASE_RESULTS = {
 class EosBody:
     """One connection to an EOS body.
 
-    - Every step was recorded from a host, or is sent by libgphoto2. Nothing is sent that the body does not list. If it
-      lists an operation but rejects it as unknown, the connection continues without that operation if possible.
+    - Each request was recorded from a host, or is sent by libgphoto2. No operation is sent that the body does not list.
+      If it lists an operation but rejects it as unknown, the connection continues without that operation if possible.
     - Counts and sizes are checked before memory is used; the limits are far above those of real bodies.
     - A body keeps a frame in memory until TransferComplete, and refuses to release while the memory is full. Therefore
       every announced object is fetched or discarded, and then freed.
@@ -1059,7 +1060,7 @@ class EosBody:
         parameters, _ = self._session.call(Operation.EOS_REMOTE_RELEASE, timeout=CAPTURE_TIMEOUT_S)
         result = parameters[0] if parameters else 0
         if result:
-            reason = _RELEASE_RESULTS.get(result, f"result 0x{result:x}; switch it off and on")
+            reason = _RELEASE_RESULTS.get(result, f"result 0x{result:x}: look at its display")
             raise DeviceRefused(f"{self.label} does not release: {reason}")
 
     def _press_button(self) -> None:
@@ -1106,8 +1107,8 @@ class EosBody:
         """Append the bytes of an object from `offset` on to `into`, piece by piece."""
         if not 0 < pending.size <= MAX_FRAME_BYTES:
             raise DeviceError(
-                f"{self.label} announces {pending.name!r} of {pending.size} bytes, expected 1 to {MAX_FRAME_BYTES}; "
-                "repeat it"
+                f"{self.label} announces {pending.name!r} of {pending.size} bytes, 1 to {MAX_FRAME_BYTES} expected; "
+                "expose again"
             )
         while offset < pending.size:
             operation = next((candidate for candidate in _PARTIAL_READS if self._offers(candidate)), None)
@@ -1206,7 +1207,7 @@ class EosBody:
         reported = self.state.values.get(code)
         raise DeviceRefused(
             f"{self.label} reports {reported.hex() if reported is not None else 'nothing'} for property "
-            f"{describe(Property, code)}, {value.hex()} was set; set it by hand, or switch the camera off and on"
+            f"{describe(Property, code)}, {value.hex()} expected; set it by hand, or switch the camera off and on"
         )
 
     def _retry_while_busy(self, action: Callable[[], None]) -> None:
@@ -1220,7 +1221,9 @@ class EosBody:
                 if error.code != ResponseCode.DEVICE_BUSY:
                     raise
                 if self._clock.monotonic() >= end:
-                    raise DeviceRefused(f"{error}; it has been busy for {BUSY_LIMIT_S:g} s") from error
+                    raise DeviceRefused(
+                        f"{error}; it has been busy for {BUSY_LIMIT_S:g} s; switch it off and on"
+                    ) from error
 
     def _release_button(self) -> None:
         with contextlib.suppress(OperationDeclined):
@@ -1350,8 +1353,8 @@ class CanonEos:
       its first cause; the caller decides about longer waits.
     - A release is never repeated if it may have happened. After a fault the frame is searched in the camera's memory; a
       missing frame is an error. Objects in memory before a release are discarded, so frames are never mixed up.
-    - The frame stays in memory until its download is complete, or until the next exposure. A failed cable or an
-      unwritable file costs a download, not a frame.
+    - The frame stays in memory until its download is complete, or until the next exposure. After a fault of the cable
+      or the file, only the download is repeated.
     """
 
     def __init__(self, open_transport: Callable[[], Transport], clock: Clock = SYSTEM_CLOCK) -> None:
@@ -1399,9 +1402,9 @@ class CanonEos:
         return self._run(list_speeds)
 
     def expose(self) -> datetime:
-        """Release the shutter without autofocus, and return its time (UTC) when the body announces the frame.
+        """Release the shutter without autofocus, and return the time of the release (UTC).
 
-        An earlier frame without download is dropped.
+        Wait until the body announces the frame. An earlier frame without download is dropped.
         """
         settings = self._settings
         if settings is None:
@@ -1478,7 +1481,7 @@ class CanonEos:
 
     def _record_fault(self, fault: DeviceError) -> None:
         """Drop a failed connection, and keep the first fault of a call as its cause."""
-        # Faults before a new connection is ready follow from the end of the old one and are not recorded.
+        # Later faults, until a new connection is ready, are consequences of the first one and are not recorded.
         if self._first_fault is None:
             self._first_fault = fault
             self._renewal_deadline = self._clock.monotonic() + RECOVERY_S
@@ -1489,7 +1492,7 @@ class CanonEos:
         return f"{first}, {attempts}{'' if latest == first else f', last fault: {latest}'}; {_REMEDY}"
 
     def _release(self, settings: ExposureSettings) -> _Release:
-        """Release the shutter; return the release, which has or may have happened."""
+        """Release the shutter; return the release, which has happened or may have happened."""
 
         def press(body: EosBody) -> _Release:
             body.make_ready()

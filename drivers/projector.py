@@ -118,4 +118,4 @@ class ReportsPictureFault(Protocol):
     """A projector that reports if it does not display the signal it receives."""
 
     def picture_fault(self) -> str | None:
-        """Return why the displayed image differs from the signal (frozen, no signal); None if no fault is reported."""
+        """Return the reason of a difference between image and signal (frozen, no signal); None if none is reported."""

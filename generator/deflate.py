@@ -13,7 +13,8 @@ pack bands in parallel. All arithmetic is in integers, so equal images give equa
 docs/decisions/0040-png-keeps-its-own-deflate.md gives the reasons for our own packer.
 """
 
-# A Huffman code is stored as its bits, the first bit lowest as deflate writes them, and its length from bit 16 on.
+# A Huffman code is stored in one number: its bits from bit 0 on, in the order in which deflate writes them, and its
+# length from bit 16 on.
 
 from __future__ import annotations
 
@@ -129,10 +130,10 @@ def codes_of(lengths: Any) -> Any:
         length = lengths[symbol]
         code = following[length]
         following[length] += 1
-        turned = 0
+        reversed_code = 0
         for bit in range(length):
-            turned = (turned << 1) | ((code >> bit) & 1)
-        codes[symbol] = uint32(turned | (length << 16))
+            reversed_code = (reversed_code << 1) | ((code >> bit) & 1)
+        codes[symbol] = uint32(reversed_code | (length << 16))
     return codes
 
 
@@ -234,7 +235,8 @@ def put_head(out: Any, writer: Any, literals: Any, distances: Any, last: int) ->
         put(out, writer, tokens[i, 1], tokens[i, 2])
 
 
-# Largest number of pixels in a row: byte positions need 31 bits, above the 33 bits of a pixel that are not in the hash.
+# Largest number of pixels in a row: its byte positions need 31 bits. An entry of the history has 64 bits, of which 33
+# hold the bits of a pixel that are not in the hash.
 WIDEST: Final = 1 << 28
 
 _WINDOW: Final = 32768  # Largest distance of a match in bytes (RFC 1951, 2)
@@ -245,16 +247,17 @@ _HASHES: Final = 1 << 15
 # Multiplier of the hash. It is odd, so that multiplication modulo 2⁴⁸ maps pixels one to one.
 _MIX: Final = 0x9E3779B97F4B
 # Pixels on which both methods are compared: one window to fill the history, and two that are counted.
-_TRIED: Final = 3 * _WINDOW_PIXELS
-# One row in so many is counted in a large band. Counting all rows takes a third of the time of packing, and makes the
-# file only a six-hundredth smaller.
+_TRIAL_PIXELS: Final = 3 * _WINDOW_PIXELS
+# Interval of the counted rows in a large band. Counting all rows takes a third of the time of packing, and makes the
+# file only 0.17 % smaller.
 _STEP: Final = 8
 _FEW_ROWS: Final = 4  # Smallest number of counted rows, so that no single row decides
-_FEW: Final = 1 << 13  # Smallest number of counted symbols that represents a band; with fewer, all rows are counted
-_ROOMY: Final = 56  # Bits that fit next to seven waiting bits before a flush of 63 bits
+# Smallest number of counted symbols that represents a band; with fewer, all rows are counted.
+_FEW_SYMBOLS: Final = 1 << 13
+_FLUSH_BITS: Final = 56  # Bits that fit into a flush of 63 bits together with seven waiting bits
 # Bytes for the head and end of a block and for the overrun of a flush. Codes are below 16 bits (`LONGEST`), so a row
 # needs less than twice its bytes.
-_ROOM: Final = 1024
+_EXTRA_BYTES: Final = 1024
 
 
 def _distance_symbol(distance: int) -> int:
@@ -279,7 +282,7 @@ _DISTANCE_SYMBOLS: Final = np.array(
 _DISTANCE_BITS: Final = np.array([max(symbol // 2 - 1, 0) for symbol in range(DISTANCES)], dtype=np.int64)
 # Symbol, number of extra bits and their value, by the length of a match in pixels.
 _RUNS: Final = np.array([(0, 0, 0), *(_length_symbol(6 * run) for run in range(1, _LONGEST_RUN + 1))], dtype=np.int64)
-_ONE: Final = int(_RUNS[1, 0])  # Symbol of a match of one pixel
+_ONE_PIXEL: Final = int(_RUNS[1, 0])  # Symbol of a match of one pixel
 _LENGTH_BITS: Final = np.zeros(LITERALS, np.int64)  # Extra bits of each symbol of a literal or length
 _LENGTH_BITS[_RUNS[:, 0]] = _RUNS[:, 1]
 
@@ -292,13 +295,13 @@ def _split(image: Any, rows: Any) -> Any:
     for y in range(image.shape[0]):
         samples, row = image[y].reshape(-1), rows[y]
         row[0] = 0
-        # Combined for each row, otherwise the compiler does not vectorise the loop.
-        of_row = uint16(0)
+        # The samples of each row are combined separately, otherwise the compiler does not vectorise the loop.
+        row_bits = uint16(0)
         for i in range(len(samples)):
             row[1 + 2 * i] = samples[i] >> 8
             row[2 + 2 * i] = samples[i] & 255
-            of_row |= samples[i]
-        joined |= of_row
+            row_bits |= samples[i]
+        joined |= row_bits
     return joined
 
 
@@ -316,7 +319,7 @@ def _subtract(rows: Any, filtered: Any) -> None:
 
 @compiled
 def _count_bytes(rows: Any, literals: Any) -> None:
-    # Four counters avoid that an increment waits for the previous one of the same byte.
+    # With four counters, an increment does not wait for the previous one of the same byte.
     counts = np.zeros((4, 256), np.uint32)
     data = rows.reshape(-1)
     aligned_size = len(data) // 4 * 4
@@ -334,7 +337,7 @@ def _count_bytes(rows: Any, literals: Any) -> None:
 
 @compiled
 def find_repeats(image: Any, history: Any, distances: Any) -> None:
-    """Fill `distances` (h, w) uint16 with the bytes back to the last equal pixel of `image` (h, w, 3) uint16.
+    """Fill `distances` (h, w) uint16 with the distance in bytes to the last equal pixel of `image` (h, w, 3) uint16.
 
     The distance is 0 if the window has no equal pixel. `history` (32768,) uint64 is working memory.
     """
@@ -345,8 +348,8 @@ def find_repeats(image: Any, history: Any, distances: Any) -> None:
     for slot in range(_HASHES):
         history[slot] = 0
     samples, backs = image.reshape(-1), distances.reshape(-1)
-    # The first position makes empty entries too far for every pixel. All numbers are unsigned, because numba adds a
-    # branch to each index that may be negative.
+    # With this first position, empty entries are outside the window of every pixel. All numbers are unsigned,
+    # because numba adds a branch to each index that may be negative.
     position = uint64(_WINDOW + 1)
     index, pixels = uint64(0), uint64(0)
     for _ in range(image.shape[0]):
@@ -407,7 +410,7 @@ def _count(rows: Any, distances: Any, step: int, literals: Any, backs: Any) -> N
             match = np.int64(uint32(1) - literal)
             backs[_symbol_of(distance)] += match
             matches += match
-    literals[_ONE] += matches
+    literals[_ONE_PIXEL] += matches
     for value in range(256):
         for i in range(6):
             literals[value] += counts[i, value]
@@ -429,11 +432,11 @@ def _bits(literals: Any, backs: Any) -> int:
 def _are_repeats_smaller(image: Any, plain: Any, filtered: Any, distances: Any, history: Any) -> bool:
     # Compares both methods on rows from the middle of the band.
     height, width = distances.shape
-    tried = min(height, 1 + _TRIED // width)
-    top = (height - tried) // 2
+    trial_rows = min(height, 1 + _TRIAL_PIXELS // width)
+    top = (height - trial_rows) // 2
     # The first rows are not counted, because their history is too short for repeats.
-    counted = top + min(tried - 1, _WINDOW_PIXELS // width)
-    end = top + tried
+    counted = top + min(trial_rows - 1, _WINDOW_PIXELS // width)
+    end = top + trial_rows
     find_repeats(image[top:end], history, distances[top:end])
     literals, backs = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
     _count(plain[counted:end], distances[counted:end], 1, literals, backs)
@@ -448,7 +451,7 @@ def _estimate(plain: Any, distances: Any, literals: Any, backs: Any) -> None:
     # Estimates the frequencies of literals and distances of a band; every symbol that may occur gets at least 1.
     step = max(1, min(_STEP, len(distances) // _FEW_ROWS))
     _count(plain, distances, step, literals, backs)
-    if step > 1 and literals.sum() < _FEW:
+    if step > 1 and literals.sum() < _FEW_SYMBOLS:
         literals[:], backs[:], step = 0, 0, 1
         literals[END] = 1
         _count(plain, distances, step, literals, backs)
@@ -577,7 +580,7 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
             match, match_length = _match(matches, distance)
             bits = literal if distance == u0 else match
             length = literal_length if distance == u0 else match_length
-            if length > uint64(_ROOMY):
+            if length > uint64(_FLUSH_BITS):
                 waiting |= start << bit_count
                 offset, waiting, bit_count = flush(out, offset, waiting, bit_count + (pair & low))
                 bits, length = blue >> byte, blue & low
@@ -593,10 +596,10 @@ def _pack(image: Any, last: int, plain: Any, filtered: Any, distances: Any, hist
     # is a single compiled call: taking the interpreter lock between its steps of a millisecond would slow other
     # threads.
     largest = _split(image, plain)
-    repeats = _are_repeats_smaller(image, plain, filtered, distances, history)
+    uses_repeats = _are_repeats_smaller(image, plain, filtered, distances, history)
     literals, backs = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
     literals[END] = 1
-    if repeats:
+    if uses_repeats:
         find_repeats(image, history, distances)
         _estimate(plain, distances, literals, backs)
     else:
@@ -606,7 +609,7 @@ def _pack(image: Any, last: int, plain: Any, filtered: Any, distances: Any, hist
     codes = codes_of(lengths)
     writer = np.zeros(3, np.uint64)
     put_head(out, writer, lengths, back_lengths, last)
-    if repeats:
+    if uses_repeats:
         _join_codes(codes, largest, joined)
         _put_repeats(out, writer, image, distances, codes, codes_of(back_lengths), joined)
     else:
@@ -618,7 +621,7 @@ def _pack(image: Any, last: int, plain: Any, filtered: Any, distances: Any, hist
     put(out, writer, 0, (uint64(8) - writer[2]) & uint64(7))
     if not last:
         put(out, writer, 0xFFFF0000, 32)
-    return writer[0], not repeats
+    return writer[0], not uses_repeats
 
 
 class Packer:
@@ -643,7 +646,7 @@ class Packer:
             self._bytes = np.empty((2, size), np.uint8)
             # Large enough for any shape with this number of bytes.
             self._distances = np.empty(size // 6, np.uint16)
-            self._out = np.empty(_ROOM + 2 * size, np.uint8)
+            self._out = np.empty(_EXTRA_BYTES + 2 * size, np.uint8)
         plain, filtered = (buffer[:size].reshape(height, 1 + 6 * width) for buffer in self._bytes)
         distances = self._distances[: height * width].reshape(height, width)
         memory = plain, filtered, distances, self._history, self._joined, self._out

@@ -165,7 +165,9 @@ def encode_exr(image: Image, metadata: ImageMetadata) -> bytes:
     height, width, _ = image.shape
     if 12 * width * _LINES > LARGEST_SIDE:
         largest = LARGEST_SIDE // 12 // _LINES
-        raise InputError(f"an image is {width} px wide, EXR allows {largest}; choose png or tiff, or reduce the image")
+        raise InputError(
+            f"an image is {width} px wide, EXR allows {largest} px; choose png or tiff, or reduce the image"
+        )
     start = _header(width, height, metadata)
     chunks = [_scan_lines(image, y) for y in range(0, height, _LINES)]
     sizes = np.array([len(chunk) for chunk in chunks], dtype=np.uint64)
@@ -321,7 +323,7 @@ def encode_dng(image: Image, metadata: ImageMetadata) -> bytes:
         TiffTag.COMPRESSION: (ValueType.SHORT, [1]),  # none
         TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [CFA]),
         TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
-        # Not the maker of the camera, so that raw developers do not apply its black level or other facts.
+        # Not the maker of the camera, so that raw developers do not apply its black level or other properties.
         TiffTag.MAKE: text("CroP"),
         TiffTag.MODEL: text(model),
         TiffTag.ORIENTATION: (ValueType.SHORT, [1]),  # not rotated
@@ -462,7 +464,7 @@ def _require_rgb16(image: Image) -> None:
 
 
 def decode_image(data: bytes, form: Format, name: str) -> Image:
-    """Return the image (H, W, 3) uint16 of a file; of ``dng`` the half-size image (H // 2, W // 2, 3).
+    """Return the image (H, W, 3) uint16 of a file; for ``dng``, the half-size image (H // 2, W // 2, 3).
 
     `name` is the file name in messages. Raises FormatError.
     """
@@ -481,8 +483,8 @@ def decode_image(data: bytes, form: Format, name: str) -> Image:
 
 def require_plausible(data: bytes, name: str) -> None:
     """Raise FormatError if a PNG file declares more pixels or bytes than it can contain; accept other formats."""
-    # A decoder allocates the declared size (ISO/IEC 15948, 5.3 and 11.2.2), which a small file could set to fill the
-    # memory. Deflate unpacks one byte to at most 1032 (the "Maximum Compression Factor" of zlib).
+    # A decoder allocates the declared size (ISO/IEC 15948, 5.3 and 11.2.2), so a small file with a false size could
+    # fill the memory. Deflate unpacks one byte to at most 1032 (the "Maximum Compression Factor" of zlib).
     if len(data) < 26 or not data.startswith(SIGNATURE):
         return
     width, height, depth, colour = struct.unpack(">IIBB", data[16:26])
@@ -647,8 +649,8 @@ def _shrink(image: Any, factor: int, out: Any) -> None:
 def _shrunk(image: npt.NDArray[np.uint16], factor: int) -> npt.NDArray[np.uint16]:
     height, width = image.shape[:2]
     if factor == 2 and height % 2 == width % 2 == 0:
-        # OpenCV gives the same 2×2 means (halves rounded up) in a third of the time; other factors it rounds
-        # differently.
+        # OpenCV gives the same 2×2 means (halves rounded up) in a third of the time; it rounds differently for
+        # other factors.
         import cv2
 
         return cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA).astype(np.uint16, copy=False)
@@ -660,8 +662,8 @@ def _shrunk(image: npt.NDArray[np.uint16], factor: int) -> npt.NDArray[np.uint16
 @compiled
 def _brightest(samples: Any, logs: Any) -> Any:
     # Return the largest value of `samples` (3 N,) uint16, and the sum over pixels of the logarithm of the largest
-    # channel, from `logs` (65536,) float64. Pixels are counted by value, so that each logarithm is taken once. Two
-    # counters avoid that an increment waits for the previous one of the same value.
+    # channel, from `logs` (65536,) float64. Pixels are counted by value, so that each logarithm is taken once. With
+    # two counters, an increment does not wait for the previous one of the same value.
     counts = np.zeros((2, 1 << 16), np.uint32)
     top = uint16(0)
     i = uint64(0)

@@ -117,7 +117,7 @@ def _draw_sharpness(axes: Any, table: TableMeasurements, chart: Chart) -> None:
 
 def _draw_print(axes: Any, table: TableMeasurements, chart: Chart) -> None:
     stains = table.cells.stains
-    if not stains.known:
+    if not stains.is_known:
         _page(axes, chart, "print: cannot be measured on a chart of few colours")
         return
     points, deviation_percent = stains.places_mm, 100 * stains.largest_deviation()

@@ -155,7 +155,7 @@ def _gather_disturbed(table: TableMeasurements, softer: float) -> CauseEvidence 
         showing=showing(other_frames),
         even_showing=showing(whites),
         in_first=float(showing(other_frames) >= IN_FIRST),
-        spot=float((stains.stained | stains.doubtful)[cells].mean()) if stains.known else np.nan,
+        spot=float((stains.stained | stains.doubtful)[cells].mean()) if stains.is_known else np.nan,
         share=len(cells) / len(stains.places_mm),
         deviation=deviation,
         scatter=worst.consistency.scatter,
@@ -208,7 +208,7 @@ def noisy_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | No
     """Gather evidence on patches that are noisier than expected for their level."""
     noisy_cells, stains = np.flatnonzero(table.sensor.transfer.noisy), table.cells.stains
     is_in_spot = stains.stained | stains.doubtful
-    if len(noisy_cells) and stains.known and float(is_in_spot[noisy_cells].mean()) >= _IN_SPOT:
+    if len(noisy_cells) and stains.is_known and float(is_in_spot[noisy_cells].mean()) >= _IN_SPOT:
         return spot_evidence(table, limit)
     gathered = chart_evidence(table, limit)
     hottest = table.dark_frames.hottest
@@ -382,7 +382,7 @@ def _position_of(stains: Stains, spot: npt.NDArray[np.int64], file: str) -> Prin
 
 
 def _spot_fraction(stains: Stains, at_mm: _Array, size_mm: float) -> float:
-    if not stains.known:
+    if not stains.is_known:
         return np.nan
     near = np.linalg.norm(stains.places_mm - at_mm, axis=1) < max(size_mm / 2, 2 * cell_mm(stains))
     return float((stains.stained | stains.doubtful)[near].mean()) if near.any() else np.nan

@@ -90,7 +90,7 @@ DOUBTFUL_SHARE = Figure(
     why="the print, or the light on it, differs there from the rest; from 2 % on, the patches are listed as unfit",
     source=SIMULATED + ": none on a clean flat print",
     remedy="clean the print, hang it flatter, and look for shadows on it",
-    measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.known else None,
+    measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.is_known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
 
@@ -102,7 +102,7 @@ ADDED_LIGHT = Figure(
     source=SIMULATED + ": 0 in healthy rooms; 1 % of paper white makes patches of 10 % of paper white 10 % brighter, "
     "and patches of 3 % 30 % brighter; a reflection of 3 % causes errors of 57 %",
     remedy="turn the print or the projector until it shows no reflection, or print on matt paper",
-    measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
+    measure=lambda table: added_light(table.cells.stains) if table.cells.stains.is_known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
 

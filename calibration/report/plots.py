@@ -382,7 +382,7 @@ def draw_errors(figure: Any, table: TableMeasurements, chart: Chart) -> None:
     left, right = figure.subplots(1, 2)
     side_mm = float(np.mean(chart.cell_mm))
     stains = table.cells.stains
-    if stains.known:
+    if stains.is_known:
         percent = 100 * stains.largest_deviation()
         mm = chart.centres_mm[chart.cell_of_colour]
         limit = max(1.0, float(np.abs(percent).max()))

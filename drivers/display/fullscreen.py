@@ -1,7 +1,7 @@
 """Uniform colours with exact codes on a whole display, read back from the screen before each frame.
 
-The window fills one display in the mode set by the desktop. `FullScreen.show` returns when every pixel, both of the
-drawn frame and on the screen, has exactly the requested code. On X the screen is read over another connection, like a
+The window fills one display in the mode set by the desktop. `FullScreen.show` returns when every pixel, both in the
+drawn buffer and on the screen, has exactly the requested code. On X the screen is read over another connection, like a
 screenshot; on macOS from the front buffer. If a display was disconnected, the next `show` fills it again if its mode is
 unchanged. A display in use by another process is refused.
 
@@ -57,12 +57,12 @@ class Display:
     refresh_hz: int
 
     @property
-    def place(self) -> str:
+    def position(self) -> str:
         """Position on the desktop, such as ``+1920+0``."""
         return f"{self.x:+d}{self.y:+d}"
 
     def __str__(self) -> str:
-        return f"{self.number}: {self.name} {self.width}×{self.height} at {self.place}, {self.refresh_hz} Hz"
+        return f"{self.number}: {self.name} {self.width}×{self.height} at {self.position}, {self.refresh_hz} Hz"
 
 
 def list_displays() -> tuple[Display, ...]:
@@ -93,7 +93,7 @@ def choose_display(displays: tuple[Display, ...], selection: str | int | None = 
         x_position = min(x_positions) if selection == "left" else max(x_positions)
         matches = [display for display in displays if display.x == x_position]
     elif re.fullmatch(r"[+-]\d+[+-]\d+", selection):
-        matches = [display for display in displays if display.place == selection]
+        matches = [display for display in displays if display.position == selection]
     else:
         matches = [display for display in displays if display.name == selection]
         if not matches and selection.isdecimal():
@@ -102,7 +102,9 @@ def choose_display(displays: tuple[Display, ...], selection: str | int | None = 
         return matches[0]
     subject = "display (not set)" if selection is None else f"display {selection!r}"
     if matches:
-        raise ConfigurationError(f"{subject}: {len(matches)} match, expected 1; set one of these positions: {present}")
+        raise ConfigurationError(
+            f"{subject}: {len(matches)} displays match, 1 expected; present: {present}; set a position such as +1920+0"
+        )
     raise ConfigurationError(
         f"{subject} is not connected (present: {present})",
         remedy="connect and switch on the projector, or set another display",
@@ -144,7 +146,7 @@ def _server_state() -> str:
 
 def _load_glfw() -> ModuleType:
     if sys.platform == "linux":
-        # The wheel has two libraries; only the variant for X can select X.
+        # The wheel of glfw contains two libraries; only the one for X supports the platform X11.
         os.environ.setdefault("PYGLFW_LIBRARY_VARIANT", "x11")
     # Imported late, because loading it starts another process to read its version.
     try:
@@ -209,12 +211,12 @@ class OpenGl:
 
 OPENING_S: Final = 5.0  # Time for a window to fill its display; window managers animate
 
-CONFIRMING_S: Final = 1.0  # Time from the buffer swap to the screen; a compositor adds one or two frames
+CONFIRMING_S: Final = 1.0  # Time from the buffer swap to the screen; a compositor adds one or two refresh periods
 
-# Accepted deviation of a gamma ramp from a straight line, of 1; drivers end it at 255/256 or at 1.
+# Accepted deviation of a gamma ramp, 0 … 1, from a straight line; drivers end it at 255/256 or at 1.
 RAMP_TOLERANCE: Final = 1.5 / 255
 
-_POLL_S: Final = 0.002  # Pause between two readings of the screen; a frame lasts eight of them
+_POLL_S: Final = 0.002  # Pause between two readings of the screen; a refresh period is eight of them
 
 # Digits 0 to 9 in 3×5 blocks, rows from the top.
 _DIGITS: Final = (
@@ -302,7 +304,7 @@ class FullScreen:
         self._glfw.poll_events()
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what may change the light for codes that were read back; empty if nothing does."""
+        """Return reasons why the light may be wrong although the codes on the screen are right; empty if none."""
         self._require_usable()
         return _find_warnings(self._glfw, self.display, self._monitor, self._screen)
 
@@ -348,8 +350,8 @@ class FullScreen:
         return window
 
     def _make_full_screen(self, window: Any) -> None:
-        # Window managers without ``_NET_WM_FULLSCREEN_MONITORS`` (e.g. Openbox) fill the display under the window. A
-        # window that is full screen from the start would open on the first display.
+        # Window managers without ``_NET_WM_FULLSCREEN_MONITORS`` (e.g. Openbox) fill the display on which the window
+        # is. A window that is full screen from the start would open on the first display.
         display = self.display
         refresh_hz = display.refresh_hz or self._glfw.DONT_CARE
         self._glfw.set_window_monitor(window, self._monitor, 0, 0, display.width, display.height, refresh_hz)
@@ -410,7 +412,7 @@ class FullScreen:
     def _require_awake(self) -> None:
         if self._screen is not None and is_dark(self._glfw.get_x11_display()):
             raise DeviceError(
-                f"power saving keeps display {self.display} dark; move the mouse, and disable it (xset -dpms)"
+                f"power saving keeps display {self.display} dark; move the mouse, and disable power saving (xset -dpms)"
             )
 
     def _is_full(self) -> bool:
@@ -500,7 +502,7 @@ class FullScreen:
 def _hold_display(display: Display) -> Generator[None]:
     """Reserve a display against other processes; the screens of a server (``:0.0``) share their displays."""
     server = re.sub(r"\.\d+$", "", os.environ.get("DISPLAY", ""))
-    with hold(f"display {display}", f"display {server} {display.place}"):
+    with hold(f"display {display}", f"display {server} {display.position}"):
         yield
 
 
@@ -509,13 +511,14 @@ def display_warnings(selection: str | int | None = None) -> tuple[str, ...]:
     with contextlib.ExitStack() as opened:
         glfw = opened.enter_context(running_glfw())
         displays = displays_with_monitors(glfw)
-        display = choose_display(tuple(one for one, _ in displays), selection)
+        display = choose_display(tuple(candidate for candidate, _ in displays), selection)
         opened.enter_context(_hold_display(display))
         screen: XScreen | None = None
         if glfw.get_platform() == glfw.PLATFORM_X11:
             screen = XScreen()
             opened.callback(screen.close)
-        return _find_warnings(glfw, display, next(monitor for one, monitor in displays if one == display), screen)
+        monitor = next(monitor for candidate, monitor in displays if candidate == display)
+        return _find_warnings(glfw, display, monitor, screen)
 
 
 def _find_warnings(glfw: Any, display: Display, monitor: Any, screen: XScreen | None) -> tuple[str, ...]:
@@ -527,15 +530,20 @@ def _find_warnings(glfw: Any, display: Display, monitor: Any, screen: XScreen | 
             "management for this display"
         )
     if screen is not None and (screen.has_extension("XWAYLAND") or display.name.startswith("XWAYLAND")):
-        warnings.append("the desktop is Wayland, which may scale or tint without notice: log in to an X session (Xorg)")
+        warnings.append(
+            "the desktop uses Wayland, and its compositor may scale or tint the image without notice: log in to an X "
+            "session (Xorg)"
+        )
     if screen is not None and not screen.stays_awake:
-        warnings.append("power saving may darken the display: install libxcb-screensaver0, or disable it (xset -dpms)")
+        warnings.append(
+            "power saving may darken the display: install libxcb-screensaver0, or disable power saving (xset -dpms)"
+        )
     if screen is not None and screen.has_root_property(_profile_property(glfw, monitor)):
         warnings.append(
             f"a colour profile is set for {display.name}, which desktops may apply to the image: remove it in the "
             "desktop's colour settings (colormgr, dispwin -U)"
         )
-    mirrors = [str(twin) for twin, _ in displays_with_monitors(glfw) if twin.place == display.place]
+    mirrors = [str(twin) for twin, _ in displays_with_monitors(glfw) if twin.position == display.position]
     if len(mirrors) > 1:
         warnings.append(f"several displays show the same image ({'; '.join(mirrors)}): extend the desktop instead")
     return tuple(warnings)

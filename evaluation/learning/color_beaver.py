@@ -29,7 +29,8 @@ from evaluation.scene import Image
 
 _ELITE_SIZE = 4  # genomes that survive unchanged: few, so that most genomes of a generation are new
 _TOURNAMENT_SIZE = 3  # genomes of which the best becomes a parent
-_CROSSOVER_MARGIN = 0.3  # largest distance of a child's gene beyond its parents', fraction of their distance (BLX-α)
+# largest distance of a child's gene outside the interval of its parents' genes, fraction of this interval (BLX-α)
+_CROSSOVER_MARGIN = 0.3
 _MUTATION = 0.15  # probability of a mutation per gene: one or two per genome
 # Standard deviation of a mutation in the first and last generation, in standard deviations of the training illuminants.
 _STEPS = (0.5, 0.02)
@@ -80,7 +81,10 @@ class ColorBeaver(FeatureLearner):
         loaded: dict[str, Any] = {name: arrays[name] for name in ("corners", "widths", "base")}
         shapes = [array.shape for array in loaded.values()]
         if shapes != [(self.corners, 2), (2,), ()] or not 0 <= int(loaded["base"]) < len(self.bases()):
-            raise ValueError(f"arrays have the shapes {shapes}, expected corners, 2 widths and a base")
+            raise ValueError(
+                f"arrays have the shapes {shapes} and base {loaded['base']}, expected shapes ({self.corners}, 2), (2,) "
+                f"and (), and a base below {len(self.bases())}"
+            )
         if not all(np.isfinite(array).all() for array in loaded.values()):
             raise ValueError("arrays have infinite or NaN values, expected finite ones")
         return LightBand(**loaded)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 
-# Pixels from which a sample determines the limits: for smaller images, counting all takes less than 1 ms.
+# Number of usable pixels from which a sample of them determines the limits. Counting fewer pixels takes less than 1 ms.
 _SPARSE_COUNT = 1 << 16
 _SPARSE_INTERVAL = 16  # px between sampled pixels
 # Margin of the limits, standard deviations of independently drawn pixels; beyond it, all pixels are counted.

@@ -1,12 +1,13 @@
 """Stains, folds, shadows and reflections on the print: patches that do not have the colour of their code.
 
 A stain changes whole patches, so that neither edges nor noise of a patch show it, and the look-up table (LUT) would
-contain the colours of a dirty print. It is detected as a neighbourhood that deviates, while the same codes elsewhere on
-the sheet are correct. A deviation must be significant and large enough to matter; it is listed and never corrected.
+contain the colours of a dirty print. It is detected as a neighbourhood that deviates from patches
+with similar codes elsewhere on the sheet. A deviation must be significant and exceed a limit. It is listed and never
+corrected.
 
-A stain takes a fraction of the light of a patch, a reflection adds the same light to all. So the measured light of the
-patches of a spot is a line over the expected light. Its slope is the kept fraction, its intercept the added light
-(dichromatic reflection: S. Shafer, Color Research & Application 10, 1985, eq. 1).
+A stain absorbs a fraction of the light of a patch; a reflection adds the same light to all patches. In a spot, the
+measured light is therefore a linear function of the expected light. The slope is the fraction that remains, the
+intercept is the added light (dichromatic reflection: S. Shafer, Color Research & Application 10, 1985, eq. 1).
 """
 
 from __future__ import annotations
@@ -22,15 +23,17 @@ from scipy.spatial import cKDTree
 from experiment.measures.least_squares import least_absolute_line
 from foundation.robust import robust_sigma
 
-NEIGHBOURS = 13  # A patch and the twelve within two patches of it: a tenth of a thumb-sized stain at 5 mm a patch
+# A patch and the twelve patches within two patch sides: a tenth of a stain the size of a thumb, with patches of 5 mm
+NEIGHBOURS = 13
 
 STAINED = 0.02  # Relative deviation of a neighbourhood from which its patches are listed as unfit
 
-# Relative deviation from which patches are counted and shown. All patches but one of clean prints in the simulated
-# laboratory are below.
+# Relative deviation from which patches are counted and shown. In clean prints of the simulated laboratory, only one
+# patch exceeds it.
 DOUBTFUL = 0.01
 
-SIGNIFICANT = 6.0  # Deviation in standard errors that is required too; by chance one neighbourhood in 5·10⁸
+# Deviation that is required in addition, in standard errors; by chance, one neighbourhood in 5·10⁸ exceeds it
+SIGNIFICANT = 6.0
 
 # Deviation of a patch next to a stain, in standard deviations of single patches, from which it belongs to the stain
 RIM_SIGMA = 4.0
@@ -43,12 +46,12 @@ LEAST_BITS = 3
 
 LEAST_CELLS = 6  # Fewest patches for a line fit
 
-# Fraction of the patches from which a spot counts: the limit on unfit patches. A smaller glint is listed, and its
-# remaining effect is an error of a few patches.
+# Fraction of the patches from which a spot is large: the limit of unfit patches. A smaller reflection is listed too,
+# and outside its listed patches it affects only a few others.
 LARGE_SPOT = 0.005
 
-# Smallest fraction of its light that a patch keeps under a reflection. With less, it is covered (the table of causes
-# reports a hand below this value).
+# Smallest fraction of its own light that a patch keeps under a reflection. Below this value, an object covers the patch
+# (the table of causes reports a hand).
 OWN_KEPT = 0.85
 
 _ROUNDS = 3  # Largest number of repetitions, each without the previously stained patches in the predictions
@@ -66,9 +69,9 @@ _BRIGHT_PERCENTILE = 99.0  # Percentile of the patch levels that counts as white
 
 _SPOT_DISTANCE = 2.3  # Largest distance between patches of one spot, in patch sides: one patch may lie between them
 
-# Largest distance from a spot, in patch sides, at which added light is measured in unlisted patches: two rings, of
-# which the first is half in the neighbourhoods of the spot (judgement).
-_AROUND = 2.5
+# Largest distance from a spot, in patch sides, at which added light is measured in unlisted patches: two rings of
+# patches. Half of the first ring is in neighbourhoods of the spot (judgement).
+_SURROUNDING_DISTANCE = 2.5
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
@@ -77,7 +80,7 @@ _Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Stains:
-    """Deviations of C patches from the colours of their codes elsewhere on the sheet."""
+    """Deviations of C patches from the prediction by patches with similar codes elsewhere on the sheet."""
 
     deviation: _Array  # (C, 3), measured / expected − 1 of the neighbourhood of each patch; NaN if unknown
     error: _Array  # (C, 3), standard error of `deviation`
@@ -92,7 +95,7 @@ class Stains:
         return _is_significant(self.deviation, self.error, DOUBTFUL)
 
     @property
-    def known(self) -> bool:
+    def is_known(self) -> bool:
         """Whether any deviation is known."""
         return bool(np.isfinite(self.deviation).any())
 
@@ -120,8 +123,8 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     Parameters
     ----------
     level
-        (8**bits, 3) float64, mean counts above black by colour index, divided by the flat field; best of all white
-        frames.
+        (8**bits, 3) float64, mean counts above black by colour index, divided by the flat field; best averaged over
+        all white frames.
     centres_mm
         (8**bits, 2) float64, position of each colour on the sheet.
     bits
@@ -133,14 +136,13 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
         unknown = np.full(level.shape, np.nan)
         return Stains(unknown, unknown, unknown, np.zeros(len(level), dtype=np.bool_), level, centres_mm)
     usable = np.ones(len(level), dtype=np.bool_) if usable is None else usable
-    # The prediction uses codes that are next in colour and lie elsewhere on the sheet: no model of ink or paper, and
-    # little in common with the position of the patch.
     neighbours = np.asarray(cKDTree(centres_mm).query(centres_mm, k=min(NEIGHBOURS, len(level)))[1])
     neighbours = neighbours.reshape(len(level), -1)
     clean = usable.copy()
     deviation, error, log_ratios = (np.full(level.shape, np.nan) for _ in range(3))
     stained = np.zeros(len(level), dtype=np.bool_)
-    # Stained patches spoil predictions too; without them, edge and depth of a stain are more accurate.
+    # Patches of neighbouring codes, which lie elsewhere on the sheet, predict a patch. The prediction needs no model of
+    # ink or paper, and hardly depends on the position. It is repeated without stained patches, which reduce accuracy.
     for _ in range(_ROUNDS):
         log_ratios = _log_ratios(np.where(clean[:, None], level, np.nan), level, usable, bits)
         deviation, error = _neighbourhood_means(log_ratios, neighbours)
@@ -153,7 +155,7 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
         limit = np.maximum(RIM_SIGMA * _patch_sigma(log_ratios), STAINED)
         is_deviating = (np.abs(np.expm1(log_ratios)) > limit).any(axis=1)
     # Next to a stain a patch is judged alone, because only half of its neighbourhood is stained. That half must
-    # deviate; a patch that deviates without it has an error of prediction.
+    # deviate too; otherwise, the prediction of the patch is wrong.
     stained_neighbours = stained[neighbours].sum(axis=1)
     is_affected = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (stained_neighbours >= _MANY_STAINED)
     rim = is_deviating & is_affected & (stained_neighbours > 0)
@@ -218,7 +220,7 @@ def _median_over_neighbour_codes(cube: _Array, axis: int) -> _Array:
 def _median_at_equal_codes(curvature: _Array, axis: int) -> _Array:
     """Return the median (n, n, n, 3) over similar codes with equal values on an axis and another one; 0 elsewhere.
 
-    Codes with a third value that is below, equal or above are separate. NaN if too few codes are known.
+    Codes with a third value below, equal to or above the two equal ones are separate groups. NaN if too few are known.
     """
     values = np.indices(curvature.shape[:3])
     medians = np.zeros_like(curvature)
@@ -286,7 +288,7 @@ def spot_colour(stains: Stains, spot: _Index) -> _Array:
 def light_of_spot(stains: Stains, spot: _Index, channel: int) -> tuple[float, float]:
     """Return the light added in a spot, relative to white paper, and the fraction of their light that its patches keep.
 
-    Line through one channel by least absolute deviations; NaN for too few patches.
+    A line is fitted to one channel by least absolute deviations. NaN if there are too few patches.
     """
     levels, alone = stains.level[:, channel], stains.alone[:, channel]
     patches = spot[np.isfinite(alone[spot]) & (alone[spot] > -0.99)]
@@ -301,9 +303,9 @@ def light_of_spot(stains: Stains, spot: _Index, channel: int) -> tuple[float, fl
 def added_light(stains: Stains) -> float:
     """Return the light that a large reflection adds to patches that are not listed, 0 … 1 of white paper.
 
-    A reflection is a spot of more than `LARGE_SPOT` of the patches, brighter than their codes, that keep `OWN_KEPT` of
-    their own light. The patches of the spot are listed as unfit and do no harm. A broad reflection continues around it,
-    and is measured there. The largest value of all reflections; 0 without one.
+    A reflection is a spot of more than `LARGE_SPOT` of the patches that are brighter than predicted and keep `OWN_KEPT`
+    of their own light. The patches of the spot are listed as unfit, so they are not used. A broad reflection continues
+    around the spot, and is measured there. Return the largest value of all reflections; 0 without one.
     """
     largest = 0.0
     for spot in spots_of(stains):
@@ -314,7 +316,7 @@ def added_light(stains: Stains) -> float:
         if not (colour[channel] > 0 and light_of_spot(stains, spot, channel)[1] >= OWN_KEPT):
             continue
         distances = np.asarray(cKDTree(stains.places_mm[spot]).query(stains.places_mm)[0])
-        surrounding = np.flatnonzero((distances < _AROUND * cell_mm(stains)) & ~stains.stained)
+        surrounding = np.flatnonzero((distances < _SURROUNDING_DISTANCE * cell_mm(stains)) & ~stains.stained)
         added, _ = light_of_spot(stains, surrounding, channel)
         largest = max(largest, float(np.nan_to_num(added)))
     return largest

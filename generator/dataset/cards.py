@@ -255,7 +255,7 @@ def _front_matter(description: Description) -> str:
 def _configs(description: Description) -> str:
     layout = LAYOUTS[option(description, "layout")]
     # With single files, the Hub reads the rows of the table of ground truths.
-    if not layout.hub_reads_images:
+    if not layout.is_read_by_hugging_face:
         files = "  - split: train\n    path: ground_truth.csv\n"
     else:
         files = "".join(

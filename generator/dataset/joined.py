@@ -316,8 +316,8 @@ class JoinedLayout:
     # Returns the bytes of a file named as in a tar file (``000123.masks_0.png``), or None; raises if damaged.
     read: Callable[[BinaryIO, str], bytes | None]
     library: str  # required Python library, or ""
-    hub_reads_images: bool  # whether `load_dataset` reads the images; else it reads the table of ground truths
-    reading_help: str  # text of the card: how to read images with all bits
+    is_read_by_hugging_face: bool  # `load_dataset` reads the images; else it reads the table of ground truths
+    reading: str  # text of the card: how to read images with all bits
 
     def open_writer(self, store: Store, shard: int, extras: Extras) -> JoinedWriter:
         """Return the writer of a shard."""
@@ -364,15 +364,15 @@ JOINED: Final[Mapping[str, JoinedLayout]] = {
         start=lambda stream, _: _Tar(stream),
         read=_read_tar,
         library="",
-        hub_reads_images=True,
-        reading_help=_HUB_READING,
+        is_read_by_hugging_face=True,
+        reading=_HUB_READING,
     ),
     "parquet": JoinedLayout(
         ending="parquet",
         start=lambda stream, extras: _Parquet(stream, _schema(*extras)),
         read=_read_parquet,
         library="pyarrow",
-        hub_reads_images=True,
-        reading_help=_HUB_READING,
+        is_read_by_hugging_face=True,
+        reading=_HUB_READING,
     ),
 }

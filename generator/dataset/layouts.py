@@ -86,7 +86,7 @@ class FileLayout:
     # the data set is not divided; name of the file, such as ``000123.png``.
     file_name: Callable[[str, str, str], str]
     library: ClassVar[str] = ""
-    hub_reads_images: ClassVar[bool] = False
+    is_read_by_hugging_face: ClassVar[bool] = False
 
     def open_writer(self, store: Store, shard: int, extras: Extras) -> FileWriter:
         """Return the writer of a shard."""

@@ -103,7 +103,7 @@ def draw_printed_crops(
     no_shares = np.zeros((1, 1, 1), np.float32)
 
     def fill(first: int, end: int) -> None:
-        memory = PrintMemory(members.most)
+        memory = PrintMemory(members.largest_size)
         _print_crops(
             plan,
             first,

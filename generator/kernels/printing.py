@@ -79,8 +79,10 @@ NODES: Final = SIDE**3  # Nodes of all colours
 
 NODE_CODES: Final = (*range(0, 256, 16), 255)  # sRGB codes of the nodes of a channel
 
+# Distances between the indices of neighbouring nodes in each channel, and in all three.
 _RED, _GREEN, _BLUE = np.int32(SIDE * SIDE), np.int32(SIDE), np.int32(1)
-_ALL, _HALF = np.int32(SIDE * SIDE + SIDE + 1), np.int32(8)
+_ALL = np.int32(SIDE * SIDE + SIDE + 1)
+_HALF = np.int32(8)  # Half the distance between nodes, codes
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,7 +345,7 @@ def write_planes(builder: Builder, line: Value, scales: Value, red: Value, green
 
 @step(*[ADDRESS] * 5)
 def write_mirrored(builder: Builder, line: Value, scales: Value, red: Value, green: Value, blue: Value) -> None:
-    """Do `write_planes` from right to left."""
+    """Write a block like `write_planes`, from right to left."""
     _write_planes(builder, line, scales, (red, green, blue), mirrored=True)
 
 
@@ -513,7 +515,7 @@ class PrintMemory:
     def __init__(self, components: int) -> None:
         sizes = {
             "plans": 2 * _SEGMENT * _PLAN_BYTES,
-            "places": 2 * _SEGMENT * _ROW * components,
+            "sample_offsets": 2 * _SEGMENT * _ROW * components,
             "choices": 4 * GROUP * _SEGMENT_GROUPS,
             "lines": 2 * _LINE_BYTES,
             "factors": _ROW * max(components, 2),
@@ -532,7 +534,7 @@ class PrintMemory:
 
 
 class PrintedMembers:
-    """The illuminants of the LUT that make up the illuminants of an image or batch, for compiled code.
+    """Illuminants of the LUT whose mixtures are the illuminants of an image or batch, for compiled code.
 
     The addresses are valid as long as this object exists. `starts`: (M + 1,) int64, first member of each illuminant,
     and the end.
@@ -548,7 +550,7 @@ class PrintedMembers:
         owners, roots = np.repeat(np.arange(len(lights)), sizes), np.concatenate([light.roots for light in lights])
         self.arrays = addresses, roots, owners
         self.starts = np.concatenate([[0], np.cumsum(sizes)])
-        self.most = max(sizes)
+        self.largest_size = max(sizes)
 
 
 _ZEROS: Final = np.zeros(GROUP, np.uint32)  # Colour offsets for `choose_for_colours`: choices alone

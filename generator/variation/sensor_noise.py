@@ -8,8 +8,8 @@ A further term in y² (differences of photosites and print) scales with the samp
 measured from the mean and variance of the samples of patches of all levels.
 
 At k times the ISO speed of the LUT, a count stands for k times fewer electrons, so shot becomes k · shot. Read noise
-from before the amplifier grows with k, read noise from after it does not. One speed does not show how it is divided;
-`SENSOR_ELECTRONS` is assumed unless a value is given.
+from before the amplifier grows with k, read noise from after it does not. A LUT of one speed does not show the ratio of
+both; `SENSOR_ELECTRONS` is assumed unless a value is given.
 
 A normal deviate is one of 2¹⁴ numbers: the quantiles of the standard normal distribution at (i + ½) / 2¹⁴, scaled to
 variance 1. Their mean is exactly 0. They reach 4.0 standard deviations; 6 of 100 000 normal numbers lie beyond.
@@ -86,7 +86,7 @@ def measured_noise(lut: Lut) -> SensorNoise:
 
     Values are rounded to six digits, so that they are equal on all machines.
     """
-    # Imported here because it loads scipy and cv2, which making images does not need.
+    # Imported here because it loads scipy and cv2, which the generation of images does not need.
     from calibration.radiometry.table_noise import noise_curve
 
     curve = noise_curve(lut)

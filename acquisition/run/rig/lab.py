@@ -122,9 +122,9 @@ def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector 
         return None
     if cable.host is not None and cable.device is not None:
         raise ConfigurationError(
-            "lab.projector.host and lab.projector.device are both given, but only one line controls the projector",
+            "lab.projector.host and lab.projector.device are both given, but only one can control the projector",
             about=file,
-            remedy="delete the one that is not connected",
+            remedy="delete the one that is not used",
         )
     if cable.control == "serial":
         return _line_projector(cable, clock, file)
@@ -168,7 +168,7 @@ def _line_projector(cable: ProjectorCable, clock: Clock, file: str) -> LineProje
 
 def _required(value: str | None, key: str, meaning: str, file: str) -> str:
     if value is None:
-        remedy = f"set it to {meaning}; acquire devices lists what is available"
+        remedy = f"set it to {meaning}; acquire devices lists the available devices"
         raise ConfigurationError(f"{key} is missing", about=file, remedy=remedy, value=key)
     return value
 

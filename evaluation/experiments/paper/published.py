@@ -1,7 +1,7 @@
 """Numbers published in the paper, for comparison with results.
 
 N. Banić, K. Koščević, M. Subašić, S. Lončarić, "CroP: Color constancy benchmark dataset generator", tables 1 and 2. The
-source of the paper contains no numbers of its figures.
+numbers of its figures are not published.
 """
 
 from __future__ import annotations

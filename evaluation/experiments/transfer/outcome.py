@@ -1,7 +1,7 @@
 """Outcome of a transfer: statistics with intervals, ratios of rows, tables, and the results folder.
 
-With several seeds, a statistic is the mean over the seeds of their statistics. A resample draws images, which are then
-used for every seed. The interval therefore describes other test images; the spread over seeds is given separately.
+With several seeds, each statistic is averaged over the seeds. A bootstrap sample has the same images for all seeds.
+Intervals therefore show the effect of other test images only; the standard deviation over seeds is given separately.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class TransferFigures:
     rows: tuple[RowFigures, ...]  # Every row with its statistics
     to_real: tuple[RowRatio, ...]  # Rows trained on other data, relative to real cross-validation of the same method
     to_naive: tuple[RowRatio, ...]  # Generated rows relative to the naive rows of the same pictures and illuminants
-    # Adapted rows relative to the better (by mean error) of real images alone and the set alone
+    # Adapted rows relative to training on real images alone or the set alone, whichever has the smaller mean error
     to_better: tuple[RowRatio, ...] = ()
     # Adapted generated rows relative to naive rows adapted to the same images
     to_naive_adapted: tuple[RowRatio, ...] = ()
@@ -74,8 +74,7 @@ class TransferFigures:
 def figures_of(rows: Sequence[TransferRow], error: ErrorKind, groups: Sequence[str] | None = None) -> TransferFigures:
     """Return statistics, intervals and ratios of rows on the same test images.
 
-    `groups`: what each test image shares with others, so that they are drawn together; None if every image is its own
-    group.
+    `groups`: group of each test image; images of one group are drawn together. None if every image is its own group.
     """
     samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]
     values = [np.mean([sample.estimate() for sample in seeds], axis=0) for seeds in samples]
@@ -166,7 +165,7 @@ def errors_table(figures: TransferFigures, name: str, images: int) -> Table:
 def intervals_table(figures: TransferFigures, name: str) -> Table:
     """Return the confidence intervals of every row's statistics."""
     return Table(
-        f"{name}: {LEVEL * 100:.0f} % intervals of these errors, degrees",
+        f"{name}: {LEVEL * 100:.0f} % intervals of the {figures.error} angular error, degrees",
         ("Method", "Trained on", "Images", *STATISTIC_HEADS),
         tuple(
             (*_row_start(row.row), *(f"{statistic.low:.2f} – {statistic.high:.2f}" for statistic in row.statistics))
@@ -185,7 +184,7 @@ def real_ratios_table(figures: TransferFigures, name: str) -> Table:
     return _ratios_table(
         f"{name}: errors relative to the same method's {base_text}",
         [(ratio, ratio.row.training) for ratio in figures.to_real],
-        f"With {LEVEL * 100:.0f} % intervals, paired by test image. 1: {meaning}.",
+        f"With {LEVEL * 100:.0f} % intervals, paired by test image. A ratio of 1: {meaning}.",
     )
 
 
@@ -197,7 +196,7 @@ def naive_ratios_table(figures: TransferFigures, name: str) -> Table | None:
         f"{name}: errors with generated images relative to errors with the same pictures and illuminants without a LUT",
         [(ratio, ratio.base.training) for ratio in figures.to_naive],
         "Paired by test image. Below 1: the LUT improves this method.",
-        "In parts of",
+        "Relative to",
     )
 
 
@@ -211,7 +210,7 @@ def _ratios_table(
     return Table(title, ("Method", second_head, "Images", "Base", *STATISTIC_HEADS), rows, notes=(note, _BASE_NOTE))
 
 
-_BASE_NOTE: Final = "Images and Base: training images of the row, and of the row that it is relative to."
+_BASE_NOTE: Final = "Images: training images of the row. Base: training images of the row in the denominator."
 
 
 def _ratio_text(figure: BoundedFigure) -> str:
@@ -233,11 +232,11 @@ def adaptation_table(figures: TransferFigures, name: str) -> Table | None:
         return None
     return Table(
         f"{name}: mean {figures.error} error with N real images, degrees",
-        ("Method", "Set", "N", "N alone", "Set alone", "Adapted", "Adapted in parts of the better alone"),
+        ("Method", "Set", "N", "N alone", "Set alone", "Adapted", "Adapted / better alone"),
         tuple(rows),
         notes=(
-            "N images of the other folds. Adapted: trained on the set, then adapted to N. All statistics are "
-            "in results.csv.",
+            "N: number of real images, from the other folds. Adapted: trained on the set, then adapted to these N "
+            "images. All statistics are in results.csv.",
         ),
     )
 
@@ -245,8 +244,8 @@ def adaptation_table(figures: TransferFigures, name: str) -> Table | None:
 def harm_notes(figures: TransferFigures) -> list[str]:
     """Return a note for each row whose adaptation increased the mean error significantly."""
     return [
-        f"{ratio.row.method}, {ratio.row.training}: adaptation increases the mean error, "
-        f"{_ratio_text(ratio.ratios[0])} relative to {ratio.base.training} alone; use that instead"
+        f"{ratio.row.method}, {ratio.row.training}: adaptation changes the mean error by a factor of "
+        f"{_ratio_text(ratio.ratios[0])}, 1 or less expected; use only {ratio.base.training} for training"
         for ratio in figures.to_better
         if ratio.ratios[0].low > 1
     ]
@@ -262,7 +261,7 @@ def naive_adapted_table(figures: TransferFigures, name: str) -> Table | None:
     )
     return Table(
         f"{name}: errors with generated images relative to naive ones, both adapted to N real images",
-        ("Method", "In parts of", "N", *STATISTIC_HEADS),
+        ("Method", "Relative to", "N", *STATISTIC_HEADS),
         rows,
         notes=("Paired by test image. Below 1: with N real images, the LUT still improves this method.",),
     )
@@ -378,7 +377,7 @@ def labelled_results(rows: Sequence[TransferRow]) -> tuple[Result, ...]:
 def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
     """Write the results folder: results.csv, errors.csv, folds_SEED.csv, tables.tex, report.html, run.json.
 
-    With real images also beside_real.svg.
+    If real images were used, also beside_real.svg.
     """
     names = [scene.name for scene in outcome.test.scenes]
     truths = np.stack([scene.truth for scene in outcome.test.scenes])

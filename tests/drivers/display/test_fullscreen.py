@@ -355,8 +355,8 @@ def test_shows_all_codes_in_every_pixel_without_a_cursor(tmp_path: Path, monkeyp
 
 def test_lists_displays_from_left_to_right(outputs: str) -> None:
     desk, projector = list_displays()
-    assert (desk.number, desk.name, desk.place, desk.width, desk.height) == (1, "DUMMY0", "+0+0", 640, 360)
-    assert (projector.number, projector.name, projector.place) == (2, "DUMMY1", "+640+0")
+    assert (desk.number, desk.name, desk.position, desk.width, desk.height) == (1, "DUMMY0", "+0+0", 640, 360)
+    assert (projector.number, projector.name, projector.position) == (2, "DUMMY1", "+640+0")
     assert (projector.width, projector.height) == (480, 270)
     # The pixel clock over the totals of the mode line: 12 MHz / (520 · 290).
     assert projector.refresh_hz == 80
@@ -516,11 +516,11 @@ def test_selects_a_display_by_each_property(
 @pytest.mark.parametrize(
     ("displays", "selection", "reason"),
     [
-        ((DESK, BEAMER), None, "display \\(not set\\): 2 match"),
+        ((DESK, BEAMER), None, "display \\(not set\\): 2 displays match"),
         ((DESK, BEAMER), "HDMI-2", "display 'HDMI-2' is not connected"),
         ((DESK, BEAMER), "+1920+0", "not connected"),
         ((DESK, BEAMER), 3, "display 3 is not connected"),
-        ((DESK, ABOVE), "DP-1", "display 'DP-1': 2 match, expected 1; set one of these positions"),
+        ((DESK, ABOVE), "DP-1", "display 'DP-1': 2 displays match, 1 expected"),
         ((DESK,), "right", "two displays side by side"),
         ((DESK, ABOVE), "left", "two displays side by side"),
         ((), None, r"not connected \(present: none\)"),

@@ -83,7 +83,7 @@ def test_ignores_charts_of_four_levels() -> None:
     for bits in (2, 3):
         codes = np.stack(np.meshgrid(*[np.linspace(0, 1, 1 << bits)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         places = np.column_stack(np.divmod(np.random.default_rng(0).permutation(len(codes)), 8)) * 5.0
-        has_result.append(find_stains(6000 * (0.1 + 0.9 * codes**2.2), places, bits).known)
+        has_result.append(find_stains(6000 * (0.1 + 0.9 * codes**2.2), places, bits).is_known)
     assert has_result == [False, True]
 
 

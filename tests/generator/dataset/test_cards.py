@@ -88,7 +88,7 @@ def test_hub_client_reads_card(data_set: Dataset) -> None:
     splits = data_set.description.splits
     split_names: set[Split] = {split for split, images in splits.items() if images}  # pyrefly: ignore[bad-assignment]
     assert {entry["split"] for entry in files} == (
-        split_names if LAYOUTS[data_set.layout].hub_reads_images else {"train"}
+        split_names if LAYOUTS[data_set.layout].is_read_by_hugging_face else {"train"}
     )
     for entry in files:
         assert list(folder_of(data_set).glob(entry["path"])), entry

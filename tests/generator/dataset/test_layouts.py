@@ -209,7 +209,7 @@ def test_closes_incomplete_shard_without_warnings(
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if layouts.LAYOUTS[name].hub_reads_images])
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if layouts.LAYOUTS[name].is_read_by_hugging_face])
 def test_hugging_face_reads_splits_by_card(make: Make, hugging_face: Any, tmp_path: Path, layout: Layout) -> None:
     data_set = make(layout, split=(0.6, 0.0, 0.4), previews=False)
     loaded = hugging_face.load_dataset(str(folder_of(data_set)), cache_dir=str(tmp_path / "cache"))
