@@ -138,7 +138,7 @@ def test_another_language_than_the_projectors(bench: Bench, camera: str) -> None
         )
     assert code == 3
     assert "answers 'ERR" in said
-    assert "check speed and parity against the projector's menu, and that the language is the correct one" in said
+    assert "compare speed and parity with the projector's menu, and check the name of the language" in said
 
 
 def test_a_port_at_which_nobody_listens(bench: Bench, camera: str) -> None:

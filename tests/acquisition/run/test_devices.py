@@ -90,7 +90,7 @@ def test_leaves_lamp_as_configured_and_reports_it(end: RunEnd, settings: Sequenc
     ((event, sentence),) = reports
     assert event == "lamp"
     assert ("was switched off" in sentence) == (power is OFF)
-    assert ("burns on" in sentence) == (power is ON and end is not RunEnd.INTERRUPTED)
+    assert ("stays on" in sentence) == (power is ON and end is not RunEnd.INTERRUPTED)
     assert ("left as it is" in sentence) == (end is RunEnd.INTERRUPTED)
 
 
@@ -126,7 +126,7 @@ def test_reports_lamp_that_stays_on() -> None:
 
     clock = SimulatedClock()
     sentence = settle_lamp(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
-    assert "still burns" in sentence
+    assert "still on" in sentence
     assert "by hand" in sentence
     assert clock.monotonic() == 5
 
