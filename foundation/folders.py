@@ -202,10 +202,7 @@ def locked_folder(
             yield FolderLock(handle)
             return
     path = folder if target is None else target
-    raise StorageError(
-        f"cannot write {path}: its folder was removed {FOLDER_ATTEMPTS} times after it was made; choose a path on an "
-        "ordinary disk"
-    )
+    raise StorageError(f"cannot write {path}: its folder was removed {FOLDER_ATTEMPTS} times; choose an ordinary disk")
 
 
 def _open_folder(folder: Path, resources: ExitStack) -> int:
