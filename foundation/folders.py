@@ -1,7 +1,7 @@
 """Folders: atomic creation, locks, unmounted disks, the user's cache.
 
-A folder is filled next to its place under a hidden name, then renamed, as files are (`foundation.files`). Locks are
-locks of the system, so a program that ends leaves none behind. If a file system cannot lock folders, a file in the
+A folder is filled under a hidden name next to its final path, then renamed, as files are (`foundation.files`). Locks
+are locks of the system, so a program that ends leaves none behind. If a file system cannot lock folders, a file in the
 folder is locked.
 """
 
@@ -69,14 +69,14 @@ def require_free_file(path: Path, content: str) -> None:
     try:
         exists = path.exists() or path.is_symlink()
         folder = next(parent for parent in path.absolute().parents if parent.exists())
-        is_probed = not exists and folder.is_dir()
+        must_probe = not exists and folder.is_dir()
     except OSError as error:
         if disk_remedy(error) is None:
             raise
         raise storage_error(path, error, "read") from error
     if exists:
         raise InputError(f"{path} already exists; choose another place for {content}, or remove it")
-    if is_probed:
+    if must_probe:
         try:
             # Permissions and mount options can be misleading: only writing a file is a reliable test.
             tempfile.TemporaryFile(dir=folder).close()
@@ -121,7 +121,7 @@ MOUNTS: Final = Path("/proc/self/mounts")  # Linux lists disks in FSTAB and moun
 
 
 def unmounted_folder(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
-    """Return the folder at or above `path` whose disk is not mounted; None if all are mounted or nothing is known.
+    """Return the mount point at or above `path` without a mounted disk; None if there is none or the lists are missing.
 
     `fstab`, `mounts`: lists of disks and mounted disks (fstab(5), proc(5)).
     """
@@ -153,7 +153,7 @@ def clear_folder(folder: Path) -> None:
             path.unlink()
 
 
-LOCK_FILE: Final = ".lock"  # File that is locked if the folder cannot be
+LOCK_FILE: Final = ".lock"  # File that is locked if the folder cannot be locked
 
 # Errors of file systems that cannot lock a file or folder (flock(2); NFS, Lustre, FUSE, SMB, macOS).
 _NO_LOCKS: Final = {errno.ENOLCK, errno.EBADF, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL}
@@ -202,7 +202,7 @@ def locked_folder(
             yield FolderLock(handle)
             return
     path = folder if target is None else target
-    raise StorageError(f"cannot write {path}: its folder disappears when made; choose a path on an ordinary disk")
+    raise StorageError(f"cannot write {path}: its folder was removed {FOLDER_ATTEMPTS} times; choose an ordinary disk")
 
 
 def _open_folder(folder: Path, resources: ExitStack) -> int:
@@ -254,7 +254,8 @@ def _is_lock_file(file: int, folder_handle: int) -> bool:
 
 
 def _release_lock_file(file: int, folder_handle: int) -> None:
-    # Fails if another program shares the lock. The folder may have been renamed, so it is addressed by its handle.
+    # An exclusive lock fails if another program shares the lock. The folder is addressed by its handle, because it may
+    # have been renamed.
     with contextlib.suppress(OSError):
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         _remove_lock_file(folder_handle)
@@ -266,7 +267,7 @@ def _remove_lock_file(folder_handle: int) -> None:
 
 
 def _lock(handle: int, wait: bool) -> bool:
-    """Lock alone, or after waiting together with others; return whether the lock is shared."""
+    """Lock exclusively; if another program has the lock, wait and share it. Return whether the lock is shared."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -52,7 +52,8 @@ from foundation.errors import (
 Report = Callable[[str, str], object]
 
 POWER_LIMIT_S: Final = 300.0  # Time for a lamp to light, s; makers state up to 130 s with repeated ignition
-RELIGHT_S: Final = 15.0  # s; no lamp lights again, with its projector back on the network, in less
+# Shortest time, s, in which a lamp can light again and its projector be on the network again.
+RELIGHT_S: Final = 15.0
 
 QUESTIONS_SHARE: Final = 0.01  # Share of a frame's time that questions may always take: five answers of 4 ms in 2.3 s
 
@@ -62,8 +63,8 @@ _NAME: Final = "the projector"
 OBEYS_S: Final = 5.0
 LOOK_S: Final = 0.5  # Interval between two questions for the power state, s
 
-TRIES: Final = 3  # Tries to switch off the lamp: after one lost answer it must not burn until the morning
-AGAIN_S: Final = 2.0  # Interval between two of them, s: a busy controller answers then
+TRIES: Final = 3  # Tries to switch off the lamp: after one lost answer it must not stay on until the morning
+AGAIN_S: Final = 2.0  # Interval between two such tries, s: enough for a busy controller to answer
 
 _BY_HAND: Final = "switch it off by hand"
 
@@ -71,7 +72,7 @@ _BY_HAND: Final = "switch it off by hand"
 def make_ready(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> None:
     """Switch the lamp on if necessary, wait until it is warm and the projector is healthy.
 
-    Without patience in `retry` the first fault is raised.
+    With a time limit of 0 in `retry`, the first fault is raised.
     """
     # A lamp that is lit at the first question is assumed to be warm.
     was_lit = _light(projector, retry)
@@ -134,7 +135,7 @@ class HealthWatch:
     """Asks for the health of a projector between frames: all questions if they are fast, otherwise one per frame.
 
     On a slow line, questions would lengthen every frame. The judge detects a lamp that is out and a picture that is
-    muted or frozen. All questions are asked at dark frames, where it cannot, and after a refused frame.
+    muted or frozen, except in dark frames. All questions are therefore asked at dark frames, and after a refused frame.
     """
 
     def __init__(self, projector: Projector, clock: Clock) -> None:
@@ -283,7 +284,7 @@ def settle_lamp(projector: Projector | None, end: RunEnd, sequence: SequenceSett
         return f"the projector is not controlled: {_BY_HAND}"
     if end is RunEnd.INTERRUPTED:
         # The operator is waiting for the end, which a projector that does not answer would delay.
-        return f"it is left as it is, so that the next run needs no warm-up; otherwise {_BY_HAND}"
+        return f"it is left as it is, so that the next run needs no warm-up; if no run follows, {_BY_HAND}"
     goes_out = sequence.switch_off if end is RunEnd.COMPLETE else sequence.lamp_if_unfinished == "off"
     for _ in range(TRIES - 1):
         with suppress(DeviceError):
@@ -301,7 +302,7 @@ def _set_lamp(projector: Projector, goes_out: bool, clock: Clock) -> str:
     if power is not Power.ON and power is not Power.WARMING:
         return f"it is already off: the projector is in {power.value}"
     if not goes_out:
-        return f"it stays on, so that the next run needs no warm-up; otherwise {_BY_HAND}"
+        return f"it stays on, so that the next run needs no warm-up; if no run follows, {_BY_HAND}"
     projector.switch_off()
     until = clock.monotonic() + OBEYS_S
     while (power := projector.power()) is Power.ON and clock.monotonic() < until:
@@ -404,7 +405,7 @@ def wheel_of(settings: LabSettings) -> float:
 
 
 def period_s(settings: LabSettings) -> float:
-    """Return the period of the light, s: a turn of the colour wheel, or a picture."""
+    """Return the period of the light, s: a turn of the colour wheel, or the duration of a picture."""
     wheel_hz = wheel_of(settings)
     return 1 / wheel_hz if wheel_hz else _light_period_s(settings.lab.projector)
 
@@ -447,11 +448,11 @@ SLOW_S: Final = 10.0
 # Longest time between signs of life during a try, s: a camera's driver waits 90 s for a frame of 30 s, then 70 s over a
 # new connection, and a question may take 20 s.
 TRY_S: Final = 300.0
-# Frames that must be accepted after a pause before the next one counts as a new fault. With fewer, the pauses of one
-# fault are added up and share patience and back-off, so that an intermittent fault also ends a run. After half a minute
-# of work a session makes progress, after one or two frames it does not.
+# Frames that must be accepted after a pause before the next pause counts as a new fault. With fewer frames, the pauses
+# of one fault are added up and share time limit and back-off, so that an intermittent fault also ends a run. After half
+# a minute of work a session makes progress, after one or two frames it does not.
 RECURS_WITHIN: Final = 10
-# Time between the second and the third try of a refused frame, s; every later pause is twice as long.
+# Time between the second and the third try of a refused frame, s; every later interval is twice the one before.
 BACK_OFF_S: Final = 5.0
 LONGEST_BACK_OFF_S: Final = 300.0  # Longest such time, s: an operator can wait for five minutes
 FRAMES: Final = "the frames"  # Name of the "device" in pauses for refused frames
@@ -469,8 +470,8 @@ def is_curable(fault: CropError) -> bool:
 class RetryPolicy:
     """How a run waits for a device or disk that fails, and how long.
 
-    An error that is no `CropError` ends a pause at once: Ctrl-C. A report never ends the run: if the disk is full, it
-    is stored when there is space again.
+    An error that is no `CropError` ends a pause at once, such as Ctrl-C. A report never ends the run: if the disk is
+    full, it is stored when there is space again.
 
     - `report`: receives an event, such as ``retry`` or ``paused``, and a sentence.
     - `idle`: keeps the other devices awake every few seconds; its `DeviceError` is ignored.
@@ -510,7 +511,7 @@ class RetryPolicy:
         curable: Callable[[CropError], bool] = is_curable,
         idle: bool = True,
     ) -> _Result:
-        """Return the result of `action`, repeated until it succeeds or the patience is used up."""
+        """Return the result of `action`, repeated until it succeeds or the time limit is reached."""
         pause = self.pause(name, idle=idle)
         while True:
             try:
@@ -538,7 +539,7 @@ class RetryPolicy:
                 self._unreported.pop(0)
 
     def wait(self, seconds: float, state: str, sentence: Callable[[], str], *, idle: bool = True) -> None:
-        """Wait for `seconds`, and report the result of `sentence` every few of them."""
+        """Wait for `seconds`, and report the result of `sentence` every few seconds."""
         until = self.clock.monotonic() + seconds
         while (left_s := until - self.clock.monotonic()) >= INSTANT_S:
             self.sign_of_life(state, sentence(), 2 * PAUSE_S + TRY_S * idle)
@@ -675,13 +676,13 @@ def _family(fault: CropError) -> type[CropError]:
 
 TICK_S: Final = 1.0  # Interval between two looks at the time, s
 
-# Delay of a look, s, after which the program was stopped: a busy machine delays a thread by 1 to 2 s
+# Delay of a look at the time, s, that proves a stopped program: a busy machine delays a thread by 1 to 2 s
 GAP_S: Final = 10.0
 
 # Factor of the expected duration after which a step is late: a download that is tried again takes twice as long.
 LATE_TIMES: Final = 3.0
 
-LATE_S: Final = 10.0  # Additional seconds: a busy disk or machine may stall for some
+LATE_S: Final = 10.0  # Additional time, s: a busy disk or machine may stall for some seconds
 
 
 @dataclass
@@ -699,7 +700,7 @@ class RunWatch:
     """Watches the duration of steps in its own thread; use it in a `with` block.
 
     `on_late`: called by this thread, once for a late step, with a sentence and the start of the step. `elapsed`:
-    returns seconds that include sleep of the machine; None for the machine's own.
+    returns seconds that include sleep of the machine; None for `elapsed_s`.
     """
 
     def __init__(

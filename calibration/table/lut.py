@@ -131,9 +131,9 @@ class Provenance(Record):
     unfit: list[Unfit] = Field(default_factory=list[Unfit])
     samples_sha256: Sha256 | None = None  # None until the LUT is written
     illuminations_sha256: Sha256 | None = None
-    # of the samples of each illuminant as bytes of the file, to locate damage
+    # hash of the samples of each illuminant, as bytes of the file; locates damage
     lights_sha256: list[Sha256] = Field(default_factory=list[Sha256])
-    # of further files: `references.csv`
+    # hashes of further files: `references.csv`
     files_sha256: dict[FileName, Sha256] = Field(default_factory=dict[FileName, Sha256])
     has_sums: bool = False  # `SHA256SUMS` lists all files; false until it is written
     # program and settings, if the LUT was computed from spectra and a sensor model; None for frames
@@ -145,7 +145,7 @@ class Provenance(Record):
     def _require_colours(self) -> Self:
         invalid = [cell.colour for cell in self.unfit if cell.colour >= 8**self.bits]
         if invalid:
-            raise ValueError(f"unfit: colour {invalid[0]}, but {self.bits} bits a channel have {8**self.bits} colours")
+            raise ValueError(f"unfit: colour {invalid[0]}, expected 0 to {8**self.bits - 1} with {self.bits} bits")
         return self
 
     def to_json(self) -> str:
@@ -185,7 +185,7 @@ class SourceFrame:
     kind: str  # ``light``, ``white`` or ``dark``
     illumination: int | None  # index of the illuminant; None for white and dark frames
     file: str  # path relative to the session folder
-    sha256: str  # of the file
+    sha256: str  # hash of the file
 
 
 def frames_sha256(frames: Sequence[SourceFrame]) -> str:
@@ -292,7 +292,7 @@ def parse_sums(text: str, path: Path) -> dict[str, str]:
 
 
 def require_plain_table(folder: Path) -> None:
-    """Raise `FormatError` if the folder has other than regular files, or files above their largest size."""
+    """Raise `FormatError` if the folder has an entry that is no regular file, or a file above its largest size."""
     require_plain_folder(folder, MOST_BYTES)
 
 
@@ -463,7 +463,7 @@ def _load_uncertainty(path: Path, count: int) -> npt.NDArray[np.float64]:
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{path} is damaged, expected numbers under {EXPANDED}; {RESTORE}") from error
     if len(expanded) != count or not np.isfinite(expanded).all() or (expanded < 0).any():
-        raise FormatError(f"{path} has {len(expanded)} rows, expected {count} of finite numbers ≥ 0; {RESTORE}")
+        raise FormatError(f"{path} has {len(expanded)} rows, expected {count} rows with finite numbers ≥ 0; {RESTORE}")
     return expanded
 
 
@@ -476,7 +476,8 @@ def _load_white(path: Path) -> npt.NDArray[np.float64]:
             f"{path} is damaged, expected numbers under {','.join(WHITE_COLUMNS)}; build the LUT again"
         ) from error
     if not ((white > 0).all() and (white < MOST_WHITE).all()):
-        raise FormatError(f"{path}: a ground truth is out of range, expected 0 to {MOST_WHITE}; build the LUT again")
+        extremes = f"{white.min():g} to {white.max():g}"
+        raise FormatError(f"{path}: ground truths from {extremes}, expected 0 to {MOST_WHITE}; build the LUT again")
     return white
 
 

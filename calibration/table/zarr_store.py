@@ -1,8 +1,8 @@
 """Publish a LUT as a sharded Zarr array on any fsspec store, and fetch it back to a folder.
 
 Zarr specification version 3 with the codec `sharding_indexed`: one chunk per illuminant, 32 illuminants per object,
-compressed by Blosc (Zstandard after bit shuffle). The other files of the LUT are attributes, unchanged. `whole` is set
-last; only an array without it is overwritten.
+compressed by Blosc (Zstandard after bit shuffle). The other files of the LUT are attributes, unchanged. The attribute
+`whole` is set last; only an array without it is overwritten.
 
 Data from a store are not trusted: texts, shape and chunks of the array and the header of `samples.npy` must agree.
 Sizes are limited; names and codecs must be those of published LUTs. A fetched LUT appears in its folder complete and
@@ -89,9 +89,7 @@ def table_texts(attributes: dict[str, Any], url: str) -> dict[str, str]:
     texts: dict[str, str] = {}
     for name, text in cast("dict[str, Any]", files).items():
         if name not in TEXTS or not isinstance(text, str) or len(text) > MOST_BYTES[name]:
-            raise FormatError(
-                f"{url} contains {name!r}, which is not a file of a LUT or too large; publish the LUT again"
-            )
+            raise FormatError(f"{url} holds {name!r}, which is no file of a LUT or too large; publish it again")
         texts[name] = text
     missing = {PROVENANCE, ILLUMINATIONS, SUMS} - texts.keys()
     if missing:
@@ -153,7 +151,7 @@ def samples_header(attributes: dict[str, Any], shape: tuple[int, int, int, int],
     return head
 
 
-def require_room(folder: Path, size: int, url: str) -> None:
+def require_space(folder: Path, size: int, url: str) -> None:
     """Raise `StorageError` if the samples do not fit on the disk, before they are copied."""
     free_bytes = shutil.disk_usage(folder).free
     if size > free_bytes:
@@ -262,7 +260,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
         require_listed(partial, provenance, lights)
         shape = require_shape(metadata, (lights, 8**provenance.bits), url)
         head = samples_header(attributes, shape, url)
-        require_room(partial, len(head) + math.prod(shape) * 2, url)
+        require_space(partial, len(head) + math.prod(shape) * 2, url)
         try:
             array: Any = zarr.open_array(url, mode="r")
         except Exception as error:

@@ -26,9 +26,9 @@ FOLDER: Final = Path(__file__).parents[1] / "data" / "languages"
 FILE_ENDING: Final = ".toml"  # A text with this ending is the path of a language file, not the name of a language
 
 # Remedy for bytes that cannot be decoded.
-CHECK_SPEED: Final = "check speed and parity against the projector's menu, and that the language is the correct one"
+CHECK_SPEED: Final = "compare speed and parity with the projector's menu, and check the name of the language"
 
-_BLANK: Final = b"\r\n\0 "  # Bytes between two messages without meaning in any language
+_BLANK: Final = b"\r\n\0 "  # Bytes between messages, without meaning in any language
 
 _VALUE: Final = "{}"
 
@@ -41,13 +41,13 @@ def _require_ascii(text: str) -> str:
 
 def _require_value(text: str) -> str:
     if text.count(_VALUE) != 1:
-        raise ValueError(f"expected a text with {_VALUE} at the position of its value")
+        raise ValueError(f"expected a text with {_VALUE} exactly once, at the position of its value")
     return text
 
 
 def _require_no_value(text: str) -> str:
     if not text or _VALUE in text:
-        raise ValueError(f"expected a text without {_VALUE}, and not empty")
+        raise ValueError(f"expected a text without {_VALUE} that is not empty")
     return text
 
 
@@ -60,7 +60,7 @@ def _as_tuple(value: Any) -> Any:
 def _uppercase_keys(table: dict[str, Any]) -> dict[str, Any]:
     uppercase = {key.strip().upper(): value for key, value in table.items()}
     if len(uppercase) < len(table):
-        raise ValueError("expected values that differ in more than upper and lower case")
+        raise ValueError("expected values that differ if case is ignored")
     return uppercase
 
 
@@ -105,7 +105,7 @@ class LineFormat(_Table):
     ends: Annotated[Words, Field(min_length=1)]
     """Characters that end a reply."""
     unended: Texts = ()
-    """Replies that may arrive without such a character."""
+    """Replies that may arrive without an end character."""
     echo: bool = False
     """True if the projector may repeat a command before its reply."""
     prompt: Words = ""
@@ -232,7 +232,7 @@ class PowerWords(_Commands, Question):
     stopped: Annotated[dict[str, str], AfterValidator(_uppercase_keys)] = {}
     """Values of states that need a person, each with its remedy."""
     done_within_s: Annotated[float, Field(ge=0, le=600)] = 0.0
-    """Longest time to that reply if it follows the switching, seconds; 0 if it is immediate."""
+    """Longest time to the reply `done`, seconds, if it is sent after the switching; 0 if it is sent at once."""
 
     @model_validator(mode="after")
     def _check_states(self) -> PowerWords:
@@ -252,7 +252,7 @@ class MuteWords(_Commands):
     """Commands and replies for the image mute."""
 
     ask: Words = ""
-    """Text of the query, which requires `states`; empty if there is none and the last command counts."""
+    """Text of the query, which requires `states`; empty for no query: the last command then gives the state."""
     answer: Templates = (_VALUE,)
     """Text of the reply."""
     states: Annotated[dict[str, bool], AfterValidator(_uppercase_keys)] = {}
@@ -305,7 +305,7 @@ class Unasked(_Table):
     text: Words
     """The message; `{}` matches any text."""
     power: State | None = None
-    """Power state that starts with it."""
+    """Power state that begins with this message."""
     fault: Part | None = None
     """Faulty component; reported until the lamp is struck again."""
 

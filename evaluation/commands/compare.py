@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from evaluation.metrics import ErrorKind
     from evaluation.results.files import MethodErrors
 
-# Most comparisons with details; with more, only tests and verdicts are printed.
+# Largest number of comparisons that are printed with details; with more, only tests and verdicts are printed.
 _MAX_DETAILED = 3
 
 HELP = f"""Compare two methods on the same images, or one method in two runs, image by image.
@@ -84,7 +84,7 @@ def compare(
 def _pairs(
     runs: Sequence[Mapping[str, MethodErrors]], locations: Sequence[str], names: Sequence[str] | None, error: ErrorKind
 ) -> list[MatchedErrors]:
-    """Return the pairs to compare: all pairs of one run, or each method of one run with that of the other."""
+    """Return the pairs to compare: all pairs of one run, or each method of both runs."""
     from evaluation.experiments.comparing import match
 
     run_a, run_b = runs[0], runs[-1]
@@ -100,7 +100,7 @@ def _pairs(
         pairs = [(name, name) for name in run_a if name in run_b]
     if not pairs:
         methods = " and ".join(f"{name} has {', '.join(run)}" for name, run in zip(locations, runs, strict=True))
-        raise InputError(f"{methods}, expected two to compare; give one of each run: --method FIRST=SECOND")
+        raise InputError(f"{methods}, expected two to compare; give a second RESULTS, or --method FIRST=SECOND")
     suffixes = ["", ""] if len(runs) == 1 else [f" ({location})" for location in locations]
     return [match(run_a[a], run_b[b], (a + suffixes[0], b + suffixes[1]), error) for a, b in dict.fromkeys(pairs)]
 

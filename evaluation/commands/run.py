@@ -23,10 +23,10 @@ from foundation.folders import require_free
 HELP = f"""Estimate the illuminant of every image of a data set and summarise the errors.
 
 Reads DATA: a data set made by generate (folder or URL), or a real data set in its published layout. Methods are
-methods of this suite, your own classes, trained models, and estimates of other programs; by default the seven standard
-methods. Prints mean, median, trimean, best 25 %, worst 25 % and Avg. (their geometric mean) in degrees, as in the
-paper. With several illuminants in an image also prints errors by pixel and region. Prints how the images were treated.
-Writes files only with --out.
+implemented in this suite, your own classes, trained models, or estimates of other programs; by default the seven
+standard methods are used. Prints mean, median, trimean, best 25 %, worst 25 % and Avg. (their geometric mean) in
+degrees, as in the paper. With several illuminants in an image also prints errors by pixel and region. Prints how the
+images were treated. Writes files only with --out.
 
 {EXIT_CODES}
 """

@@ -1,4 +1,4 @@
-"""Constant estimate: the baseline of a method that does not use the image."""
+"""Constant estimate: a baseline that does not use the image."""
 
 from __future__ import annotations
 

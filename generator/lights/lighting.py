@@ -4,10 +4,10 @@ It also defines `LightChoice`, the choice of illuminants for pictures, and two s
 `generator.lights.choices`. Contract:
 
 - The ground truth of a mixture is the same mixture of ground truths, because light adds.
-- Weights of a mixture sum to 1, so stray light counts once and the noise is that of one exposure
+- Weights of a mixture sum to 1, so that stray light and the noise of one exposure are counted once
   (`kernels.mixing.mixed_table`).
 - Weights are multiples of 10⁻⁹, so that a label specifies the mixture exactly.
-- Masks of a pixel sum to 1 in multiples of 1/65535, so that a 16-bit file stores them without loss.
+- The masks sum to 1 at each pixel, in multiples of 1/65535, so that a 16-bit file stores them without loss.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Mixture:
 
     @property
     def label(self) -> str:
-        """Return the text of the column `illumination` of `ground_truth.csv`: ``12``, or ``12:0.25+40:0.75``."""
+        """The text of the column `illumination` of `ground_truth.csv`: ``12``, or ``12:0.25+40:0.75``."""
         if len(self.lights) == 1:
             return str(self.lights[0])
         pairs = zip(self.lights, self.weights, strict=True)
@@ -167,7 +167,7 @@ class LightChoice(Protocol):
 
     @property
     def lights_each(self) -> int:
-        """Images of each picture."""
+        """Number of images of each picture."""
         ...
 
     def lightings_of(self, position: int) -> tuple[Lighting, ...]:
@@ -187,7 +187,7 @@ class ListedLights:
 
     @property
     def lights_each(self) -> int:
-        """Images of each picture."""
+        """Number of images of each picture."""
         return len(self.lights)
 
     def lightings_of(self, position: int) -> tuple[Lighting, ...]:
@@ -204,7 +204,7 @@ class ListedLights:
 
 @dataclass(frozen=True)
 class RandomLights:
-    """`lights_each` different illuminants of `total` for each picture, equally likely; purpose 1 of `philox`."""
+    """`lights_each` different illuminants of `total` for each picture, equally likely; drawn with `philox.LIGHTS`."""
 
     lights_each: int
     total: int

@@ -16,7 +16,7 @@ from sim.projectors.projector import INPUTS, SimulatedProjector
 
 @dataclass
 class _Connection:
-    """One connection."""
+    """State of one connection."""
 
     last_received_s: float  # Time of the last command, by the projector's clock
     received: bytes = b""  # Bytes of an incomplete line
@@ -108,7 +108,8 @@ class PjLinkPeer:
 
 _LONGEST = wire.MAX_LINE + wire.DIGEST_LENGTH  # Length limit of the first command of a connection, bytes.
 _INPUTS = tuple(source + number for source in "123456" for number in "123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ")
-_Answers = Mapping[str, Mapping[str, Callable[[], str | None]]]  # Command to parameter to what is done; None is OK
+# Actions by command and parameter; each returns the value of the reply, None for OK.
+_Answers = Mapping[str, Mapping[str, Callable[[], str | None]]]
 
 
 def _class_1(projector: SimulatedProjector) -> _Answers:
@@ -121,7 +122,7 @@ def _class_1(projector: SimulatedProjector) -> _Answers:
             "1": projector.switch_on,
             "0": projector.switch_off,
         },
-        "INPT": _selecting(projector, inputs),
+        "INPT": _input_actions(projector, inputs),
         "AVMT": {
             wire.QUERY: lambda: wire.format_mute(projector.muted()),
             "11": mute,
@@ -144,7 +145,7 @@ def _class_1(projector: SimulatedProjector) -> _Answers:
 
 def _class_2(projector: SimulatedProjector) -> _Answers:
     return {
-        "INPT": _selecting(projector, _INPUTS),
+        "INPT": _input_actions(projector, _INPUTS),
         "INST": {wire.QUERY: lambda: " ".join(INPUTS)},
         "IRES": {wire.QUERY: lambda: wire.format_resolution(projector.input_resolution())},
         "FREZ": {
@@ -155,7 +156,7 @@ def _class_2(projector: SimulatedProjector) -> _Answers:
     }
 
 
-def _selecting(projector: SimulatedProjector, codes: Iterable[str]) -> dict[str, Callable[[], str | None]]:
+def _input_actions(projector: SimulatedProjector, codes: Iterable[str]) -> dict[str, Callable[[], str | None]]:
     return {wire.QUERY: projector.input, **{code: partial(projector.set_input, code) for code in codes}}
 
 

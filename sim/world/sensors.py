@@ -7,8 +7,8 @@ Sizes and margins: dcraw 9.28 (`adobe_coeff` and the Canon table in `identify`).
 rawspeed. Saturation: camconst.json of RawTherapee. Conversion gain and read noise: typical of EMVA 1288 measurements of
 such sensors, not measured on these bodies.
 
-For bodies selected by sensitivities (`FACTS`), sizes are the recorded pixels of the makers. Their other values are
-typical of such sensors, not measured. A settings file can replace them.
+For bodies selected by sensitivities (`SENSITIVITY_BODIES`), sizes are the makers' numbers of recorded pixels. The other
+values are typical of such sensors, not measured. A settings file can replace them.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Rectangle(NamedTuple):
 
 @dataclass(frozen=True)
 class Body:
-    """A camera."""
+    """Sensor, colour filters and noise of a camera."""
 
     maker: str  # As in its files, for example ``Canon``
     model: str  # As in its files, for example ``Canon EOS 550D``
@@ -83,8 +83,8 @@ class Body:
 
     def noise_dn(self, iso: int) -> float:
         """Return the standard deviation of a dark count at an ISO speed, DN."""
-        late = self.read_noise_dn**2 - (self.sensor_noise_e / self.electrons_per_dn) ** 2
-        return (late + (self.sensor_noise_e / self.gain_e(iso)) ** 2) ** 0.5
+        later_variance = self.read_noise_dn**2 - (self.sensor_noise_e / self.electrons_per_dn) ** 2
+        return (later_variance + (self.sensor_noise_e / self.gain_e(iso)) ** 2) ** 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class HotPattern:
     years, detected at ISO 3200, proportional to size⁻³ and √ISO (G. Chapman and others, DFT 2022, doi
     10.1109/DFT56152.2022.9962368; size⁻²·⁵ in Proc. SPIE 7875 (2011)). At ISO 100, this is about 3 per million on an
     EOS 550D (4.3 µm) after ten years, and 0.4 on an EOS 6D Mark II (5.7 µm) after three. Hot photosites of new bodies
-    are not included. The exponential distribution is chosen.
+    are not included. The exponential distribution is an assumption.
     """
 
     rows: NDArray[np.int64]  # (H,) int64, ascending rows of the sensor
@@ -208,7 +208,7 @@ def _areas(width: int, height: int) -> dict[str, Any]:
 
 
 def _body(
-    name: str, size: tuple[int, int], black: int, saturation: int, gain_e: float, noise_dn: float, early_e: float
+    name: str, size: tuple[int, int], black: int, saturation: int, gain_e: float, noise_dn: float, sensor_noise_e: float
 ) -> Body:
     # A Canon with `size` columns and rows of visible photosites.
     return replace(
@@ -218,14 +218,14 @@ def _body(
         saturation=saturation,
         electrons_per_dn=gain_e,
         read_noise_dn=noise_dn,
-        sensor_noise_e=early_e,
+        sensor_noise_e=sensor_noise_e,
         sensitivities=name,
         **_areas(*size),
     )
 
 
 # Cameras by the name of their sensitivities. The EOS 600D has a sensor of the same generation as the EOS 550D.
-FACTS: Final[Mapping[str, Body]] = MappingProxyType(
+SENSITIVITY_BODIES: Final[Mapping[str, Body]] = MappingProxyType(
     {
         "Canon_EOS_600D": replace(BODIES["EOS 550D"], model="Canon EOS 600D"),
         "Canon_EOS_200D": _body("Canon_EOS_200D", (6000, 4000), 2048, 16383, 2.3, 5.2, 2.4),
@@ -241,22 +241,22 @@ def find_body(
 ) -> Body:
     """Return the camera of a name, or of a file of sensitivities, with changed properties.
 
-    `where`, `key`: file or command line, and its table, for messages.
+    `where`, `key`: file or option with the changes, and their table, for messages.
     """
     body = BODIES.get(camera) or _body_of_sensitivities(camera, read_sensitivities(camera, tuple(BODIES)))
     values = dict(changes)
     pixels = values.pop("pixels", None)
     if pixels is not None:
         values = _areas(*_checked_pixels(pixels, where, key)) | values
-    facts = {field.name: getattr(body, field.name) for field in fields(Body)}
-    changed = from_settings(Body, values, where, key, [*facts, "pixels"], **facts)
+    properties = {field.name: getattr(body, field.name) for field in fields(Body)}
+    changed = from_settings(Body, values, where, key, [*properties, "pixels"], **properties)
     _require_sensor(changed, where, key)
     return changed
 
 
 def _body_of_sensitivities(camera: str, sensitivities: Sensitivities) -> Body:
-    if camera in FACTS:
-        return FACTS[camera]
+    if camera in SENSITIVITY_BODIES:
+        return SENSITIVITY_BODIES[camera]
     default = BODIES["EOS 550D"]
     return replace(default, maker=sensitivities.maker or "unknown", model=sensitivities.camera, sensitivities=camera)
 
@@ -316,7 +316,7 @@ def counts(
     Parameters
     ----------
     light
-        (3, rows, visible columns) float32, from `light`; no columns for rows of the masked border.
+        (3, rows, visible columns) float32, from `sim.world.rendering.light`; no columns for rows of the masked border.
     weights
         (3,) float32, exposure to each primary.
     noise
@@ -340,14 +340,14 @@ def counts(
     floor = np.float32(read_noise * read_noise)
     dark = np.float32(read_noise)
     red, green, blue = weights[0], weights[1], weights[2]
-    nothing = np.float32(0)
+    zero = np.float32(0)
     for row in range(rows):
         for x in range(first_column):
-            out[row, x] = np.uint16(min(max(half + dark * noise[row, x], nothing), top))
+            out[row, x] = np.uint16(min(max(half + dark * noise[row, x], zero), top))
         for x in range(first_column, right):
             i = x - first_column
             signal = red * light[0, row, i] + green * light[1, row, i] + blue * light[2, row, i]
             count = half + signal + math.sqrt(signal * per_dn + floor) * noise[row, x]
-            out[row, x] = np.uint16(min(max(count, nothing), top))
+            out[row, x] = np.uint16(min(max(count, zero), top))
         for x in range(right, columns):
-            out[row, x] = np.uint16(min(max(half + dark * noise[row, x], nothing), top))
+            out[row, x] = np.uint16(min(max(half + dark * noise[row, x], zero), top))

@@ -138,7 +138,7 @@ def test_reports_wrong_language(bench: Bench, camera: str) -> None:
         )
     assert code == 3
     assert "answers 'ERR" in message
-    assert "check speed and parity against the projector's menu, and that the language is the correct one" in message
+    assert "compare speed and parity with the projector's menu, and check the name of the language" in message
 
 
 def test_reports_closed_port(bench: Bench, camera: str) -> None:

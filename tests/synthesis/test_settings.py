@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from foundation.errors import ConfigurationError
-from sim.world.sensors import FACTS, find_body
+from sim.world.sensors import SENSITIVITY_BODIES, find_body
 from synthesis.settings import TableSettings, citation_record, load_settings, parse_settings, table_room
 
 FILE = """
@@ -37,7 +37,8 @@ def test_file_changes_the_named_settings(tmp_path: Path) -> None:
     room = table_room(settings, "here")
     assert (room.seed, room.vignetting, room.profile, room.lamp_drift_per_hour) == (3, 0.1, "managed", 0)
     body = find_body("Canon_EOS_5DS", settings.camera, "here")
-    assert (body.model, body.electrons_per_dn, body.saturation) == ("Maker M2", 2.5, FACTS["Canon_EOS_5DS"].saturation)
+    saturation = SENSITIVITY_BODIES["Canon_EOS_5DS"].saturation
+    assert (body.model, body.electrons_per_dn, body.saturation) == ("Maker M2", 2.5, saturation)
     assert body.half_size == (2000, 3000)
     assert body.sensitivities == "Canon_EOS_5DS"
 

@@ -36,28 +36,28 @@ from sim.world.rendering import Print
 from sim.world.sensors import BODIES, Body, find_body
 from sim.world.world import Room, World, read_room
 
-SERIAL = "0000000001"  # Serial number of the simulated camera and in its frames; one laboratory has one camera
+SERIAL = "0000000001"  # Serial number of the simulated camera, also in its frames; a laboratory has one camera
 
 
 def open_simulated(settings: LabSettings, chart: Chart, session: Session | None, opened: ExitStack) -> Devices:
     """Build the simulated laboratory; `session` is the resumed session, or None."""
     exposures = _earlier_exposures(session)
-    exposed = Counter(colour for _, colour in exposures)
+    colour_counts = Counter(colour for _, colour in exposures)
     last = None if session is None else last_frame_time(session.journal.attempts())
     clock = SimulatedClock(last or SIM_START)
     screen = Screen()
-    simulated = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)
+    simulated_projector = SimulatedProjector(clock, power=Power.ON if exposures else Power.STANDBY)
     sensor = simulated_body(settings)
     world = World(sheet(chart), sensor, simulated_room(settings))
     events = read_disturbances(settings.simulated.events, settings.file)
-    film = WorldFilm(world, lambda: screen.colour, simulated.light, SERIAL, exposed, events, exposures)
+    film = WorldFilm(world, lambda: screen.colour, simulated_projector.light, SERIAL, colour_counts, events, exposures)
     # A body given by its sensitivities alone uses the protocol of an EOS 550D.
     protocol = EOS_BODIES.get(settings.simulated.body, EOS_BODIES["EOS 550D"])
     apertures = () if settings.camera.exposure.aperture is None else protocol.aperture_codes
     # The camera runs on mains power, as for any long session.
     body = replace(protocol, shots_per_charge=10**9, aperture_codes=apertures)
     eos = SimulatedEos(body, film, clock, serial=SERIAL, auto_power_off_s=0)
-    peer = PjLinkPeer(simulated)
+    peer = PjLinkPeer(simulated_projector)
     projector = PjLinkProjector(lambda: PeerLink(peer))
     opened.callback(projector.close)
     presenter = SimulatedPresenter(screen, clock)
@@ -95,7 +95,7 @@ def simulated_room(settings: LabSettings) -> Room:
 
 
 def _earlier_exposures(session: Session | None) -> list[tuple[float, Colour]]:
-    # Time, s since the opening, and colour of every earlier exposure.
+    # Time in seconds since `SIM_START`, and colour, of every earlier exposure.
     if session is None:
         return []
     colours = {step.number: step.colour for step in session.steps}

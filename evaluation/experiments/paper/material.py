@@ -1,7 +1,7 @@
 """Material of the paper's experiments: pictures, ground truths, illuminants and scenes generated in memory.
 
 Image i of a set shows source i under the i-th chosen illuminant. Samples are drawn as by `generate` with the same
-seed, so that command can write the same images to files.
+seed, so `generate` can write the same images to files.
 
 The paper prints "the sRGB images of the Canon 1Ds Mark III" (section 4.3). Their development is not published; here,
 pictures are developed from linear raw images with known ground truth (`develop_image`).
@@ -131,10 +131,7 @@ def lights_at_random(lut: Lut, count: int, seed: int) -> ChosenLights:
 def render_scenes(lut: Lut, sources: Sequence[Source], lights: ChosenLights, seed: int) -> tuple[RenderedScene, ...]:
     """Return the scenes of the pictures under the chosen illuminants."""
     if len(sources) != len(lights.numbers):
-        raise InputError(
-            f"{len(sources)} pictures have {len(lights.numbers)} illuminants, expected equal numbers; choose one for "
-            "each"
-        )
+        raise InputError(f"{len(lights.numbers)} illuminants, expected {len(sources)}; choose one for each picture")
     pairs = zip(sources, lights.numbers, strict=True)
     return tuple(RenderedScene(lut, source, light, number, seed) for number, (source, light) in enumerate(pairs))
 
@@ -174,15 +171,15 @@ def develop_image(
     if not (np.isfinite(light).all() and light.min() > 0):
         raise InputError(f"the illuminant is {light.tolist()}, expected three numbers above 0; correct it")
     # Balanced with green unchanged, and cut where the first channel clips, so that clipped skies become white and not
-    # pink (dcraw -H 0). Thumbnails do not record clipping; a few of theirs stay pink.
+    # pink (dcraw -H 0). Thumbnails do not record clipping; a few of their skies stay pink.
     linear: npt.NDArray[np.float64] = np.asarray(image, dtype=np.float64) * (light[1] / light)
     if saturation is not None:
         linear = np.minimum(linear, saturation * float((light[1] / light).min()))
     if matrix is not None:
         # The matrix keeps white.
         linear = np.asarray(linear @ np.linalg.inv(matrix.rows).T, dtype=np.float64)
-    judged = linear.reshape(-1, 3) if mask is None else linear[~mask]
-    white = float(np.percentile(judged, WHITE_PERCENTILE, axis=0).max()) if len(judged) else 0.0
+    usable = linear.reshape(-1, 3) if mask is None else linear[~mask]
+    white = float(np.percentile(usable, WHITE_PERCENTILE, axis=0).max()) if len(usable) else 0.0
     return srgb_codes(linear / max(white, _MIN_WHITE))
 
 
@@ -232,7 +229,7 @@ class Truths:
 
 
 def read_truths(location: str) -> Truths:
-    """Return the ground truths of a text file, FILE or FILE#PREFIX of image names, or of a data set."""
+    """Return the ground truths of a data set, or of a text file: FILE, or FILE#PREFIX for images named PREFIX…."""
     file, _, prefix = location.partition("#")
     if not file.lower().endswith(_TEXT_EXTENSIONS):
         data = open_scenes(location)
@@ -245,7 +242,7 @@ def read_truths(location: str) -> Truths:
         return Truths(Path(file).stem, lights, tuple(names) if len(names) == len(lights) else ())
     if len(names) != len(lights):
         raise FormatError(
-            f"{file} has {len(lights)} ground truths, {len(names)} names, expected equal numbers; correct it"
+            f"{file} has {len(lights)} ground truths and {len(names)} image names, expected equal numbers; correct it"
         )
     is_chosen = np.array([name.startswith(prefix) for name in names])
     if not is_chosen.any():

@@ -81,7 +81,7 @@ def test_loads_a_user_file(tmp_path: Path) -> None:
         ('off = "POWER OFF"', 'off = "Power On"', "power: on and off are both 'POWER ON'"),
         ('done = "POWER {}"', 'done = "BUSY"', "power.done = 'BUSY' is also one of the refusals"),
         ("stopped = { HOT", "stopped = { Off", "power: OFF: expected each value in only one"),
-        ("{ NO = true, YES = false }", "{ NO = true, no = false }", "mute.states: expected values that differ in more"),
+        ("{ NO = true, YES = false }", "{ NO = true, no = false }", "mute.states: expected values that differ"),
         ("states = { NO = true, YES = false }", "", "mute: ask is given: expected states with a value"),
         ("states = { NO = true, YES = false }", "states = { NO = true }", "mute: ask is given: expected states"),
         ('ask = "SHOW?"', "", "mute: answer is given without ask"),

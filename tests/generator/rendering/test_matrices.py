@@ -11,7 +11,7 @@ from drivers.raw.rawfile import camera_matrix as libraw_matrix
 from foundation.errors import InputError
 from generator.rendering.matrices import camera_matrix, cameras, choose_matrix, fit_matrix
 from generator.rendering.print_profiles import PrintProfile
-from sim.world.sensors import BODIES, FACTS, Body
+from sim.world.sensors import BODIES, SENSITIVITY_BODIES, Body
 
 
 def test_matrices_keep_white() -> None:
@@ -30,7 +30,7 @@ def test_unlisted_cameras_have_no_matrix(name: str) -> None:
     assert camera_matrix(name) is None
 
 
-@pytest.mark.parametrize("body", [*FACTS.values(), BODIES["EOS 550D"], BODIES["EOS 6D Mark II"]])
+@pytest.mark.parametrize("body", [*SENSITIVITY_BODIES.values(), BODIES["EOS 550D"], BODIES["EOS 6D Mark II"]])
 def test_simulated_bodies_have_listed_matrices(body: Body) -> None:
     assert camera_matrix(body.camera) is not None
 

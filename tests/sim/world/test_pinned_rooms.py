@@ -13,7 +13,7 @@ from drivers.presenter import BLACK, WHITE, Colour
 from sim import spectral
 from sim.spectral import daylight, projector_primaries
 from sim.world.disturbances import AnyDisturbance, Disturbances, Moment
-from sim.world.sensors import BODIES, FACTS, Body, Rectangle, find_body
+from sim.world.sensors import BODIES, SENSITIVITY_BODIES, Body, Rectangle, find_body
 from sim.world.world import REFERENCE_EXPOSURE, UNDISTURBED, Blob, Glare, Patch, Room, Situation, World
 from tests.pinned import Pinned
 from tests.sim.conftest import patches
@@ -154,7 +154,7 @@ def test_lights_and_cameras_are_unchanged(pinned: Pinned) -> None:
         "cameras": {
             name: [spectral.sensitivities(name), spectral.describe_sensitivities(spectral.read_sensitivities(name))]
             for name in spectral.known_sensitivities()
-            if name in FACTS
+            if name in SENSITIVITY_BODIES
         },
         "a body with changes": find_body("Canon_EOS_5DS", {"pixels": [64, 17], "black": 100, "read_noise_dn": 9.5}),
         "observer": spectral._observer(),

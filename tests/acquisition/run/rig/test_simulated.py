@@ -25,7 +25,7 @@ from experiment.session.folder import Session
 from foundation.clock import Clock
 from foundation.errors import ConfigurationError, DeviceRefused
 from sim.projectors.projector import Screen, SimulatedPresenter
-from sim.world.sensors import FACTS
+from sim.world.sensors import SENSITIVITY_BODIES
 
 HEAD = 'rig = "simulated"\nchart = "c.json"\nilluminations = "l.csv"\n'
 
@@ -103,7 +103,7 @@ def test_records_such_body_in_session(tmp_path: Path) -> None:
     assert mosaic.aperture is None
     black = mosaic.masked_black()
     assert black is not None
-    assert black == pytest.approx(FACTS["Canon_EOS-1Ds_Mark_III"].black, abs=1)
+    assert black == pytest.approx(SENSITIVITY_BODIES["Canon_EOS-1Ds_Mark_III"].black, abs=1)
 
 
 def test_refuses_imported_session() -> None:
