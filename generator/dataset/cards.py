@@ -269,7 +269,7 @@ def _configs(description: Description) -> str:
 def _reading(description: Description) -> str:
     layout = LAYOUTS[option(description, "layout")]
     if isinstance(layout, JoinedLayout):
-        return layout.reading_help
+        return layout.reading
     names = layout.patterns(description.parts, suffix_of(option(description, "format")))
     files = " and ".join(f"`{name.replace('*', 'NNNNNN')}`" for name in names)
     return (
