@@ -30,7 +30,7 @@ def open_rig(
             'rig is "imported", expected "lab" or "simulated": frames were taken by other means; start a new session'
         )
     with ExitStack() as opened:
-        # Drivers and the simulated world are imported only if they are needed.
+        # Drivers and the simulated laboratory are imported only if they are needed.
         if settings.rig == "lab":
             from acquisition.run.rig.lab import open_lab
 
