@@ -18,12 +18,12 @@ def open_rig(
     chart: Chart,
     session: Session | None = None,
     *,
-    shows: bool = True,
+    opens_display: bool = True,
 ) -> Generator[Devices]:
     """Open every device of the settings; close them all at the end.
 
-    `session`: the resumed session; None for a new one, and for a check. `shows`: whether to open the display, which is
-    black then; a dry run does not.
+    `session`: the resumed session; None for a new one, and for a check. `opens_display`: whether to open the display,
+    which is black then; a dry run does not.
     """
     if settings.rig == "imported":
         raise ConfigurationError(
@@ -34,7 +34,7 @@ def open_rig(
         if settings.rig == "lab":
             from acquisition.run.rig.lab import open_lab
 
-            yield open_lab(settings, session, opened, shows)
+            yield open_lab(settings, session, opened, opens_display)
         else:
             from acquisition.run.rig.simulated import open_simulated
 
