@@ -380,8 +380,8 @@ def completed_dataset(plan: Plan, out: Path | str) -> Dataset | None:
     differing = differences(stored, {key: identity[key] for key in stored}) or _differing_pictures(dataset, plan, out)
     if differing:
         raise InputError(
-            f"{out} already contains another data set ({'; '.join(differing)}); choose another location, or remove the "
-            "data set"
+            f"{out} already contains a different data set ({'; '.join(differing)}); choose another location, or remove "
+            "the data set"
         )
     return dataset
 
