@@ -458,8 +458,8 @@ def import_(
         print(f"  {line}")
     if imported.missing:
         raise QualityError(
-            f"{session} has 0 accepted frames for {first_few(imported.missing)}, expected 1 or more for each; list "
-            "other files, and import them into a new folder"
+            f"{session} lacks accepted frames: {first_few(imported.missing)}; expected 1 or more of each: list other "
+            "files, and import them into a new folder"
         )
 
 
