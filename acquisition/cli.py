@@ -87,11 +87,11 @@ def chart(
     bits: Annotated[int, typer.Option(min=1, max=5, help="Bits per channel; 5 gives 32 768 colours.")] = 5,
     page: Annotated[
         str | None,
-        typer.Option(help="Paper, landscape: A0 … A8, or WIDTHxHEIGHT in mm; by default the smallest that fits."),
+        typer.Option(help="Sheet, landscape: A0 … A8, or WIDTHxHEIGHT in mm; by default the smallest that fits."),
     ] = None,
     arrangement: Annotated[
         Arrangement,
-        typer.Option(help="tagged: random order, tags and references; paper: the paper's 256 × 128 grid without tags."),
+        typer.Option(help="tagged: random order, tags and references; paper: published 256 × 128 grid, without tags."),
     ] = Arrangement.TAGGED,
     tiff: Annotated[bool, typer.Option(help="Write the 600-dpi TIFF.")] = True,
     tagged_tiff: Annotated[
@@ -172,7 +172,7 @@ def illuminations(
 
     plot = out.with_suffix(".png")
     if plot == out:
-        raise InputError(f"{out} is the name of the plot, expected another name; give {out.with_suffix('.csv')}")
+        raise InputError(f"OUT is {out}, the name of the plot, expected a CSV file; use {out.with_suffix('.csv')}")
     require_free(out, "the illuminants")
     require_free(plot, "the plot of the illuminants")
     lights = plan_illuminants(grid, parse_ccts(blackbodies))
@@ -284,8 +284,8 @@ def run(
         bool,
         typer.Option(
             "--dry-run",
-            help="Query every device, and print the frames, time and space of the run, and faults that would end it; "
-            "switches no lamp on, takes no frame, shows and writes nothing.",
+            help="Query every device, then print frames, time and space of the run, and faults that would end it. "
+            "No lamp is switched on, no frame is taken, nothing is shown or written.",
         ),
     ] = False,
     *,
@@ -304,9 +304,9 @@ def run(
     if dry_run:
         _print_plan(settings, session, retake, output)
         return
-    with orderly_end() as ending, Terminal() as shown:
+    with orderly_end() as ending, Terminal() as terminal:
         outcome = run_session(
-            settings, session, shown.progress, shown.announce, retake, ending, shown.show_frame, shown.state
+            settings, session, terminal.progress, terminal.announce, retake, ending, terminal.show_frame, terminal.state
         )
     missing, refused, doubts = outcome.remaining, outcome.refused, outcome.doubts
     output.add(session=session, frames=outcome.total, left=missing, refused=refused, doubts=doubts)
@@ -351,9 +351,9 @@ def status(
     """Show the progress of a session: state, remaining time, last measurements, and refused frames.
 
     Reads SESSION, also during a run; writes nothing. Ends with 0 if a run is active, or the session is complete. Ends
-    with 3 if a step is late, no sign of life came in time, the run is paused or ended for a device, or was killed; with
-    4 if it is paused for its frames, has ended with missing frames, or files, chart or illuminants are lost; with 5 if
-    the disk is full or faulty.
+    with 3 if a step is late, if the run was killed or no longer reports its state, or if it is paused or ended because
+    of a device. Ends with 4 if it is paused because of its frames, if frames are missing at the end, or if files, chart
+    or illuminants are lost. Ends with 5 if the disk is full or faulty.
     """
     from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path
@@ -458,8 +458,8 @@ def import_(
         print(f"  {line}")
     if imported.missing:
         raise QualityError(
-            f"{session}: {len(imported.missing)} without an accepted frame: {first_few(imported.missing)}; list other "
-            "files and import them into a new folder"
+            f"{session} lacks accepted frames: {first_few(imported.missing)}; expected 1 or more of each: list other "
+            "files, and import them into a new folder"
         )
 
 

@@ -30,7 +30,7 @@ from foundation.folders import require_free
 
 @dataclass(frozen=True)
 class ListedFrame:
-    """One row of the list; fields are empty or None if it states nothing."""
+    """One row of the list; fields without a value in the row are empty or None."""
 
     kind: FrameKind
     illumination: int | None
@@ -59,11 +59,12 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illuminant, ..
     """Read a list of frames (columns as in `frames.csv`, paths relative to it) and the illuminants next to it.
 
     Only `kind`, `illumination` and `file` must be filled. Rows of the kind ``response`` are ignored: only a running
-    session needs them, and the list does not state their codes.
+    session needs them, and the list does not contain their codes.
     """
-    rows = read_csv(path, "give a CSV file in UTF-8", "the list of frames")[1]
-    if not rows or any(column not in rows[0] for column in FRAME_COLUMNS[:3]):
-        raise FormatError(f"no frames, expected rows with the columns {','.join(FRAME_COLUMNS)}; add them", about=path)
+    columns, rows = read_csv(path, "name a CSV file in UTF-8", "the list of frames")
+    if not rows or not set(columns).issuperset(FRAME_COLUMNS[:3]):
+        problem = f"{len(rows)} frames with the columns {','.join(columns)}, expected 1 or more frames with at least "
+        raise FormatError(f"{problem}{','.join(FRAME_COLUMNS[:3])}; correct the list", about=path)
     lights = load_illuminants(path.parent / "illuminations.csv")
     frames = [
         _listed(row, f"{path}, line {number}", path.parent, len(lights))
@@ -91,7 +92,8 @@ def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int
         time = cell("taken_at")
         taken_at = datetime.fromisoformat(time) if time else datetime.fromtimestamp(file.stat().st_mtime, UTC)
     except ValueError as error:
-        raise FormatError(str(error), about=where) from error
+        remedy = "give illumination as an integer, exposure_s in s, and taken_at in ISO 8601"
+        raise FormatError(str(error), about=where, remedy=remedy) from error
     if illumination is not None and not 0 <= illumination < lights:
         problem = f"illumination is {illumination}, expected 0 … {lights - 1} as in illuminations.csv; correct it"
         raise FormatError(problem, about=where, value=illumination)
@@ -110,7 +112,7 @@ def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int
 def import_session(
     frame_list: Path, chart: Path, folder: Path, observe: Callable[[int, int], None] = lambda done, total: None
 ) -> Imported:
-    """Make a session of listed raw files."""
+    """Make a session from listed raw files."""
     require_free(folder, "the session")
     frames, lights = read_frame_list(frame_list)
     loaded = load_chart(chart)
@@ -125,7 +127,7 @@ def import_session(
     with Session.create(folder, settings.to_toml(), loaded, lights, steps) as session:
         try:
             for step, frame in zip(steps, frames, strict=True):
-                reason, sha256 = _take_over(session, step, frame, settings)
+                reason, sha256 = _import_frame(session, step, frame, settings)
                 first = light_files.setdefault(sha256, frame) if frame.kind == "light" else frame
                 if first.illumination != frame.illumination:
                     raise FormatError(
@@ -170,10 +172,10 @@ def _step(number: int, frame: ListedFrame, lights: tuple[Illuminant, ...]) -> Se
     return SessionStep(number, frame.kind, frame.illumination, colour)
 
 
-def _take_over(
+def _import_frame(
     session: Session, step: SessionStep, frame: ListedFrame, settings: LabSettings
 ) -> tuple[str | None, str]:
-    """Copy and judge a frame; return the reason of a refusal, or None, and the SHA-256 of its file."""
+    """Copy and judge a frame; return the reason if it is refused, else None, and the SHA-256 of its file."""
 
     def copy(into: BinaryIO) -> CapturedFrame:
         with frame.path.open("rb") as stream:
@@ -183,7 +185,7 @@ def _take_over(
     attempt = session.journal.begin(step, f"frames/{step.stem}", frame.taken_at)
     received = session.receive(step.stem, copy)
     if frame.verdict == ACCEPTED:
-        # The file may have been damaged after this verdict, or without notice.
+        # The file may have been damaged after this verdict, or the damage was not noticed.
         content = whole_frame(received.path)
         reason = content if isinstance(content, str) else None
     elif frame.verdict:

@@ -665,7 +665,7 @@ def dry_run(settings: LabSettings, folder: Path, retake: str | None = None) -> R
             require_frames_folder(folder)
         work = outline(settings, folder, session, retake)
         try:
-            devices = opened.enter_context(open_rig(settings, work.chart, session, shows=False))
+            devices = opened.enter_context(open_rig(settings, work.chart, session, opens_display=False))
         except CropError as fault:
             return make_plan(settings, work, Answers(faults=(fault,)), free_bytes_at(folder))
         return make_plan(settings, work, ask(devices), free_bytes_at(folder), known_frame_bytes(settings))

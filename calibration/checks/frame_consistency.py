@@ -5,11 +5,11 @@ ratio of a patch's channel to its value in the reference frame is a smooth funct
 illuminants and any inks. It is modelled by a polynomial in the code, fitted to the frame itself. The residual consists
 of noise, the error of the polynomial (random over the sheet, as the codes are) and faults of the frame:
 
-- `scatter` of all patches: blur mixes neighbours, and another order of patches fits badly. Possible noise is
-  subtracted.
+- `scatter` of all patches: large if the frame is blurred, because neighbours mix, or if the patches have another order.
+  The scatter that noise can cause is subtracted.
 - `block`, the mean of neighbouring patches: a hand, a shadow or a reflection covers one area. A patch that differs from
   all its neighbours, for example by a hot photosite, gets the nearest value of a neighbour.
-- `disturbed`, adjacent patches with large deviations: covers that are too small to change the mean of a block
+- `disturbed`, adjacent patches with large deviations: covered areas that are too small to change the mean of a block
   (`calibration.checks.small_places`).
 
 Charts of 8 and 64 patches cannot be checked: the polynomial has too many terms for them.
@@ -51,7 +51,7 @@ CELLS = 8192
 
 FIT_CELLS = 1500  # Approximate number of patches for fitting the polynomial: forty per term
 
-# Compared patches of a block: on a full A0 chart a square of 60 mm with four times as many patches.
+# Compared patches of a block. On a full A0 chart, where every fourth patch is compared, a block is a square of 60 mm.
 BLOCK_CELLS = 32
 
 LEAST_CELLS = 12  # Minimum number of compared patches in a block
@@ -60,15 +60,15 @@ CELLS_A_TERM = 2  # Minimum number of patches per term; with fewer, the polynomi
 
 _ROUNDS = 3  # Number of reweighted solutions after the unweighted one
 
-# Standard uncertainties subtracted from the mean of a block and from the scatter. Noise alone exceeds them in one of
-# sixty frames, with the 256 blocks of a full chart.
+# Number of standard uncertainties subtracted from the mean of a block and from the scatter. With the 256 blocks of a
+# full chart, noise alone exceeds them in one of sixty frames.
 _CERTAIN = 4.0
 
 # Variance of a standard deviation estimated by the median deviation of N normal values, over σ²/N (P. Rousseeuw and
 # C. Croux, Journal of the American Statistical Association 88, 1993: an efficiency of 37 %).
 _SPREAD_ERROR2 = 1.36
 
-_AS_MUCH = 0.3  # Deviation relative to the worst block above which a block belongs to the same fault
+_SAME_FAULT_RATIO = 0.3  # Deviation relative to the worst block above which a block belongs to the same fault
 
 # Percentile of the expected levels that represents the brightest patch; paper is not among them.
 _BRIGHT_PERCENTILE = 99.0
@@ -83,8 +83,8 @@ class FrameConsistency:
     # relative scatter about the polynomial without noise, beyond 4 standard uncertainties, worst channel
     scatter: float = 0.0
     block: float = 0.0  # relative deviation of the worst block, beyond 4 standard uncertainties
-    at_mm: tuple[float, float] = (0.0, 0.0)  # centre of that block on the print
-    colour: tuple[float, float, float] = (0.0, 0.0, 0.0)  # its relative deviation in R, G and B; 0 for a dim channel
+    at_mm: tuple[float, float] = (0.0, 0.0)  # centre of the worst block on the print
+    colour: tuple[float, float, float] = (0.0, 0.0, 0.0)  # relative deviation of this block in R, G, B; 0 if dim
     share: float = 0.0  # share of the blocks with at least 0.3 times this deviation
     extent_mm: float = 0.0  # side of a square with the area of these blocks
     added: float = 0.0  # light added to these blocks, relative to the brightest patch
@@ -172,8 +172,9 @@ class ConsistencyCheck:
         compared_mm = cells_mm[self._selection]
         block, self._block_centres, self._block_mm2 = _blocks(compared_mm)
         self._members = _members(block, len(self._block_centres))
-        # Compare with the eight neighbours of a square grid: a cover includes two patches or concerns only one. A limit
-        # by the scatter of the block would hide covers of less than half of each block.
+        # Each deviation is limited to the deviations of its eight neighbours, so that a single patch cannot change a
+        # block. A covered area contains several patches, so it remains. A limit by the scatter of the block would hide
+        # an area that covers less than half of the block.
         neighbours = cKDTree(compared_mm).query(compared_mm, k=min(AROUND + 1, len(compared_mm)))[1]
         self._around = np.ascontiguousarray(np.atleast_2d(neighbours), dtype=np.int64)
 
@@ -198,7 +199,7 @@ class ConsistencyCheck:
         worst = int(np.argmax(excess))
         if not excess[worst] > 0:
             return FrameConsistency(scatter, disturbed=disturbed, seeds=seeds, alone=alone)
-        affected = np.flatnonzero(excess >= _AS_MUCH * excess[worst])
+        affected = np.flatnonzero(excess >= _SAME_FAULT_RATIO * excess[worst])
         red, green, blue = (float(valid[c].mean[worst]) if c in valid else 0.0 for c in range(3))
         x, y = self._block_centres[worst].tolist()
         added, kept = _fit_added_light(list(valid.values()), self._members[affected])
@@ -283,7 +284,7 @@ class ConsistencyCheck:
 def _fit_added_light(channels: list[_Deviations], members: npt.NDArray[np.int64]) -> tuple[float, float]:
     """Return the added light, relative to the brightest patch, and the remaining fraction of the patches' own light.
 
-    Of the patches `members` (B, M), −1 for none, by least absolute deviations against outliers.
+    The line is fitted to the patches `members` (B, M; −1 for none) by least absolute deviations, because of outliers.
     """
     cells = members[members >= 0]
     own: list[_Array] = []
@@ -344,7 +345,7 @@ class OriginFigures:
 
     @property
     def exposure_difference(self) -> float:
-        """Largest relative difference of an exposure from most frames: 1 is twice or half."""
+        """Largest relative difference of an exposure from most frames; 1 means twice or half of the exposure."""
         return max((max(frame.ratio, 1 / frame.ratio) - 1 for frame in self.other_exposure), default=0.0)
 
 
@@ -394,7 +395,7 @@ def _other_exposures(frames: Sequence[tuple[FrameRecord, FrameOrigin]]) -> tuple
     example = next(origin for _, origin in with_exposure if origin.exposure == usual)
     foreign: list[ForeignFrame] = []
     for record, origin in with_exposure:
-        # If only one file gives an f-number, both are taken to be equal.
+        # If only one of two files gives an f-number, the f-numbers are assumed to be equal.
         is_comparable = bool(origin.aperture) == bool(example.aperture)
         ratio = origin.exposure / usual if is_comparable else _exposure(origin) / _exposure(example)
         if not 1 / _SAME_EXPOSURE < ratio < _SAME_EXPOSURE:

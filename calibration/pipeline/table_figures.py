@@ -3,7 +3,7 @@
 An effect that the session does not show is assumed to have its usual size, never 0, and is marked as assumed. The
 linearity series (`read_linearity`) does not affect the samples.
 
-L illuminants, C patches in the order of colour indices.
+Shapes: L illuminants, C patches in the order of colour indices.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ _DARK_CHANGE = 0.2  # Relative change of dark light over a session with a single
 # Difference between dark light in dark frames and in illuminants' frames, relative, if not measured (judgement).
 _USUAL_OVERSUBTRACTION = 0.2
 
-# Relative error by lamp flicker, or an incomplete turn of the wheel, in an exposure (judgement: 0.5 s; Heinz et al.
-# 2018).
+# Relative error due to lamp flicker or an incomplete turn of the colour wheel in an exposure of 0.5 s (judgement; Heinz
+# et al. 2018).
 _FLICKER = 5e-5
 
-_STRAY = 1e-4  # Relative light from outside the print, if not measured (judgement)
+_STRAY = 1e-4  # Light from outside the print relative to the illuminant, if not measured (judgement)
 
-# Fraction of the mean square of these two common to all channels: a lamp flickers in all, a wheel ends in one primary;
-# walls reflect the illuminant in their own colour (judgement).
+# Fraction of the mean square of both errors that is common to all channels (judgement). A lamp flickers in all
+# channels, but a colour wheel stops in one primary, and walls reflect the illuminant in their own colour.
 _COMMON = 0.75
 
 
@@ -103,14 +103,14 @@ def _partly_common(size: float, lights: int) -> _Array:
 
 
 def _noise_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    # The field has the references' noise once per term of its polynomial, white once.
+    # The flat field contains the variance of white once per term of its polynomial.
     square = (table.lights.white_error / white) ** 2
     field = max(len(factor) for frame in table.frames for factor in frame.paper.field.coefficients[0])
     response = (table.sensor.transfer.response**2 + _RESPONSE**2) / table.cells.window**2
     return Component(
         "noise", "noise of the white references", False,
-        "scatter of the white references about each frame's flat field, and photosite response within a patch; the "
-        "camera's noise between frames is no error",
+        "scatter of the white references about each frame's flat field, and photosite response within a patch; noise "
+        "of the samples is not included",
         _diagonal(square), np.broadcast_to(field * square.min(axis=0) + response, cells.shape),
     )  # fmt: skip
 
@@ -146,7 +146,7 @@ def _darkness_component(table: TableMeasurements, white: _Array, cells: _Array) 
 
 def _oversubtracted_counts(table: TableMeasurements, dark: _Array) -> _Array:
     # If `dark` (3,) counts are too high, white exceeds the primaries' sum by twice the excess, because each primary
-    # lacks it. A projector that adds light to white looks the same.
+    # lacks it. A projector with a white segment has the same effect.
     additivity = table.lights.additivity
     if additivity is None:
         return _USUAL_OVERSUBTRACTION * dark
@@ -175,7 +175,8 @@ def _added_light_component(table: TableMeasurements, white: _Array, cells: _Arra
     at_cells = (_STRAY**2 + measured_share**2 + table.cells.added.mean_square) / cells**2
     return Component(
         "added light", "reflections, and light in single frames", table.lights.stray is None,
-        "light that is equal on dark and bright patches; codes of 0, and white against the primaries", lights, at_cells,
+        "light added equally to dark and bright patches; paper at codes of 0, and white against the sum of primaries",
+        lights, at_cells,
     )  # fmt: skip
 
 
@@ -188,7 +189,7 @@ def _flicker_component(white: _Array, cells: _Array) -> Component:
 
 
 def _geometry_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    # An uncertain position blurs the rim of a patch by as much, on average.
+    # On average, a position error has the same effect on a patch as a blur of this σ.
     registration, window = table.registration, table.cells.window
     blur_px = np.hypot(registration.blur_px, registration.uncertainty_px(table.cells.stains.places_mm))
     of_neighbours = mean_bleed(registration.cell_px, blur_px, window)[:, None]
@@ -203,7 +204,7 @@ def _geometry_component(table: TableMeasurements, white: _Array, cells: _Array) 
 
 _MIN_BITS = 3  # Bits per channel needed to predict a patch from its neighbours in colour
 
-# Number of different exposure times (judgement): with fewer, errors of recorded times look like nonlinearity.
+# Minimum number of different exposure times (judgement): with fewer, errors of recorded times look like nonlinearity.
 MIN_EXPOSURES = 4
 
 
@@ -275,7 +276,7 @@ def _require_in_place(shift: Shift, path: Path) -> None:
 # Lower limit of the ground truth, counts, so that it has a direction even without light.
 _MIN_WHITE = 1e-3
 
-# Drift of white, relative and in degrees, beyond which a LUT is refused; larger differences are not drift.
+# Largest drift of white in an accepted LUT, relative and in degrees; larger differences have other causes.
 _MAX_DRIFT, _MAX_DRIFT_DEG = 0.15, 2.0
 
 _FULL_CODE = 255  # Code of a primary at full brightness
@@ -284,16 +285,16 @@ _FULL_CODE = 255  # Code of a primary at full brightness
 def table_figures(accumulator: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
     """Return the measurements of a LUT with all frames added. `linearity`: result of a series of exposures, if any."""
     frames = accumulator.frames
-    even = next((frame for frame in frames if accumulator.selected.is_even(frame.record)), frames[0])
+    even_frame = next((frame for frame in frames if accumulator.selected.is_even(frame.record)), frames[0])
     frame_by_light = {frame.record.illumination: frame for frame in frames if frame.record.kind == "light"}
     by_light = [frame_by_light[light.index] for light in accumulator.session.illuminations]
     greys = np.array([frame.greys for frame in by_light]), np.array([frame.grey_errors for frame in by_light])
     lights = _light_figures(accumulator, by_light)
-    return _table_measurements(accumulator, even, len(by_light), lights, greys, linearity)
+    return _table_measurements(accumulator, even_frame, len(by_light), lights, greys, linearity)
 
 
 def check_figures(accumulator: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
-    """Return the measurements of a check, with the registered frame and a dark frame, if there is one."""
+    """Return the measurements of a check, from the registered frame and a dark frame, if there is one."""
     (frame,) = accumulator.frames
     lights = LightMeasurements(
         white=frame.paper.white[None],
@@ -318,7 +319,7 @@ def _table_measurements(
     greys: tuple[_Array, _Array],
     linearity: LinearityMeasurements | None,
 ) -> TableMeasurements:
-    # `even_frame` shows the uniformity of patches.
+    # `even_frame`: frame for measuring the uniformity of patches.
     session, baseline, saturation = accumulator.session, accumulator.baseline, accumulator.saturation
     stated = stated_origin(session)
     origins = [frame.origin for frame in accumulator.figures]
@@ -393,7 +394,7 @@ def _field_at_cells(baseline: Baseline, even_frame: FrameMeasurements) -> _Array
 def _without_hot(
     frames: tuple[FrameMeasurements, ...], hottest: _Array, cells_mm: _Array
 ) -> tuple[FrameMeasurements, ...]:
-    # A patch with a hot photosite does not count as covered. `hottest`: (C,) counts, or (0,) without dark frames.
+    # A patch with a hot photosite is not regarded as covered. `hottest`: (C,) counts, or (0,) without dark frames.
     if not len(hottest):
         return frames
     hot = hottest > 0
@@ -463,10 +464,10 @@ def _code_agreement(
 
 
 def _to_one_exposure(frames: Sequence[FrameMeasurements]) -> _Array:
-    """Return the ratio of the median exposure to each frame's, (N, 1) float64; 1 if not recorded."""
+    """Return the median exposure divided by the exposure of each frame, (N, 1) float64; 1 if not recorded."""
     exposures = np.array([frame.origin.exposure for frame in frames])
-    usual = float(np.median(exposures[exposures > 0])) if (exposures > 0).any() else 1.0
-    return np.where(exposures > 0, usual / np.maximum(exposures, 1e-12), 1.0)[:, None]
+    median = float(np.median(exposures[exposures > 0])) if (exposures > 0).any() else 1.0
+    return np.where(exposures > 0, median / np.maximum(exposures, 1e-12), 1.0)[:, None]
 
 
 def _stray_light(

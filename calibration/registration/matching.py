@@ -1,9 +1,9 @@
 """Move the map from print to frame until both coincide, and estimate the uncertainty of positions.
 
-The frame is rectified to the print and compared with the print in camera colours (a model fitted to the frame itself).
-A smooth displacement is fitted to the differences. First, blocks of patches are located by correlation (`find_blocks`);
-otherwise the next stage could converge to neighbouring patches. Then all patches move together in Gauss-Newton steps
-(`compare_tiles`). All channels are used, each at its own position; the map describes green.
+The frame is rectified and compared with the print in camera colours, which a model predicts. The model is fitted to the
+frame itself. A smooth displacement is fitted to the differences. First, blocks of patches are located by correlation
+(`find_blocks`); otherwise the next stage could converge to neighbouring patches. Then all patches move together in
+Gauss-Newton steps (`compare_tiles`). All channels are used, each at its own position; the map is valid for green.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _MEDIAN_CHI2 = 1.386  # Median of χ² with 2 degrees of freedom
 # Width in patches of the window for averaging residual movements; a single patch has a noise of 0.05 px.
 _AROUND_CELLS = 3
 
-# Upper bound of the weight of a patch, relative to the median information: a curled rim has less than others.
-_LEAST_SHARE = 0.15
+# Largest weight of a patch, relative to the median information: patches at a curled rim have less information.
+_MOST_WEIGHT = 0.15
 
 # Systematic standard uncertainty of positions: the blur of the predicted print is not exact (simulated frames, small
 # and large charts).
@@ -55,7 +55,7 @@ _INSIDE_FACTOR = 4.0
 _NEAR_MARKS = 24
 
 # Multiple of the expected noise that is subtracted from the square of an averaged movement.
-_NOISE = 2.0
+_NOISE_FACTOR = 2.0
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -99,7 +99,7 @@ _COLOUR_PATCHES = 5000
 
 _LENS_POINTS = 2000  # Number of patches for refitting the lens; more do not improve a dozen parameters
 
-# Their assumed standard uncertainty (judgement). The smoothing error, 0.02 px, is corrected by the next steps.
+# Assumed standard uncertainty of these positions, px (judgement). The next steps correct the smoothing error, 0.02 px.
 _LENS_POINT_SIGMA_PX = 0.1
 
 # Blur σ that cubic interpolation adds: measured on edges of σ 0.4 to 0.7 px, less on softer edges. Without it in the
@@ -171,8 +171,8 @@ def unfollowed_px(
 ) -> _Array:
     """Return the standard uncertainty (N,) float64 px from waves of the outline that the map does not follow.
 
-    Inside, a sheet is taken to wave as much as its outline along both axes; near the outline, as much as the outline
-    there.
+    Inside, the waves of a sheet are assumed to be as large as the waves of its outline along both axes. Near the
+    outline, they are assumed to be as large as at the nearest outline points.
 
     `points_mm`: (N, 2) float64. `marks_mm`, `residual_px`: (M, 2) float64, outline points and their distance from the
     map. `departure_px`: RMS displacement of the outline. `reach_mm`: range of the local mean.
@@ -188,7 +188,8 @@ def unfollowed_px(
     for axis in (0, 1):
         for end in (low[axis], high[axis]):
             side = marks_mm[(np.abs(marks_mm[:, axis] - end) < reach_mm / 4) & ~on_side[:, 1 - axis]]
-            # A missing part of the outline, such as a curled corner, gets the departure of the other parts.
+            # Near a missing part of the outline, such as a curled corner, the uncertainty is at least the RMS
+            # displacement of the other parts.
             is_missing = cKDTree(side).query(points_mm)[0] > np.abs(points_mm[:, axis] - end) + reach_mm
             squared = np.where(is_missing, np.maximum(squared, departure_px**2), squared)
     return np.sqrt(squared)
@@ -207,8 +208,8 @@ def place_errors(
 
     The scatter part is the posterior uncertainty of the smooth fit; it grows in areas without measurements. The
     residual part covers shapes that the displacement cannot follow, such as folds and curled edges. In simulated rooms
-    with waves, curl and dog-ears, 99 % of the patches of a full chart lie within three standard uncertainties, and 98 %
-    of the patches of a chart with 512.
+    with waves, curl and folded corners, 99 % of the patches of a full chart lie within three standard uncertainties; on
+    charts with 512 colours, 98 %.
 
     `anchors`: (N, 2) mm and (N, 2, 2) px⁻², other points that fix the map, and their information. `systematic_px`:
     additional standard uncertainty, one value or (N,) per tile. `correlated`: neighbouring patches have common errors.
@@ -226,7 +227,7 @@ def place_errors(
     # The weight limit keeps strong edges from dominating; patches with weak edges get a low weight against noise.
     strength = np.zeros(len(points))
     strength[is_known] = np.linalg.eigvalsh(information[is_known])[:, 0]
-    weight_limit = _LEAST_SHARE * float(np.median(strength[is_known])) if len(chi2) else 0.0
+    weight_limit = _MOST_WEIGHT * float(np.median(strength[is_known])) if len(chi2) else 0.0
     weight = np.minimum(strength, weight_limit)
 
     def local_mean(values: _Array) -> _Array:
@@ -238,8 +239,8 @@ def place_errors(
         noise = 2 * scatter * (local_mean(weight / np.sqrt(np.maximum(strength, 1e-6))) / total) ** 2
     else:
         noise = 2 * scatter * local_mean(weight**2 / np.maximum(strength, 1e-6)) / (_AROUND_CELLS * total) ** 2
-    residual2 = np.maximum(residual2 - _NOISE * noise, 0.0)
-    # In the margin and next to tags this is the noise of one patch or a rounding error.
+    residual2 = np.maximum(residual2 - _NOISE_FACTOR * noise, 0.0)
+    # In the margin and next to tags the mean contains the noise of one patch only, or a rounding error.
     residual2[total < 0.5 * weight_limit] = 0.0
     # Unfollowed shapes oscillate around the map: their residual passes through zero next to its maximum.
     residual2 = ndimage.maximum_filter(residual2, _AROUND_CELLS)
@@ -333,7 +334,7 @@ class Matcher:
         self._remainder: TileComparison | None = None
 
     def to_pixels(self, points_mm: npt.ArrayLike, channel: Channel = "G") -> _Array:
-        """Map points (N, 2) mm to half-size px (N, 2) float64 of a channel, by the present map."""
+        """Map points (N, 2) mm to half-size px (N, 2) float64 of a channel, with the current map."""
         positions_px = self.lens.to_pixels(points_mm) + self.displacement.at(points_mm)
         return positions_px + self.lateral.shift_px(positions_px, channel)
 
@@ -502,9 +503,9 @@ class Matcher:
         )
 
     def slipped(self, mismatched_cells: _Mask) -> tuple[_Array, int]:
-        """Return the centres (B, 2) mm of areas that match their neighbouring patches, and the number of areas.
+        """Return the centres (B, 2) mm of areas that are displaced by a patch, and the number of areas.
 
-        `mismatched_cells` (C,) bool are ignored.
+        `mismatched_cells`: (C,) bool, patches to ignore.
         """
         measured, expected, paper = self.patches()
         count = self._chart.colour_count

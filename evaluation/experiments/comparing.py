@@ -35,7 +35,7 @@ from foundation.plots import FAINT, SERIES, draw_svg
 # Smaller errors are drawn at this value, degrees: a logarithmic axis has no zero, and no ground truth is more accurate.
 _FLOOR_DEG: Final = 0.01
 
-# Ground truths of the same image agree within the rounding of files, degrees.
+# Largest angle between two ground truths of the same image, degrees: files round them differently.
 _SAME_TRUTH_DEG: Final = 0.01
 
 _STATISTIC_HEADS: Final = dict(zip(STATISTICS, PAPER_COLUMNS[1:], strict=True))
@@ -61,7 +61,7 @@ class MatchedErrors:
     errors_b: npt.NDArray[np.float64]
     # Group of each image, such as its source picture; None if every image is its own group
     groups: tuple[str, ...] | None = None
-    notes: tuple[str, ...] = ()  # A sentence for each of the two in which images of the other are missing
+    notes: tuple[str, ...] = ()  # A sentence for each method that lacks images of the other
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -90,7 +90,7 @@ class SignedRank:
     losses: int
     ties: int
     p: float  # Two-sided; equal errors are ranked, then excluded (J. W. Pratt, JASA 54 (1959) 655-667).
-    effect: float  # Matched-pairs rank-biserial correlation, (losses - wins) as fractions of the rank sum
+    effect: float  # Matched-pairs rank-biserial correlation, (rank sum of losses - rank sum of wins) / sum of all ranks
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ def match(first: MethodErrors, second: MethodErrors, names: tuple[str, str], met
     index_of = {image: index for index, image in enumerate(second.images)}
     pairs = [(index, index_of[image]) for index, image in enumerate(first.images) if image in index_of]
     if not pairs:
-        raise InputError(f"{names[0]} and {names[1]} have 0 common images, expected some; compare the same data set")
+        raise InputError(f"{names[0]} and {names[1]} have 0 common images, expected 1 or more; use one data set")
     indices_a, indices_b = np.array(pairs, dtype=np.int64).T
     images = tuple(first.images[index] for index in indices_a.tolist())
     angles = angles_deg(first.truths[indices_a], second.truths[indices_b])
@@ -118,7 +118,7 @@ def match(first: MethodErrors, second: MethodErrors, names: tuple[str, str], met
             f"the ground truths of {images[worst]} in {names[0]} and {names[1]} differ by {angles[worst]:.2f} degrees, "
             f"expected at most {_SAME_TRUTH_DEG:g}; run both methods on the same data and ground truths"
         )
-    # Groups of the first file are used if it has some, else those of the second
+    # The groups of the first method are used if it has groups, otherwise the groups of the second.
     groups: tuple[str, ...] = ()
     for source, indices in ((second, indices_b), (first, indices_a)):
         groups = groups if source.groups is None else tuple(source.groups[index] for index in indices.tolist())
@@ -159,7 +159,7 @@ def signed_rank(errors_a: npt.ArrayLike, errors_b: npt.ArrayLike) -> SignedRank:
 
 
 def holm(probabilities: Sequence[float]) -> list[float]:
-    """Return p-values corrected for several tests: the chance of any false alarm is then at most the level.
+    """Return p-values for which the probability of any false positive is at most the significance level.
 
     S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statistics 6 (1979) 65-70.
 
@@ -280,7 +280,7 @@ def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str]) -> 
 
 
 def _interval_cells(pair: PairedFigure) -> list[Cell]:
-    # NaN is unknown; the upper end of a ratio may be infinite and stays.
+    # NaN: unknown. An infinite upper end of a ratio is kept.
     return [None if np.isnan(number) else number for number in (*pair.difference, *pair.ratio)]
 
 

@@ -1,4 +1,4 @@
-"""Methods that apply another method to patches of an image, or to a smaller image.
+"""Methods that apply another method to patches of an image (not of a chart), or to a smaller image.
 
 With patches, a global method estimates an illuminant map: A. Gijsenij, R. Lu, T. Gevers, "Color constancy for multiple
 light sources", IEEE Transactions on Image Processing 21(2), 2012. The paper groups the estimates into two illuminants;
@@ -29,7 +29,7 @@ PATCHES = 8
 
 @dataclass(frozen=True)
 class PatchwiseMethod:
-    """A global method that estimates each patch of a grid; `estimate` uses the whole image.
+    """A global method that is applied to each patch of a grid; `estimate` uses the whole image.
 
     - `method`: the global method.
     - `patches`: patches along the shorter side; patches are nearly square.
@@ -54,7 +54,7 @@ class PatchwiseMethod:
 
     def __post_init__(self) -> None:
         if self.patches < 1:
-            raise ValueError(f"{self.patches} patches along the shorter side, expected 1 or more; correct it")
+            raise ValueError(f"{self.patches} patches along the shorter side, expected 1 or more; correct the number")
 
     @property
     def name(self) -> str:
@@ -131,7 +131,7 @@ def _interpolate(
 
 @dataclass(frozen=True)
 class ResizedMethod(PreparedMethod):
-    """A method that is applied to images shrunk to a given size.
+    """A method that is applied to images reduced to a given size.
 
     - `method`: the method.
     - `longest`: largest length of the longer side, px; smaller images are not changed.
@@ -149,7 +149,7 @@ class ResizedMethod(PreparedMethod):
 
     def __post_init__(self) -> None:
         if self.longest < 1:
-            raise ValueError(f"images of {self.longest} px, expected 1 or more; correct it")
+            raise ValueError(f"the longer side is {self.longest} px, expected 1 px or more; correct the length")
 
     @property
     def name(self) -> str:

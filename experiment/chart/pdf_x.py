@@ -4,17 +4,17 @@ Requirements of the standard, with the clauses of ISO 32000-1 (PDF 1.7) that def
 
 - Version 1.6, a binary comment after the header, no encryption, a file identifier (7.5.2, 14.4).
 - MediaBox and TrimBox, the latter within the former (14.11.2); here the TrimBox is the sheet.
-- Device colours of the same kind as the output intent (14.11.5): DeviceRGB, with an embedded RGB profile. The page has
-  plain codes, which nothing changes without colour management.
+- Device colours of the same kind as the output intent (14.11.5): DeviceRGB, with an embedded RGB profile. The page
+  contains plain codes; without colour management they are not changed.
 - XMP metadata with the version of PDF/X, dates, identifiers and trapping (14.3.2, 14.11.6).
 - No fonts, actions or external files; no transparency, no transfer functions.
 
-The profiles declare sRGB (IEC 61966-2-1) for colour-managed printing; neither describes a printer. A TIFF takes an
-input or display profile, the output intent of PDF/X one of an output device. Sources: ICC.1:2001-04 (version 2.4):
-header 6.1, required tags 6.3, lut16Type 6.5.8, textDescriptionType 6.5.17. The primaries of sRGB are adapted to D50 by
-the Bradford transform, as in the sRGB profiles of the ICC.
+The profiles declare sRGB (IEC 61966-2-1) for colour-managed printing; neither describes a printer. A TIFF needs the
+profile of an input device or display; the output intent of PDF/X needs the profile of an output device. Sources:
+ICC.1:2001-04 (version 2.4): header 6.1, required tags 6.3, lut16Type 6.5.8, textDescriptionType 6.5.17. The primaries
+of sRGB are adapted to D50 by the Bradford transform, as in the sRGB profiles of the ICC.
 
-This is our own code because libraries that write PDF add fonts, dates or dictionaries, and no maintained one writes
+This is our own code because libraries that write PDF add fonts, dates or dictionaries, and no maintained library writes
 PDF/X. Without dates, the same chart gives the same bytes.
 """
 
@@ -36,7 +36,7 @@ from foundation.files import atomic_file
 # Date in the metadata, which is required. It is constant, so that the same chart gives the same bytes.
 DATE = "2000-01-01T00:00:00+00:00"
 
-# Name of the printing condition in the output intent: not a registered one, because no printer is characterised.
+# Name of the printing condition in the output intent: not a registered name, because no printer is characterised.
 CONDITION = "RGB codes, unmanaged"
 
 # Description of the printing condition in the output intent.
@@ -54,7 +54,7 @@ _WHITE = (0.9642, 1.0, 0.8249)  # D50, white of the profile connection space (IC
 
 _CURVE = 4096  # Entries of a curve, the maximum of lut16Type
 
-_DISPLAY_CURVE = 1024  # Entries of a curve of the display profile, as in that of the ICC
+_DISPLAY_CURVE = 1024  # Entries of a curve of the display profile, as in the sRGB profile of the ICC
 
 _GAMUT_GRID = 17  # Points along each side of the gamut table: enough for a warning
 
@@ -122,7 +122,7 @@ def save_page(path: Path, size_pt: tuple[float, float], content: bytes, title: s
 
 
 def _number(value: float) -> str:
-    # To a hundred-thousandth: 35 nm on paper, a 300th of an 8-bit code.
+    # Five decimals: 3.5 nm on paper, 1/400 of an 8-bit code.
     return f"{value:.5f}".rstrip("0").rstrip(".")
 
 
@@ -208,7 +208,7 @@ _LINEAR = _curves(np.array([0.0, 1.0]))  # The identity as a curve
 
 
 def _gamut() -> bytes:
-    # 0 for colours in the gamut, more for those outside.
+    # 0 for colours in the gamut, 65535 for colours outside of it.
     side = np.linspace(0, _FULL / _ONE_XYZ, _GAMUT_GRID)
     xyz = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     rgb = xyz @ np.linalg.inv(_PRIMARIES).T
@@ -222,9 +222,9 @@ def _lut16(
     """Return a lut16Type: matrix, input curves, table (points, channels), output curves."""
     grid = round(len(table) ** (1 / 3))
     head = struct.pack(">4s4x3Bx", b"mft2", 3, table.shape[1], grid)
-    numbers = np.rint(matrix * 65536).astype(">i4").tobytes()
+    matrix_bytes = np.rint(matrix * 65536).astype(">i4").tobytes()
     sizes = struct.pack(">2H", inputs.shape[1], outputs.shape[1])
-    return head + numbers + sizes + b"".join(values.astype(">u2").tobytes() for values in (inputs, table, outputs))
+    return head + matrix_bytes + sizes + b"".join(values.astype(">u2").tobytes() for values in (inputs, table, outputs))
 
 
 def _xyz(values: tuple[float, ...]) -> bytes:
@@ -242,7 +242,7 @@ def _description(text: str) -> bytes:
 
 
 def _profile(kind: bytes, tags: Mapping[str, bytes]) -> bytes:
-    """Return an RGB profile with connection space XYZ; tags with equal data share it."""
+    """Return an RGB profile with connection space XYZ; equal data of several tags are stored once."""
     offset = 128 + 4 + 12 * len(tags)
     entries, body = b"", b""
     offsets: dict[bytes, int] = {}

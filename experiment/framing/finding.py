@@ -98,7 +98,7 @@ def find_chart(
         (4, 2) float, half-size px: corners of the patch area, clockwise from the printed top-left. Only for a chart
         without tags.
     near
-        Pose in another frame of the session, near which a chart without tags is searched.
+        Pose in another frame of the session. A chart without tags is searched for near this pose.
 
     Raises
     ------
@@ -119,8 +119,8 @@ def find_chart(
             f"{image_name}: the chart has {len(chart.tags)} tags, expected at least {MIN_TAGS}; "
             "print a chart made by acquire chart"
         )
-    # One linear plane: a square root moves the corners of a tag by a quarter pixel, a sum of the planes under deep red
-    # or blue light by a fifth.
+    # Tags are detected in one linear plane. A square root would move their corners by 0.25 px. A sum of the planes
+    # would move them by 0.2 px under deep red or blue illuminants.
     plane = strongest_plane(frame) if isinstance(frame, Mosaic) else frame
     detected_tags = detect_tags(plane)
     printed_tags = {tag.id: tag for tag in chart.tags}
@@ -241,7 +241,7 @@ def _detect(image: npt.NDArray[np.uint8], offset_px: tuple[float, float]) -> tup
     detector: Detector = _detectors.detector
     tags: dict[int, DetectedTag] = {}
     for detection in detector.detect(np.ascontiguousarray(image)):
-        # AprilTag has the corner of a pixel, not its centre, at whole numbers.
+        # In AprilTag, whole numbers are the corners of pixels; here they are the centres.
         corners = detection.corners[_CORNERS] - 0.5 + np.asarray(offset_px)
         tag = DetectedTag(detection.tag_id, corners, float(detection.decision_margin))
         if detection.hamming <= 1 and (tag.id not in tags or tags[tag.id].margin < tag.margin):
@@ -249,7 +249,7 @@ def _detect(image: npt.NDArray[np.uint8], offset_px: tuple[float, float]) -> tup
     return tuple(tags[tag_id] for tag_id in sorted(tags))
 
 
-# BGR codes: page and tags; outlines and deviations; texts and candidates; ticks.
+# BGR codes: green for the page, red for tags and outlines, amber for texts, grey for ticks.
 GREEN, RED, AMBER, _GREY = (60, 200, 60), (40, 40, 255), (40, 200, 255), (200, 200, 200)
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -263,8 +263,8 @@ _Image = npt.NDArray[np.uint8]
 def annotated_png(mosaic: Mosaic, chart: Chart, pose: ChartPose | None) -> bytes:
     """Draw the pose of the chart onto a frame of half size and return it as PNG bytes.
 
-    Drawn are the page and the tags, or the outline of the patch area. Without `pose`, all detected tags and the
-    expected ids are drawn, or for a chart without tags how to give its corners.
+    The drawing shows the page and the tags, or the outline of the patch area. Without `pose`, it shows all detected
+    tags and the expected ids; for a chart without tags, an instruction to give its corners.
     """
     black = frame_black(mosaic)
     plane = pose.plane if pose is not None else strongest_plane(mosaic, black)
@@ -335,14 +335,14 @@ def _draw_text(image: _Image, *lines: str) -> None:
         cv2.putText(image, line, origin, FONT, scale, AMBER, 1, cv2.LINE_AA)
 
 
-# Smallest side of a patch, half-size px: 5 for its 25 samples, and the rest for rounding, registration and blur. Even
-# 8.6 px gets 1 % of light from its neighbours at a blur of σ = 0.7 px.
+# Smallest side of a patch, half-size px: 5 for its 25 samples, and the rest for rounding, registration and blur. With
+# 8.6 px and a blur of σ = 0.7 px, neighbours still contribute 1 % of the light.
 MIN_CELL_PX = 8.0
 
 # Width and height of the half-size images of the cameras of the paper (section 3.3), px.
 HALF_SIZE_PX = {"EOS 550D": (2601, 1732), "EOS 6D Mark II": (3132, 2090)}
 
-FILL = 0.94  # Fraction of the frame that a sheet fills along its tighter axis
+FILL = 0.94  # Fraction of the frame that a sheet fills, along the axis with the smaller margin
 
 
 @dataclass(frozen=True)
@@ -354,8 +354,8 @@ class _ApparentSize:
     module_px: float | None
 
     @property
-    def enough(self) -> bool:
-        """Whether 25 pixels of a patch can be sampled and tags be detected."""
+    def is_sufficient(self) -> bool:
+        """Whether patches are large enough for 25 samples, and tags for detection."""
         return self.cell_px >= MIN_CELL_PX and (self.module_px is None or self.module_px >= MIN_MODULE_PX)
 
     def __str__(self) -> str:
@@ -378,7 +378,7 @@ def apparent_sizes(chart: Chart) -> list[_ApparentSize]:
 def small_parts_warning(chart: Chart) -> str | None:
     """Return a warning if a camera of the paper cannot separate the patches or read the tags, else None."""
     sizes = apparent_sizes(chart)
-    if all(size.enough for size in sizes):
+    if all(size.is_sufficient for size in sizes):
         return None
     smallest_module = "" if sizes[0].module_px is None else f" and {MIN_MODULE_PX:g} px a tag module"
     return (

@@ -71,7 +71,7 @@ class Workers:
         ``"local"`` for threads, ``"dask"`` for a cluster on this machine, or ``"dask://HOST:PORT"`` of a scheduler.
     count
         Number of threads, or of processes of a cluster on this machine, 1 or more. Each keeps about three pictures in
-        memory. An existing cluster has its own number.
+        memory. Ignored for an existing cluster.
 
     Raises
     ------
@@ -140,9 +140,9 @@ def _by_threads(plan: Plan, shards: Sequence[int], workplace: Workplace, workers
     events: SimpleQueue[_Event | None] = SimpleQueue()
     cancelled = threading.Event()
     waiting = iter(shards)
-    taking = threading.Lock()
-    at_once = min(2, len(shards), workers)
-    depth = -(-workers // at_once)
+    shard_lock = threading.Lock()
+    parallel_shards = min(2, len(shards), workers)
+    depth = -(-workers // parallel_shards)
     queued = Callbacks(
         on_done=lambda images: events.put(partial(callbacks.on_done, images)),
         on_image=lambda: events.put(callbacks.on_image),
@@ -155,7 +155,7 @@ def _by_threads(plan: Plan, shards: Sequence[int], workplace: Workplace, workers
 
         try:
             while not cancelled.is_set():
-                with taking:
+                with shard_lock:
                     shard = next(waiting, None)
                     if shard is None:
                         return
@@ -168,10 +168,10 @@ def _by_threads(plan: Plan, shards: Sequence[int], workplace: Workplace, workers
         finally:
             events.put(None)
 
-    with ThreadPoolExecutor(workers) as pool, ThreadPoolExecutor(at_once) as drivers:
-        driving = [drivers.submit(drive, pool) for _ in range(at_once)]
+    with ThreadPoolExecutor(workers) as pool, ThreadPoolExecutor(parallel_shards) as drivers:
+        jobs = [drivers.submit(drive, pool) for _ in range(parallel_shards)]
         try:
-            for _ in driving:
+            for _ in jobs:
                 while (event := events.get()) is not None:
                     event()
         finally:
@@ -184,7 +184,7 @@ def _by_dask(
     try:
         from distributed import KilledWorker, as_completed
     except ImportError as error:
-        raise InputError("the engine dask needs Dask, not installed here; run pip install dask distributed") from error
+        raise InputError("the engine is dask, but Dask is not installed; run pip install dask distributed") from error
 
     attempts = dict.fromkeys(shards, 0)
     waiting: Iterator[int] = iter(shards)
@@ -199,8 +199,8 @@ def _by_dask(
         if not threads:
             callbacks.on_wait(f"the Dask scheduler has 0 workers, expected 1 or more; run dask worker {address}")
         # Only a few tasks for each thread are submitted at once, because all tasks of a plan may exceed the memory.
-        at_once = max(4, 3 * sum(threads.values()))
-        running = {submit(shard): shard for shard in islice(waiting, at_once)}
+        task_limit = max(4, 3 * sum(threads.values()))
+        running = {submit(shard): shard for shard in islice(waiting, task_limit)}
         futures = as_completed(list(running), loop=client.loop)
         for future in futures:
             shard = running.pop(future)
@@ -364,7 +364,8 @@ def existing_rendering(out: Path | str) -> Rendering | None:
 def completed_dataset(plan: Plan, out: Path | str) -> Dataset | None:
     """Return the complete data set at `out`, or None if there is none; raises InputError if its plan differs.
 
-    Pictures on this machine that were modified since are hashed again; those in a store are compared by name.
+    Pictures on this machine are hashed again if they were modified after the data set was completed. Pictures in a
+    store are compared by name.
     """
     if not holds_dataset(out):
         return None
@@ -381,8 +382,8 @@ def completed_dataset(plan: Plan, out: Path | str) -> Dataset | None:
     differing = differences(stored, {key: identity[key] for key in stored}) or _differing_pictures(dataset, plan, out)
     if differing:
         raise InputError(
-            f"{out} already has a different data set ({'; '.join(differing)}); choose another location, or remove the "
-            "data set"
+            f"{out} already contains a different data set ({'; '.join(differing)}); choose another location, or remove "
+            "the data set"
         )
     return dataset
 
@@ -451,7 +452,7 @@ def require_free_place(out: str | Path) -> None:
         return
     if isinstance(out, str) and is_remote(out):
         if RemoteStore(out).has(DESCRIPTION):
-            raise InputError(f"{out} already has a data set; choose another location, or remove the data set")
+            raise InputError(f"{out} already contains a data set; choose another location, or remove the data set")
     else:
         require_free(local_path(out), "the data set")
 
@@ -525,13 +526,13 @@ def _open_remote_workplace(out: str, identity: PlanIdentity) -> Generator[Workpl
     files, notes = RemoteStore(out), RemoteStore(f"{out.rstrip('/')}/{NOTES}")
     workplace = Workplace(files, notes, out, _plan_id(identity))
     if files.has(DESCRIPTION):
-        raise InputError(f"{out} already has a data set; choose another location, or remove the data set")
+        raise InputError(f"{out} already contains a data set; choose another location, or remove the data set")
     is_started = notes.has(PLAN)
     if not is_started:
         if next(files.names(), None) is not None:
-            raise InputError(f"{out} already has other files; choose another location, or remove them")
+            raise InputError(f"{out} already contains other files; choose another location, or remove them")
         notes.put(PLAN, _plan_bytes(identity))
-    _require_same(notes, identity, out, f"remove what is below {out}")
+    _require_same(notes, identity, out, f"remove all files below {out}")
     try:
         yield workplace
     except BaseException:
@@ -589,7 +590,7 @@ def _differences(stored: Any, planned: Any, name: str = "") -> Generator[str]:
     if isinstance(stored, dict) and isinstance(planned, dict):
         stored_values, planned_values = cast("dict[str, Any]", stored), cast("dict[str, Any]", planned)
         for key in dict.fromkeys([*stored_values, *planned_values]):
-            # "lights", not "options lights lights".
+            # The name in the message is "lights", not "options lights lights".
             inner = name if key in ("options", name.rpartition(" ")[2]) else f"{name} {key}".strip()
             yield from _differences(stored_values.get(key), planned_values.get(key), inner)
     elif stored != planned:

@@ -1,4 +1,4 @@
-"""`generate explore`: the server of the page on a LUT, its requests, and computed sample pictures.
+"""`generate explore`: server of a page that shows a LUT, and computed sample pictures.
 
 Images are rendered by `generator.dataset.shards.photograph`, as the first image of a data set of one picture and one
 illuminant with seed 0. The command on the page therefore makes the same bytes as the page shows. The server
@@ -48,12 +48,12 @@ if TYPE_CHECKING:
 
 MAX_SIDE: Final = 1000  # Longest side of a picture on the page, px: fits a window and renders in milliseconds
 
-MOST_DROPPED: Final = 8  # Number of uploaded pictures that are kept, and of decoded pictures in the cache
+MOST_UPLOADS: Final = 8  # Number of uploaded pictures that are kept, and of decoded pictures in the cache
 
-# Largest number of pixels of an uploaded picture: that of the largest cameras, 200 MB while it is decoded.
-MOST_DROPPED_PIXELS: Final = 1 << 26
+# Largest number of pixels of an uploaded picture: as many as the largest cameras have; decoding needs 200 MB.
+MOST_UPLOADED_PIXELS: Final = 1 << 26
 
-# Side of the area of equal pixels that measures noise: 256 samples give a standard deviation to 5 %.
+# Side of a uniform area for measuring noise, px: its 256 pixels give the standard deviation within 5 %.
 _DRAWS: Final = 16
 
 _STEPS: Final = 33  # Points of the black-body curve
@@ -82,10 +82,10 @@ class Explorer:
         self._sources = sources
         self._preparation = Preparation(max_side=max_side)
         self._gamut = Gamut.of(lut)
-        self._dropped: OrderedDict[int, _Scene] = OrderedDict()
-        self._adding = threading.Lock()
-        self._added = len(sources)
-        self._read = lru_cache(maxsize=MOST_DROPPED)(self._read_source)
+        self._uploads: OrderedDict[int, _Scene] = OrderedDict()
+        self._uploads_lock = threading.Lock()
+        self._next_number = len(sources)
+        self._read = lru_cache(maxsize=MOST_UPLOADS)(self._read_source)
 
     def describe(self) -> dict[str, Any]:
         """Return illuminants, gamut and black bodies of the LUT, and the number of pictures, as plain values."""
@@ -94,7 +94,7 @@ class Explorer:
         lut, gamut = self.lut, self._gamut
         lights = [light_of(lut, number) for number in range(len(lut.white))]
         # Illuminants on a line have no triangles; their edges give the hull. A single illuminant has no edge either.
-        around = ConvexHull(gamut.rb).vertices.tolist() if len(gamut.triangles) else {0, *gamut.edges.ravel().tolist()}
+        on_hull = ConvexHull(gamut.rb).vertices.tolist() if len(gamut.triangles) else {0, *gamut.edges.ravel().tolist()}
         return {
             "name": self._lut_argument,
             "camera": lut.provenance.camera,
@@ -106,16 +106,16 @@ class Explorer:
                 {"label": light.label, "codes": light.codes, "rb": rb}
                 for light, rb in zip(lights, gamut.rb.tolist(), strict=True)
             ],
-            "hull": gamut.rb[[*around]].tolist(),
+            "hull": gamut.rb[[*on_hull]].tolist(),
             "black_bodies": self._black_bodies(),
             "first": reference_light(lut),
             "pictures": len(self._sources),
         }
 
     def add(self, name: str, data: bytes) -> int:
-        """Store an uploaded picture and return its number; raises FormatError.
+        """Store an uploaded picture and return its number; raises FormatError if it cannot be read.
 
-        If there are more than `MOST_DROPPED`, the oldest is removed.
+        If more than `MOST_UPLOADS` are stored, the oldest is removed.
         """
         plain = "".join(character for character in PurePosixPath(name).name if character.isprintable()) or "picture"
         suffix = PurePosixPath(plain).suffix.lower()
@@ -123,14 +123,14 @@ class Explorer:
             file.write(data)
             file.flush()
             try:
-                read = open_picture(Path(file.name), self._preparation, plain, data, MOST_DROPPED_PIXELS)
+                read = open_picture(Path(file.name), self._preparation, plain, data, MOST_UPLOADED_PIXELS)
             except FormatError as error:
                 raise FormatError(str(error).replace(file.name, plain)) from error
-        with self._adding:
-            number, self._added = self._added, self._added + 1
-            self._dropped[number] = _Scene(plain, read.profile, read.picture)
-            while len(self._dropped) > MOST_DROPPED:
-                self._dropped.popitem(last=False)
+        with self._uploads_lock:
+            number, self._next_number = self._next_number, self._next_number + 1
+            self._uploads[number] = _Scene(plain, read.profile, read.picture)
+            while len(self._uploads) > MOST_UPLOADS:
+                self._uploads.popitem(last=False)
         return number
 
     def show(self, number: int, light: str) -> dict[str, Any]:
@@ -163,10 +163,8 @@ class Explorer:
         """Return the codes of one pixel, and mean and standard deviation of its counts over many samples."""
         picture = self._scene(number).picture
         if not (0 <= y < picture.shape[0] and 0 <= x < picture.shape[1]):
-            raise InputError(
-                f"the pixel {x}, {y} is outside the picture, expected less than {picture.shape[1]}, "
-                f"{picture.shape[0]}; correct it"
-            )
+            height, width = picture.shape[:2]
+            raise InputError(f"the pixel {x}, {y} is outside the picture of {width}x{height} px; select another one")
         field = np.broadcast_to(picture[y, x], (_DRAWS, _DRAWS, 3)).copy()
         drawn = self._photograph(field, self._mixture(light), rendering, 1).reshape(-1, 3).astype(np.float64)
         mean, deviation = drawn.mean(axis=0), drawn.std(axis=0, ddof=1)
@@ -178,7 +176,7 @@ class Explorer:
         }
 
     def command(self, number: int, mixture: Mixture, rendering: Rendering) -> str:
-        """Return the command that makes a data set of the image, for the folder in which this program was started."""
+        """Return the command that generates the image; paths are relative to the working folder of the server."""
         # For an uploaded picture only the file name is known, because browsers do not send its folder.
         if number < len(self._sources):
             location = self._sources[number].location
@@ -196,7 +194,8 @@ class Explorer:
         return matrix_for(self.lut)
 
     def _black_bodies(self) -> list[list[float]]:
-        # Temperature (K), r and b of points on the black-body curve between those of the LUT; empty for fewer than two.
+        # Temperature (K), r and b of points on the black-body curve, between the lowest and the highest temperature of
+        # the black bodies of the LUT; empty if it has fewer than two.
         bodies = {light.cct_k for light in self.lut.illuminations if light.cct_k is not None}
         if len(bodies) < 2:
             return []
@@ -207,10 +206,10 @@ class Explorer:
     def _scene(self, number: int) -> _Scene:
         if 0 <= number < len(self._sources):
             return self._read(number)
-        with self._adding:
-            scene = self._dropped.get(number)
+        with self._uploads_lock:
+            scene = self._uploads.get(number)
         if scene is None:
-            raise InputError(f"there is no picture {number}, the last {MOST_DROPPED} uploads are kept; upload it again")
+            raise InputError(f"there is no picture {number}, the last {MOST_UPLOADS} uploads are kept; upload it again")
         return scene
 
     def _read_source(self, number: int) -> _Scene:
@@ -234,7 +233,7 @@ class Explorer:
 
 
 def _as_argument(name: str) -> str:
-    # Prevents that a path is parsed as an option or as the subcommand.
+    # Without ./, such a path would be parsed as an option or as the subcommand.
     return f"./{name}" if name.startswith("-") or name == "explore" else name
 
 
@@ -243,7 +242,7 @@ def _relative_path(location: str) -> str:
     return os.fspath(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else location
 
 
-MOST_BYTES: Final = 64 << 20  # Largest upload in bytes: enough for a 16-bit photograph, too small for a film
+MOST_BYTES: Final = 64 << 20  # Largest upload in bytes: enough for a 16-bit photograph, too small for a video
 
 
 class ExploreServer(LocalServer):
@@ -270,7 +269,7 @@ class ExploreServer(LocalServer):
         super().__init__(host, port)
 
     def answer(self, request: Request) -> Response | Refusal:
-        """Return the answer, or status 422 with the error message of an invalid request."""
+        """Return the answer; if the request is invalid, status 422 with the error message."""
         try:
             return self._answer(request)
         except CropError as error:
@@ -369,11 +368,11 @@ def _balls() -> Picture:
     y, x = np.mgrid[:_HEIGHT, :_WIDTH].astype(np.float64)
     lamp = _TO_LAMP / np.linalg.norm(_TO_LAMP)
     floor = y > 0.55 * _HEIGHT
-    fall = 1.0 - 0.45 * np.hypot((x - 250) / _WIDTH, (y - 150) / _HEIGHT)
-    linear = (np.where(floor, 0.30, 0.42) * fall)[..., None] * np.ones(3)
+    falloff = 1.0 - 0.45 * np.hypot((x - 250) / _WIDTH, (y - 150) / _HEIGHT)
+    linear = (np.where(floor, 0.30, 0.42) * falloff)[..., None] * np.ones(3)
     for (left, top, radius), _ in _BALLS:
-        away = np.hypot((x - left - 0.55 * radius) / (1.25 * radius), (y - top - 0.85 * radius) / (0.35 * radius))
-        linear *= (1 - 0.6 * np.clip(1.3 - away, 0, 1) * floor)[..., None]
+        distance = np.hypot((x - left - 0.55 * radius) / (1.25 * radius), (y - top - 0.85 * radius) / (0.35 * radius))
+        linear *= (1 - 0.6 * np.clip(1.3 - distance, 0, 1) * floor)[..., None]
     for (left, top, radius), surface in _BALLS:
         across, down = (x - left) / radius, (y - top) / radius
         towards = np.sqrt(np.maximum(1 - across**2 - down**2, 0.0))

@@ -8,11 +8,11 @@ would have only g Σ w_i² m_i, half of it for two equal illuminants. Deviations
     y = Σ w_i m_i + Σ √w_i (x_i − m_i),   x_i drawn independently for each illuminant
 
 The variance is Σ w_i (g m_i + r²). Photon noise is exact for any weights. Read noise is exact if the weights sum to 1,
-otherwise √(Σ w_i) times too large. A single illuminant of weight 1 gives its own samples exactly.
+otherwise it is √(Σ w_i) times its true value. A single illuminant of weight 1 gives its own samples exactly.
 
 Approximations: m_i is the mean of the S samples, not of all paper of that colour. Deviations of print and photosites,
-which are proportional to the light, are treated as noise; for illuminants of equal brightness they become
-√(Σ w_i²) times too small. Samples clipped by the sensor stay clipped.
+which are proportional to the light, are treated as noise. For illuminants of equal brightness and weights of sum 1 they
+are exact, otherwise √(Σ w_i) times too small. Samples clipped by the sensor stay clipped.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def mixed_table(
     seed: int = 0,
     colours: npt.NDArray[np.bool_] | None = None,
 ) -> Samples:
-    """Mix the samples of several illuminants to those of one; the module docstring has the formula.
+    """Mix the samples of several illuminants to samples of one combined illuminant, by the formula of the module.
 
     The result is used like the samples of an illuminant: `draw_samples(mixed_table(...), picture)`. For each colour,
     the samples of the first illuminant with a weight keep their order. The samples of each further illuminant are
@@ -184,9 +184,10 @@ def mixed_table(
 
 # Pixels of a row that are mixed together, whole groups: their weights and offsets fit into the second-level cache.
 SEGMENT_PIXELS: Final = 512
-# Pixels by which weights are prefetched before they are read, eight segments. It hides the latency of memory.
+# Distance between prefetching and reading weights, pixels: eight segments, which hides the latency of memory.
 _PREFETCH_PIXELS: Final = 4096
-# Bytes of offsets, or of weights of one illuminant, in a segment; the last of a row has up to seven pixels more.
+# Bytes of offsets, or of weights of one illuminant, in a segment; the last segment of a row has up to seven more
+# pixels.
 SEGMENT_BYTES: Final = OFFSETS_BYTES * (SEGMENT_PIXELS // GROUP + 1)
 # Bytes of a segment for two illuminants: weights in pixel order, weights in the order of `mix`, and offsets.
 PAIR_BYTES: Final = 6 * SEGMENT_BYTES
@@ -232,7 +233,7 @@ def _draw_segment(
     lines_per_group: int,
     base: int,
 ) -> None:
-    # Separate functions, this and `_mix_segment`: within the loop of rows both need more registers than there are.
+    # This function and `_mix_segment` are separate, because in one loop over rows they would need too many registers.
     choose_first_groups(row, width, keys, count, bits, scratch, low, high)
     draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, prefetch_from, lines_per_group, base)
 
@@ -363,8 +364,8 @@ def _mix_pixels(
             stop = segment_target + SAMPLE_BYTES * pixels
             if streamed:
                 segment_target = line_buffer + buffered
-            # The first pixels usually show that several illuminants have weights. A segment under one illuminant of
-            # weight 1 is drawn without mixing.
+            # A segment under one illuminant of weight 1 is drawn without mixing. The first pixels are checked first,
+            # because they usually show that several illuminants have weights.
             single = _single_light(pair_weights, BLOCK)
             if single >= 0:
                 single = _single_light(pair_weights, pixels)

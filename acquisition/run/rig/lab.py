@@ -39,11 +39,11 @@ __all__ = ["Attached", "attached_devices", "identify_displays"]
 CONNECT_S = 5.0  # Time for a projector to accept a connection, s; milliseconds on a local network
 
 
-def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, shows: bool = True) -> Devices:
+def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, opens_display: bool = True) -> Devices:
     """Open the camera, the projector and its display.
 
-    `session`: the resumed session, whose last frame sets the time; None for a new one. `shows`: whether to open the
-    display; if not, a `LightNotShown` replaces it.
+    `session`: the resumed session, whose last frame sets the time; None for a new one. `opens_display`: whether to open
+    the display; if not, a `LightNotShown` replaces it.
     """
     _hold_lab(settings.file, opened)
     clock = session_clock(session)
@@ -67,7 +67,7 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, 
 
     def open_presenter() -> None:
         display = settings.lab.light.display
-        if shows and cameras and projectors:
+        if opens_display and cameras and projectors:
             presenters.append(FullScreen(display, clock))
         else:
             presenters.append(LightNotShown(display_warnings(display)))

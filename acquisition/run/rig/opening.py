@@ -18,23 +18,23 @@ def open_rig(
     chart: Chart,
     session: Session | None = None,
     *,
-    shows: bool = True,
+    opens_display: bool = True,
 ) -> Generator[Devices]:
     """Open every device of the settings; close them all at the end.
 
-    `session`: the resumed session; None for a new one, and for a check. `shows`: whether to open the display, which is
-    black then; a dry run does not.
+    `session`: the resumed session; None for a new one, and for a check. `opens_display`: whether to open the display,
+    which is black then; a dry run does not.
     """
     if settings.rig == "imported":
         raise ConfigurationError(
             'rig is "imported", expected "lab" or "simulated": frames were taken by other means; start a new session'
         )
     with ExitStack() as opened:
-        # Drivers and the simulated world are imported only if they are needed.
+        # Drivers and the simulated laboratory are imported only if they are needed.
         if settings.rig == "lab":
             from acquisition.run.rig.lab import open_lab
 
-            yield open_lab(settings, session, opened, shows)
+            yield open_lab(settings, session, opened, opens_display)
         else:
             from acquisition.run.rig.simulated import open_simulated
 

@@ -135,4 +135,4 @@ def test_exit_code_reports_missing_illuminant(
     assert found["left"] == (["illuminant 1"] if code else [])
     shutil.rmtree(folder / "session")
     assert main(list(map(str, arguments))) == code
-    assert ("accepted frame: illuminant 1;" in capsys.readouterr().err) == (code == 4)
+    assert ("accepted frames: illuminant 1;" in capsys.readouterr().err) == (code == 4)

@@ -149,7 +149,7 @@ def test_refuses_unreadable_pictures(explorer: Explorer) -> None:
 
 
 def test_refuses_picture_with_too_many_pixels(explorer: Explorer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("generator.explore.explorer.MOST_DROPPED_PIXELS", 90 * 50 - 1)
+    monkeypatch.setattr("generator.explore.explorer.MOST_UPLOADED_PIXELS", 90 * 50 - 1)
     with pytest.raises(FormatError):
         explorer.add("large.png", png(1))
 

@@ -141,7 +141,7 @@ def test_dry_run_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acquisition.run.rig.lab.display_warnings", Mock(return_value=("a bent ramp",)))
     monkeypatch.setattr("acquisition.run.rig.lab.CanonEos", Mock())
     real = parse_lab(HEAD.replace("simulated", "lab"), "LAB.toml")
-    with open_rig(real, design_chart(bits=1), shows=False) as devices:
+    with open_rig(real, design_chart(bits=1), opens_display=False) as devices:
         assert "a bent ramp" in ask(devices).warnings
         with pytest.raises(DeviceRefused):
             devices.presenter.show(WHITE)
@@ -159,10 +159,10 @@ def test_refuses_lab_in_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with subprocess.Popen([sys.executable, "-uc", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         other.stdout.readline()
-        for shows in (True, False):
+        for opens_display in (True, False):
             with (
                 pytest.raises(DeviceRefused, match=f"process {other.pid}"),
-                open_rig(parse_lab(lab.read_text(), str(lab)), design_chart(bits=1), shows=shows),
+                open_rig(parse_lab(lab.read_text(), str(lab)), design_chart(bits=1), opens_display=opens_display),
             ):
                 pass
         other.communicate(b"\n")
