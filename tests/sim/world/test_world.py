@@ -291,7 +291,7 @@ def test_stain_and_fold_have_the_given_depth() -> None:
         (lambda: Room(stain_mm=-1.0), "stain_mm is -1.0"),
         (lambda: Room(stain_depth=1.0), "stain_depth is 1.0"),
         (lambda: Print((10, 10), np.zeros((2, 4)), np.zeros((1, 3), dtype=np.uint8)), r"\(1, 3\)"),
-        (lambda: Print((10, 10), np.array([[5.0, 5, 4, 6]]), np.zeros((1, 3), dtype=np.uint8)), "before"),
+        (lambda: Print((10, 10), np.array([[5.0, 5, 4, 6]]), np.zeros((1, 3), dtype=np.uint8)), "right < left"),
         (lambda: replace(BODIES["Test"], pattern="RGBB"), "pattern is 'RGBB'"),
         (lambda: replace(BODIES["Test"], sensor=(100, 100)), "outside the sensor"),
     ],
