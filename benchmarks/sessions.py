@@ -275,9 +275,9 @@ def compare(
     cells_mm = chart.centres_mm[chart.cell_of_colour]
     codes = chart.rgb[chart.cell_of_colour]
     paper = [PAPER] * len(cells_mm)
-    white = np.array([world.seen(paper, cells_mm, light.colour, SETTINGS).mean(axis=0) for light in lights])
+    white = np.array([world.camera_rgb_at(paper, cells_mm, light.colour, SETTINGS).mean(axis=0) for light in lights])
     if result.figures.lights.subtracted is not None:
-        white -= world.seen(paper, cells_mm, BLACK, SETTINGS).mean(axis=0)
+        white -= world.camera_rgb_at(paper, cells_mm, BLACK, SETTINGS).mean(axis=0)
     records = {frame.record.illumination: frame for frame in result.figures.frames if frame.record.kind == "light"}
     steps = {step.illumination: step for step in plan_steps(lights, every) if step.kind == "light"}
     level, error = (np.zeros((len(lights), len(codes), 3)) for _ in range(2))

@@ -1,8 +1,8 @@
 """The origin of a LUT (camera, lens, exposure, dates, projector, authors, licence), and its citation.
 
-A published serial number would link a LUT to all photographs of its owner, but readers need to know if two LUTs are
-from one body. A hash answers that. Serial numbers are short, so the hash is scrypt (RFC 7914): trying all numbers of
-ten digits takes one core over twelve years. A lab can also withhold the number.
+A published serial number would link a LUT to all photographs of its owner, but readers must see whether two LUTs are
+from one body. A hash is sufficient for this. Serial numbers are short, so the hash is scrypt (RFC 7914): trying all
+numbers of ten digits takes more than twelve years on one core. A lab can also withhold the number.
 
 A citation is a BibTeX entry of type `misc` (O. Patashnik, BibTeXing, 1988, section 3.1). Unknown values are omitted
 from the entry and listed in a comment.
@@ -101,7 +101,7 @@ class OriginRecord(Record):
     first_frame: Line | None = None  # Time of the first frame, ISO 8601, UTC
     last_frame: Line | None = None  # Time of the last frame, ISO 8601, UTC
     frames: int = Field(default=0, ge=0)
-    projector: Line | None = None  # Maker and model by its control port, else by the lab
+    projector: Line | None = None  # Maker and model from its control port, else from the lab
     screen: Line | None = None  # Display of the colours, as the session names it
     taken_by: Line | None = None  # Software that took the session; `Provenance.software` built the LUT
     title: Line | None = None
@@ -150,7 +150,7 @@ def origin_lines(origin: OriginRecord | None) -> list[tuple[str, str]]:
     record = origin or OriginRecord()
     rows: list[tuple[str, str | None]] = [
         ("Taken in", _rig_text(record.rig)),
-        ("Camera's serial", serial_text(origin)),
+        ("Serial number", serial_text(origin)),
         ("Lens", record.lens),
         ("Exposure", exposure_text(origin)),
         ("Dates", dates_text(origin)),
@@ -176,8 +176,8 @@ def _rig_text(rig: Rig | None) -> str | None:
 
 
 @dataclass(frozen=True)
-class StatedOrigin:
-    """Origin of a session by `session.toml` and the journal."""
+class SessionOrigin:
+    """Origin of a session, as recorded in `session.toml` and the journal."""
 
     citation: CitationSettings
     rig: Rig | None  # None if the settings do not record it
@@ -185,19 +185,19 @@ class StatedOrigin:
     devices: dict[str, str]  # Names in the journal of camera, projector, screen and software, if known
 
 
-def origin_record(stated: StatedOrigin, records: Sequence[FrameRecord], origins: Sequence[FrameOrigin]) -> OriginRecord:
+def origin_record(lab: SessionOrigin, records: Sequence[FrameRecord], origins: Sequence[FrameOrigin]) -> OriginRecord:
     """Return the origin of a LUT."""
-    citation, exposures = stated.citation, [origin for origin in origins if origin.exposure > 0]
-    serial, serial_form = _serial(stated, origins)
+    citation, exposures = lab.citation, [origin for origin in origins if origin.exposure > 0]
+    serial, serial_form = _serial(lab, origins)
     moments = [record.taken_at.astimezone(UTC) for record in records]
     exposure = _most_frequent([(origin.iso, origin.aperture, origin.shutter_s) for origin in exposures])
-    source = None if exposure is None and stated.camera is None else "settings" if exposure is None else "raw files"
-    if exposure is None and stated.camera is not None:
-        settings = stated.camera.exposure
+    source = None if exposure is None and lab.camera is None else "settings" if exposure is None else "raw files"
+    if exposure is None and lab.camera is not None:
+        settings = lab.camera.exposure
         exposure = settings.iso, settings.aperture, settings.shutter_s
     iso, aperture, shutter_s = exposure or (None, None, None)
     return OriginRecord(
-        rig=stated.rig,
+        rig=lab.rig,
         camera_serial=serial,
         camera_serial_is=serial_form,
         lens=_line(_most_frequent([origin.lens for origin in origins if origin.lens]) or citation.lens),
@@ -208,9 +208,9 @@ def origin_record(stated: StatedOrigin, records: Sequence[FrameRecord], origins:
         first_frame=min(moments).isoformat(timespec="seconds") if moments else None,
         last_frame=max(moments).isoformat(timespec="seconds") if moments else None,
         frames=len(records),
-        projector=_line(citation.projector or stated.devices.get("projector", "")),
-        screen=_line(stated.devices.get("screen", "")),
-        taken_by=_line(stated.devices.get("software", "")),
+        projector=_line(citation.projector or lab.devices.get("projector", "")),
+        screen=_line(lab.devices.get("screen", "")),
+        taken_by=_line(lab.devices.get("software", "")),
         title=citation.title or None,
         authors=list(citation.authors),
         note=citation.note or None,
@@ -219,15 +219,15 @@ def origin_record(stated: StatedOrigin, records: Sequence[FrameRecord], origins:
     )
 
 
-def _serial(stated: StatedOrigin, origins: Sequence[FrameOrigin]) -> tuple[str | None, Any]:
+def _serial(lab: SessionOrigin, origins: Sequence[FrameOrigin]) -> tuple[str | None, Any]:
     """Return the published serial number of most frames, and its form; from the journal if files lack it."""
     camera, serial = _most_frequent([(origin.camera, origin.serial) for origin in origins if origin.serial]) or ("", "")
     if not serial:
-        name, _, serial = stated.devices.get("camera", "").partition(_SERIAL)
+        name, _, serial = lab.devices.get("camera", "").partition(_SERIAL)
         camera = _most_frequent([origin.camera for origin in origins if origin.camera]) or name
     if not serial.strip():
         return None, "not stated"
-    form = stated.citation.camera_serial
+    form = lab.citation.camera_serial
     if form == "withheld":
         return None, form
     return published_serials([FrameOrigin(camera, serial)], form)[camera, serial], form
@@ -270,7 +270,7 @@ def bibtex(
     if not record.licence:
         missing.append("licence")
     body = "".join(f"  {name} = {{{value}}},\n" for name, value in fields.items() if value)
-    comment = f"% {NOT_RECORDED} by the LUT: {', '.join(missing)}\n" if missing else ""
+    comment = f"% {NOT_RECORDED} in the LUT: {', '.join(missing)}\n" if missing else ""
     return f"{comment}@misc{{{key},\n{body}}}\n"
 
 

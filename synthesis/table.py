@@ -212,7 +212,7 @@ def _measurement(task: TableTask) -> PatchMeasurement:
     world = World(blank, task.body, task.room)
     lamp: ChartLamp
     if task.powers is None:
-        light = sensor.light(world.of_primaries(codes, positions_mm))
+        light = sensor.light(world.signals_of_primaries(codes, positions_mm))
         lamp = ProjectorLamp(world, task.exposure, task.illuminations, light)
     else:
         reflectance = printed_reflectance(codes, task.room.profile, task.room.paper)

@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from calibration.citation import Rig, StatedOrigin
+from calibration.citation import Rig, SessionOrigin
 from calibration.radiometry.primaries import pure_lights
 from calibration.sampling import WINDOW, WINDOWS
 from calibration.spread.predicting import VARYING_BITS
@@ -163,7 +163,7 @@ def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> Fra
     return max((record for record in accepted if record.kind == "light"), key=brightness)
 
 
-def stated_origin(session: Session) -> StatedOrigin:
+def stated_origin(session: Session) -> SessionOrigin:
     """Return the origin that a session states; missing or damaged values are unknown."""
     try:
         document: dict[str, Any] = tomllib.loads(session.settings_text())
@@ -179,8 +179,8 @@ def stated_origin(session: Session) -> StatedOrigin:
                 "again",
                 why,
             )
-        return StatedOrigin(CitationSettings(), None, None, session.journal.records())
-    return StatedOrigin(citation, rig, settings, session.journal.records())
+        return SessionOrigin(CitationSettings(), None, None, session.journal.records())
+    return SessionOrigin(citation, rig, settings, session.journal.records())
 
 
 def source_frames(records: Sequence[FrameRecord]) -> list[SourceFrame]:

@@ -1,4 +1,4 @@
-"""Measure the linearity of the sensor by flux superposition: an illuminant against red, green and blue alone.
+"""Measure the linearity of the sensor by flux superposition: compare an illuminant with red, green and blue alone.
 
 Light adds: the light of a patch under several primaries is the sum of its light under each primary, times the amount of
 each. Counts of a linear sensor add in the same way; the counts of a sensor with compression near saturation, loss near
@@ -32,7 +32,7 @@ _USUAL_BEND = 0.01
 
 _USUAL_LOSS = 0.0005  # prior loss or gain near black, relative to saturation: some counts of 14 bits
 
-_LOSS_SCALES = (0.0005, 0.002)  # range of this loss, relative to saturation
+_LOSS_SCALES = (0.0005, 0.002)  # levels at which this loss reaches 63 %, relative to saturation
 
 _USUAL_REST = 0.0003  # prior of other deviations, relative to the level
 
@@ -44,11 +44,11 @@ _CODE_DEGREE = 4  # degree of the polynomial in the codes that predicts patches 
 
 _LOOSE = 10.0  # prior standard deviation of the amount of a primary: no information
 
-_OWN_SPECTRUM = 0.001  # prior for differences of it between channels: a primary keeps its spectrum
+_OWN_SPECTRUM = 0.001  # prior for differences of the amount between channels: a primary keeps its spectrum
 
-# Models of full white: standard deviation of the primaries' amounts, the same between channels, and prior odds
-# (judgement). The primaries as in their own frames; with exposures that cut the period of a colour wheel; and with
-# additional light of another spectrum, from a projector that boosts white.
+# Models of full white: standard deviation of the amounts of the primaries, of their differences between channels, and
+# prior odds (judgement). First model: the same primaries as in their own frames. Second: exposures that are no whole
+# number of turns of a colour wheel. Third: additional light of another spectrum, from a projector that boosts white.
 _WHITES = ((0.003, _OWN_SPECTRUM, 0.6), (0.05, _OWN_SPECTRUM, 0.3), (_LOOSE, _LOOSE, 0.1))
 
 _GROUPS = 12  # number of groups of similar levels for measuring the scatter
@@ -106,7 +106,7 @@ class Superposition:
         return weights @ self.deviation, weights
 
     def errors(self, level: _Array, reference: _Array) -> _Array:
-        """Return the mean square (...) of the relative error of levels (...) against references, broadcast."""
+        """Return the mean square (...) of the relative error of levels (...) against references; shapes broadcast."""
         # Counts are not corrected for the deviation, so its full size is an error.
         deviation, variance = self.difference(level, reference)
         return deviation**2 + variance
@@ -154,11 +154,11 @@ def superposition(
     predictors : (P, M) float64
         Functions of the printed codes that predict levels without noise (`printed_predictors`).
     white : bool
-        The illuminant is full white.
+        Whether the illuminant is full white.
     """
     patches, needed = int(usable.sum()), max(_LEAST_PATCHES, 2 * predictors.shape[1])
     if patches < needed:
-        why = f"the chart has {patches} usable patches, expected at least {needed}, with any illuminants"
+        why = f"the chart has {patches} usable patches, {needed} or more expected"
         return Superposition.usual(full, Unmeasured(why, f"use a chart with more colours, or {_SERIES}"))
     levels, predictors = np.stack([together, *alone])[:, usable], predictors[usable]
     hats, size = _hats(levels / full), _AMOUNTS + len(NODES)

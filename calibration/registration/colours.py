@@ -1,6 +1,6 @@
 """Predict the camera RGB of printed codes in one frame, and compare patches with the prediction.
 
-The model is fitted to the frame itself; neither print nor illuminant need be known. Patches with other colours are
+The model is fitted to the frame itself, so print and illuminant may be unknown. Patches that differ from the model are
 covered or damaged, or the registration is displaced by a patch. Counts above black level, camera RGB; codes 0 … 255;
 millimetres on the page.
 """
@@ -28,7 +28,7 @@ _MISMATCH_SHARE = 0.08
 
 _NEIGHBOURS = 13  # A patch and the twelve within a distance of two patches
 
-# Share of mismatched neighbours above which a patch is taken for covered as well (judgement).
+# Share of mismatched neighbours above which a patch is also treated as covered (judgement).
 _MISMATCH_NEIGHBOURS = 0.35
 
 _SLIP_CELLS = 16  # Largest width, in patches, of an area that is tested for a displacement
@@ -53,7 +53,7 @@ _Mask = npt.NDArray[np.bool_]
 
 
 def mismatched(measured: _Array, expected: _Array, paper: _Array, chart: Chart) -> _Mask:
-    """Return the patches (C,) bool, in chart order, with a colour far from the model, and all patches amid them.
+    """Return the patches (C,) bool, in chart order, with a colour far from the model, and patches surrounded by them.
 
     `measured`, `expected`: (C, 3) colours of the patches, optionally followed by (R, 3) of references; NaN outside the
     frame. `paper`: (3,) colour of the paper.
@@ -67,11 +67,11 @@ def mismatched(measured: _Array, expected: _Array, paper: _Array, chart: Chart) 
     return _with_neighbours(np.asarray(is_mismatched)[:count], chart.centres_mm / np.array(chart.cell_mm))
 
 
-def _with_neighbours(cells: _Mask, centres: _Array) -> _Mask:
-    # A cover of a colour like the chart's hides among its mismatched neighbours.
+def _with_neighbours(is_mismatched: _Mask, centres: _Array) -> _Mask:
+    # A covered patch may match by chance, if the cover has its colour; most of its neighbours do not.
     neighbours = cKDTree(centres).query(centres, k=min(_NEIGHBOURS, len(centres)))[1]
-    mismatched_share = cells[np.asarray(neighbours).reshape(len(centres), -1)].mean(axis=1)
-    return np.asarray(cells | (mismatched_share > _MISMATCH_NEIGHBOURS))
+    mismatched_share = is_mismatched[np.asarray(neighbours).reshape(len(centres), -1)].mean(axis=1)
+    return np.asarray(is_mismatched | (mismatched_share > _MISMATCH_NEIGHBOURS))
 
 
 def agreement(measured: _Array, expected: _Array) -> float:
@@ -89,10 +89,10 @@ def displaced_areas(
     indices: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]],
     shape: tuple[int, int],
 ) -> tuple[_Array, int]:
-    """Return the areas of a grid of patches that match the colours of the neighbouring patches.
+    """Return the areas of a grid of patches with the colours that are expected one patch further.
 
     The difference of measured and expected colours is fitted, area by area, with the change that a displacement to the
-    next patch causes. The level of the colours is used, which the registration leaves free.
+    next patch causes. Unlike registration, this uses the absolute level of the colours.
 
     `measured`, `expected`: (C, 3) colours of the patches. `paper`: (3,) colour of the paper. `ignored`: (C,) bool.
     `indices`: row and column of each patch, (C,) each. `shape`: rows and columns. Returns the centres (B, 2) of the

@@ -5,7 +5,7 @@ any spread that decreases with distance. Light that the lens spreads uniformly o
 9358).
 
 The colours of a chart are in random order, so the neighbours of a patch are unrelated to its code. The level of a patch
-is predicted from similar codes; the difference is regressed on the light that each kernel would bring.
+is predicted from similar codes; the difference is regressed on the light that each kernel would add.
 
 - No regressor contains the noise of the patch itself: predicted levels are used for it.
 - Errors of the field and unevenness of the print are smooth factors of levels; they are fitted too, with a prior near
@@ -31,8 +31,8 @@ from calibration.spread.predicting import VARYING_BITS, LevelModel
 from experiment.measures.least_squares import page_polynomial, page_powers
 from foundation.robust import sigma_by_level
 
-# σ of the near kernels, half-size px: from the first effect of neighbours on the 25 samples to the width of a slot.
-# With factors of two, their sum fits a smooth spread within the measurement uncertainty.
+# σ of the near kernels, half-size px: from the first effect of neighbours on the 25 samples to the width of a slot (the
+# place of a patch). With factors of two, their sum fits a smooth spread within the measurement uncertainty.
 NEAR_PX = (1.5, 3.0, 6.0)
 
 # σ of the far kernels, half-size px: one slot, two, a tenth of the height of a full chart, and the widest that can be
@@ -80,7 +80,7 @@ DARK_LEVEL = 0.1  # level of dark patches, relative to paper, for comparing the 
 
 _LEAST_BEND = 1e-4  # lower bound of the standard deviation of the sensor's nonlinearity
 
-# Largest prior standard deviation of a share: keeps kernels solvable that have little effect on the samples.
+# Largest prior standard deviation of a share: the equations can then be solved for kernels with little effect, too.
 _PRIOR_SHARE = 0.1
 
 # Prior standard deviation of veiling glare: 0.3 to 1.5 % by ISO 9358 and ISO 18844. It is used unchanged if the chart
@@ -92,11 +92,11 @@ _WIDE_KERNELS = 2  # number of far kernels that resemble smooth light on the pri
 # Prior standard deviation of the share of each far kernel, in addition to its expectation from the previous kernel.
 _FAR_STEPS = (0.01, 0.01, 0.004, 0.003)
 
-# Factors of these for lenses with scatter, with equal prior odds.
+# Factors of `_FAR_STEPS` for lenses with scatter, with equal prior odds.
 _FAR_SIZES = (0.3, 1.0, 3.0)
 
-# Factor for near and far kernels of a lens without scatter, and for veiling glare of a lens without it: coated glass
-# without dust.
+# Factor of the usual near and far kernels for a lens without scatter, and of the usual veiling glare for a lens without
+# veiling glare: coated glass without dust.
 _CLEAN = 0.001
 
 # Prior probability of a lens without scatter, for all charts and for charts with few colours (judgement). Otherwise
@@ -113,16 +113,16 @@ _LAWS = ((2.0, 1.0), (3.0, 1.0), (3.0, _CLEAN))
 
 _POWER_ODDS = 0.5  # prior probability that scattered light follows one of these laws (judgement)
 
-_SCATTERED = 0.04  # prior standard deviation of all scattered light of such a lens (judgement)
+_SCATTERED = 0.04  # prior standard deviation of all scattered light of a lens that follows a law (judgement)
 
-# Relative prior standard deviation of a kernel's share from the law, per channel (judgement): light near a patch
-# determines light over the whole frame.
+# Prior standard deviation of a kernel's share from the law, relative to it, per channel (judgement): scattered light
+# near a patch predicts scattered light over the whole frame.
 _OFF_LAW = 0.35
 
 # As `CHANNELS_APART`, for deviations from a law (judgement): the lens determines the shape, the channel the amount.
 _LAW_APART = 0.7
 
-_SCATTER_APART = 0.5  # as `CHANNELS_APART`, for such a lens
+_SCATTER_APART = 0.5  # as `CHANNELS_APART`, for a lens that follows a law
 
 # Expected share of a far kernel relative to the previous one: 1 for r⁻², 0.25 for r⁻³, 0 for an exponential. Charts
 # with few colours cannot show 384 px, but 24 px.
@@ -135,11 +135,11 @@ CHANNELS_APART = 1 / 3
 # The same for lenses with similar channels, with different channels, and with coatings for one channel.
 _APART = (0.03, CHANNELS_APART, 0.7)
 
-# Prior probabilities of these (judgement). Without a visible difference, similar channels dominate.
+# Prior probabilities of `_APART` (judgement). Without a visible difference, similar channels dominate.
 _APART_ODDS = (0.4, 0.4, 0.2)
 
 # Largest veiling glare with shares that are constant over the frame: the worst lens by ISO 9358 plus half a standard
-# uncertainty. Kernels that grew threefold to the corners were once taken for 4.6 % veiling glare, with errors of 11 %.
+# uncertainty. Kernels that grew threefold to the corners were once mistaken for 4.6 % veiling glare.
 MOST_VEIL = 0.02
 
 # Lower bound of the misfit for charts with few colours, because patch errors are correlated over channels. In 46 rooms
@@ -335,7 +335,7 @@ def fit_spread(
             lens = [solution[channel_terms(item.channel)] for item in data]
             rows = [_rows(item, n, cells_mm, page_mm, bits, lens[n]) for n, item in enumerate(data)]
         normal, right = _normal_equations([*rows, *reference_rows], solution)
-        solution[others] = _solved(*_of(normal.sum(axis=0), right.sum(axis=0), prior, others), np.arange(TERMS))
+        solution[others] = _solved(*_take(normal.sum(axis=0), right.sum(axis=0), prior, others), np.arange(TERMS))
     is_few = bits < VARYING_BITS
     misfit = _misfit(normal.sum(axis=0), right.sum(axis=0), prior, shapes)
     normal, right = normal[:, others][:, :, others], right[:, others]
@@ -344,8 +344,8 @@ def fit_spread(
     # The misfit inflates the uncertainty of the data, but not the prior.
     variance = max(misfit, _LEAST_MISFIT) if is_few else misfit
     inflated = _without_factors(normal.sum(axis=0), right.sum(axis=0), variance * prior)
-    certain = inflated[0] / variance - usual, inflated[1] / variance
-    lenses = _Lenses.of((matrix - usual, vector), certain, bits)
+    weakened = inflated[0] / variance - usual, inflated[1] / variance
+    lenses = _Lenses.of((matrix - usual, vector), weakened, bits)
     matrix = matrix + lenses.likeliest_prior - usual
     candidates = groups_of_terms()
     if is_few:
@@ -354,15 +354,15 @@ def fit_spread(
     veil = far[-1]
     extra = np.zeros((TERMS, TERMS))
     for item in data:
-        # Counts lost near black by nonlinearity hide as much veiling glare.
+        # Counts lost near black by nonlinearity hide veiling glare of the same size.
         hidden = DARK_LEVEL * item.bend / float(np.median(item.even * item.field))
         extra[veil[item.channel], veil[item.channel]] += hidden**2
-    even = _positive(matrix, vector, _terms(candidates))[0][veil]
-    # There is other smooth light, or shares grow to the corners, which few patches cannot show.
-    is_ambiguous = misfit > MOST_MISFIT or (is_few and even.mean() > MOST_VEIL)
+    apparent_veil = _positive(matrix, vector, _terms(candidates))[0][veil]
+    # There is other smooth light, or shares grow to the corners, which charts with few patches cannot show.
+    is_ambiguous = misfit > MOST_MISFIT or (is_few and apparent_veil.mean() > MOST_VEIL)
     if is_ambiguous:
         # The source of the apparent veiling glare is unknown.
-        extra[np.ix_(veil, veil)] += np.outer(even, even)
+        extra[np.ix_(veil, veil)] += np.outer(apparent_veil, apparent_veil)
         candidates.pop()
         far.pop()
     proven = _selected(matrix, vector, misfit, candidates)
@@ -392,16 +392,16 @@ class _Lenses:
     likeliest_prior: _Array  # (TERMS, TERMS) inverse prior covariance of the most likely lens
 
     @staticmethod
-    def of(equations: tuple[_Array, _Array], certain: tuple[_Array, _Array], bits: int) -> _Lenses:
+    def of(equations: tuple[_Array, _Array], weakened: tuple[_Array, _Array], bits: int) -> _Lenses:
         """Return all assumed lenses with equations (TERMS, TERMS), (TERMS,) of the print.
 
-        `certain`: the same equations, weakened by the misfit.
+        `weakened`: the same equations with less weight, because of the misfit.
         """
-        matrix, vector = certain
-        lenses = _supposed_lenses(bits < VARYING_BITS)
+        matrix, vector = weakened
+        lenses = _assumed_lenses(bits < VARYING_BITS)
         priors = np.array([np.linalg.inv(_usual_shares(bits, lens)) for lens in lenses])
-        # Log evidence (D. MacKay, Bayesian interpolation, 1992) at the most likely possible shares: a negative veiling
-        # glare is no evidence for a lens with one.
+        # Log evidence (D. MacKay, Bayesian interpolation, 1992) at the most likely shares that are not negative: a
+        # negative fit is no evidence for a lens with veiling glare.
         gains = np.array([_positive(matrix + prior, vector, np.arange(TERMS))[1] for prior in priors])
         evidence = gains + np.linalg.slogdet(priors)[1] - np.linalg.slogdet(matrix + priors)[1]
         odds = np.array([lens.odds for lens in lenses])
@@ -435,7 +435,7 @@ class _Lens:
     odds: float = 1.0  # prior probability
 
 
-def _supposed_lenses(few: bool) -> list[_Lens]:
+def _assumed_lenses(few: bool) -> list[_Lens]:
     clean, clear = (_CLEAN_ODDS_OF_FEW, _CLEAR_ODDS_OF_FEW) if few else (_CLEAN_ODDS, 0.0)
     apart_odds = list(zip(_APART, _APART_ODDS, strict=True))
     scatter = [(_Lens(near=_CLEAN, far=_CLEAN, odds=clean), clean)]
@@ -446,17 +446,17 @@ def _supposed_lenses(few: bool) -> list[_Lens]:
         (_Lens(far=size, far_apart=apart, odds=independent * odds), clear)
         for size, (apart, odds) in product(_FAR_SIZES, apart_odds)
     ]
-    lenses = [replace(lens, veil=_CLEAN, odds=lens.odds * bare) for lens, bare in scatter if bare]
+    lenses = [replace(lens, veil=_CLEAN, odds=lens.odds * clear_odds) for lens, clear_odds in scatter if clear_odds]
     return lenses + [
-        replace(lens, veil_apart=veil_apart, odds=lens.odds * (1 - bare) * odds)
-        for (lens, bare), (veil_apart, odds) in product(scatter, apart_odds)
+        replace(lens, veil_apart=veil_apart, odds=lens.odds * (1 - clear_odds) * odds)
+        for (lens, clear_odds), (veil_apart, odds) in product(scatter, apart_odds)
     ]
 
 
 def _usual_wide_light(bits: int, scatters: bool) -> _Array:
     """Return the prior mean squares (TERMS, TERMS) of wide shares; `scatters`: the lens is known to scatter."""
     wide = _terms(far_groups()[-_WIDE_KERNELS - 1 :])
-    lenses = [lens for lens in _supposed_lenses(bits < VARYING_BITS) if lens.near == 1 or not scatters]
+    lenses = [lens for lens in _assumed_lenses(bits < VARYING_BITS) if lens.near == 1 or not scatters]
     mean_squares = np.zeros((TERMS, TERMS))
     for lens in lenses:
         probability = lens.odds / sum(lens.odds for lens in lenses)
@@ -506,8 +506,8 @@ def channels_alike(apart: float = CHANNELS_APART) -> _Array:
     return (1 - apart**2) + apart**2 * np.eye(3)
 
 
-def _of(normal: _Array, right: _Array, prior: _Array, chosen: npt.NDArray[np.int64]) -> tuple[_Array, _Array, _Array]:
-    return normal[np.ix_(chosen, chosen)], right[chosen], prior[np.ix_(chosen, chosen)]
+def _take(normal: _Array, right: _Array, prior: _Array, terms: npt.NDArray[np.int64]) -> tuple[_Array, _Array, _Array]:
+    return normal[np.ix_(terms, terms)], right[terms], prior[np.ix_(terms, terms)]
 
 
 def _misfit(normal: _Array, right: _Array, prior: _Array, shapes: int) -> float:
@@ -515,7 +515,7 @@ def _misfit(normal: _Array, right: _Array, prior: _Array, shapes: int) -> float:
     # These unknowns add equally to dark and bright patches. Without such light, each gains about 1.
     with_shape = _without_factors(normal, right, prior, TERMS + shapes)
     others = np.delete(np.arange(len(prior)), np.arange(TERMS, TERMS + shapes))
-    plain = _without_factors(*_of(normal, right, prior, others))
+    plain = _without_factors(*_take(normal, right, prior, others))
     gains = [_explained(*pair, np.asarray(np.linalg.solve(*pair), dtype=np.float64)) for pair in (with_shape, plain)]
     return max(1.0, (gains[0] - gains[1]) / shapes)
 

@@ -1,7 +1,7 @@
 """Serial port; the only module that imports pyserial.
 
 All projectors in `drivers.serial_projectors` use eight data bits, no parity, one stop bit and no flow control. The port
-is opened exclusively, and older input is discarded. If the cable is pulled out, the last bytes may be lost.
+is opened exclusively, and earlier input is discarded. If the cable is disconnected, the last bytes may be lost.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _open_error(error: OSError, device: str) -> LinkError | DeviceRefused:
     if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         present_ports = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"
         return LinkClosed(
-            f"serial port {device} does not exist (present: {present_ports}); plug the adapter in, or set one of these"
+            f"serial port {device} does not exist (present: {present_ports}); plug the adapter in, or set one of them"
         )
     return LinkClosed(f"{device} cannot be opened: {error}; check that it is a serial port")
 

@@ -79,8 +79,8 @@ class ContainerReader:
     """Splits the bytes of one pipe into messages, for pieces of any size.
 
     `packet_size` is the pipe's wMaxPacketSize. It is used only in data phases of unknown length, which a short packet
-    ends: there each piece must be the result of one read. After a `ProtocolError` the position in the stream is lost,
-    and every further `feed` raises too.
+    ends: in these phases, each piece must be the result of one read. After a `ProtocolError` the position in the stream
+    is lost, and every further `feed` raises too.
     """
 
     def __init__(self, packet_size: int = HIGH_SPEED_PACKET) -> None:
@@ -164,7 +164,7 @@ def encode(message: PtpRequest | PtpResponse | PtpEvent) -> bytes:
 
 
 def encode_data_header(code: int, transaction: int, length: int | None) -> bytes:
-    """Return the header of a payload of `length` bytes; None, or more than 32 bits: until a short packet."""
+    """Return the header of a payload of `length` bytes; if None or 4 GiB and more, a short packet ends the payload."""
     total = UNKNOWN_LENGTH if length is None else min(HEADER_LENGTH + length, UNKNOWN_LENGTH)
     start = encode_integer(total, 4) + encode_integer(ContainerType.DATA, 2)
     return start + encode_integer(code, 2) + encode_integer(transaction, 4)
@@ -183,7 +183,7 @@ def _check_length(container_type: int, length: int) -> None:
     if excess or not 0 <= count <= MAX_PARAMETERS:
         raise _stream_error(
             f"a {ContainerType(container_type).name.lower()} container of {length} bytes, "
-            f"expected 12 and 4 for each of 0 to {MAX_PARAMETERS} parameters"
+            f"expected 12 plus 4 for each of 0 to {MAX_PARAMETERS} parameters"
         )
 
 
@@ -233,7 +233,7 @@ class DeviceStatus:
         length = cursor.u16("length")
         count, excess = divmod(length - 4, 4)
         if excess or count < 0 or count > MAX_PARAMETERS:
-            raise cursor.fault("length", f"4 and 4 for each of 0 to {MAX_PARAMETERS} parameters", length)
+            raise cursor.fault("length", f"4 plus 4 for each of 0 to {MAX_PARAMETERS} parameters", length)
         return cls(cursor.u16("code"), cursor.integers(count, 4, "parameters"))
 
     def encode(self) -> bytes:
@@ -243,13 +243,13 @@ class DeviceStatus:
 
 
 PIECE = 512 * 1024  # Largest transfer, bytes; some hosts and cameras fail with larger ones
-MAX_EVENTS = 4096  # Most events of one call, for a device that never stops sending them
+MAX_EVENTS = 4096  # Maximum number of events of one call, because a faulty device may never stop sending
 
 _CONTROL_S = 1.0  # Timeout of a control request; a reply takes milliseconds
 _READY_TRIES = 40  # Status requests after a cancellation or reset, 2 s in total
 _READY_EVERY_S = 0.05  # Pause between two status requests; short compared with a reset
 _DRAIN_S = 0.05  # Silence after which all old data have arrived
-# Most pieces to discard, 128 MiB: more than a raw frame, and a limit for a device that never stops.
+# Maximum number of pieces to discard, 128 MiB: more than a raw frame, but a faulty device may never stop.
 _DRAIN_READS = 256
 _EMPTY_READS = 16  # Empty packets in a row that are skipped; one may follow a full packet, more are a fault
 
@@ -383,7 +383,7 @@ class UsbTransport(CableTransport):
         return max(packet_size, min(PIECE, remaining // packet_size * packet_size))
 
     def cancel(self, transaction: int) -> bool:
-        """Cancel a transaction whose data the caller cannot accept; return whether the next can follow."""
+        """Cancel a transaction if the caller cannot accept its data; return whether another transaction is possible."""
         with contextlib.suppress(LinkError, ProtocolError):
             self._pipes.control_out(ControlRequest.CANCEL, encode_cancel(transaction), _CONTROL_S)
             self._await_ready()

@@ -4,13 +4,14 @@ Layout::
 
     gt.csv              image,r,g,b: one row per image; path relative to the table, with or without the ending
                         columns black, saturation: levels of the image, in the units of its file, optional
-                        column mask: a picture that is not 0 for pixels that must not be used, optional
+                        column mask: a picture with values above 0 at pixels that must not be used, optional
                         column fold: whole numbers from 0 for cross-validation, optional
     photo1.png …        linear camera RGB, red first: PNG or TIFF of 16 bits, TIFF of floats, or NumPy files
     photo1_mask.png     mask of photo1 if column mask is empty, optional
 
-The table is the only .csv of the folder with these columns, or is given itself. Images without a row are refused, so
-that no image is excluded by mistake. JPEG and 8-bit sRGB are refused: their values are not proportional to light.
+The table is the only .csv of the folder with these columns, or the path of the table is given. Images without a row
+are refused, so that no image is excluded by mistake. JPEG and 8-bit sRGB are refused, because their values are not
+proportional to light.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _INSPECTED_TABLES = 50  # tables of a folder whose headers are read to find the 
 
 @dataclass(frozen=True, slots=True)
 class OwnScene(RawScene):
-    """Image of the user; `mask_path` is a picture that is not 0 for pixels that must not be used, or empty."""
+    """Image of the user; `mask_path`: picture with values above 0 at pixels that must not be used, or empty."""
 
     mask_path: str = ""
 
@@ -139,7 +140,7 @@ def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folde
 
 
 def _mask_source(given_columns: set[str], path: Path, masks: int, count: int) -> str:
-    sources_by_key = ((f"column mask of {path.name}", "mask"), ("NAME_mask beside the image", "mask beside"))
+    sources_by_key = ((f"column mask of {path.name}", "mask"), ("NAME_mask next to the image", "mask beside"))
     sources = " or ".join(text for text, key in sources_by_key if key in given_columns)
     return f"{sources}: pixels that are not 0; {masks} of {count} images have one" if sources else "none"
 
@@ -232,12 +233,12 @@ def _ending(file: str) -> str:
 
 def _find_image(folder: Path, name: str, origin: str, indices: dict[str, _FolderIndex]) -> str | None:
     """Return the path of a listed image, with or without ending in the table; None if it does not exist."""
-    below, _, file = name.rpartition("/")
+    parent, _, file = name.rpartition("/")
     if reason := _refusal_reason(file):
         raise FormatError(f"{origin}: {name} is {reason}")
-    if below not in indices:
-        indices[below] = _FolderIndex(Folder(folder / below))
-    index = indices[below]
+    if parent not in indices:
+        indices[parent] = _FolderIndex(Folder(folder / parent))
+    index = indices[parent]
     if _ending(file) in IMAGE_ENDINGS:
         return f"{index.folder.path}{os.sep}{file}" if file in index.files else None
     return index.images.get(file)
@@ -249,7 +250,7 @@ def _refusal_reason(file: str) -> str:
         file_type = "JPEG, " if _ending(file) in (".jpg", ".jpeg") else ""
         return (
             f"{file_type}an sRGB picture, whose values are not proportional to light; expected linear camera RGB "
-            f"({', '.join(IMAGE_ENDINGS)})"
+            f"({', '.join(IMAGE_ENDINGS)}); convert the raw file without gamma, and list that file"
         )
     if _ending(file) in _RAWS:
         return (
@@ -261,10 +262,10 @@ def _refusal_reason(file: str) -> str:
 
 def _unusable_file(folder: Path, name: str, origin: str, indices: Mapping[str, _FolderIndex]) -> str | None:
     """Return why the unusable file that has the name of a missing image is refused; None if there is none."""
-    below, _, file = name.rpartition("/")
+    parent, _, file = name.rpartition("/")
     stem = Path(file).stem if _ending(file) in IMAGE_ENDINGS else file
-    file_name = indices[below].unusable.get(stem)
-    return file_name and f"{origin}: {name} exists only as {folder / below / file_name}: {_refusal_reason(file_name)}"
+    file_name = indices[parent].unusable.get(stem)
+    return file_name and f"{origin}: {name} exists only as {folder / parent / file_name}: {_refusal_reason(file_name)}"
 
 
 def _find_mask(name: str, image: str, indices: Mapping[str, _FolderIndex]) -> str:
@@ -284,26 +285,26 @@ def _unlisted_note(
     """Return a note on excluded images without a row; an empty string if there are none."""
     folders = {file.rpartition(os.sep)[0] or "." for file in images}
     root = Folder(path.parent)
-    open_folders = [index.folder for index in indices.values() if index.files]
-    beside_images: list[str] = []
+    row_folders = [index.folder for index in indices.values() if index.files]
+    near_images: list[str] = []
     elsewhere: list[str] = []
-    for folder_path, folder in {os.path.normpath(item.path): item for item in (*open_folders, *root.within(1))}.items():
+    for folder_path, folder in {os.path.normpath(item.path): item for item in (*row_folders, *root.within(1))}.items():
         names = [name for name in folder.files if _ending(name) in IMAGE_ENDINGS]
         files = [os.path.normpath(f"{folder_path}{os.sep}{name}") for name in names]
-        (beside_images if folder_path in folders else elsewhere).extend(
+        (near_images if folder_path in folders else elsewhere).extend(
             file for file in files if file not in images and file not in masks
         )
-    # Masks need no row of their own; they are listed only if there are no other images.
-    beside_images = [file for file in beside_images if not Path(file).stem.endswith(_MASK)] or beside_images
+    # Masks need no row of their own; they are reported only if there are no other images.
+    near_images = [file for file in near_images if not Path(file).stem.endswith(_MASK)] or near_images
     # If the user gave one of several tables, it is a selection of images. Otherwise an image without a row is an error.
     is_selection = location.is_file() and len(_tables(root)) > 1
-    if beside_images and not (partial or is_selection):
+    if near_images and not (partial or is_selection):
         raise FormatError(
-            f"{path} has no row for {len(beside_images)} images in the folders of its images "
-            f"({first_few([os.path.relpath(file, root.path) for file in beside_images])}), expected one row each; add "
+            f"{path} has no row for {len(near_images)} images in the folders of its images "
+            f"({first_few([os.path.relpath(file, root.path) for file in near_images])}), expected one row each; add "
             "rows, remove the files, or exclude them with --read partial"
         )
-    groups = ((beside_images, "beside them"), (elsewhere, "in other folders"))
+    groups = ((near_images, "next to them"), (elsewhere, "in other folders"))
     return ", ".join(f"{len(files)} {note} without a row in {path.name} excluded" for files, note in groups if files)
 
 

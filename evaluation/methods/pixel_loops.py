@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
 
 SPAN = 64  # pixels of a row that are added together if all are usable: a few vectors per channel
-# Spans after which 32-bit sums are emptied: 65 537 values of uint16 fit, minus one more row of 350 000 px.
+# Number of spans after which the 32-bit sums are emptied. 65 537 spans of uint16 fit; the check is at the end of a row,
+# so a row of 350 000 px may be added.
 LARGEST_SPAN_COUNT = 60_000
 CHUNK = 256  # pixels whose powers are computed together, in the first-level cache
 BLOCK = 16  # pixels of float32 whose whole powers are computed together: three vectors, six of float64
@@ -75,13 +76,13 @@ def _add_span(
     span: npt.NDArray[np.uint16],
     sums: npt.NDArray[np.uint32],
     squares: npt.NDArray[np.uint64],
-    highs: npt.NDArray[np.uint16],
+    maxima: npt.NDArray[np.uint16],
 ) -> None:
     # LLVM uses vectors for loops of this form.
     for j in range(3 * SPAN):
         value = span[j]
         sums[j] += uint32(value)
-        highs[j] = max(highs[j], value)
+        maxima[j] = max(maxima[j], value)
     for j in range(3 * SPAN):
         wide = uint32(span[j])
         squares[j] += uint64(uint32(wide * wide))
@@ -108,7 +109,7 @@ def integer_moments(
     flat = image.reshape(-1)
     sums = np.zeros(3 * SPAN, np.uint32)
     squares = np.zeros(3 * SPAN, np.uint64)
-    highs = np.zeros(3 * SPAN, np.uint16)
+    maxima = np.zeros(3 * SPAN, np.uint16)
     count, span_count = 0, 0
     for y in range(border, height - border):
         for left in range(border, width - border, SPAN):
@@ -119,7 +120,7 @@ def integer_moments(
             count += usable_count
             if usable_count == SPAN:
                 begin = 3 * (y * width + left)
-                _add_span(flat[begin : begin + 3 * SPAN], sums, squares, highs)
+                _add_span(flat[begin : begin + 3 * SPAN], sums, squares, maxima)
                 span_count += 1
                 continue
             for x in range(left, right):
@@ -136,7 +137,7 @@ def integer_moments(
             span_count = 0
     for j in range(sums.size):
         moments[1, j % 3] += squares[j]
-        moments[2, j % 3] = max(moments[2, j % 3], uint64(highs[j]))
+        moments[2, j % 3] = max(moments[2, j % 3], uint64(maxima[j]))
     return moments, count
 
 
@@ -243,7 +244,7 @@ def sum_powers(
     """Add the powers p of scaled values of some rows of an image to `sums` (3,) float64.
 
     `values`: (rows, Q) uint16, float32 or float64 ≥ 0, rows of interleaved pixels or parts of them, from row `top` and
-    pixel `first` on. Values beyond the image are ignored. `height`, `width` and `usable` are those of the image.
+    pixel `first` on. Values beyond the image are ignored. `height`, `width` and `usable` belong to the whole image.
     """
     factors = np.empty(3 * CHUNK, np.float64)
     powers = np.empty(3 * CHUNK, np.float64)
@@ -291,10 +292,10 @@ def sum_powers(
             sums[j % 3] += sums_by_position[j]
 
 
-# Equal bins of projections from 0 to the largest possible one: of 18 million pixels some thousand are in the bin with a
-# limit.
+# Number of equal bins of projections, from 0 to the largest possible projection. With 18 million pixels, the bin that
+# contains a limit has some thousand pixels.
 BINS = 4096
-# Offset between rows of the pixels that are counted, px: no column is preferred if every 16th pixel is counted.
+# Offset of the counted pixels from row to row, px. Without it, only every 16th column would be counted.
 _ROW_SHIFT = 5
 
 
@@ -333,7 +334,7 @@ def sum_outer_bins(
     numbers of pixels below, above and inside.
     """
     # Projections of a chunk are computed before they are compared, so that both loops have no branches and the first
-    # uses vectors. Only the few pixels at the ends are processed one by one.
+    # uses vectors. Only the few pixels in the outer bins are processed one by one.
     total = np.zeros((3, 3), np.float64)
     bins, kept_positions = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
     first, low, high, last = brackets

@@ -1,8 +1,8 @@
 """Output of result tables for people: terminal, LaTeX, HTML.
 
-On a narrow terminal names are folded; numbers are never cut. LaTeX follows tables 1 and 2 of the paper and needs no
-package: floats with a caption, headings of several words stacked, and tables with the same columns joined, each with
-its title.
+On a narrow terminal, names are wrapped; numbers are never cut. LaTeX follows tables 1 and 2 of the paper and needs no
+package. Tables are floats with a caption, and headings of several words are stacked. Tables with the same columns can
+be joined, each with its title.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _UNLIMITED_WIDTH = 10_000  # Terminal columns, more than any table needs, for me
 def print_table(table: Table) -> None:
     """Print a table with title and notes to standard output.
 
-    Text is folded only on a terminal that is narrower than the table; files and pipes get the full width.
+    Text is wrapped only on a terminal that is narrower than the table; files and pipes get the full width.
     """
     from rich.console import Console
     from rich.table import Table as Grid

@@ -1,8 +1,8 @@
 """The chart: positions of all printed patches, tags and references, and its file `chart.json`.
 
 A chart is data only. `experiment.chart.layout` designs it, `experiment.chart.printing` prints it, and registration and
-sampling read it. Every patch is explicit, so a reader need not know the rule of the layout. Positions are millimetres
-on the print; origin at its top-left corner, x right, y down.
+sampling read it. The position of every patch is listed, so the rule of the layout is not needed. Positions are
+millimetres on the print; origin at its top-left corner, x right, y down.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class Chart:
         return tuple(reference for reference in self.references if reference.is_white)
 
     def to_json(self) -> str:
-        """Return the text of `chart.json`. Equal charts have equal text, and reading keeps it."""
+        """Return the text of `chart.json`. Equal charts have equal text, also after they are saved and read."""
         document = {
             "format": FORMAT,
             "version": VERSION,
@@ -157,7 +157,7 @@ class Chart:
                 for reference in self.references
             ],
         }
-        # A chart without them keeps the text that it was read from, so that its hash is stable.
+        # If seed and software are unknown, the text has no such keys, so that the hash of a chart does not change.
         document |= {
             key: value for key, value in (("seed", self.seed), ("software", self.software)) if value is not None
         }
@@ -209,7 +209,7 @@ def load_chart(path: Path) -> Chart:
         raise reading_error(path, error, "give the chart.json of the print", "chart") from error
     if path.suffix.lower() != ".json" and not text.lstrip().startswith(b"{"):
         remedy = "give chart.json, which acquire chart writes next to the files to print"
-        raise FormatError("not a chart.json but another file", about=path, remedy=remedy)
+        raise FormatError("not a chart: chart.json contains JSON text", about=path, remedy=remedy)
     document = from_json(_Document, text, path, "restore it from a copy")
     count = 8**document.bits
     colours = np.asarray(document.cells.colour, dtype=np.int64)

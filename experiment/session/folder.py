@@ -91,7 +91,7 @@ class Session:
         self.steps: tuple[SessionStep, ...] = journal.steps()
         self._require_planned_lights()
 
-    # With other illuminants than planned, frames would get wrong codes.
+    # If the illuminants differed from the plan, frames would get wrong codes.
     def _require_planned_lights(self) -> None:
         for step in self.steps:
             if step.illumination is None:
@@ -206,7 +206,7 @@ class Session:
         self.steps = self.journal.steps()
 
     def verify(self, observe: Callable[[int, int], None] = lambda done, total: None) -> tuple[str, ...]:
-        """Void accepted frames with missing or changed files, so that they are repeated; return the reasons."""
+        """Void accepted frames with missing or changed files, so that the frames are repeated; return the reasons."""
         damaged = damaged_files(self.folder, self.journal.accepted_files(), observe)
         for attempt, reason in damaged.items():
             self.journal.void([attempt], datetime.now(UTC), reason)
@@ -255,7 +255,7 @@ class Session:
         return {frame.step for frame in accepted} - {frame.step for frame in lost_files(self.folder, accepted)}
 
     def frames(self) -> list[FrameRecord]:
-        """Return every frame that was taken and judged, also refused ones, in the order of the plan."""
+        """Return every frame that was taken and judged, also rejected frames, in the order of the plan."""
         return self.journal.frames()
 
     def lost_files(self) -> list[AcceptedFile]:
@@ -327,8 +327,8 @@ def _own_copy(load: Callable[[Path], _Loaded], path: Path, content: str) -> _Loa
 
 
 def busy_message(folder: Path) -> str:
-    """Return the message for a session that another program takes."""
-    return f"another program is using the session {folder}; wait until it has ended, or follow it with acquire status"
+    """Return the message for a session that another program is taking."""
+    return f"another program is taking the session {folder}; wait for its end, or watch it with acquire status"
 
 
 def journal_path(folder: Path) -> Path:

@@ -213,13 +213,13 @@ def photograph(
 
 
 def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int) -> npt.NDArray[np.uint16]:
-    # Samples with a share of the black of the print subtracted, at least for the colours of the picture.
+    # Samples minus a share of the black of the print; samples of colours that the picture lacks may be unchanged.
     samples = mixture.samples(lut, seed, picture)
     if not share:
         return samples
     colours = colours_in(picture, lut.provenance.bits) if picture.size < 3 * WHOLE_LIGHT_PIXELS else None
-    veil = black_subtraction(lut, mixture, share)
-    return subtract_black(samples, veil, lut.provenance.white_level, colours)
+    black = black_subtraction(lut, mixture, share)
+    return subtract_black(samples, black, lut.provenance.white_level, colours)
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
@@ -448,14 +448,14 @@ def make_shard_on_worker(job: ShardJob, workplace: Workplace) -> ShardDone:
     def skip(name: str, reason: str, images: int) -> None:
         skipped.append((name, reason, images))
 
-    lut = _table_of(job.table, job.table_sha256)
+    lut = _planned_lut(job.table, job.table_sha256)
     with ThreadPoolExecutor(1) as pool:
         record = make_shard(job, lut, workplace, pool, 1, Callbacks(on_done=reused_counts.append, on_skip=skip))
     return ShardDone(len(record.images), tuple(skipped), sum(reused_counts))
 
 
 @lru_cache(maxsize=2)
-def _table_of(folder: Path, sha256: str) -> Lut:
+def _planned_lut(folder: Path, sha256: str) -> Lut:
     lut = open_lut(folder)
     if lut.sha256 != sha256:
         raise InputError(
@@ -484,14 +484,14 @@ def _read(job: ShardJob, lut: Lut, row: int, finished: Mapping[int, FinishedImag
     source_cuts = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
     if len(source_cuts) != job.options.crops:
         raise InputError(
-            f"{source.name} has {max(1, len(source_cuts))} crops, expected {job.options.crops}; use one number of "
-            "crops for the preparation and the data set, and omit random scenes"
+            f"{source.name} has {max(1, len(source_cuts))} crops, expected {job.options.crops}; use the "
+            "same number of crops for the preparation and the data set, and omit random scenes"
         )
     if job.options.rendering == "codes":
-        fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in source_cuts]
+        repaired = [replace_unfit_colours(cut.picture, lut.provenance) for cut in source_cuts]
     else:
-        # Colorimetric rendering uses only fit patches.
-        fit = [(cut.picture, 0) for cut in source_cuts]
+        # Rendering by colour does not use unfit patches.
+        repaired = [(cut.picture, 0) for cut in source_cuts]
     height, width = scene.picture.shape[:2]
     smallest_side = FILE_FORMATS[job.options.form].smallest_side
     if min(height, width) < smallest_side:
@@ -511,11 +511,11 @@ def _read(job: ShardJob, lut: Lut, row: int, finished: Mapping[int, FinishedImag
         profile=scene.profile or None,
         width=width,
         height=height,
-        replaced_pixels=sum(replaced for _, replaced in fit),
+        replaced_pixels=sum(replaced for _, replaced in repaired),
         split=split_of(job.options.split, job.seed, scene.sha256, source.name),
         note="; ".join(notes) or None,
     )
-    cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(source_cuts, fit, strict=True))
+    cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(source_cuts, repaired, strict=True))
     return _ReadSource(cuts, record)
 
 
@@ -788,7 +788,7 @@ class Workplace:
 
     def count_done(self) -> int:
         """Return the number of complete shards, from the heads of their records."""
-        return sum(ordered_map(self._is_headed_whole, self._recorded(), _READERS))
+        return sum(ordered_map(self._has_shard_head, self._recorded(), _READERS))
 
     def _recorded(self) -> list[int]:
         # Complete and incomplete shards with a record.
@@ -796,8 +796,8 @@ class Workplace:
         names = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
         return [int(name.removesuffix(ending)) for name in names if name.endswith(ending)]
 
-    def _is_headed_whole(self, shard: int) -> bool:
-        # A store has records of complete shards only. On a disk, `commit` replaces the pieces of images by the shard.
+    def _has_shard_head(self, shard: int) -> bool:
+        # An object store has records of complete shards only. On a disk, `commit` replaces the pieces of images.
         if not isinstance(self.notes, LocalStore):
             return True
         with self.notes.open(self._record_name(shard)) as stream:

@@ -91,7 +91,7 @@ class Setup:
 
 @dataclass
 class _Exchange:
-    """State of the pipes, until the host or a disconnection resets it."""
+    """State of the pipes; reset by the host and by a disconnection."""
 
     # Splits the bytes of the host into containers
     reader: ContainerReader = field(default_factory=lambda: ContainerReader(PACKET))
@@ -192,7 +192,7 @@ class PtpUsbDevice:
         return interface + bulk + endpoint_descriptor(INTERRUPT_IN, _INTERRUPT, INTERRUPT_PACKET, 6)
 
     def write(self, endpoint: int, data: bytes) -> None:
-        """Receive packets: full ones, of which the last may be short or, for b"", empty."""
+        """Receive packets: all are full, but the last may be short; b"" is an empty packet."""
         if BULK_OUT in self._halted:
             raise Stalled
         exchange = self._exchange
@@ -346,7 +346,7 @@ class SimulatedBus(IBackend):
 
     def __init__(self, *devices: PtpUsbDevice) -> None:
         self._attachments: list[Attachment] = []
-        self._addresses = 1
+        self._last_address = 1
         self._claims: dict[Attachment, Handle] = {}
         self._held: set[PtpUsbDevice] = set()
         self._locked: set[PtpUsbDevice] = set()
@@ -356,8 +356,8 @@ class SimulatedBus(IBackend):
 
     def plug(self, device: PtpUsbDevice, port: int = 1) -> None:
         """Plug a device in."""
-        self._addresses += 1
-        self._attachments.append(Attachment(device, port, self._addresses))
+        self._last_address += 1
+        self._attachments.append(Attachment(device, port, self._last_address))
 
     def unplug(self, device: PtpUsbDevice) -> None:
         """Unplug a device; do nothing if it is not plugged in."""
@@ -384,7 +384,7 @@ class SimulatedBus(IBackend):
         """Let a kernel driver use the interface."""
         self._kernel.add(device)
 
-    def kernel_driver_sits_on(self, device: PtpUsbDevice) -> bool:
+    def has_kernel_driver(self, device: PtpUsbDevice) -> bool:
         """Return whether a kernel driver uses the interface."""
         return device in self._kernel
 
@@ -557,7 +557,7 @@ def _error(number: int) -> usb.core.USBError:
 
 
 def _descriptor(descriptors: bytes, code: int, index: int = 0) -> SimpleNamespace:
-    """Return the fields of a descriptor of type `code`, the one with number `index`."""
+    """Return the fields of the descriptor number `index` of type `code`."""
     names = _FIELDS[code].split()
     layout = "<" + "".join("H" if name.startswith(("w", "id", "bcd")) else "B" for name in names)
     at = 0
@@ -569,7 +569,7 @@ def _descriptor(descriptors: bytes, code: int, index: int = 0) -> SimpleNamespac
                 return SimpleNamespace(bLength=descriptors[at], bDescriptorType=code, **values, extra_descriptors=[])
             index -= 1
         at += descriptors[at]
-    raise IndexError(f"descriptor {index} of type {code}")
+    raise IndexError(f"there is no descriptor {index} of type {code}")
 
 
 class MemoryTransport(UsbTransport):

@@ -1,20 +1,20 @@
-"""A printed chart under projector light in front of a camera: the displayed colour decides the photograph.
+"""A printed chart under projector light in front of a camera: frames are calculated from the displayed colour.
 
 Light is additive, and signals are linear in the brightness of the three primaries. So the room is rendered once under
 each primary (`_render`); a frame is their weighted sum, noise and black level. Rules:
 
 - The same print, camera, room, colour, settings and key give the same counts with any number of threads.
 - The noise of a frame depends only on the seed of the room and the key.
-- `project`, `white`, `reflected`, `seen` and `field` are the exact values without point spread and veiling glare, which
-an ideal LUT would contain; tests compare with them.
+- `project`, `white`, `reflected`, `camera_rgb_at` and `field` return exact values, without point spread and veiling
+  glare. An ideal LUT would contain these values; tests compare with them.
 
 Signal = ∫ primary × reflectance × sensitivity dλ. It is scaled so that bare paper under full white has
 `Room.white_level_share` of the range in its strongest channel at 0.5 s, f/8, ISO 100. Positions are millimetres on the
 print or half-size pixels; DN are counts above the black level.
 
-A `Room` describes light, lens and print. A `Situation` describes how one frame differs from the undisturbed room. Its
-positions are relative to the page: (0, 0) is the top left corner, (1, 1) the bottom right corner, other values lie off
-the page.
+A `Room` describes light, lens and print. A `Situation` describes the differences of one frame from the undisturbed
+room. Its positions are relative to the page: (0, 0) is the top left corner, (1, 1) the bottom right corner, other
+values lie off the page.
 """
 
 from __future__ import annotations
@@ -75,11 +75,11 @@ class Room:
     seed
         Seed of the shape of the paper, the response of photosites and the noise; 0 or more.
     fill
-        Extent of the print relative to the frame, along the tighter axis.
+        Extent of the print relative to the frame, along the axis with less margin.
     focal_diagonals
         Focal length relative to the diagonal of the frame; 1.3 is 35 mm on APS-C.
     tilt_deg, pan_deg, roll_deg
-        Rotation of the print against the camera.
+        Rotation of the print relative to the camera.
     k1, k2, p1, p2
         Distortion by Brown in normalised coordinates, as in OpenCV.
     waviness_mm
@@ -124,17 +124,17 @@ class Room:
         Rotations of the colour wheel per second, a third each red, green and blue; 0 for steady light. Exposures
         that are not a whole number of rotations get different amounts of the primaries.
     shutter_jitter_s
-        Standard deviation of the exposure time; has an effect with a colour wheel only.
+        Standard deviation of the exposure time, s; has an effect with a colour wheel only.
     stain_mm, stain_depth
-        Diameter of a stain on the print, 0 for none (a thumb: 25), and its absorption of blue light; of green 0.6
-        and of red 0.3 times this.
+        Diameter of a stain on the print, 0 for none (a thumb: 25), and its absorption of blue light. It absorbs 0.6
+        times this share of green and 0.3 times of red.
     fold_mm
         Height of a crease across the print, 0 for none.
     hot_per_million
         Photosites per million with high dark current, the same in all frames. 20 is plausible for an EOS 550D after
         ten years, 2 for an EOS 6D Mark II after three. These are several times the numbers in
-        `sim.world.sensors.HotPattern`, as new bodies also have some (chosen). With dark frames, `build-lut` lists
-        patches with 30 counts of excess or more as unfit; `sim table` does not.
+        `sim.world.sensors.HotPattern`, because new bodies also have hot photosites (chosen). With dark frames,
+        `build-lut` lists patches with 30 counts of excess or more as unfit; `sim table` does not.
     hot_dn_per_s
         Mean excess of such a photosite, DN per second at ISO 100; exponentially distributed. At 0.5 s, the hottest
         of a hundred is nearly saturated (chosen).
@@ -197,8 +197,8 @@ class Room:
         time = max(shutter_s + self.shutter_jitter_s * random.standard_normal(), 0)
         turns = np.array([start, start + time * self.wheel_hz])[:, None]
         segment = np.arange(3) / 3
-        shone = np.floor(turns) / 3 + np.clip(turns - np.floor(turns) - segment, 0, 1 / 3)
-        return 3 * (shone[1] - shone[0]) / (shutter_s * self.wheel_hz)
+        lit_turns = np.floor(turns) / 3 + np.clip(turns - np.floor(turns) - segment, 0, 1 / 3)
+        return 3 * (lit_turns[1] - lit_turns[0]) / (shutter_s * self.wheel_hz)
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -233,7 +233,7 @@ class Stain:
     diameter_mm: float
     transmittance: tuple[float, float, float]  # Reflected red, green and blue light relative to clean paper
 
-    def passed(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def transmittance_at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the transmittance (..., 3) at points (..., 2)."""
         distance = np.linalg.norm(points_mm - np.array(self.centre_mm), axis=-1) - self.diameter_mm / 2
         cover = 1 / (1 + np.exp(np.clip(4 * distance / RIM_MM, -40, 40)))
@@ -253,10 +253,10 @@ def wear(room: Room, page_mm: tuple[float, float], random: np.random.Generator) 
     return stain, Fold(crease, direction, room.fold_mm, _SLANT) if room.fold_mm else None
 
 
-def _relative_position(rectangle: Place, at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _relative_position(rectangle: Place, xy: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     # Position relative to the centre of a rectangle, across and down: ±1 at its sides.
     left, top, right, bottom = rectangle
-    return (2 * at[..., 0] - left - right) / (right - left), (2 * at[..., 1] - top - bottom) / (bottom - top)
+    return (2 * xy[..., 0] - left - right) / (right - left), (2 * xy[..., 1] - top - bottom) / (bottom - top)
 
 
 @dataclass(frozen=True)
@@ -267,10 +267,10 @@ class Patch:
     colour: Colour
     share: float = 1.0  # Share of the exposure time, 0 to 1
 
-    def cover(self, at: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def cover(self, position: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether points (..., 2), relative to the page, are in the rectangle: (...) bool."""
         left, top, right, bottom = self.place
-        x, y = at[..., 0], at[..., 1]
+        x, y = position[..., 0], position[..., 1]
         return (x >= left) & (x < right) & (y >= top) & (y < bottom)
 
 
@@ -279,11 +279,11 @@ class Blob:
     """A dark object between chart and camera: an ellipse with a soft edge that fills a rectangle."""
 
     place: Place
-    left: float = 0.08  # Relative light from there, 0 to 1
+    left: float = 0.08  # Light that remains behind the object, relative to the light without it, 0 to 1
 
-    def passed(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    def transmittance(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the relative light (...) at points (..., 2), relative to the page."""
-        across, down = _relative_position(self.place, at)
+        across, down = _relative_position(self.place, position)
         inside = np.clip((1 + _BLOB_RIM / 2 - np.hypot(across, down)) / _BLOB_RIM, 0, 1)
         return 1 - (1 - self.left) * inside * inside * (3 - 2 * inside)
 
@@ -292,12 +292,12 @@ class Blob:
 class Glare:
     """Specular reflection of the print: a broad, soft ellipse with the colour of projector and ambient light."""
 
-    place: Place  # The ellipse touches its sides at 1 / e² of its maximum
+    place: Place  # The light at the sides of the rectangle is 1 / e² of its maximum
     share: float = 0.03  # Relative to the light from bare paper
 
-    def added(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    def reflected_light(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reflected light (...) at points (..., 2), relative to the page, relative to bare paper."""
-        across, down = _relative_position(self.place, at)
+        across, down = _relative_position(self.place, position)
         return self.share * np.exp(-2 * (across**2 + down**2))
 
 
@@ -331,7 +331,7 @@ class Situation:
         """Position and sharpness of the chart; situations with equal values share one rendering."""
         return (*self.bump_px, *self.bump_mm, self.turn_deg, self.defocus_px)
 
-    def shown(
+    def picture_light(
         self,
         points_mm: NDArray[np.float64],
         page_mm: tuple[float, float],
@@ -349,26 +349,26 @@ class Situation:
             light = sampled(
                 self.picture, projected_mm(page_mm, self.picture.shape[1] / self.picture.shape[0]), points_mm
             )
-        at = points_mm / np.array(page_mm)
+        position = points_mm / np.array(page_mm)
         for patch in self.patches:
-            covered = patch.cover(at)
+            covered = patch.cover(position)
             light[covered] += patch.share * (decoded(patch.colour) - light[covered])
         return light
 
-    def passed(self, points_mm: NDArray[np.float64], page_mm: tuple[float, float]) -> NDArray[np.float64]:
+    def transmittance(self, points_mm: NDArray[np.float64], page_mm: tuple[float, float]) -> NDArray[np.float64]:
         """Return the relative light (...) float64 that passes objects in front of points (..., 2) mm."""
-        at = points_mm / np.array(page_mm)
+        position = points_mm / np.array(page_mm)
         transmitted = np.ones(points_mm.shape[:-1])
         for blob in self.blobs:
-            transmitted *= blob.passed(at)
+            transmitted *= blob.transmittance(position)
         return transmitted
 
-    def mirrored(self, points_mm: NDArray[np.float64], page_mm: tuple[float, float]) -> NDArray[np.float64]:
+    def reflected_light(self, points_mm: NDArray[np.float64], page_mm: tuple[float, float]) -> NDArray[np.float64]:
         """Return the specularly reflected light (...) float64 at points (..., 2) mm, relative to bare paper."""
-        at = points_mm / np.array(page_mm)
+        position = points_mm / np.array(page_mm)
         added = np.zeros(points_mm.shape[:-1])
         for glare in self.glares:
-            added += glare.added(at)
+            added += glare.reflected_light(position)
         return added
 
 
@@ -401,20 +401,20 @@ def sampled(picture: NDArray[np.float32], place_mm: Place, points_mm: NDArray[np
 
 
 def displaced(
-    points_mm: NDArray[np.float64], middle_mm: ArrayLike, by_mm: ArrayLike, turn_deg: float
+    points_mm: NDArray[np.float64], middle_mm: ArrayLike, shift_mm: ArrayLike, turn_deg: float
 ) -> NDArray[np.float64]:
-    """Return the positions of points of the chart after a rotation about `middle_mm` and a shift `by_mm`.
+    """Return the positions of points of the chart after a rotation about `middle_mm` and a shift `shift_mm`.
 
     `points_mm`: (..., 2) float64. Returns (..., 2) float64, mm, in the coordinates of the chart before.
     """
-    return (points_mm - np.asarray(middle_mm)) @ _rotation(turn_deg).T + np.asarray(middle_mm) + np.asarray(by_mm)
+    return (points_mm - np.asarray(middle_mm)) @ _rotation(turn_deg).T + np.asarray(middle_mm) + np.asarray(shift_mm)
 
 
 def undisplaced(
-    points_mm: NDArray[np.float64], middle_mm: ArrayLike, by_mm: ArrayLike, turn_deg: float
+    points_mm: NDArray[np.float64], middle_mm: ArrayLike, shift_mm: ArrayLike, turn_deg: float
 ) -> NDArray[np.float64]:
     """Return the points (..., 2) float64, mm, of the chart at positions (..., 2): inverse of `displaced`."""
-    return (points_mm - np.asarray(by_mm) - np.asarray(middle_mm)) @ _rotation(turn_deg) + np.asarray(middle_mm)
+    return (points_mm - np.asarray(shift_mm) - np.asarray(middle_mm)) @ _rotation(turn_deg) + np.asarray(middle_mm)
 
 
 def _rotation(turn_deg: float) -> NDArray[np.float64]:
@@ -485,8 +485,8 @@ class World:
             Differences from the undisturbed room.
         """
         body, room = self.body, self.room
-        of_lamp = lamp * room.wheel_light(settings.shutter_s, self._random(4, *key)) * np.array(situation.lamp)
-        light, weights = self._lighting(colour, settings, of_lamp, situation)
+        lamp_light = lamp * room.wheel_light(settings.shutter_s, self._random(4, *key)) * np.array(situation.lamp)
+        light, weights = self._lighting(colour, settings, lamp_light, situation)
         visible = body.visible
         black = body.black + situation.black_dn
         noise_dn, gain_e = body.noise_dn(settings.iso), body.gain_e(settings.iso)
@@ -536,8 +536,9 @@ class World:
 
         def block(first: int, last: int) -> None:
             points = self._points(nodes, first, last)
-            weights = self._collected(situation.shown(points, page, plain, self.decoded), settings, lamp, ambient)
-            weights *= situation.passed(points, page)[..., None]
+            picture_light = situation.picture_light(points, page, plain, self.decoded)
+            weights = self._collected(picture_light, settings, lamp, ambient)
+            weights *= situation.transmittance(points, page)[..., None]
             patch_light = self.lens.unveiled(light[:, first:last], veil, first)
             if situation.glares:
                 patch_light = patch_light + self._mirrored(points, situation, first)
@@ -551,7 +552,7 @@ class World:
         """Return the specular reflection (3, rows, columns) float32 on rows from `first`, in the units of `_render`."""
         row, column = np.mgrid[first : first + len(points), : points.shape[1]]
         paper = self._signals(self._reflectance([PAPER]))[0][self._channels()[row % 2, column % 2]]
-        added = situation.mirrored(points, self.sheet.page_mm)[..., None] * self.field(points) * paper
+        added = situation.reflected_light(points, self.sheet.page_mm)[..., None] * self.field(points) * paper
         return added.transpose(2, 0, 1).astype(np.float32)
 
     def _channels(self) -> NDArray[np.int64]:
@@ -594,7 +595,7 @@ class World:
         """
         return self._signals(self._reflectance(rgb)) @ self.drive(colour, settings, lamp)
 
-    def seen(
+    def camera_rgb_at(
         self,
         rgb: ArrayLike,
         points_mm: NDArray[np.float64],
@@ -608,14 +609,14 @@ class World:
         clipping.
         """
         light = self.field(points_mm) * self.drive(colour, settings, lamp)
-        return np.einsum("ncp,np->nc", self._signals(self._reflectance(rgb)), light) * self.worn(points_mm)
+        return np.einsum("ncp,np->nc", self._signals(self._reflectance(rgb)), light) * self.worn_light(points_mm)
 
-    def of_primaries(self, rgb: ArrayLike, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def signals_of_primaries(self, rgb: ArrayLike, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signal of printed codes at points of a clean flat print under each primary at full brightness.
 
         `rgb`: (N, 3) codes 0 to 255. `points_mm`: (N, 2) float64. Returns (N, 3, 3) float64 [point, channel, primary],
-        DN above black at the reference exposure, without blur. Its product with `drive` is `seen` without stain and
-        fold.
+        DN above black at the reference exposure, without blur. Its product with `drive` is `camera_rgb_at`
+        without stain and fold.
         """
         return self._signals(self._reflectance(rgb)) * self.field(points_mm)[:, None]
 
@@ -648,12 +649,12 @@ class World:
         opening = 1.0 if settings.aperture is None else (REFERENCE_APERTURE / settings.aperture) ** 2
         return relative_light * time * opening * (settings.iso / reference.iso)
 
-    def worn(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def worn_light(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the relative light (..., 3) float64 in R, G, B that stain and fold leave at points (..., 2) mm."""
         points = np.asarray(points_mm, dtype=np.float64)
         transmitted = np.ones((*points.shape[:-1], 3))
         if self.stain is not None:
-            transmitted *= self.stain.passed(points)
+            transmitted *= self.stain.transmittance_at(points)
         if self.fold is not None:
             transmitted *= self.fold.shade(points)[..., None]
         return transmitted
@@ -663,8 +664,8 @@ class World:
 
         `points_mm`: (..., 2) float64. Returns (..., 3) float64 for each primary. The lens is 1 on its axis and green is
         1 at its brightest point. Red and blue are balanced to the same mean over the sheet, so `white` has the
-        chromaticity of the mean light. A camera channel has the mean of the primaries, weighted by its signal from
-        each.
+        chromaticity of the mean light. The field of a camera channel is the mean of the fields of the primaries,
+        weighted by the signal of the channel under each primary.
         """
         points = np.asarray(points_mm, dtype=np.float64)
         photosites = 2 * self.project(points) + 0.5
@@ -769,7 +770,7 @@ class World:
         row, column = np.mgrid[first:last, : self.body.visible.width]
         points = self._points(nodes, first, last)
         channel = channels[row % 2, column % 2]
-        return np.take_along_axis(self.worn(points), channel[..., None], axis=-1)[..., 0].astype(np.float32)
+        return np.take_along_axis(self.worn_light(points), channel[..., None], axis=-1)[..., 0].astype(np.float32)
 
     def _nodes(self, situation: Situation, channel: str = "G") -> NDArray[np.float64]:
         # Points of the print (ny, nx, 2), mm, at every 16th photosite, with one more node on each side.

@@ -15,7 +15,7 @@ import tomli_w
 from calibration.citation import (
     NOT_RECORDED,
     OriginRecord,
-    StatedOrigin,
+    SessionOrigin,
     bibtex,
     origin_lines,
     origin_record,
@@ -44,9 +44,9 @@ RECORDS = [
 DEVICES = {"camera": "Canon Canon EOS 550D, serial number 77", "projector": "Acme 3000", "software": "croplab 0.1.0"}
 
 
-def stated(citation: CitationSettings | None = None, rig: str | None = "lab") -> StatedOrigin:
+def stated(citation: CitationSettings | None = None, rig: str | None = "lab") -> SessionOrigin:
     known = citation or CitationSettings()
-    return StatedOrigin(known, rig, CameraSettings(iso=200), DEVICES)  # pyrefly: ignore[bad-argument-type]
+    return SessionOrigin(known, rig, CameraSettings(iso=200), DEVICES)  # pyrefly: ignore[bad-argument-type]
 
 
 def test_raw_files_precede_settings_and_journal() -> None:
@@ -78,7 +78,7 @@ def test_lens_without_aperture_records_none() -> None:
 
 
 def test_settings_without_camera_give_no_exposure() -> None:
-    known = StatedOrigin(CitationSettings(), "imported", None, {})
+    known = SessionOrigin(CitationSettings(), "imported", None, {})
     result = origin_record(known, RECORDS, [FrameOrigin()])
     assert (result.iso, result.shutter_s, result.exposure_by, result.projector) == (None, None, None, None)
     assert dict(origin_lines(result))["Exposure"] == NOT_RECORDED
@@ -126,10 +126,10 @@ def test_entry_lists_missing_fields() -> None:
     assert "author = {Knuth, Donald and {A \\& B Institute}}" in entry
     assert "@misc{knuth-canoneos550d-2026-abababab," in entry
     assert "year = {2026}" in entry
-    assert entry.startswith("% not recorded by the LUT: url, licence\n")
+    assert entry.startswith("% not recorded in the LUT: url, licence\n")
     older = bibtex("Canon EOS 550D", 707, "croplab 0.1.0", "ab" * 32, None)
     assert "author =" not in older
-    assert "% not recorded by the LUT: author, year, url, licence" in older
+    assert "% not recorded in the LUT: author, year, url, licence" in older
 
 
 def test_escapes_tex_commands() -> None:

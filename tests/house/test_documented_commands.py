@@ -118,7 +118,9 @@ def test_tutorial_states_number_of_frames(tmp_path: Path) -> None:
     steps = planned_steps(load_lab(tmp_path / "LAB.toml"), lights)
     kinds = Counter(step.kind for step in steps)
     assert f"these are {len(lights)}." in text
-    counts = re.search(r"There are (\d+) frames: a white and a dark frame, (\d+) frames from", " ".join(text.split()))
+    counts = re.search(
+        r"There are (\d+) frames: a white and a dark frame, (\d+) response frames", " ".join(text.split())
+    )
     assert counts is not None
     assert (int(counts[1]), int(counts[2])) == (len(steps), kinds["response"])
     assert (kinds["white"], kinds["dark"]) == (2, 2)

@@ -31,10 +31,10 @@ def world() -> World:
 
 def seen(world: World, colour: Colour) -> tuple[npt.NDArray[np.float64], ...]:
     """Return cells with the noise of 25 samples, references, and the true field at the cells, mean 1."""
-    cells = world.seen(CHART.rgb, CHART.centres_mm, colour, SETTINGS)
+    cells = world.camera_rgb_at(CHART.rgb, CHART.centres_mm, colour, SETTINGS)
     cells += np.random.default_rng(1).normal(size=cells.shape) * np.sqrt(np.maximum(cells, 0) / 50 + 2)
-    whites = world.seen(np.full((len(WHITES_MM), 3), 255), WHITES_MM, colour, SETTINGS)
-    bare = world.seen(np.full((len(cells), 3), 255), CHART.centres_mm, colour, SETTINGS)
+    whites = world.camera_rgb_at(np.full((len(WHITES_MM), 3), 255), WHITES_MM, colour, SETTINGS)
+    bare = world.camera_rgb_at(np.full((len(cells), 3), 255), CHART.centres_mm, colour, SETTINGS)
     return cells, whites, bare / bare.mean(axis=0)
 
 

@@ -826,8 +826,10 @@ def test_uneven_primaries_are_no_dirt_on_the_print(tmp_path: Path) -> None:
     with taken(lab, tmp_path / "session") as session:
         stains = build(session, tmp_path / "lut").figures.cells.stains
     codes, places = lab.chart.rgb[lab.chart.cell_of_colour], stains.places_mm
-    own = lab.world.seen(codes, places, WHITE, SETTINGS) / lab.world.reflected(codes, WHITE, SETTINGS)
-    of_paper = lab.world.seen([PAPER] * len(places), places, WHITE, SETTINGS) / lab.world.white(WHITE, SETTINGS)
+    own = lab.world.camera_rgb_at(codes, places, WHITE, SETTINGS) / lab.world.reflected(codes, WHITE, SETTINGS)
+    of_paper = lab.world.camera_rgb_at([PAPER] * len(places), places, WHITE, SETTINGS) / lab.world.white(
+        WHITE, SETTINGS
+    )
     expected = np.log(own / of_paper)
     assert expected.std(axis=0).min() > 0.003
     for channel in range(3):

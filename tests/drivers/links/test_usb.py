@@ -99,9 +99,9 @@ def test_detaches_and_restores_the_kernel_driver() -> None:
     bus = bus_with(device)
     bus.bind_kernel_driver(device)
     pipes = open_usb(backend=bus)
-    assert not bus.kernel_driver_sits_on(device)
+    assert not bus.has_kernel_driver(device)
     pipes.close()
-    assert bus.kernel_driver_sits_on(device)
+    assert bus.has_kernel_driver(device)
     assert not bus.is_claimed(device)
 
 

@@ -131,7 +131,7 @@ def test_requires_choice_of_table(copy: Path) -> None:
         open_scenes(copy)
     data = open_scenes(copy / "other.csv")
     assert [scene.name for scene in data.scenes] == ["c"]
-    assert data.treatment["images"].startswith("1; 1 beside them without a row in other.csv excluded")
+    assert data.treatment["images"].startswith("1; 1 next to them without a row in other.csv excluded")
 
 
 def test_refuses_eight_bit_image_and_mask_of_wrong_size(copy: Path) -> None:
@@ -160,7 +160,7 @@ def test_uses_mask_beside_image_without_column(copy: Path) -> None:
     assert without is None
     assert with_mask.sum() == 6
     assert with_mask[5:, :2].all()
-    assert data.treatment["mask"] == "NAME_mask beside the image: pixels that are not 0; 1 of 2 images have one"
+    assert data.treatment["mask"] == "NAME_mask next to the image: pixels that are not 0; 1 of 2 images have one"
 
 
 def test_prefers_mask_in_column_to_mask_beside_image(copy: Path) -> None:
@@ -174,7 +174,7 @@ def test_prefers_mask_in_column_to_mask_beside_image(copy: Path) -> None:
     data = open_scenes(copy)
     sums = [0 if mask is None else mask.sum() for _, mask in (scene.read() for scene in data.scenes)]
     assert sums == [80, 6]
-    assert data.treatment["mask"].startswith("column mask of gt.csv or NAME_mask beside the image: ")
+    assert data.treatment["mask"].startswith("column mask of gt.csv or NAME_mask next to the image: ")
 
 
 def test_refuses_invalid_mask(copy: Path) -> None:
@@ -196,7 +196,7 @@ def test_images_without_row_require_partial(copy: Path) -> None:
         open_scenes(copy)
     data = open_scenes(copy, options=DataOptions(partial=True))
     assert [scene.name for scene in data.scenes] == ["a.png", "more/b", "c"]
-    assert data.treatment["images"] == "3; 2 beside them without a row in gt.csv excluded"
+    assert data.treatment["images"] == "3; 2 next to them without a row in gt.csv excluded"
 
 
 def test_counts_images_in_unlisted_folders(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -265,13 +265,15 @@ def test_stain_and_fold_have_the_given_depth() -> None:
     for channel, offset in enumerate((-0.25, 0, 0.25)):
         positions = worn.view.locate((np.stack([x, y], axis=-1) + offset).astype(np.float64))
         white = np.full((positions[..., 0].size, 3), 255)
-        true = worn.seen(white, positions.reshape(-1, 2), WHITE, REFERENCE_EXPOSURE)[:, channel].reshape(x.shape)
+        true = worn.camera_rgb_at(white, positions.reshape(-1, 2), WHITE, REFERENCE_EXPOSURE)[:, channel].reshape(
+            x.shape
+        )
         inside = ((positions > 2) & (positions < np.array(BARE.page_mm) - 2)).all(axis=-1)
         # A stain's rim is blurred by the lens, paper is not.
         rim = np.abs(np.linalg.norm(positions - worn.stain.centre_mm, axis=-1) - 12.5) < 3
         np.testing.assert_allclose(planes[..., channel][inside & ~rim], true[inside & ~rim], rtol=2e-3)
     middle = np.array(worn.stain.centre_mm)
-    np.testing.assert_allclose(worn.stain.passed(middle), [0.88, 0.76, 0.6], atol=1e-6)
+    np.testing.assert_allclose(worn.stain.transmittance_at(middle), [0.88, 0.76, 0.6], atol=1e-6)
     away = np.array(worn.fold.at_mm) + np.array([[-6.0, 0], [6, 0], [-80, 0]])
     left, right, flat = worn.fold.shade(away).tolist()
     assert left - 1 == pytest.approx(1 - right, rel=0.02)
@@ -289,10 +291,7 @@ def test_stain_and_fold_have_the_given_depth() -> None:
         (lambda: Room(stain_mm=-1.0), "stain_mm is -1.0"),
         (lambda: Room(stain_depth=1.0), "stain_depth is 1.0"),
         (lambda: Print((10, 10), np.zeros((2, 4)), np.zeros((1, 3), dtype=np.uint8)), r"\(1, 3\)"),
-        (
-            lambda: Print((10, 10), np.array([[5.0, 5, 4, 6]]), np.zeros((1, 3), dtype=np.uint8)),
-            "expected \\(left, top",
-        ),
+        (lambda: Print((10, 10), np.array([[5.0, 5, 4, 6]]), np.zeros((1, 3), dtype=np.uint8)), "right < left"),
         (lambda: replace(BODIES["Test"], pattern="RGBB"), "pattern is 'RGBB'"),
         (lambda: replace(BODIES["Test"], sensor=(100, 100)), "outside the sensor"),
     ],
