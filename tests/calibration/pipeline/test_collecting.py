@@ -114,7 +114,7 @@ def test_detects_stains_in_corrected_mean() -> None:
     # Of eight colours nothing is known but what was judged.
     accumulator.baseline.chart.bits, accumulator.baseline.points = 1, SimpleNamespace(cells_mm=np.zeros((CELLS, 2)))
     result = accumulator.stains(field)
-    assert not result.known
+    assert not result.is_known
     np.testing.assert_allclose(result.level, 500 / field)
 
 
