@@ -89,7 +89,9 @@ def table_texts(attributes: dict[str, Any], url: str) -> dict[str, str]:
     texts: dict[str, str] = {}
     for name, text in cast("dict[str, Any]", files).items():
         if name not in TEXTS or not isinstance(text, str) or len(text) > MOST_BYTES[name]:
-            raise FormatError(f"{url} holds {name!r}, which is no file of a LUT or too large; publish it again")
+            raise FormatError(
+                f"{url} contains {name!r}, which is not a file of a LUT or too large; publish the LUT again"
+            )
         texts[name] = text
     missing = {PROVENANCE, ILLUMINATIONS, SUMS} - texts.keys()
     if missing:

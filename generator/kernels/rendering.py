@@ -260,7 +260,7 @@ def valid_light(lut: Lut, light: int) -> int:
         number = operator.index(light)
     except TypeError as error:
         raise InputError(
-            f"{light!r} is no illuminant; give its index, a whole number ≥ 0, or a text such as 5600K"
+            f"{light!r} is not an illuminant; give its index, a whole number ≥ 0, or a text such as 5600K"
         ) from error
     if not 0 <= number < len(lut.samples):
         raise InputError(f"there is no illuminant {number}; the LUT {lut.folder} has 0 to {len(lut.samples) - 1}")

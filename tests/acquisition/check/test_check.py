@@ -123,7 +123,7 @@ def test_proposes_shorter_time_if_white_clips(check: Check) -> None:
     report = check(2, white_level_share=4.0)
     assert {finding.name for finding in report.with_grade("fault")} == {"brightest_share", "clipping"}
     assert finding_of(report, "brightest_share").details["proposed_shutter_s"] == pytest.approx(0.1)
-    assert "exposed 0.1 s" in report.devices[-1]
+    assert "exposed for 0.1 s" in report.devices[-1]
     # The figures do not hold for the shutter time of the settings.
     assert report.forecast is None
     assert "no forecast" in report.lines()[-2]

@@ -189,7 +189,7 @@ def test_compares_expected_hash(lut: Lut, tmp_path: Path, capsys: pytest.Capture
     assert main(["fetch", url, str(tmp_path / "unknown")]) == 0
     printed = capsys.readouterr().out
     assert f"Compare its hash, {lut.sha256}, with the expected hash" in printed
-    assert "every file is as its own hashes say" in printed
+    assert "all files match the hashes in the LUT" in printed
     edit(tmp_path / "published", change_all_hashes)
     # All files are consistent: only a hash from elsewhere detects the change.
     assert main(["fetch", url, str(tmp_path / "other")]) == 0

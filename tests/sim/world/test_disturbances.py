@@ -220,7 +220,7 @@ def test_events_have_the_documented_defaults() -> None:
             default: Any = event.__dataclass_fields__[key].default
             assert json.loads(json.dumps(default)) == json.loads(value), (event.what, key)
             compared += 1
-    assert compared == 17
+    assert compared == 27
 
 
 @pytest.mark.parametrize(
