@@ -85,7 +85,7 @@ def test_reports_expected_arguments() -> None:
         (render, ("lut", picture, 3), {}, "the text 'lut', expected a Lut"),
         (render, (lut, "cat.png", 3), {}, r"the text 'cat.png', expected an array uint8"),
         (render, (lut, picture / 255, 3), {}, "float64"),
-        (render, (lut, picture, 2.5), {}, "2.5 is no illuminant"),
+        (render, (lut, picture, 2.5), {}, "2.5 is not an illuminant"),
         (Crops, ("lut", gallery), {}, "open_lut"),
         (Crops, (lut, [picture], (8, 8)), {}, "gallery_of"),
         (Crops, (lut, gallery, 8), {}, "height and width"),

@@ -199,7 +199,7 @@ def test_compares_expected_hash(lut: Lut, tmp_path: Path, capsys: pytest.Capture
     assert "is another LUT" in capsys.readouterr().err
     assert not (tmp_path / "refused").exists()
     assert main(["fetch", url, str(tmp_path / "refused"), "--expect", lut.sha256[:12]]) == 2
-    assert "is no hash of a LUT" in capsys.readouterr().err
+    assert "is not the hash of a LUT" in capsys.readouterr().err
 
 
 Change = Callable[[dict[str, Any]], object]
