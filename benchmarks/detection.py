@@ -4,7 +4,7 @@ It prints four Markdown tables:
 
 - detection: each disturbance and size is tried in several simulated rooms and under several illuminants (also deep
   blue, white and dark frames). The table counts detections at the same frame, at the next one or never, and the causes;
-- false alarms: rejected frames in undisturbed sessions, one room each. Some rooms have a drifting lamp and a warming
+- false alarms: refused frames in undisturbed sessions, one room each. Some rooms have a drifting lamp and a warming
   sensor, or a projector that is not additive, depends on the previous image or flickers;
 - neighbours: illuminants of the plan (707) that could replace each other undetected;
 - whole runs with intermittent causes (`benchmarks.troubled_runs`).
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for number, lab in enumerate(labs):
             for step, judgement in lab.session(options.lights, 12, number):
                 if not judgement.accepted:
-                    print(f"room {number}: {step.stem} rejected: {judgement.reason}", file=sys.stderr)
+                    print(f"room {number}: {step.stem} refused: {judgement.reason}", file=sys.stderr)
         print("| disturbance | size | tried | same frame | next frame | missed | wrong cause | causes |")
         print("|---|---|---|---|---|---|---|---|")
         for (label, size), tally in detection(labs, options.tries).items():
@@ -108,9 +108,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 end="",
             )
             print(f" ({', '.join(f'{name} {count}' for name, count in alarms.items())})" if alarms else "")
-            print("\n| world | frames | rejected | causes | chromaticity limit at the end |\n|---|---|---|---|---|")
-            for label, count, rejected, counts_by_cause, limit in unusual_worlds(folder, options.lights):
-                print(f"| {label} | {count} | {rejected} | {dict(counts_by_cause) or ''} | {limit} |")
+            print("\n| world | frames | refused | causes | chromaticity limit at the end |\n|---|---|---|---|---|")
+            for label, count, refused, counts_by_cause, limit in unusual_worlds(folder, options.lights):
+                print(f"| {label} | {count} | {refused} | {dict(counts_by_cause) or ''} | {limit} |")
     as_documented = True
     if not options.frames_only:
         print("\nIntermittent causes in whole runs:\n")

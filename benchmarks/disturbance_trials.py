@@ -183,7 +183,7 @@ def detection(labs: Sequence[Lab], tries: int) -> dict[tuple[str, str], Tally]:
                 accepted = fork.show(counts, SessionStep(8999, "light", 0, previous))
                 fork.previous = previous
                 if not accepted.accepted:
-                    tally.causes["(previous frame rejected)"] += 1
+                    tally.causes["(previous frame refused)"] += 1
                     continue
                 if trial.special == "file":
                     judgement = fork.show(counts, step)

@@ -46,7 +46,7 @@ def with_memory(room: Room, share: float) -> Projector:
 
 
 def false_alarms(folder: Path, sessions: int, lights: int, drifts: int) -> tuple[int, int, Counter[str]]:
-    """Count undisturbed sessions with a rejected frame, all frames, and causes, in rooms of many seeds."""
+    """Count undisturbed sessions with a refused frame, all frames, and causes, in rooms of many seeds."""
     rejected_sessions, frames, causes = 0, 0, Counter[str]()
     for seed in range(sessions):
         room, lab_options = rooms(seed)
@@ -55,10 +55,10 @@ def false_alarms(folder: Path, sessions: int, lights: int, drifts: int) -> tuple
             lab_options["events"] = drifting(light_count + 40)
         lab = lab_of(folder, room, chart=_chart_of(seed), **lab_options)
         judgements = lab.session(light_count, 12, seed)
-        rejected = [(step, judgement) for step, judgement in judgements if not judgement.accepted]
+        refused = [(step, judgement) for step, judgement in judgements if not judgement.accepted]
         frames += len(judgements)
-        rejected_sessions += bool(rejected)
-        for step, judgement in rejected:
+        rejected_sessions += bool(refused)
+        for step, judgement in refused:
             causes[cause(judgement)] += 1
             print(f"session {seed}: {step.stem} {step.colour}: {judgement.reason}", file=sys.stderr)
     return rejected_sessions, frames, causes

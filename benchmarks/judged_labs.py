@@ -91,7 +91,7 @@ class Lab:
         return judgement
 
     def session(self, count: int, reference_every: int, seed: int) -> list[tuple[SessionStep, Judgement]]:
-        """Take a session with `count` illuminants of the plan, each frame once, even if it is rejected."""
+        """Take a session with `count` illuminants of the plan, each frame once, even if it is refused."""
         order: list[int] = np.random.default_rng(seed).permutation(len(self.plan)).tolist()
         lights = [replace(self.plan[k], index=n) for n, k in enumerate(order[:count])]
         steps = plan_steps(lights, reference_every, seed=seed, response=RESPONSE)
@@ -137,5 +137,5 @@ def rooms(seed: int) -> tuple[Room, dict[str, Any]]:
 
 
 def cause(judgement: Judgement) -> str:
-    """Return the name of the check that rejected a frame; empty if it was accepted."""
+    """Return the name of the check that refused a frame; empty if it was accepted."""
     return next((check.name for check in judgement.checks if check.reason), "")

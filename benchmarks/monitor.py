@@ -29,7 +29,7 @@ from experiment.lights import plan_illuminants, save_illuminants
 from experiment.session.journal import JOURNAL_FILE, Journal, ReceivedFile
 from experiment.session.records import RESPONSE, Check, Judgement, SessionStep, plan_steps
 
-# Attempts of a night: 707 illuminants, references, response frames, and some rejected frames.
+# Attempts of a night: 707 illuminants, references, response frames, and some refused frames.
 ATTEMPTS = 800
 
 # Checks per frame.

@@ -14,7 +14,7 @@ The unavoidable time of a frame is release, exposure and readout, plus the longe
 does not expose while it sends a file, and the illuminant may change when it has announced the frame.
 
 Simplifications: two files (a dark and a lit one, with the slices of a 550D, without previews) are prepared. Cable and
-camera use no processor time, latencies are constant, and no frame is rejected. The judge measures and compares each
+camera use no processor time, latencies are constant, and no frame is refused. The judge measures and compares each
 frame as in a session without primaries; its message that the illuminant does not change is ignored. In simulated time,
 work of this machine takes no time; the figures in real time include it.
 """

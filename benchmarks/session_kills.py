@@ -7,7 +7,7 @@ session is completed. Its frames, the accepted rows of its journal and `frames.c
 run: bytes, hashes, times. A LUT depends on these alone. Ctrl-C ends the program with the figures so far. A kill takes
 about 50 ms of one core.
 
-`python -m benchmarks.session_kills troubled [KILLS [SEED]]` kills runs with continuous faults: rejected and repeated
+`python -m benchmarks.session_kills troubled [KILLS [SEED]]` kills runs with continuous faults: refused and repeated
 frames, a failing camera, power cuts, a lamp that is lit again, a deleted or cut journal that is rebuilt. Kills are
 counted by the phase of the run. Times differ with each kill. Required: no counted frame is lost, each step has one
 frame of its own illuminant in the end, and no exposure counts twice. `… programs [KILLS [SEED]]` kills `acquire run`
@@ -277,7 +277,7 @@ class TroubledLab(SmallLab):
 
 
 class TroubledJudge(LightJudge):
-    """A judge that rejects the first frame of every third colour, and the first two of another with a lasting cause."""
+    """A judge that refuses the first frame of every third colour, and the first two of another with a lasting cause."""
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
         """Decide by the colour and the number of its exposures."""

@@ -173,7 +173,7 @@ def record_session(
 ) -> Session:
     """Record a session with a frame for every step of its plan, and open it.
 
-    `reason` returns why a frame is rejected, or None. `steps` replaces the usual plan.
+    `reason` returns why a frame is refused, or None. `steps` replaces the usual plan.
     """
     with Session.create(folder, settings, chart, lights) as session:
         for step in plan_steps(lights, every) if steps is None else steps:

@@ -399,7 +399,7 @@ class Outcome:
 
 
 HEAD = (
-    "| cause | run | accepted | rejected | rejected MB | paused | resumed | notices per cause and hour | minutes "
+    "| cause | run | accepted | refused | refused MB | paused | resumed | notices per cause and hour | minutes "
     "| as documented |"
     "\n|---|---|---|---|---|---|---|---|---|---|"
 )

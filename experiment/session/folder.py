@@ -255,7 +255,7 @@ class Session:
         return {frame.step for frame in accepted} - {frame.step for frame in lost_files(self.folder, accepted)}
 
     def frames(self) -> list[FrameRecord]:
-        """Return every frame that was taken and judged, also rejected frames, in the order of the plan."""
+        """Return every frame that was taken and judged, also refused frames, in the order of the plan."""
         return self.journal.frames()
 
     def lost_files(self) -> list[AcceptedFile]:
