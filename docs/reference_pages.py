@@ -28,7 +28,7 @@ _FIGURES_HEAD = """# Figures
 `build-lut` judges a LUT by these figures. A figure within the *accepted* limit causes no remark, beyond it a remark,
 and beyond the *refused* limit no LUT is made. `acquire check` judges most figures before a session, from trial frames.
 `build-lut check` judges those that one frame determines. Figures that more frames can only make worse are judged if
-they are already *beyond* the limit. The names are those of `report.json`.
+they are already *beyond* the limit. `report.json` uses the same names.
 
 *Written by `python -m docs.reference_pages` from `calibration/figures`.*
 """
@@ -37,14 +37,14 @@ _CAUSES_HEAD = """# Causes
 
 Each remark and refusal of `build-lut` names the frame, the position on the print, the probable cause and the remedy.
 The cause follows from the table below. Its evidence is in `report.json` under `causes`, and in the report next to each
-cause. The first rule whose intervals all match decides; values that were not measured match no interval. If no rule
+cause. The first rule with matching intervals decides; values that were not measured match no interval. If no rule
 applies, the cause is reported as unknown, and the position is circled in the report.
 
 *Written by `python -m docs.reference_pages` from `calibration/causes`.*
 """
 
 _AGAIN = {
-    "frames": "the frames named: `acquire run LAB.toml SESSION --retake 12,40`, or `--retake bad` as the report says",
+    "frames": "the named frames: `acquire run LAB.toml SESSION --retake 12,40`, or `--retake bad`",
     "session": "the session",
     "nothing": "nothing",
 }
