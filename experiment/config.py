@@ -1,6 +1,6 @@
 """Settings of `LAB.toml`: typed, frozen and checked; an unknown key is an error that names the closest known key.
 
-Nothing is opened here: paths are resolved against the folder of the file, and values are checked.
+No device is opened here. Paths are resolved against the folder of the file, and values are checked.
 """
 
 from __future__ import annotations
@@ -39,18 +39,17 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 # Keys whose values must not appear in messages or in `session.toml`, because sessions are copied and published.
 _SECRETS = ("sequence.notify", "notify.alive", "lab.projector.password")
 
-# Rig of a session of which no more frames can be taken. Nobody writes it into LAB.toml.
+# Rig of a session with imported frames, in which no more frames can be taken. Messages do not offer it for LAB.toml.
 NOT_TO_CHOOSE: Final = "imported"
 
-# Bytes that are read of a file with a secret: passwords and addresses are shorter, and a longer file was named by
-# mistake.
-_SECRET_BYTES = 4096
+# Characters read from a file with a secret: passwords and addresses are shorter. A longer file was given by mistake.
+_SECRET_CHARACTERS = 4096
 
 
 # A target of notices is a URL with a host, or a command line. No message contains it, because it may hold a secret.
 def _check_target(target: str) -> str:
     if not is_webhook(target):
-        # Raises ValueError for an open quotation.
+        # Raises ValueError for an unclosed quotation mark.
         shlex.split(target)
         return target
     url = urlsplit(target)
@@ -345,7 +344,7 @@ class LabSettings(Settings):
     def read_from(self, file: str) -> LabSettings:
         """Return a copy of the settings with the name of their file."""
         copy = self.model_copy()
-        copy._file = file  # noqa: SLF001 - its own class
+        copy._file = file  # noqa: SLF001 - same class
         return copy
 
     def to_toml(self) -> str:
@@ -353,7 +352,7 @@ class LabSettings(Settings):
         values = self.model_dump(mode="json", exclude_none=True)
         values["sequence"]["notify"] = target_label(self.sequence.notify)
         values["notify"]["alive"] = target_label(self.notify.alive)
-        # A password is needed only for taking frames, that is with LAB.toml.
+        # Commands that need the password read it from LAB.toml.
         values["lab"]["projector"].pop("password", None)
         return tomli_w.dumps(values)
 
@@ -401,7 +400,7 @@ def validate_settings(model: type[_AnySettings], document: dict[str, Any], sourc
         return model.model_validate(document)
     except ValidationError as error:
         mistakes = find_mistakes(model, document, error, _is_secret, NOT_TO_CHOOSE)
-        # The cause would contain the values.
+        # The cause would show the secret in the traceback.
         has_secret = any(_is_secret(".".join(map(str, mistake["loc"]))) for mistake in error.errors())
         raise ConfigurationError(f"{source_name}:{list_mistakes(mistakes)}") from (None if has_secret else error)
 
@@ -423,7 +422,7 @@ def _insert_secrets(document: dict[str, Any], folder: Path, source_name: str) ->
         if isinstance(value, dict):
             source = cast("dict[str, Any]", value)
             if tables[0] == "lab" and document.get("rig") != "lab":
-                # A session can be rehearsed without the password of devices that its rig does not have.
+                # Only real devices need a password, so a session can be rehearsed without it.
                 del table[name]
                 continue
             try:
@@ -450,7 +449,7 @@ def _read_secret(key: str, source: dict[str, Any], folder: Path) -> str:
                 if path.exists() and not path.is_file():
                     raise ConfigurationError(f"{key}: {path} is not a file; give a file with only the secret")
                 with path.open(encoding="utf-8-sig") as stream:
-                    secret = stream.read(_SECRET_BYTES).partition("\n")[0].strip()
+                    secret = stream.read(_SECRET_CHARACTERS).partition("\n")[0].strip()
             except (OSError, UnicodeDecodeError, ValueError) as error:
                 reason = (error.strerror if isinstance(error, OSError) else None) or "it is not text in UTF-8"
                 raise ConfigurationError(f"{key}: cannot read {path}: {reason}; give a readable file") from error

@@ -137,16 +137,16 @@ def camera(
     if watch_screen is None and watch_projector is not None:
         raise ConfigurationError("--watch-projector is given without --watch-screen; give both")
     changes = dict(_setting("--room", text) for text in room or ())
-    # Lamp drift is off by default: the simulated lamp would be dark by now.
+    # Lamp drift is off by default: its time starts at `SIM_START`, long ago, so the lamp would be dark.
     world = World(
         _grey_squares() if chart is None else _print(context, chart),
         BODIES[model],
         read_room(_SEED, {"lamp_drift_per_hour": 0.0} | changes, "the command line", "--room"),
     )
-    with ExitStack() as opened:
-        film = opened.enter_context(_film(world, watch_screen, watch_projector))
-        # A frame may be exposed while others are still being developed.
-        executor = opened.enter_context(ThreadPoolExecutor(3, "developing"))
+    with ExitStack() as resources:
+        film = resources.enter_context(_film(world, watch_screen, watch_projector))
+        # A frame may be exposed while earlier frames are still developed.
+        executor = resources.enter_context(ThreadPoolExecutor(3, "developing"))
         eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, executor=executor)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
         with serve_ptpip(eos, port, name=eos.body.model) as server:
@@ -170,7 +170,7 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
         yield WorldFilm(world, lambda: WHITE, lambda: 1.0, serial, {})
         return
     clock, pictures = SystemClock(), Screenshots(ScreenPlace.parse(screen))
-    # A screen that is missing now is a mistake of the user; later it is part of the rehearsal.
+    # A screen that is missing now is a mistake of the user; if it fails later, this is part of the rehearsal.
     pictures.take()
     pjlink_projector = None
     if projector is not None:
@@ -181,14 +181,14 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
         # Renders the room now, so that the first frame is not delayed by seconds.
         world.signal(WHITE, REFERENCE_EXPOSURE)
 
-        def gather(number: int, seconds: float) -> tuple[NDArray[np.float32], float]:
+        def measure_light(number: int, seconds: float) -> tuple[NDArray[np.float32], float]:
             print(f"exposure {number} starts, {seconds:g} s", flush=True)
             projected = beam.measure_exposure(seconds, lambda: print(f"exposure {number} half over", flush=True))
             dark = f"; no light: {beam.trouble}" if beam.trouble else ""
             print(f"exposure {number} ends: {projected}{dark}", flush=True)
             return projected.picture, projected.lamp
 
-        yield WatchedFilm(world, gather, serial, clock.now())
+        yield WatchedFilm(world, measure_light, serial, clock.now())
 
 
 def _print(context: typer.Context, chart: Path) -> Print:
@@ -199,7 +199,7 @@ def _print(context: typer.Context, chart: Path) -> Print:
 
 
 def _setting(option: str, text: str) -> tuple[str, Any]:
-    # Values are in TOML syntax; texts may be without quotes.
+    # Values are in TOML syntax, but texts need no quotes.
     name, equals, value = text.partition("=")
     if not name or not equals:
         raise InputError(f"{option} is {text!r}, expected NAME=VALUE, such as waviness_mm=1.5; correct it")
@@ -235,7 +235,7 @@ def _until_interrupted(announcement: str) -> None:
     signals = queue.SimpleQueue[int]()
     for request in (signal.SIGINT, signal.SIGTERM):
         signal.signal(request, lambda number, _: signals.put(number))
-    # Handlers are set first: a reader may interrupt at once, and an exception would print the text twice.
+    # Handlers are set first: a reader of the address may send a signal at once, and an exception would print it twice.
     print(announcement, flush=True)
     signals.get()
     print("stopped")

@@ -5,8 +5,8 @@ spectra, each illuminant has its own frame. Spectra are read from a file, or pub
 (`sim.spectral`; `--lights` in docs/how-to/table-without-a-lab.md).
 
 A computed frame has only the centre of each patch and reference, by default 10 × 10 photosites (25 half-size pixels),
-one below the other. The simulated room gives their light, the simulated sensor their counts
-(`sim.world.sensors.counts`), and the functions of calibration sample them like any frame.
+one below the other. The simulated room provides their light, and the simulated sensor their counts
+(`sim.world.sensors.counts`). The functions of calibration sample them like any frame.
 
 Differences from a photograph: without blur, no light leaks between neighbouring patches. A whole patch has the light
 of its centre. The position of the chart is exact.
@@ -81,7 +81,7 @@ class LightSpectra:
     """Spectra of illuminants with different names."""
 
     lights: tuple[LightSpectrum, ...]
-    source: dict[str, Any]  # For the record: file and hash, or names
+    source: dict[str, Any]  # Origin for the record of the LUT: file and hash, or names
 
 
 def read_lights(text: str) -> LightSpectra:
@@ -120,7 +120,7 @@ def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
         )
     numeric = [name for name in headings[1:] if re.fullmatch(r"[\d.:+]+", name)]
     if numeric:
-        # generate --light takes numbers as indices of the LUT.
+        # `generate --light` reads a number as an index of the LUT.
         raise FormatError(
             f"{where}: the name of an illuminant is {numeric[0]!r}, expected a name with a letter; rename it, for "
             f"example to lamp {numeric[0]}"
@@ -238,7 +238,7 @@ class PatchSensor:
     body: Body
     patches: int  # N
     window: int  # Side of a patch, in half-size pixels
-    seed: int  # Of response and noise
+    seed: int  # Seed of response and noise
     response: _Float  # float32, shape of a frame: relative response of each photosite, the fixed pattern
     hot: HotPattern  # Photosites with high dark current
     shutter_s: float  # Exposure time of all frames, s; dark current grows with it
@@ -302,7 +302,7 @@ class PatchSensor:
         hot_light = weights @ light[:, self.hot.rows, self.hot.columns]
         self.hot.raise_counts(raw, noise, hot_light, body, iso, self.shutter_s)
         raw.setflags(write=False)
-        # Mean of the masked photosites of each position in the Bayer block. Without them, the exact black level.
+        # Mean of the masked photosites of each position in the Bayer block; the exact level if there are none.
         black = np.full((2, 2), float(body.black))
         masked = sum(area.height * max(area.width - _SKIPPED_COLUMNS, 0) for area in body.masked) // 4
         if masked:

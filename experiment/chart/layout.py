@@ -1,15 +1,15 @@
 """Design of the chart: positions of colours, tags and references.
 
 - The sheet is a grid of square slots of 125 pixels at 600 dpi (5.292 mm), whose origin is a whole pixel. So all printed
-  edges of patches and tag modules are between two pixels, and sizes are whole at any multiple of 24 dpi. On a smaller
-  page the slot is the largest multiple of 5 pixels that fits, so that a tag module (2/5 of a slot) is a whole pixel.
-- Each colour is printed once, in random order. Random order registers four times more accurately than a smooth one,
-  and shows an error by one patch.
+  edges of patches and tag modules are between two pixels, and sizes are whole pixels at any multiple of 24 dpi. On a
+  smaller page the slot is the largest multiple of 5 pixels that fits. So a tag module (2/5 of a slot) has whole pixels.
+- Each colour is printed once, in random order. A random chart is registered four times more accurately than a smooth
+  one, and shows an error by one patch.
 - Tags are on a regular grid up to the edges. They take 4 × 4 slots: the 10 modules of an AprilTag 36h11 with its rim.
 - All other slots are achromatic references. They are spread evenly but not regularly, because a regular grid causes
   streaks in the fitted flat field.
 
-`paper_chart` makes the plain grid of the paper, 256 × 128 patches, for existing sheets. The same bits, page, patch and
+`paper_chart` makes the plain grid of the paper, 256 × 128 patches, for existing sheets. The same bits, page and
 seed give the same chart. On A0, 221 × 155 slots hold 32 768 colours, 35 tags and 927 references.
 """
 
@@ -33,7 +33,7 @@ SLOT_STEP_PX = 5  # Slots are multiples of this, because the ten modules of a ta
 # Smallest slot: a patch of 1.06 mm, a module of 0.42 mm; with fewer dots a printer cannot mix a colour
 LEAST_SLOT_PX = 25
 
-TAG_SLOTS = 4  # Slots along a tag with its white rim: its ten modules are then 2/5 of a slot, whole pixels at 600 dpi
+TAG_SLOTS = 4  # Slots along a tag with its white rim: each of its ten modules is 2/5 of a slot, whole pixels
 
 TAG_SPACING_SLOTS = 38  # Largest distance between tags in slots: 35 tags on A0, seven by five
 
@@ -65,8 +65,8 @@ A_SERIES_MM: dict[str, tuple[float, float]] = {
 }
 
 # Codes of grey references. In sRGB each reflects half the light of the previous one, 1/2 … 1/16 of white. Four equal
-# stops show whether a frame is linear, and the darkest still has some hundred counts if white is well exposed. None is
-# a colour of the chart, because its low bits are not 0.
+# stops show whether a frame is linear, and the darkest still has several hundred counts if white is well exposed.
+# None is a colour of the chart, because its low bits are not 0.
 GREY_CODES = (188, 137, 99, 71)
 
 # With at least this number of white references, calibration can measure the fall-off to the corners; with fewer, only a
@@ -107,15 +107,15 @@ class _Grid:
         return [(column, row) for row in _tag_starts(self.rows) for column in _tag_starts(self.columns)]
 
     @property
-    def reference_count(self) -> int:
-        """Slots that are not taken by tags, colours included."""
+    def free_slot_count(self) -> int:
+        """Number of slots without tags, for colours and references."""
         return self.columns * self.rows - len(self.tag_slots) * TAG_SLOTS**2
 
     def holds(self, bits: int) -> bool:
-        # Two by two tags at least.
+        # At least two by two tags.
         if min(self.columns, self.rows) < 2 * TAG_SLOTS or len(self.tag_slots) > TAG_IDS:
             return False
-        return self.reference_count >= 8**bits + _least_references(bits)
+        return self.free_slot_count >= 8**bits + _least_references(bits)
 
     def mm(self, column: float, row: float) -> tuple[float, float]:
         """Return the position (x, y) of a point of the slot grid, mm."""
@@ -131,7 +131,7 @@ def _tag_starts(slots: int) -> list[int]:
 
 
 def _least_references(bits: int) -> int:
-    # Three of each grey and 20 whites, or one for 40 colours.
+    # Three of each grey and 20 whites, or one reference for each 40 colours.
     return max(32, 8**bits // 40)
 
 
@@ -212,8 +212,8 @@ def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) ->
 
     The figure in the paper shows no order, so this is a reconstruction: 8 × 4 blocks of 32 × 32 patches. In a block red
     rises by column and green by row. Blue rises from block to block, row by row, the second row from right to left, and
-    so on. Every second column of blocks has red in reverse, every second row green. So neighbours differ by one step in
-    one channel, except for blue between blocks above each other.
+    so on. In every second column of blocks red falls; in every second row green falls. So neighbours differ by one
+    step in one channel, except for blue between blocks above each other.
 
     References are squares of bare paper in the margin, 5 mm wide, at the corners and every 100 mm or less above and to
     the right of the patches. The sheet is assumed to have this margin.
@@ -227,8 +227,8 @@ def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) ->
 
     Returns
     -------
-        The chart. Its patches are the largest whole pixels at 600 dpi with a margin of 8 mm: 108 × 152 on A0, that is
-        4.57 × 6.43 mm.
+        The chart. Sides of its patches are whole pixels at 600 dpi, the largest with a margin of 8 mm: 108 × 152 on A0,
+        that is 4.57 × 6.43 mm.
     """
     if bits not in PAPER_BLOCKS:
         raise InputError(f"{bits} bits per channel are given, expected 1 to 5; give another number")
@@ -329,9 +329,9 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
     """Choose `count` of the allowed slots (rows, columns), spread evenly over the grid, but not regularly.
 
     After the void-and-cluster method (Ulichney, "The void-and-cluster method for dither array generation", 1993).
-    Starting with a random choice, each slot in turn moves to the emptiest position. One pass is enough: on A0, no two
-    references are then closer than 4 slots, and no slot is farther than 6 from one. The spectrum is the even ring of
-    blue noise. Each quarter of the grid keeps its number.
+    The first choice is random; then each chosen slot in turn moves to the emptiest position of its quarter of the grid.
+    One pass is enough: on A0, no two references are closer than 4 slots. No slot is farther than 6 slots from a
+    reference. The spectrum is that of blue noise, equal in all directions.
     """
     rows, columns = allowed.shape
     middle_row, middle_column = (rows + 1) // 2, (columns + 1) // 2
@@ -347,20 +347,20 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
         is_chosen.flat[rng.choice(slots, quota, replace=False)] = True
     if count == 0:
         return is_chosen
-    # Relative to the mean distance between neighbours; the best value for the closest pair and the largest gap on A0.
+    # 0.4 times the mean distance between neighbours is best for the closest pair and the largest gap on A0.
     sigma = 0.4 * math.sqrt(allowed.size / count)
     down, across = _nearness(rows, sigma), _nearness(columns, sigma)
     # Random numbers decide between equal slots; they are smaller than any relevant difference.
-    crowd = down @ is_chosen.astype(np.float64) @ across.T + 1e-6 * rng.random(allowed.shape)
-    penalty, contribution = np.where(allowed & ~is_chosen, 0.0, np.inf), np.empty_like(crowd)
+    density = down @ is_chosen.astype(np.float64) @ across.T + 1e-6 * rng.random(allowed.shape)
+    penalty, contribution = np.where(allowed & ~is_chosen, 0.0, np.inf), np.empty_like(density)
     for row, column in rng.permutation(np.argwhere(is_chosen)):
-        crowd -= np.multiply(down[:, row, None], across[:, column], out=contribution)
+        density -= np.multiply(down[:, row, None], across[:, column], out=contribution)
         penalty[row, column] = 0.0
         quarter = quarters[2 * int(row >= middle_row) + int(column >= middle_column)]
         # Slots that may not be chosen have infinite scores.
-        score = crowd[quarter] + penalty[quarter]
+        score = density[quarter] + penalty[quarter]
         row, column = divmod(int(slot_numbers[quarter].flat[score.argmin()]), columns)
-        crowd += np.multiply(down[:, row, None], across[:, column], out=contribution)
+        density += np.multiply(down[:, row, None], across[:, column], out=contribution)
         penalty[row, column] = np.inf
     return allowed & (penalty > 0)
 
@@ -369,9 +369,9 @@ def _nearness(count: int, sigma: float) -> npt.NDArray[np.float64]:
     """Return the weight of each slot (column) at each position (row), (count, count) float64, rows of sum 1."""
     positions = np.arange(count)
     weights = np.exp(-0.5 * ((positions[:, None] - positions[None, :]) / sigma) ** 2)
-    # Subnormal numbers slow a processor down, and do not change any sum.
+    # Subnormal numbers are slow and do not change any sum.
     weights[weights < 1e-40] = 0
-    # A position at the edge has neighbours on one side only; without normalisation all would collect at the edges.
+    # A position at the edge has neighbours on one side only; without normalisation, all slots would move to the edges.
     return weights / weights.sum(axis=1, keepdims=True)
 
 

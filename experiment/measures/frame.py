@@ -1,6 +1,6 @@
 """Measure one frame in a single pass: light in all regions, noise, exposure and camera.
 
-Every photosite of the visible area belongs to one tile and one strip, so that every local change is measured. Nothing
+Every photosite of the visible area belongs to one tile and one strip, so that every local change is measured. No result
 depends on other frames, on the chart or on the requested illuminant.
 
 Positions are in 2×2 blocks of the mosaic (half-size pixels). There are T = 384 tiles, S strips (four in each row of
@@ -22,7 +22,7 @@ from experiment.measures.exposure import BRIGHTEST_PERCENTILE
 from foundation.compiled import compiled
 
 # Tiles over a frame of 3 : 2: 384 squares of 108 px on an EOS 550D. Each has about a hundred patches, so that its mean
-# is accurate to 0.1 %; a hand covers several tiles.
+# is accurate to 0.1 %; a hand in front of the chart covers several tiles.
 TILE_COLUMNS, TILE_ROWS = 24, 16
 
 # Strips along a row: 650 px on an EOS 550D, that is 65 patches, whose mean differs between rows of patches.
@@ -31,17 +31,17 @@ SEGMENTS = 4
 # Sampled blocks for the comparison of the noise of two frames: correlations are then accurate to 1 %.
 SAMPLES = 8192
 
-# A sensor has no counts below this fraction of black: noise reaches down by tens of counts, black is hundreds.
+# Fraction of black below which a photosite is empty: noise lowers counts by tens, and black is hundreds of counts.
 _EMPTY_SHARE = 0.5
 
-# Smallest black level, counts, at which such counts can be recognised: older bodies by Nikon subtract black.
+# Smallest black level, counts, at which empty photosites can be detected: older bodies by Nikon subtract black.
 _LEAST_BLACK = 64.0
 
 _NOISE_BINS = 6  # Levels at which noise is measured: enough for a line, with a thousand blocks each
 
 _INNER = 0.3  # Fraction of the blocks of a level, with the smallest differences, that are used for the noise
 
-_INNER_SIGMAS = 0.3853  # That fraction of normal deviates lies within this many standard deviations: Φ⁻¹(0.65)
+_INNER_SIGMAS = 0.3853  # Standard deviations within which this fraction of normal deviates lies: Φ⁻¹(0.65)
 
 _Array = npt.NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class FramePlaces:
 def _mean_counts(
     counts: npt.NDArray[np.uint16], division: FramePlaces, clipping: float, floor: float
 ) -> tuple[_Array, _Array, _Array]:
-    """Return mean counts of tiles (T, 4) and strips (rows, 4, 4), and shares (2,) of clipped and empty pixels.
+    """Return mean counts of tiles (T, 4) and strips (rows, 4, 4), and shares (2,) of clipped and empty photosites.
 
     The last axis of the means has the four positions of the block, row by row.
     """
@@ -216,12 +216,12 @@ def _noise(greens: _Array) -> Noise:
         in_bin = (level >= low) & (level <= high)
         differences = difference[in_bin]
         centred = np.abs(differences - np.median(differences))
-        # Blocks on an edge between two patches differ by more than noise. If patches are small, such blocks are many.
+        # Blocks on an edge between two patches differ by more than noise. Small patches have many such blocks.
         sigma = float(np.quantile(centred, _INNER)) / _INNER_SIGMAS
         levels.append(float(np.median(level[in_bin])))
         variances.append(sigma**2 / 2)
-    # The darkest blocks contain the read noise, brighter ones also the photon noise. Each weight is the inverse of the
-    # variance.
+    # The darkest blocks contain the read noise, brighter ones also the photon noise. The weight of a level is
+    # the inverse of its variance.
     x, y = np.maximum(np.array(levels), 0), np.maximum(np.array(variances), 1e-3)
     design = np.column_stack([np.ones_like(x), x]) / y[:, None]
     floor, slope = np.linalg.lstsq(design, np.ones_like(y), rcond=None)[0].tolist()
@@ -241,7 +241,7 @@ def _sum_rows(
     sums: npt.NDArray[np.int64],
     tallies: npt.NDArray[np.int64],
 ) -> None:
-    """Sum counts (H, W) between column edges to `sums` (rows, tiles, 4); count clipped and empty in `tallies` (2,)."""
+    """Write sums of counts (H, W) of tiles to `sums` (rows, tiles, 4), clipped and empty counts to `tallies` (2,)."""
     clipped, empty = 0, 0
     for row in range(sums.shape[0]):
         for half in range(2):

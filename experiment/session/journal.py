@@ -1,12 +1,12 @@
 """The journal of a session, `journal.sqlite`: plan, attempts at frames, verdicts and events.
 
-- Every write is a transaction that is on disk when the call returns, because a committed row makes a frame count. Rows
-  are never deleted; an accepted frame can be voided.
-- During a run the journal is in SQLite's write-ahead mode if that works: readers see the last commit and block nobody.
-  After a normal end it is one file again. A reader creates and changes nothing.
+- Every write is a transaction that is on disk when the call returns, because a frame without a committed row is not
+  accepted. Rows are never deleted; an accepted frame can be voided.
+- During a run the journal is in SQLite's write-ahead mode if the disk allows it: readers get the last commit and
+  block no writer. After a normal end the journal is one file again. A reader creates and changes no file.
 - A session may come from somebody else: `experiment.session.opening` refuses everything except valid rows.
-- Another program may delete, replace or truncate the file, and SQLite does not read pages again. So a run checks that
-  the journal on disk is its own and complete (`_JournalGuard`).
+- Another program may delete, replace or truncate the file, but SQLite does not read cached pages again. So a run
+  checks that the journal on disk is the open one and complete (`_JournalGuard`).
 - All facts are also written to `ledger.jsonl`, from which a lost journal is restored. Each line is a transaction: its
   rows by table as a JSON object, on disk before the journal commits it. Signs of life and the place of the session are
   not in it. A crash can truncate only the last line.
@@ -86,7 +86,7 @@ PATIENCE_S = 600.0
 
 @dataclass(frozen=True)
 class ReceivedFile:
-    """A raw file that is complete on disk, and not counted yet."""
+    """A raw file that is complete on disk, but not yet recorded in the journal."""
 
     path: Path
     size: int
@@ -104,7 +104,7 @@ class IncomingFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._final = path
-        # A missing folder means that the disk was unmounted: the path below it is another disk.
+        # A missing folder means that the disk was unmounted. A new folder with this path would be on another disk.
         self._file = atomic_file(path, lambda: self._final, make_parents=False)
         self._open = True
         self.stream: BinaryIO = self._file.__enter__()
@@ -149,7 +149,7 @@ class IncomingFile:
 class Journal:
     """An open journal, for one thread; close it after use.
 
-    `retry`: repeats operations while other programs hold the file; None for a reader, for whom SQLite waits.
+    `retry`: repeats operations while other programs hold the file; None for a reader, because SQLite itself waits then.
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection, retry: Retry | None = None) -> None:
@@ -159,7 +159,7 @@ class Journal:
         self._retry = retry or _LockRetry(path, 0, lambda sentence: None)
         self._ledger: _Ledger | None = None
         self._guard: _JournalGuard | None = None
-        self._gives_signs = False
+        self._is_run_alive = False
 
     @staticmethod
     def create(path: Path, steps: Sequence[SessionStep]) -> None:
@@ -209,7 +209,7 @@ class Journal:
         self._guard = _JournalGuard(self.path, self._ledger)
 
     def require_whole(self) -> None:
-        """Raise `LostJournalError` if the journal on disk is not the open one, or is incomplete."""
+        """Raise `LostJournalError` if the journal on disk is not the open journal, or is incomplete."""
         if self._guard is not None:
             self._guard.require_same()
             self._guard.require_whole()
@@ -229,13 +229,13 @@ class Journal:
 
     @contextmanager
     def snapshot(self) -> Generator[None]:
-        """Read everything inside from one state, so that no verdict is without its checks."""
+        """Read everything in the block from one state of the journal, so that each verdict has its checks."""
         self._rows("BEGIN")
         yield
         self._rows("ROLLBACK")
 
     def steps(self) -> tuple[SessionStep, ...]:
-        """Return the plan, in the order of taking."""
+        """Return the plan, in the order in which frames are taken."""
         rows = self._rows("SELECT step, kind, illumination, red, green, blue FROM plan ORDER BY step")
         self._require_known_kinds(row[1] for row in rows)
         return tuple([_step(*row) for row in rows])
@@ -264,7 +264,7 @@ class Journal:
         exposure_s: float,
         ended_at: datetime,
     ) -> None:
-        """Record the complete raw file and the judgement of an attempt; only now the frame counts.
+        """Record the complete raw file and the judgement of an attempt; the frame has a verdict only after this call.
 
         `timings`: seconds of each stage by name. `exposure_s`: requested exposure, seconds.
         """
@@ -284,7 +284,7 @@ class Journal:
                 change.put("timings", {"attempt": attempt, "name": name, "seconds": seconds})
 
     def fail(self, attempt: int, at: datetime, reason: str) -> None:
-        """Record that an attempt gave no frame."""
+        """Record that an attempt produced no frame."""
         with self._writing() as change:
             change.set_attempt(attempt, {"ended_at": time_text(at), "verdict": FAILED, "reason": reason})
 
@@ -308,7 +308,7 @@ class Journal:
         """Record a sign of life, which replaces the previous one."""
         with self._writing():
             _put_beat(self._connection, self.path, state, sentence, until)
-        self._gives_signs = state != "ended"
+        self._is_run_alive = state != "ended"
 
     def record(self, key: str, text: str) -> None:
         """Record a fact of the session, such as the identity of a device; replaces the text of `key`."""
@@ -387,7 +387,7 @@ class Journal:
         }
 
     def measurements(self) -> Iterator[tuple[SessionStep, int, bytes, bool]]:
-        """Yield the data of the judge for each frame, in order: step, attempt, bytes, whether the frame counts."""
+        """Yield the data of the judge for each frame, in order: step, attempt, bytes, whether it is accepted."""
         plan = {step.number: step for step in self.steps()}
         for attempt, step, data, verdict in self._rows(
             "SELECT id, step, data, verdict FROM attempts JOIN measurements ON attempt = id ORDER BY id"
@@ -414,7 +414,7 @@ class Journal:
         return int(self._rows(query, (after, REFUSED, VOIDED))[0][0])
 
     def kept_files(self, step: SessionStep) -> int:
-        """Return the number of raw files of `step`, accepted or refused."""
+        """Return the number of raw files of `step`, with any verdict."""
         query = "SELECT COUNT(*) FROM attempts WHERE step=? AND sha256 IS NOT NULL"
         return int(self._rows(query, (step.number,))[0][0])
 
@@ -455,15 +455,15 @@ class Journal:
 
     @contextmanager
     def _writing(self) -> Generator[_Change]:
-        """Write everything inside in one transaction, which is on disk at the end of the block."""
+        """Write everything in the block as one transaction, which is on disk at its end."""
         try:
             self._retry.run(lambda: self._connection.execute("BEGIN IMMEDIATE"))
             change = _Change(self._connection)
             yield change
             if self._ledger is not None and change.rows:
                 self._append(self._ledger, change.rows)
-            if self._gives_signs and change.rows:
-                # A frame is a sign of life, too: a run that is killed was alive at its last frame.
+            if self._is_run_alive and change.rows:
+                # Each write is also a sign of life: a killed run was alive at its last write.
                 self._connection.execute("UPDATE heartbeat SET at = ?", (time_text(datetime.now(UTC)),))
             if self._guard is not None:
                 self._guard.require_same()
@@ -486,14 +486,14 @@ class Journal:
 
     def _append(self, ledger: _Ledger, rows: Mapping[str, Sequence[Row]]) -> None:
         if not ledger.is_intact():
-            # From the open file, because the journal on disk may be missing, too.
+            # Rows of the open journal, because the file on disk may be missing, too.
             ledger.restore(rows_of(self._connection))
         ledger.append(rows)
 
 
 def open_journal(folder: Path) -> Journal:
-    """Open the journal of a session for reading; refuse one that lacks frames of the ledger."""
-    # A run writes the ledger first: in this order, the journal misses one transaction at most.
+    """Open the journal of a session for reading; refuse a journal that lacks frames of the ledger."""
+    # A run writes the ledger first. If the ledger is also read first, the journal lacks at most its last transaction.
     settled = settled_frames(ledger_path(folder))
     journal = Journal.open(folder / JOURNAL_FILE)
     try:
@@ -505,7 +505,7 @@ def open_journal(folder: Path) -> Journal:
 
 
 def lost_files(folder: Path, accepted: Sequence[AcceptedFile]) -> list[AcceptedFile]:
-    """Return the current frame of each step with a missing or shorter file."""
+    """Return the newest accepted frame of each step, if its file is missing or has another size."""
     newest = {frame.step: frame for frame in accepted}
     # As text: creating 800 path objects takes twice as long as the check.
     return [frame for frame in newest.values() if not _has_size(f"{folder}/{frame.file}", frame.size)]
@@ -513,7 +513,7 @@ def lost_files(folder: Path, accepted: Sequence[AcceptedFile]) -> list[AcceptedF
 
 def _has_size(path: str, size: int) -> bool:
     try:
-        return os.stat(path).st_size == size  # noqa: PTH116 - see above
+        return os.stat(path).st_size == size  # noqa: PTH116 - see `lost_files`
     except OSError:
         return False
 
@@ -525,7 +525,7 @@ def no_journal_text(folder: Path) -> str:
 
 
 def thread_beat(path: Path, state: RunState, sentence: str, until: datetime) -> None:
-    """Write a sign of life from another thread than the one with the open journal; failures are ignored."""
+    """Write a sign of life from a thread that has no open journal; failures are ignored."""
     with suppress(sqlite3.Error), closing(connect(path, "rw")) as connection:
         connection.execute("BEGIN IMMEDIATE")
         _put_beat(connection, path, state, sentence, until)
@@ -587,7 +587,7 @@ _accepted_file: Final = lru_cache(_ROWS_KEPT)(AcceptedFile)
 
 
 def _condition_of(column: str, numbers: Sequence[int] | None) -> tuple[str, tuple[str, ...]]:
-    # SQL condition that a column is one of the numbers, and its value.
+    # SQL condition that a column is one of the numbers, and the value of its parameter.
     if numbers is None:
         return "TRUE", ()
     return f"{column} IN (SELECT value FROM json_each(?))", (json.dumps(list(numbers)),)
@@ -626,7 +626,7 @@ def _verdict_text(verdict: str, reason: str) -> str:
 
 @dataclass(frozen=True)
 class _FileState:
-    """State of a file."""
+    """Properties of a file, from which changes are detected."""
 
     numbers: tuple[int, int]  # device and inode
     size: int
@@ -640,7 +640,7 @@ class _JournalGuard:
         self._path, self._ledger = path, ledger
         self._files = (path, side_file(path, "-wal"))
         self._folders = {folder: self._file_state(folder) for folder in (path.parent, path.parent / "frames")}
-        self._trusts_numbers = not file_system_of(path).startswith(INVENTED_NUMBERS)
+        self._has_fixed_numbers = not file_system_of(path).startswith(INVENTED_NUMBERS)
         self._states: dict[Path, _FileState] = {}
         self.remember()
 
@@ -652,14 +652,14 @@ class _JournalGuard:
         """Raise `LostJournalError` if the journal changed since the last write of the run."""
         for folder, previous in self._folders.items():
             current = self._file_state(folder)
-            if current is None or previous is None or (self._trusts_numbers and current.numbers != previous.numbers):
+            if current is None or previous is None or (self._has_fixed_numbers and current.numbers != previous.numbers):
                 raise StorageError(f"{folder} is missing or was replaced", remedy="check that its disk is mounted")
         is_written = False
         for file, previous in self._states.items():
             current = self._file_state(file)
             if current is None:
                 self._raise_lost(file, "was deleted")
-            elif self._trusts_numbers and current.numbers != previous.numbers:
+            elif self._has_fixed_numbers and current.numbers != previous.numbers:
                 self._raise_lost(file, "was replaced by another file")
             elif current.size < previous.size:
                 self._raise_lost(file, f"was truncated from {previous.size} to {current.size} bytes")
@@ -669,7 +669,7 @@ class _JournalGuard:
             self.remember()
 
     def require_whole(self) -> None:
-        """Raise `LostJournalError` if other readers of the journal do not see the rows of the run."""
+        """Raise `LostJournalError` if the journal on disk does not have the rows of the run."""
         try:
             with closing(connect(self._path, "ro")) as connection:
                 is_sound = connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
@@ -702,7 +702,7 @@ _T = TypeVar("_T")
 
 
 class LostJournalError(StorageError):
-    """The journal on disk is not the one that the run has open; waiting does not help."""
+    """The journal on disk is not the open journal of the run; waiting does not help."""
 
 
 class _LockRetry:
@@ -735,7 +735,7 @@ LEDGER_FILE: Final = "ledger.jsonl"  # Name of the ledger in the folder of a ses
 # file.
 _MOST_LEDGER_BYTES: Final = 1 << 30
 
-PLACE: Final = "place"  # Key of the record with the place of the session for which signs of life are given
+PLACE: Final = "place"  # Key of the record with the place of the session, written with each sign of life
 
 # Key columns of each table.
 _ROW_KEYS: Final = {
@@ -868,7 +868,7 @@ class _Ledger:
                 os.close(handle)
 
     def append(self, changes: Mapping[str, Sequence[Row]]) -> None:
-        """Write a transaction, in place of one that was not confirmed; it is on disk when this returns."""
+        """Write a transaction over an unconfirmed one; it is on disk when this method returns."""
         line = _ledger_line(changes)
         try:
             os.pwrite(self._handle, line, self._end)
@@ -885,7 +885,7 @@ class _Ledger:
         self._end = self._next
 
     def is_intact(self) -> bool:
-        """Return whether the open file is the one on disk, in full size."""
+        """Return whether the open file is still the file on disk, in full size."""
         try:
             on_disk, opened = self._path.stat(), os.fstat(self._handle)
         except OSError:
@@ -926,9 +926,9 @@ Frames = set[tuple[int, str, str | None]]  # Frames by attempt and hash, with th
 
 
 def settled_frames(path: Path) -> Frames:
-    """Return the frames that a journal opened later must have: all except the last transaction.
+    """Return the frames that a journal opened later must have: all except frames of the last transaction.
 
-    Empty if the ledger is missing or damaged, which is no fault of an intact journal.
+    Empty if the ledger is missing or damaged, because the journal may be intact.
     """
     with suppress(FormatError, StorageError):
         if os.path.isfile(path):  # noqa: PTH113 - it never raises
@@ -937,7 +937,7 @@ def settled_frames(path: Path) -> Frames:
 
 
 def _missing_frames(settled: Frames, journal_frames: Frames) -> Frames:
-    # A void frame in the journal is not an older state, because no verdict follows that one.
+    # A void frame in the journal is not an older state, because no verdict follows `VOIDED`.
     voided = {(attempt, sha256) for attempt, sha256, verdict in journal_frames if verdict == VOIDED}
     return {frame for frame in settled - journal_frames if frame[:2] not in voided}
 

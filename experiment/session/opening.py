@@ -1,8 +1,8 @@
 """Open the SQLite file of a journal on any disk, check its contents, and explain its faults.
 
 A reader never writes. A run switches the file to write-ahead mode. Both check the file first: the schema has only
-tables, because views, triggers and generated columns run foreign SQL. Each row has valid types, and no path leads out
-of the session.
+tables, because views, triggers and generated columns could run foreign SQL. Each row has valid types, and no path
+leads out of the session.
 
 Sources: sqlite.org/wal.html, sqlite.org/lockingv3.html, sqlite.org/fileformat.html.
 """
@@ -43,14 +43,14 @@ _DAMAGED: Final = "it is damaged or was manipulated"
 
 JOURNAL_VERSION = 2  # `PRAGMA user_version` of the journals that this software writes and reads (docs/formats.md)
 
-# Seconds that SQLite itself waits for another program before it returns: Ctrl-C may be delayed by as much.
+# Seconds that SQLite itself waits for another program before it returns: Ctrl-C may be delayed by this time.
 TRY_S = 1.0
 
 # Seconds that a reader waits if the journal is not in write-ahead mode: a commit takes milliseconds, but a disk may
 # block for seconds.
 READING_LIMIT_S = 10.0
 
-# Longest text, blob or row that SQLite reads: the measurement of a frame has some 100 kilobytes.
+# Longest text, blob or row that SQLite reads: the measurement of a frame has about 100 kilobytes.
 _MOST_VALUE_BYTES: Final = 64 << 20
 
 # Largest sizes of files that are read completely, in bytes: forty times the sizes for 707 illuminants and 32 768
@@ -97,8 +97,8 @@ CREATE TABLE heartbeat (
 CREATE TABLE records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
 """
 
-# Errors of SQLite if reading would need writing.
-_CANNOT_IN_PLACE = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
+# Errors of SQLite if a file cannot be read without writing.
+_NEEDS_WRITING = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
 
 # Errors of a file system without locks (fcntl(2); Lustre, FUSE, NFS without its lock service).
 _NO_LOCKS = {errno.ENOLCK, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EBADF}
@@ -108,15 +108,15 @@ _READABLE_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.
 
 _SIDE_FILES = ("-wal", "-shm", "-journal")  # Suffixes of SQLite's files next to a journal
 
-_PROBE_BYTES = 65536  # Size of a commit with the pages of its log
+_PROBE_BYTES = 65536  # Size of a test write: as a commit with the pages of its log
 
-# File systems that several computers can use without shared memory, as in /proc/self/mounts.
+# Network file systems, as named in /proc/self/mounts. They have no shared memory, which write-ahead mode needs.
 _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "ceph", "fuse.glusterfs", "lustre"}
 
 
 def restore_remedy(path: Path) -> str:
     """Return the remedy for a damaged or missing journal."""
-    # A fault of the disk is reported before this.
+    # Callers report a fault of the disk first.
     if os.path.isfile(path.with_name("ledger.jsonl")):  # noqa: PTH113 - it never raises
         return f"restore it from ledger.jsonl with acquire rebuild {shlex.quote(str(path.parent))}"
     return "restore it from a copy"
@@ -153,7 +153,7 @@ def open_to_read(path: Path) -> sqlite3.Connection:
     """Return a read-only connection."""
     require_plain_folder(path.parent, MOST_BYTES)
     try:
-        # A run has all three files. Without the third there is no run, and reading in place would create it.
+        # During a run, the file `-shm` exists. Without it there is no run, and reading in place would create it.
         if _is_write_ahead(path) and not side_file(path, "-shm").exists():
             connection = _copy_to_memory(path)
         else:
@@ -167,7 +167,7 @@ def open_to_read(path: Path) -> sqlite3.Connection:
 def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
     """Return a writing connection, after switching the journal to write-ahead mode.
 
-    The caller has locked the folder of the session against other runs. Other writers are waited for with `retry`.
+    The caller has locked the folder of the session against other runs. `retry` waits for other writers.
     """
     require_plain_folder(path.parent, MOST_BYTES)
     try:
@@ -176,7 +176,7 @@ def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_fault(path, error) from error
     try:
-        with suppress(OSError):  # Left by a run that was killed during a copy.
+        with suppress(OSError):  # A run that was killed during a copy leaves this file.
             partial_path(path).unlink(missing_ok=True)
         if not _on_network(path):
             connection = _switch_to_write_ahead(path, connection, retry)
@@ -228,7 +228,7 @@ def _connect_with(path: Path, parameters: str) -> sqlite3.Connection:
         isolation_level=None,
     )
     try:
-        # A committed row must survive a power cut, because it makes a frame count.
+        # A committed row must survive a power cut, because a frame without it is not accepted.
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchall()
     except sqlite3.DatabaseError:
@@ -256,7 +256,7 @@ def _open_or_copy(path: Path) -> sqlite3.Connection:
     try:
         return connect(path, "ro")
     except sqlite3.OperationalError as error:
-        if _primary_code(error) not in _CANNOT_IN_PLACE:
+        if _primary_code(error) not in _NEEDS_WRITING:
             raise
         return _copy_to_memory(path)
 
@@ -275,8 +275,8 @@ def _copy_to_memory(path: Path) -> sqlite3.Connection:
 
 
 def _is_write_ahead(path: Path) -> bool:
-    # Offset 18 of the header is 2 (sqlite.org/fileformat.html, 1.3.3). The file is opened only without `-shm`: closing
-    # it releases all locks of the process on it.
+    # Bytes 18 and 19 of the header are 2 (sqlite.org/fileformat.html, 1.3.3). The file is opened only without `-shm`:
+    # closing it releases all locks of the process on it.
     if side_file(path, "-shm").exists():
         return True
     with path.open("rb") as stream:
@@ -284,8 +284,8 @@ def _is_write_ahead(path: Path) -> bool:
 
 
 def _switch_to_write_ahead(path: Path, connection: sqlite3.Connection, retry: Retry) -> sqlite3.Connection:
-    # The mode cannot be changed during a read. A reader that does not end keeps its file, which then has no name, and
-    # the run continues with a copy.
+    # The mode cannot be changed during a read. If a reader does not end, a copy replaces the file, and the run uses the
+    # copy. The reader keeps the old file, which then has no name.
     try:
         connection.execute("PRAGMA journal_mode = WAL").fetchall()
     except sqlite3.OperationalError as error:
@@ -300,9 +300,9 @@ def _switch_to_write_ahead(path: Path, connection: sqlite3.Connection, retry: Re
         connection.close()
         copy.replace(path)
         sync_folder(path.parent)
-        renewed = connect(path, "rw")
-        renewed.execute("PRAGMA journal_mode = WAL").fetchall()
-        return renewed
+        new_connection = connect(path, "rw")
+        new_connection.execute("PRAGMA journal_mode = WAL").fetchall()
+        return new_connection
     return connection
 
 
@@ -326,7 +326,7 @@ def _make_tables(connection: sqlite3.Connection) -> None:
 def _require_journal(path: Path, connection: sqlite3.Connection) -> None:
     """Refuse a file with another version, missing tables or invalid rows, and close its connection."""
     try:
-        # Limit the memory for a foreign file, and allow nothing in its schema except rows.
+        # Limit the memory for a foreign file, and forbid unsafe SQL functions in its schema.
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_VALUE_BYTES)
         connection.execute("PRAGMA trusted_schema = OFF")
         _require_plain_schema(path, connection)
@@ -351,7 +351,7 @@ def _require_journal(path: Path, connection: sqlite3.Connection) -> None:
 def reading_fault(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
     """Return the error for a journal that cannot be read, with a remedy."""
     # SQLite also reports damage if the disk fails, and an intact journal must not be replaced by a copy. So the disk is
-    # tested, and the file checked again.
+    # tested, and the file is checked again.
     if isinstance(error, OSError):
         is_missing = isinstance(error, FileNotFoundError)
         return reading_error(path, error, restore_remedy(path) if is_missing else "check its permissions")
@@ -443,8 +443,9 @@ _ZONE = "[+-]??:??"
 _FORMS = f"{{0}} GLOB '{_MOMENT}.{6 * '[0-9]'}{_ZONE}' OR {{0}} GLOB '{_MOMENT}{_ZONE}'"
 
 
-# SQLite checks digits except in fractions of a second, and the zones. But it ends a text at a zero byte, and accepts 30
-# February as 2 March, and 24:00. Cheapest condition first, because a page reads every two seconds.
+# SQLite checks the zone and all digits except fractions of a second. But it ends a text at a zero byte, reads
+# 30 February as 2 March, and accepts 24:00. The cheapest condition is first, because the page of a session reads the
+# journal every two seconds.
 _TIME = (
     f"typeof({{0}}) = 'text' AND ({_FORMS}) AND length(CAST({{0}} AS BLOB)) = length({{0}}) "
     "AND {0} BETWEEN '1970' AND '9999' AND julianday({0}) IS NOT NULL AND substr({0}, 12, 2) < '24' "
@@ -517,7 +518,7 @@ _COLUMNS: Final = {
 }
 
 _JOINT_CONDITIONS: Final = {
-    # A frame with a hash has a time, an exposure (0 if unknown) and a verdict.
+    # A frame with a hash has a time, an exposure (0 if unknown), a size and a verdict.
     "attempts": "(sha256 IS NULL OR (taken_at <> '' AND exposure_s BETWEEN 0 AND 1e9 AND size IS NOT NULL "
     "AND verdict IS NOT NULL))",
     "measurements": "(red IS NULL OR (green IS NOT NULL AND blue IS NOT NULL))",

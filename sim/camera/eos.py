@@ -1,8 +1,8 @@
 """Simulated Canon EOS: a PTP responder that behaves like a body of the series, with a `Film` in place of the sensor.
 
 The state advances with the clock, and only at calls: due actions are then carried out in their order. With a
-`SimulatedClock`, an initiator must wait by the same clock. Behaviour follows a recorded EOS 60D; where no public
-recording exists, a comment has the word "assumed". Methods may be called by several threads.
+`SimulatedClock`, an initiator must wait by the same clock. Behaviour follows a recorded EOS 60D; if there is no
+public recording, a comment has the word "assumed". Methods may be called by several threads.
 
 Sources: a recorded EOS 60D; ISO 15740:2013 for the standard; libgphoto2 2.5.34 for expectations of initiators.
 """
@@ -139,7 +139,7 @@ class StoredObject:
 
     @property
     def entry(self) -> ObjectEntry:
-        """Its entry in lists and events."""
+        """Entry of the object in lists and events."""
         return ObjectEntry(
             self.handle, self.storage, self.format, len(self.data), self.name, self.parent, self.handle,
             time=int(self.taken_at.timestamp()) & U32,
@@ -198,15 +198,15 @@ _SHUTDOWN_WARNING_S = 10.0  # Time between the warning and switching off, s (ass
 
 
 class SimulatedEos:
-    """EOS body at a cable; a `drivers.ptp.protocol.Responder`.
+    """EOS body on a cable; a `drivers.ptp.protocol.Responder`.
 
     Parameters
     ----------
     card_bytes
         Capacity of the card; None for an empty slot.
     auto_power_off_s
-        Idle seconds before it switches off; 0 for never, None for the setting of the body. KeepDeviceOn resets the
-        time, asking for events does not.
+        Idle seconds before the body switches off; 0 for never, None for the setting of the body. GetEvent and
+        GetDeviceInfo do not end the idle time; other operations do.
     battery
         Charge, 0 to 1.
     without
@@ -306,7 +306,7 @@ class SimulatedEos:
             self._is_warned = True
             self._record(Notice(EosEvent.WILL_SOON_SHUT_DOWN, int(limit - idle)))
 
-    def _touch(self) -> None:
+    def _restart_idle_time(self) -> None:
         self._idle_since = self._clock.monotonic()
         if self._is_warned:
             self._is_warned = False
@@ -396,12 +396,12 @@ class SimulatedEos:
             self._change(Property.EOS_SHUTTER_SPEED, number_value(shutter[len(shutter) // 2]))
 
     def _renew_destinations(self) -> None:
-        """Update the capture destinations; without remote control, frames are stored on the card."""
+        """Update the capture destinations; without a session, frames are stored on the card."""
         destinations = (CaptureDestination.CARD, CaptureDestination.HOST, CaptureDestination.CARD_AND_HOST)
         choices = destinations if self._card is not None else (CaptureDestination.HOST,)
         self._set_choices(Property.EOS_CAPTURE_DESTINATION, choices)
         if not self._session or self._number_of(Property.EOS_CAPTURE_DESTINATION) not in choices:
-            # Without a card, the 60D reports the card as destination too.
+            # Even without a card, the 60D reports the card as destination.
             self._change(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.CARD))
             self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
 
@@ -488,11 +488,11 @@ class SimulatedEos:
     def _get_object_info(self, arguments: Arguments) -> OperationResult:
         item = self._object(arguments.first)
         stamp = item.taken_at.strftime("%Y%m%dT%H%M%S")
-        folder = item.format == ObjectFormat.ASSOCIATION
+        is_folder = item.format == ObjectFormat.ASSOCIATION
         return OperationResult(
             ObjectInfo(
                 storage=item.storage, format=item.format, size=len(item.data), parent=item.parent,
-                association_type=int(folder), filename=item.name, captured_at=stamp, modified_at=stamp,
+                association_type=int(is_folder), filename=item.name, captured_at=stamp, modified_at=stamp,
             ).encode()
         )  # fmt: skip
 
@@ -618,9 +618,9 @@ class SimulatedEos:
         self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
 
         def open_shutter() -> None:
-            late = timedelta(seconds=self._clock.monotonic() - opens_at)
+            delay = timedelta(seconds=self._clock.monotonic() - opens_at)
             self._unfinished -= 1
-            self._expose(settings, self._clock.now() - late, opens_at + settings.shutter_s)
+            self._expose(settings, self._clock.now() - delay, opens_at + settings.shutter_s)
 
         self._schedule(opens_at, open_shutter)
 
@@ -640,14 +640,14 @@ class SimulatedEos:
 
     def _develop(self, settings: ExposureSettings, opened: datetime) -> Future[bytes | None]:
         def develop() -> bytes | None:
-            into = BytesIO()
+            buffer = BytesIO()
             try:
                 self._film.accept(settings)
-                self._film.expose(settings, opened, into)
+                self._film.expose(settings, opened, buffer)
             except (DeviceError, CropError):
                 # The frame never arrives, as from a real camera with an internal error.
                 return None
-            return into.getvalue()
+            return buffer.getvalue()
 
         if self._executor is not None:
             return self._executor.submit(develop)
@@ -701,7 +701,7 @@ class SimulatedEos:
         state = self._properties.get(setting.code)
         if state is None:
             raise OperationRefusal(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
-        # The recorded 60D answers 2019, not 201c, to a value that is not in its list.
+        # The recorded 60D answers 0x2019, not 0x201c, to a value that is not in its list.
         if self._is_busy or not self._allows(setting, state):
             raise OperationRefusal(ResponseCode.DEVICE_BUSY)
         self._store(setting.code, setting.value)
@@ -788,12 +788,12 @@ class SimulatedEos:
                 raise LinkClosed(f"the simulated {self.body.model} has switched itself off; call wake()")
             try:
                 reply = self._carry_out(request, data)
-            except OperationRefusal as no:
-                return Answer(PtpResponse(no.code, request.transaction, no.parameters))
+            except OperationRefusal as refusal:
+                return Answer(PtpResponse(refusal.code, request.transaction, refusal.parameters))
             return Answer(PtpResponse(ResponseCode.OK, request.transaction, reply.parameters), reply.data)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return hints that GetEvent has events: one when an empty queue gets its first event."""
+        """Return hints that GetEvent has events: one hint when an empty queue gets its first event."""
         with self._updated():
             hints, self._hints = tuple(self._hints), []
             return hints
@@ -810,7 +810,7 @@ class SimulatedEos:
 
     @property
     def asleep(self) -> bool:
-        """Whether it has switched itself off."""
+        """Whether the camera has switched itself off."""
         with self._updated():
             return self._is_asleep
 
@@ -824,7 +824,7 @@ class SimulatedEos:
         """Half-press the release of a sleeping camera."""
         with self._updated():
             self._is_asleep = False
-            self._touch()
+            self._restart_idle_time()
 
     def turn_dial(self, mode: AeMode) -> None:
         """Turn the mode dial, which determines whether shutter time and aperture can be set."""
@@ -871,7 +871,7 @@ class SimulatedEos:
         elif self._session and request.code == Operation.GET_DEVICE_INFO and request.transaction:
             self._check_transaction(request.transaction)
         if request.code not in (Operation.EOS_GET_EVENT, Operation.GET_DEVICE_INFO):
-            self._touch()
+            self._restart_idle_time()
         first, second, third, *_ = (*request.parameters, 0, 0, 0)
         return operation(Arguments(first, second, third, data)) or OperationResult()
 
@@ -903,7 +903,7 @@ class SimulatedEos:
             raise OperationRefusal(ResponseCode.SESSION_ALREADY_OPEN, self._session)
         self._session = arguments.first
         self._last_transaction = 0
-        self._touch()
+        self._restart_idle_time()
 
     def _close_session(self, _: Arguments) -> None:
         self._end_session()
@@ -991,7 +991,7 @@ class SimulatedEos:
 
 
 def _small_jpeg(name: str) -> bytes:
-    # Replaces a rendered frame: grey, with the file name.
+    # A small grey picture with the file name, in place of a rendered frame.
     import cv2
     import numpy as np
 
