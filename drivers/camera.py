@@ -1,6 +1,6 @@
 """Interface of a tethered camera, and the values that it takes and returns.
 
-A camera is configured once. Then `Camera.expose` and `Camera.download` take one raw frame after another. They are two
+A camera is configured first. Then `Camera.expose` and `Camera.download` take one raw frame after another. They are two
 calls, so that the projector can show the next illuminant while the frame is transferred.
 """
 
@@ -101,7 +101,7 @@ class Camera(Protocol):
         Returns
         -------
         tuple of float
-            Nominal times in seconds, rising; empty if the body lists none.
+            Nominal times in seconds, in ascending order; empty if the body lists none.
 
         Raises
         ------
@@ -159,7 +159,7 @@ class Supplies:
     Attributes
     ----------
     battery
-        Charge, 0 to 1, in the few steps that the body reports.
+        Charge, 0 to 1; most bodies report only a few steps.
     mains
         True on mains power.
     card_free_bytes

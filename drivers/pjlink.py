@@ -1,8 +1,8 @@
 """PJLink over TCP: messages, a projector driver, and the network search.
 
-We send exactly what the standard defines, and accept more: any case, LF instead of or after CR, empty lines, and NUL
-between lines (some projectors pad their packets with it). Datagrams may come from any sender; a datagram without a
-valid reply gives an empty result, not an error.
+The driver sends only lines that the standard defines, and accepts more: any case, LF instead of CR or after it, empty
+lines, and NUL between lines (some projectors pad their packets with NUL). Datagrams may come from any sender; a
+datagram without a valid reply gives an empty result, not an error.
 
 Source: JBMIA, PJLink Specifications 1.04 (class 1) and 2.00 (class 2: same lines with digit 2; 3.2 search, 3.3 status
 notification).
@@ -47,14 +47,17 @@ class ErrorCode(Enum):
 
 
 class Refused(Enum):
-    """Reply to a wrong password, in place of a greeting or a reply."""
+    """Reply to a wrong password, instead of a greeting or a usual reply."""
 
     WRONG_PASSWORD = "PJLINK ERRA"
 
 
 @dataclass(frozen=True)
 class PjLinkRequest:
-    """A command: four capital letters, and a parameter or `QUERY`; only the first on a connection has a digest."""
+    """A command: four capital letters or digits, and a parameter or `QUERY`.
+
+    Only the first command on a connection may have a digest.
+    """
 
     command: str
     parameter: str = QUERY
@@ -80,7 +83,10 @@ class PjLinkReply:
 
 
 def split_line(data: bytes, limit: int = MAX_LINE) -> tuple[bytes, int] | None:
-    """Return the first line without its end, and its length in bytes; skip empty lines and NUL."""
+    """Return the first line without its end, and the number of bytes that were read; None if it is incomplete.
+
+    Empty lines and NUL are skipped.
+    """
     start = len(data) - len(data.lstrip(b"\r\n\0"))
     line_end = re.compile(rb"[\r\n]").search(data, start)
     line = data[start : None if line_end is None else line_end.start()].replace(b"\0", b"")
@@ -103,7 +109,7 @@ def encode_greeting(seed: str | None) -> bytes:
 
 
 def parse_greeting(line: bytes) -> str | Refused | None:
-    """Return the seed in the projector's first line; None if it requires no password."""
+    """Return the seed in the projector's first line; None if it requires no password, `Refused` if it refuses one."""
     text = line.decode("ascii", "replace").strip()
     words = text.split()
     match [words[0].upper(), *words[1:]] if words else []:
@@ -188,7 +194,7 @@ def parse_power(value: str) -> Power:
 
 
 def format_mute(muted: bool) -> str:
-    """Return the AVMT code that mutes image and sound, or neither."""
+    """Return the AVMT code that mutes image and sound, or shows both."""
     return MUTE_ON if muted else MUTE_OFF
 
 
@@ -215,7 +221,7 @@ def parse_faults(value: str) -> tuple[Fault, ...]:
 
 
 def format_lamps(lamps: Sequence[Lamp]) -> str:
-    """Return the LAMP value: pairs of hours, and 1 if lit or 0."""
+    """Return the LAMP value: the hours of each lamp, then 1 if it is lit, else 0."""
     return " ".join(f"{lamp.hours} {int(lamp.lit)}" for lamp in lamps)
 
 
@@ -262,7 +268,7 @@ def format_resolution(resolution: Resolution | NoResolution) -> str:
 
 
 def parse_input_resolution(value: str) -> Resolution | NoResolution:
-    """Return the resolution in an IRES reply, such as ``1920x1080``, or why it is missing."""
+    """Return the resolution in an IRES reply, such as ``1920x1080``, or the reason if it is missing."""
     if value in ("-", "*"):
         return NoResolution(value)
     match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", value, re.ASCII)
@@ -320,7 +326,7 @@ DEFAULT_TIMEOUT_S = 5.0
 _SILENCE_REMEDY = "check that it is on the network, and that PJLink is enabled on it, also in standby"
 _PORT_REMEDY = "check that a projector answers at this port"
 
-# Timeout for the reply of another kind of server; on a local network it takes milliseconds.
+# Time limit for the reply of another kind of server; on a local network a reply takes milliseconds.
 _OTHER_SERVER_TIMEOUT_S = 2.0
 _HTTP_REQUEST = b"GET / HTTP/1.0\r\n\r\n"
 _HTTP_REPLY_STARTS = (b"http/", b"rtsp/", b"<!doc", b"<html")
@@ -336,12 +342,13 @@ _Value = TypeVar("_Value")
 class PjLinkProjector:
     """A `drivers.projector.Projector` over PJLink class 1, with the additions of class 2.
 
-    All queries and commands may raise `DeviceRefused` (unknown, not offered, not now, wrong password), `DeviceFault`
-    (the projector reports a failure), `LinkError` and `ProtocolError`.
+    All queries and commands may raise `DeviceRefused` (unknown command, value not offered, not possible now, wrong
+    password), `DeviceFault` (the projector reports a failure), `LinkError` and `ProtocolError`.
 
-    - `connect` opens a connection when it is first needed. Many projectors serve only one, and close it after about 30
-      s without a command. A command that meets a closed connection is sent once more, which does no harm.
-    - After a fault the connection is closed, so that a late reply is never taken for the next one.
+    - `connect` opens a connection when it is first needed. Many projectors accept only one connection, and close it
+      after about 30 s without a command. If the connection was closed, the command is sent once more; this does no
+      harm.
+    - After an error the connection is closed, so that a late reply is not read as the reply to the next command.
     - Many projectors implement only part of their class. A query answered with `ERR1` or `ERR2` returns None or an
       empty value and is not repeated. After `ERR3` it may be repeated.
     - `password` is None if the projector has none.
@@ -388,7 +395,7 @@ class PjLinkProjector:
         self._set("AVMT", format_mute(muted))
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return all present faults; empty if there are none, or none are reported (now)."""
+        """Return all present faults; empty if there are none, or if the projector does not report them now."""
         request = PjLinkRequest("ERST")
         if request in self._unsupported:
             self.power()  # raises if the cable is unplugged, which must not look like a healthy projector
@@ -415,7 +422,7 @@ class PjLinkProjector:
         return parse_input(self._query("INPT", level=min(self.pjlink_class(), 2)))
 
     def input_resolution(self) -> Resolution | NoResolution | None:
-        """Return the resolution of the signal, or why it is missing; None if not reported; class 2."""
+        """Return the resolution of the signal, or the reason if it is missing; None if not reported; class 2."""
         value = self._query_class_2("IRES")
         return None if value is None else parse_input_resolution(value)
 
@@ -498,14 +505,14 @@ class PjLinkProjector:
                 raise DeviceFault(f"{exchange}: it reports an internal failure; check its indicator lamps and display")
 
     def _exchange_request(self, request: PjLinkRequest) -> PjLinkReply:
-        reply = self._exchange.query(encode_request(request), split_line, is_startup_notice)
+        line = self._exchange.query(encode_request(request), split_line, is_startup_notice)
         try:
-            answer = parse_reply(reply)
-            if isinstance(answer, Refused):
+            reply = parse_reply(line)
+            if isinstance(reply, Refused):
                 raise self._wrong_password_error()
-            if answer.command != request.command:
+            if reply.command != request.command:
                 raise ProtocolError(
-                    f"{self._label} answers {answer.command} to {request.command}; check that no other controller uses "
+                    f"{self._label} answers {reply.command} to {request.command}; check that no other controller uses "
                     "this connection"
                 )
         except DeviceRefused:
@@ -518,7 +525,7 @@ class PjLinkProjector:
         except ProtocolError:
             self._exchange.close()
             raise
-        return answer
+        return reply
 
     def _greet(self, exchange: Exchange) -> bytes:
         """Return the digest that precedes the first command."""
@@ -567,7 +574,7 @@ class PjLinkProjector:
         return DeviceRefused(f"{self._label} refuses the password; set the PJLink password of its menu")
 
 
-# The search is repeated because datagrams may be lost; a projector may reply to each.
+# The search is repeated because datagrams may be lost; a projector may reply to each search.
 SEARCH_COUNT = 3
 SEARCH_INTERVAL_S = 1.0  # Long enough that one network disturbance does not affect two searches
 
@@ -589,10 +596,10 @@ def search(
     open_socket: Callable[[int], UdpSocket] = UdpSocket,
     clock: Clock = SYSTEM_CLOCK,
 ) -> tuple[FoundProjector, ...]:
-    """Broadcast a search over UDP for `seconds`; return the class 2 projectors in the order of their replies.
+    """Search for class 2 projectors by UDP broadcast; return them in the order of their replies within `seconds`.
 
-    Nothing in these replies is authenticated. Projectors also send notices of start-up, faults, power and input to the
-    controller in their menu; these are ignored here.
+    The replies are not authenticated. Projectors also send notices of start-up, faults, power and input to the
+    controller that is set in their menu; these notices are ignored here.
     """
     projectors: dict[FoundProjector, None] = {}
     with open_socket(listen_port) as datagrams:

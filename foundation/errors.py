@@ -1,4 +1,4 @@
-"""All errors that a user of CroP can meet, and phrases for their messages.
+"""All errors that CroP reports to its user, and phrases for their messages.
 
 The classes form one tree::
 
@@ -35,10 +35,10 @@ from foundation.secret_texts import masked
 # Exit code of a command that was ended by Ctrl-C: 128 + SIGINT, as in shells.
 EXIT_INTERRUPTED = 130
 
-# Last part of a remedy, if the command ended. A command that waits resumes automatically (`CropError.while_waiting`).
+# Last part of a remedy. A command that waits resumes automatically and leaves it out (`CropError.while_waiting`).
 RUN_AGAIN: Final = "then run the same command again"
 
-# Longest message, in characters: names and values of files from others can have any length.
+# Longest message, in characters: names and values in files from other people can have any length.
 _MAX_LENGTH = 8000
 
 
@@ -50,9 +50,9 @@ class CropError(Exception):
     problem
         Fault, with the value found and the value expected.
     about
-        File, folder or device, first part of the message; None if `problem` names it.
+        File, folder or device: the first part of the message. None if `problem` names it.
     remedy
-        Instruction, last part of the message. If empty, the part of `problem` after its first semicolon.
+        Instruction: the last part of the message. If empty, the part of `problem` after its first semicolon.
     value, expected
         Value found and value expected, for programs.
 
@@ -80,7 +80,7 @@ class CropError(Exception):
         self.about, self.value, self.expected = about, value, expected
 
     def __str__(self) -> str:
-        """Return the message; users, passwords and tokens in addresses are masked, very long texts shortened."""
+        """Return the message; users, passwords and tokens in addresses are masked, a very long text is shortened."""
         return self._message(self.remedy)
 
     def without_remedy(self) -> str:
@@ -126,7 +126,7 @@ class LinkTimeout(LinkError):
 
 
 class LinkClosed(LinkError):
-    """The device closed the connection, or it could not be opened."""
+    """The device closed the connection, or the connection could not be opened."""
 
 
 class ProtocolError(DeviceError):
@@ -158,7 +158,7 @@ class StorageError(CropError):
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:
-    """Return a number and its noun; the plural, by default with -s, is used for all numbers but 1.
+    """Return a number and its noun, in the plural for all numbers except 1; the default plural ends in -s.
 
     Examples
     --------
@@ -184,7 +184,7 @@ def nearest_names(name: str, candidates: Iterable[str], limit: int = 1) -> str:
 
 
 def first_few(items: Sequence[object], limit: int = 10) -> str:
-    """Return the first items, separated by commas, and an ellipsis if there are more than `limit`."""
+    """Return the first `limit` items, separated by commas, and an ellipsis if there are more."""
     return ", ".join(map(str, items[:limit])) + (" …" if len(items) > limit else "")
 
 

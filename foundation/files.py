@@ -1,15 +1,16 @@
 """Atomic writing of files, and safe reading of files and folders from other people.
 
-Files are written next to their place under a hidden name, flushed to the disk, then renamed. After a crash, a hidden
-partial file may remain, never an incomplete file under the final name. Hashes are SHA-256 (FIPS 180-4).
+A file is written under a hidden name in its final folder, flushed to the disk, then renamed. After a crash, an
+incomplete file may remain under the hidden name, never under the final name. Hashes are SHA-256 (FIPS 180-4).
 
-Reading functions raise a `FormatError` with the name of a file that breaks one of these rules:
+Functions that read raise a `FormatError` with the name of a file that breaks one of these rules:
 
-- A file name in a file leads to a file inside the folder: no ``..``, no absolute path, no link to the outside.
-- Only regular files are opened. A device or pipe may never end, and reading some devices has effects.
-- Files that are read at once have a size limit; files that are read line by line have a limit for the line.
+- A file name from a file must lead to a file inside the folder: no ``..``, no absolute path, no link to the outside.
+- Only regular files are opened. The data of a device or pipe may never end, and reading changes some devices.
+- A file that is read as a whole has a size limit. A file that is read line by line has a limit for each line.
 
-A folder is checked once, when it is opened. A person who can change it later can change its content anyway.
+A folder is checked once, when it is opened. Later checks would not help: a person who can change the folder can also
+change the content of its files.
 """
 
 from __future__ import annotations
@@ -67,12 +68,12 @@ _DISK_REMEDIES = {
     "ENFILE": f"close other programs, {RUN_AGAIN}",
 }
 _DISK_FAULTS = {getattr(errno, name): remedy for name, remedy in _DISK_REMEDIES.items() if hasattr(errno, name)}
-# Errors of a write to an open file, which come without a file name. Errors that a socket, or a file that is read at the
-# same time, can also cause are excluded.
+# Errors of a write to an open file; they have no file name. Errors that a socket can also cause are excluded, and
+# errors of a file that is read at the same time.
 _NAMELESS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT, errno.ENOTCONN}
 
-# Attempts to make a folder that another program removes at the same time. Programs do so once or twice; on special
-# file systems (/proc) no number is enough.
+# Number of attempts to make a folder, because another program may remove it at the same time. Usually two or three are
+# sufficient; on special file systems such as /proc, all of them fail.
 FOLDER_ATTEMPTS = 1000
 
 
@@ -82,7 +83,7 @@ def partial_path(path: Path) -> Path:
 
 
 def is_partial(name: str) -> bool:
-    """Return whether a file or folder with this name is the rest of an unfinished write."""
+    """Return whether a file or folder with this name remains from an unfinished write."""
     return name.startswith(".") and name.endswith(_PARTIAL)
 
 
@@ -107,9 +108,9 @@ def storage_error(path: Path, error: OSError, action: str = "write") -> InputErr
 
 
 def _write_error(path: Path, error: OSError) -> InputError | StorageError:
-    # If the folder exists, no disk is missing: the file system, such as /proc, allows no new files.
-    missing = error.filename if error.errno == errno.ENOENT and error.filename2 is None else None
-    if isinstance(missing, str | bytes) and Path(os.fsdecode(missing)).parent.is_dir():
+    # If the folder exists, its disk is connected, but a file system such as /proc allows no new files.
+    missing_name = error.filename if error.errno == errno.ENOENT and error.filename2 is None else None
+    if isinstance(missing_name, str | bytes) and Path(os.fsdecode(missing_name)).parent.is_dir():
         return InputError(
             f"cannot write {path}: {error.strerror}, the system allows no new files there; choose a path on an "
             "ordinary disk"
@@ -120,16 +121,16 @@ def _write_error(path: Path, error: OSError) -> InputError | StorageError:
 def reading_error(path: Path, error: OSError, remedy: str, description: str = "") -> FormatError | StorageError:
     """Return the error for a file that cannot be read: a StorageError if the disk is the cause, else a FormatError.
 
-    `remedy` is the remedy if the disk is not the cause. `description` precedes the path in the message.
+    `remedy` is used if the disk is not the cause. `description` precedes the path in the message.
     """
-    of_disk = disk_remedy(error) if error.errno != errno.ENOENT else None
+    remedy_for_disk = disk_remedy(error) if error.errno != errno.ENOENT else None
     file = f"{description} {path}" if description else str(path)
-    error_class = StorageError if of_disk else FormatError
-    return error_class(f"cannot read {file}: {error.strerror or error}", remedy=of_disk or remedy)
+    error_class = StorageError if remedy_for_disk else FormatError
+    return error_class(f"cannot read {file}: {error.strerror or error}", remedy=remedy_for_disk or remedy)
 
 
 def read_text(path: Path, remedy: str, description: str = "") -> str:
-    """Return a file's text, UTF-8; errors as in `reading_error`."""
+    """Return the text of a file in UTF-8; errors as in `reading_error`."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -185,7 +186,7 @@ def make_folder(folder: Path, target: Path | None = None) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
-            # Another program may have removed it between two calls.
+            # Another program may have removed the folder between two calls.
             if os.path.lexists(folder) and not folder.is_dir():
                 raise InputError(
                     f"cannot write {path}: {_BROKEN_LINK if folder.is_symlink() else _PART_IS_A_FILE}"
@@ -244,7 +245,7 @@ def read_buffer(path: Path) -> memoryview:
     import numpy as np
 
     with path.open("rb", buffering=0) as stream:
-        # Faster than `bytes`, whose pages the system clears first. numpy uses large pages: 1/500 of the page faults.
+        # Faster than `bytes`: numpy uses large memory pages, with 1/500 of the page faults.
         buffer = np.empty(os.fstat(stream.fileno()).st_size, np.uint8).data
         filled = 0
         while filled < len(buffer) and (count := stream.readinto(buffer[filled:])):
@@ -282,7 +283,7 @@ def file_sha256(path: Path) -> str:
 
 
 class HashingWriter(io.RawIOBase):
-    """Stream that hashes and counts the bytes written to `stream`, a buffered file, which stays open."""
+    """Stream that hashes and counts the bytes written to `stream`, a buffered file that stays open."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -311,18 +312,19 @@ class HashingWriter(io.RawIOBase):
         return self._digest.hexdigest()
 
 
-# Largest JSON file, in bytes: the description of a data set that skips a million pictures has a third of it.
+# Largest JSON file, in bytes. The description of a data set with a million skipped source images has a third of it.
 MAX_JSON_BYTES: Final = 256 << 20
 
-# Longest line of a file that is read line by line, in bytes. Our longest lines have some hundred, file names 4096.
+# Longest line of a file that is read line by line, in bytes. Our longest lines have a few hundred bytes, a file
+# name at most 4096.
 MAX_LINE_BYTES: Final = 1 << 20
 
 _MAX_NAME_LENGTH: Final = 4096  # PATH_MAX of Linux, in characters
 
-# Bytes of a file that may be holes, without blocks on the disk. Copies of black pictures have smaller holes.
+# Most bytes of a file that may be holes, which have no blocks on the disk. Copies of black pictures have smaller holes.
 _MAX_HOLE_BYTES: Final = 1 << 30
 
-# Number of holes that are counted. A file with more of them has as many blocks with data.
+# Number of holes that are counted. A file with more holes has as many blocks with data.
 _MAX_HOLES: Final = 4096
 
 _COPY_REMEDY: Final = "ask the author of the folder for a copy without it, or copy it with links resolved (cp -rL)"
@@ -351,8 +353,8 @@ def open_inside(root: Path, name: str) -> Generator[BinaryIO]:
         raise FormatError(f"{root}: {name!r}, expected the name of a file inside the folder; {_COPY_REMEDY}")
     handle = _open_without_links(root, name)
     if handle is None:
-        inside = _target_inside(root, name)
-        handle = _open_without_links(root, inside)
+        target = _target_inside(root, name)
+        handle = _open_without_links(root, target)
         if handle is None:
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(root / name))
     with open(handle, "rb") as stream:  # noqa: PTH123  a descriptor
@@ -361,7 +363,7 @@ def open_inside(root: Path, name: str) -> Generator[BinaryIO]:
 
 
 def require_plain_folder(folder: Path, max_bytes: Mapping[str, int] | None = None, below: tuple[str, ...] = ()) -> None:
-    """Raise a FormatError unless a folder has only folders, regular files and links that stay inside.
+    """Raise a FormatError unless a folder contains only folders, regular files and links that stay inside.
 
     `max_bytes`: size limits of files by name. `below`: subfolders that are checked too.
     """
@@ -386,7 +388,7 @@ def _require_size(path: Path, limit: int) -> None:
 
 
 def require_plain_tree(folder: Path) -> None:
-    """Raise a FormatError unless a folder has only folders and regular files, at any depth."""
+    """Raise a FormatError unless a folder contains only folders and regular files, at any depth."""
     for path, folders, files in os.walk(folder):
         for name in (*folders, *files):
             mode = (Path(path) / name).lstat().st_mode
@@ -407,7 +409,7 @@ def bounded_lines(stream: BinaryIO, name: str) -> Iterator[bytes]:
 def _parse_json(data: bytes | str, name: str) -> Any:
     import pydantic_core
 
-    # pydantic refuses lone surrogates, which the standard library accepts and which cannot be written as UTF-8.
+    # pydantic refuses lone surrogates, which cannot be written as UTF-8; the standard library accepts them.
     try:
         return pydantic_core.from_json(data)
     except ValueError as error:
@@ -448,7 +450,7 @@ def _require_filled(handle: int, path: Path) -> None:
         return
     holes = data = 0
     with suppress(OSError):
-        # File systems without holes report the first one at the end of the file.
+        # File systems that store no holes report the first hole at the end of the file.
         for _ in range(_MAX_HOLES):
             hole = os.lseek(handle, data, os.SEEK_HOLE)
             if hole >= size:
@@ -472,7 +474,7 @@ def _kind(mode: int) -> str:
 
 
 def _open_without_links(root: Path, name: str) -> int | None:
-    """Return a descriptor of a file that is opened without following links; None if a part of its path is a link."""
+    """Open a file without following links and return its descriptor; None if a part of its path is a link."""
     *folders, file = name.split("/")
     handle = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -503,7 +505,7 @@ def _has_link(root: Path, name: str) -> bool:
 
 
 def _target_inside(root: Path, name: str) -> str:
-    """Return the name below `root` to which a name with links leads."""
+    """Resolve the links in a name, and return the resulting name below `root`."""
     top = root.resolve()
     try:
         target = (top / name).resolve(strict=True)

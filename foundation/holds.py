@@ -1,7 +1,7 @@
-"""Locks for things that only one process may use at a time but no system locks, such as a display.
+"""Locks for things such as a display: only one process may use them at a time, but the system does not lock them.
 
-A lock is a socket in the abstract namespace of Linux (unix(7)). It leaves no file behind, ends with its process, and
-reports the process that holds it. Other systems have no such namespace; there, nothing is locked or refused.
+A lock is a socket in the abstract namespace of Linux (unix(7)). It leaves no file, ends with its process, and reports
+the process that holds it. Other systems have no such namespace, so nothing is locked or refused on them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 
 from foundation.errors import DeviceRefused
 
-# Length of the queue of processes that ask for the holder; a process beyond it gets no process number.
+# Most processes that can wait for the process number of the holder; further processes do not get this number.
 _QUEUE_LENGTH = 128
 
 
@@ -24,17 +24,17 @@ _QUEUE_LENGTH = 128
 def hold(noun: str, key: str) -> Generator[None]:
     """Lock a thing against other processes while the block runs; a process may lock it several times.
 
-    `noun` names the thing in messages, `key` identifies it on this machine. The DeviceRefused has the
-    number of the locking process as `value`, None if unknown.
+    `noun` names the thing in messages, `key` identifies it on this machine. If another process holds the lock, the
+    DeviceRefused has its process number as `value`, None if unknown.
     """
     if sys.platform != "linux":
         yield
         return
     name = b"\0croplab-" + hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest().encode()
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC) as own:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC) as lock:
         try:
-            own.bind(name)
-            own.listen(_QUEUE_LENGTH)
+            lock.bind(name)
+            lock.listen(_QUEUE_LENGTH)
         except OSError as error:
             holder = _holder(name)
             if holder != os.getpid():

@@ -1,4 +1,4 @@
-"""Record file of the finished pieces of a long job, with which a killed program resumes.
+"""Record file of the finished pieces of a long job, from which a killed program resumes.
 
 A line has five fields, separated by tabs: SHA-256 of the rest of the line, name of a piece, hash of its inputs, JSON
 object of its file names with their SHA-256, and its values as JSON.
@@ -30,13 +30,13 @@ class Piece:
     values: str  # Other results, as JSON on one line
 
     def to_line(self) -> bytes:
-        """Return its line of a record file."""
-        # Begins with a line end, because the last line of the file may be incomplete.
+        """Return the line of this piece in a record file."""
+        # Starts with a line end, because the last line of the file may be incomplete.
         rest = "\t".join((self.name, self.inputs, json.dumps(dict(self.files)), self.values)).encode()
         return b"\n%s\t%s\n" % (sha256_of(rest).encode(), rest)
 
     def is_complete(self, open_file: Callable[[str], AbstractContextManager[BinaryIO]]) -> bool:
-        """Return whether all its files exist with the recorded hashes; `open_file` opens a file by name."""
+        """Return whether all files of this piece exist with the recorded hashes; `open_file` opens a file by name."""
         try:
             for name, sha256 in self.files.items():
                 with open_file(name) as stream:
@@ -50,7 +50,7 @@ class Piece:
 def read_pieces(data: bytes, inputs: str | None = None) -> dict[str, Piece]:
     """Return the pieces of a record file by name, the last one of each name.
 
-    `inputs`: if given, only pieces made from these inputs.
+    If `inputs` is given, only pieces made from these inputs are returned.
     """
     pieces: dict[str, Piece] = {}
     for line in data.split(b"\n"):

@@ -1,7 +1,7 @@
 """Typed, frozen records that are written as JSON or TOML and read again, with checks by pydantic.
 
-The fields of a record are the keys of the file. Files of later versions may have more keys, files of earlier versions
-fewer, so new fields need a default. Arrays are lists in the file; NaN and infinite numbers are null.
+The fields of a record are the keys of the file. Files of later versions may have more keys. Files of earlier versions
+may have fewer keys, so new fields need a default. Arrays are lists in the file; NaN and infinite numbers are null.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def _as_lists(values: npt.NDArray[Any]) -> Any:
 
 
 def _finite(value: Any) -> Any:
-    # JSON has no NaN and infinity.
+    # JSON has no NaN and no infinite numbers.
     if isinstance(value, list):
         return [_finite(item) for item in cast("list[Any]", value)]
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -75,7 +75,7 @@ def to_plain(record: Any, record_type: Any = None) -> Any:
 def from_plain(record_type: type[T], value: Any, about: object, remedy: str) -> T:
     """Make a record, or a dataclass, from JSON or TOML objects; a FormatError names a wrong key.
 
-    `about` (the file) and `remedy` are for the message.
+    `about` (the file) and `remedy` are parts of the message.
     """
     try:
         return _adapter(record_type).validate_python(value)
@@ -116,7 +116,7 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
 
 
 def list_mistakes(mistakes: Collection[str]) -> str:
-    """Return one mistake after a space, or several in separate lines."""
+    """Return one mistake after a space, or the number of several mistakes and each on its own line."""
     lines = "".join(f"\n  {mistake}" for mistake in mistakes)
     return f" {next(iter(mistakes))}" if len(mistakes) == 1 else f" {len(mistakes)} mistakes:{lines}"
 
@@ -163,8 +163,8 @@ def find_mistakes(
 
 
 def _file_key(location: tuple[int | str, ...], document: Any) -> str:
-    # Omits the additions of pydantic: a number if a single value is read as a list, the type if several are allowed,
-    # and "[key]" if the key of a table is wrong.
+    # Leaves out the parts that pydantic adds: a number if a single value is read as a list, the type if several are
+    # allowed, and "[key]" if the key of a table is wrong.
     components: list[str] = []
     for component in location:
         if component == "[key]" or not isinstance(document, list if isinstance(component, int) else dict):
@@ -185,7 +185,7 @@ def _missing(key: str, table: type[BaseModel] | None) -> str:
 
 
 def _expectation(key: str, error: ErrorDetails, is_secret: bool = False, hidden_choice: str = "") -> str:
-    """Return the expected value of a key in our words instead of pydantic's."""
+    """Return the expected value of a key in plain words, not in the words of pydantic."""
     value, limits = error["input"], error.get("ctx", {})
     match error["type"]:
         case "literal_error" | "enum":
@@ -220,7 +220,7 @@ def _expectation(key: str, error: ErrorDetails, is_secret: bool = False, hidden_
             return error["msg"].removeprefix("Value error, ")
 
 
-# Expectation for a number, by the name of the bound in an error of pydantic.
+# Words for the limit of a number, by the name of this limit in an error of pydantic.
 _BOUNDS: Final = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of at most"}
 
 

@@ -4,16 +4,16 @@
   without its rotation.
 - Any bytes give a `Mosaic` or raise one `FormatError`. LibRaw fills missing pixels and reads beyond the stored data
   without an error. Therefore each sensor image in a file must be complete, and LibRaw's result must have the size of
-  one of them (`StoredFrame.has_size`). Files other than TIFF and CR3 (`layout_is_known`) are only checked for their
-  size and for empty parts of the frame.
+  one of them (`StoredFrame.has_size`). In files other than TIFF and CR3 (see `layout_is_known`), only the size
+  and empty parts of the frame are checked.
 - LibRaw is called only here. DNG files with counts stored as in memory are read directly, with the same result. Colour
   matrices of LibRaw are read by opening a small raw file with the camera's name.
 
 Sources: TIFF 6.0 (strips), TIFF technical note 1 and DNG 1.7.1 (tiles, CameraSerialNumber; ActiveArea, the origin of
 colour filters and black levels); LibRaw 0.22 for the selected directory, size and packing (src/metadata/tiff.cpp); Exif
-2.32, section 4.6.5 (BodySerialNumber, LensModel). Canon's maker note of bodies before Exif 2.3 is a TIFF directory with
-offsets from the start of the file, without a standard: P. Harvey, ExifTool, lib/Image/ExifTool/Canon.pm (0x000c
-SerialNumber, 0x0095 LensModel).
+2.32, section 4.6.5 (BodySerialNumber, LensModel). Canon bodies before Exif 2.3 write a maker note that no standard
+defines: a TIFF directory with offsets from the start of the file. Source: P. Harvey, ExifTool,
+lib/Image/ExifTool/Canon.pm (0x000c SerialNumber, 0x0095 LensModel).
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ _EXIF_POINTER, _NOTE = int(TiffTag.EXIF_IFD_POINTER), 37500
 
 _CANON_SERIAL, _CANON_LENS = 0x000C, 0x0095  # Tags of Canon's maker note
 
-_MAX_ENTRIES = 512  # Most entries of a directory; Canon's notes have about 60
+_MAX_ENTRIES = 512  # Most entries read from a directory; Canon's notes have about 60
 
-_MAX_TEXT = 128  # Longest lens name, bytes; Canon's have 70
+_MAX_TEXT = 128  # Longest lens name that is read, bytes; names of Canon have 70
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class FrameOrigin:
 
 
 def read_serial_and_lens(data: bytes | memoryview, directories: Sequence[Directory]) -> tuple[str, str]:
-    """Return serial number of the body and lens model from the bytes of a file; empty if not stated."""
+    """Return the serial number of the body and the lens model from the bytes of a file; empty if not stated."""
     serial = _first_text(directories, (TiffTag.BODY_SERIAL_NUMBER, TiffTag.CAMERA_SERIAL_NUMBER))
     lens = _first_text(directories, (TiffTag.LENS_MODEL,))
     if serial and lens:
@@ -124,7 +124,7 @@ def _first_text(directories: Sequence[Directory], tags: Sequence[TiffTag]) -> st
 
 
 def _read_canon_note(data: bytes | memoryview) -> tuple[str, str]:
-    """Return serial number and lens of Canon's maker note in a CR2; empty if there is none."""
+    """Return the serial number and lens model in Canon's maker note in a CR2; empty if there is none."""
     if bytes(data[:2]) not in (b"II", b"MM") or bytes(data[8:10]) != b"CR":
         return "", ""
     order = "<" if bytes(data[:2]) == b"II" else ">"
@@ -156,7 +156,7 @@ def _read_entries(data: bytes | memoryview, order: str, start: int) -> dict[int,
     return entries
 
 
-# From CIE XYZ (D65, Y = 1) to linear camera RGB, three rows of three numbers.
+# Matrix from CIE XYZ (D65, Y = 1) to linear camera RGB, three rows of three numbers.
 Matrix = tuple[tuple[float, float, float], ...]
 
 _SIDE = 32  # Side of the small raw file, photosites; LibRaw requires at least 22
@@ -197,9 +197,11 @@ def camera_matrix(camera: str) -> Matrix | None:
 
 _SKIPPED_COLUMNS = 4  # The readout of a row disturbs the first columns of a masked area (observed on the 550D)
 
-_MIN_MASKED = 256  # Photosites per phase; with fewer, the masked mean is less certain than the metadata
+# Photosites per position of the 2×2 block; with fewer, the masked mean is less certain than the metadata.
+_MIN_MASKED = 256
 
-# Photosites at the highest count from which this count is saturation; noise does not give so many equal counts.
+# If at least so many photosites have the highest count, it is the saturation level; noise does not give so many equal
+# counts.
 _PLATEAU = 64
 
 
@@ -246,9 +248,9 @@ class Mosaic:
         Returns
         -------
         (2, 2) float64, counts, or None
-            Mean for each position of the top left visible block. Photosites beyond six robust standard deviations of
-            the median and the first four columns of each area are left out. None without a masked area of sufficient
-            size. Not truncated: an integer would lose up to one count (LibRaw's 2047 for 2047.98).
+            Mean for each position of the top left visible block. The first four columns of each area are left out,
+            as are photosites more than six robust standard deviations from the median. None if the masked areas are
+            too small. Not truncated: an integer would lose up to one count (LibRaw's 2047 for 2047.98).
         """
         means = np.empty((2, 2))
         for row in range(2):
@@ -269,8 +271,8 @@ class Mosaic:
     def saturation(self) -> int:
         """Return the saturation level of this frame, counts.
 
-        The stated white level, or the highest count if it is lower and at least 64 photosites have it. A session
-        without clipped photosites keeps the stated level, which is too high; this does no harm, because no count comes
+        The stated white level, or the highest count if it is lower and at least 64 photosites have it. A frame
+        without clipped photosites keeps the stated level, which is too high. This does no harm, because no count is
         near it.
         """
         top = int(self.counts.max())
@@ -352,7 +354,7 @@ def decode_raw(data: bytes | memoryview, path: Path, *, is_verified: bool = Fals
     if plain_mosaic is not None:
         return plain_mosaic
     with ThreadPoolExecutor(1, "LibRaw") as executor:
-        # LibRaw releases the interpreter lock, so both run in parallel.
+        # LibRaw releases the interpreter lock, so decoding and check run in parallel.
         mosaic = executor.submit(_decode_with_libraw, path, data, contents)
         fault = None if is_verified else _lossless_fault(data, contents)
     if fault is not None:
@@ -400,7 +402,7 @@ LAYOUT_START = 12  # Number of first bytes that identify the layout of a file
 
 
 def layout_is_known(start: bytes | memoryview) -> bool:
-    """Return whether a file with these first `LAYOUT_START` bytes is a TIFF or CR3, whose storage is checked."""
+    """Return whether a file with these first `LAYOUT_START` bytes is a TIFF or CR3; only their storage is checked."""
     # Panasonic's files start almost like TIFF, but their pixel tags have other meanings.
     return bytes(start[4:12]) == _CR3_START or (is_tiff(start) and start[:4] != b"IIU\0")
 
@@ -438,11 +440,11 @@ def check_frames(data: bytes | memoryview, frames: Sequence[StoredFrame]) -> Seq
 
 
 def _tiff_frames(data: bytes | memoryview, directories: Sequence[Directory]) -> Iterator[StoredFrame]:
-    # LibRaw treats a version of zeros as missing.
+    # LibRaw treats a DNG version of zeros as missing.
     is_dng = any(any(directory.integers(TiffTag.DNG_VERSION)) for directory in directories)
     is_canon = bytes(data[8:10]) == b"CR" and not is_dng
     maker = next((name for directory in directories if (name := directory.text(TiffTag.MAKE))), "")
-    # Olympus states its pixels as grey.
+    # Files of Olympus state that their pixels are grey.
     interpretations = {CFA, 1} if data[2:4] in (b"RO", b"RS", b"OR") else {CFA}
     for directory in directories:
         if is_canon:
@@ -491,7 +493,7 @@ def _dng_frame(data: bytes | memoryview, directory: Directory, extents: tuple[Ex
     if compression not in (_UNCOMPRESSED, _JPEG, _LOSSY_JPEG):
         name = _UNSUPPORTED.get(compression, f"number {compression}")
         raise RawUnsupported(f"its compression is {name}, which is not supported")
-    # A linearisation table may give any count.
+    # A linearisation table may give any count of 16 bits.
     count_bits = 16 if any(directory.integers(tag) for tag in _TONES) else min(bits, 16)
     if not 8 <= bits <= 16 or directory.first(TiffTag.SAMPLE_FORMAT) > 1:
         raise RawUnsupported(f"its photosites have {bits} bits or are not integers, expected integers of 8 to 16 bits")
@@ -529,7 +531,7 @@ def _dng_frame(data: bytes | memoryview, directory: Directory, extents: tuple[Ex
 
 
 def _cr2_frame(data: bytes | memoryview, directory: Directory) -> StoredFrame | None:
-    """Return the frame of the directory with a lossless JPEG, and its size from the JPEG; else None."""
+    """Return the frame of a directory with a lossless JPEG, with the size of the JPEG; None for other directories."""
     if not directory.integers(TiffTag.STRIP_OFFSETS):
         return None
     offset, size = directory.first(TiffTag.STRIP_OFFSETS), directory.first(TiffTag.STRIP_BYTE_COUNTS)
@@ -720,7 +722,7 @@ def _camera_name(data: bytes | memoryview, directories: list[Directory]) -> str:
 
 
 def _join_names(maker: str, model: str) -> str:
-    """Return maker and model; only the model if it starts with the maker, as ``Canon EOS 550D``."""
+    """Return maker and model; only the model if it starts with the maker, as in ``Canon EOS 550D``."""
     if not maker or model.split(" ")[0].casefold() == maker.split(" ")[0].casefold():
         return model
     return f"{maker} {model}"
@@ -735,7 +737,7 @@ def _dcraw_frame(sensor: tuple[int, int], libraw_area: Area) -> Area:
 def _masked_areas(
     directory: Directory | None, camera: str, visible: Area, sensor: tuple[int, int], cr3: Cr3 | None = None
 ) -> tuple[Area, ...]:
-    """Return the optically black areas from the file, from `_MASKED`, or for any Canon sensor."""
+    """Return the optically black areas: from the file, from `_MASKED`, or the usual area of a Canon sensor."""
     stated_areas = _stated_areas(directory, TiffTag.MASKED_AREAS, sensor)
     if stated_areas:
         return stated_areas
@@ -746,7 +748,7 @@ def _masked_areas(
     if not camera.startswith("Canon") or visible.left - outer - inner < _SKIPPED_COLUMNS + 2:
         return ()
     area = Area(visible.top, outer, visible.height, visible.left - outer - inner)
-    # No standard confirms the areas in a CR3, so they only reduce the area that is known for Canon sensors.
+    # No standard confirms the areas in a CR3, so they only reduce the usual area of Canon sensors.
     stated_left = next((black for black in cr3.black if black.left < visible.left), None) if cr3 is not None else None
     if stated_left is not None and stated_left.left + stated_left.width <= visible.left:
         area = _intersection(area, stated_left)
@@ -795,7 +797,7 @@ _saved_stream: int | None = None
 def _libraw_silenced() -> Generator[None]:
     """Suppress LibRaw's messages about damaged data on stderr; the errors are raised anyway."""
     # LibRaw prints through C's `stderr`, and rawpy cannot redirect it. Only this stream is set to /dev/null while any
-    # thread decodes; Python's stderr is not changed. Without a C variable of that name nothing is done.
+    # thread decodes; Python's stderr is not changed. If C has no variable of this name, nothing is done.
     _count_silencers(1)
     try:
         yield
@@ -911,12 +913,12 @@ def _stated_areas(directory: Directory | None, tag: TiffTag, sensor: tuple[int, 
     )
 
 
-# Smallest black level (counts) for which much lower counts are impossible; cameras with less black clip at zero.
+# Smallest black level (counts) for which much lower counts are impossible; cameras with a lower one clip at zero.
 _MIN_BLACK = 16
 
 _TILE = (32, 256)  # Rows and columns of the smallest checked part, the smallest unit of storage
 
-_LARGEST = 65535  # Largest count; bits of ones
+_LARGEST = 65535  # Largest count of 16 bits, with all bits set
 
 
 def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, bits: int) -> None:
@@ -932,11 +934,11 @@ def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, 
 
 
 def filled_fault(counts: NDArray[np.uint16], black: NDArray[np.float64], white_level: int) -> str | None:
-    """Return which part of a frame is not exposed, as in a truncated file that was padded; None if none is.
+    """Describe the part of a frame without real counts, as in a truncated file that was padded; None if there is none.
 
-    `counts`: (H, W) of the visible area; `black`: (2, 2) counts. A sensor never gives a row or a 32×256 tile in which
-    no photosite reaches half of the black level; without a black level, one of only zeros. It also never gives one of
-    only ones, if the white level is far below.
+    `counts`: (H, W) of the visible area; `black`: (2, 2) counts. In a row or a 32×256 tile of a real frame, at least
+    one photosite reaches half of the black level, or one count if the black level is near zero. If the white level is
+    at most half of the largest count of 16 bits, no row or tile has only this count.
     """
     level = float(black.min())
     floor = level / 2 if level >= _MIN_BLACK else 1
@@ -982,11 +984,11 @@ def _extent_text(indices: NDArray[np.intp], shape: tuple[int, ...]) -> str | Non
 Channel = Literal["R", "G", "B"]
 CHANNELS: tuple[Channel, Channel, Channel] = ("R", "G", "B")
 
-# Counts above this fraction of saturation are treated as clipped (chosen: the response bends only above it).
+# Counts above this fraction of saturation are treated as clipped (our choice: the response bends only above it).
 CLIPPING_SHARE = 0.98
 
 # Percentile of the counts that represents paper: bare paper covers more than 2 % of a frame, hot photosites and
-# highlights less.
+# highlights cover less.
 PAPER_PERCENTILE = 98
 
 
@@ -1025,7 +1027,7 @@ def frame_black(mosaic: Mosaic) -> NDArray[np.float64]:
 
 
 def plane_of(mosaic: Mosaic, channel: Channel, black: NDArray[np.float64] | None = None) -> Plane:
-    """Return one colour of a mosaic above `black`, (2, 2) float64 counts; None measures it in the frame."""
+    """Return one colour of a mosaic above `black`, (2, 2) float64 counts; None for the result of `frame_black`."""
     black = frame_black(mosaic) if black is None else black
     positions = phases(mosaic)[channel]
     blocks = mosaic.block_planes()

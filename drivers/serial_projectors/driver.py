@@ -47,8 +47,8 @@ class LineProjector(Projector):
     """A `drivers.projector.Projector` with a line protocol; the connection is opened at the first use.
 
     All queries and commands may raise `DeviceRefused`, `DeviceFault`, `LinkError` and `ProtocolError`. A command may be
-    repeated without harm. No command is sent if the projector is already in the requested state or changes to it. With
-    `network` the connection starts with the handshake of the language.
+    repeated without harm. No power command is sent if the projector is already in the requested state or changes to it.
+    With `network` the connection starts with the handshake of the language.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class LineProjector(Projector):
         return ProjectorIdentity(language.maker, self._query_text(language.model), self._query_text(language.name))
 
     def power(self) -> Power:
-        """Return the power state; the last announced or commanded state fills gaps of the language."""
+        """Return the power state; if the language cannot report it, the last announced or commanded state."""
         self._read_switch_reply()
         if self._switching_to is not None:
             return self._switching_to
@@ -120,7 +120,7 @@ class LineProjector(Projector):
             self._switch(self._language.power.off, Power.COOLING)
 
     def muted(self) -> bool | None:
-        """Return whether mute hides the image; the last command if this is not reported, None before it."""
+        """Return whether mute hides the image; if not reported, the last command, or None without one."""
         reported = self._query_mute()
         return self._mute_set if reported is None else reported
 
@@ -145,9 +145,9 @@ class LineProjector(Projector):
         self._mute_set = muted
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return all faults reported now, or announced since the lamp was last struck.
+        """Return all faults reported now, or announced since the start of the last warm-up.
 
-        Empty without a fault, if the language has no faults, and if the projector does not report them now outside
+        Empty if there are none, if the projector does not support the query, or if it refuses the query outside
         standby.
         """
         words = self._language.faults
@@ -172,7 +172,7 @@ class LineProjector(Projector):
         return tuple(Fault(component, Severity.ERROR) for component in components)
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return all lamps; empty for a lampless projector, or if it does not count hours."""
+        """Return all lamps; empty for a lampless projector, or if lamp hours are not reported."""
         query = self._language.lamp_hours
         value = None if query is None else self._query_if_supported(query)
         if query is None or value is None:
