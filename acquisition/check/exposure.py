@@ -1,4 +1,4 @@
-"""Measure the saturation level of the sensor and search the shutter time at which white is bright but not clipped.
+"""Measure the saturation level of the sensor and find a shutter time at which white is bright but not clipped.
 
 Every proposed shutter time has been tried.
 """
@@ -46,14 +46,14 @@ class Shot:
 
 
 class Photographer:
-    """Takes frames with the devices of a rig; never changes the ISO speed and the aperture of the settings."""
+    """Takes frames with the devices of a rig; never changes ISO speed or aperture."""
 
     def __init__(self, devices: Devices, settings: LabSettings, scratch: Path) -> None:
         self._devices = devices
         self._settings = settings
         self._file = scratch / "frame"
         self._shutter_s = settings.camera.shutter_s
-        # Of every frame: shutter time, and time from release until its file was received, s.
+        # Shutter time of every frame, and time from release to the end of its download, s.
         self.timings: list[tuple[float, float]] = []
 
     def capture(self, colour: Colour, shutter_s: float, into: BinaryIO) -> CapturedFrame:
@@ -77,7 +77,7 @@ class Photographer:
         return Shot(seconds, mosaic, size)
 
     def now(self) -> datetime:
-        """Return the time of the clock of the frames."""
+        """Return the time of the clock of the laboratory."""
         return self._devices.clock.now()
 
     def restore(self) -> None:
@@ -92,20 +92,20 @@ class Photographer:
 
 TARGET = 0.7  # White level to search for, as a share of saturation
 
-# White levels, as shares of saturation, at which no other time is proposed (judgement). Above, brighter places and the
-# drift of the lamp clip; below, each stop doubles the noise of dark patches.
+# White levels, as shares of saturation, at which no other time is proposed (our choice). Above, brighter places clip
+# after a drift of the lamp; below, each stop doubles the noise of dark patches.
 SUITABLE = (0.6, 0.8)
 
-TRIALS = 8  # Tries at most: five steps of 16 and a last one lead from any time to any other
+TRIALS = 8  # Most tries: five steps by a factor of 16 and a last one reach any other time
 
-# Factor of the exposure that saturates the sensor: the weakest channel of white has a third of the strongest, which is
-# at 0.7 of saturation in a good exposure.
+# Factor by which the exposure is increased to saturate the sensor. The weakest channel of white has a third of the
+# strongest, which is at 0.7 of saturation in a good exposure.
 LONGER = 8.0
 
 LONGEST_S = 30.0  # Longest shutter time to try: longer frames cost waiting time and have more hot photosites
 
-# Share of the expected counts below which a photosite is saturated. Shutter times are stated as engraved (0.3 s for
-# 0.315 s), so that a ratio of two is wrong by up to 8 %.
+# Share of the expected counts below which a photosite is saturated. Cameras report nominal shutter times (0.3 s for
+# 0.315 s), so that the ratio of two is wrong by up to 8 %.
 PROPORTIONAL = 0.9
 
 # Share of the stated range below which counts cannot be saturation: noise in the dark is not proportional either.
@@ -120,7 +120,7 @@ _Array = npt.NDArray[np.float64]
 class Saturation:
     """Saturation level of the sensor.
 
-    - `counts`: raw counts, the lowest of the positions of the 2×2 block.
+    - `counts`: raw counts, the lowest level of the positions of the 2×2 block.
     - `measured`: whether a frame was saturated; if not, `counts` is the level in the file.
     - `stated`: the level in the file.
     """
@@ -148,7 +148,7 @@ class TriedTime:
 
 
 def fitting_times(offered_s: Sequence[float], period_s: float | None) -> list[float]:
-    """Return the offered times up to 30 s, rising, that hold whole periods of the light, if it has a period."""
+    """Return the offered times up to 30 s, rising, that are whole periods of the light, if it has a period."""
     return [
         time
         for time in sorted(offered_s)
@@ -167,14 +167,14 @@ def measure_saturation(first: Shot, take: Callable[[float], Shot], times_s: Sequ
         longer_s = next((time for time in times_s if time >= LONGER * longer.shutter_s), max(times_s, default=0.0))
         if longer_s < 1.5 * first.shutter_s or longer_s <= longer.shutter_s:
             return Saturation(stated_counts, False, stated_counts)
-        # Compared with the previous frame: the brightest hundredth of a dim first frame is noise.
+        # Compared with the previous frame, because the brightest counts of a dim first frame are noise.
         shorter, longer = longer, take(longer_s)
-        saturated_counts = _plateaus(shorter, longer)
+        saturated_counts = _saturated_levels(shorter, longer)
         if saturated_counts:
             return Saturation(min(saturated_counts), True, stated_counts)
 
 
-def _plateaus(shorter: Shot, longer: Shot) -> list[float]:
+def _saturated_levels(shorter: Shot, longer: Shot) -> list[float]:
     """Return the counts of all saturated positions of the 2×2 block in the longer frame."""
     shorter_counts, longer_counts = _paper_counts(shorter.mosaic), _paper_counts(longer.mosaic)
     black = frame_black(shorter.mosaic)
@@ -204,7 +204,7 @@ def measure_level(shot: Shot, saturation: Saturation, white: _Array | None = Non
 
 
 def search(first: TriedTime, measure: Callable[[float], TriedTime], times_s: Sequence[float]) -> tuple[TriedTime, ...]:
-    """Return the tried times, `first` included, until the best offered time is among them.
+    """Try shutter times until the best offered one is among them; return all trials, `first` included.
 
     `measure`: takes a frame at a shutter time, s, and returns its white level.
     """
@@ -218,7 +218,7 @@ def search(first: TriedTime, measure: Callable[[float], TriedTime], times_s: Seq
 
 
 def best_trial(trials: Sequence[TriedTime]) -> TriedTime:
-    """Return the trial nearest to the target, or the darkest if all are clipped."""
+    """Return the trial nearest to the target, or the shortest if all are clipped."""
     unclipped = [trial for trial in trials if not trial.clipped]
     if not unclipped:
         return min(trials, key=lambda trial: trial.shutter_s)

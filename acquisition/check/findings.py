@@ -1,7 +1,7 @@
 """Findings of `acquire check`: one frozen value for each measured quantity, graded by its limit, as text and as JSON.
 
-A value that `build-lut` accepts is good, a value that it remarks on is a remark, a value that it refuses is a fault
-(`calibration.figures.figure.Limit`). A quantity that could not be measured is `not checked`, never good.
+Grades follow the verdicts of `build-lut` (`calibration.figures.figure.Limit`): accepted values are good, values
+accepted with remarks are remarks, refused values are faults. A quantity that could not be measured is `not checked`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Finding:
     - `value`: the judged value; None without a value.
     - `unit`: unit of the value and the limits, as in `Limit`.
     - `good`, `tolerable`: ranges that are accepted, and accepted with remarks.
-    - `reason`: the expected value and the harm beyond it; empty if the value is good.
+    - `reason`: the expected value, and the consequence of others; empty if the value is good.
     - `remedy`: what to do; empty if nothing needs to be done.
     - `details`: further values by name, for programs.
     """
@@ -64,7 +64,7 @@ class CheckReport:
       the trial frames were not exposed as the settings state.
     - `figures`: measured figures by their names in `report.json`.
     - `not_known`: names of the figures that only a session can measure.
-    - `first_s`: shutter time of the trial frames, s, to be set before the forecast is valid; None if it is set.
+    - `first_s`: shutter time of the trial frames, s, if the settings have another one; None otherwise.
     """
 
     devices: tuple[str, ...]

@@ -1,6 +1,6 @@
-"""Trial frames: a temporary session of about 12 frames, measured as any session is.
+"""Trial session: a temporary session of about 14 frames, measured like any session.
 
-They are white several times, dark, the primaries, grey, and the darkest illuminant of the plan.
+The frames are several of white, dark frames, the primaries, grey, and the darkest illuminant of the plan.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from experiment.session.records import MIDDLE, FrameKind, Judgement, SessionStep
 from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError, QualityError, RegistrationError
 
-WHITES = 3  # White frames at the beginning and at the end: their scatter is the flicker of the lamp
+WHITES = 3  # White frames at the beginning, and again at the end: their scatter is the flicker of the lamp
 
 SERIES = 8  # Shutter times of a linearity series
 
@@ -47,8 +47,8 @@ class Trial:
     - `table`: measurements; None if the chart was not detected or cannot be used.
     - `verdict`: the judged figures that trial frames can measure.
     - `dark_percent`: light in the dark frames, percent of white, as `acquire run` measures it.
-    - `trouble`: why `table` is None; "" if it is not.
-    - `series_trouble`: why the linearity series cannot be used; "" if it can, or was not requested.
+    - `trouble`: the reason for a missing `table`; "" if there is a table.
+    - `series_trouble`: the reason for an unusable linearity series; "" if it is usable or was not requested.
     """
 
     white: Mosaic
@@ -68,7 +68,7 @@ class Trial:
 def trial_lights(plan: Sequence[Illuminant], primaries: npt.NDArray[np.float64]) -> tuple[Illuminant, ...]:
     """Return the illuminants of a trial: white, the primaries, grey, and the darkest of the plan.
 
-    `primaries`: (3, 3) counts of R, G and B under the red, green and blue of the projector, which predict the counts of
+    `primaries`: (3, 3) counts of R, G and B under the projector's red, green and blue, which predict the counts of
     any illuminant. The darkest illuminant has the fewest counts in its strongest channel, as in `darkest_counts`.
     """
     colours = dict(_COLOURS)
@@ -106,7 +106,7 @@ def series_times(times_s: Sequence[float], white_s: float, white_level: float) -
 def take_trial(
     camera: Photographer, session: Session, shutter_s: float, series_s: Sequence[float], series: Path
 ) -> None:
-    """Take the trial frames into their session, and frames of white at rising shutter times into a folder."""
+    """Store the trial frames in their session, and white frames at rising shutter times in a folder."""
     for step in session.steps:
         attempt = session.journal.begin(step, f"frames/{step.stem}", camera.now())
         received = session.receive(step.stem, lambda stream, step=step: camera.capture(step.colour, shutter_s, stream))

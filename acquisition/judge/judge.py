@@ -3,10 +3,10 @@
 Each check returns its value and limits, and a message if it fails. The value is None if it could not be measured. If a
 frame fails several checks, only the cause has a message (`CAUSES`), not its consequences.
 
-The amounts of the three primaries in a frame are compared with the prediction from the codes. The colour is compared at
-any lamp brightness; the brightness has its own check. If an illuminant is wrong, the frame is compared with the
-previous illuminant, with other illuminants of the plan, and with the ordered illuminant plus other light. Tiles and
-rows that deviate from the whole frame are covered, part of another picture, or damaged.
+The amounts of the three primaries in a frame are compared with the prediction from the codes. The comparison of colour
+does not depend on lamp brightness, which has its own check. If the colour is wrong, the frame is compared with the
+previous illuminant, other illuminants of the plan, and the ordered illuminant plus other light. Tiles and rows that
+deviate from the whole frame are covered, part of another picture, or damaged.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _UNPREDICTABLE = (
 
 @dataclass(frozen=True, eq=False)
 class _FrameChecks:
-    """Result of the checks of a frame; `deviating` (T,) bool are its tiles that deviate."""
+    """Result of the checks of a frame; `deviating`: (T,) bool, tiles that deviate; None if not measured."""
 
     frame: Frame
     checks: tuple[Check, ...]
@@ -173,7 +173,7 @@ class LiveJudge:
             return _FrameChecks(frame, (*checks, Check(OFF_CODES_DEG.name, reason=_UNPREDICTABLE)))
         anchor = state.anchor
         if step.kind != "dark" and (anchor is None or (state.rested and _has_moved(state, mosaic, black, measured))):
-            # The anchor is the first lit frame, which is white; or, in a resumed run, a frame with a moved chart.
+            # The anchor is the first lit frame, which is white. A resumed run replaces it if the chart was moved.
             try:
                 anchor = Anchor.from_white(mosaic, black, self._chart)
             except RegistrationError as error:
@@ -212,7 +212,7 @@ class LiveJudge:
             return _FrameChecks(frame, tuple(checks))
         light = state.basis.light(measured)
         if not state.modelled and step.kind == "response":
-            # A basis of white cannot describe a frame of one primary.
+            # A basis from white cannot describe a frame of one primary.
             return _FrameChecks(frame, tuple(checks), light)
         moved = frame.moved_px if not np.isnan(frame.moved_px).any() else state.moved_px
         previous = state.recent[-1] if state.recent else None
@@ -255,7 +255,7 @@ def _paper_rgb(paper: npt.NDArray[np.float64]) -> tuple[float, float, float] | N
 
 
 def _judge_basis(state: JudgeState, following: JudgeState) -> Check | None:
-    # A single frame of a primary cannot show that a part of it is covered, but all later frames depend on it.
+    # One frame of a primary cannot show that the chart is partly covered, but all later frames depend on it.
     if state.modelled or not following.modelled or state.witness is None or following.basis is None:
         return None
     moved = np.zeros(2) if following.moved_px is None else following.moved_px
@@ -314,7 +314,7 @@ def _judge_repeated(state: JudgeState, measured: Measured) -> Check:
 
 
 def _independence(frame: Measured, reference: Measured) -> float | None:
-    """Return the noise of the difference of two frames, relative to independent frames; None if it is too small."""
+    """Return √(1 − r²) for the correlation r of the noise of two frames; None if their noise is too small."""
     if frame.samples.shape != reference.samples.shape or len(frame.samples) == 0:
         return None
     noise, other_noise = frame.green_noise, reference.green_noise
@@ -420,12 +420,12 @@ def _movement_reason(shift_px: Sequence[float], allowed_px: float) -> str:
     )
 
 
-_SIGMAS = 6.0  # Standard deviations of the noise of a mean that are no change
+_SIGMAS = 6.0  # Significant change of a mean, in standard deviations of its noise
 
-_TILES = 16  # Tiles averaged before their change in the dark is judged: a lamp in a corner lights as many
+_TILES = 16  # Tiles averaged to judge the change of a dark frame: a lamp in a corner lights about as many
 
-# Immediate repetitions of contradicted first frames: a passing disturbance ends within a minute, and one that returns a
-# third time needs a person.
+# Most immediate repetitions of the first frames, if later frames contradict them. A passing disturbance ends within a
+# minute; a person must remove any other.
 MOST_RESTARTS: Final = 2
 
 # Checks that compare a frame with earlier frames.
@@ -434,7 +434,7 @@ _CONTRADICTIONS: Final = (
     OFF_CODES_DEG.name, STRAY_SHARE.name, DARK_DRIFT.name, OFF_BRIGHTNESS.name,
 )  # fmt: skip
 
-# Amount of light in a dark frame, share of a primary, above which it may show the previous illuminant.
+# Amount of light in a dark frame, share of a full primary, above which it may show the previous illuminant.
 _STALE_LEAST = 0.02
 
 
@@ -472,7 +472,7 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
         drift = float(np.abs(changed).max())
         black = 100 * BLACK_DN / float(scale.min())
         limit = max(ambient_percent, _SIGMAS * 2**0.5 * float(np.hypot(noise, black)))
-        # Without a masked border the black level is a constant in the file, and its drift looks like light.
+        # Without optical black, the black level is a constant in the file, and its drift looks like light.
         if not frame.black_measured:
             limit = max(limit, 100 * 8.0 / float(scale.min()))
         reason = ""
@@ -487,7 +487,7 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
 
 
 def white_scale(white: _Array) -> _Array:
-    """Return (T, 3) white with which tiles are compared, at least a third of its mean."""
+    """Return the white (T, 3) by which tiles are divided; each value is at least a third of the mean."""
     return np.maximum(white, np.maximum(white.mean(axis=0) / 3, 1.0))
 
 
@@ -537,10 +537,10 @@ def judge_first_primary(state: JudgeState, frame: Measured, primary: int) -> Che
 
 
 def judge_first_frames(state: JudgeState, step: SessionStep, cause: Check | None, judge: JudgeSettings) -> Check | None:
-    """Return why the first frames of a session or run are inconsistent; None if they are not.
+    """Return the check by which the first frames of a session or run are inconsistent; None if they are consistent.
 
-    The model is learnt from them, so that only later frames can show an error: a step that is refused twice
-    contradicts them, and before the first illuminant white is compared with the prediction of the others.
+    The model is learnt from them, so that only later frames can show an error. A step that is refused twice
+    contradicts them. With the first illuminant, white is compared with its prediction from the other frames.
 
     `cause`: the check that refuses the frame; None if it is accepted.
     """
@@ -596,7 +596,7 @@ class _FrameCause:
     """Properties of a check that refuses a frame.
 
     - `explains`: checks that fail as a consequence.
-    - `lasts`: whether repeating the frame never helps.
+    - `lasts`: whether every repeated frame fails, too.
     - `is_hidden`: whether only a reference can show it, so that frames since the last good reference are voided.
     - `in_each_light`: whether every illuminant shows it, if frames of the primaries predict it.
     """
@@ -607,12 +607,12 @@ class _FrameCause:
     in_each_light: bool = False
 
 
-# Additional light: in an illuminant, and in a dark frame compared with the first.
-_ELSEWHERE = frozenset({STRAY_SHARE.name, DARK_DRIFT.name})
+# Checks for added light: in an illuminant, and in a dark frame compared with the first one.
+_ADDED_LIGHT = frozenset({STRAY_SHARE.name, DARK_DRIFT.name})
 
 _AMBIENT = _FrameCause(frozenset({OFF_CODES_DEG.name, OFF_BRIGHTNESS.name, "uniformity"}), is_hidden=True)
 
-_OF_THE_LIGHT = frozenset({"uniformity", "blur", OFF_CODES_DEG.name, OFF_BRIGHTNESS.name, WHITE_DRIFT.name})
+_LIGHT_CHECKS = frozenset({"uniformity", "blur", OFF_CODES_DEG.name, OFF_BRIGHTNESS.name, WHITE_DRIFT.name})
 
 # Checks in the order in which they are reported as the cause: earlier ones explain later ones.
 CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
@@ -625,13 +625,13 @@ CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
         "clipping": _FrameCause(),
         "exposure": _FrameCause(),
         "chart": _FrameCause(lasts=True),
-        "movement": _FrameCause(_OF_THE_LIGHT | {"rows"}),
+        "movement": _FrameCause(_LIGHT_CHECKS | {"rows"}),
         "blur": _FrameCause(frozenset({"rows", "uniformity"})),
-        "rows": _FrameCause(_OF_THE_LIGHT | _ELSEWHERE | {"movement"}, in_each_light=True),
+        "rows": _FrameCause(_LIGHT_CHECKS | _ADDED_LIGHT | {"movement"}, in_each_light=True),
         "uniformity": _FrameCause(
-            _OF_THE_LIGHT - {"uniformity"} | _ELSEWHERE | {"rows", "movement"}, in_each_light=True
+            _LIGHT_CHECKS - {"uniformity"} | _ADDED_LIGHT | {"rows", "movement"}, in_each_light=True
         ),
-        OFF_CODES_DEG.name: _FrameCause(_ELSEWHERE | {OFF_BRIGHTNESS.name, WHITE_DRIFT.name}, in_each_light=True),
+        OFF_CODES_DEG.name: _FrameCause(_ADDED_LIGHT | {OFF_BRIGHTNESS.name, WHITE_DRIFT.name}, in_each_light=True),
         STRAY_SHARE.name: _AMBIENT,
         DARK_DRIFT.name: _AMBIENT,
         OFF_BRIGHTNESS.name: _FrameCause(in_each_light=True),
@@ -641,12 +641,12 @@ CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
     }
 )
 
-# Ratio of a tile's deviation to its limit above which uneven light explains small movement and blur. Of charts out of
-# focus by 0.5 px, one tile in 16 frames deviated at all (simulated).
-_PLAINLY = 2.0
+# Ratio of a tile's deviation to its limit above which uneven light explains small movement and blur. In 16
+# simulated frames with a blur of 0.5 px, only one tile exceeded its limit.
+_CLEARLY_UNEVEN = 2.0
 
-# Blur, px, below which rows match (simulated: none deviates at 0.75 px). If rows deviate at less, they cause the blur.
-_ROWS_STAND_PX = 0.7
+# Blur, px, below which rows match (simulated: none deviates at 0.75 px). If they deviate at less, they cause the blur.
+_ROWS_MATCH_PX = 0.7
 
 
 def _without_consequences(checks: Sequence[Check]) -> tuple[Check, ...]:
@@ -658,25 +658,25 @@ def _without_consequences(checks: Sequence[Check]) -> tuple[Check, ...]:
     reasons = [check.name for check in order if check.reason]
     if "movement" in reasons and len(reasons) > 1:
         movement = next(check for check in order if check.name == "movement")
-        # Undetected tags have another cause; moved tags are a cause.
+        # If no tag was detected, another failed check is the cause; if tags have moved, the movement is.
         if movement.value is None:
             reasons.remove("movement")
     blur = by_name.get("blur")
-    if "rows" in reasons and "blur" in reasons and blur is not None and abs(blur.value or np.inf) < _ROWS_STAND_PX:
+    if "rows" in reasons and "blur" in reasons and blur is not None and abs(blur.value or np.inf) < _ROWS_MATCH_PX:
         reasons.remove("blur")
         by_name["blur"] = replace(blur, reason="")
         order = [by_name[check.name] for check in order]
     uneven = by_name.get("uniformity")
-    if uneven is not None and uneven.reason and (uneven.value or 0.0) > _PLAINLY * (uneven.high or np.inf):
+    if uneven is not None and uneven.reason and (uneven.value or 0.0) > _CLEARLY_UNEVEN * (uneven.high or np.inf):
         # Edges of a wrong picture shift and soften the measured edges of the chart.
-        for name, limit in (("movement", limits.MOVED_FOLLOWED_PX), ("blur", _ROWS_STAND_PX)):
+        for name, limit in (("movement", limits.MOVED_FOLLOWED_PX), ("blur", _ROWS_MATCH_PX)):
             check = by_name.get(name)
             if name in reasons and check is not None and check.value is not None and abs(check.value) < limit:
                 reasons.remove(name)
                 by_name[name] = replace(check, reason="")
         order = [by_name[check.name] for check in order]
-    follows = CAUSES[reasons[0]].explains if reasons else frozenset[str]()
-    return tuple(replace(check, reason="") if check.name in follows else check for check in order)
+    consequences = CAUSES[reasons[0]].explains if reasons else frozenset[str]()
+    return tuple(replace(check, reason="") if check.name in consequences else check for check in order)
 
 
 def _voids_others(state: JudgeState, cause: str) -> bool:
@@ -694,15 +694,15 @@ def _is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
 
 _SAME_SD = 0.0015  # Least relative scatter of amounts between two frames of one illuminant
 
-_SAME_FLOOR = 4e-4  # The same without light, share of a full primary
+_SAME_FLOOR = 4e-4  # Least scatter of amounts in the dark, share of a full primary
 
-_NEAREST = 12  # Illuminants of the plan that are compared in full with a wrong one
+_NEAREST = 12  # Illuminants of the plan with which a wrong one is compared in full
 
 _PRIMARIES = ("red", "green", "blue")
 
 _ORDERED_LEAST = 0.005  # Least ordered light of a primary, share of its full light, that can be missing
 
-_MISSING = 0.05  # Share of the ordered light of a primary below which it is missing: leaked black is less
+_MISSING = 0.05  # Share of its ordered light below which a primary is missing: the leak at black is less
 
 _Array = npt.NDArray[np.float64]
 
@@ -740,7 +740,7 @@ def _judge_light(
         lamp, added = slow_change(state.leaning.extended(leaning), drift_percent / 100)
         reason = _ambient_reason(added) if added else ""
     ambient = (Check(STRAY_SHARE.name, round(100 * added, 2), None, None, "%", reason),) if added else ()
-    # If another cause changes the light, its brightness says nothing about the lamp.
+    # If another cause changes the light, its brightness does not measure the lamp.
     checks = (
         *ambient,
         Check(OFF_CODES_DEG.name, round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
@@ -760,7 +760,7 @@ def lamp_check(brightness: float, room: float, reason: str) -> Check:
 
 
 def slow_change(leaning: Leaning, drift: float) -> tuple[str, float]:
-    """Return the message about the lamp, or the added light (share of white), of the last frames together.
+    """Return the message about a changed lamp, and the added light (share of white), from the last frames together.
 
     `drift`: change of brightness that is always allowed, 0 … 1.
     """
@@ -809,13 +809,13 @@ class _LightComparison:
         """Return the message about a wrong colour, or "", and the light added to the ordered illuminant.
 
         `is_wrong`: whether the colour is beyond its limit. `room`: allowed change of log lamp brightness.
-        `was_refused`: whether the previous frame was also refused for its light.
+        `was_refused`: whether the previous frame was also refused for its colour.
         """
         fit = self.fit
         squared = fit.distance**2 + (fit.brightness / fit.brightness_sd) ** 2
-        same = self._distance_to_previous()
+        distance = self._distance_to_previous()
         changed = self.previous is not None and self.previous.codes != self.codes
-        fits_previous = same < limits.LIGHT_SIGMAS and squared - same**2 > limits.STALE_ADVANTAGE
+        fits_previous = distance < limits.LIGHT_SIGMAS and squared - distance**2 > limits.STALE_ADVANTAGE
         if self.previous is not None and changed and fits_previous:
             return _stale_reason(self.previous, self.codes), 0.0
         missing = self._missing_reason()
@@ -836,7 +836,7 @@ class _LightComparison:
             coloured = 0.0 if other_illuminant else self._coloured_light()
             if coloured:
                 return _ambient_reason(coloured), coloured
-            repeated = was_refused and not changed and same < limits.LIGHT_SIGMAS
+            repeated = was_refused and not changed and distance < limits.LIGHT_SIGMAS
             if repeated and not other_illuminant and fit.angle_deg <= limits.LIGHT_FOLLOWED_DEG:
                 return "", 0.0
             return other_illuminant or self._wrong_reason(), 0.0
@@ -848,11 +848,11 @@ class _LightComparison:
 
     def neutral_light(self) -> tuple[float, float]:
         """Return the neutral light added to the ordered illuminant, share of white, and its standard deviation."""
-        h, neutral = self.expected.amounts, np.ones(3)
-        scatter = self.model.brightness_sd**2 * np.outer(h, h)
+        ordered, neutral = self.expected.amounts, np.ones(3)
+        scatter = self.model.brightness_sd**2 * np.outer(ordered, ordered)
         weight = np.linalg.inv(self.expected.with_lamp + self.light.covariance + scatter)
         power = float(neutral @ weight @ neutral)
-        return float(neutral @ weight @ (self.light.amounts - h)) / power, power**-0.5
+        return float(neutral @ weight @ (self.light.amounts - ordered)) / power, power**-0.5
 
     def _distance_to_previous(self) -> float:
         """Return the distance to the previous illuminant in standard deviations; infinite if it is unknown."""
@@ -895,7 +895,7 @@ class _LightComparison:
         )
 
     def _other_reason(self, squared: float) -> str:
-        # Also black and white may be shown instead of the ordered illuminant.
+        # Black or white may also be shown instead of the ordered illuminant.
         best: tuple[float, Codes] | None = None
         # Only codes of similar amounts are compared in full.
         for codes in self._nearest([*self.plan, (0, 0, 0), (255, 255, 255)]):
@@ -927,33 +927,33 @@ class _LightComparison:
     def _added_light(self, source: RecentFrame | None) -> tuple[float, float] | None:
         """Return the added neutral light, or the share of another frame's light, that explains the measured light.
 
-        The second value is the remaining squared distance. None if nothing was added, or it is unlikely. `source`: the
-        other frame; None for neutral light.
+        The second value is the remaining squared distance. None if the added light is not significant, or does not
+        explain the frame. `source`: the other frame; None for neutral light.
         """
-        h = self.expected.amounts
+        ordered = self.expected.amounts
         if source is None:
             direction = np.ones(3)
         elif source.amounts is None or source.codes == self.codes or not any(source.codes):
             return None
         else:
             # The other light was shown instead during a share of the exposure.
-            direction = source.amounts - h
+            direction = source.amounts - ordered
         # Lamp brightness is fixed within its scatter: only the added light is fitted.
-        scatter = (self.model.brightness_sd**2 + 1e-6) * np.outer(h, h)
+        scatter = (self.model.brightness_sd**2 + 1e-6) * np.outer(ordered, ordered)
         weight = np.linalg.inv(self.expected.covariance + self.light.covariance + scatter)
         power = float(direction @ weight @ direction)
-        added = float(direction @ weight @ (self.light.amounts - h)) / power
-        residual = self.light.amounts - h - added * direction
+        added = float(direction @ weight @ (self.light.amounts - ordered)) / power
+        residual = self.light.amounts - ordered - added * direction
         distance = float(residual @ weight @ residual)
         if added <= 4 * power**-0.5 or added < 0.002 or distance > limits.LIGHT_SIGMAS**2:
             return None
         return added, distance
 
     def _coloured_light(self) -> float:
-        """Return the added light of any colour, share of white; 0 if any primary has less than ordered."""
-        h = self.expected.amounts
-        excess = self.light.amounts - h
-        variance = np.diag(self.expected.with_lamp + self.light.covariance) + (self.model.brightness_sd * h) ** 2
+        """Return the mean added light, share of white; 0 if it is out of range or a primary is too dark."""
+        ordered = self.expected.amounts
+        excess = self.light.amounts - ordered
+        variance = np.diag(self.expected.with_lamp + self.light.covariance) + (self.model.brightness_sd * ordered) ** 2
         mean = float(np.mean(excess))
         is_added = (excess > -3 * np.sqrt(variance)).all() and limits.ADDED_LEAST < mean < limits.ADDED_MOST
         return mean if is_added else 0.0
@@ -1004,12 +1004,12 @@ def _codes_text(codes: Codes) -> str:
 # Median relative deviation below which places are reported as covered
 _DARKER = -0.1
 
-# Share of squared deviation that the previous illuminant may leave unexplained if a place still shows it: 6° off.
+# Share of squared deviation that may remain if a place still shows the previous illuminant: an angle of 6°.
 _PREVIOUS_RESIDUAL = 0.01
 
 _WHOLE_FRAME = 0.5  # Share of deviating tiles above which the whole frame deviates
 
-# Trial blurs σ, half-size px, for rows that deviate.
+# Blurs σ, half-size px, that are tried if rows deviate.
 _BLURS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 
 _EXPLAINED = 0.4  # Share of the median deviation of rows that may remain if a blur is the cause
@@ -1019,7 +1019,7 @@ _BLURRED = 0.02
 
 _CONTRAST = 2.0  # Contrast of the chart at the edges of a tile, relative: tags, paper, patches
 
-_BY_TURNS = 0.1  # Share of deviating rows of either sign above which they belong to other places
+_BOTH_SIGNS = 0.1  # Share of deviating rows with the rarer sign, above which rows belong to other places
 
 # Median step from row to row over the median deviation, above which rows belong to several places. Shadows, windows and
 # parts of a picture have at most 0.03, scrambled rows at least 0.2 (simulated).
@@ -1039,20 +1039,20 @@ def _judge_evenness(
     `moved_px`: (2,) displacement of the chart from the basis. `previous`: the previous frame, which may still be shown
     in a part of this one, or None.
     """
-    rest = light.tiles
+    residuals = light.tiles
     systematic = UNIFORMITY.accept if basis.of_primaries else limits.UNEVEN_WHITE
     shift_tiles = float(np.hypot(*moved_px)) / float(np.diff(frame.places.x_edges).mean())
     # Movement brings other patches, or paper instead of the backdrop, into a tile.
     systematic = systematic + shift_tiles * _CONTRAST * _neighbour_contrast(basis)
-    allowed = np.maximum(systematic, limits.UNEVEN_SIGMAS * rest.noise)
-    excess = np.nan_to_num(rest.relative / allowed, nan=0.0)
+    allowed = np.maximum(systematic, limits.UNEVEN_SIGMAS * residuals.noise)
+    excess = np.nan_to_num(residuals.relative / allowed, nan=0.0)
     deviating = excess > 1
     worst = int(excess.argmax())
-    # The coarse basis of white does not describe single tiles with few patches.
+    # The coarse basis from white does not describe single tiles with few patches.
     least_tiles = 1 if basis.of_primaries else max(1, round(limits.UNEVEN_TILES * len(deviating)))
     late = _share_of_previous(basis, light, frame, deviating, previous)
-    reason = _uneven_reason(rest, deviating, late) if deviating.sum() >= least_tiles else ""
-    value, limit = (100 * float(np.nan_to_num(number)) for number in (rest.relative[worst], allowed[worst]))
+    reason = _uneven_reason(residuals, deviating, late) if deviating.sum() >= least_tiles else ""
+    value, limit = (100 * float(np.nan_to_num(number)) for number in (residuals.relative[worst], allowed[worst]))
     checks = [Check(UNIFORMITY.name, round(value, 2), None, round(limit, 2), "%", reason)]
     if len(frame.strips):
         checks += _judge_rows(basis, light, frame, moved_px, bool(reason))
@@ -1091,27 +1091,27 @@ def _neighbour_contrast(basis: Basis) -> _Array:
 
 def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Array, uneven: bool) -> list[Check]:
     down = float(moved_px[1])
-    rest = basis.strips(frame, light.amounts, down)
-    if rest is None:
+    sharp = basis.strips(frame, light.amounts, down)
+    if sharp is None:
         return []
-    is_wrong = _wrong_rows(basis, rest, moved_px)
+    is_wrong = _wrong_rows(basis, sharp, moved_px)
     count = int(is_wrong.sum())
     checks = [Check(ROWS.name, float(count), None, float(ROWS.accept))]
     if count <= ROWS.accept:
         return checks
     for sigma in _BLURS:
         soft = basis.strips(frame, light.amounts, down, sigma)
-        if soft is not None and _deviation(soft) < _EXPLAINED * _deviation(rest) and _deviation(rest) > _BLURRED:
+        if soft is not None and _deviation(soft) < _EXPLAINED * _deviation(sharp) and _deviation(sharp) > _BLURRED:
             reason = (
                 f"the frame is out of focus or shaken: its rows match with an additional blur of {sigma:g} px; check "
                 "the focus, switch off autofocus, and check for vibrations"
             )
             return [*checks, Check("blur", sigma, None, None, "px", reason)]
     # Rows of other places are brighter and darker alternately; a shadow or other light has one sign.
-    signed = rest.signed[is_wrong]
+    signed = sharp.signed[is_wrong]
     brighter = float((signed > 0).mean())
-    ragged = _is_ragged(rest, is_wrong)
-    if uneven and min(brighter, 1 - brighter) < _BY_TURNS and not ragged:
+    ragged = _is_ragged(sharp, is_wrong)
+    if uneven and min(brighter, 1 - brighter) < _BOTH_SIGNS and not ragged:
         return checks
     cause = "the file was damaged during transfer: check the cable and the memory card"
     if uneven and not ragged:
@@ -1125,39 +1125,39 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
     return [Check(ROWS.name, float(count), None, float(ROWS.accept), "", reason)]
 
 
-def _is_ragged(rest: Residuals, wrong_strips: npt.NDArray[np.bool_]) -> bool:
+def _is_ragged(residuals: Residuals, wrong_strips: npt.NDArray[np.bool_]) -> bool:
     # The deviation of a shadow is continuous, the deviation of scrambled rows changes from row to row.
-    deviation, is_wrong = np.nan_to_num(rest.signed).reshape(-1, SEGMENTS), wrong_strips.reshape(-1, SEGMENTS)
+    deviation, is_wrong = np.nan_to_num(residuals.signed).reshape(-1, SEGMENTS), wrong_strips.reshape(-1, SEGMENTS)
     are_neighbours = is_wrong[1:] & is_wrong[:-1]
     if np.count_nonzero(are_neighbours) < ROWS.accept:
         return False
     steps = np.abs(np.diff(deviation, axis=0))[are_neighbours]
-    return bool(np.median(steps) > _RAGGED * np.median(np.abs(rest.signed[wrong_strips])))
+    return bool(np.median(steps) > _RAGGED * np.median(np.abs(residuals.signed[wrong_strips])))
 
 
-def _deviation(rest: Residuals) -> float:
-    return float(np.nanmedian(np.where(np.isfinite(rest.relative), np.abs(rest.signed), np.nan)))
+def _deviation(residuals: Residuals) -> float:
+    return float(np.nanmedian(np.where(np.isfinite(residuals.relative), np.abs(residuals.signed), np.nan)))
 
 
-def _wrong_rows(basis: Basis, rest: Residuals, moved_px: _Array) -> npt.NDArray[np.bool_]:
-    is_measured = np.isfinite(rest.relative)
+def _wrong_rows(basis: Basis, residuals: Residuals, moved_px: _Array) -> npt.NDArray[np.bool_]:
+    is_measured = np.isfinite(residuals.relative)
     if not is_measured.any():
         return np.zeros(len(is_measured), dtype=np.bool_)
-    usual = max(robust_sigma(rest.signed[is_measured]), 1e-6)
+    usual = max(robust_sigma(residuals.signed[is_measured]), 1e-6)
     # A row at the edge of the chart changes with the least movement.
     assert basis.strip_maps is not None
     strength = np.linalg.norm(basis.strip_maps.sum(axis=0), axis=1).reshape(-1, SEGMENTS)
     steep = np.abs(np.gradient(strength, axis=0)).ravel() / np.maximum(strength.ravel(), 1e-6)
     shift_px = float(np.hypot(*moved_px))
     least_limit = limits.ROW_DEVIATION + _EDGE * shift_px + steep * max(shift_px, _UNSEEN_PX)
-    room = np.maximum(least_limit, limits.ROW_SIGMAS * np.maximum(usual, rest.noise))
-    return np.asarray(np.abs(np.where(is_measured, rest.signed, 0.0)) > room)
+    limit = np.maximum(least_limit, limits.ROW_SIGMAS * np.maximum(usual, residuals.noise))
+    return np.asarray(np.abs(np.where(is_measured, residuals.signed, 0.0)) > limit)
 
 
-def _uneven_reason(rest: Residuals, deviating: npt.NDArray[np.bool_], late: float) -> str:
-    lit = np.isfinite(rest.relative)
+def _uneven_reason(residuals: Residuals, deviating: npt.NDArray[np.bool_], late: float) -> str:
+    lit = np.isfinite(residuals.relative)
     share = float(deviating.sum() / max(int(lit.sum()), 1))
-    median = float(np.median(rest.signed[deviating]))
+    median = float(np.median(residuals.signed[deviating]))
     amount = f"{max(share, 0.01):.0%} of the frame, {_position_text(deviating)},"
     if late:
         return (

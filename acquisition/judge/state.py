@@ -3,21 +3,22 @@
 **Light of a frame.** The counts of a tile are its counts in the dark, plus the amount of each projector primary times
 the counts under this primary alone (`Basis`). The three amounts are fitted to all tiles at once by a robust method, so
 that a person in front of a quarter of the chart does not change them. The residuals show tiles that are lit
-differently. Sessions without frames of the primaries have white alone: the three colour channels of the camera are then
-used as coarse primaries.
+differently. A session without frames of the primaries has only white: the three colour channels of the camera then
+replace the primaries.
 
-**Model of the projector** (`ProjectorModel`). Each amount is 1 at code `TOP`. Its logarithm is a power law of the code,
-plus a smooth deviation (the tone curve), plus the light added where primaries overlap (a wheel with white, yellow, cyan
-or magenta segments, "brilliant colour"), plus the lamp brightness. All of this is one linear Gaussian state with a
-covariance. It is learnt from response frames and refined by every accepted illuminant. A prediction has an uncertainty,
-which is large before the response frames.
+**Model of the projector** (`ProjectorModel`). Each amount is 1 at code `TOP`. Its logarithm is the sum of four terms:
+a power law of the code, a smooth deviation (the tone curve), the overlap, and the lamp brightness. The overlap is the
+additional light of mixed colours, for example by a colour wheel with white, yellow, cyan or magenta segments
+("brilliant colour"). All terms form one linear Gaussian state with a covariance. It is learnt from
+response frames and refined by every accepted illuminant. The uncertainty of a prediction is large before the response
+frames.
 
-**State of a session** (`JudgeState`) is one frozen value. `updated` is the only step to the next state, for a new frame
-and for a frame of an earlier run, so that a resumed run has the state of an uninterrupted one.
+**State of a session** (`JudgeState`) is one frozen value. `updated` is the only step to the next state, for new
+frames and for frames of an earlier run. A resumed run therefore has the state of an uninterrupted one.
 
 Sources: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 2.22 to 2.26 (tone
-curves are Gaussian processes on nodes); Kalman filter in Joseph form with a linearised overlap (extended). The overlap
-is the one of `calibration.checks.projector_model`: functions of the least of two and of three codes.
+curves are Gaussian processes on nodes); Kalman filter in Joseph form with a linearised overlap (extended). Overlaps
+have the form of `calibration.checks.projector_model`: functions of the least of two and of three codes.
 
 Shapes: T tiles, S strips, K entries of the state.
 """
@@ -48,13 +49,13 @@ _POWER = 2.2  # Exponent of the mean tone curve: displays have 1.8 to 2.6
 # code: sRGB, S-shaped curves and any exponent from 1.4 to 3 lie within two standard deviations.
 _SLOPE, _BEND, _LENGTH = 0.4, 0.12, 0.7
 
-# Share of that deviation that a primary has alone: the three curves of a projector are similar, least so for LCDs.
+# Share of this deviation that is different for each primary: the three curves are similar, except for LCDs.
 _OWN = 0.15
 
-# Prior standard deviation of a primary's frame at `TOP`, relative: 0.5 % for a colour wheel, and the lamp.
+# Prior standard deviation of a primary's frame at `TOP`, relative: 0.5 % by a colour wheel, in addition to the lamp.
 _LEVEL = 0.01
 
-_OVERLAP = 0.25  # Prior standard deviation of light added by overlaps: white segments add up to half
+_OVERLAP = 0.25  # Prior standard deviation of overlaps, relative: white segments add up to half
 
 # Share by which the added light may deviate from the assumed form: except for white, it need not follow the least code.
 # It widens the limits of mixed illuminants only if light does not add.
@@ -76,7 +77,7 @@ _CHROMA, _BRIGHTNESS = 0.004, 0.002
 
 _PRIOR_WEIGHT = 12.0  # Weight of this prior scatter, in number of amounts
 
-# Lower bounds of the scatter: tiles and tone curves are not more accurate.
+# Lower limits of the scatter: tiles and tone curves are not more accurate.
 _LEAST_CHROMA, _LEAST_BRIGHTNESS = 0.0006, 0.0006
 
 _ITERATIONS = 6  # Iterations of an update: an overlap of 60 % needs four for 0.1 %
@@ -102,6 +103,7 @@ Codes = tuple[int, int, int]
 
 
 def _x(codes: npt.ArrayLike) -> _Array:
+    # Logarithm of codes relative to `TOP`: the abscissa of the tone curves.
     return np.log(np.maximum(np.asarray(codes, dtype=np.float64), 0.5) / TOP)
 
 
@@ -163,7 +165,7 @@ class ProjectorModel:
 
     - `state`, `covariance`: (K,) and (K, K) float64: deviations of the curves at the nodes, one primary after another;
       logarithms of the primaries' levels; overlaps; logarithm of lamp brightness.
-    - `chroma`, `brightness`: weighted sum of squares and number of the scatter of single amounts, and of all together.
+    - `chroma`, `brightness`: weighted sum of squared deviations and sum of weights, of each amount and of all together.
     """
 
     state: _Array
@@ -225,15 +227,15 @@ class ProjectorModel:
         expected = self.predict(codes)
         own = np.zeros((3, 3)) if added is None else added
         weight = np.linalg.inv(expected.covariance + own)
-        h = expected.amounts
-        power = max(float(h @ weight @ h), 1e-12)
-        level = float(h @ weight @ amounts) / power
-        deviation = amounts - level * h
+        predicted = expected.amounts
+        power = max(float(predicted @ weight @ predicted), 1e-12)
+        level = float(predicted @ weight @ amounts) / power
+        deviation = amounts - level * predicted
         distance = float(np.sqrt(max(deviation @ weight @ deviation, 0)))
-        sine = np.linalg.norm(np.cross(amounts, h))
-        angle = float(np.degrees(np.arctan2(sine, amounts @ h))) if h.any() else 180.0
+        sine = np.linalg.norm(np.cross(amounts, predicted))
+        angle = float(np.degrees(np.arctan2(sine, amounts @ predicted))) if predicted.any() else 180.0
         brightness = float(np.log(max(level, 1e-6)))
-        share = weight @ h / power
+        share = weight @ predicted / power
         sd = (float(share @ (expected.with_lamp + own) @ share) + self.brightness_sd**2 + LAMP_STEP**2) ** 0.5
         return Fit(distance, angle, brightness, sd)
 
@@ -327,8 +329,8 @@ _LIT = 0.01  # Least share of the median tile's white for a tile to be used: a b
 
 _SYSTEMATIC = 0.003  # Relative error of a tile's counts, in addition to noise, in the weights of the fit
 
-# Standard deviation of a frame's black level in each channel, counts. The mean of a masked border is accurate to 0.1,
-# but the black level of the image differs from it by some tenths. It matters if white has only some hundred counts.
+# Standard deviation of a frame's black level in each channel, counts. The mean of optical black is accurate to 0.1,
+# but the black level of the image differs from it by some tenths. This matters if white has only some hundred counts.
 BLACK_DN = 0.3
 
 # Share of the median signal to which deviations of darker tiles are related: a glint on a dark backdrop is harmless.
@@ -345,7 +347,7 @@ class Residuals:
     """Residuals of a fit of the light, at N tiles or strips.
 
     - `relative`: (N,) float64, length of the deviation (R, G, B) over the length of the expected signal; NaN if unlit.
-    - `noise`: (N,) float64, its standard deviation by noise.
+    - `noise`: (N,) float64, standard deviation of `relative` by noise.
     - `signed`: (N,) float64, relative deviation of the sum of the channels; negative if too dark.
     """
 
@@ -368,7 +370,7 @@ class Basis:
     """Images of the primaries; a frame is their weighted sum.
 
     - `dark`: (T, 3) float64, counts above black while the projector shows black.
-    - `maps`: (3, T, 3) float64, light added by each primary, of channel R, G, B.
+    - `maps`: (3, T, 3) float64, counts of R, G and B added by each primary.
     - `dark_strips`, `strip_maps`: (S, 3) and (3, S, 3), the same of the strips; None if not measured.
     - `of_primaries`: whether the maps show primaries of the projector; if not, the camera's channels under white.
     - `spread`, `strip_spread`: (4, T, 3) and (4, S, 3), variance of dark and of each map by noise. In dim light it is
@@ -420,7 +422,7 @@ class Basis:
         signal = frame.tiles - self.dark
         variance = _mean_variance(frame.tiles, frame.noise, blocks) + (_SYSTEMATIC * np.maximum(signal, 0)) ** 2
         trust, inverse = lit.astype(np.float64), np.eye(3)
-        # Start with the median of the solutions of single tiles: a person in front of a third of them does not move it.
+        # Start with the median of the solutions of single tiles: a person in front of a third of them cannot change it.
         single = np.moveaxis(design, 0, -1)[lit] + 1e-9 * strength[lit, None, None] * np.eye(3)
         solutions = np.asarray(np.linalg.solve(single, signal[lit][..., None]), dtype=np.float64)[..., 0]
         amounts: _Array = np.median(solutions, axis=0)
@@ -515,7 +517,7 @@ class RecentFrame:
 
 @dataclass(frozen=True)
 class Leaning:
-    """Small deviations of accepted frames: too small to judge one frame, but significant in two or three.
+    """Small deviations of accepted frames: not significant in one frame, but in two or three together.
 
     - `lamp`: log of lamp brightness over the predicted one, newest frame first, each with its standard deviation.
     - `added`: neutral light added, share of white, in the same form. Both have at most `LEANING` frames.
@@ -576,7 +578,7 @@ class JudgeState:
     - `first_grey`: first frame of the brightest grey; its paper is compared with the same grey of a resumed run.
     - `primaries`: frames of the three primaries at `experiment.session.records.TOP`.
     - `basis`, `model`: decomposition of a frame into primaries, and prediction of their amounts from codes.
-    - `moved_px`: (2,) rest position of the chart, half-size px from the anchor: (0, 0), or another after a bump.
+    - `moved_px`: (2,) rest position of the chart, half-size px from the anchor: (0, 0) until it is moved.
     - `recent`: last frames, the newest last.
     - `digests`: digests of all frames.
     - `unmeasured`: names of checks for which an accepted frame since the last good reference was too dark.
@@ -593,7 +595,7 @@ class JudgeState:
     - `first_frames`: frames accepted during this time.
     - `contradicted`: numbers of the steps that contradicted these frames once.
     - `restarts`: number of repetitions of these frames for this reason.
-    - `first_step`: number of the step of their first; None before it.
+    - `first_step`: number of the step of the first of these frames; None before it.
     - `restart_step`: number of the step that a restart takes first; None after it. A frame of another step was already
       exposed when the restart was decided.
     """
@@ -690,7 +692,7 @@ class JudgeState:
         if step.kind == "light" and not state.contradicted:
             state = replace(state, founding=False, first_frames=(), restarts=0)
         if step.kind != "dark":
-            # Deviations from before a step of the lamp are meaningless.
+            # After a step of the lamp, earlier deviations do not count.
             is_new = examined.lamp.stepped or state.rested
             leaning = Leaning() if is_new else state.leaning.extended(examined.lamp.leaning)
             state = replace(state, rested=False, leaning=leaning)
@@ -718,7 +720,7 @@ class JudgeState:
         return model
 
     def _with_anchor(self, anchor: Anchor) -> JudgeState:
-        # Images of another chart position are no basis.
+        # Frames of another chart position cannot form a basis.
         has_moved = self.anchor is not None
         return replace(
             self,

@@ -1,14 +1,14 @@
 """View of a session from its journal: attempts, current state, and the changes for a page.
 
-Nothing is written, and no file stays open. `Head` answers first whether the run is alive and well, when it will be
-complete, and what must be done. Rows that cannot change any more are read only once.
+Nothing is written, and no file stays open. `Head` reports the state of the run, its expected end, and the next
+action of the user. Rows that cannot change any more are read only once.
 
 One `SessionWatch` serves any number of pages. It opens the journal only after a change and for a short time, so that a
-session can be started, ended, deleted, replaced or restored meanwhile. Each change has a number; a page sends the
+session can be started, ended, deleted, replaced or restored at any time. Each change has a number; a page sends the
 newest number that it has, and receives the later changes as JSON, and previews of frames.
 
 Times for a page are milliseconds since 1970 UTC, numbers have six digits; its script (`web/page.js`) reads this format.
-All of it is data; the page makes elements of it, never markup.
+The page uses these data as text and numbers, never as markup.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from foundation.files import write_atomic
 
 RUN_STARTS = "start"  # Event at the start of the first frame of a run
 
-# Durations of recent frames after which a frame is late: a repeated download takes twice as long.
+# Number of frame durations after which a frame is late: a repeated download takes twice as long.
 LATE_FRAMES = 3
 
 AT_WORK = ("running", "waiting", "paused", "late")  # States of an active run
@@ -97,7 +97,7 @@ class Head:
     """State of a session.
 
     - `state`: ``running``, ``waiting`` or ``paused`` as reported by the run; ``late``: a frame takes much longer than
-      the previous ones; ``silent``: the process exists, but its sign of life did not come; ``complete``;
+      the previous ones; ``silent``: the process exists, but its sign of life is overdue; ``complete``;
       ``incomplete``: ended with missing frames; ``stopped``: killed, or power lost; ``copy``: the signs of life belong
       to another folder; ``unknown``: the journal has no sign of life; ``absent``, ``gone``, ``unreadable``: there is no
       journal yet, or no longer, or it cannot be read.
@@ -141,13 +141,13 @@ class Head:
 class SessionView:
     """A session as read from the disk; attempts and events, oldest first.
 
-    - `name`, `given`: name of its folder, and its path as given, for the sentence with the next command.
+    - `name`, `path_text`: name of its folder, and its path as given, for the sentence with the next command.
     - `lights`: illuminants of the plan; empty if their file cannot be read.
     - `records`: devices, software and plan, as recorded in the journal.
     - `heartbeat`, `place`: newest sign of life, and the location of the folder; None if unknown.
     - `frame_bytes`: size of its largest frame; 0 without frames.
     - `lost`: deleted or truncated files of accepted frames by step; determined only for a complete session.
-    - `unreadable`: why no LUT can be made, and the remedy; determined only for a complete session.
+    - `unreadable`: reason why no LUT can be built, and the remedy; determined only for a complete session.
     """
 
     name: str
@@ -186,15 +186,15 @@ class SessionView:
             if view.step in white_steps and view.verdict == ACCEPTED and view.seen and min(view.seen) > 0
         }
         newest = next(iter(whites.values()), None)
-        against: dict[int, tuple[float, float, float] | None] = {}
+        white_of_attempt: dict[int, tuple[float, float, float] | None] = {}
         for view in self.attempts:
             newest = whites.get(view.id, newest)
-            against[view.id] = newest
-        return against
+            white_of_attempt[view.id] = newest
+        return white_of_attempt
 
 
 def read_session(folder: Path, earlier: SessionView | None = None) -> SessionView:
-    """Read a session from the disk; `before`: an earlier view, of which only changes are read again."""
+    """Read a session from the disk; `earlier`: a previous view, of which only changes are read again."""
     path = folder / JOURNAL_FILE
     opened = Journal.open(path) if earlier else open_journal(folder)
     with closing(opened) as journal, journal.snapshot():
@@ -448,7 +448,7 @@ class SessionWatch:
                 return None
             state: Json = {"cursor": cursor, "head": head}
             if numbered is not None:
-                state |= self._news(numbered, since)
+                state |= self._changes(numbered, since)
             return state
 
     def _head(self) -> Head:
@@ -456,7 +456,7 @@ class SessionWatch:
             return self._trouble or Head("absent", f"there is no session {self.folder} yet; this page waits for it")
         return self._known.view.head(datetime.now(UTC))
 
-    def _news(self, numbered: _Numbered, since: str) -> Json:
+    def _changes(self, numbered: _Numbered, since: str) -> Json:
         view = numbered.view
         epoch, revision, *_ = (*since.split("."), "", "")
         is_complete = epoch != numbered.epoch or not _REVISION.fullmatch(revision)
@@ -513,15 +513,15 @@ def _numbered(inode: int, view: SessionView, earlier: _Numbered | None) -> _Numb
     # Identity is compared first, because comparing all checks is slow. Attempts that were not read again are identical.
     differing = {new.id for new in view.attempts if old.get(new.id) is not new and old.get(new.id) != new}
     changed = [number for number, white in whites.items() if number in differing or earlier.whites[number] != white]
-    new = [event.number for event in view.events if event.number not in earlier.events]
-    revision = earlier.revision + bool(changed or new)
+    new_events = [event.number for event in view.events if event.number not in earlier.events]
+    revision = earlier.revision + bool(changed or new_events)
     attempts = {**earlier.attempts, **dict.fromkeys(changed, revision)}
-    events = {**earlier.events, **dict.fromkeys(new, revision)}
+    events = {**earlier.events, **dict.fromkeys(new_events, revision)}
     return _Numbered(earlier.epoch, inode, revision, view, whites, attempts, events)
 
 
 def _signature(path: Path) -> _Signature:
-    # Data that change with the journal: of its file, and of its write-ahead file.
+    # Data of the journal and of its write-ahead file, which change with every row.
     signature: list[tuple[int, int, int]] = []
     for suffix in ("", "-wal"):
         try:
@@ -666,7 +666,7 @@ def live_page(name: str) -> tuple[str, str]:
 def write_session_report(folder: Path, path: Path | None = None) -> Path:
     """Write the report of the session in `folder`, by default into it, and return its path.
 
-    Also called by the run itself at its end: a run in this process counts as ended.
+    A run calls this function at its end; a run in this process therefore counts as ended.
     """
     path = folder / REPORT_FILE if path is None else path
     read_session(folder)
@@ -713,7 +713,7 @@ def _pictures(folder: Path, attempts: Sequence[AttemptView]) -> Iterator[tuple[i
 
 
 def _spread(count: int) -> list[int]:
-    """Return 0 … count − 1, last and first in front, so that any number of them from the front is spread evenly."""
+    """Return 0 … count − 1 in an order of which any first part is spread evenly; last and first come first."""
     indices = dict.fromkeys([count - 1, 0] if count else [])
     step = count
     while step > 1:
@@ -743,7 +743,7 @@ def _filled(*, title: str, plain: str, policy: str, data: str) -> str:
         "style": _web_text("page.css"),
         "script": _script(),
     }
-    # In one pass, so that inserted text is not searched for further fields.
+    # In one pass, so that no field is replaced in inserted text.
     return _FIELD.sub(lambda match: values[match[1]], _web_text("page.html"))
 
 

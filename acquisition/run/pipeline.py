@@ -2,8 +2,8 @@
 
 docs/explanation/steps.md has the order of the steps. `StepQueue` selects the next frame, `Pipeline` moves the devices,
 `Verdicts` records verdicts and their consequences for other frames, `LastingCause` waits for a cause that would refuse
-every frame. The saving thread uses no device and no journal: rows are committed by the devices' thread, in the order of
-taking.
+every frame. The saving thread uses no device and no journal: the thread of the devices commits rows in the
+order of exposure.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that a run needs for its frames."""
+    """Objects that a run needs for its frames."""
 
     session: Session
     devices: Devices
@@ -140,7 +140,7 @@ class Saved:
     """A complete raw file and its verdict.
 
     - `save_s`, `judge_s`: durations of hashing, flushing and renaming, and of judging, s of the computer's clock.
-    - `preview_fault`: why its preview could not be written; "" if there was no fault.
+    - `preview_fault`: the reason for a missing preview; "" if there was no fault.
     """
 
     received: ReceivedFile
@@ -340,7 +340,7 @@ class Pipeline:
         return self._job.retry.attempt(download, _DISK, curable=_is_of_disk)
 
     def _collect(self, keep: int) -> None:
-        """Record the oldest frames with their verdicts until only `keep` wait for one."""
+        """Record the oldest frames with their verdicts until only `keep` frames wait for a verdict."""
         while len(self._under_way) > keep:
             frame, awaited = self._under_way.popleft()
             start_s = time.perf_counter()
@@ -425,7 +425,7 @@ def _save(job: Job, complete: Callable[[], ReceivedFile], frame: Exposed) -> Sav
 
 
 class Verdicts:
-    """Records verdicts in the order of taking, and their consequences for earlier and later frames."""
+    """Records verdicts in the order of exposure, and their consequences for earlier and later frames."""
 
     def __init__(self, job: Job, lasting: LastingCause) -> None:
         self._job, self._lasting = job, lasting
@@ -505,9 +505,9 @@ class Verdicts:
         # A reference that voids other frames is repeated before them, to show whether the cause has gone.
         is_first = judgement.lasting or (judgement.voids and step.kind in REFERENCES)
         is_repeated = queue.refuse(step, judgement.reason, before_others=is_first)
-        # Without a good reference, repeated frames would be voided again, all night.
-        in_vain = judgement.voids and not is_repeated
-        pauses = judgement.lasting or queue.is_stuck or self._lasting.is_testing or in_vain
+        # Without a good reference, repeated frames would be voided again and again.
+        lacks_reference = judgement.voids and not is_repeated
+        pauses = judgement.lasting or queue.is_stuck or self._lasting.is_testing or lacks_reference
         follow_up = "repeated after a pause" if pauses else "left for the next run"
         sentence = f"{step_name(step)}: {judgement.reason}"
         self._job.retry.report("refused", f"{sentence} ({'repeated now' if is_repeated else follow_up})")
@@ -560,10 +560,10 @@ class Verdicts:
 
 
 class LastingCause:
-    """A cause that would refuse every frame: the run waits, and repeats frames at growing intervals until it has gone.
+    """A cause that would refuse every frame. The run waits, and tests at growing intervals whether it is removed.
 
-    A picture that is always late shows the right illuminant if it is shown twice in a row. The cause has therefore
-    gone after an accepted change of the illuminant, or after all test frames, one of which changes it.
+    A picture that is always late shows the right illuminant if it is shown twice in a row. The cause is therefore
+    removed after an accepted change of the illuminant, or after all test frames if one of them changes it.
 
     - `last_before`: newest attempt before the run, or before its last pause for a lasting cause.
     """
@@ -588,7 +588,7 @@ class LastingCause:
         return self._testing is not None
 
     def note(self, sentence: str, step: SessionStep | None) -> None:
-        """Note the cause, and the refused step; None if it voided frames of others."""
+        """Note the cause, and the refused step; None if the cause voided other frames."""
         self._sentence, self._step = sentence, step
 
     def wait(self) -> None:
@@ -650,8 +650,8 @@ def _accepted_changes(
     percent = values.get(OFF_BRIGHTNESS.name, 0.0)
     # An accepted step of the lamp is beyond its limit. Frames that connect runs have wide limits.
     stepped = any(check.name == OFF_BRIGHTNESS.name and check.is_beyond for check in judgement.checks)
-    links = step.kind == "response" and any(lit.kind == "light" and lit.number < step.number for lit in steps)
-    if stepped or (links and abs(percent) > judge.drift_percent):
+    connects_runs = step.kind == "response" and any(lit.kind == "light" and lit.number < step.number for lit in steps)
+    if stepped or (connects_runs and abs(percent) > judge.drift_percent):
         sign = "stronger" if percent > 0 else "weaker"
         sentence = (
             f"{step_name(step)}: the light is {abs(percent):.1f} % {sign} than in the previous frames; the run "
@@ -843,7 +843,7 @@ class StepQueue:
 
 
 def unclosed_kinds(kinds: Iterable[str]) -> frozenset[str]:
-    """Return the kinds of references missing after the last illuminant; `taken`: kinds of accepted frames in order."""
+    """Return the kinds of references missing after the last illuminant; `kinds`: of accepted frames in order."""
     unclosed: set[str] = set()
     for name in kinds:
         if name == "light":
