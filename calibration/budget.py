@@ -1,11 +1,11 @@
 """The uncertainty budget of a LUT: components and expanded uncertainty of ground truth and patch means.
 
 Errors are relative to bare paper under each illuminant, or to the mean of each patch, by channel. A component is a mean
-square error: its variance, plus the square of an effect that is measured but not corrected. Components are independent
-and add up (JCGM 100:2008, 5.1). Results are expanded with k = 2 (6.2), about 95 %. Sample noise is not an error of a
-patch, but a property of the camera.
+square error: a variance, plus the square of an effect that is measured but not corrected. Components are independent
+and are added (JCGM 100:2008, 5.1). The expanded uncertainty has k = 2 (6.2), which covers about 95 %. Sample noise is
+not an error of a patch, but a property of the camera.
 
-L illuminants, C patches in the order of colour indices.
+K components, L illuminants, C patches in the order of colour indices.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """One cause of errors."""
+    """Part of the uncertainty with one origin."""
 
-    name: str  # For programs
-    title: str  # For people
-    assumed: bool  # True if the session cannot show it and a usual value is assumed
+    name: str  # Identifier in files
+    title: str  # Name in reports
+    assumed: bool  # True if the session cannot show it, so that a usual value is used
     source: str
     lights: _Array  # (L, 3, 3) float64, mean square relative error of each illuminant's white in R, G, B
     cells: _Array  # (C, 3) float64, mean square relative error of each patch mean, without the error of bare paper
@@ -39,7 +39,7 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """All components of a LUT."""
+    """All components of the uncertainty of a LUT."""
 
     components: tuple[Component, ...]
     white: _Array  # (L, 3) float64 counts above black, the ground truth
@@ -51,7 +51,7 @@ class Budget:
 
     @cached_property
     def lights_deg(self) -> _Array:
-        """(K, L) float64 degrees, standard uncertainty of each ground truth by component."""
+        """(K, L) float64 degrees, standard uncertainty of each ground truth from each component."""
         return np.array([direction_deg(self.white, component.lights) for component in self.components])
 
     @cached_property
@@ -69,7 +69,7 @@ class Budget:
         return self.components[int(np.argmax(self.lights_deg[:, light]))]
 
     def lights_csv(self) -> str:
-        """Return the text of `uncertainty.csv`: uncertainties by illuminant, expanded, and standard by component."""
+        """Return the text of `uncertainty.csv`: expanded uncertainty of each illuminant, and its components."""
         names = [f"{component.name.replace(' ', '_')}_deg" for component in self.components]
         rows = zip(self.expanded_deg.tolist(), self.lights_deg.T.tolist(), strict=True)
         return _csv(["illumination", EXPANDED, *names], ([expanded, *standard] for expanded, standard in rows))
@@ -108,11 +108,11 @@ def _csv(columns: list[str], rows: Iterable[list[float]]) -> str:
 
 
 def direction_deg(white: _Array, relative: _Array) -> _Array:
-    """Return the RMS angle (L,) float64, degrees, of vectors `white` (L, 3) with uncertain components.
+    """Return the RMS angle (L,) float64, degrees, of the error of vectors `white` (L, 3).
 
-    First-order propagation (JCGM 100, 5.1.2): only the error perpendicular to the vector counts.
+    First-order propagation (JCGM 100, 5.1.2): only the error perpendicular to the vector changes its direction.
 
-    `relative`: (L, 3, 3) float64, mean square of the components' relative errors.
+    `relative`: (L, 3, 3) float64, mean square of the relative errors of the vectors' components.
     """
     length = np.linalg.norm(white, axis=1)
     along = white / np.maximum(length, 1e-9)[:, None]

@@ -1,7 +1,7 @@
 """Judge a LUT: compare figures with limits, explain values beyond them, and select frames to take again.
 
-Judging is a pure function of values. A value that could not be measured is not judged. Frames are taken again if they
-exceed a refusing limit individually, or if they are the cause; a fault common to all frames is not corrected by this.
+The verdict depends only on the values. A value that could not be measured is not judged. Single frames are selected if
+they exceed a refusing limit or cause a value beyond a limit. New frames do not correct a fault of all frames.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class JudgedValue:
         return self.figure.text(self.value)
 
     def text(self) -> str:
-        """Return value, expectation and consequence in one line."""
+        """Return value, accepted range and consequence in one line."""
         figure = self.figure
         side = "above" if figure.sense == "at most" else "below"
         refusal = "" if figure.refuse is None else f", refused {side} {figure.text(figure.refuse)}"
@@ -64,7 +64,7 @@ class Verdict:
 
     @property
     def remarks(self) -> tuple[JudgedValue, ...]:
-        """Values beyond the accepted limit with which a LUT is still built."""
+        """Values beyond the accepted limit, but not beyond the refusing limit."""
         return tuple(row for row in self.rows if row.outcome == "accept with remarks")
 
 
@@ -84,7 +84,7 @@ class ProbableCause:
     figure: str  # Name of the figure
     decision: Decision  # The cause, and the rule that applied
     evidence: Evidence
-    frames: tuple[FrameRecord, ...]  # Frames that show it, the worst first; empty if all do
+    frames: tuple[FrameRecord, ...]  # Frames that show it, the worst first; empty if all frames show it
     positions: tuple[PrintPosition, ...]
 
     @property
@@ -111,7 +111,7 @@ def judge(values: Mapping[str, float], figures: Sequence[Figure] = FIGURES) -> V
 
 
 def explain(figure: Figure, table: TableMeasurements) -> ProbableCause | None:
-    """Return the cause of a figure beyond its limit; None if the figure explains itself, such as the patch size."""
+    """Return the cause of a figure beyond its limit; None without evidence, or if the figure explains itself."""
     gathered = None if figure.cause is None else figure.cause.gather(table, figure.accept)
     if figure.cause is None or gathered is None:
         return None
@@ -121,8 +121,8 @@ def explain(figure: Figure, table: TableMeasurements) -> ProbableCause | None:
 
 
 def _shared_cause(unknown: ProbableCause, follows: Sequence[str], table: TableMeasurements) -> ProbableCause:
-    """Return a cause that another figure shows in the same frames; the unknown cause if there is none."""
-    # For example, an object on the print in a frame increases the scatter of its patches, too.
+    """Return the cause of another figure in the same frames; the unknown cause if there is no such figure."""
+    # For example, an object on the print in a frame also increases the scatter of the frame's patches.
     for name in follows:
         main = explain(BY_NAME[name], table)
         if main is None or not main.is_known or not main.frames:
@@ -136,33 +136,33 @@ def _shared_cause(unknown: ProbableCause, follows: Sequence[str], table: TableMe
 
 
 def findings(verdict: Verdict, table: TableMeasurements) -> dict[str, ProbableCause]:
-    """Return the probable cause of each value beyond its limit, by figure name."""
+    """Return the probable cause of each value beyond its accepted limit, by figure name."""
     explained = (explain(row.figure, table) for row in (*verdict.refused, *verdict.remarks))
     return {cause.figure: cause for cause in explained if cause is not None}
 
 
 def retake_command(records: Sequence[FrameRecord]) -> str:
-    """Return the command that repeats frames: by illuminant numbers, or from the report for other frames."""
+    """Return the command that repeats frames: by illuminant number, or from the report if there are other frames."""
     lights = [record.illumination for record in records if record.kind == "light"]
     numbers = [light for light in lights if light is not None]
     return COMMAND if len(numbers) < len(records) else COMMAND.replace("bad", lights_text(numbers))
 
 
 def retaken_frames(verdict: Verdict, table: TableMeasurements) -> tuple[FrameRecord, ...]:
-    """Return the frames to repeat, in the order taken."""
+    """Return the frames to repeat, in the order of their attempts."""
     causes = findings(verdict, table)
     hashes = {frame.sha256 for row in verdict.refused for frame in _frames_beyond(row, table, causes) or ()}
     for cause in causes.values():
         if cause.is_of_frames:
             hashes |= {frame.sha256 for frame in cause.frames}
-    # Dark frames have no figures of their own, and can only be refused for camera or exposure.
+    # Figures list a dark frame only if its camera or exposure differs.
     foreign = [frame.record for frame in (*table.origins.other_camera, *table.origins.other_exposure)]
     records = [*(frame.record for frame in table.frames), *(record for record in foreign if record.kind == "dark")]
     return tuple(sorted((record for record in records if record.sha256 in hashes), key=lambda record: record.attempt))
 
 
 def is_mended_by_retaking(verdict: Verdict, table: TableMeasurements) -> bool:
-    """Return True if every refusal concerns single frames, so that repeating them makes a LUT possible."""
+    """Return True if every refused value concerns single frames, so that new frames make a LUT possible."""
     causes = findings(verdict, table)
     return bool(verdict.refused) and all(
         _frames_beyond(row, table, causes) or (row.figure.name in causes and causes[row.figure.name].is_of_frames)
@@ -185,7 +185,7 @@ def _frames_beyond(
 ) -> list[FrameRecord] | None:
     """Return the frames beyond a row's refusing limit.
 
-    None if the value does not concern single frames, or if repeated frames would have the same cause.
+    None if the value does not concern single frames, or if new frames would have the same fault.
     """
     figure, cause = row.figure, causes.get(row.figure.name)
     if cause is not None and cause.is_known and cause.decision.cause.repeats != "frames":
@@ -194,9 +194,9 @@ def _frames_beyond(
 
 
 def refusal(verdict: Verdict, table: TableMeasurements, *, reported: bool = False) -> str:
-    """Return in one line why the LUT is refused and what to do; explains the most informative of the refused rows."""
+    """Return reason and remedy of the refusal in one line, from the most informative refused row."""
     causes = findings(verdict, table)
-    # A row with a known cause is more informative than the first one.
+    # A row with a known cause is more informative than a row without.
     explained = [row for row in verdict.refused if row.figure.name in causes and causes[row.figure.name].is_known]
     foremost = [row for row in verdict.refused if row.figure.foremost]
     main_row = (*foremost, *explained, *verdict.refused)[0]
@@ -215,7 +215,7 @@ def refusal(verdict: Verdict, table: TableMeasurements, *, reported: bool = Fals
 
 
 def remark(row: JudgedValue, table: TableMeasurements) -> str:
-    """Return a remark in one line: value, expectation, position, cause, remedy and command."""
+    """Return a remark in one line: value, accepted range, position, cause, remedy and command."""
     cause, repeat_text = explain(row.figure, table), ""
     detail, remedy = detail_and_remedy(row.figure, table)
     if cause is not None and cause.is_known:
@@ -226,7 +226,7 @@ def remark(row: JudgedValue, table: TableMeasurements) -> str:
 
 
 def detail_and_remedy(figure: Figure, table: TableMeasurements) -> tuple[str, str]:
-    """Return the addition to a figure's value beyond a limit, or "", and its remedy."""
+    """Return the text added to a figure's value beyond a limit, or "", and the remedy."""
     detail = None if figure.detail is None else figure.detail(table)
     return ("", figure.remedy) if detail is None else detail
 
@@ -237,7 +237,7 @@ def _cause_text(cause: ProbableCause | None) -> str:
     decision = cause.decision
     if decision.rule is None:
         return "cause unknown; possible remedy: "
-    # The reason is reported with the figure that it follows.
+    # The message of the other figure gives the reason.
     why = "" if decision.follows else f" ({decision.rule.why})"
     return f"probably {decision.cause.description}{why}; "
 
@@ -253,7 +253,7 @@ def position_text(figure: Figure, table: TableMeasurements) -> str:
 
 
 def positions_text(cause: ProbableCause | None) -> str:
-    """Return the frames and the position on the print of a cause, or ""."""
+    """Return the frames of a cause and its position on the print, or ""."""
     if cause is None:
         return ""
     files = [frame.file for frame in cause.frames]

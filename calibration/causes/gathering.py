@@ -1,7 +1,7 @@
 """Gather the evidence for the cause of a figure beyond its limit.
 
-Each public function takes a LUT's measurements and the accepted limit, and returns a `CauseEvidence`, or None without
-evidence. First come positions on the print, then whole frames, then illuminants.
+Each public function with a name `…_evidence` takes a LUT's measurements and the accepted limit. It returns a
+`CauseEvidence`, or None if there is no evidence. The order is: positions on the print, whole frames, illuminants.
 """
 
 from __future__ import annotations
@@ -17,43 +17,44 @@ from calibration.sampling import WINDOW, bleed
 from experiment.measures.stains import Stains, cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
 from experiment.session.records import FrameRecord
 
-# Relative deviation of a block, beyond noise, above which it is real: clean simulated frames stay below.
+# Relative deviation of a block, beyond noise, that shows a fault. Clean simulated frames have smaller deviations.
 MIN_BLOCK = 0.004
 
-# Fraction of the worst frame's deviation above which another frame shows the same fault.
+# Fraction of the worst frame's deviation from which another frame shows the same fault.
 SAME_FAULT = 0.3
 
-MAX_POSITIONS = 12  # Positions listed and drawn per figure; more would hide the picture
+MAX_POSITIONS = 12  # Largest number of positions per figure; more marks would cover the plotted image
 
-# If at least this fraction of frames differs from the first frame at a position, the first frame is at fault.
+# If at least this fraction of frames differs at a position from the frame registered first, that frame is faulty.
 IN_FIRST = 0.8
 
-# A single frame explains a deviation of the mean of white frames if it has at least this fraction of it.
+# Smallest fraction of a deviation with which another frame shows the same fault, and largest fraction of white frames
+# that are reported as single frames.
 _HALF = 0.5
 
-# Relative residual of references that shows an object: ten times their noise under white.
+# Relative residual of references from which an object is reported: ten times their noise under white.
 _MIN_RESIDUAL = 0.02
 
 # Mean relative residual of the outermost references below which a frame's corners are darker than its flat field.
 DARK_RIM = -0.005
 
-# Number of patches at a small position that prove added light if all of them are brighter.
+# Smallest number of adjacent patches that proves added light, if all are brighter.
 _MIN_BRIGHT = 4
 
-# Fraction of the patches at a small position that a thin shadow darkens (judgement: all of them, except for noise).
+# Smallest fraction of adjacent patches that a thin shadow darkens (judgement: all, except for noise).
 _MOSTLY = 0.8
 
-# Relative deviation of at least one covered patch, unless all are darker (judgement: few printed colours are within
-# 10 % of a hand's reflectance).
+# Smallest relative deviation of the worst covered patch, unless nearly all are darker (judgement: few printed colours
+# are within 10 % of a hand's reflectance).
 _COVERED = 0.1
 
-# Fraction of noisy patches in a spot of the print above which the spot explains them.
+# Fraction of the noisy patches in spots of the print from which the spots explain the noise.
 _IN_SPOT = 0.5
 
-# Relative deviation of a block above which the object also changes the mean of the paper (judgement).
+# Relative deviation of a block above which an object also changes the mean of the references (judgement).
 _DISTURBED = 0.03
 
-# Largest log ratio of equal exposures: shutter speeds are steps of 25 %, and are recorded rounded.
+# Largest logarithm of the ratio of equal exposures. Shutter times have steps of 26 %, and files contain rounded times.
 _SAME_EXPOSURE = 0.03
 
 _Array = npt.NDArray[np.float64]
@@ -80,7 +81,7 @@ class CauseEvidence:
 
 
 def block_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
-    """Gather evidence on the block that deviates most, in any frame, from the frame registered first."""
+    """Gather evidence on the block with the largest deviation from the frame registered first, over all frames."""
     return _gather_block(table, max(table.frames, key=lambda frame: frame.consistency.block), limit)
 
 
@@ -120,21 +121,21 @@ def covered_deviation(deviations: npt.NDArray[np.float64]) -> float:
     known_deviations = deviations[deviations != 0]
     darker = known_deviations[known_deviations < 0]
     if not len(darker):
-        # A few brighter patches may be dark ones covered by a hand.
+        # A few brighter patches may be dark patches that a hand covers.
         return float(np.median(known_deviations)) if len(known_deviations) >= _MIN_BRIGHT else np.nan
-    # Patches with light of their neighbours are about equally often brighter and darker, by small amounts.
+    # Light of neighbouring patches makes about as many patches brighter as darker, by small amounts.
     is_mixed = len(darker) < _MOSTLY * len(known_deviations) and np.abs(known_deviations).max() < _COVERED
     return np.nan if is_mixed else float(darker.min())
 
 
 def disturbed_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | None:
-    """Gather evidence on the patches that a small object covers in illuminants' frames; None without such patches."""
+    """Gather evidence on the patches that a small object covers in illuminants' frames; None if there are none."""
     worst = max(table.frames, key=lambda frame: len(frame.consistency.disturbed))
     return _gather_disturbed(table, table.added_bleed(worst))
 
 
 def _gather_disturbed(table: TableMeasurements, softer: float) -> CauseEvidence | None:
-    # `softer`: light of neighbouring patches that the worst frame's blur adds, relative.
+    # `softer`: fraction of light of neighbouring patches that the worst frame's blur adds.
     lights = [frame for frame in table.frames if frame.record.kind == "light" and frame.consistency.disturbed]
     if not lights:
         return None
@@ -169,7 +170,7 @@ def _gather_disturbed(table: TableMeasurements, softer: float) -> CauseEvidence 
 
 
 def spot_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | None:
-    """Gather evidence on the print's largest spot; None if it has none."""
+    """Gather evidence on the largest spot of the print; None if the print has no spot."""
     stains = table.cells.stains
     spots = spots_of(stains)
     if not spots:
@@ -181,7 +182,7 @@ def spot_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | Non
 
 
 def unfit_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | None:
-    """Gather evidence on the patches with the most frequent kind of unfitness."""
+    """Gather evidence on the unfit patches of the most frequent kind."""
     kinds = [cell.kind for cell in table.cells.unfit]
     common = max(dict.fromkeys(kinds), key=kinds.count, default="stained")
     if common == "stained":
@@ -221,13 +222,13 @@ def noisy_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | No
 
 
 def _lens_evidence(table: TableMeasurements) -> dict[str, float]:
-    """Return evidence on light from outside patches, and on the flatness of the sheet, by names of `Evidence`."""
+    """Return evidence on light from outside the patches and on the flatness of the sheet, by names of `Evidence`."""
     registration, unfit = table.registration, table.cells.unfit
     evidence = {"waves_px": registration.lens_residual_px / registration.clearance}
-    # Too large a window includes the neighbours with any lens.
+    # A window that is too large contains light of neighbouring patches with any lens.
     if table.cells.window <= WINDOW:
-        core = bleed(registration.cell_px, registration.blur_px, table.cells.window)
-        evidence["beyond_cell"] = core + table.lens.beyond_cell
+        window_bleed = bleed(registration.cell_px, registration.blur_px, table.cells.window)
+        evidence["beyond_cell"] = window_bleed + table.lens.beyond_cell
     if unfit:
         evidence["uneven"] = sum(cell.cause.startswith("uneven") for cell in unfit) / len(unfit)
     return evidence
@@ -288,7 +289,7 @@ def _dark_rim_fraction(table: TableMeasurements) -> float:
 def _residual_evidence(
     table: TableMeasurements, frame: FrameMeasurements
 ) -> tuple[dict[str, float], tuple[PrintPosition, ...]]:
-    """Return evidence from the largest residual of a white frame's references, and its position, if there is any."""
+    """Return evidence from the largest residual of a white frame's references, and its position; both may be empty."""
     whites, residuals = table.white_frames, frame.paper.left
     deviation, tint = _largest_deviation(np.array(residuals.deviation))
     if frame not in whites or len(whites) < 2 or abs(deviation) < _MIN_RESIDUAL:
@@ -334,12 +335,12 @@ def reference_evidence(table: TableMeasurements, limit: float) -> CauseEvidence 
         position = PrintPosition(worst.record.file, *residuals.at_mm, 0.0)
         return CauseEvidence(Evidence(**evidence), (), (position,))
     gathered = _gather_spot(table, stains, near_spots[0])
-    # The spot's values are based on patches of all colours, and more accurate.
+    # The values of the spot are based on patches of all colours, and are more accurate.
     return replace(gathered, evidence=Evidence(**evidence | gathered.evidence.measured_values()))
 
 
 def _frame_evidence(table: TableMeasurements, at_mm: _Array, size_mm: float, min_deviation: float) -> dict[str, float]:
-    """Return which frames deviate at a position from the frame registered first, by names of `Evidence`."""
+    """Return evidence on frames that deviate at a position from the frame registered first, by names of `Evidence`."""
     first = table.registered_frame
     other_frames = [frame for frame in table.frames if frame is not first]
     if not other_frames:
@@ -356,7 +357,7 @@ def _frame_evidence(table: TableMeasurements, at_mm: _Array, size_mm: float, min
 
 
 def _frames_off(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float) -> list[FrameMeasurements]:
-    """Return the frames that deviate at a position from the frame registered first, the worst first."""
+    """Return the frames that deviate at a position from the frame registered first, worst first."""
     first = table.registered_frame
     frames = [
         frame
@@ -370,10 +371,10 @@ def _frames_off(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum
 
 
 def _largest_deviation(colour: _Array) -> tuple[float, float]:
-    """Return the largest deviation of a channel, and the range of all channels relative to it."""
+    """Return the largest deviation of a channel and the relative range of the channels; channels at 0 are unknown."""
     deviation = float(colour[int(np.argmax(np.abs(colour)))])
-    lit = colour[colour != 0]
-    return deviation, float(np.ptp(lit)) / max(abs(deviation), 1e-9) if len(lit) > 1 else 0.0
+    known = colour[colour != 0]
+    return deviation, float(np.ptp(known)) / max(abs(deviation), 1e-9) if len(known) > 1 else 0.0
 
 
 def _position_of(stains: Stains, spot: npt.NDArray[np.int64], file: str) -> PrintPosition:
@@ -420,7 +421,7 @@ def chart_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on the frame in which the chart was registered first."""
     registered = table.registered_frame
     gathered = _gather_frames(table, registered, [registered])
-    # The references show an object on the print if other white frames do not contain it.
+    # The references show an object on the print only if other white frames do not contain it.
     evidence, positions = _residual_evidence(table, registered)
     return CauseEvidence(Evidence(**gathered.evidence.measured_values() | evidence), gathered.frames, positions)
 
@@ -441,15 +442,15 @@ def _gather_frames(table: TableMeasurements, worst: FrameMeasurements, beyond: _
 
 
 def light_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
-    """Gather evidence on whites that do not add up, drift, or do not fit their codes."""
+    """Gather the exposures and colour scatter of whites that do not add up, drift, or do not fit their codes."""
     frames = table.frames
     evidence = Evidence(frames=float(len(frames)), colour_scatter=_colour_scatter(table))
     exposures = np.array([frame.exposure for frame in frames])
     if len(frames) < 2 or not (exposures > 0).all():
         return CauseEvidence(evidence, (), ())
-    # Most illuminants' frames define the session's exposure; white frames are few.
-    of_lights = [frame.exposure for frame in frames if frame.record.kind == "light"]
-    ratio = exposures / float(np.median(of_lights or exposures))
+    # The session's exposure is the median over the frames of illuminants; white frames are few.
+    light_exposures = [frame.exposure for frame in frames if frame.record.kind == "light"]
+    ratio = exposures / float(np.median(light_exposures or exposures))
     log_ratio = np.abs(np.log(ratio))
     worst = int(np.argmax(log_ratio))
     deviating_frames = np.flatnonzero(log_ratio > 0.5 * log_ratio[worst]) if log_ratio[worst] > _SAME_EXPOSURE else ()
@@ -469,7 +470,7 @@ def drift_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
 
 
 def sum_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
-    """Gather evidence on primaries that do not add up to white, and the frame of the faulty one."""
+    """Gather evidence on primaries that do not add up to white, and on the frame of the faulty primary."""
     light, white = light_evidence(table, limit), table.lights.additivity
     if light.frames or white is None:
         return light
@@ -477,7 +478,7 @@ def sum_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     low, middle, high = np.argsort(amounts).tolist()
     lower_step, upper_step = (float(step) for step in (amounts[middle] - amounts[low], amounts[high] - amounts[middle]))
     larger_step, smaller_step = max(lower_step, upper_step), min(lower_step, upper_step)
-    # The frame of a primary may vary as much as the white frames do.
+    # Frames of primaries may vary as much as white frames.
     if not larger_step > _LONE_RATIO * _colour_range(table):
         return light
     if larger_step > _LONE_RATIO * smaller_step:
@@ -490,11 +491,12 @@ def sum_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     return CauseEvidence(evidence, frames, ())
 
 
-# One primary differs alone if its distance from the nearer one is this many times their distance (judgement).
+# One primary is faulty if its difference from the nearest primary is this many times the difference of the other two.
+# Smaller multiples of the white frames' colour range are no fault (judgement).
 _LONE_RATIO = 3.0
 
-# If a primary's frame contains another illuminant, white's deficit of one primary is at least this fraction of its
-# excess of another (judgement).
+# Smallest ratio of deficit and excess of two primaries in white if a primary's frame contains another illuminant
+# (judgement).
 _EQUALLY = 0.7
 
 
@@ -504,7 +506,7 @@ def _colour_range(table: TableMeasurements) -> float:
 
 
 def _colour_scatter(table: TableMeasurements) -> float:
-    # 0 if white's colour drifts further than it scatters from frame to frame.
+    # 0 if the colour of white drifts more than it scatters between frames.
     log_white = np.log([frame.paper.white for frame in table.white_frames]).reshape(-1, 3)
     if len(log_white) < 3:
         return 0.0

@@ -1,4 +1,4 @@
-"""Causes of a figure beyond its limit, the evidence for them, and the table of rules that decides.
+"""Causes of a figure beyond its limit, the evidence for them, and the table of rules that selects a cause.
 
 The first rule that applies decides. If no rule applies, the cause is reported as unknown.
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 from typing import Literal
 
-# What must be taken again: the listed frames, the whole session, or nothing because new frames do not help.
+# Taken again after the remedy: the listed frames, the whole session, or nothing because new frames do not help.
 Repeats = Literal["frames", "session", "nothing"]
 
 
@@ -20,8 +20,8 @@ class Cause:
 
     - `name`: identifier, as in `report.json`.
     - `description`: noun phrase that follows "probably" in a message.
-    - `remedy`: what to do, in the imperative.
-    - `repeats`: what must be taken again after the remedy.
+    - `remedy`: instruction for the user, in the imperative.
+    - `repeats`: frames or session that must be taken again after the remedy, or nothing.
     """
 
     name: str
@@ -149,7 +149,7 @@ MIXED = Cause(
     "take that frame again, and let the projected image settle longer (sequence.settle_s)",
     "frames",
 )
-UNKNOWN = Cause("unknown", "", "", "nothing")  # No rule applies; the limit's own remedy is reported
+UNKNOWN = Cause("unknown", "", "", "nothing")  # No rule applies; the remedy of the limit is reported
 
 CAUSES = (
     HOT_PHOTOSITES, OBJECT_IN_FRAME, REFLECTION, REFLECTION_IN_FRAME, STAIN, SHADOW, CURL, FALL_OFF, SPREAD, BUMP,
@@ -260,7 +260,7 @@ _INFINITY = math.inf
 
 @dataclass(frozen=True)
 class Condition:
-    """Closed interval in which a value of `Evidence` must lie; a value that was not measured never does."""
+    """Closed interval in which a value of `Evidence` must lie; a value that was not measured fails."""
 
     name: str
     low: float
@@ -285,7 +285,7 @@ class Rule:
         return subject in self.about and all(condition.holds(evidence) for condition in self.conditions)
 
 
-# What a figure is about. Rules refer to this subject instead of the figure's name.
+# Subject of a figure. Rules refer to it instead of the figure's name.
 Subject = Literal[
     "block", "few cells", "unfit cells", "spot", "references", "frame", "movement", "noisy cells", "chart", "drift",
     "names", "brightness", "sum", "dark", "stray", "camera", "iso",
@@ -306,23 +306,23 @@ DARK = _subjects("dark")
 STRAY = _subjects("stray")
 CHART = _subjects("chart")
 
-# A position on the print looks the same in every frame as in the frame registered first.
+# At a position on the print, the white frames agree with the frame registered first.
 _IN_ALL_FRAMES = (
     Condition("in_first", 0, 0), Condition("even_showing", 0, 0), Condition("some_whites", 0, 0),
     Condition("frames", 2, _INFINITY),
 )  # fmt: skip
 
-# The deviation is local, and the other parts of the frame are as sharp as before.
+# The deviation is local, and the frame is as sharp as the frame registered first.
 _SHARP_PLACE = (Condition("share", 0, 0.5), Condition("scatter", 0, 0.1), Condition("softer", -_INFINITY, 0.003))
 
-# A position deviates in few frames, but not in the frame that they are compared with.
+# At most 34 % of the frames deviate at a position, and the frame registered first is correct there.
 _IN_FEW_FRAMES = (
     Condition("in_first", 0, 0), Condition("frames", 3, _INFINITY), Condition("showing", 1e-9, 0.34),
 )  # fmt: skip
 
-# The rules in the order of decision: those based on file data and dark frames precede those based on appearance.
-# A wrong cause may cost a whole session, a missing one only a look at the report. Therefore the intervals of
-# different causes leave gaps.
+# Rules in the order of decision: rules based on file data and dark frames precede rules based on appearance.
+# A wrong cause may lead to an unnecessary session; an unknown cause does less harm. Therefore there are gaps between
+# the intervals of different causes.
 RULES: tuple[Rule, ...] = (
     Rule(
         OTHER_CAMERA,
@@ -581,7 +581,7 @@ RULES: tuple[Rule, ...] = (
 class Decision:
     """Probable cause of a figure beyond its limit, with the rule that applied; None if the cause is unknown.
 
-    - `follows`: name of another figure that the rule explains, if this one shares its cause; else "".
+    - `follows`: name of another figure that the rule explains, if this figure has the same cause; else "".
     """
 
     cause: Cause

@@ -1,8 +1,8 @@
 """Types of the judged figures: one object per figure holds its limits, measurement, explanation and report lines.
 
-A value within `accept` is accepted; between `accept` and `refuse` the LUT is accepted with a remark; beyond `refuse` it
-is not written. A figure without `refuse` never makes a LUT wrong. All limits are defined in this package, except those
-that a measurement applies itself (`calibration.registration.register`), which are imported from there.
+A value within `accept` is accepted. Between `accept` and `refuse`, the LUT is accepted with a remark. Beyond `refuse`,
+it is not written. A figure without `refuse` only leads to remarks. Limits are defined in this package. Only limits that
+a measurement applies itself are imported from its module, for example from `calibration.registration.register`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Range = tuple[float | None, float | None]  # Lowest and highest value; None if u
 # Smaller values are rounding errors of sums and count as 0. Limits other than 0 are at least 1000 times higher.
 _ZERO_BELOW = 1e-7
 
-_INTEGER_FROM = 1000.0  # From here on, :.3g would print an exponent
+_INTEGER_FROM = 1000.0  # From this value on, :.3g would print an exponent
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class Explanation:
     """How the cause of a figure beyond its limit is determined (`calibration.causes`).
 
     - `about`: subject of the figure, by which rules are selected.
-    - `gather`: returns evidence, frames and places for a LUT and the accepted limit.
-    - `follows`: names of figures with the same causes, which are reported if this figure has none of its own.
+    - `gather`: returns evidence, frames and positions for a LUT and the accepted limit.
+    - `follows`: names of figures with the same causes; their cause is reported if the cause of this figure is unknown.
     """
 
     about: Subject
@@ -69,7 +69,7 @@ class SummaryRow:
     """One measured value as text.
 
     - `name`, `value`: quantity, and number with unit.
-    - `note`: meaning or usual value; may be "".
+    - `note`: meaning or usual value; "" if not needed.
     - `brief`: True for the few rows that a command prints.
     """
 
@@ -81,7 +81,7 @@ class SummaryRow:
 
 @dataclass(frozen=True)
 class Line:
-    """A figure's line in the summary: its position among all lines, and its row, or None if not applicable."""
+    """A figure's line in the summary: its position among all lines, and its row; None if not applicable."""
 
     position: int
     row: Callable[[TableMeasurements], SummaryRow | None]
@@ -89,18 +89,18 @@ class Line:
 
 @dataclass(frozen=True)
 class Limit:
-    """Limit of one measured value: the same type for the check, the live judge and the LUT.
+    """Limit of one measured value, for the check, for frames during a session, and for the LUT.
 
     - `name`: identifier in messages and files.
-    - `title`: the quantity, for people.
+    - `title`: name of the quantity in reports.
     - `group`: group of the report's page.
-    - `unit`: unit of value and limits; "" for a count or ratio, "share" for a fraction 0 … 1.
+    - `unit`: unit of value and limits; "" for a number or ratio, "share" for a fraction 0 … 1.
     - `sense`: side of the limits on which a value is accepted.
     - `accept`: limit of acceptance without a remark.
-    - `refuse`: limit beyond which the LUT is refused or the frame repeated; None if there are only remarks.
+    - `refuse`: limit beyond which the LUT is refused or the frame is repeated; None if there are only remarks.
     - `why`: consequence of a value beyond the limit.
     - `source`: origin of the limits.
-    - `remedy`: what to do; "" if it depends on the detected fault.
+    - `remedy`: instruction for the user; "" if it depends on the detected fault.
     """
 
     name: str
@@ -116,7 +116,7 @@ class Limit:
     remedy: str
 
     def outcome(self, value: float) -> Outcome:
-        """Return the outcome of a value; NaN is refused."""
+        """Return the outcome of a value; NaN has the worst outcome of this limit."""
         sign = 1 if self.sense == "at most" else -1
         if self.refuse is not None and not sign * value <= sign * self.refuse:
             return "refuse"
@@ -124,7 +124,7 @@ class Limit:
 
     @property
     def ranges(self) -> tuple[Range, Range]:
-        """Ranges of accepted values and of values that are not refused; None if unlimited."""
+        """Range of accepted values and range of values that are not refused; None if unlimited."""
         if self.sense == "at most":
             return (None, self.accept), (None, self.refuse)
         return (self.accept, None), (self.refuse, None)
@@ -139,7 +139,7 @@ class Limit:
         return f"{self.sense} {self.text(self.accept)}"
 
     def limit_json(self) -> dict[str, Any]:
-        """Return the limit as in `report.json`."""
+        """Return the limit for `report.json`."""
         keys = ("name", "title", "unit", "sense", "accept", "refuse", "why", "source", "remedy")
         return {key: getattr(self, key) for key in keys}
 
@@ -150,15 +150,16 @@ class Figure(Limit):
 
     - `measure`: the value; None if it could not be measured, for example without tags or dark frames.
     - `before_session`: True if the trial frames of `acquire check` show it as well as a session does.
-    - `of_one_frame`: use in `build-lut check`, which reads one light or white frame and a dark one. The value is
-      `known`; `bounded` (more frames can only make it worse, so it is judged only if beyond its limit); or `unknown`.
-    - `where`: text with the frames, illuminants or position beyond the accepted limit; None to use its cause.
+    - `of_one_frame`: use in `build-lut check`, which reads one light or white frame and one dark frame. `known`: the
+      value is judged. `bounded`: it is judged only if beyond its limit, because more frames can only make it worse.
+      `unknown`: it is not judged.
+    - `where`: text with the frames, illuminants or position beyond the accepted limit; None if its cause provides it.
     - `retake`: the single frames beyond a limit; None if all are, or if the figure does not concern single frames.
-    - `cause`: how its cause is determined; None if the figure explains itself.
+    - `cause`: evidence and rules for its cause; None if the figure explains itself.
     - `drawing`: the plot that shows it, if any.
     - `lines`: its lines in the summary.
     - `foremost`: True if a refusal reports it first, because others may follow from it.
-    - `detail`: addition to a message and the remedy, if both depend on the detected fault.
+    - `detail`: text added to a message, and the remedy, if both depend on the detected fault.
     """
 
     _: KW_ONLY
@@ -187,7 +188,7 @@ def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:
 
 
 def format_value(value: float, unit: str) -> str:
-    """Return a value as text: fractions in %, two significant digits for degrees, otherwise three.
+    """Return a value as text: fractions in %, two significant digits for degrees, otherwise at least three.
 
     `unit`: as in `Limit`.
     """

@@ -1,4 +1,4 @@
-"""Figures of the registration, of the position of samples in their patches, and of light that the lens spreads."""
+"""Figures of the registration, of the position of samples in their patches, and of light spread by the lens."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from experiment.framing.finding import MIN_CELL_PX, MIN_TAG_SHARE
 if TYPE_CHECKING:
     from calibration.measurements import TableMeasurements
 
-_MIN_CELLS_FOR_GLARE = 8**4  # Patches needed to separate veiling glare from other smooth light
+_MIN_CELLS_FOR_GLARE = 8**4  # Minimum number of patches that separates veiling glare from other light
 
 _HANG_FLATTER = "hang the print flatter"
 _REDUCE_GLARE = (
@@ -42,10 +42,10 @@ def _tag_fraction(table: TableMeasurements) -> float | None:
 def _tags_row(table: TableMeasurements) -> SummaryRow:
     framing = table.registration.framing
     detected_count = len(framing.tags)
-    described = "chart without tags"
+    count_text = "chart without tags"
     if framing.field is None:
-        described = f"{detected_count} of {detected_count + len(framing.missing)}"
-    return SummaryRow("Detected tags", described, "", brief=True)
+        count_text = f"{detected_count} of {detected_count + len(framing.missing)}"
+    return SummaryRow("Detected tags", count_text, "", brief=True)
 
 
 TAGS_FOUND = Figure(
@@ -103,13 +103,13 @@ BLEED = Figure(
 
 
 def _uncorrected_lens_light(table: TableMeasurements) -> float | None:
-    # Few patches cannot show the lens's spread; it is then part of the uncertainty, and no remedy exists.
+    # Few patches cannot show light spread by the lens. It is then part of the uncertainty, without a remedy.
     is_detectable = len(table.registration.mismatched_cells) >= _MIN_CELLS_FOR_GLARE or table.lens.is_uncorrected
     return table.lens.remaining_rms if table.lens.measured and is_detectable else None
 
 
 def _uncorrected_in_worst_cell(table: TableMeasurements) -> float | None:
-    # A remark on all patches includes the worst one; report only one of the two.
+    # A remark on all patches includes the worst patch; report only one of the two remarks.
     residual = _uncorrected_lens_light(table)
     return None if residual is None or residual > CORRECTION_RESIDUAL.accept else table.lens.remaining_worst
 
@@ -134,9 +134,9 @@ def _lens_row(table: TableMeasurements) -> SummaryRow:
         note = f"{lens.why_not}; most likely {glare}; patch means may contain {residual[:-1]}"
         return SummaryRow(name, "none", note)
     treatment = f"subtracted; residual up to {residual[:-1]}" if lens.corrected else f"not subtracted: {lens.why_not}"
-    size = f"{100 * lens.rms:.2g} % RMS, {100 * lens.worst:.2g} % at most"
+    spread_light = f"{100 * lens.rms:.2g} % RMS, {100 * lens.worst:.2g} % at most"
     note = f"of patch means above 300 counts, relative to paper; includes {glare}; {treatment}"
-    return SummaryRow(name, size, note)
+    return SummaryRow(name, spread_light, note)
 
 
 CORRECTION_RESIDUAL = Figure(

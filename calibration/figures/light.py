@@ -1,4 +1,4 @@
-"""Figures of the illuminants: one lamp, no other light, additivity, and agreement with their codes."""
+"""Figures of the illuminants: lamp drift, other light, additivity, codes, linearity, and tint of greys."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from calibration.measurements import FrameMeasurements, TableMeasurements
     from experiment.session.records import FrameRecord
 
-_MAX_PAIRS = 4  # Exchanged pairs that a remark lists; the report lists all
+_MAX_PAIRS = 4  # Largest number of exchanged pairs in a remark; the report lists all pairs
 
 _WARM_UP = "let the lamp warm up for longer before the session"
 
@@ -55,16 +55,16 @@ def percents(values: npt.NDArray[np.floating]) -> str:
 
 
 def _are_frames_comparable(table: TableMeasurements) -> bool:
-    # Frames may be added up only if names, camera and exposure agree.
+    # Counts of frames can be added only if names, camera and exposure are correct.
     exchanged = table.lights.codes is not None and len(table.lights.codes.exchanges) > 0
     return not exchanged and not table.origins.other_camera and not table.origins.other_exposure
 
 
 def _are_names_right(table: TableMeasurements) -> bool:
     off_codes_deg, white_frames = table.lights.off_codes_deg, table.lights.white_frames
-    fit_codes = off_codes_deg is None or not (off_codes_deg > 0).any()
-    fit_codes = fit_codes and (white_frames is None or not (white_frames.off_deg > 0).any())
-    return fit_codes and _are_frames_comparable(table)
+    match_codes = off_codes_deg is None or not (off_codes_deg > 0).any()
+    match_codes = match_codes and (white_frames is None or not (white_frames.off_deg > 0).any())
+    return match_codes and _are_frames_comparable(table)
 
 
 def _has_drift(table: TableMeasurements) -> bool:
@@ -141,14 +141,14 @@ WHITE_DRIFT_DEG = Figure(
 
 
 def _shows_white(table: TableMeasurements) -> bool:
-    # A check may have read the frame of an illuminant of any colour.
+    # The frame of a check may show a coloured illuminant.
     return bool(table.white_frames) or not table.is_of_one_frame
 
 
 def _leak_share(table: TableMeasurements) -> float | None:
     share = table.dark_share
-    measured = np.isfinite(share) and table.lights.subtracted is None
-    return share if measured and _shows_white(table) else None
+    is_unsubtracted = np.isfinite(share) and table.lights.subtracted is None
+    return share if is_unsubtracted and _shows_white(table) else None
 
 
 def _dark_row(table: TableMeasurements) -> SummaryRow | None:
@@ -210,8 +210,8 @@ STRAY_SHARE = Figure(
 )  # fmt: skip
 
 
-def _superposition_bend(table: TableMeasurements) -> float | None:
-    # Largest bend beyond two standard errors, over the levels of paper under the illuminants.
+def _superposition_deviation(table: TableMeasurements) -> float | None:
+    # Largest deviation beyond two standard errors, over the levels of paper under the illuminants.
     superposition = table.sensor.superposition
     if not superposition.measured or not _are_names_right(table):
         return None
@@ -219,26 +219,26 @@ def _superposition_bend(table: TableMeasurements) -> float | None:
     level = np.geomspace(max(float(white.min()), superposition.full * NODES[1]), float(white.max()), 30)
     errors = superposition.errors(level, np.full(len(level), level[-1]))
     relative_error, _ = superposition.relative(level)
-    bend = np.abs(relative_error - relative_error[-1])
-    return float(np.maximum(bend - 2 * np.sqrt(np.maximum(errors - bend**2, 0)), 0).max())
+    deviation = np.abs(relative_error - relative_error[-1])
+    return float(np.maximum(deviation - 2 * np.sqrt(np.maximum(errors - deviation**2, 0)), 0).max())
 
 
 def _linearity_deviation(table: TableMeasurements) -> float | None:
-    return _superposition_bend(table) if table.sensor.linearity is None else table.sensor.linearity.worst
+    return _superposition_deviation(table) if table.sensor.linearity is None else table.sensor.linearity.worst
 
 
 def _linearity_row(table: TableMeasurements) -> SummaryRow:
-    linearity, bend = table.sensor.linearity, _superposition_bend(table)
+    linearity, deviation = table.sensor.linearity, _superposition_deviation(table)
     if linearity is not None:
         low, high = linearity.range
         note = f"{len(linearity.files)} exposures, {low:.0%} to {high:.0%} of saturation; 1 % is usual"
         return SummaryRow("Linearity", f"{percent(linearity.worst)} at most from a straight line", note)
-    if bend is None:
+    if deviation is None:
         unmeasured = table.sensor.superposition.unmeasured
         note = "illuminants have wrong names" if unmeasured is None else f"{unmeasured.why}; {unmeasured.remedy}"
         return SummaryRow("Linearity", "not measured", note)
     note = "beyond two standard errors, over the levels of paper; red, green and blue alone against white, by patch"
-    return SummaryRow("Linearity", f"{percent(bend)} from proportionality", note)
+    return SummaryRow("Linearity", f"{percent(deviation)} from proportionality", note)
 
 
 LINEARITY = Figure(
@@ -271,8 +271,8 @@ LINEARITY_KNOWN = Figure(
 
 
 def _oversubtracted_share(table: TableMeasurements) -> float | None:
-    # Too much dark light was subtracted if white exceeds the sum of the primaries, each of which lacks that light, in
-    # every channel by at most the dark light. A projector that adds light to white adds more, in another colour.
+    # Light subtracted in excess is missing in each primary, so that white exceeds their sum in every channel. The
+    # excess is at most the dark light. A projector that brightens white adds more light, in another colour.
     lights, dark = table.lights, table.dark_frames.light
     if lights.subtracted is None or lights.additivity is None or not _are_names_right(table):
         return None
@@ -285,7 +285,7 @@ def _oversubtracted_share(table: TableMeasurements) -> float | None:
     return float(certain.max()) if is_dark_light else 0.0
 
 
-_DARK_MARGIN = 1.25  # Largest excess relative to the dark light: all of it, and its error
+_DARK_MARGIN = 1.25  # Largest excess relative to the dark light; the part above 1 allows for its error
 
 
 TOO_DARK = Figure(

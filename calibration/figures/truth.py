@@ -1,4 +1,4 @@
-"""Figures of the noise of samples, and of the uncertainty of the ground truth."""
+"""Figures of noise, white references, uncertainty of the ground truth, and brightness of illuminants."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _error_row(table: TableMeasurements) -> SummaryRow:
     return SummaryRow("Uncertainty of the ground truth", value, note, brief=True)
 
 
-_REMEDY_BY_CAUSE = (
+_REDUCE_COMPONENT = (
     "reduce its largest component. Noise: expose longer or omit the darkest illuminants; lens: stop it down, clean it "
     "and shield it from light outside the print; dark light: darken the room; linearity: expose less"
 )
@@ -117,7 +117,7 @@ TRUTH_MEDIAN_DEG = Figure(
     "truth_median_deg", "Expanded uncertainty of the ground truth, median illuminant", "truth", "°", "at most", 0.4,
     1.0,
     why="the error of a method cannot be measured more accurately than the ground truth",
-    source=JUDGEMENT + ": a quarter of a good method's error; k = 2 (JCGM 100)", remedy=_REMEDY_BY_CAUSE,
+    source=JUDGEMENT + ": a quarter of a good method's error; k = 2 (JCGM 100)", remedy=_REDUCE_COMPONENT,
     before_session=False, measure=lambda table: float(np.median(table.budget.expanded_deg)), drawing="budget",
     lines=(Line(190, _error_row),),
 )  # fmt: skip
@@ -126,7 +126,7 @@ TRUTH_MEDIAN_DEG = Figure(
 TRUTH_WORST_DEG = Figure(
     "truth_worst_deg", "Expanded uncertainty of the ground truth, worst illuminant", "truth", "°", "at most", 0.5, 3.0,
     why="under that illuminant, the error of a method cannot be measured more accurately than the ground truth",
-    source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_REMEDY_BY_CAUSE,
+    source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_REDUCE_COMPONENT,
     before_session=False, measure=lambda table: float(table.budget.expanded_deg.max()), drawing="budget",
 )  # fmt: skip
 
