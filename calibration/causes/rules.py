@@ -165,13 +165,13 @@ NAN = float("nan")
 class Evidence:
     """Measured properties of a deviation; NaN if not measured.
 
-    - `frames`: number of compared frames of the print.
+    - `frames`: number of compared frames.
     - `showing`: fraction of these frames with the deviation.
-    - `even_showing`: fraction of the other white frames with the deviation; 0 if there are none.
+    - `even_showing`: fraction of the white frames among them with the deviation; 0 without white frames.
     - `white_residual`: fraction of white frames with references that deviate there by at least half as much.
     - `some_whites`: 1 if the references deviate there in some white frames and not in others, else 0.
     - `spot`: fraction of patches there with a wrong colour in the mean of the white frames.
-    - `in_first`: 1 if all frames differ there from the frame that they are compared with; else 0.
+    - `in_first`: 1 if at least 80 % of the frames differ there from the frame registered first; else 0.
     - `share`: fraction of the print that deviates.
     - `deviation`: relative deviation in the channel that deviates most; negative is darker.
     - `tint`: range of the deviation over the channels, divided by its magnitude; 0 if all channels are alike.
@@ -187,19 +187,19 @@ class Evidence:
     - `anew`: fraction of frames in which the chart was registered again.
     - `agreement`: correlation of the patches with the chart at the registered position.
     - `exposure`: exposure of the frame by its file, relative to the other frames.
-    - `off_codes_deg`: angle between an illuminant's white and the prediction from its codes, degrees.
-    - `named_right`: 1 if an illuminant's white fits its own codes, 0 if it fits the codes of another illuminant.
+    - `off_codes_deg`: largest angle between an illuminant's white and the prediction from its codes, degrees.
+    - `named_right`: 0 if an illuminant's white fits the codes of another illuminant; else not measured.
     - `cameras`: number of cameras or lenses among the frames, by their files.
     - `room`: light while the projector shows black, as a fraction of white.
     - `room_change`: change of `room` between dark frames, as a fraction of white.
     - `stray`: light of a primary under a code of 0 that is missing in the dark frames, as a fraction of that primary.
     - `stray_primaries`: light common to the primaries' frames that exceeds white, as a fraction of white.
     - `lone_primary`: relative difference of one primary in white from the other two, which agree.
-    - `mixed`: relative excess of one primary in white over the third, if another one is too low.
+    - `mixed`: relative excess of one primary in white, if another primary lacks about as much.
     - `colour_scatter`: relative scatter of white's colour between successive white frames, beyond drift.
     - `other_iso`: number of frames with another recorded ISO speed than the settings or most frames.
     - `lit`: fraction of the unfit patches with too much light on the print for their level.
-    - `misplaced`: fraction of the unfit patches with too uncertain a position.
+    - `misplaced`: fraction of the unfit patches with too large an uncertainty of position.
     - `uneven`: fraction of the unfit patches with different rim and centre.
     - `waves_px`: RMS distance of the tags from a flat sheet, half-size px, for patches of 10 px.
     - `beyond_cell`: fraction of the worst sample's light that the lens brings from outside its patch.
