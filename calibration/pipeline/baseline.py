@@ -1,7 +1,7 @@
 """Create the baseline that all frames of a LUT share, from the first frame, the primaries and further white frames.
 
-The flat field of the first frame is the base of all others, and its patches are the reference for every frame. The
-frames of the primaries show the field of coloured patches relative to paper, and the light that the lens spreads.
+The flat field of the first frame is the base of all others, and every frame is compared with its patches. Frames of
+the primaries show the field of coloured patches relative to paper, and the light spread by the lens.
 
 C patches, W white and N grey references; positions on the print in mm, in frames in half-size px.
 """
@@ -54,21 +54,21 @@ from foundation.robust import huber_weights, robust_sigma
 _Array = npt.NDArray[np.float64]
 _Frames = Iterable[DecodedFrame]
 
-# Degree of the polynomial in the codes, with enough patches: describes inks to a fraction of a per cent.
+# Degree of the polynomial in the codes, with enough patches. It describes inks with errors below 1 %.
 CODE_DEGREE = 8
 
 LIGHT_ORDER = 4  # Order of the polynomial over the page, with enough patches
 
 _MIN_CELLS_PER_TERM = 5  # Patches per term of the polynomial in the codes; with fewer, its degree is lowered
 
-_MIN_COUNTS = 10.0  # Counts above black below which a patch's logarithm is mostly noise
+_MIN_COUNTS = 10.0  # Least counts above black; below, the logarithm is mostly noise
 
-# Counts at which weights of patches approach their maximum: the polynomial's error exceeds noise from there on.
-_FULL_WEIGHT_COUNTS = 300.0
+# Counts at which the weight of a patch is half of its maximum. Above, errors of the polynomial exceed noise.
+_HALF_WEIGHT_COUNTS = 300.0
 
-_PAPER_WEIGHT = 10.0  # Weight of a white reference, in patches: its colour needs no polynomial
+_PAPER_WEIGHT = 10.0  # Weight of a white reference, relative to a patch: its colour needs no polynomial
 
-_ROUNDS = 5  # Reweighted solutions; Huber's weights, squared, have converged by then
+_ROUNDS = 5  # Number of reweighted solutions, after which squared Huber weights have converged
 
 
 def baseline_of(
@@ -80,11 +80,11 @@ def baseline_of(
     *,
     measures_lens: bool = True,
 ) -> Baseline:
-    """Return the baseline.
+    """Return the baseline of a session.
 
     `first`: frame to register first. `primaries`: frames of red, green and blue alone; the chart may have moved in
-    them. `more_whites`: more frames of the same illuminant, to reduce noise in measuring the lens. `measures_lens`:
-    measure the light that the lens spreads, which takes a minute.
+    them. `more_whites`: more frames of the same illuminant as `first`, to reduce noise of the lens measurement.
+    `measures_lens`: measure the light spread by the lens, which takes a minute.
     """
     points = ChartPoints.of(chart)
     registered = register_frame(first, chart, points, options)
@@ -98,10 +98,10 @@ def baseline_of(
 def _baseline_of_first(
     chart: Chart, points: ChartPoints, options: BuildOptions, first: DecodedFrame, registered: RegisteredFrame
 ) -> Baseline:
-    """Return the baseline of a registered frame, with the lens corrected if `registered` has a correction."""
+    """Return the baseline of a registered frame, with the lens correction of `registered`, if any."""
     cells = gather(first.mosaic, first.black, registered.cells)[0].astype(np.float64)
     references, highest = gather(first.mosaic, first.black, registered.references)
-    spread = cells.var(axis=1, ddof=1)
+    variance = cells.var(axis=1, ddof=1)
     if registered.lens is not None:
         means = np.concatenate([cells.mean(axis=1), references.mean(axis=1, dtype=np.float64)])
         added = registered.lens.added(FrameLevels(means, beyond_print(first, registered.lens.background)))
@@ -111,7 +111,7 @@ def _baseline_of_first(
     whites = usable_means(references, highest, registered.references, first.saturation)[: len(points.whites_mm)]
     base = PaperReader(points.whites_mm, points.cells_mm, chart.page_mm).read(whites, first.record.file)[0].field
     if not chart.tags:
-        # References are only in the margin, and do not show the light in the centre.
+        # Without tags, all references are in the margin, and do not show the light in the centre.
         usable, codes = compared_cells(chart, registered), chart.rgb[chart.cell_of_colour]
         base = field_of_cells(codes, points.cells_mm, level, usable, points.whites_mm, whites, chart.page_mm)
     order = MAX_ORDER if chart.tags else MAX_ORDER_AROUND
@@ -125,7 +125,7 @@ def _baseline_of_first(
         whites=whites,
         means=np.concatenate([level, references.mean(axis=1, dtype=np.float64)]),
         paper=PaperReader(points.whites_mm, points.cells_mm, chart.page_mm, base, order),
-        transfer=photon_transfer(level, spread, options.samples),
+        transfer=photon_transfer(level, variance, options.samples),
         superposition=Superposition.usual(first.saturation - float(first.black.mean())),
     )
 
@@ -154,7 +154,7 @@ def _measure_superposition(baseline: Baseline, first: DecodedFrame, primaries: S
 def with_lens(
     baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame], more_whites: Iterable[DecodedFrame]
 ) -> Baseline:
-    """Return the baseline with the measured lens, and corrected for it if the print proves that it spreads light."""
+    """Return the baseline with the measured light spread, and corrected for it if the print proves it."""
     chart, points = baseline.chart, baseline.points
     if unsuitable(chart):
         return baseline
@@ -171,11 +171,11 @@ def with_lens(
     around = view.around(registered.registration, registered.cells, registered.references)
     candidates = [_spread_frame(baseline, [decoded], view, is_mixed=False) for decoded in primaries]
     if not any(candidates) or chart.bits < VARYING_BITS:
-        # With few patches, noise limits the measurement of the lens.
+        # With few patches, noise limits the measurement of the lens; white frames reduce it.
         candidates.append(_spread_frame(baseline, chain([first], more_whites), view, is_mixed=True))
     frames = [frame for frame in candidates if frame is not None]
     reason = "" if baseline.options.lens_correction else "disabled by --no-lens-correction"
-    # On a busy machine, threads of linear algebra wait for each other longer than the work takes.
+    # On a busy machine, several threads of linear algebra wait for each other longer than they compute.
     with threadpool_limits(limits=1, user_api="blas"):
         measurement = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS, reason)
     if measurement is None:
@@ -195,7 +195,7 @@ def _is_still(baseline: Baseline, decoded: DecodedFrame) -> bool:
 
 
 def _spread_frame(baseline: Baseline, frames: _Frames, view: PrintView, is_mixed: bool) -> SpreadFrame | None:
-    # Mean of the frames of one illuminant in which the chart has not moved. `is_mixed`: several primaries.
+    # Mean of the frames of one illuminant in which the chart has not moved. `is_mixed`: it has several primaries.
     chart, points = baseline.chart, baseline.points
     usable = ~np.concatenate(
         [
@@ -215,7 +215,7 @@ def _spread_frame(baseline: Baseline, frames: _Frames, view: PrintView, is_mixed
     if not count:
         return None
     whites, sensor = points.white_patches, baseline.superposition
-    # Counts lost near black would look like less spread light, and hide veiling glare.
+    # Correct for counts lost near black: otherwise they would hide veiling glare.
     means, beyond = (values / count for values in (total, beyond))
     usual = np.median(means[whites], axis=0)
     means, beyond = (values * (1 - sensor.difference(np.maximum(values, 0), usual)[0]) for values in (means, beyond))
@@ -268,13 +268,13 @@ def field_of_cells(
     """Return the flat field of a frame from its patches.
 
     `rgb`: (C, 3) int printed codes, 0 … 255. `cells_mm`: (C, 2) float64 mm, centres. `level`: (C, 3) float64 mean
-    counts above black. `usable`: (C,) bool, inside the frame and not covered. `paper_mm`: (N, 2) mm, white references.
-    `paper`: (N, 3) their mean counts above black; NaN if unusable.
+    counts above black. `usable`: (C,) bool, patches inside the frame and not covered. `paper_mm`: (N, 2) mm, white
+    references. `paper`: (N, 3) their mean counts above black; NaN if unusable.
     """
     degree = CODE_DEGREE
     while degree > 1 and len(cells_mm) < _MIN_CELLS_PER_TERM * len(code_powers(degree)):
         degree -= 1
-    # With few patches, a higher order of light cannot be separated from the interaction of inks.
+    # With few patches, higher orders of the light cannot be separated from the interaction of inks.
     order = LIGHT_ORDER if degree == CODE_DEGREE else min(2, degree)
     codes = code_polynomial(rgb, degree)
     light, at_paper = page_polynomial(cells_mm, page_mm, order), page_polynomial(paper_mm, page_mm, order)
@@ -292,15 +292,15 @@ def field_of_cells(
         if is_used.sum() < 2 * design.shape[1]:
             factors.append(())
             continue
-        value, rows = np.log(counts[is_used]), np.ascontiguousarray(design[is_used])
-        base_weights = counts[is_used] / (counts[is_used] + _FULL_WEIGHT_COUNTS)
+        logs, rows = np.log(counts[is_used]), np.ascontiguousarray(design[is_used])
+        base_weights = counts[is_used] / (counts[is_used] + _HALF_WEIGHT_COUNTS)
         base_weights *= np.where(np.arange(len(counts))[is_used] < len(codes), 1.0, _PAPER_WEIGHT)
         weights, solution = base_weights, np.zeros(design.shape[1])
         for _ in range(_ROUNDS):
-            solution = least_squares(rows, value, weights)
-            residual = np.abs(value - rows @ solution)
-            spread = max(robust_sigma(residual), 1e-6)
-            weights = base_weights * huber_weights(residual, spread) ** 2
+            solution = least_squares(rows, logs, weights)
+            residual = np.abs(logs - rows @ solution)
+            sigma = max(robust_sigma(residual), 1e-6)
+            weights = base_weights * huber_weights(residual, sigma) ** 2
         shape = np.exp(light[:, 1:] @ solution[codes.shape[1] : -1])
         smooth = least_squares(np.ascontiguousarray(light), shape, np.ones(len(shape)))
         factors.append((smooth / float((light @ smooth).mean()),))

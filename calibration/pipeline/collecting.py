@@ -1,6 +1,6 @@
-"""Accumulate the frames of a session, and list the unfit patches.
+"""Accumulate measurements of the frames of a session, and list the unfit patches.
 
-Frames are added in the order taken. The result of each depends only on the previous ones, so that an interrupted build
+Frames are added in the order taken. Each state depends only on the frames added so far. Therefore an interrupted build
 resumes with identical results. C patches of S samples, in the order of colour indices.
 """
 
@@ -37,7 +37,7 @@ from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.records import from_plain, to_plain
 
-# Percentile of the patches' levels used as paper white: the brightest may be a reflection.
+# Percentile of the levels of patches, used as paper white. The brightest patch may be a reflection.
 _BRIGHTEST_PERCENTILE = 99.5
 
 _Array = npt.NDArray[np.float64]
@@ -56,13 +56,13 @@ class Accumulator:
     saturation: int  # Raw count of saturation, the lowest of all frames
     registered: RegisteredFrame
     dark: DarkLight | None  # Light to subtract from the following frames, if any
-    estimate: DarkLightEstimate  # Of the dark light; includes only dark frames that are subtracted
+    estimate: DarkLightEstimate  # Of the dark light, only from dark frames that are subtracted
     hot: HotPixels
     highest: npt.NDArray[np.uint16]  # (C,), highest raw count of each patch
     highest_at: npt.NDArray[np.int64]  # (C,), illuminant of that count; −1 for a white frame
     outside: npt.NDArray[np.bool_]  # (C,), patch cut off in a frame
-    covered: npt.NDArray[np.bool_]  # (C,), patch unlike the chart where it was registered
-    place_error: _Array  # (C,) px, largest expanded uncertainty of position, divided by `Registration.clearance`
+    covered: npt.NDArray[np.bool_]  # (C,), patch does not match the chart in a registered frame
+    place_error: _Array  # (C,) px, largest `Registration.expanded_px` of all registered frames
     even_sum: npt.NDArray[np.float32]  # (C, S, 3) counts above black, sum of the evenly lit frames
     even_noise2: _Array  # (C, 3) counts², sum of the variances of one sample in these frames
     even_frames: int
@@ -184,8 +184,8 @@ class Accumulator:
             registered = self.baseline.register(decode_frame(self.session, record))
 
         def stored(prefix: str) -> dict[str, Any]:
-            chosen = {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
-            return {name: value if value.ndim else value.item() for name, value in chosen.items() if "." not in name}
+            subset = {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
+            return {name: value if value.ndim else value.item() for name, value in subset.items() if "." not in name}
 
         dark = stored("dark.")
         return replace(
@@ -203,23 +203,23 @@ class Accumulator:
         return dark_summary(self.darks, self.hot)
 
     def noise(self) -> _Array:
-        """Return (3,) float64, median standard deviation of one sample in evenly lit frames, of paper white."""
+        """Return (3,) float64, median noise of one sample in evenly lit frames, relative to paper white."""
         frames = max(self.even_frames, 1)
         level = np.percentile(self.even_sum.mean(axis=1) / frames, _BRIGHTEST_PERCENTILE, axis=0)
         return np.sqrt(np.median(self.even_noise2 / frames, axis=0)) / np.maximum(level, 1e-6)
 
     def stains(self, field: _Array) -> Stains:
-        """Return the areas of the print with other colours than their codes'.
+        """Return the areas of the print that differ in colour from the same codes elsewhere.
 
-        `field`: (C, 3) float64, flat field of an evenly lit frame for the colour of each patch. The field of paper
-        alone would give errors where the primaries differ in their fields.
+        `field`: (C, 3) float64, flat field of an evenly lit frame for the colour of each patch. The flat field of paper
+        would give errors if the primaries have different fields.
         """
         cells_mm = self.baseline.points.cells_mm
         level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field
         return find_stains(level, cells_mm, self.baseline.chart.bits, ~(self.outside | self.covered))
 
     def unfit(self, stains: Stains, frames: Sequence[FrameMeasurements], added: AddedLight) -> tuple[Unfit, ...]:
-        """Return the unfit patches, each with the first cause that applies. `frames`: their measurements."""
+        """Return the unfit patches, each with the first cause that applies. `frames`: measurements of all frames."""
         added_share = added.certain_share_of(self.baseline.levels).max(axis=1)
         disturbed = disturbed_cells(frames)
         alone_by_frame = [(frame.consistency.alone, frame.record.illumination) for frame in frames]
@@ -269,7 +269,7 @@ class Accumulator:
 
 
 def stored_names() -> list[str]:
-    """Return the names in a checkpoint; a build does not resume from one with other names."""
+    """Return the names of the fields in a checkpoint; a build resumes only from a checkpoint with the same names."""
     stored_types = (Accumulator, FrameMeasurements, DarkFrameFigures, DarkLight, DarkLightEstimate, HotPixels)
     return [f"{stored_type.__name__}.{field.name}" for stored_type in stored_types for field in fields(stored_type)]
 
@@ -296,13 +296,13 @@ def _disturbance(disturbances: list[tuple[int, float]]) -> str:
 
 
 def _covered_cells(baseline: Baseline, registered: RegisteredFrame) -> npt.NDArray[np.bool_]:
-    """Return the cells (C,) that do not look like the chart's, alone or with their neighbourhood."""
+    """Return the patches (C,) that do not match the chart, alone or together with their neighbours."""
     registration = registered.registration
     nearest = np.asarray(cKDTree(registration.blocks.centres_mm).query(baseline.points.cells_mm)[1])
     return registration.mismatched_cells[baseline.chart.cell_of_colour] | ~registration.blocks.good[nearest]
 
 
-def _arrays_of(part: Any) -> _Arrays:
-    """Return the arrays and counts of a frozen value by the names of its fields; none of None."""
-    values = {} if part is None else {field.name: getattr(part, field.name) for field in fields(part)}
+def _arrays_of(owner: Any) -> _Arrays:
+    """Return the arrays and integers of a data class by field name; an empty dictionary for None."""
+    values = {} if owner is None else {field.name: getattr(owner, field.name) for field in fields(owner)}
     return {name: np.asarray(value) for name, value in values.items() if isinstance(value, np.ndarray | int)}

@@ -1,4 +1,4 @@
-"""Options of a LUT, the frames that it is built from, and the stated origin of their session."""
+"""Options of a build, the source frames of a LUT, and the stated origin of their session."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from foundation.files import file_sha256
 
 _log = logging.getLogger(__name__)
 
-_MAX_MORE_WHITES = 3  # Additional white frames for the lens of a chart with few patches, to reduce noise
+_MAX_MORE_WHITES = 3  # Maximum of `SelectedFrames.more_whites`
 
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """Options of a build; the defaults are those of the paper, with spread light subtracted."""
+    """Options of a build; the defaults follow Banić et al. 2019, but subtract spread light."""
 
     window: int = WINDOW  # Side of a patch's sampling window, px; one of `calibration.sampling.WINDOWS`
     subtract_dark: bool = False  # Subtract dark light from samples and ground truth
@@ -54,7 +54,7 @@ class BuildOptions:
         return self.window**2
 
 
-PAPER_OPTIONS = BuildOptions()  # The defaults, as in the paper
+PAPER_OPTIONS = BuildOptions()  # The defaults
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +64,13 @@ class SelectedFrames:
     # Last accepted frame of each illuminant, and accepted white and dark frames, in the order taken
     records: tuple[FrameRecord, ...]
     lights_without: tuple[int, ...]  # Illuminants without a frame
-    registered: FrameRecord
+    registered: FrameRecord  # Frame to register first
     primaries: tuple[FrameRecord, ...]  # Frames of red, green and blue alone; () if one is missing
-    more_whites: tuple[FrameRecord, ...]  # Further white frames, for a chart of few colours
+    more_whites: tuple[FrameRecord, ...]  # Further white frames, against noise of the lens with few patches
 
     @property
     def newest(self) -> FrameRecord:
-        """The last frame except dark ones."""
+        """The light or white frame taken last."""
         return max(self._lit_frames, key=lambda record: record.attempt)
 
     @property
@@ -83,15 +83,15 @@ class SelectedFrames:
         return (record for record in self.records if record.kind != "dark")
 
     def is_even(self, record: FrameRecord) -> bool:
-        """Return True for frames that show the uniformity of patches: white ones, else the first lit frame.
+        """Return True for frames that show the uniformity of patches: white frames, and the first light or white frame.
 
-        A repeated file counts once, because its noise would not average out.
+        A white frame whose file was repeated counts once, because repeated noise does not average out.
         """
         first = next((white for white in self.records if white.kind == "white" and white.sha256 == record.sha256), None)
         return record == first or record is next(self._lit_frames)
 
 
-ReportProgress = Callable[[int, int, str], None]  # Called with finished frames, all frames, and the current step
+ReportProgress = Callable[[int, int, str], None]  # Called with the numbers of finished and of all frames, and a text
 
 _CONFIGURED_RIGS = ("lab", "simulated")  # Only these rigs set the camera's exposure
 
@@ -118,9 +118,9 @@ def select_frames(session: Session) -> SelectedFrames:
 
 
 def _in_order_taken(session: Session, records: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
-    """Return frames in the order of the journal, with increasing times."""
-    # White frames are interpolated in time. If a clock was set back between two frames, the later ones are assumed to
-    # follow after the usual interval. Imported frames have only their file times.
+    """Return frames in the order taken; their times never decrease."""
+    # White frames are interpolated in time. If a clock was set back between two frames, the second frame is assumed to
+    # follow after the usual interval. For imported frames, only the times in their files are known.
     if any(event.what == "import" for event in session.journal.events()):
         return tuple(sorted(records, key=lambda record: (record.taken_at, record.file)))
     ordered = sorted(records, key=lambda record: record.attempt)
@@ -164,7 +164,7 @@ def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> Fra
 
 
 def stated_origin(session: Session) -> SessionOrigin:
-    """Return the origin that a session states; missing or damaged values are unknown."""
+    """Return the stated origin of a session; missing or damaged values count as unknown."""
     try:
         document: dict[str, Any] = tomllib.loads(session.settings_text())
         rig: Rig | None = next((name for name in get_args(Rig) if name == document.get("rig")), None)
@@ -173,18 +173,18 @@ def stated_origin(session: Session) -> SessionOrigin:
         settings = CameraSettings.model_validate(document["camera"]) if rig in _CONFIGURED_RIGS else None
     except (CropError, ValidationError, ValueError, KeyError, RecursionError) as error:
         if isinstance(error, CropError | tomllib.TOMLDecodeError):
-            why = error if isinstance(error, CropError) else f"{session.folder / 'session.toml'} is not TOML: {error}"
+            fault = error if isinstance(error, CropError) else f"{session.folder / 'session.toml'} is not TOML: {error}"
             _log.warning(
                 "%s; the LUT will not contain origin, authors, exposure and licence; correct it, and build the LUT "
                 "again",
-                why,
+                fault,
             )
         return SessionOrigin(CitationSettings(), None, None, session.journal.records())
     return SessionOrigin(citation, rig, settings, session.journal.records())
 
 
 def source_frames(records: Sequence[FrameRecord]) -> list[SourceFrame]:
-    """Return frames as `frames.csv` of a LUT lists them."""
+    """Return the rows of frames in `frames.csv` of a LUT."""
     return [SourceFrame(record.kind, record.illumination, record.file, record.sha256) for record in records]
 
 

@@ -1,8 +1,8 @@
-"""The steps of one frame: decoded → located → sampled → measured, with the baseline that all frames of a LUT share.
+"""Measure one frame in steps: decode, locate, sample, measure. All frames of a LUT share one baseline.
 
-Patches are in the order of colour indices. References follow them, the white ones first. A frame is measured with the
-baseline, the frame registered last and the dark light of the last dark frame only (before it, of the first one).
-Therefore any thread may measure it in any order.
+Patches are in the order of colour indices. References follow them, the white references first. A measurement depends
+only on the frame, the baseline, the frame registered last and the dark light. The dark light is from the last dark
+frame before; if there is none, from the first dark frame. Therefore several threads may measure frames in any order.
 
 C patches of S samples, W white and N grey references; positions on the print in mm, in frames in half-size px.
 """
@@ -71,10 +71,10 @@ IN_PLACE = Shift(0.0, 0.0, 0.0, 0)  # No movement
 
 _RETAKE_HINT = "or take it again with acquire run LAB.toml SESSION, which detects such frames"
 
-# Robust standard deviations from the median above which a patch counts as covered or dirty.
+# Distance from the median, in robust standard deviations, above which a grey reference counts as covered or dirty.
 _OUTLIER_SIGMAS = 6.0
 
-_MAX_WITHOUT_OUTLIERS = 4  # Number of patches too small to identify a wrong one
+_MAX_WITHOUT_OUTLIERS = 4  # Largest number of grey references among which a wrong one cannot be identified
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class GreyLevels:
 
     @classmethod
     def of(cls, references: Sequence[Reference]) -> GreyLevels:
-        """Return the levels of references, one per printed code."""
+        """Return the levels of grey references, one level per printed code."""
         codes = sorted({reference.rgb for reference in references}, reverse=True)
         first = {reference.rgb: reference.name for reference in reversed(references)}
         return cls(
@@ -95,21 +95,21 @@ class GreyLevels:
         )
 
     def read(self, means: _Array, field: _Array) -> tuple[_Array, _Array]:
-        """Return value and standard error (G, 3) float64 of each level, counts; NaN without a usable patch.
+        """Return value and standard error of each level, (G, 3) float64 counts; NaN without a usable reference.
 
-        `means`: (N, 3) counts above black of each patch, NaN if unusable. `field`: (N, 3) flat field at each patch.
+        `means`: (N, 3) counts above black of each grey reference, NaN if unusable. `field`: (N, 3) flat field there.
         """
         flat = means / field
         value, error = np.full((len(self.names), 3), np.nan), np.full((len(self.names), 3), np.nan)
         for number in range(len(self.names)):
-            patches = flat[self.level == number]
-            patches = patches[np.isfinite(patches).all(axis=1)]
-            if len(patches) == 0:
+            counts = flat[self.level == number]
+            counts = counts[np.isfinite(counts).all(axis=1)]
+            if len(counts) == 0:
                 continue
-            middle = np.median(patches, axis=0)
-            scale = MAD_TO_SIGMA * np.median(np.abs(patches - middle), axis=0) + 1e-9
-            near = (np.abs(patches - middle) < _OUTLIER_SIGMAS * scale).all(axis=1)
-            used = patches[near] if len(patches) > _MAX_WITHOUT_OUTLIERS else patches
+            median = np.median(counts, axis=0)
+            sigma = MAD_TO_SIGMA * np.median(np.abs(counts - median), axis=0) + 1e-9
+            is_near = (np.abs(counts - median) < _OUTLIER_SIGMAS * sigma).all(axis=1)
+            used = counts[is_near] if len(counts) > _MAX_WITHOUT_OUTLIERS else counts
             value[number] = used.mean(axis=0)
             error[number] = used.std(axis=0, ddof=1) / np.sqrt(len(used)) if len(used) > 1 else np.nan
         return value, error
@@ -146,7 +146,7 @@ class ChartPoints:
 
     @property
     def printed(self) -> npt.NDArray[np.int64]:
-        """(W + N,) int64, print of each reference: 0 for bare paper, else 1 + its level of grey."""
+        """(W + N,) int64, ink of each reference: 0 for bare paper, else 1 + index of its level of grey."""
         return np.concatenate([np.zeros(len(self.whites_mm), dtype=np.int64), 1 + self.levels.level])
 
 
@@ -156,13 +156,13 @@ class ChangedFrame(FormatError):
 
 @dataclass(frozen=True, eq=False)
 class DecodedFrame:
-    """A frame as read."""
+    """A frame as read from its file."""
 
     record: FrameRecord
     mosaic: Mosaic
     black: _Array  # (2, 2) counts, black level of each position of the Bayer block
     strongest: Channel  # Channel with the brightest paper
-    saturation: int  # Raw count of saturation, as far as this frame shows it
+    saturation: int  # Raw count of saturation in this frame (`Mosaic.saturation`)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -201,14 +201,14 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
 
 @dataclass(frozen=True, eq=False)
 class RegisteredFrame:
-    """A frame with a registered chart; valid for the following frames until the chart moves too far."""
+    """A frame with the chart registered in it, used for the following frames until the chart moves too far."""
 
     file: str
     registration: Registration
     cells: Sites
     references: Sites
     gauges: dict[Channel, Plane]  # Areas around the tags, or the outline of the patches, to measure movement
-    lens: FrameCorrection | None = None  # Corrects frames sampled at these positions for light spread by the lens
+    lens: FrameCorrection | None = None  # Of light spread by the lens, for frames sampled at these positions
 
 
 def register_frame(
@@ -259,14 +259,14 @@ class Baseline:
     means: _Array  # (C + W + N, 3) counts above black of patches and references
     paper: PaperReader  # Reads flat field and white of a frame, based on the shape of the first frame
     transfer: PhotonTransfer
-    # Linearity from the first frame and the primaries; a usual value if these are missing or moved
+    # Linearity, from the first frame and the primaries; a usual value if primaries are missing or the chart moved
     superposition: Superposition
     primaries: Primaries | None = None  # The primaries alone; None if missing or unusable
     lens: LensCorrection | None = None  # Measured light spread; None if not measured
 
     @cached_property
     def consistency_check(self) -> ConsistencyCheck:
-        """Check of frames against the first, with the field for each patch's colour if known."""
+        """Comparison of frames with the first frame, with the flat field for each patch's colour if known."""
         level = self.means[: len(self.points.cells_mm)]
         if self.primaries is None:
             field = self.paper.base.at(self.points.cells_mm)
@@ -279,7 +279,7 @@ class Baseline:
 
     @property
     def levels(self) -> _Array:
-        """(C, 3) float64, each patch in the first frame, relative to bare paper."""
+        """(C, 3) float64, level of each patch in the first frame, relative to bare paper."""
         paper, at_cells = self.paper.read(self.whites, self.first.file)
         return self.means[: len(at_cells)] / (at_cells * np.maximum(paper.white, 1e-9))
 
@@ -332,7 +332,7 @@ class Baseline:
         return np.concatenate(means), np.concatenate(peaks)
 
     def reflectances(self) -> _Array:
-        """Return the reflectance (C + W + N, 3) float64 of patches and references in the first frame, bare paper 1."""
+        """Return the reflectance (C + W + N, 3) float64 of patches and references in the first frame; paper is 1."""
         paper, shape = self.paper.read(self.whites, self.first.file)
         field = np.concatenate([shape, paper.field.at(self.points.references_mm)])
         return reflectances(self.means, field, paper.white)
@@ -369,8 +369,8 @@ class LocatedFrame:
 
     decoded: DecodedFrame
     registered: RegisteredFrame  # The frame registered last; this one, if it was registered again
-    moved: RegisteredFrame  # Sampling positions: those of `registered`, moved by `shift`
-    shift: Shift  # Movement since the previously registered frame
+    moved: RegisteredFrame  # `registered` with its sampling positions moved by `shift`
+    shift: Shift  # Movement since the frame registered before
     reregistered: bool
 
 
@@ -408,7 +408,7 @@ class MeasuredDarkFrame:
 
     figures: DarkFrameFigures
     registered: RegisteredFrame  # The frame registered last, used for the measurement
-    excess: npt.NDArray[np.int16]  # (C, S, 3) counts of samples above their patch
+    excess: npt.NDArray[np.int16]  # (C, S, 3) counts of samples above the median of their patch
     means: _Array  # (C + W + N, 3) counts above black of patches and references
 
 
@@ -417,7 +417,7 @@ def locate(
 ) -> LocatedFrame | None:
     """Return the position of the chart in a frame, relative to the frame registered last.
 
-    If the chart has moved too far, it is registered again; None if `register_again` is False.
+    If the chart has moved too far, it is registered again; if `register_again` is False, the result is None.
     """
     baseline.require_layout(decoded.mosaic, decoded.record.file)
     channel, framing = decoded.strongest, registered.registration.framing
@@ -464,7 +464,7 @@ def sample(baseline: Baseline, located: LocatedFrame, dark: DarkLight | None, ke
         samples, highest = gather(decoded.mosaic, decoded.black, moved.cells)
         values, noise = table_values(samples, shape, dark_of_cells), sample_noise(samples)
         if dark_of_cells is not None:
-            # Hot photosites and stains are detected in samples that include the dark light.
+            # Subtract only light spread by the lens: samples with dark light show hot photosites and stains.
             added = dark_of_cells if dark is None else dark_of_cells - dark.patches[: len(dark_of_cells)]
             samples -= added[:, None]
     else:
@@ -493,7 +493,7 @@ def measure(baseline: Baseline, sampled: SampledFrame) -> MeasuredFrame:
     located, points, values = sampled.located, baseline.points, sampled.values
     decoded, shift, origin = located.decoded, located.shift, located.decoded.mosaic.origin
     greys, grey_errors = points.levels.read(sampled.greys, sampled.paper.field.at(points.greys_mm))
-    # Blur of the registered frame, plus the growth of the blur at the gauges.
+    # Blur of the registered frame, plus the increase of blur at the gauges.
     blur_growth_px2 = 0.0 if located.reregistered else shift.blur_growth_px2
     mean = patch_means(values)
     variance = baseline.transfer.variance(mean) / baseline.options.samples
@@ -526,7 +526,7 @@ def measure(baseline: Baseline, sampled: SampledFrame) -> MeasuredFrame:
 
 
 def measure_dark(baseline: Baseline, decoded: DecodedFrame, registered: RegisteredFrame) -> MeasuredDarkFrame:
-    """Return the measurements of a dark frame, in which the chart is assumed to be at its last position."""
+    """Return the measurements of a dark frame; the chart is assumed at its position in `registered`."""
     baseline.require_layout(decoded.mosaic, decoded.record.file)
     whites_mm = baseline.points.whites_mm
     cells, _ = gather(decoded.mosaic, decoded.black, registered.cells)

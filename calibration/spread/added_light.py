@@ -1,10 +1,10 @@
 """Estimate light that covers part of the print and adds equally to dark and bright patches, such as a reflection.
 
 The colours of a chart are in random order, so patches of similar colour elsewhere on the print predict the level of a
-patch (`calibration.spread.predicting`). A residual that is visible on dark patches and smooth over the page is added
-light. Its usual size is estimated from the print itself: the size with the largest evidence (empirical Bayes, C. E.
-Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, 5.4.1). Uniform light cannot be detected
-here; it is part of the veiling glare.
+patch (`calibration.spread.predicting`). Added light is the part of the residual that is smooth over the page and not
+proportional to the level. Its prior standard deviation is estimated from the print itself: the candidate with the
+largest evidence (empirical Bayes, C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006,
+5.4.1). Uniform light cannot be detected here; it is part of the veiling glare.
 
 C patches in the order of colour indices; levels are relative to paper.
 """
@@ -20,20 +20,20 @@ from calibration.spread.predicting import LevelModel
 from experiment.measures.least_squares import page_polynomial
 from foundation.robust import biweight, sigma_by_level
 
-# Number of knots along the longer side of the page; added light is smooth between them, such as a spot with a width of
-# an eighth of the page.
+# Number of knots along the longer side of the page. Added light is smooth between them; an example is a spot with an
+# eighth of this side as its width.
 _KNOTS = 9
 
-_FACTOR_ORDER = 4  # order of a smooth factor of all levels, fitted to separate errors of the field
+_FACTOR_ORDER = 4  # order of a smooth factor of all levels, which takes errors of the flat field
 
-_USUAL_FACTOR = 0.003  # prior standard deviation of its coefficients (judgement)
+_FACTOR_SD = 0.003  # prior standard deviation of the factor's coefficients (judgement)
 
-# Prior standard deviations of added light, to choose from.
+# Candidate prior standard deviations of added light, relative to paper.
 _SIZES = (1e-5, 1e-4, 2e-4, 4e-4, 8e-4, 1.6e-3, 3.2e-3, 6.4e-3, 0.013, 0.026, 0.05)
 
 MOST_ADDED = 0.05  # largest added light of a usable patch, relative to its level (judgement)
 
-_CERTAIN = 4.0  # standard uncertainties subtracted, so that none of some thousand patches is listed for noise
+_CERTAIN_SIGMAS = 4.0  # standard uncertainties to subtract, so that noise alone lists no patch
 
 LEAST_LEVEL = 1e-3  # lower bound of levels in relative errors
 
@@ -46,21 +46,21 @@ _Array = npt.NDArray[np.float64]
 class AddedLight:
     """Added light on each patch."""
 
-    share: _Array  # (C, 3) relative to paper; 0 at the least
+    share: _Array  # (C, 3) relative to paper; 0 at the fifth percentile of patches
     error: _Array  # (C, 3) its standard uncertainty
 
     @staticmethod
     def zero(cells: int) -> AddedLight:
-        """Return no added light, without uncertainty."""
+        """Return added light of 0 with uncertainty 0."""
         return AddedLight(np.zeros((cells, 3)), np.zeros((cells, 3)))
 
     def certain_share_of(self, level: _Array) -> _Array:
-        """Return the added light beyond uncertainty (C, 3) float64, relative to levels (C, 3)."""
-        return np.maximum(self.share - _CERTAIN * self.error, 0) / np.maximum(level, LEAST_LEVEL)
+        """Return the certain part of the added light, (C, 3) float64, relative to levels (C, 3)."""
+        return np.maximum(self.share - _CERTAIN_SIGMAS * self.error, 0) / np.maximum(level, LEAST_LEVEL)
 
     @property
     def mean_square(self) -> _Array:
-        """(C, 3) float64, mean square error of patches: added light and its uncertainty."""
+        """(C, 3) float64, mean square error of each patch from added light and its uncertainty."""
         return self.share**2 + self.error**2
 
 
@@ -94,31 +94,31 @@ def added_light(
         sigma = np.sqrt(scatter**2 + variance[rows, channel])
         value = residual[rows] / sigma
         design = model.residual(np.column_stack([bumps, factor * expected[:, None]]))[rows] / sigma[:, None]
-        solution, covariance = _likeliest(value, design, bumps.shape[1])
-        # Dust, folds and clipped patches are outliers, not light on the surrounding patches.
+        solution, covariance = _most_likely(value, design, bumps.shape[1])
+        # Dust, folds and clipped patches are outliers; they must not look like light on the patches around them.
         weight = biweight(np.abs(value - design[:, : bumps.shape[1]] @ solution), 1.0)
-        solution, covariance = _likeliest(value * weight, design * weight[:, None], bumps.shape[1])
+        solution, covariance = _most_likely(value * weight, design * weight[:, None], bumps.shape[1])
         share = bumps @ solution
         result.share[:, channel] = share - np.quantile(share[usable], 0.05)
         result.error[:, channel] = np.sqrt(np.einsum("ck,kl,cl->c", bumps, covariance, bumps))
     return result
 
 
-def _bumps(places_mm: _Array) -> _Array:
-    low, high = places_mm.min(axis=0), places_mm.max(axis=0)
+def _bumps(centres_mm: _Array) -> _Array:
+    low, high = centres_mm.min(axis=0), centres_mm.max(axis=0)
     step = float((high - low).max()) / (_KNOTS - 1)
     axes: list[_Array] = [np.linspace(a, b, max(round((b - a) / step), 1) + 1) for a, b in zip(low, high, strict=True)]
-    # Gaussian bumps with σ equal to their distance
-    x, y = (np.exp(-0.5 * ((places_mm[:, n, None] - axes[n]) / step) ** 2) for n in range(2))
-    return (y[:, :, None] * x[:, None, :]).reshape(len(places_mm), -1)
+    # Gaussian bumps with σ equal to the distance between knots
+    x, y = (np.exp(-0.5 * ((centres_mm[:, n, None] - axes[n]) / step) ** 2) for n in range(2))
+    return (y[:, :, None] * x[:, None, :]).reshape(len(centres_mm), -1)
 
 
-def _likeliest(value: _Array, design: _Array, bumps: int) -> tuple[_Array, _Array]:
-    """Return heights (K,) of the bumps and their covariance, for the prior size with the largest evidence."""
+def _most_likely(value: _Array, design: _Array, bumps: int) -> tuple[_Array, _Array]:
+    """Return the heights (K,) of the bumps and their covariance, for the size with the largest evidence."""
     normal, right = design.T @ design, design.T @ value
     best_evidence, heights, best_covariance = -np.inf, np.zeros(bumps), np.zeros((bumps, bumps))
     for size in _SIZES:
-        prior = np.full(len(right), _USUAL_FACTOR**-2)
+        prior = np.full(len(right), _FACTOR_SD**-2)
         prior[:bumps] = size**-2
         matrix = normal + np.diag(prior)
         covariance: _Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)

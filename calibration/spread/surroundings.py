@@ -1,12 +1,12 @@
-"""Model the print around each patch, and the light that the kernels of a point spread bring to the patch.
+"""Model the print around each patch, and the light that the kernels of the point spread bring to the patch.
 
 - The print is a grid of slots of one size, as made by `experiment.chart.layout`: every patch and reference fills a
-  slot, a tag has 4 × 4 slots, and a module of a tag is 0.4 slots wide. "Patches" here are the patches in the order of
-  colour indices, then the white and the grey references.
-- Near kernels are integrated over each slot and each photosite of a window, per channel; tags and margins in fifths of
-  a slot. Far kernels blur the print slot by slot.
-- Paper and black ink have usual levels under the local illumination; the background has the mean of positions next to
-  the sheet.
+  slot, a tag has 4 × 4 slots, and a module of a tag is 0.4 slots wide. In this module, "patches" include the white and
+  the grey references, after the patches in the order of colour indices.
+- Near kernels are integrated over each slot and each photosite of a window, per channel. Tags and margins are divided
+  into fifths of a slot. Far kernels blur the print slot by slot.
+- Paper and black ink each have one level, multiplied by the local flat field. The background has the mean of positions
+  next to the sheet.
 
 Half-size pixels; P patches as in `PrintedGrid`; counts above black level.
 """
@@ -30,7 +30,7 @@ from experiment.chart.printing import drawing
 
 PAD = 6  # slots around the outermost patches: margins and background within the range of wide kernels
 
-_OFF_GRID = 0.02  # tolerance of positions on the grid, in slots: rounding of files, too small to matter
+_OFF_GRID = 0.02  # tolerance of positions on the grid, in slots, for rounding in files
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int32]
@@ -38,13 +38,13 @@ _Index = npt.NDArray[np.int32]
 # Minimum bits per channel: with fewer, the curvature between codes cannot be separated from noise.
 LEAST_BITS = 3
 
-# First, step and number of tabulated window offsets, px. Rounding, colour filters, registration and lateral colour stay
-# within 2 px; cubic terms of a step are below 10⁻⁴ of a share.
+# Tabulated offsets of windows: first, px; step, px; number. Offsets by rounding, colour filters, registration and
+# lateral chromatic aberration stay within 2 px. Cubic terms of a step are below 10⁻⁴ of a share.
 _OFFSETS_PX = (-2.0, 1 / 16, 65)
 
 _PITCHES = 9  # number of tabulated slot sizes, over the range in the frame
 
-_FAR_REACH = 3.0  # half width of a far kernel in σ; the truncated 0.3 % are compensated by scaling
+_FAR_REACH = 3.0  # half width of a far kernel in σ; scaling compensates the truncated 0.3 %
 
 _Float = npt.NDArray[np.float32]
 
@@ -93,7 +93,7 @@ def _points(chart: Chart) -> _Array:
 
 def _slots(chart: Chart) -> tuple[_Array, _Array]:
     points = _points(chart)
-    # first slot's centre, mm, and slots (P, 2) of patches, column then row
+    # Centre of the first slot in mm, and slots (P, 2) of the patches: column, row
     low = points.min(axis=0)
     return low, (points - low) / np.array(chart.cell_mm)
 
@@ -152,11 +152,11 @@ class FrameLevels:
 
 @dataclass(frozen=True, eq=False)
 class UsualLight:
-    """Illumination field of the session's first frame, used for unmeasured areas in all frames."""
+    """Flat field of the session's first frame, used for unmeasured areas in all frames."""
 
     patches: _Array  # (P, 3)
-    slots: _Array  # (R K, 3); beyond the outermost patches as at these patches
-    elsewhere: _Array  # (2, 3) paper and black ink, summed over all slots
+    slots: _Array  # (R K, 3); beyond the outermost patches, the value at these patches
+    elsewhere: _Array  # (2, 3) sum over the areas of paper and of black ink, in slots
 
     @staticmethod
     def of(grid: PrintedGrid, patches: _Array, slots: _Array) -> UsualLight:
@@ -200,20 +200,20 @@ class Surroundings:
         return NearLight(grid.neighbours, weights, blank_weights, local.sum(axis=2), self.light.patches)
 
     def inks(self, levels: FrameLevels) -> _Array:
-        """Return paper, black ink and background, (3, 3) float64 counts at field 1."""
+        """Return paper, black ink and background, (3, 3) float64 counts at flat field 1."""
         whites = levels.patches[self.whites] / self.light.patches[self.whites]
         # The first colour is the code (0, 0, 0), the black of tags.
         return np.stack([np.median(whites, axis=0), levels.patches[0] / self.light.patches[0], levels.beyond])
 
     def mean(self, levels: FrameLevels, inks: _Array) -> _Array:
-        """Return the mean light (3,) float64 counts of the frame: print and background; `inks` (3, 3) as of `inks`."""
+        """Return the mean light (3,) float64 counts of print and background in the frame; `inks` (3, 3) from `inks`."""
         sheet = levels.patches.sum(axis=0) + (self.light.elsewhere * inks[:2]).sum(axis=0)
         slots = len(levels.patches) + self.grid.plain_slots
         background = max(self.frame_slots - slots, 0.0)
         return (sheet + background * inks[2]) / (slots + background)
 
     def image(self, levels: FrameLevels, inks: _Array) -> _Float:
-        """Return the print slot by slot, (R, K, 3) float32 counts; `inks` (3, 3) as of `inks`."""
+        """Return the print slot by slot, (R, K, 3) float32 counts; `inks` (3, 3) from `inks`."""
         image = np.empty((*self.grid.source.shape, 3), dtype=np.float32)
         kernels.print_slots(self.grid.blank_shares.reshape(-1, 3), self.light.slots, inks, image.reshape(-1, 3))
         image[self.grid.row, self.grid.column] = levels.patches
@@ -222,7 +222,7 @@ class Surroundings:
     def blurred(self, image: _Float, scale_px: float) -> _Float:
         """Return the print blurred by a far kernel, (K, R, 3) float32 counts: columns first."""
         width, height = self._mean_pitch_px
-        # Columns and channels are one axis, for the innermost loop of the kernel.
+        # Columns and channels are one axis, because the innermost loop of `blur_rows` runs over it.
         rows = image.reshape(image.shape[0], -1)
         down = np.empty_like(rows)
         kernels.blur_rows(rows, far_taps(scale_px / height), down)
@@ -242,7 +242,7 @@ class Surroundings:
         return width, height
 
     def own_share(self, scale_px: float) -> float:
-        """Return the share of a far kernel's light at a patch from the patch's own slot."""
+        """Return the share of a far kernel's light at a patch that comes from its own slot."""
         width, height = self._mean_pitch_px
         taps = far_taps(scale_px / width), far_taps(scale_px / height)
         return float(taps[0][len(taps[0]) // 2] * taps[1][len(taps[1]) // 2])
@@ -252,26 +252,26 @@ class Surroundings:
 class NearLight:
     """Weights of the light that near kernels bring to patches."""
 
-    neighbours: npt.NDArray[np.int32]  # (P, 25) patches around each patch
+    neighbours: npt.NDArray[np.int32]  # (P, 25) patches around each patch, as in `PrintedGrid`
     weights: _Float  # (P, 25, 3) of each neighbour
     blank_weights: _Float  # (P, 3, 3) of paper, black ink and background
     total: _Array  # (P, 3) sum of the weights of a patch
-    light: _Array  # (P, 3) usual field at the patches
+    light: _Array  # (P, 3) flat field at the patches, as in `UsualLight`
 
     @property
     def own(self) -> _Array:
-        """(P, 3) float64, weight of the own slot of each patch."""
+        """(P, 3) float64, weight of each patch's own slot."""
         return self.weights[:, self.weights.shape[1] // 2].astype(np.float64)
 
     def at(self, levels: FrameLevels, inks: _Array) -> _Array:
-        """Return the light (P, 3) float64 counts; `inks` (3, 3) as of `Surroundings.inks`."""
+        """Return the light (P, 3) float64 counts; `inks` (3, 3) from `Surroundings.inks`."""
         out = np.empty_like(levels.patches)
         kernels.light_around(self.neighbours, self.weights, self.blank_weights, levels.patches, self.light, inks, out)
         return out
 
 
 def far_taps(scale: float) -> _Float:
-    """Return the shares (n,) float32, n odd, sum 1, of slots on a line in a Gaussian with σ `scale` slots."""
+    """Return the shares (n,) float32 of slots on a line in a Gaussian of σ `scale` slots; n is odd, the sum 1."""
     reach = max(1, math.ceil(_FAR_REACH * scale))
     edges = np.arange(-reach, reach + 2) - 0.5
     taps = np.diff(ndtr(edges / scale))
