@@ -1,6 +1,6 @@
 """Generate raw linear images and data sets from a look-up table (LUT) and any picture.
 
-Three lines give the raw image that the camera would have taken of a print of the picture::
+Three lines calculate the raw image that the camera would take of the printed picture::
 
     from generator import open_lut, read_picture, render
     lut = open_lut("LUT")
@@ -75,7 +75,7 @@ def open_lut(folder: Path | str) -> Lut:
     Returns
     -------
     Lut
-        The LUT; samples are read when they are used.
+        The LUT; its samples are read from the disk when they are used.
 
     Raises
     ------

@@ -2,8 +2,8 @@
 
 A location is a path or a URL as the user writes it. A name is a path below it, with forward slashes. Contract:
 
-- Writing is atomic: a file exists with all its bytes or not at all. If two programs write one name, the later wins.
-- A file survives a loss of power only after `Store.sync`. Synchronise many files at once: they share one wait.
+- Writing is atomic: a file exists with all its bytes or not at all. If two programs write a name, the later file stays.
+- A file survives a loss of power only after `Store.sync`. Synchronise many files in one call: they share one wait.
 - An object store has no rename. An object appears when its last byte has arrived.
 """
 
@@ -67,7 +67,7 @@ def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
     try:
         return url_to_fs(url)
     except Exception as error:
-        # A store may connect here and raise its own errors; those of ftplib are not OSError.
+        # A store may connect here and raise its own errors; errors of ftplib are not OSError.
         reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
             f"cannot open the store {url}: {reason}; use a store that fsspec supports, and install its library (s3://: "
@@ -77,22 +77,22 @@ def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
 
 Pieces = Iterable[bytes | memoryview]  # The bytes of a file in order; each piece is valid until the next one
 
-# Files that are synchronised in parallel. A file system commits its journal once for all waiting files, so 16 waits
-# take little longer than one.
+# Number of files synchronised in parallel. A file system commits its journal once for all waiting files, so 16 waits
+# take little longer than one wait.
 _SYNC_THREADS: Final = 16
 
-# Buffer size in bytes; larger pieces are written directly. Without a size Python makes two system calls to get one,
+# Buffer size in bytes; larger pieces are written directly. Without a size, Python makes two system calls to choose it,
 # and each call may pass the interpreter lock to another thread.
 _BUFFER: Final = 1 << 16
 
-# Protocols of fsspec with real folders, which must exist before a file is written. Other stores are not asked for
-# folders, because some would create a bucket.
+# Protocols of fsspec with real folders, which must exist before a file is written. In other stores no folder is
+# created, because some stores would create a bucket.
 _WITH_FOLDERS: Final = frozenset({"ftp", "sftp", "ssh", "smb", "webdav", "webdavs", "hdfs", "arrow_hdfs"})
 
 
 @dataclass(frozen=True)
 class LocalStore:
-    """A folder of this machine. It is not created here, so that late writes cannot change a completed data set."""
+    """A folder of this machine. It must exist, so that late writes cannot change a completed data set."""
 
     root: Path
 
@@ -123,19 +123,19 @@ class LocalStore:
         """Open a new file for writing; it appears at the end of the block, unless the block raises."""
         path = self.root / name
         # A random name, because two programs may write the same shard; see `foundation.files.is_partial`.
-        hidden = partial_path(path.with_name(f"{path.name}.{secrets.token_hex(8)}"))
+        unfinished = partial_path(path.with_name(f"{path.name}.{secrets.token_hex(8)}"))
         try:
             try:
-                stream = hidden.open("wb", _BUFFER)
+                stream = unfinished.open("wb", _BUFFER)
             except FileNotFoundError:
                 self._make_folder(path.parent)
-                stream = hidden.open("wb", _BUFFER)
+                stream = unfinished.open("wb", _BUFFER)
             with stream:
                 yield stream
-            hidden.replace(path)
+            unfinished.replace(path)
         except BaseException as error:
             with contextlib.suppress(OSError):
-                hidden.unlink(missing_ok=True)
+                unfinished.unlink(missing_ok=True)
             if isinstance(error, OSError) and not isinstance(error, CropError):
                 raise storage_error(path, error) from error
             raise
@@ -161,7 +161,7 @@ class LocalStore:
     def open(self, name: str) -> Generator[BinaryIO]:
         """Open a file for sequential reading; raises FormatError."""
         try:
-            # Lists of a foreign data set may contain any name, so names that leave the folder are refused.
+            # Lists of a foreign data set may contain any name, so names outside the folder are refused.
             with open_inside(self.root, name) as stream:
                 yield stream
         except OSError as error:
@@ -175,7 +175,7 @@ class LocalStore:
             raise reading_error(self.root / name, error, "check its permissions") from error
 
     def names(self, folder: str = "") -> Iterator[str]:
-        """Yield the names of all complete files below `folder`, in no order."""
+        """Yield the names of all complete files below `folder`, in any order."""
         for path, _, files in os.walk(self.root / folder):
             below = Path(path).relative_to(self.root)
             yield from ((below / file).as_posix() for file in files if not is_partial(file))
@@ -185,7 +185,7 @@ class LocalStore:
         shutil.rmtree(self.root / folder, ignore_errors=True)
 
     def sweep(self) -> None:
-        """Remove incomplete files; no other program may be writing."""
+        """Remove incomplete files; no other program may write at the same time."""
         for path, _, files in os.walk(self.root):
             for file in files:
                 if is_partial(file):
@@ -194,7 +194,7 @@ class LocalStore:
 
 @lru_cache(maxsize=1)
 def _sync_pool() -> ThreadPoolExecutor:
-    # Kept, because starting the threads takes as long as synchronising a few files.
+    # The threads are kept, because starting them takes as long as synchronising a few files.
     return ThreadPoolExecutor(_SYNC_THREADS, "sync")
 
 
@@ -230,7 +230,7 @@ class RemoteStore:
 
     @property
     def _files(self) -> AbstractFileSystem:
-        # Not stored, because this object is sent to workers and a file system is not; fsspec caches one for each URL.
+        # Not stored, because workers get this object but cannot get a file system; fsspec caches one for each URL.
         return filesystem(self.url)[0]
 
     @property

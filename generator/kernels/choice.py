@@ -10,7 +10,7 @@ except for p and q::
     sample   p = h S and q = (p mod 2³²) S, S samples of a colour; ⌊p/2³²⌋ if x mod 16 < 8, else ⌊q/2³²⌋
 
 The stream is 0, or the index of the illuminant if several illuminants are mixed per pixel. Functions decorated with
-`step` write LLVM vectors (`kernels/vector.py`) and can be called from compiled functions only.
+`step` emit LLVM vector code (`kernels/vector.py`) and can be called from compiled functions only.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ from generator.kernels.vector import (
 )
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES, key_of
 
-# Number of groups by which offsets are chosen ahead of fetching their samples. It hides the latency of memory.
+# Number of groups between the choice of offsets and the reading of their samples; hides the latency of memory.
 LEAD: Final = 2
 OFFSETS_BYTES: Final = 4 * GROUP  # Bytes of the offsets of a group, uint32 each
-# Bytes by which the picture is prefetched before it is read, about 21 groups. It hides the latency of memory.
+# Distance in bytes between prefetching and reading of the picture, about 21 groups; hides the latency of memory.
 _PREFETCH_BYTES: Final = 2048
 # Bytes of scratch memory for the last pixels of a row: 96 bytes of a group, rounded up to whole cache lines.
 EDGE_BYTES: Final = 128
@@ -64,7 +64,7 @@ _P0: Final = np.uint64(MULTIPLIERS[0])
 _P1: Final = np.uint64(MULTIPLIERS[1])
 _W0: Final = np.uint32(KEY_STEPS[0])
 _W1: Final = np.uint32(KEY_STEPS[1])
-_HALF: Final = np.uint64(32)
+_WORD_BITS: Final = np.uint64(32)
 _PURPOSE: Final = np.uint32(SAMPLES)
 _PAIRS: Final = ir.VectorType(I64, LANES // 2)
 # Odd multipliers of the three rounds, which spread changes of bits well: C. Wellons, "Prospecting for hash functions",
@@ -85,8 +85,8 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
 
 
 def _hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
-    # Three keyed rounds are needed. With one, images of two seeds are equal after swapping neighbours. With two, pixels
-    # at distances near a power of two depend on each other.
+    # Three keyed rounds are needed. With one round, images of two seeds are equal after swapping neighbours. With two
+    # rounds, pixels at distances near a power of two depend on each other.
     numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
     h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
     h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
@@ -155,7 +155,7 @@ def write_colours(
     second_stride: Value,
     second_target: Value,
 ) -> None:
-    """Write the colour indices of the 32 pixels at `picture` as uint32, times each stride, to each target."""
+    """Write the colour indices (uint32) of the 32 pixels at `picture`, times each stride, to its target."""
     for half in range(2):
         colours = _colours(builder, builder.add(picture, ir.Constant(I64, 3 * LANES * half)), bits)
         for factor, address in ((stride, target), (second_stride, second_target)):
@@ -166,7 +166,7 @@ def write_colours(
 def choose_for_colours(
     builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
 ) -> None:
-    """Do `choose` for 32 pixels whose colour offsets (index times bytes of a colour) are at `colours`."""
+    """Choose like `choose` for 32 pixels with colour offsets (index times bytes of a colour) at `colours`."""
     for half, choices in enumerate(_choices_of_words(builder, _hashed(builder, word, (k0, k1, k2)), count)):
         colour_offsets = load(builder, colours, 4 * LANES * half, WORDS)
         offsets = builder.add(colour_offsets, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
@@ -174,7 +174,7 @@ def choose_for_colours(
 
 
 def emit_prefetch(builder: Builder, address: Value, locality: int) -> None:
-    """Emit an LLVM prefetch; locality 3 keeps the line in every cache, 0 in none."""
+    """Emit an LLVM prefetch; locality 3 keeps the cache line in every cache, 0 in none."""
     pointer = I8.as_pointer()
     function_type = ir.FunctionType(ir.VoidType(), [pointer, I32, I32, I32])
     function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], function_type)
@@ -184,26 +184,26 @@ def emit_prefetch(builder: Builder, address: Value, locality: int) -> None:
 
 @step(ADDRESS)
 def prefetch(builder: Builder, address: Value) -> None:
-    """Prefetch the line of `address` into all caches; an invalid address is ignored."""
+    """Prefetch the cache line of `address` into all caches; an invalid address is ignored."""
     emit_prefetch(builder, address, 3)
 
 
 @step(ADDRESS)
 def prefetch_once(builder: Builder, address: Value) -> None:
-    """Prefetch a line that is read once, without filling the larger caches."""
+    """Prefetch a cache line that is read once, without filling the larger caches."""
     emit_prefetch(builder, address, 0)
 
 
 @inlined
 def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
     """Return the four words of Philox4x32-10; words and counter are uint32, `seed` is uint64."""
-    k0, k1 = uint32(seed), uint32(seed >> _HALF)
+    k0, k1 = uint32(seed), uint32(seed >> _WORD_BITS)
     for _ in range(ROUNDS):
         p0, p1 = uint64(c0) * _P0, uint64(c2) * _P1
         c0, c1, c2, c3 = (
-            uint32(uint32(p1 >> _HALF) ^ c1 ^ k0),
+            uint32(uint32(p1 >> _WORD_BITS) ^ c1 ^ k0),
             uint32(p1),
-            uint32(uint32(p0 >> _HALF) ^ c3 ^ k1),
+            uint32(uint32(p0 >> _WORD_BITS) ^ c3 ^ k1),
             uint32(p0),
         )
         k0, k1 = uint32(k0 + _W0), uint32(k1 + _W1)
@@ -227,7 +227,7 @@ def offsets_slot(scratch: int, group: int) -> int:
 def group_address(row: int, width: int, group: int, scratch: int) -> int:
     """Return an address from which the pixels at x = 32 `group` can be read; `row` is the address of the row.
 
-    A group that is longer than the rest of the row is copied to scratch memory.
+    If the row ends before the end of the group, its pixels are copied to scratch memory.
     """
     source = row + 3 * GROUP * group
     if GROUP * (group + 1) > width:

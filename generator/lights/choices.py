@@ -1,8 +1,8 @@
 """Choices of illuminants for source pictures, and parsing of illuminants from text.
 
 A choice is a `LightChoice`: its result depends only on the position of the picture in the list of sources and on a
-seed. Illuminants are listed, drawn from the LUT or from a distribution, or they match the ground truths of another data
-set (paper, section 4.3).
+seed. Illuminants are listed, drawn from the look-up table (LUT) or from a distribution, or they match the ground truths
+of another data set (paper, section 4.3).
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ if TYPE_CHECKING:
 # Chromaticities drawn at once: enough that one of them is in the gamut, unless the gamut is narrow.
 _BATCH: Final = 32
 # Largest number of batches for one illuminant: 65 536 draws. If the share `_LEAST_WITHIN` of the distribution is in the
-# gamut, the probability that no draw is in it is e⁻⁶⁵.
+# gamut, all draws are outside with the probability e⁻⁶⁵.
 _BATCHES: Final = 2048
 # Smallest share of a distribution in the gamut; with less, an illuminant would need thousands of draws.
 _LEAST_WITHIN: Final = 1e-3
-# Angle in degrees between a ground truth and the nearest mixture beyond which the ground truth is far. It is larger
-# than the error of good methods (2 degrees), so the mixture would be a different illuminant.
+# A ground truth is far if its angle to the nearest mixture is larger, in degrees. The limit is above the error of good
+# methods (2 degrees), so the mixture would be a different illuminant.
 _FAR_DEG: Final = 3.0
 # Share of far ground truths above which a file is refused. A few ground truths at the edge of a data set may be far;
-# many mean that the channels are in another order or that the ground truths are of another camera.
+# many mean that the channels are in another order or that the ground truths belong to another camera.
 _MOST_FAR: Final = 0.25
 _MOST_DEG: Final = 10.0  # Largest angle in degrees for a ground truth of the same camera
 
@@ -86,7 +86,7 @@ class SequentialLights:
 
 @dataclass(frozen=True, eq=False)
 class DrawnLights:
-    """Illuminants for each picture, drawn from a distribution that is cut to the gamut of the LUT.
+    """Illuminants for each picture, drawn from a distribution within the gamut of the LUT.
 
     Illuminant j of the picture at position p is the first of the draws 0, 1, 2 … in the gamut. Draw i uses the words
     of `philox` with counter (i, j), number p and purpose 4.
@@ -134,8 +134,8 @@ class DrawnLights:
 class SimultaneousLights:
     """Several illuminants of another choice in each image, combined by masks.
 
-    Image i of a picture gets the illuminants i · together … of `choice`, and the masks of number
-    position · images + i.
+    Image i of a picture gets `together` illuminants of `choice`, from number i · together on. Its masks have the number
+    position · lights_each + i.
     """
 
     choice: LightChoice
@@ -176,7 +176,7 @@ class SimultaneousLights:
 
 
 def parse_lights(texts: Iterable[str], lut: Lut) -> ListedLights:
-    """Return the illuminants of several texts, each a list for `light_numbers` or one for `parse_light`."""
+    """Return the illuminants of several texts, each for `light_numbers` or `parse_light`."""
     gamut, lights = Gamut.of(lut), list[int | Mixture]()
     for text in texts:
         is_number = re.fullmatch(r"\s*\d+\s*", text, re.ASCII)
@@ -274,16 +274,16 @@ def listed_lights(lights: Iterable[int | str | Mixture] | str | float | Mixture,
     """Return the choice of the same illuminants for every picture, each given as for `light_of`."""
     if isinstance(lights, str | int | float | Mixture):
         raise InputError(f"lights is {value_text(lights)}, expected a list such as [0, 3] or ['D65']; correct it")
-    # Numbers stay numbers, so that `describe` gives the same record as for the command.
+    # Numbers stay numbers, so that `describe` returns the same record as for the command.
     return ListedLights(
         tuple(light_of(light, lut) if isinstance(light, str | Mixture) else valid_light(lut, light) for light in lights)
     )
 
 
 def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", lights_each: int = 1) -> SequentialLights:
-    """Return the illuminant of the LUT with the smallest angle to each ground truth; of equal ones the lowest number.
+    """Return the illuminant of the LUT with the smallest angle to each ground truth; if equal, the lowest index.
 
-    `truths` is (N, 3) float64 ≥ 0, linear RGB of the camera of the LUT, of any length.
+    `truths` is (N, 3) float64 ≥ 0, linear RGB of the camera of the LUT, not necessarily normalised.
     """
     table = lut.ground_truth / np.linalg.norm(lut.ground_truth, axis=1, keepdims=True)
     targets = truths / np.linalg.norm(truths, axis=1, keepdims=True)
@@ -299,7 +299,7 @@ def matched_lights(
 ) -> SequentialLights:
     """Return the mixture that matches each ground truth, or the nearest mixture (`Gamut.match`).
 
-    `truths` has linear RGB ≥ 0 of the camera of the LUT by line number in the file. Raises InputError if too many
+    `truths` maps line numbers of the file to linear RGB ≥ 0 of the camera of the LUT. Raises InputError if too many
     ground truths are far outside the gamut.
     """
     matches = tuple(gamut.match(truth, "nearest") for truth in truths.values())

@@ -1,9 +1,9 @@
 """Masks: the weight of each of several illuminants in each pixel, computed or read from files.
 
-A mask plan returns a mask maker for each image, and a maker returns the masks at any size. Weights of a pixel sum to 1
-in multiples of 1/65535, so that a 16-bit file stores them without loss. Contract of computed masks:
+A mask plan returns a mask maker for each image, and a maker returns the masks at any size. The weights of a
+pixel are multiples of 1/65535 with sum 1, so that a 16-bit file stores them without loss. Contract of computed masks:
 
-- They depend only on the seed and the number of the image; purpose 5 of `philox`.
+- They depend only on the seed and the number of the image (purpose 5 of `philox`).
 - Lengths are relative to the longer side of the image. Masks with one seed and number look the same at every size, and
   an edge is never sharper than one pixel.
 - Pixels are computed only with +, −, ×, ÷ and √, which IEEE 754 rounds equally everywhere. Masks therefore have the
@@ -39,11 +39,11 @@ _ZERO: Final = np.float32(0)
 _HALF: Final = np.float32(0.5)
 _ONE: Final = np.float32(1)
 _THREE: Final = np.float32(3)
-_STEP: Final = 64  # Numbers of one stream: more than the largest shape needs, 1 + 3 · 20 for spots
-# Width of the bars between the panes of a window, relative to the window: 6 cm of 1 m, as glazing bars.
+_STREAM_LENGTH: Final = 64  # Numbers per stream; spots need up to 1 + 3 · 20, smooth fields pass their count
+# Width of the bars between the panes of a window, relative to the window: 6 cm of 1 m, as in real windows.
 _BAR: Final = 0.06
 
-# Maps v (h, 1), the distance of rows from the image centre relative to the longer side, to the shares (K, h, W).
+# Maps v (h, 1) to the shares (K, h, W): v is the distance of rows from the image centre, relative to the longer side.
 Shares = Callable[[Array], Array]
 
 
@@ -55,7 +55,7 @@ class RandomStreams:
     number: int
     purpose: int = philox.MASKS
 
-    def uniform(self, stream: int, count: int = _STEP) -> npt.NDArray[np.float64]:
+    def uniform(self, stream: int, count: int = _STREAM_LENGTH) -> npt.NDArray[np.float64]:
         """Return (count,) float64 between 0 and 1."""
         word = philox.words(self.seed, np.arange(count), stream, self.number, self.purpose)[0]
         return (word + 0.5) / (1 << 32)
@@ -78,8 +78,8 @@ class HalfPlanes:
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to the shares (K, h, W) float32 of the illuminants.
 
-        All lengths are relative to the longer side: `half` has half the width and height of the image, `pixel` is the
-        size of a pixel, and `u` (1, W) float32 are the distances of columns from the image centre.
+        All lengths are relative to the longer side. `half` is half the width and half the height of the image, `pixel`
+        the size of a pixel. `u` (1, W) float32 are the distances of columns from the image centre.
         """
         drawn: list[float] = streams.uniform(0).tolist()
         angle = math.radians(360 * drawn[0] if self.angle is None else self.angle)
@@ -191,7 +191,7 @@ class Windows:
 
     columns: int | None = None  # of panes; None: 2 or 3
     rows: int | None = None  # of panes; None: 2 or 3
-    softness: float | None = None  # width of the half shadow relative to the window; None: random from 0.02 to 0.1
+    softness: float | None = None  # width of the penumbra relative to the window; None: random from 0.02 to 0.1
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `HalfPlanes.shares`."""
@@ -226,8 +226,8 @@ class Windows:
         turn = math.radians(40 * (drawn[5] - 0.5))
         corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
         # One side of the window is farther away and therefore shorter.
-        far = 1 - 0.4 * drawn[6:8] * np.sign(corners[:, ::-1] * (drawn[8:10] - 0.5)).clip(0)
-        corners = corners * far * [width, height]
+        shortening = 1 - 0.4 * drawn[6:8] * np.sign(corners[:, ::-1] * (drawn[8:10] - 0.5)).clip(0)
+        corners = corners * shortening * [width, height]
         corners[:, 0] += slant * corners[:, 1]
         rotation = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
         matrix = _homography(corners @ rotation + centre)
@@ -243,7 +243,7 @@ Shape = HalfPlanes | Spots | SmoothFields | Windows
 
 @compiled
 def _fill_strips(u: Any, v: Any, right: Any, down: Any, edges: Any, width: Any, shares: Any) -> None:
-    # Fills `shares` (K, n, m), all 1 before, with strips between K − 1 soft edges.
+    # Fills `shares` (K, n, m), initially 1, with strips between K − 1 soft edges.
     for y in range(len(v)):
         for edge in range(len(edges)):
             for x in range(len(u)):
@@ -254,7 +254,7 @@ def _fill_strips(u: Any, v: Any, right: Any, down: Any, edges: Any, width: Any, 
 
 @compiled
 def _fill_discs(u: Any, v: Any, discs: Any, light: Any) -> None:
-    # Fills the shares of one illuminant (n, m), all 1 before, with discs.
+    # Fills the shares of one illuminant (n, m), initially 1, with discs.
     for y in range(len(v)):
         for disc in range(len(discs)):
             x0, y0, radius, edge = discs[disc, 0], discs[disc, 1], discs[disc, 2], discs[disc, 3]
@@ -267,7 +267,7 @@ def _fill_discs(u: Any, v: Any, discs: Any, light: Any) -> None:
 
 @compiled
 def _add_splines(knots: Any, index: Any, weights: Any, total: Any) -> None:
-    # Adds to each row of `total` (n, m) four rows of `knots`, starting at `index` (n,), times `weights` (4, n).
+    # Adds four rows of `knots` from `index` (n,) on, times `weights` (4, n), to each row of `total` (n, m).
     for y in range(total.shape[0]):
         for step in range(4):
             weight, row = weights[step, y], index[y] + step
@@ -287,7 +287,7 @@ def _grow(levels: Any) -> None:
 
 
 def _homography(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    # From four points (4, 2), clockwise, to the corners of the unit square.
+    # Maps four points (4, 2), clockwise, to the corners of the unit square.
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     rows: list[list[float]] = []
     for (u, v), (x, y) in zip(corners.tolist(), square.tolist(), strict=True):
@@ -322,7 +322,7 @@ def _panes(positions: Array, count: int, soft: float) -> Array:
 
 
 def _with_first_light(shares: Array) -> Array:
-    # In place: the first illuminant, all 1 before, gets the product of 1 − share over the others.
+    # Multiplies the shares of the first illuminant, initially 1, by 1 − share of each other illuminant, in place.
     for light in shares[1:]:
         shares[0] *= 1 - light
     return shares
@@ -420,8 +420,8 @@ class GivenMasks:
             masks[0] = np.where(total > 0, masks[0], 1)
             shares = np.stack(masks)
         else:
-            over = np.maximum(total, 1)
-            shares = np.stack([np.maximum(1 - total, 0), *(mask / over for mask in masks)])
+            divisor = np.maximum(total, 1)
+            shares = np.stack([np.maximum(1 - total, 0), *(mask / divisor for mask in masks)])
         out = np.empty((height, width, lights), np.float32)
         quantise_shares(shares, out)
         return out
@@ -483,7 +483,7 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _read(path: Path) -> list[_Array]:
-    # A grey file, or one with equal channels, has one mask (H, W) float32, 0 … 1; another file has three.
+    # A file with one channel or equal channels has one mask (H, W) float32, 0 … 1; other files have three.
     image = decode_values(_bytes_of(path), path)
     if image.dtype.kind == "u" and image.dtype.itemsize <= 2:
         scaled = np.asarray(image / np.float32(np.iinfo(image.dtype).max), dtype=np.float32)
@@ -493,18 +493,18 @@ def _read(path: Path) -> list[_Array]:
         raise FormatError(f"{path} has {image.dtype} or non-finite values, expected 8 or 16 bits; convert it")
     if scaled.ndim == 2:
         return [scaled]
-    grey = bool((scaled == scaled[..., :1]).all())
-    return [np.ascontiguousarray(scaled[..., channel]) for channel in range(1 if grey else 3)]
+    is_grey = bool((scaled == scaled[..., :1]).all())
+    return [np.ascontiguousarray(scaled[..., channel]) for channel in range(1 if is_grey else 3)]
 
 
 def _resized(mask: _Array, height: int, width: int) -> _Array:
-    # Reduced by averaging over areas, enlarged by linear interpolation.
+    # Masks are reduced by averaging over areas, and enlarged by linear interpolation.
     import cv2
 
     if mask.shape == (height, width):
         return mask
-    smaller = height <= mask.shape[0] and width <= mask.shape[1]
-    interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+    is_smaller = height <= mask.shape[0] and width <= mask.shape[1]
+    interpolation = cv2.INTER_AREA if is_smaller else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(mask, (width, height), interpolation=interpolation), dtype=np.float32)
 
 
@@ -566,9 +566,9 @@ _OPTIONS: Final[dict[str, dict[str, Range]]] = {
 def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
     """Return the masks that a text specifies.
 
-    It is a shape with optional numbers, such as ``half-plane``, ``soft-edge:angle=30,width=0.2``,
+    The text is a shape with optional numbers, such as ``half-plane``, ``soft-edge:angle=30,width=0.2``,
     ``spots:count=3,radius=0.1,softness=0.5``, ``smooth:scale=0.3,contrast=8`` or
-    ``window:columns=2,rows=3,softness=0.05``, or else a folder for `find_masks`.
+    ``window:columns=2,rows=3,softness=0.05``. Any other text is a folder for `find_masks`.
     """
     if text.strip().partition(":")[0] not in _OPTIONS:
         if not text.strip() or not Path(text).is_dir():

@@ -5,15 +5,15 @@ print's black is not black and its paper is not white. Black is mapped to the bl
 its white point w, as in black point compensation (ISO 18619:2015; there in XYZ, here in camera RGB):
 t = b + (w - b) a.
 
-Once per look-up table (LUT), `print_inverse` finds for each of 17 × 17 × 17 source colours
-(`kernels.printing.NODE_CODES`) the position in the chart at which the camera records t under a reference illuminant.
-Like the profile of a printer, this does not depend on the illuminant of an image. Under an illuminant of the LUT, the
-value of a node is interpolated between the means of the patches around its position. Values under several illuminants
-are added, as light is. A new illuminant takes a few milliseconds and nothing on disk.
+Nodes are 17 × 17 × 17 source colours (`kernels.printing.NODE_CODES`). Once per look-up table (LUT), `print_inverse`
+calculates the position of each node in the chart, where the camera records t under a reference illuminant. Like the
+profile of a printer, positions do not depend on the illuminant of an image. Under an illuminant of the LUT, the value
+of a node is interpolated between the means of the patches around its position. Values under several illuminants are
+added, because light is additive. A new illuminant takes a few milliseconds and no space on the disk.
 
-The greys of a print change their tint with the illuminant, by degrees if inks are not neutral. Estimators and the eye
-judge an illuminant by greys. Greys are therefore made neutral: each level is multiplied by one factor per channel that
-keeps its brightness, and colours get the factor of the grey of equal brightness. `kernels/printing.py` adds the noise.
+The greys of a print change their tint with the illuminant, by some degrees if inks are not neutral. Estimators and the
+eye judge an illuminant by greys, so greys are made neutral. Each grey is multiplied by a factor per channel that keeps
+its brightness. Colours get the factor of the grey of equal brightness. `kernels/printing.py` adds the noise.
 """
 
 from __future__ import annotations
@@ -54,15 +54,15 @@ if TYPE_CHECKING:
 
 _Array = npt.NDArray[np.float64]
 
-# Temperature of the reference illuminant, K: about the middle of daylight. Estimators trained with maps of 5600 K were
-# as accurate as with one map per illuminant (docs/transfer.md).
+# Temperature of the reference illuminant, K: about the middle of daylight. Estimators trained with a map of 5600 K
+# were as accurate as with one map per illuminant (docs/transfer.md).
 REFERENCE_K: Final = 5600.0
 
-# Smallest ratio of the darkest to the brightest channel of white for a reference illuminant: it must contain all
-# colours.
+# Smallest ratio of the darkest to the brightest channel of white under a reference illuminant, which must contain
+# light of all channels.
 _LEAST_RATIO: Final = 0.2
 
-# Largest relative difference in a channel between target and print inside the gamut: 1/5 of the difference of
+# Largest relative difference in a channel between target and print inside the gamut: 1/5 of the difference between
 # neighbouring patches of a 5-bit chart.
 GAMUT_TOLERANCE: Final = 0.02
 
@@ -73,25 +73,25 @@ BLACK_WITHIN_DEG: Final = 0.4
 # contrast of a print by 0.01 of white.
 MOST_LIFT: Final = 1.25
 
-# Largest factor that makes greys neutral. Prints need up to 1.1; channels with very few counts may need more only
-# because of noise.
+# Largest factor that makes greys neutral. Prints need up to 1.1; channels with very few counts may need more, but
+# because of noise alone.
 MOST_TINT: Final = 1.5
 
-# Largest factor that scales recorded deviations to the noise at their level. The spread of 25 samples has an error of
-# 1/7, and the nearest patch has a different level.
+# Largest factor that scales recorded deviations to the noise at their level. The standard deviation of 25 samples has
+# an uncertainty of 1/7, and the nearest patch has a different level.
 MOST_SPREAD: Final = 2.0
 
 # Smallest distance of a mean from 0 after subtraction of black, in standard deviations of noise. Clipping then raises
 # the mean by 2 %.
 NOISE_ABOVE: Final = 1.5
 
-# Rounding steps per code and per level: 0.001 of the distance of neighbouring patches, and far above the rounding
+# Rounding steps per code and per level: 0.001 of the distance between neighbouring patches, far above the rounding
 # differences of processors.
 _ROUNDING_STEPS: Final = 1024
 
 _GREYS: Final = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)  # Nodes of three equal codes
 
-_LIGHTS_AT_HAND: Final = 1024  # Illuminants of a LUT whose nodes are kept in memory, 200 kB each
+_CACHED_LIGHTS: Final = 1024  # Illuminants of a LUT with nodes in memory, 200 kB each
 
 
 def source_colours(matrix: ColourMatrix) -> _Array:
@@ -108,7 +108,7 @@ def source_colours(matrix: ColourMatrix) -> _Array:
 class PrintMap:
     """Positions of the nodes in a chart, and the properties of the print there.
 
-    - `cells`: (U,) int64, patches that nodes need.
+    - `cells`: (U,) int64, indices of the patches that the nodes use.
     - `around`: (4913, 8) int64, positions in `cells` of the patches around each node.
     - `weights`: (4913, 8) float64, weights of these patches, sum 1.
     - `nearest`: (4913,) int64, position in `cells` of the patch whose samples a node uses.
@@ -130,7 +130,7 @@ class PrintMap:
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the arrays that decide pixels."""
+        """Hash of the arrays that determine the pixels."""
         arrays = self.cells.astype("<i8"), self.around.astype("<i8"), self.weights.astype("<f8")
         arrays = *arrays, self.nearest.astype("<i8"), self.levels.astype("<f8"), self.noise.astype("<f8")
         return sha256_of(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
@@ -153,7 +153,7 @@ _SUFFIX: Final = ".print"
 def print_map(lut: Lut, matrix: ColourMatrix, folder: Path | None = None) -> PrintMap:
     """Return the map of the print of a LUT for a colour matrix, from the cache if possible.
 
-    An unreadable cache file is ignored, and a failed write, too: the map takes only seconds to compute. `folder`: cache
+    Unreadable cache files and failed writes are ignored, because the map takes only seconds to compute. `folder`: cache
     folder; None for `cache_folder`.
     """
     cache_key = {
@@ -204,9 +204,9 @@ def _code_sha256() -> str:
 
 
 def reference_light(lut: Lut) -> int:
-    """Return the index of the illuminant under which positions are found: the black body nearest to 5600 K.
+    """Return the index of the reference illuminant for positions: the black body nearest to 5600 K.
 
-    If the LUT has no black body with light in all channels, the illuminant with the most even white is returned.
+    If the LUT has no black body with light in all channels, the illuminant with the most equal channels is returned.
     """
     ratio = lut.white.min(axis=1) / lut.white.max(axis=1)
     bodies = [
@@ -218,7 +218,7 @@ def reference_light(lut: Lut) -> int:
 
 
 def compute_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
-    """Compute the map of the print of a LUT for a colour matrix, in seconds.
+    """Compute the map of the print of a LUT for a colour matrix; takes seconds.
 
     Raises QualityError if no patch is usable or the print has no contrast.
     """
@@ -232,24 +232,24 @@ def compute_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
     black = black_point(profile, colours, bits)
     source = source_colours(matrix)
     targets = black + (profile.white - black) * source
-    # Rounded, because last digits differ between processors and libraries, and pixels must not.
+    # Rounded, because last digits differ between processors and libraries, but pixels must be equal.
     positions = _rounded(invert(colours, targets.mean(axis=1), targets, bits))
     around, weights = corners(positions, bits)
     weights = weights * usable[around]
     sums = weights.sum(axis=1)
     nearest = _nearest(positions, np.flatnonzero(usable), bits)
-    is_lost = sums < 1e-6
-    weights[is_lost], around[is_lost] = np.eye(8)[0], nearest[is_lost, None]
-    weights[~is_lost] /= sums[~is_lost, None]
+    lacks_patches = sums < 1e-6
+    weights[lacks_patches], around[lacks_patches] = np.eye(8)[0], nearest[lacks_patches, None]
+    weights[~lacks_patches] /= sums[~lacks_patches, None]
     shown_colours = np.einsum("kc,kcx->kx", weights, profile.colours[around])
-    cells, positions_of = np.unique(np.concatenate([around.ravel(), nearest]), return_inverse=True)
+    cells, cell_positions = np.unique(np.concatenate([around.ravel(), nearest]), return_inverse=True)
     brightness = np.asarray(source.mean(axis=1), np.float64)
     levels = _rounded(np.asarray(np.interp(brightness, brightness[_GREYS], np.arange(SIDE)), np.float64))
     return PrintMap(
         cells,
-        positions_of[: NODES * 8].reshape(NODES, 8),
+        cell_positions[: NODES * 8].reshape(NODES, 8),
         weights,
-        positions_of[NODES * 8 :],
+        cell_positions[NODES * 8 :],
         levels,
         angles_deg(shown_colours, targets),
         np.asarray((np.abs(shown_colours - targets) > GAMUT_TOLERANCE * targets).any(axis=1)),
@@ -298,9 +298,9 @@ def _nearest(positions: npt.NDArray[Any], cells: npt.NDArray[np.int64], bits: in
 def black_point(profile: PrintProfile, colours: _Array, bits: int) -> float:
     """Return the grey to which black is mapped, 1 = ideal white.
 
-    It is the darkest grey, from the print's own black to 1.25 times it, that the print shows within `BLACK_WITHIN_DEG`.
-    If there is none, it is the print's own black. `colours`: (8**bits, 3) float64, colours of the profile, unusable
-    patches filled.
+    It is the darkest grey that the print shows within `BLACK_WITHIN_DEG`, at 1 to 1.25 times the print's own black. If
+    there is no such grey, it is the print's own black. `colours`: (8**bits, 3) float64, colours of the profile, with
+    replacements for unusable patches.
     """
     levels = profile.black * np.linspace(1.0, MOST_LIFT, 26)
     levels = levels[levels <= profile.white]
@@ -311,7 +311,7 @@ def black_point(profile: PrintProfile, colours: _Array, bits: int) -> float:
 
 
 def _noise_of(lut: Lut) -> _Array:
-    # Coefficients of 1, y and y² in the variance at y counts. Imported here because it loads scipy and cv2.
+    # Coefficients of 1, y and y² in the variance at y counts. The import is here because it loads scipy and cv2.
     from calibration.radiometry.table_noise import noise_curve
 
     with contextlib.suppress(InputError):
@@ -346,13 +346,13 @@ class ColorimetricRendering:
 
     @cached_property
     def _lights(self) -> Any:
-        return lru_cache(maxsize=_LIGHTS_AT_HAND)(self._nodes_of)
+        return lru_cache(maxsize=_CACHED_LIGHTS)(self._nodes_of)
 
     def _nodes_of(self, light: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Return node means (4913, 3) under an illuminant of the LUT, counts, and values of the nearest patches.
 
-        The latter are (4913, 2, 4): means, and the factors that scale deviations to the noise of the LUT at the node;
-        the fourth column is unused.
+        The values (4913, 2, 4) are means, and the factors that scale deviations to the noise of the LUT at the node.
+        The fourth column is unused.
         """
         chart, samples = self.map, np.asarray(self.lut.light_samples(light))
         means, spreads, cell_values = np.empty((NODES, 3)), np.empty((NODES, 3)), np.zeros((NODES, 2, 4), np.float32)
@@ -365,7 +365,7 @@ class ColorimetricRendering:
         return means.astype(np.float32), cell_values
 
     def node_means(self, light: Mixture) -> _Array:
-        """Return the counts of each node under an illuminant, (4913, 3) float64, with neutral greys.
+        """Return the counts of each node under an illuminant, (4913, 3) float64; greys are neutral.
 
         Raises QualityError if the print has no contrast under the illuminant.
         """

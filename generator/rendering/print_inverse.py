@@ -7,13 +7,13 @@ minimises ::
 
     |S (log R(p) - log t)|²,   0 ≤ p ≤ 2ⁿ - 1
 
-S converts channel differences to brightness and chromaticity, with less weight on brightness: errors of illuminants
-are angles, so a colour outside the gamut of the print should keep its hue rather than its brightness.
+S converts channel differences to brightness and chromaticity, with less weight on brightness. Errors of estimates are
+angles, so a colour outside the gamut of the print should keep its hue rather than its brightness.
 
-Positions are found along a path from the grey of equal brightness to the colour, in `STEPS` steps. Each step starts at
-the previous position and takes Levenberg-Marquardt steps within the chart (K. Levenberg 1944, D. Marquardt 1963;
-bounds by projection, C. T. Kelley, *Iterative Methods for Optimization*, 1999, section 5.4). Colours outside the gamut
-end where their path leaves it and slide along its surface, so neighbours stay neighbours.
+Positions are calculated along a path from the grey of equal brightness to the colour, in `STEPS` steps. Each step
+starts at the previous position and makes Levenberg-Marquardt iterations within the chart (K. Levenberg 1944,
+D. Marquardt 1963; bounds by projection, C. T. Kelley, *Iterative Methods for Optimization*, 1999, section 5.4).
+Outside the gamut, positions follow its surface, so similar colours have neighbouring positions.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _ROUNDS: Final = 12  # Levenberg-Marquardt iterations per step of a path; inside
 
 _STRIDE: Final = 4.0  # Largest change of a position per iteration along each axis, patches
 
-# Weight of a relative difference of brightness against one of chromaticity (docs/reference/rendering.md).
+# Weight of relative differences of brightness; chromaticity has the weight 1 (docs/reference/rendering.md).
 BRIGHTNESS_COST: Final = 0.5
 
 # Unit vectors of brightness and two chromaticity directions, for logarithmic channel differences.
@@ -63,7 +63,7 @@ def corners(positions: _Array, bits: int) -> tuple[npt.NDArray[np.int64], _Array
 
 @compiled
 def _evaluate(colours: Any, position: Any, target: Any, side: Any, scale: Any, residual: Any, jacobian: Any) -> Any:
-    # Fills `residual` (3,) with S (log R(p) - log t) and `jacobian` (3, 3) with its derivatives; returns its square.
+    # Fills `residual` (3,) with S (log R(p) - log t) and `jacobian` (3, 3) with its derivatives; returns |residual|².
     low_r = min(max(math.floor(position[0]), 0), side - 2)
     low_g = min(max(math.floor(position[1]), 0), side - 2)
     low_b = min(max(math.floor(position[2]), 0), side - 2)
@@ -180,8 +180,8 @@ def _grey_positions(colours: _Array, levels: _Array, bits: int) -> _Array:
     targets = np.repeat(levels[:, None], 3, axis=1)
     logs = np.log(colours) @ _SCALE.T
     nearest = [((logs - target) ** 2).sum(axis=1).argmin() for target in np.log(targets) @ _SCALE.T]
-    # On a chart of few patches the nearest patch may be a local minimum off the grey axis. A second start on the
-    # diagonal of equal codes is tried, and the better result is used.
+    # On a chart of few patches, a path from the nearest patch may end in a local minimum off the grey axis. A second
+    # path starts on the diagonal of equal codes, and the better result is used.
     starts = [channels_of(nearest, bits).astype(np.float64)]
     brightness = np.maximum.accumulate(np.sort(colours.mean(axis=1)[_diagonal(bits)]))
     diagonal_codes = np.interp(levels, brightness, np.linspace(0, top, len(brightness)))

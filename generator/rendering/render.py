@@ -32,10 +32,10 @@ def render(
     image: int = 0,
     threads: int = 1,
 ) -> npt.NDArray[np.uint16]:
-    """Return the raw linear image of `picture` printed, lit by `light` and photographed.
+    """Return the raw linear image of a print of `picture` under the illuminant `light`.
 
-    The result is image number `image` of the data set that `generate` makes with the same seed, if that data set uses
-    whole pictures and keeps the print's black.
+    The result is equal to image number `image` of a data set from `generate` with the same seed. That data set must use
+    whole pictures and keep the print's black.
 
     Parameters
     ----------
@@ -48,15 +48,15 @@ def render(
         ``"12:0.25+40:0.75"``; or a mixture from `lights.choices.parse_light`, whose ``white(lut)`` is the ground truth.
     rendering
         ``"colorimetric"``: the camera records the colours of the picture; the first use of a LUT takes seconds.
-        ``"codes"``: the codes of the picture are those of the print, as in the paper. Colours that the LUT lists as
-        unfit are replaced by the nearest fit colour.
+        ``"codes"``: the print has the codes of the picture, as in the paper. Colours that the LUT lists as unfit are
+        replaced by the nearest fit colour.
     seed, image, threads
         As for `kernels.rendering.draw_samples`.
 
     Returns
     -------
     ndarray
-        (H, W, 3) uint16, linear camera RGB in counts; `lut.provenance.white_level` = saturation.
+        (H, W, 3) uint16, linear camera RGB in counts; `lut.provenance.white_level` is the saturation level.
 
     Raises
     ------

@@ -1,11 +1,11 @@
 """Training batches: crops of pictures under newly drawn illuminants, with their ground truths.
 
-`Crops` is the endless set of crops from a look-up table (LUT) and a gallery. Picture, window, illuminant, mirroring,
-gain and samples of item i of an epoch are a pure function of (seed, epoch, i): the words of Philox4x32-10 with counter
-(i, epoch, k, 7). k = 0: picture, column, row, illuminant; k = 1: mirroring, gain, share of the subtracted black; k = 2:
-seed of the kernel. Items do not depend on the number of workers.
+`Crops` is an unlimited set of crops from a look-up table (LUT) and a gallery. Item i of an epoch is a pure function of
+(seed, epoch, i). Its random numbers are the words of Philox4x32-10 with counter (i, epoch, k, 7). k = 0: picture,
+column, row, illuminant; k = 1: mirroring, gain, share of the subtracted black; k = 2: seed of the kernel. Items do not
+depend on the number of workers.
 
-This module does not need PyTorch; `torch_crops` has data sets for it::
+This module does not need PyTorch; `torch_crops` has data sets for PyTorch::
 
     from torch.utils.data import DataLoader
     from generator.training import Crops, open_gallery
@@ -72,7 +72,7 @@ class RecycledMemory:
         """Return an array (...) float32 in C order, with arbitrary content."""
         size = 4 * int(np.prod(shape))
         memory = self._memory(size)
-        # All views refer to `values`, because its own base is not an array. So it lives as long as the last view.
+        # All views refer to `values`, because its own base is not an array. It therefore exists as long as a view does.
         values = np.frombuffer(memory, dtype=np.float32)
         weakref.finalize(values, self._free.append, memory).atexit = False
         return values.reshape(shape)
@@ -83,7 +83,7 @@ class RecycledMemory:
                 pass
             return memory
         memory = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        # Huge pages, if available: 1/500 of the page faults.
+        # Huge pages, if available, reduce the page faults to 1/500.
         if hasattr(mmap, "MADV_HUGEPAGE"):
             memory.madvise(mmap.MADV_HUGEPAGE)
         return memory
@@ -136,7 +136,7 @@ class Crops:
     lut
         The LUT.
     gallery
-        The pictures, each at least as large as a crop. If they contain colours that the LUT lists as unfit, these are
+        The pictures, each at least as large as a crop. With ``"codes"``, colours that the LUT lists as unfit are
         replaced by the nearest fit colours in a copy in memory.
     size
         Height and width of a crop, px.
@@ -147,12 +147,12 @@ class Crops:
         ``"D65"`` or ``"5600K"``, or mixtures. With ``"codes"``, mixtures take 5 MB of memory per illuminant. None: all
         illuminants of the LUT.
     exposure
-        Smallest and largest gain, > 0, drawn uniformly in stops. Values above saturation are clipped.
+        Smallest and largest gain, > 0. Gains are drawn uniformly in stops. Values above saturation are clipped.
     noise
         Noise of the samples, `generator.variation.sensor_noise.measured_noise(lut)`. Crops with a gain below 1 then get
         the noise of a camera in less light. None scales the samples with their noise.
     iso
-        ISO speed that determines the noise of the crops; needs `noise`. None for that of the LUT. A gain above the
+        ISO speed that determines the noise of the crops; needs `noise`. None for the speed of the LUT. A gain above the
         relative speed gives more noise.
     flip
         Mirror half of the crops left to right.
@@ -164,8 +164,8 @@ class Crops:
         Number of threads that share a batch. The result does not depend on it.
     rendering
         ``"colorimetric"``: the camera records the colours of the picture. The first use of a LUT takes seconds; the
-        result is stored in the cache folder of the user. Each illuminant takes 0.5 MB of memory. ``"codes"``: the codes
-        of the picture are those of the print, as in the paper.
+        result is stored in the cache folder of the user. Each illuminant takes 0.5 MB of memory. ``"codes"``: the print
+        has the codes of the picture, as in the paper.
     matrix
         Linear sRGB to camera RGB, for colorimetric rendering; None for the matrix of the LUT's camera.
     black_point
@@ -208,7 +208,7 @@ class Crops:
         require_lut(lut)
         if isinstance(black_point, str):
             black_point = parse_black_point(black_point)
-        _require_kinds(gallery, size, lights, black_point)
+        _require_types(gallery, size, lights, black_point)
         height, width = size
         if min(height, width) < 1:
             raise InputError(f"the crops have {height}x{width} px, expected 1x1 or more")
@@ -262,7 +262,7 @@ class Crops:
         self._whites = np.minimum(whites, lut.provenance.white_level)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # The LUT has gigabytes; its folder is enough to map it again.
+        # The LUT has gigabytes; workers open it again from its folder.
         options = {name: getattr(self, name) for name in _OPTIONS}
         return _reopened, (self.lut.folder, self.gallery, self.size, options)
 
@@ -402,7 +402,7 @@ class Crops:
         return batch.images[0], batch.illuminants[0]
 
 
-def _require_kinds(gallery: object, size: object, lights: object, black_point: object) -> None:
+def _require_types(gallery: object, size: object, lights: object, black_point: object) -> None:
     if not isinstance(gallery, Gallery):
         raise InputError(
             f"the gallery is {value_text(gallery)}, expected gallery_of([picture, …]) or open_gallery(FOLDER)"
