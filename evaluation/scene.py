@@ -1,4 +1,4 @@
-"""One image of a data set as all programs use it: pixels, mask and the illuminant to be estimated."""
+"""Images of data sets as all commands and methods use them: pixels, mask and ground truth."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class Scene(Protocol):
     def truth(self) -> npt.NDArray[np.float64]:
         """Ground truth: the illuminant (3,) float64, linear camera RGB of any length.
 
-        If several illuminants reach the image, their mean over the pixels; estimates of one illuminant are compared
-        with it.
+        If the scene has several illuminants, the ground truth is their mean over the pixels. Estimates of a single
+        illuminant are compared with this mean.
         """
         ...
 
     @property
     def saturation(self) -> float | None:
-        """Value from which a pixel is clipped; None if no pixel is."""
+        """Value from which a pixel is clipped; None if no pixel is clipped."""
         ...
 
     def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
@@ -84,7 +84,7 @@ class SceneSet:
     Parameters
     ----------
     name
-        Name of the data set as its authors write it, for headings: "Cube+".
+        Name of the data set in the spelling of its authors, for headings: "Cube+".
     layout
         Name of the layout of its files: "cube-plus".
     location
@@ -95,9 +95,9 @@ class SceneSet:
         Printed with every result: "black level", "saturation", "mask" and "ground truth", each with the applied value
         and its source; "reader" if the reader was never tested on a published copy.
     folds
-        Fold of each scene, from 0, as the authors of the data set divide it; None if they do not.
+        Fold of each scene, from 0, as the authors of the data set define it; None if they define no folds.
     truth_uncertainty_deg
-        Largest uncertainty of a ground truth, degrees, expanded (k = 2); None if the data set does not report it.
+        Largest uncertainty (k = 2) of a ground truth, degrees; None if the data set does not report it.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Options, data sets and methods shared by the commands.
 
-A text is interpreted as a method in this order: FILE.csv (estimates), FILE.npz (a model), a name of `standard_methods`
-or `standard_learners`, then module:Class or path/file.py:Class.
+The text for a method is interpreted in this order: FILE.csv (estimates), FILE.npz (a model), a name of
+`standard_methods` or `standard_learners`, module:Class or path/file.py:Class.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ PrintedError = Annotated[
 
 @contextmanager
 def image_steps(count: int) -> Generator[Callable[[], None]]:
-    """Show the progress of `count` images; yield a function that counts one; Ctrl-C ends the block orderly."""
+    """Show the progress of `count` images with `orderly_end`; yield a function that counts one image."""
     with orderly_end(), progress("images") as advance:
         steps = itertools.count(1)
         yield lambda: advance(next(steps), count)
@@ -105,15 +105,15 @@ def reading_options(texts: Sequence[str]) -> tuple[str | None, DataOptions]:
 
 
 def split_names(texts: Iterable[str]) -> list[str]:
-    """Return the names between commas in all texts."""
+    """Return all names in the texts; names in one text are separated by commas."""
     return [name.strip() for text in texts for name in text.split(",") if name.strip()]
 
 
 def choose_methods(texts: Iterable[str]) -> list[Method]:
     """Return the named methods in their order, each once.
 
-    `standard` stands for the methods of `STANDARD`, `all` for all `standard_methods`. A method named in addition to
-    its group is used once; a name that is given twice is refused.
+    `standard` stands for the methods of `STANDARD`, `all` for all `standard_methods`. A method that is named
+    in addition to its group is used once. A name that is given twice is refused.
 
     Examples
     --------
@@ -160,9 +160,9 @@ def _distinct_names(texts: Iterable[str]) -> list[str]:
 
 
 def choose_without_constant(texts: Sequence[str]) -> tuple[list[Learner], list[str]]:
-    """Return the named learners without the constant illuminant, and notes on learners of `all` that are unavailable.
+    """Return the named learners without the constant illuminant, and notes on omitted learners.
 
-    The commands add the constant illuminant themselves.
+    Learners of `all` are omitted if a requirement is not installed. The commands add the constant illuminant.
     """
     from evaluation.learning.constant_light import ConstantLight
     from evaluation.learning.feature_learner import missing_requirement
@@ -170,8 +170,8 @@ def choose_without_constant(texts: Sequence[str]) -> tuple[list[Learner], list[s
     explicit = {learner.name for learner in choose_learners(text for text in texts if text.lower() != "all")}
     learners = [learner for learner in choose_learners(texts) if learner.name != ConstantLight().name]
     missing = {learner.name: missing_requirement(learner) for learner in learners if learner.name not in explicit}
-    left_out = [f"{name} is omitted: {reason}" for name, reason in missing.items() if reason]
-    return [learner for learner in learners if not missing.get(learner.name)], left_out
+    notes = [f"{name} is omitted: {reason}" for name, reason in missing.items() if reason]
+    return [learner for learner in learners if not missing.get(learner.name)], notes
 
 
 def choose_estimates(texts: Sequence[str], images: Sequence[str]) -> list[GivenEstimates]:

@@ -37,11 +37,11 @@ class Layout:
     - `title`: description for help and messages: "a dataset made by generate".
     - `signature`: files by which the layout is recognised: "cube+_gt.txt".
     - `matches`: returns True if a folder has the layout; reads only names and first lines of tables.
-    - `open`: returns the data set at a path or URL; the `Folder` is passed if its names were read already.
+    - `open`: returns the data set at a path or URL; the `Folder` is passed if its file names were already read.
     - `options`: fields of `DataOptions` that apply to the layout.
-    - `is_generic`: the layout belongs to no particular data set; it is tried only if no other layout matches.
+    - `is_generic`: many data sets may have the layout; it is tried only if no other layout matches.
     - `is_unverified`: the reader was never tested on a published copy; results report this.
-    - `path_type`: "folder" or "file"; None if both, or a URL, are possible.
+    - `path_type`: "folder" or "file"; None if both are possible, or a URL.
     """
 
     title: str
@@ -154,7 +154,7 @@ LAYOUTS: Mapping[str, Layout] = {
 
 
 def open_scenes(location: Path | str, layout: str | None = None, options: DataOptions | None = None) -> SceneSet:
-    """Return the data set at a location; images are read on use.
+    """Return the data set at a location; images are read when they are used.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def open_scenes(location: Path | str, layout: str | None = None, options: DataOp
     layout
         Name in `LAYOUTS`; None to recognise the layout from the files.
     options
-        Selected part of the data set, and levels that replace those of the layout; None for `DataOptions()`.
+        Selected part of the data set, and levels that replace the levels of the layout; None for `DataOptions()`.
 
     Returns
     -------
@@ -197,11 +197,12 @@ def open_scenes(location: Path | str, layout: str | None = None, options: DataOp
 
 
 def check_black_level(data: SceneSet, black: float | None) -> SceneSet:
-    """Return the data set, with a warning in its treatment if the black level may not be subtracted.
+    """Return the data set, with a warning in its treatment if the black level was probably not subtracted.
 
-    `black` is the level given by the user. Raises InputError if a given level is above all pixels of all images.
+    `black` is the level given by the user. Raises InputError if a given level is not below the largest
+    pixel of all images.
     """
-    # Images are read until one is plausible, which is usually the first.
+    # Images are read until one has plausible values; usually this is the first image.
     scenes = [scene for scene in data.scenes if isinstance(scene, RawScene)]
     if black is not None or data.layout == "folder":
         require_black_below_peak(scenes)
@@ -230,7 +231,7 @@ def _require_file_type(location: str, name: str, entry: Layout) -> None:
 
 
 def _refuse_results(folder: Path, location: str) -> None:
-    # The errors.csv of results has the columns of a table of images, so it would be read as a data set.
+    # The file errors.csv has the columns image, r, g and b, so a results folder would be read as a data set.
     if (folder / "run.json").is_file() and any((folder / name).is_file() for name in ("errors.csv", "results.csv")):
         raise FormatError(
             f"{location} is a results folder of evaluate, expected a data set; give the data set in its run.json, or "

@@ -35,19 +35,19 @@ from evaluation.scene import Image, Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
-# Least usable fraction of a reduced pixel's area; below it, rounding of areas dominates the colour.
+# Smallest usable fraction of the area of a reduced pixel; with less, rounding errors of areas dominate its colour.
 _MIN_USABLE_AREA: Final = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class SmallScene:
-    """A scene reduced in size, in memory."""
+    """A scene in memory, reduced in size if it was larger than requested."""
 
     name: str
     truth: npt.NDArray[np.float64]  # (3,) float64, ground truth, linear camera RGB of any length
-    image: Image  # (H, W, 3) float32, linear camera RGB, in the unit of the original image
-    mask: npt.NDArray[np.bool_] | None  # (H, W) bool, True if no pixel was usable; None if all were
-    saturation: float | None  # None if clipped pixels were excluded; that of the original if its size was not changed
+    image: Image  # (H, W, 3), linear camera RGB, in the unit of the original image; float32 if reduced
+    mask: npt.NDArray[np.bool_] | None  # (H, W) bool, True for pixels that must not be used; None if all may be used
+    saturation: float | None  # level of the original image; None if the image was reduced without clipped pixels
 
     def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
         """Return the image (H, W, 3) and its mask (H, W) bool."""
@@ -75,8 +75,8 @@ def shrink_image(
 
     `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB. `side`: longest side of the result, px.
     `saturation`: value from which a channel is clipped; None for no clipping. `mask`: (H, W) bool, True for pixels that
-    must not be used. Returns the image (h, w, 3) float32, and (h, w) bool, True if no pixel of the area was usable; the
-    image is 0 there.
+    must not be used. Returns the image (h, w, 3) float32 and its mask (h, w) bool. The mask is True and the image is
+    0 where too few pixels of an area are usable.
 
     Examples
     --------
@@ -98,7 +98,7 @@ def shrink_image(
 
 Indices = npt.NDArray[np.int64]  # (P,) int64: indices of scenes in a data set, from 0
 
-AnyLearner = Learner | FeatureLearner  # Learns from scenes, or from features of scenes
+AnyLearner = Learner | FeatureLearner  # Is fitted to scenes, or to features of scenes
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ def collect_material(
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> Material:
-    """Return the material of scenes for learners; each image is read once for all learners that extract features.
+    """Return the material of scenes for learners; learners that extract features share one reading of each image.
 
     `side`: longest side to which images are reduced first, px; None keeps their size.
     """
@@ -142,22 +142,22 @@ def collect_material(
 
 def fit_on(learner: AnyLearner, number: int, material: Material, indices: Indices, seed: int) -> Method:
     """Return the method fitted to the scenes with these indices (P,) int64; `number` is the index of the learner."""
-    features, chosen = material.features[number], [int(index) for index in indices.tolist()]
+    features, scene_indices = material.features[number], [int(index) for index in indices.tolist()]
     if isinstance(learner, FeatureLearner) and features is not None:
-        return fit_extracted(learner, [features[index] for index in chosen], material.truths[indices], seed)
-    return fit_copy(learner, [material.scenes[index] for index in chosen], seed)
+        return fit_extracted(learner, [features[index] for index in scene_indices], material.truths[indices], seed)
+    return fit_copy(learner, [material.scenes[index] for index in scene_indices], seed)
 
 
 def estimate_on(method: Method, number: int, material: Material, indices: Indices) -> list[SceneAnswer]:
     """Return the P answers of a fitted method for the scenes with these indices (P,) int64."""
-    features, chosen = material.features[number], [int(index) for index in indices.tolist()]
+    features, scene_indices = material.features[number], [int(index) for index in indices.tolist()]
     if not isinstance(method, LearnedMethod) or features is None:
-        return [answer for (answer,) in answer_scenes([material.scenes[index] for index in chosen], [method])]
-    usable = [item for item in (features[index] for index in chosen) if item is not None]
+        return [answer for (answer,) in answer_scenes([material.scenes[index] for index in scene_indices], [method])]
+    usable = [item for item in (features[index] for index in scene_indices) if item is not None]
     lights = iter(method.model.lights(np.stack(usable)) if usable else ())
     return [
         read_estimate(unit(next(lights))) if features[index] is not None else SceneAnswer(None, NO_PIXEL)
-        for index in chosen
+        for index in scene_indices
     ]
 
 
@@ -178,7 +178,7 @@ def cross_validate(
     """Return the estimates and errors of learned methods; each image is estimated by a model of the other folds.
 
     Images are read once for all learners that extract features, and again in each fold by learners that only have
-    `fit(scenes, seed)`. `folds`: (N,) int64, fold of each image, at least two different.
+    `fit(scenes, seed)`. `folds`: (N,) int64, fold of each image, at least two different folds.
     """
     truths_of(scenes)
     fold_count = len(np.unique(folds))
@@ -194,7 +194,7 @@ def cross_validate(
 
 
 def cross_fit(learner: AnyLearner, number: int, material: Material, folds: npt.NDArray[np.int64], seed: int) -> Result:
-    """Return the result of one learner; each scene is estimated after a fit to the other folds, (N,) int64."""
+    """Return the result of one learner; each scene is estimated by a model of the other `folds` (N,) int64."""
     answers: dict[int, SceneAnswer] = {}
     for fold in np.unique(folds):
         test_indices = np.flatnonzero(folds == fold)
@@ -207,7 +207,7 @@ def cross_fit(learner: AnyLearner, number: int, material: Material, folds: npt.N
 class FamilySetting:
     """One set of parameters of a family, with its results."""
 
-    text: str  # Value of `--method` for it: "gray-edge-1:p=4:sigma=2"
+    text: str  # Value of `--method` for this set: "gray-edge-1:p=4:sigma=2"
     name: str  # Name of the method in tables
     spread: float  # Standard deviation of the green chromaticity g / (r + g + b) of its estimates
     errors: Summary | None  # Its errors on the counted images, degrees; None if not requested
@@ -219,9 +219,10 @@ class Tuning:
 
     - `family`: name of the family: "gray-edge-1", or "gray-edge-1@360".
     - `data`: name of the data set.
-    - `settings`: all sets of parameters by rising spread; the first is chosen.
-    - `images`, `counted`: number of images, and of those for which every setting gives an estimate.
-    - `metric`: kind of the errors shown for comparison; None for no errors.
+    - `settings`: all sets of parameters in ascending order of spread; the first is selected.
+    - `images`: number of images.
+    - `counted`: number of images for which every setting gives an estimate.
+    - `metric`: kind of errors shown for comparison; None for no errors.
     """
 
     family: str
@@ -255,7 +256,7 @@ def tune_family(
 ) -> Tuning:
     """Return the sets of parameters of a family, sorted by the spread of their estimates in green chromaticity.
 
-    `metric`: kind of errors to add for comparison; with None no ground truth is read.
+    `metric`: kind of errors to add for comparison; if None, ground truths are not read.
     """
     texts, methods = zip(*family_settings(family), strict=True)
     tuned = tune(methods, scenes, on_scene, workers)

@@ -2,9 +2,9 @@
 
 Two models are blended. The pretrained model was usually fitted to generated images; its method may tune it to the N
 images (`FeatureLearner.tune`). The local model is fitted to the N images alone. The estimate is the mean of the
-logarithms of both estimates; the pretrained model has the weight w.
+logarithms of both estimates. In this mean, the pretrained model has the weight w.
 
-Test images are not used. docs/transfer.md#what-was-chosen-and-on-what explains the constants.
+Test images are not used. docs/decisions/0044-adapted-is-two-models-and-a-weight.md explains the constants.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from evaluation.learning.feature_learner import FeatureLearner, Features, Learne
 from evaluation.metrics import recovery_error
 
 PRETRAINED_WORTH: Final = 200.0  # W: number of local images to which a pretrained model is equivalent
-PRIOR_IMAGES: Final = 25.0  # weight of the expected w, as a number of images
+PRIOR_IMAGES: Final = 25.0  # weight of the expected w, expressed as a number of images
 _SHARES: Final = np.linspace(0, 1, 101)  # candidates for w
 _FOLDS: Final = 3  # folds of the N images for cross-validation; few, because each requires a fit
 
@@ -32,8 +32,8 @@ class LocalFit:
     - `method`: method fitted to all N images.
     - `features`: (N, ...) features of the images with usable pixels.
     - `truths`: (N, 3) float64, r + g + b = 1.
-    - `held_out`: (N, 3) float64, estimate of each image by a model fitted to the other folds; None for fewer images
-      than folds.
+    - `held_out`: (N, 3) float64, estimate of each image by a model fitted to the other folds; None if there are
+      fewer images than folds.
     - `seed`: seed of the fits.
     """
 
@@ -69,15 +69,15 @@ def adapt(pretrained: LearnedMethod, local_fit: LocalFit, worth: float = PRETRAI
     if not worth > 0:
         return local_fit.method
     model, count = pretrained.model, len(local_fit.features)
-    # A model that was adapted before blends models of two cameras, so it is not tuned.
+    # A model that was already adapted blends models of two cameras, so it is not tuned.
     tuned = model
     if not isinstance(model, BlendedModel):
         tuned = pretrained.learner.tune(model, local_fit.features, local_fit.truths, worth, local_fit.seed)
-    # The expected w is W / (W + N), and 1 if the pretrained model was tuned, because it then knows the N images too.
+    # The expected w is W / (W + N), or 1 after tuning, because the tuning also uses the N images.
     share = worth / (worth + count) if tuned is model else 1.0
     if local_fit.held_out is not None:
         share = stacked_share(model.lights(local_fit.features), local_fit.held_out, local_fit.truths, share)
-    # A pretrained model does not improve with N: from N = 2 W on, it has little weight whatever stacking returns.
+    # A pretrained model does not improve with N: from N = 2 W, its weight is small even if stacking returns 1.
     share *= worth**4 / (worth**4 + count**4)
     return replace(pretrained, model=BlendedModel(tuned, local_fit.method.model, np.array(share)))
 
@@ -89,14 +89,14 @@ def stacked_share(
 
     Examples
     --------
-    If only the first is correct, its weight increases with the number of images although the expected weight is 0:
+    The expected weight is 0, but only the first estimate is correct: its weight increases with the number of images:
 
     >>> truths, wrong = np.tile([0.3, 0.4, 0.3], (450, 1)), np.tile([0.2, 0.4, 0.4], (450, 1))
     >>> [round(stacked_share(truths[:n], wrong[:n], truths[:n], 0.0), 1) for n in (0, 25, 450)]
     [0.0, 0.5, 1.0]
     """
-    # Stacking (L. Breiman, "Stacked regressions", Machine Learning 24, 1996) with a prior, because the errors of twenty
-    # images alone select poorly: both compared models are worse than the final ones.
+    # Stacking: L. Breiman, "Stacked regressions", Machine Learning 24, 1996. A prior is added, because twenty images
+    # alone select the weight poorly. Both compared models are also worse than the final models.
     if not len(truths):
         return expected
     errors = np.array([recovery_error(_log_mean(first, second, share), truths).sum() for share in _SHARES])

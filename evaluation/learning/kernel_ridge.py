@@ -5,10 +5,10 @@ a weighted sum of kernels between an image and each training image; the weights 
 V. Agarwal, A. V. Gribok, A. Koschan, M. A. Abidi, "Estimating illumination chromaticity via kernel regression", ICIP
 2006, use kernel regression on chromaticity histograms.
 
-Features are square roots of bin fractions, so that the distance of two images is proportional to the Hellinger
-distance: K = exp(-d² / 2), d² = Σ (√p - √q)² ≤ 2. Pixels are weighted by brightness, because the chromaticity of dark
-pixels is mostly noise. *Not from these papers:* the 64 × 64 bins of (r, g), the square root, the width of the kernel,
-and λ. They were not selected by results on generated images; see docs/reference/learned-methods.md.
+The kernel is K = exp(-d² / 2), with d² = Σ (√p - √q)² ≤ 2 for the bin fractions p and q of two images; d is
+proportional to the Hellinger distance. Pixels are weighted by brightness, because the chromaticity of dark pixels is
+mostly noise. *Not from these papers:* the 64 × 64 bins of (r, g), the square root, the width of the kernel, and
+λ. They were not selected by results on generated images; see docs/decisions/0056-settings-of-learned-methods.md.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from evaluation.scene import Image
 BINS = 64  # bins of r and of g, each 0 … 1; near usual illuminants a bin is 2° to 4° wide
 _LARGEST_SIZE = 255  # largest working size for which unweighted counts fit into 16 bits, px
 _PENALTY_IMAGES = 900  # number of training images for which λ is `penalty`
-_LARGEST_COUNT = 65535  # stored value of a bin that has all weight of an image: the largest 16-bit number
+_LARGEST_COUNT = 65535  # stored value of a bin that contains all weights of an image: the largest 16-bit number
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class KernelRidge(FeatureLearner):
     """Settings of the method.
 
     - `working_size`: longer side of the reduced image, px.
-    - `penalty`: λ for 900 training images, above 0; it is proportional to their number.
+    - `penalty`: λ for 900 training images, above 0; λ is proportional to the number of training images.
     - `brightness`: exponent of the brightness in the weight of a pixel, 0 or more; 0 for equal weights.
     """
 
@@ -59,7 +59,7 @@ class KernelRidge(FeatureLearner):
     ) -> npt.NDArray[np.uint16] | None:
         """Return the counts of (r, g), (64, 64) uint16, r along the first axis; see `FeatureLearner.features`.
 
-        Black pixels are excluded. With brightness weights, counts have the sum 65535.
+        Black pixels are excluded. If pixels are weighted by brightness, the sum of the counts is 65535 before rounding.
         """
         small, used = reduce(image, saturation, mask, self.working_size)
         pixels = small[used & small.any(axis=2)]
@@ -73,7 +73,7 @@ class KernelRidge(FeatureLearner):
         return np.rint(counts).astype(np.uint16)
 
     def fit_features(self, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> KernelRidgeModel:
-        """Return the weights fitted to counts (N, 64, 64) and ground truths (N, 3); without randomness."""
+        """Return the model fitted to counts (N, 64, 64) and ground truths (N, 3); `seed` is not used."""
         roots = _square_roots(features)
         centre = truths[:, :2].mean(axis=0)
         penalty = self.penalty * len(roots) / _PENALTY_IMAGES
@@ -84,7 +84,7 @@ class KernelRidge(FeatureLearner):
     def tune(
         self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
     ) -> KernelRidgeModel:
-        """Return the model fitted to its own M images and to N further images with M / `worth` times their weight."""
+        """Return the model fitted to its own M images and to N new images, each of weight M / `worth`, at least 1."""
         if not isinstance(model, KernelRidgeModel):
             raise TypeError(f"the model is {type(model).__name__}, expected KernelRidgeModel")
         old, new = _square_roots(model.counts), _square_roots(features)
@@ -145,5 +145,5 @@ def _square_roots(counts: Features) -> npt.NDArray[np.float64]:
 
 
 def _kernel(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    # exp(-d² / 2), with d² = 2 - 2 x · y because vectors have the length 1.
+    # exp(-d² / 2), with d² = 2 - 2 x · y, because the vectors have the length 1.
     return np.exp(first @ second.T - 1)

@@ -4,16 +4,16 @@ J. T. Barron, Y.-T. Tsai, "Fast Fourier color constancy", CVPR 2017. A change of
 log chromas u = log(g / r), v = log(g / b) (equation 2). The histogram is convolved with a learned filter, and the
 illuminant is at the largest response (equations 5 and 6). The histogram is on a torus, so the convolution is a product
 of Fourier transforms. Two histograms are used, of pixels and of their local absolute deviations (section 4). A softmax
-of the response plus a learned bias gives probabilities; the estimate is the mean of a bivariate von Mises distribution
+of the response plus a learned bias gives probabilities. The estimate is the mean of a bivariate von Mises distribution
 with the same moments (section 3.1).
 
-*Differences to the paper.* The bias is learned and the gain map of equation 5 is not, as in the authors' program. Of
-the chromas in one bin of the torus, the one nearest to the middle of the training illuminants is used; the paper uses
-grey light or grey world (section 3.3).
+*Differences from the paper.* A bias is learned, but no gain map (equation 5), as in the authors' program. Each bin of
+the torus contains several chromas. The estimate is the chroma nearest to the middle of the training illuminants; in the
+paper it is the chroma nearest to grey light or to the grey-world estimate (section 3.3).
 
 *Training* follows sections 3 and 4 of the paper and its supplement. The first iterations minimise a convex loss, the
-cross-entropy between the softmax and the bin of the ground truth. The others minimise the negative log-likelihood of
-the ground truth under the fitted von Mises distribution, approximated by a normal distribution on the unrolled torus
+cross-entropy between the softmax and the bin of the ground truth. Later iterations minimise the negative log-likelihood
+of the ground truth under the fitted von Mises distribution, approximated by a normal distribution on the unrolled torus
 (equations 9 to 13). Penalties are squares of the parameters and of their differences between neighbouring bins.
 """
 
@@ -32,10 +32,10 @@ from evaluation.scene import Image
 from foundation.errors import InputError
 
 BINS = 64  # bins of the torus along each axis (section 5 of the paper)
-_BATCH_SIZE = 16  # images per batch: their arrays fit into the second-level cache
+_BATCH_SIZE = 16  # images per batch; the arrays of a batch fit into the second-level cache
 _SHAPE = (BINS, BINS)
 _BIN_ANGLE = 2 * np.pi / BINS  # radians per bin
-# Smallest squared length of a mean direction; it is 0 for a flat distribution, whose angle is undefined.
+# Smallest squared length of a mean direction. The length of a uniform distribution is 0, and its angle is undefined.
 _SMALLEST_LENGTH = 1e-12
 
 
@@ -94,8 +94,8 @@ def likelihood(
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     """Return the losses (N,) and their derivatives with respect to the responses (N, 64, 64).
 
-    The loss of an image is its negative log-likelihood minus the smallest possible value, that of an exact estimate
-    with the variance `spread`. `probabilities` are (N, 64, 64), `truth_bins` (N, 2) ground truths in bins.
+    The loss of an image is its negative log-likelihood minus the smallest possible value. This is the value of an exact
+    estimate with the variance `spread`. `probabilities` are (N, 64, 64), `truth_bins` (N, 2) ground truths in bins.
     """
     offset = fit.mean - truth_bins
     offset = offset - BINS * np.rint(offset / BINS)
@@ -123,16 +123,16 @@ def likelihood(
 def crossentropy(
     response: npt.NDArray[np.floating], probabilities: npt.NDArray[np.floating], truth_bins: npt.NDArray[np.floating]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[Any]]:
-    """Return the cross-entropies (N,) with the bins of ground truths, and their derivatives (N, 64, 64).
+    """Return the cross-entropies (N,) and their derivatives with respect to the responses (N, 64, 64).
 
-    `response` is the logarithm of the `probabilities`, (N, 64, 64), plus a constant; `truth_bins` is (N, 2).
+    `response` is the logarithm of the `probabilities`, (N, 64, 64), plus a constant. `truth_bins`: (N, 2), in bins.
     """
     u, v = (np.rint(truth_bins).astype(np.int64) % BINS).T
     image = np.arange(len(truth_bins))
-    totals = np.log(np.exp(response.astype(np.float64)).sum(axis=(1, 2)))
+    log_sums = np.log(np.exp(response.astype(np.float64)).sum(axis=(1, 2)))
     slope = probabilities.copy()
     slope[image, u, v] -= 1
-    return totals - response[image, u, v], slope
+    return log_sums - response[image, u, v], slope
 
 
 def train(
@@ -144,12 +144,13 @@ def train(
 ) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.float64]]:
     """Return the fitted filters (2, 64, 33) complex128, in Fourier space, and the bias (64, 64) float64.
 
-    `histograms`: (N, 2, 64, 64) float64, each with sum 1. `truth_bins`: (N, 2) float64, ground truths in bins, also
-    outside 0 … 64. `repeats`: (N,) float64, weight of each image. `stages`: iterations and weights of both losses.
+    `histograms`: (N, 2, 64, 64) float64, each with sum 1. `truth_bins`: (N, 2) float64, ground truths in bins;
+    values outside 0 … 64 are allowed. `repeats`: (N,) float64, weight of each image. `stages`: for each stage, number
+    of iterations, weight of the cross-entropy and weight of the likelihood.
     """
     # Penalties are diagonal in Fourier space. L-BFGS uses parameters scaled so that the penalty is half their squared
-    # length (preconditioning, section 4.2). Scaled parameters are stored in the plane of bins, because the packing of
-    # the paper is then unnecessary. Gradients have single precision, so that a batch fits into the cache.
+    # length (preconditioning, section 4.2). Scaled parameters are stored by bin, because the packing of the paper is
+    # then unnecessary. Each batch is calculated in single precision, so that it fits into the cache.
     import scipy.fft
     import scipy.optimize
 
@@ -171,16 +172,16 @@ def train(
         gradient = np.zeros((3, BINS, BINS // 2 + 1), np.complex128)
         for start in range(0, len(spectra), _BATCH_SIZE):
             rows = slice(start, start + _BATCH_SIZE)
-            batch, aims, batch_weights = spectra[rows], targets[rows], image_weights[rows]
+            batch, batch_truths, batch_weights = spectra[rows], targets[rows], image_weights[rows]
             response: Any = fft.irfft2((batch * single_filters).sum(axis=1), s=_SHAPE) + single_bias
             response -= response.max(axis=(1, 2), keepdims=True)
             probabilities = np.exp(response)
             probabilities /= probabilities.sum(axis=(1, 2), keepdims=True)
             if entropy_weight:
-                values, slopes = crossentropy(response, probabilities, aims)
+                values, slopes = crossentropy(response, probabilities, batch_truths)
                 weight = entropy_weight
             else:
-                values, slopes = likelihood(probabilities, moments(probabilities), aims, penalties.spread)
+                values, slopes = likelihood(probabilities, moments(probabilities), batch_truths, penalties.spread)
                 weight = likelihood_weight
             total += weight * float(values.astype(np.float64) @ batch_weights)
             spectrum: Any = fft.rfft2(slopes * batch_weights[:, None, None])
@@ -199,7 +200,7 @@ def train(
 
 
 def _fourier_scale(smoothness: float, size: float) -> npt.NDArray[np.float64]:
-    # Factors (64, 33) of the Fourier coefficients that make the penalty the squared length. The authors' penalty is
+    # Factors (64, 33) of the Fourier coefficients, after which the penalty is a squared length. The authors' penalty is
     # Σ |F|² (smoothness (|1 − e^iα|² + |1 − e^iβ|²) / 8 + size) over all coefficients F. The constant coefficient is
     # omitted, because it does not change the softmax.
     differences = (2 - 2 * np.cos(_BIN_ANGLE * np.arange(BINS))) / 8
@@ -208,8 +209,8 @@ def _fourier_scale(smoothness: float, size: float) -> npt.NDArray[np.float64]:
     return 1 / (BINS * np.sqrt(weights))
 
 
-# Bins of extracted histograms along each axis. For training they are folded to 64 bins, with the width 1/32 of the
-# paper or 1/16 for widely spread training illuminants.
+# Bins of extracted histograms along each axis. For training and estimates they are folded to 64 bins. Their width is
+# 1/32, as in the paper, or 1/16 for widely spread training illuminants.
 _FINE_BINS = 128
 _FINE_WIDTH = 1 / 32  # width of a bin, natural logarithm (section 5 of the paper)
 _CHANNELS = 2  # histograms per image: pixels and edges
@@ -222,11 +223,12 @@ _LARGEST_SIZE = 255  # largest working size for which counts fit into 16 bits, p
 class LogChroma(FeatureLearner):
     """Settings of the method.
 
-    Weights are from the authors' program for thumbnails of Gehler-Shi, except `bias_smoothness` and the three sizes.
-    Those were selected by cross-validation with a Canon 5DSR of INTEL-TAU (docs/reference/learned-methods.md).
+    Default weights are from the authors' program for thumbnails of Gehler-Shi. Exceptions are `bias_smoothness` and the
+    three sizes. They were selected by cross-validation with the Canon 5DSR of INTEL-TAU
+    (docs/decisions/0056-settings-of-learned-methods.md).
 
     - `working_size`: longer side of the reduced image, px, up to 255.
-    - `least`: smallest value of a channel that is used, fraction of the largest usable value of the image.
+    - `least`: smallest used value of a channel, as a fraction of the largest usable value of the image.
     - `crossentropy`: weight of the cross-entropy, the first loss.
     - `likelihood`: weight of the von Mises likelihood, the second loss.
     - `pixel_smoothness`, `edge_smoothness`, `bias_smoothness`: weights of squared differences of neighbouring bins.
@@ -270,14 +272,14 @@ class LogChroma(FeatureLearner):
         return np.stack([counts, _histogram(_deviations(small, used)[used], self.least)])
 
     def fit_features(self, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> LogChromaModel:
-        """Return the model fitted to histograms (N, 2, 128, 128) and ground truths (N, 3); without randomness."""
+        """Return the model fitted to histograms (N, 2, 128, 128) and ground truths (N, 3); `seed` is not used."""
         model = self._fit(features, truths, np.ones(len(features)))
         return replace(model, examples=TrainingImages.of(features, truths))
 
     def tune(
         self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
     ) -> LogChromaModel:
-        """Return the model fitted to its own M images and to N further images with M / `worth` times their weight.
+        """Return the model fitted to its own M images and to N new images, each of weight M / `worth`, at least 1.
 
         A model without its training images is returned unchanged.
         """
@@ -315,7 +317,7 @@ class LogChroma(FeatureLearner):
             ((self.pretraining, self.crossentropy, 0.0), (self.training, 0.0, self.likelihood)),
         )
         # The middle of the range, not the median: if tungsten illuminants are rare, the median is near one end of the
-        # range, and the torus would be cut inside the other end.
+        # range, and the torus would be cut inside the range near its other end.
         centre = (chromas.min(axis=0) + chromas.max(axis=0)) / 2
         return LogChromaModel(filters, bias, centre, np.array(grid))
 
@@ -338,8 +340,8 @@ class TrainingImages:
     """Training images of a model, stored sparsely for tuning.
 
     - `places`: (K,) int64, ascending indices of the filled bins of the flattened histograms (M, 2, 128, 128).
-    - `counts`: (K,) uint16.
-    - `lights`: (M, 3) float64, r + g + b = 1.
+    - `counts`: (K,) uint16, counts of these bins.
+    - `lights`: (M, 3) float64, ground truths, r + g + b = 1.
     """
 
     places: npt.NDArray[np.int64]
@@ -377,10 +379,10 @@ class LogChromaModel:
     """Fitted model.
 
     - `filters`: (2, 64, 33) complex128, Fourier transforms of both filters, see `numpy.fft.rfft2`.
-    - `bias`: (64, 64) float64.
+    - `bias`: (64, 64) float64, added to the response.
     - `centre`: (2,) float64, u and v of the middle of the training illuminants, opposite to the cut of the torus.
     - `grid`: (2,) float64, width of a bin and chroma of the centre of the first bin.
-    - `examples`: its training images; None if the model was tuned or its file does not have them.
+    - `examples`: its training images; None if the model was tuned or its file does not contain them.
     """
 
     filters: npt.NDArray[np.complex128]
@@ -390,7 +392,7 @@ class LogChromaModel:
     examples: TrainingImages | None = None
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
-        """Return the arrays by name, with the training images if known."""
+        """Return the arrays by name, and the arrays of the training images if the model contains them."""
         model_arrays = {"filters": self.filters, "bias": self.bias, "centre": self.centre, "grid": self.grid}
         examples = {} if self.examples is None else vars(self.examples)
         return {**model_arrays, **{f"learned_{name}": array for name, array in examples.items()}}
@@ -400,13 +402,13 @@ class LogChromaModel:
         return np.stack([self._light(feature) for feature in features])
 
     def _light(self, feature: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-        size, first_chroma = self.grid
-        (histograms,) = fold(feature[None], is_wide=bool(size > _FINE_WIDTH))
+        bin_width, first_chroma = self.grid
+        (histograms,) = fold(feature[None], is_wide=bool(bin_width > _FINE_WIDTH))
         response = np.fft.irfft2((np.fft.rfft2(histograms) * self.filters).sum(axis=0), s=(BINS, BINS)) + self.bias
         probabilities = np.exp(response - response.max())
         bin_position = moments((probabilities / probabilities.sum())[None]).mean[0]
-        turns = np.rint((bin_position * size + first_chroma - self.centre) / (BINS * size))
-        u, v = bin_position * size + first_chroma - turns * BINS * size
+        turns = np.rint((bin_position * bin_width + first_chroma - self.centre) / (BINS * bin_width))
+        u, v = bin_position * bin_width + first_chroma - turns * BINS * bin_width
         light = np.exp([-u, 0, -v])
         return light / light.sum()
 
@@ -427,7 +429,7 @@ def _histogram(pixels: npt.NDArray[np.float32], least: float) -> npt.NDArray[np.
 
 
 def _deviations(image: npt.NDArray[np.float32], used: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-    # Mean absolute difference of each pixel to its usable neighbours of eight.
+    # Mean absolute difference between each pixel and those of its eight neighbours that are usable.
     height, width = used.shape
     values = np.pad(image, ((1, 1), (1, 1), (0, 0)))
     usable = np.pad(used, 1).astype(np.float32)

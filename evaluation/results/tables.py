@@ -1,7 +1,7 @@
 """Tables of results as values, printed by commands, shown on pages and written as CSV.
 
-Contains the general `Table`, its CSV text, and the tables of errors: the six columns of the paper, all statistics, and
-errors under several illuminants. `reports.table_output` prints tables for people.
+Contains the general `Table`, its CSV text, and the tables of errors: the six statistics of Banić et al. 2019, all
+statistics, and errors under several illuminants. `reports.table_output` prints the tables.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from evaluation.results.result import NO_PIXEL, Result, Subject
 from foundation.errors import first_few
 from foundation.files import csv_text
 
-Cell = str | float | None  # A name, a number (an `int` stays one), or unknown
+Cell = str | float | None  # A text, a number (an `int` is not converted), or an unknown value
 
 MISSING = "–"  # Shown for `None`; CSV has an empty field
 
@@ -29,8 +29,8 @@ class Table:
 
     - `title`: content and unit: "Cube+: reproduction angular error of 1707 images, degrees".
     - `columns`: headings of the columns, at least one.
-    - `rows`: as many values as columns each. A column of numbers and None is aligned as numbers.
-    - `digits`: decimals shown of a float; CSV has nine significant digits.
+    - `rows`: each with one value for each column. A column of numbers and None is aligned as numbers.
+    - `digits`: number of decimals of a float in printed tables; CSV has nine significant digits.
     - `notes`: sentences below the table.
 
     Examples
@@ -57,7 +57,7 @@ class Table:
         return tuple(tuple(_text(cell, self.digits) for cell in row) for row in self.rows)
 
     def numeric(self) -> tuple[bool, ...]:
-        """Return for each column whether it contains numbers and no text."""
+        """Return True for each column that contains numbers and no text."""
         columns = [[row[index] for row in self.rows] for index in range(len(self.columns))]
         return tuple(
             not any(isinstance(cell, str) for cell in column) and any(cell is not None for cell in column)
@@ -99,7 +99,7 @@ def table_to_csv(table: Table) -> str:
     return csv_text([table.columns, *cells])
 
 
-PAPER_COLUMNS = ("Algorithm", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")  # Columns of the paper's tables
+PAPER_COLUMNS = ("Algorithm", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")  # Columns of Banić et al. 2019
 
 # Further statistics: 95th percentile, maximum, and percentage of errors below 3 degrees.
 FURTHER_COLUMNS = ("95%", "Max.", "< 3° (%)")
@@ -113,7 +113,7 @@ _NAMED_IMAGES = 3  # Images named in a note; errors.csv lists all
 
 
 def summary_table(subject: Subject, results: Sequence[Result], metric: ErrorKind, with_further: bool = False) -> Table:
-    """Return the table of the paper for one kind of error, with notes on images without an estimate.
+    """Return the six statistics of one kind of error for each method, with notes on images without an estimate.
 
     `with_further`: adds the 95th percentile, the maximum and the percentage below 3 degrees.
     """
@@ -130,10 +130,10 @@ def summary_table(subject: Subject, results: Sequence[Result], metric: ErrorKind
 
 
 def lights_tables(subject: Subject, results: Sequence[Result], metric: ErrorKind) -> tuple[Table, ...]:
-    """Return additional tables for images under several illuminants; none if there are no such images.
+    """Return additional tables for images under several illuminants; none if their errors by pixel are missing.
 
-    The first table has the errors by pixel, by region and against the mean illuminant. The second has the statistics of
-    the images under one illuminant, if there are any.
+    The first table has the errors by pixel, by region and against the mean illuminant. If some images have one
+    illuminant, the second table has their statistics.
     """
     single = np.array([not mixed for mixed in subject.mixed])
     if single.all() or any(result.maps is None for result in results):
@@ -150,10 +150,10 @@ def lights_tables(subject: Subject, results: Sequence[Result], metric: ErrorKind
 
 
 def statistics_rows(subject: Subject, results: Sequence[Result]) -> Table:
-    """Return every statistic of every kind of error as one table for programs: `results.csv`.
+    """Return the table of `results.csv`: all statistics of every kind of error.
 
     Column `error`: recovery or reproduction; with the prefix `pixel_` or `region_` under several illuminants; or
-    `pixel_rgb`. LSMI's MAE_illum is pixel_recovery, its MAE_rgb pixel_rgb. Column `lights`: images under "all", "one"
+    `pixel_rgb`. MAE_illum of LSMI is pixel_recovery; MAE_rgb is pixel_rgb. Column `lights`: images under "all", "one"
     or "several" illuminants. Column `count`: number of images, or of regions.
     """
     mixed = np.array(subject.mixed)
@@ -192,17 +192,17 @@ def _map_errors(maps: Mapping[int, MapError]) -> dict[str, npt.NDArray[np.float6
 
 def _mixed_table(subject: Subject, results: Sequence[Result]) -> Table:
     rows: list[tuple[Cell, ...]] = []
-    unjudged = 0
+    excluded = 0
     for result in results:
         maps = result.maps
         assert maps is not None
         errors = _map_errors(maps)
-        unjudged = max(unjudged, int(np.isnan(errors["pixel_rgb"]).sum()))
+        excluded = max(excluded, int(np.isnan(errors["pixel_rgb"]).sum()))
         columns = [errors[name] for name in ("pixel_recovery", "pixel_rgb", "region_recovery")]
         mixed = result.at(np.array(list(maps), np.int64))
         columns.append(mixed.errors["recovery"])
         rows.append((mixed.marked_name, *(cell for column in columns for cell in _mean_and_median(column))))
-    unjudged_note = (f"{unjudged} images are excluded: all of their pixels are masked or have no ground truth",)
+    excluded_note = (f"{excluded} images are excluded: all of their pixels are masked or have no ground truth",)
     return Table(
         f"{subject.name}: recovery angular error of the {sum(subject.mixed)} images under several illuminants, degrees",
         ("Algorithm", *("MAE_illum", "med.", "MAE_rgb", "med.", "By region", "med.", "Mean light", "med.")),
@@ -213,7 +213,7 @@ def _mixed_table(subject: Subject, results: Sequence[Result]) -> Table:
             "al., ICCV 2021)",
             "By region: against the illuminant that gives more than half of a pixel's light; all regions count equally",
             "Mean light: one estimate for the whole image against the mean of its illuminants, as in the table above",
-            *(unjudged_note if unjudged else ()),
+            *(excluded_note if excluded else ()),
         ),
     )
 
@@ -244,15 +244,15 @@ def _notes(subject: Subject, result: Result) -> Iterable[str]:
     count, causes = len(subject.images), result.causes or {}
     missing = [int(index) for index in np.flatnonzero(result.guessed)]
     without_pixel = [index for index in missing if causes.get(index, NO_PIXEL) == NO_PIXEL]
-    without_light = [index for index in missing if causes.get(index, NO_PIXEL) != NO_PIXEL]
-    # Grey is a defined answer: a method must not gain by leaving out difficult images.
+    without_estimate = [index for index in missing if causes.get(index, NO_PIXEL) != NO_PIXEL]
+    # Grey replaces a missing estimate, so that a method does not improve if it omits difficult images.
     replaced = "grey was used as their estimate"
     if without_pixel:
         fraction = f"{len(without_pixel)} of {count} images"
         yield f"{result.method}: no usable pixel in {fraction} ({_NO_PIXEL_CAUSES}); {replaced}"
-    if without_light:
-        examples = first_few([f"{subject.images[index]} {causes[index]}" for index in without_light], _NAMED_IMAGES)
-        yield f"{result.method}: no estimate for {len(without_light)} of {count} images ({examples}); {replaced}"
+    if without_estimate:
+        examples = first_few([f"{subject.images[index]} {causes[index]}" for index in without_estimate], _NAMED_IMAGES)
+        yield f"{result.method}: no estimate for {len(without_estimate)} of {count} images ({examples}); {replaced}"
     incomplete = [index for index in causes if not result.guessed[index]]
     if incomplete:
         examples = first_few([f"{subject.images[index]}: {causes[index]}" for index in incomplete], _NAMED_IMAGES)
