@@ -16,9 +16,9 @@ EVENNESS: Final = Limit(
 )  # fmt: skip
 
 TURN: Final = Limit(
-    "turn", "Angle between the rows of the chart and of the image", "geometry", "°", "at most", 5.0, None,
-    why="sampling windows are aligned with the rows of the image, and their corners approach the neighbouring patches",
-    source="geometry: 5 px of samples in a patch of 10 px", remedy="turn the camera until the rows are level",
+    "turn", "Angle between the rows of the chart and of the frame", "geometry", "°", "at most", 5.0, None,
+    why="sampling windows are aligned with the rows of the frame, and their corners approach the neighbouring patches",
+    source="geometry: 5 px of samples in a patch of 10 px", remedy="turn the camera until the rows are parallel",
 )  # fmt: skip
 
 KEYSTONE: Final = Limit(
@@ -76,7 +76,8 @@ UNIFORMITY: Final = Limit(
 
 ROWS: Final = Limit(
     "rows", "Strips of rows with unexpected content", "devices", "", "at most", 3, 3,
-    why="the file was damaged during transfer, or an object covers part of the chart", source="a fly covers as many",
+    why="the file was damaged during transfer, or an object covers part of the frame",
+    source="an insect in front of the chart covers as many",
     remedy="check the cable, the memory card and the frame",
 )  # fmt: skip
 
