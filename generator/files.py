@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,9 @@ from drivers.tiff import CFA, D65, RGB, Tags, TiffTag, ValueType, head, rational
 from foundation.compiled import compiled
 from foundation.errors import CropError, FormatError, InputError
 from generator.deflate import WIDEST, Packer
+
+if TYPE_CHECKING:
+    from tifffile import TiffFile, TiffPage
 
 Image = npt.NDArray[np.uint16]
 Format = Literal["png", "tiff", "exr", "jxl", "dng"]
@@ -285,15 +288,119 @@ def encode_tiff(image: Image, metadata: ImageMetadata) -> bytes:
 
 
 def decode_tiff(data: bytes) -> npt.NDArray[np.generic]:
-    """Return the first page of a TIFF: (H, W) or (H, W, channels), of the stored type."""
+    """Return the full picture of a TIFF: (H, W) or (H, W, channels), of the stored type."""
     # OpenCV misreads images stored plane by plane and truncated files, so it is not used.
     import tifffile
 
     with tifffile.TiffFile(io.BytesIO(data)) as file:
-        page = file.pages.first
+        page, index = _full_page(file)
+        if page.compression != tifffile.COMPRESSION.NONE and index is not None:
+            return _decompressed(data)
         values = np.asarray(page.asarray())
         # If planes are stored one after another, they are the first axis.
         return np.moveaxis(values, 0, -1) if page.axes.startswith("S") and values.ndim == 3 else values
+
+
+def full_picture_index(path: Path) -> int:
+    """Return the index of the full picture among the images of a TIFF file; 0 if the file cannot be read.
+
+    Raises FormatError if the picture is in a SubIFD, which OpenImageIO does not read.
+    """
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            _, index = _full_page(file)
+    except Exception:
+        # OpenImageIO reads it, or reports the fault.
+        return 0
+    if index is None:
+        raise FormatError(f"cannot read {path}: its full picture is in a SubIFD; convert it to a plain TIFF or PNG")
+    return index
+
+
+def _full_page(file: TiffFile) -> tuple[TiffPage, int | None]:
+    # The first picture that is neither reduced nor a transparency mask (TIFF 6.0, NewSubfileType, bits 0 and 2), and
+    # its index; None in a SubIFD. The first picture if all are reduced.
+    hidden = _REDUCED | _TRANSPARENCY
+    subpages: list[TiffPage] = []
+    for index, page in enumerate(file.pages):
+        page = cast("TiffPage", page.aspage())
+        if not page.subfiletype & hidden:
+            return page, index
+        pages_below = [cast("TiffPage", subpage.aspage()) for subpage in page.pages or ()]
+        subpages += [subpage for subpage in pages_below if not subpage.subfiletype & hidden]
+    return (subpages[0], None) if subpages else (file.pages.first, 0)
+
+
+_REDUCED, _TRANSPARENCY = 1, 4
+
+
+def _decompressed(data: bytes) -> npt.NDArray[np.generic]:
+    # OpenImageIO reads all usual compressions, but only files with a name.
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "image.tif"
+        path.write_bytes(data)
+        values = read_native(path).values
+    return values[..., 0] if values.shape[2] == 1 else values
+
+
+@dataclass(frozen=True, eq=False)
+class NativeImage:
+    """Values of an image file as stored, without colour conversion or rotation.
+
+    - `values`: (H, W, channels), of the stored type; 1-bit values are 0 and 255.
+    - `alpha`: index of the transparency channel; None without one.
+    - `orientation`: 1 … 8 (TIFF 6.0, tag Orientation).
+    - `format`: name of the file format in OpenImageIO, such as ``"png"``.
+    - `compression`: such as ``"lzw"``; empty if the format has none.
+    """
+
+    values: npt.NDArray[Any]
+    alpha: int | None
+    orientation: int
+    format: str
+    compression: str
+
+
+def read_native(path: Path) -> NativeImage:
+    """Return the full picture of an image file as stored; raises ValueError or CropError if it cannot be read."""
+    import OpenImageIO as oiio  # noqa: N813
+
+    request = oiio.ImageSpec()
+    request.attribute("oiio:UnassociatedAlpha", 1)
+    stream = oiio.ImageInput.open(str(path), request)
+    if stream is None:
+        raise ValueError(oiio.geterror().replace(str(path), "the file"))
+    try:
+        form = stream.format_name()
+        if form == "tiff":
+            stream.seek_subimage(full_picture_index(path), 0)
+        spec = stream.spec()
+        pixels = stream.read_image(spec.format)
+        if pixels is None or stream.has_error:
+            raise ValueError(stream.geterror().replace(str(path), "the file"))
+    finally:
+        stream.close()
+    values = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+    # For a GIF file OpenImageIO reports the channel after the last.
+    alpha = min(spec.alpha_channel, spec.nchannels - 1) if spec.alpha_channel > 0 else None
+    compression = spec.get_string_attribute("compression")
+    return NativeImage(values, alpha, spec.get_int_attribute("Orientation", 1), form, compression)
+
+
+def upright(picture: npt.NDArray[Any], orientation: int) -> npt.NDArray[Any]:
+    """Return a picture (H, W, channels) rotated or mirrored according to its orientation (TIFF 6.0), contiguous."""
+    transforms = {
+        2: lambda: picture[:, ::-1],
+        3: lambda: picture[::-1, ::-1],
+        4: lambda: picture[::-1],
+        5: lambda: picture.transpose(1, 0, 2),
+        6: lambda: picture.transpose(1, 0, 2)[:, ::-1],
+        7: lambda: picture.transpose(1, 0, 2)[::-1, ::-1],
+        8: lambda: picture.transpose(1, 0, 2)[::-1],
+    }.get(orientation)
+    return np.ascontiguousarray(transforms() if transforms else picture)
 
 
 # DNG 1.7.1, chapters 2 and 4.

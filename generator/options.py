@@ -453,13 +453,15 @@ class DatasetInputs:
 
 def dataset_inputs(lut: Lut, pictures: PictureOptions, light: LightOptions, seed: int) -> DatasetInputs:
     """Return the sources and illuminants that the options select."""
-    from generator.lights.choices import light_notes
+    from generator.lights.choices import SimultaneousLights, light_notes
 
     if light.lights_of is not None:
         return _inputs_of_dataset(lut, light.lights_of, pictures, light)
     preparation = pictures.preparation(seed)
     sources = pictures.find(preparation)
     choice = light.choose(lut, seed)
+    if isinstance(choice, SimultaneousLights):
+        choice = choice.paired([source.name for source in sources], preparation.crops)
     return DatasetInputs(sources, choice, preparation.describe(), light_notes(choice), preparation.crops)
 
 

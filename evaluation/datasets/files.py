@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import math
 import os
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,8 +21,10 @@ import numpy.typing as npt
 
 from evaluation.scene import Image
 from foundation import files
+from foundation.arrays import native
 from foundation.errors import FormatError, InputError, first_few
-from generator.files import decode_png, decode_tiff
+from foundation.natural_order import in_natural_order
+from generator.files import decode_png, decode_tiff, read_native, require_plausible
 
 IMAGE_ENDINGS = (".png", ".tif", ".tiff", ".npy")  # file types of linear images with 16 bits or more
 
@@ -94,37 +95,6 @@ def gather_images(folders: Iterable[Folder], endings: Collection[str] = (".png",
             )
         paths |= images
     return paths
-
-
-def in_natural_order(names: Iterable[str]) -> list[str]:
-    """Return names sorted with numbers in them by value.
-
-    Examples
-    --------
-    >>> in_natural_order(["a10", "10", "9", "a2"])
-    ['9', '10', 'a2', 'a10']
-    """
-    listed_names = list(names)
-    if len({name.translate(_ZERO_DIGITS) for name in listed_names}) <= 1:
-        # All numbers have equally many digits in the same places: plain sorting takes 1 s for a million names.
-        return sorted(listed_names)
-    return sorted(listed_names, key=natural_sort_key)
-
-
-_ZERO_DIGITS = str.maketrans("0123456789", "0" * 10)
-
-
-def natural_sort_key(name: str) -> list[str | int]:
-    """Return the sort key of a name with numbers, which sort by value.
-
-    Examples
-    --------
-    >>> sorted(["a10", "10.png", "9.png", "a2"], key=natural_sort_key)
-    ['9.png', '10.png', 'a2', 'a10']
-    """
-    segments: list[str | int] = list(re.split(r"([0-9]+)", name))  # text and digits alternate, text first
-    segments[1::2] = [int(digits) for digits in segments[1::2]]
-    return segments
 
 
 def match_images(
@@ -434,13 +404,53 @@ def _read_values(path: str) -> npt.NDArray[Any]:
     ending = Path(path).suffix.lower()
     try:
         if ending == ".npy":
-            return np.asarray(np.load(path, allow_pickle=False))
+            return native(np.load(path, allow_pickle=False))
         data = Path(path).read_bytes()
         if ending == ".png":
             return decode_png(data)
         if ending in (".tif", ".tiff"):
-            return decode_tiff(data)
+            return native(decode_tiff(data))
     except Exception as error:
-        reason = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
-        raise FormatError(f"{path} cannot be read: {reason or type(error).__name__}; restore it") from error
+        raise _unreadable(path, error, "restore it") from error
     raise FormatError(f"{path} ends in {ending!r}, expected .png, .tif, .tiff or .npy; convert it to linear 16 bits")
+
+
+def _unreadable(path: str, error: Exception, remedy: str) -> FormatError:
+    reason = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
+    return FormatError(f"{path} cannot be read: {reason or type(error).__name__}; {remedy}")
+
+
+# Formats in which every mask pixel is stored exactly, and compressions of TIFF in which it is not.
+_LOSSLESS_FORMATS = frozenset({"png", "tiff", "bmp", "gif", "pnm"})
+_LOSSY_COMPRESSIONS = ("jpeg", "jp2", "webp", "lerc", "jxl")
+
+
+def read_mask(path: str) -> Mask:
+    """Return the mask (H, W) bool of a picture: True if any colour channel is not 0 and the pixel is not transparent.
+
+    The picture is read as stored: its orientation is ignored, like that of images. Lossy pictures are refused, because
+    their pixels near an edge are rarely exactly 0.
+    """
+    remedy = "make it again as PNG"
+    try:
+        if path.lower().endswith(".npy"):
+            values, alpha = native(np.load(path, allow_pickle=False)), None
+            values = values[..., None] if values.ndim == 2 else values
+        else:
+            require_plausible(Path(path).read_bytes(), path)
+            image = read_native(Path(path))
+            values, alpha = image.values, image.alpha
+            if image.format not in _LOSSLESS_FORMATS or image.compression.startswith(_LOSSY_COMPRESSIONS):
+                raise FormatError(
+                    f"{path} is a lossy picture ({image.compression or image.format}), expected a mask as PNG or TIFF; "
+                    f"{remedy}"
+                )
+    except FormatError:
+        raise
+    except Exception as error:
+        raise _unreadable(path, error, remedy) from error
+    if values.ndim != 3 or values.dtype.kind not in "buif" or not np.isfinite(values).all():
+        raise FormatError(f"{path} has {values.dtype} {values.shape}, expected finite pixels; {remedy}")
+    colours = [channel for channel in range(values.shape[2]) if channel != alpha]
+    mask = values[..., colours].any(axis=2)
+    return np.asarray(mask if alpha is None else mask & (values[..., alpha] != 0))

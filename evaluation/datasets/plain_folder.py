@@ -4,7 +4,7 @@ Layout::
 
     gt.csv              image,r,g,b: one row per image; path relative to the table, with or without the ending
                         columns black, saturation: levels of the image, in the units of its file, optional
-                        column mask: a picture with values above 0 at pixels that must not be used, optional
+                        column mask: a picture that is not 0 at pixels that must not be used, optional
                         column fold: whole numbers from 0 for cross-validation, optional
     photo1.png …        linear camera RGB, red first: PNG or TIFF of 16 bits, TIFF of floats, or NumPy files
     photo1_mask.png     mask of photo1 if column mask is empty, optional
@@ -17,16 +17,27 @@ proportional to light.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from evaluation.datasets.files import IMAGE_ENDINGS, Folder, Light, Mask, RawScene, parse_light, parse_number, read_rows
+from evaluation.datasets.files import (
+    IMAGE_ENDINGS,
+    Folder,
+    Light,
+    Mask,
+    RawScene,
+    parse_light,
+    parse_number,
+    read_mask,
+    read_rows,
+)
 from evaluation.datasets.options import DataOptions, level_note
 from evaluation.scene import Image, SceneSet
+from foundation.compiled import ordered_map, processor_count
 from foundation.errors import FormatError, InputError, first_few
 
 COLUMNS = ("image", "r", "g", "b")  # required columns of the table
@@ -43,7 +54,7 @@ _INSPECTED_TABLES = 50  # tables of a folder whose headers are read to find the 
 
 @dataclass(frozen=True, slots=True)
 class OwnScene(RawScene):
-    """Image of the user; `mask_path`: picture with values above 0 at pixels that must not be used, or empty."""
+    """Image of the user; `mask_path`: picture that is not 0 at pixels that must not be used, or empty."""
 
     mask_path: str = ""
 
@@ -51,21 +62,13 @@ class OwnScene(RawScene):
         """Return (H, W) bool for an image (H, W, 3), True if the mask picture is not 0; None without a mask."""
         if not self.mask_path:
             return None
-        import cv2
-
-        try:
-            data = np.fromfile(self.mask_path, np.uint8)
-        except OSError as error:
-            raise FormatError(f"{self.mask_path} cannot be read: {error.strerror or error}; restore it") from error
-        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
-        if picture is None:
-            raise FormatError(f"{self.mask_path} cannot be decoded, expected a picture; make it again as PNG")
-        if picture.shape != image.shape[:2]:
+        mask = read_mask(self.mask_path)
+        if mask.shape != image.shape[:2]:
             raise FormatError(
-                f"{self.mask_path} has {picture.shape[1]} × {picture.shape[0]} px, expected {image.shape[1]} × "
+                f"{self.mask_path} has {mask.shape[1]} × {mask.shape[0]} px, expected {image.shape[1]} × "
                 f"{image.shape[0]} like {self.path}; make it again"
             )
-        return np.asarray(picture != 0)
+        return mask
 
 
 def is_plain_folder(folder: Folder) -> bool:
@@ -132,17 +135,29 @@ def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folde
             "black level": _level_note("black", given_columns, path, options.black, ASSUMED_BLACK),
             "saturation": _level_note("saturation", given_columns, path, options.saturation, "none: neither a column "
             "saturation nor --read saturation gives it, so clipped pixels are used"),
-            "mask": _mask_source(given_columns, path, len(masks), len(scenes)),
+            "mask": _mask_source(given_columns, path, scenes),
             "ground truth": f"r, g, b of {path.name}",
         },
         folds=tuple(folds) if "fold" in given_columns else None,
     )  # fmt: skip
 
 
-def _mask_source(given_columns: set[str], path: Path, masks: int, count: int) -> str:
+def _mask_source(given_columns: set[str], path: Path, scenes: Sequence[OwnScene]) -> str:
     sources_by_key = ((f"column mask of {path.name}", "mask"), ("NAME_mask next to the image", "mask beside"))
     sources = " or ".join(text for text, key in sources_by_key if key in given_columns)
-    return f"{sources}: pixels that are not 0; {masks} of {count} images have one" if sources else "none"
+    if not sources:
+        return "none"
+    masked_scenes = [scene for scene in scenes if scene.mask_path]
+    # All masks are read before the first image, so that a damaged mask is reported at once.
+    masks = ordered_map(lambda scene: read_mask(scene.mask_path), masked_scenes, processor_count())
+    counts = [(int(mask.sum()), mask.size) for mask in masks]
+    masked, total = (sum(column) for column in zip(*counts, strict=True))
+    empty = [scene.name for scene, (count, _) in zip(masked_scenes, counts, strict=True) if not count]
+    return (
+        f"{sources}: pixels that are not 0; {len(masked_scenes)} of {len(scenes)} images have one, with {masked} "
+        f"masked pixels ({100 * masked / total:.3g} %)"
+        + (f"; {len(empty)} masks are empty ({first_few(empty)})" if empty else "")
+    )
 
 
 def _level_note(column: str, given_columns: set[str], path: Path, option: float | None, otherwise: str) -> str:

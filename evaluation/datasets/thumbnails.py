@@ -16,6 +16,7 @@ import numpy.typing as npt
 from evaluation.datasets.files import check_light
 from evaluation.datasets.options import level_note
 from evaluation.scene import SceneSet
+from foundation.arrays import native
 from foundation.errors import FormatError
 
 _EXPECTED = "expected images (N, H, W, 3), gt (N, 3) and names (N,), as numpy.savez writes them"
@@ -45,7 +46,7 @@ def open_thumbnails(path: Path | str, saturation: float | None = None) -> SceneS
     """Return the thumbnails of an archive, in memory; `saturation` in the units of the archive, None if unknown."""
     try:
         with np.load(path) as content:
-            images, truths, names = content["images"], content["gt"].astype(np.float64), content["names"]
+            images, truths, names = native(content["images"]), content["gt"].astype(np.float64), content["names"]
     except Exception as error:  # NumPy evaluates file headers; damaged ones may raise any error.
         raise FormatError(f"{path} cannot be read as thumbnails: {error}; {_EXPECTED}") from error
     count = len(images)

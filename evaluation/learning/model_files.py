@@ -25,6 +25,7 @@ from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod
 from evaluation.learning.standard import standard_learners
 from evaluation.methods.method import Method
 from evaluation.scene import Scene, SceneSet
+from foundation.arrays import native
 from foundation.clock import Clock
 from foundation.errors import FormatError, InputError
 from foundation.files import atomic_file, sha256_of
@@ -195,7 +196,7 @@ def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
         if (damaged := archive.testzip()) is not None:
             raise ValueError(f"{damaged} is damaged")
     with np.load(path, allow_pickle=False) as content:
-        return {name: content[name] for name in content.files}
+        return {name: native(content[name]) for name in content.files}
 
 
 def settings_of(learner: FeatureLearner) -> dict[str, Any]:

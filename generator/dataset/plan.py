@@ -181,7 +181,9 @@ def parse_split(text: str) -> tuple[float, float, float]:
             f"the split {text} has the sum {total:.10g}, expected 1; give shares such as 0.8,0.1,0.1, or integers such "
             "as 8,1,1"
         )
-    return shares[0] / total, shares[1] / total, shares[2] / total
+    # Shares with the sum 1 stay as typed: a division by 0.9999999999999999 would change their last digit.
+    divisor = total if is_whole else 100.0 if total > 2 else 1.0
+    return shares[0] / divisor, shares[1] / divisor, shares[2] / divisor
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -22,7 +22,7 @@ from generator.kernels.rendering import valid_light
 from generator.lights.distributions import Distribution
 from generator.lights.gamut import TOLERANCE_DEG, Gamut, Match, OutsideGamut, black_body, rgb_of
 from generator.lights.lighting import LightChoice, Lighting, ListedLights, Mixture, parse_mixture, single_mixture
-from generator.masks.making import MaskPlan
+from generator.masks.making import GivenMaskPlan, MaskPlan
 from generator.named_numbers import parse_numbers
 
 if TYPE_CHECKING:
@@ -164,6 +164,12 @@ class SimultaneousLights:
             )
             for image in range(self.lights_each)
         )
+
+    def paired(self, pictures: Sequence[str], crops: int) -> SimultaneousLights:
+        """Return the choice with masks from files assigned to the pictures, of which each has `crops` crops."""
+        if not isinstance(self.masks, GivenMaskPlan):
+            return self
+        return replace(self, masks=self.masks.paired(pictures, crops * self.lights_each))
 
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values for `dataset.json`."""

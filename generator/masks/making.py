@@ -17,21 +17,25 @@ image. Weights are divided by their sum. A pixel that is 0 in all K masks gets t
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
 from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.compiled import compiled, inlined
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, first_few
+from foundation.natural_order import in_natural_order
 from generator import philox
-from generator.files import require_plausible
+from generator.files import read_native, require_plausible, upright
 from generator.named_numbers import Range, parse_numbers
+
+_log = logging.getLogger(__name__)
 
 # float32 in practice: numpy keeps float32 if arrays are combined with Python numbers.
 Array = npt.NDArray[np.floating[Any]]
@@ -432,18 +436,46 @@ class GivenMaskPlan:
     """Sets of mask files, used for one image after another and repeated if there are too few."""
 
     folder: str  # name of the folder
-    sets: tuple[GivenMasks, ...]  # in the order of their names
+    sets: tuple[GivenMasks, ...]  # in the natural order of their names
+    names: tuple[str, ...]  # name of each set: that of its files without number and suffix
     sha256: str  # hash of the names and bytes of all files in this order
     # Index of the set by image number, if the file names have image numbers; else empty, and sets are used in turn.
     set_of_image: Mapping[int, int] = field(default_factory=dict[int, int])
+    set_of_picture: tuple[int, ...] = ()  # index of the set of each picture, if they have the same names; else empty
+    images_each: int = 1  # images of each picture
 
     def maker(self, number: int) -> GivenMasks:
         """Return the masks of image `number`."""
+        if self.set_of_picture:
+            return self.sets[self.set_of_picture[number // self.images_each]]
         return self.sets[self.set_of_image.get(number, number % len(self.sets))]
 
     def describe(self) -> dict[str, Any]:
         """Return the plan as plain values."""
-        return {"masks": "files", "folder": self.folder, "sets": len(self.sets), "sha256": self.sha256}
+        described = {"masks": "files", "folder": self.folder, "sets": len(self.sets), "sha256": self.sha256}
+        return {**described, "pairing": "names"} if self.set_of_picture else described
+
+    def paired(self, pictures: Sequence[str], images_each: int) -> GivenMaskPlan:
+        """Return the plan with the sets assigned to pictures by name.
+
+        If no set has the name of a picture, the sets are used in turn. Raises InputError if only some pictures have a
+        set. `pictures`: names of all pictures, with folders and suffixes. `images_each`: images of each picture.
+        """
+        indices = {name: index for index, name in enumerate(self.names)}
+        stems = [PurePosixPath(picture).stem for picture in pictures]
+        missing = [picture for picture, stem in zip(pictures, stems, strict=True) if stem not in indices]
+        if missing and len(missing) < len(pictures) and not self.set_of_image:
+            raise InputError(
+                f"{self.folder} has masks for {len(pictures) - len(missing)} of {len(pictures)} pictures by name, but "
+                f"not for {first_few(missing)}; add masks named like them, or rename all masks"
+            )
+        plan = self if missing else replace(self, set_of_picture=tuple(map(indices.__getitem__, stems)))
+        plan = replace(plan, images_each=images_each)
+        for position, picture in enumerate(pictures):
+            _log.info(
+                "%s: masks %s", picture, ", ".join(file.name for file in plan.maker(position * images_each).files)
+            )
+        return plan
 
 
 def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
@@ -462,7 +494,8 @@ def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
         raise FormatError(f"{folder} has no masks, expected images such as NAME_1.png, NAME_2.png; give another folder")
     digest = hashlib.sha256()
     sets: list[GivenMasks] = []
-    for name in sorted(groups):
+    names = in_natural_order(groups)
+    for name in names:
         members = tuple(path for _, path in sorted(groups[name]))
         for path in members:
             digest.update(f"{path.name}\n".encode())
@@ -470,9 +503,11 @@ def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
         masks = GivenMasks(members)
         masks.weights(2, 2, lights)
         sets.append(masks)
-    keys = [re.fullmatch(r"(\d{6,})_", name) for name in sorted(groups)]
+    keys = [re.fullmatch(r"(\d{6,})_", name) for name in names]
     numbered = {int(key[1]): index for index, key in enumerate(keys) if key}
-    return GivenMaskPlan(folder.name, tuple(sets), digest.hexdigest(), numbered if len(numbered) == len(sets) else {})
+    set_of_image = numbered if len(numbered) == len(sets) else {}
+    set_names = tuple(name.removesuffix("_") for name in names)
+    return GivenMaskPlan(folder.name, tuple(sets), set_names, digest.hexdigest(), set_of_image)
 
 
 def _bytes_of(path: Path) -> bytes:
@@ -483,18 +518,23 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _read(path: Path) -> list[_Array]:
-    # A file with one channel or equal channels has one mask (H, W) float32, 0 … 1; other files have three.
-    image = decode_values(_bytes_of(path), path)
+    # A file with one channel or equal channels has one mask (H, W) float32, 0 … 1; other files have three. Masks are
+    # turned upright like pictures.
+    require_plausible(_bytes_of(path), str(path))
+    try:
+        stored = read_native(path)
+    except ValueError as error:
+        raise FormatError(f"{path} cannot be read: {' '.join(str(error).split())}; replace it") from error
+    colours = [channel for channel in range(stored.values.shape[2]) if channel != stored.alpha][:3]
+    image = upright(stored.values[..., colours if len(colours) == 3 else colours[:1]], stored.orientation)
     if image.dtype.kind == "u" and image.dtype.itemsize <= 2:
         scaled = np.asarray(image / np.float32(np.iinfo(image.dtype).max), dtype=np.float32)
     elif image.dtype.kind == "f" and np.isfinite(image).all():
         scaled = np.clip(image, 0, 1).astype(np.float32)
     else:
         raise FormatError(f"{path} has {image.dtype} or non-finite values, expected 8 or 16 bits; convert it")
-    if scaled.ndim == 2:
-        return [scaled]
     is_grey = bool((scaled == scaled[..., :1]).all())
-    return [np.ascontiguousarray(scaled[..., channel]) for channel in range(1 if is_grey else 3)]
+    return [np.ascontiguousarray(scaled[..., channel]) for channel in range(1 if is_grey else scaled.shape[2])]
 
 
 def _resized(mask: _Array, height: int, width: int) -> _Array:

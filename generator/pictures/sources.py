@@ -3,12 +3,14 @@
 Sources are files, folders of any size, remote stores, or random colours. The conversion has these steps, in this order,
 so that a picture always gives the same codes::
 
-    channels      the first three are R, G, B; a single one is grey; the first image of a file with several
+    channels      the first three are R, G, B; a single one is grey; the first image of a file with several, but not
+                  a reduced one of a TIFF
     depth         8-bit codes are kept; 16-bit codes v become ⌊(v + 128) / 257⌋; floating-point values are linear
                   light, 1 = white, clipped and encoded with the sRGB curve (IEC 61966-2-1), unless the file is
-                  marked as sRGB
+                  marked as sRGB or has a profile that is not linear
     transparency  composited on white, like paper in a print, with the values as stored
-    profile       codes of another colour space are converted to sRGB (`generator.pictures.conversion`)
+    profile       another colour space, by profile or by primaries and transfer function, is converted to sRGB
+                  (`generator.pictures.conversion`); HDR pictures and unknown spaces are refused
     orientation   rotated or mirrored according to EXIF or TIFF orientation
     size          on request only: reduced, by averaging areas of codes
     crop          on request only: from the centre, or at positions derived from the name of the picture and a seed
@@ -24,7 +26,7 @@ import re
 import struct
 import tempfile
 import zlib
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -38,7 +40,16 @@ from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import file_sha256, sha256_of, stream_sha256
 from foundation.secret_texts import masked
 from generator import philox
-from generator.pictures.conversion import from_adobe_rgb, to_srgb
+from generator.files import full_picture_index, upright
+from generator.pictures.conversion import (
+    RgbSpace,
+    from_adobe_rgb,
+    linear_space,
+    space_of_cicp,
+    space_of_gamma,
+    space_of_primaries,
+    to_srgb,
+)
 from generator.stores import DESCRIPTION, filesystem, is_remote, local_path
 
 if TYPE_CHECKING:
@@ -217,6 +228,7 @@ class _FileValues:
     orientation: int
     icc: bytes | None
     is_adobe_rgb: bool = False
+    space: RgbSpace | None = None  # space of `light`, if it is neither sRGB nor given by `icc`
 
 
 def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
@@ -272,12 +284,16 @@ def open_picture(
         coverage = values.alpha[..., None]
         white = (1.0 - coverage) * (1.0 if values.is_linear else 255.0)
         light = (light if values.is_associated else light * coverage) + white
-    if values.is_linear:
+    if values.space is not None:
+        codes = values.space.srgb_codes(light if values.is_linear else light / 255)
+    elif values.is_linear:
         codes = srgb_codes(light)
     else:
         # Rounding takes seconds for a large picture; 8-bit codes need none.
         codes = (light if light.dtype == np.uint8 else np.rint(np.clip(light, 0, 255))).astype(np.uint8, copy=False)
-    if values.is_linear:
+    if values.space is not None:
+        treatment = f"{values.space.name}, converted to sRGB"
+    elif values.is_linear:
         treatment = "linear light, encoded as sRGB"
     elif values.icc is None and not values.is_adobe_rgb:
         treatment = "none, taken as sRGB"
@@ -290,7 +306,7 @@ def open_picture(
         TRANSPARENT: values.alpha is not None,
         PROFILE_UNUSED: values.icc is not None and treatment.endswith("taken as sRGB"),
     }
-    codes = _upright(codes, values.orientation)
+    codes = upright(codes, values.orientation)
     cuts = _crops(codes, preparation, path, path.name if name is None else name)
     notes = tuple(note for note, applies in note_conditions.items() if applies)
     several_crops = cuts if preparation.crops > 1 else ()
@@ -300,30 +316,36 @@ def open_picture(
 def _read(path: Path, data: bytes | None, most_pixels: int) -> _FileValues:
     if not path.is_file():
         raise FormatError(f"cannot read {path}: no such file; name a picture")
-    has_profile = _checked_png(path, data)
+    chunks = _checked_png(path, data)
     with _named_in_text(path) as name:
-        values = _read_named(path, name, data, most_pixels)
+        values = _read_named(path, name, data, most_pixels, chunks)
+    has_profile = b"iCCP" in chunks and values.space is None
     # OpenImageIO silently drops a profile that it cannot use. An empty profile is treated as damaged.
     profile_was_dropped = has_profile and values.icc is None and not values.is_adobe_rgb
     return replace(values, icc=b"") if profile_was_dropped else values
 
 
-def _checked_png(path: Path, data: bytes | None) -> bool:
-    # Returns whether a PNG has a colour profile (PNG, third edition, clause 5.3). Truncated or damaged pixels are
-    # refused here, because libpng would print its own lines.
+# Chunks of a PNG that state its colour space (PNG, third edition, clause 5.6).
+_COLOUR_CHUNKS: Final = (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM")
+
+
+def _checked_png(path: Path, data: bytes | None) -> Mapping[bytes, bytes]:
+    # Returns the chunks of a PNG that state its colour space. Truncated or damaged pixels are refused here, because
+    # libpng would print its own lines.
     try:
         with path.open("rb") as stream:
             if stream.read(len(_PNG)) != _PNG:
-                return False
+                return {}
             content = memoryview(_PNG + stream.read() if data is None else data)
     except OSError:
         # OpenImageIO reports the fault.
-        return False
-    position, has_profile = len(_PNG), False
+        return {}
+    position, colour_chunks = len(_PNG), dict[bytes, bytes]()
     while position + 8 <= len(content):
         size, chunk_type = struct.unpack(">I4s", content[position : position + 8])
         end = position + 12 + size
-        has_profile |= chunk_type == b"iCCP"
+        if chunk_type in _COLOUR_CHUNKS:
+            colour_chunks[chunk_type] = bytes(content[position + 8 : end - 4])
         if chunk_type in (b"IHDR", b"PLTE", b"IDAT"):
             is_truncated = end > len(content)
             if is_truncated or zlib.crc32(content[position + 4 : end - 4]) != int.from_bytes(content[end - 4 : end]):
@@ -333,10 +355,54 @@ def _checked_png(path: Path, data: bytes | None) -> bool:
                     "use another copy"
                 )
         position = end
-    return has_profile
+    return colour_chunks
 
 
-def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> _FileValues:
+def _png_space(chunks: Mapping[bytes, bytes]) -> RgbSpace | None:
+    # The first of cICP, iCCP, sRGB, and gAMA with cHRM is valid (PNG, third edition, clause 13.14).
+    if len(codes := chunks.get(b"cICP", b"")) == 4:
+        return space_of_cicp(codes)
+    gamma, chromaticities = chunks.get(b"gAMA", b""), chunks.get(b"cHRM", b"")
+    if b"iCCP" in chunks or b"sRGB" in chunks or (len(gamma), len(chromaticities)) not in ((4, 0), (4, 32), (0, 32)):
+        return None
+    file_gamma = struct.unpack(">I", gamma)[0] / 100_000 if gamma else 0.0
+    points = [value / 100_000 for value in struct.unpack(">8I", chromaticities)] if chromaticities else None
+    return space_of_gamma(file_gamma, points)
+
+
+# First lines of a Radiance file, which may give x, y of red, green, blue and white.
+_RADIANCE_HEAD_BYTES: Final = 4096
+_RADIANCE_PRIMARIES: Final = re.compile(rb"^PRIMARIES=((?:\s+[-+.0-9eE]+){8})\s*$", re.MULTILINE)
+
+
+def _stated_space(path: Path, spec: Any, chunks: Mapping[bytes, bytes], icc: bytes | None) -> RgbSpace | None:
+    # The colour space of a file if it is neither sRGB nor linear light of its primaries.
+    if b"cICP" not in chunks and icc is not None:
+        return linear_space(icc)
+    if chunks:
+        return _png_space(chunks)
+    if (cicp := spec.getattribute("CICP")) is not None:
+        return space_of_cicp(cicp)
+    if (chromaticities := spec.getattribute("chromaticities")) is not None:
+        return space_of_primaries("linear light by chromaticities", chromaticities)
+    name = str(spec.get_string_attribute("oiio:ColorSpace"))
+    if path.suffix.lower() in (".hdr", ".rgbe"):
+        with path.open("rb") as stream:
+            primaries = _RADIANCE_PRIMARIES.search(stream.read(_RADIANCE_HEAD_BYTES).partition(b"\n\n")[0])
+        if primaries:
+            return space_of_primaries("linear light by PRIMARIES", [float(value) for value in primaries[1].split()])
+    elif name and not name.lower().startswith(_KNOWN_SPACES):
+        raise FormatError(f"its colour space {name} is not supported, expected sRGB; convert it to an sRGB PNG")
+    return None
+
+
+# Beginnings of the names of colour spaces in OpenImageIO that are read as sRGB or as linear light.
+_KNOWN_SPACES: Final = ("srgb", "rec709", "lin_srgb", "lin_rec709", "linear", "scene_linear", "g22_rec709")
+
+
+def _read_named(
+    path: Path, name: str, data: bytes | None, most_pixels: int, chunks: Mapping[bytes, bytes]
+) -> _FileValues:
     import OpenImageIO as oiio  # noqa: N813
 
     request = oiio.ImageSpec()
@@ -346,6 +412,8 @@ def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> 
         reason = _reason(oiio.geterror()).replace(name, str(path))
         raise FormatError(f"cannot read {path}: {reason}; use another picture, or convert it to PNG")
     try:
+        if stream.format_name() == "tiff":
+            stream.seek_subimage(full_picture_index(path), 0)
         spec = stream.spec()
         if spec.deep or spec.depth > 1 or spec.nchannels < 1:
             raise FormatError(f"cannot read {path}: it is a deep or 3D picture, expected a flat one; convert it to PNG")
@@ -356,7 +424,15 @@ def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> 
         space = str(spec.get_string_attribute("oiio:ColorSpace")).lower()
         base_type = spec.format.basetype
         is_floating = base_type in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-        is_linear = is_floating and "srgb" not in space.replace("lin_srgb", "")
+        icc_values = spec.getattribute("ICCProfile")
+        icc = None if icc_values is None else np.asarray(icc_values, dtype=np.uint8).tobytes()
+        try:
+            own_space = _stated_space(path, spec, chunks, icc)
+        except FormatError as error:
+            raise FormatError(f"cannot read {path}: {error}") from error
+        own_space = None if own_space is None or own_space.is_srgb else own_space
+        is_encoded = "srgb" in space.replace("lin_srgb", "") or (icc is not None and own_space is None)
+        is_linear = is_floating and not is_encoded
         pixels = None
         if stream.format_name() == "jpeg" and spec.nchannels == 3:
             pixels = _jpeg(path.read_bytes() if data is None else data)
@@ -369,7 +445,6 @@ def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> 
         alpha_channel = spec.alpha_channel
         is_separate = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) or stream.format_name() not in _PREMULTIPLIED
         orientation = spec.get_int_attribute("Orientation", 1)
-        icc = spec.getattribute("ICCProfile")
         is_uncalibrated = spec.get_int_attribute("Exif:ColorSpace", 0) == _UNCALIBRATED
     finally:
         stream.close()
@@ -388,7 +463,9 @@ def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> 
         values = pixels[..., :3]
     else:
         values = pixels[..., colours[:3] if len(colours) >= 3 else [colours[0] if colours else 0] * 3]
-    if values.dtype == np.uint16:
+    if own_space is not None and not is_floating:
+        values = values * (255.0 / np.iinfo(values.dtype).max)
+    elif values.dtype == np.uint16:
         values = ((values.astype(np.uint32) + 128) // 257).astype(np.uint8)
     elif is_floating:
         values = values.astype(np.float64) * (1.0 if is_linear else 255.0)
@@ -396,9 +473,8 @@ def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> 
     if alpha is not None and not is_floating:
         # A colour brighter than its alpha was not multiplied by it, whatever the format usually does.
         is_associated = is_associated and not bool(np.any(values > 255.0 * alpha[..., None] + 1.0))
-    profile = None if icc is None else np.asarray(icc, dtype=np.uint8).tobytes()
-    is_adobe_rgb = is_uncalibrated and profile is None and _interoperability(path) == "R03"
-    return _FileValues(values, alpha, is_associated, is_linear, orientation, profile, is_adobe_rgb)
+    is_adobe_rgb = is_uncalibrated and icc is None and own_space is None and _interoperability(path) == "R03"
+    return _FileValues(values, alpha, is_associated, is_linear, orientation, icc, is_adobe_rgb, own_space)
 
 
 @contextmanager
@@ -444,20 +520,6 @@ def _jpeg(data: bytes) -> npt.NDArray[np.uint8] | None:
 
 def _reason(message: str) -> str:
     return " ".join(message.split()).rstrip(".") or "unknown picture format"
-
-
-def _upright(picture: Picture, orientation: int) -> Picture:
-    # TIFF 6.0, tag Orientation.
-    transforms = {
-        2: lambda: picture[:, ::-1],
-        3: lambda: picture[::-1, ::-1],
-        4: lambda: picture[::-1],
-        5: lambda: picture.transpose(1, 0, 2),
-        6: lambda: picture.transpose(1, 0, 2)[:, ::-1],
-        7: lambda: picture.transpose(1, 0, 2)[::-1, ::-1],
-        8: lambda: picture.transpose(1, 0, 2)[::-1],
-    }.get(orientation)
-    return np.ascontiguousarray(transforms() if transforms else picture)
 
 
 def _crops(picture: Picture, preparation: Preparation, path: Path, name: str) -> tuple[Cut, ...]:

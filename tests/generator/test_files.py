@@ -13,7 +13,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import imagecodecs
@@ -305,6 +305,29 @@ def test_reads_any_tiff_or_refuses_it(dtype: type[np.generic], planes: bool, com
     np.testing.assert_array_equal(decoded, image)
     with pytest.raises(Exception):  # noqa: B017, PT011  # any error of the reader
         decode_tiff(stream.getvalue()[: stream.tell() // 2])
+
+
+@pytest.mark.parametrize("byte_order", ["<", ">"])
+def test_reads_full_picture_of_tiff(byte_order: Literal["<", ">"]) -> None:
+    # TIFF 6.0, NewSubfileType: a reduced picture may be first, and the full one in a SubIFD.
+    image = noisy(30, 40)
+    for subfiles in (0, 1):
+        stream = io.BytesIO()
+        with tifffile.TiffWriter(stream, byteorder=byte_order) as writer:
+            writer.write(image[::4, ::4], photometric="rgb", subfiletype=1, subifds=subfiles)
+            writer.write(image, photometric="rgb")
+        np.testing.assert_array_equal(decode_tiff(stream.getvalue()), image)
+
+
+@pytest.mark.parametrize(("compression", "predictor"), [("lzw", 2), ("zlib", 2), ("zlib", 3), ("packbits", None)])
+def test_reads_compressed_tiff_without_extra_library(
+    monkeypatch: pytest.MonkeyPatch, compression: str, predictor: int | None
+) -> None:
+    image = noisy(30, 40).astype(np.float32) if predictor == 3 else noisy(30, 40)
+    stream = io.BytesIO()
+    tifffile.imwrite(stream, image, photometric="rgb", compression=compression, predictor=predictor)
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)
+    np.testing.assert_array_equal(decode_tiff(stream.getvalue()), image)
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])

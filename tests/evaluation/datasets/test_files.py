@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from evaluation.datasets.files import chart_mask, decode_image, natural_sort_key, read_rows, subtract_black
+from evaluation.datasets.files import chart_mask, decode_image, read_rows, subtract_black
 from foundation.errors import FormatError
 from tests.data_files import shipped
 from tests.evaluation.datasets.made_up import image_of, write_png, write_tiff
@@ -97,11 +97,6 @@ def test_refuses_chart_far_outside_image(x: float) -> None:
     corners[2, 0] = x
     with pytest.raises(FormatError, match=r"chart of a\.png .*8 × 5"):
         chart_mask((5, 8), corners, "a.png")
-
-
-def test_sorts_numbers_in_names_by_value() -> None:
-    names = ["10.png", "9.png", "IMG_0010.png", "IMG_9.png", "a", "1a10", "1a9"]
-    assert sorted(names, key=natural_sort_key) == ["1a9", "1a10", "9.png", "10.png", "IMG_9.png", "IMG_0010.png", "a"]
 
 
 def test_suggested_dcraw_options_give_colours_of_mosaic(tmp_path: Path) -> None:

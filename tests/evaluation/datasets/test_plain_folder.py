@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pytest
+import tifffile
+from PIL import Image
 
 from evaluation.datasets import DataOptions, open_scenes
 from evaluation.datasets.opening import check_black_level
@@ -160,7 +164,9 @@ def test_uses_mask_beside_image_without_column(copy: Path) -> None:
     assert without is None
     assert with_mask.sum() == 6
     assert with_mask[5:, :2].all()
-    assert data.treatment["mask"] == "NAME_mask next to the image: pixels that are not 0; 1 of 2 images have one"
+    assert data.treatment["mask"] == (
+        "NAME_mask next to the image: pixels that are not 0; 1 of 2 images have one, with 6 masked pixels (7.5 %)"
+    )
 
 
 def test_prefers_mask_in_column_to_mask_beside_image(copy: Path) -> None:
@@ -204,3 +210,89 @@ def test_counts_images_in_unlisted_folders(copy: Path, monkeypatch: pytest.Monke
     monkeypatch.chdir(copy)
     for location in (".", str(copy), "gt.csv"):
         assert open_scenes(location).treatment["images"] == "3; 1 in other folders without a row in gt.csv excluded"
+
+
+def masked_right_half(shape: tuple[int, ...], dtype: type[np.generic], value: float) -> npt.NDArray[Any]:
+    """Return a picture whose right half has a value and whose left half is 0."""
+    picture = np.zeros(shape, dtype)
+    picture[:, shape[1] // 2 :] = value
+    return picture
+
+
+def write_mask(path: Path, kind: str) -> None:
+    """Write a mask of 6×8 px, whose right half is masked, as a program of users may write it."""
+    grey = masked_right_half((6, 8), np.uint8, 255)
+    match kind:
+        case "16-bit labels":
+            Image.fromarray(masked_right_half((6, 8), np.uint16, 1)).save(path)
+        case "dark colours":
+            Image.fromarray(
+                masked_right_half((6, 8, 3), np.uint8, 0) | (grey[..., None] & [0, 0, 1]).astype(np.uint8)
+            ).save(path)
+        case "opaque":
+            Image.fromarray(np.dstack([grey, grey, grey, np.full_like(grey, 255)])).save(path)
+        case "transparent white":
+            Image.fromarray(np.dstack([np.full((6, 8, 3), 255, np.uint8), grey])).save(path)
+        case "palette":
+            picture = Image.fromarray(grey // 255).convert("P")
+            picture.putpalette([0, 0, 0, 128, 0, 0])
+            picture.save(path)
+        case "one bit":
+            Image.fromarray(grey > 0).save(path)
+        case "one bit, black is 1":
+            tifffile.imwrite(path, grey == 0, photometric="miniswhite")
+        case "turned":
+            # The tag Orientation is ignored, as in images.
+            tifffile.imwrite(path, grey, photometric="minisblack", extratags=[(274, "H", 1, 3, True)])
+        case "LZW":
+            tifffile.imwrite(path, grey, photometric="minisblack", compression="lzw")
+        case _:
+            tifffile.imwrite(path, masked_right_half((6, 8), np.dtype(kind).type, 1), photometric="minisblack")
+
+
+@pytest.mark.parametrize(
+    ("kind", "ending"),
+    [
+        *(
+            (kind, "png")
+            for kind in ("16-bit labels", "dark colours", "opaque", "transparent white", "palette", "one bit")
+        ),
+        *((kind, "tif") for kind in ("one bit", "one bit, black is 1", "turned", "LZW", "int32", "float32", "bool")),
+        *(("one bit", "bmp"), ("one bit", "pbm")),
+    ],
+)
+def test_mask_is_what_is_not_zero(tmp_path: Path, kind: str, ending: str) -> None:
+    write_png(tmp_path / "a.png", image_of(6, 8))
+    write_mask(tmp_path / f"m.{ending}", kind)
+    write_table(tmp_path, f"a,1,1,1,m.{ending}", header="image,r,g,b,mask")
+    data = open_scenes(tmp_path)
+    mask = data.scenes[0].read()[1]
+    np.testing.assert_array_equal(mask, masked_right_half((6, 8), np.bool_, True))
+    assert data.treatment["mask"].endswith("1 of 1 images have one, with 24 masked pixels (50 %)")
+
+
+def test_reports_empty_mask(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", image_of(6, 8))
+    np.save(tmp_path / "m.npy", np.zeros((6, 8)))
+    write_table(tmp_path, "a,1,1,1,m.npy", header="image,r,g,b,mask")
+    assert "0 masked pixels (0 %); 1 masks are empty (a)" in open_scenes(tmp_path).treatment["mask"]
+
+
+@pytest.mark.parametrize("ending", ["jpg", "webp", "tif"])
+def test_refuses_lossy_mask(tmp_path: Path, ending: str) -> None:
+    write_png(tmp_path / "a.png", image_of(6, 8))
+    mask = Image.fromarray(masked_right_half((6, 8), np.uint8, 255))
+    mask.save(tmp_path / f"m.{ending}", **({"compression": "jpeg"} if ending == "tif" else {}))
+    write_table(tmp_path, f"a,1,1,1,m.{ending}", header="image,r,g,b,mask")
+    with pytest.raises(FormatError, match="lossy"):
+        open_scenes(tmp_path)
+
+
+@pytest.mark.parametrize("dtype", [">u2", "<u2", ">f4", ">f8"])
+def test_array_in_any_byte_order(tmp_path: Path, dtype: str) -> None:
+    image = image_of(6, 8)
+    np.save(tmp_path / "a.npy", np.asfortranarray(image.astype(dtype)))
+    write_table(tmp_path, "a,1,1,1,100", header="image,r,g,b,black")
+    values, _ = open_scenes(tmp_path).scenes[0].read()
+    assert values.dtype.isnative
+    np.testing.assert_array_equal(values, np.maximum(image.astype(float) - 100, 0))

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from foundation.errors import CropError, FormatError
+from foundation.errors import CropError, FormatError, InputError
 from generator import philox
 from generator.masks.making import (
     FULL,
@@ -103,6 +103,37 @@ def test_uses_sets_in_order_of_names(tmp_path: Path) -> None:
     assert (described["masks"], described["sets"]) == ("files", 3)
     save_mask(tmp_path / "c.png", np.full((2, 2), 0.7), 16)
     assert find_masks(tmp_path, 2).describe()["sha256"] != described["sha256"]
+
+
+def numbered_masks(folder: Path) -> dict[str, float]:
+    """Write masks of three pictures, whose numbers have one or two digits, and return their values."""
+    values = {"img1": 0.25, "img2": 0.5, "img10": 0.75}
+    for name, value in values.items():
+        save_mask(folder / f"{name}_1.png", np.full((2, 2), value), 16)
+    return values
+
+
+@pytest.mark.parametrize("order", [("img1", "img10", "img2"), ("img10", "img1"), ("img2",)])
+def test_pairs_masks_with_pictures_by_name(tmp_path: Path, order: tuple[str, ...]) -> None:
+    values = numbered_masks(tmp_path)
+    plan = find_masks(tmp_path, 2).paired([f"sub/{name}.jpg" for name in order], images_each=2)
+    second_weights = [float(plan.maker(number).weights(2, 2, 2)[0, 0, 1]) for number in range(2 * len(order))]
+    np.testing.assert_allclose(second_weights, np.repeat([values[name] for name in order], 2), atol=1e-4)
+    assert plan.describe()["pairing"] == "names"
+
+
+def test_other_names_take_masks_in_natural_order(tmp_path: Path) -> None:
+    numbered_masks(tmp_path)
+    plan = find_masks(tmp_path, 2).paired(["a.png", "b.png", "c.png"], images_each=1)
+    second_weights = [float(plan.maker(number).weights(2, 2, 2)[0, 0, 1]) for number in range(3)]
+    np.testing.assert_allclose(second_weights, [0.25, 0.5, 0.75], atol=1e-4)
+    assert "pairing" not in plan.describe()
+
+
+def test_refuses_masks_of_only_some_pictures(tmp_path: Path) -> None:
+    numbered_masks(tmp_path)
+    with pytest.raises(InputError, match=r"1 of 2 pictures .*other\.png"):
+        find_masks(tmp_path, 2).paired(["img1.png", "other.png"], images_each=1)
 
 
 @pytest.mark.parametrize("data", [b"", b"no picture"])
