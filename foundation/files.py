@@ -33,6 +33,7 @@ from typing import Any, BinaryIO, Final, TypeGuard, cast
 from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError
 
 _PARTIAL = ".partial"
+_MAX_COMPONENT_BYTES = 255  # NAME_MAX of the usual file systems
 _BROKEN_LINK = "it is a link to a place that does not exist: create or mount that place, or choose another path"
 _PART_IS_A_FILE = "a part of that path is a file, not a folder; choose another path"
 _REMEDIES = {
@@ -79,7 +80,11 @@ FOLDER_ATTEMPTS = 1000
 
 def partial_path(path: Path) -> Path:
     """Return the hidden name of `path` while it is incomplete."""
-    return path.with_name(f".{path.name}{_PARTIAL}")
+    name = f".{path.name}{_PARTIAL}"
+    if len(os.fsencode(name)) > _MAX_COMPONENT_BYTES >= len(os.fsencode(path.name)):
+        # The name itself is allowed, so it is replaced by its hash in the hidden name.
+        name = f".{sha256_of(os.fsencode(path.name))}{_PARTIAL}"
+    return path.with_name(name)
 
 
 def is_partial(name: str) -> bool:
@@ -130,27 +135,29 @@ def reading_error(path: Path, error: OSError, remedy: str, description: str = ""
 
 
 def read_text(path: Path, remedy: str, description: str = "") -> str:
-    """Return the text of a file in UTF-8; errors as in `reading_error`."""
+    """Return the text of a file in UTF-8, or in UTF-16 with a byte order mark; errors as in `reading_error`."""
     try:
-        return path.read_text(encoding="utf-8-sig")
+        data = path.read_bytes()
+        # Excel saves "Unicode text" in UTF-16.
+        is_utf_16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text = data.decode("utf-16" if is_utf_16 else "utf-8-sig")
     except OSError as error:
         raise reading_error(path, error, remedy, description) from error
     except UnicodeDecodeError as error:
         raise _not_utf_8(path, error, remedy) from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _not_utf_8(path: Path, error: UnicodeDecodeError, remedy: str) -> FormatError:
-    start, valid = error.object[:4], error.object[: error.start]
-    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        problem = "text in UTF-16, expected UTF-8"
-    elif b"\0" in error.object:
+    if b"\0" in error.object or error.encoding != "utf-8":
         return FormatError("binary data, expected text in UTF-8", about=path, remedy=remedy)
-    else:
-        problem = (
-            f"line {valid.count(10) + 1} has the byte 0x{error.object[error.start]:02x}, expected text in UTF-8; the "
-            "file may be in Latin-1 (Windows-1252)"
-        )
-    return FormatError(problem, about=path, remedy="save it as UTF-8 (Save as in most editors)")
+    line = error.object[: error.start].count(10) + 1
+    return FormatError(
+        f"line {line} has the byte 0x{error.object[error.start]:02x}, expected text in UTF-8; the file may be in "
+        "Latin-1 (Windows-1252)",
+        about=path,
+        remedy="save it as UTF-8 (Save as in most editors)",
+    )
 
 
 def read_csv(path: Path, remedy: str, description: str = "") -> tuple[list[str], list[dict[str, str]]]:

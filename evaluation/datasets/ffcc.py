@@ -36,7 +36,7 @@ def is_ffcc(folder: Folder) -> bool:
     for child in folder.within(1):
         names = child.files
         for name in islice((name for name in names if name.lower().endswith(".png")), _SAMPLED_NAMES):
-            if child.has(f"{name[:-4]}.txt"):
+            if child.has(f"{name[:-4]}.txt") or child.has(f"{name[:-4]}.TXT"):
                 return True
     return False
 
@@ -50,14 +50,14 @@ def open_ffcc(location: str, options: DataOptions, scanned_folder: Folder | None
     lone_texts: list[str] = []
     for child in folder.within(_SEARCH_DEPTH):
         images = child.images()
-        texts = {name[:-4] for name in child.files if name.lower().endswith(".txt")}
+        texts = {name[:-4]: str(child.path / name) for name in child.files if name.lower().endswith(".txt")}
         lone_thumbnails.extend(images[name] for name in images if name not in texts)
         if images:
-            lone_texts.extend(str(child.path / f"{name}.txt") for name in sorted(texts.difference(images)))
+            lone_texts.extend(texts[name] for name in sorted(texts.keys() - images))
         prefix = child.path.relative_to(folder.path).as_posix()
         prefix = "" if prefix == "." else f"{prefix}/"
         scenes.extend(
-            ThumbnailScene(f"{prefix}{name}.png", path, f"{path[:-4]}.txt", black, options.saturation)
+            ThumbnailScene(f"{prefix}{name}.png", path, texts[name], black, options.saturation)
             for name, path in images.items()
             if name in texts
         )

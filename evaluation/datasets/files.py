@@ -23,7 +23,7 @@ from evaluation.scene import Image
 from foundation import files
 from foundation.arrays import native
 from foundation.errors import FormatError, InputError, first_few
-from foundation.natural_order import in_natural_order
+from foundation.names import comparable, in_natural_order
 from generator.files import decode_png, decode_tiff, read_native, require_plausible
 
 IMAGE_ENDINGS = (".png", ".tif", ".tiff", ".npy")  # file types of linear images with 16 bits or more
@@ -75,6 +75,7 @@ class Folder:
         for name in self.files:
             stem, _, ending = name.rpartition(".")
             if f".{ending.lower()}" in endings:
+                stem = comparable(stem)
                 if stem in paths:
                     raise FormatError(
                         f"{self.path} has {name} and {Path(paths[stem]).name}, expected one file per image; remove one"
@@ -107,6 +108,7 @@ def match_images(
     >>> match_images(["1", "2"], {"2": "set/2.png"}, "gt.txt", Path("set"), partial=True)
     ([1], '1; 1 of the 2 images of gt.txt is missing and excluded')
     """
+    names = [comparable(name) for name in names]
     expected_names = set(names)
     if len(expected_names) != len(names):
         seen_names: set[str] = set()
@@ -181,31 +183,36 @@ def read_light(path: Path | str) -> Light:
     return check_light(to_numbers(read_text(path), str(path)), str(path))
 
 
+def split_header(line: str) -> tuple[list[str], str]:
+    """Return the column names in the first line of a table and its separator: comma, semicolon or tab."""
+    separator = max(",;\t", key=line.count)
+    return [name.strip().strip('"') for name in line.split(separator)], separator
+
+
 def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, Mapping[str, str]]]:
     """Yield the file and line of each table row, for messages, and its fields by column."""
+    lines = files.read_text(path, "restore it").splitlines()
+    header, separator = split_header(lines[0] if lines else "")
+    missing = [name for name in columns if name not in header]
+    if missing:
+        raise FormatError(
+            f"{path} has the columns {','.join(header) or 'of an empty file'}, expected {','.join(columns)} among "
+            f"them; {','.join(missing)} is missing"
+        )
+    duplicates = [name for name in columns if header.count(name) > 1]
+    if duplicates:
+        raise FormatError(f"{path} has two columns {duplicates[0]!r}, expected each once; remove one")
+    rows = csv.reader(lines[1:], delimiter=separator, skipinitialspace=True)
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.reader(file, skipinitialspace=True)
-            header = [name.strip() for name in next(rows, list[str]())]
-            missing = [name for name in columns if name not in header]
-            if missing:
-                raise FormatError(
-                    f"{path} has the columns {','.join(header) or 'of an empty file'}, expected "
-                    f"{','.join(columns)} among them; {','.join(missing)} is missing"
-                )
-            duplicates = [name for name in columns if header.count(name) > 1]
-            if duplicates:
-                raise FormatError(f"{path} has two columns {duplicates[0]!r}, expected each once; remove one")
-            for row in rows:
-                origin = f"{path}, line {rows.line_num}"
-                if not row:
-                    continue
-                if len(row) != len(header):
-                    raise FormatError(f"{origin} has {len(row)} fields, expected {len(header)}; correct it")
-                yield origin, dict(zip(header, row, strict=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or str(error)
-        raise FormatError(f"{path} cannot be read: {reason}; restore it") from error
+        for row in rows:
+            origin = f"{path}, line {rows.line_num + 1}"
+            if not row:
+                continue
+            if len(row) != len(header):
+                raise FormatError(f"{origin} has {len(row)} fields, expected {len(header)}; correct it")
+            yield origin, dict(zip(header, row, strict=True))
+    except csv.Error as error:
+        raise FormatError(f"{path} cannot be read: {error}; restore it") from error
 
 
 def parse_light(row: Mapping[str, str], columns: Sequence[str], origin: str, remedy: str = "restore the file") -> Light:

@@ -16,6 +16,7 @@ proportional to light.
 
 from __future__ import annotations
 
+import codecs
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,11 +35,13 @@ from evaluation.datasets.files import (
     parse_number,
     read_mask,
     read_rows,
+    split_header,
 )
 from evaluation.datasets.options import DataOptions, level_note
 from evaluation.scene import Image, SceneSet
 from foundation.compiled import ordered_map, processor_count
 from foundation.errors import FormatError, InputError, first_few
+from foundation.names import comparable
 
 COLUMNS = ("image", "r", "g", "b")  # required columns of the table
 
@@ -49,6 +52,7 @@ _PICTURES = (".jpg", ".jpeg", ".webp", ".heic", ".gif", ".bmp")
 _RAWS = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef", ".srw", ".crw")
 _MASK = "_mask"
 _MASK_ENDINGS = (".png", ".tif", ".tiff")
+_MAX_HEADER_BYTES = 4096  # of the first line of a table
 _INSPECTED_TABLES = 50  # tables of a folder whose headers are read to find the one with ground truths
 
 
@@ -188,7 +192,7 @@ def refuse_unusable_table(folder: Folder) -> None:
         raise FormatError(
             f"{folder.path} has no supported layout: for images of your own, {name} lacks the columns "
             f"{','.join(missing)} (its first line: {header.strip()[:80] or 'empty'}), expected {','.join(COLUMNS)}, "
-            "separated by commas; correct it, or give another folder"
+            "separated by commas, semicolons or tabs; correct it, or give another folder"
         )
 
 
@@ -200,15 +204,19 @@ def _headers(folder: Folder) -> dict[str, str]:
     headers: dict[str, str] = {}
     for name in [name for name in folder.files if name.lower().endswith(".csv")][:_INSPECTED_TABLES]:
         try:
-            with (folder.path / name).open(encoding="utf-8-sig") as file:
-                headers[name] = file.readline()
-        except (OSError, UnicodeDecodeError):
+            with (folder.path / name).open("rb") as file:
+                line = file.readline(_MAX_HEADER_BYTES)
+        except OSError:
             continue
+        # Bytes that are not UTF-8 are reported when the table is read.
+        is_utf_16 = line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text = line.decode("utf-16" if is_utf_16 else "utf-8-sig", errors="ignore")
+        headers[name] = text.partition("\n")[0]
     return headers
 
 
 def _columns(header: str) -> list[str]:
-    return [column.strip().strip('"') for column in header.split(",")]
+    return split_header(header)[0]
 
 
 @dataclass(frozen=True)
@@ -218,8 +226,9 @@ class _FolderIndex:
     folder: Folder
 
     @cached_property
-    def files(self) -> frozenset[str]:
-        return frozenset(self.folder.files if self.folder.path.is_dir() else ())
+    def files(self) -> Mapping[str, str]:
+        """Names of the files, by their normal form."""
+        return {comparable(name): name for name in self.folder.files} if self.folder.path.is_dir() else {}
 
     @cached_property
     def images(self) -> Mapping[str, str]:
@@ -230,16 +239,16 @@ class _FolderIndex:
         """Mask files, by name of their image without ending."""
         mask_files: dict[str, str] = {}
         for endings in (_PICTURES, _MASK_ENDINGS):
-            for file in sorted(self.files, reverse=True):
-                stem = file.rpartition(".")[0]
-                if stem.endswith(_MASK) and _ending(file) in endings:
-                    mask_files[stem[: -len(_MASK)]] = file
+            for name in sorted(self.files, reverse=True):
+                stem = name.rpartition(".")[0]
+                if stem.endswith(_MASK) and _ending(name) in endings:
+                    mask_files[stem[: -len(_MASK)]] = self.files[name]
         return mask_files
 
     @cached_property
     def unusable(self) -> Mapping[str, str]:
-        """JPEG or other sRGB pictures and raw files, by name without ending."""
-        return {Path(file).stem: file for file in self.files if _ending(file) in (*_PICTURES, *_RAWS)}
+        """Files of other types than images, by name without ending."""
+        return {Path(name).stem: file for name, file in self.files.items() if _ending(file) not in IMAGE_ENDINGS}
 
 
 def _ending(file: str) -> str:
@@ -248,19 +257,21 @@ def _ending(file: str) -> str:
 
 def _find_image(folder: Path, name: str, origin: str, indices: dict[str, _FolderIndex]) -> str | None:
     """Return the path of a listed image, with or without ending in the table; None if it does not exist."""
-    parent, _, file = name.rpartition("/")
-    if reason := _refusal_reason(file):
-        raise FormatError(f"{origin}: {name} is {reason}")
+    parent, _, file = comparable(name).rpartition("/")
+    if _ending(file) in (*_PICTURES, *_RAWS):
+        raise FormatError(f"{origin}: {name} is {_refusal_reason(file)}")
     if parent not in indices:
         indices[parent] = _FolderIndex(Folder(folder / parent))
     index = indices[parent]
-    if _ending(file) in IMAGE_ENDINGS:
-        return f"{index.folder.path}{os.sep}{file}" if file in index.files else None
+    if file in index.files:
+        if _ending(file) in IMAGE_ENDINGS:
+            return f"{index.folder.path}{os.sep}{index.files[file]}"
+        raise FormatError(f"{origin}: {name} is {_refusal_reason(file)}")
     return index.images.get(file)
 
 
 def _refusal_reason(file: str) -> str:
-    """Return why a file with this ending cannot be linear camera RGB; an empty string if it can."""
+    """Return why a file with this ending is not read as an image."""
     if _ending(file) in _PICTURES:
         file_type = "JPEG, " if _ending(file) in (".jpg", ".jpeg") else ""
         return (
@@ -272,20 +283,23 @@ def _refusal_reason(file: str) -> str:
             "a raw file with a colour mosaic, expected an image; make a linear 16-bit file of it, for instance with "
             "dcraw -h -D -4 -T, and list that file"
         )
-    return ""
+    return (
+        f"a file of the type {_ending(file)}, which is not read; expected linear camera RGB "
+        f"({', '.join(IMAGE_ENDINGS)}); convert it, and list that file"
+    )
 
 
 def _unusable_file(folder: Path, name: str, origin: str, indices: Mapping[str, _FolderIndex]) -> str | None:
     """Return why the unusable file that has the name of a missing image is refused; None if there is none."""
-    parent, _, file = name.rpartition("/")
+    parent, _, file = comparable(name).rpartition("/")
     stem = Path(file).stem if _ending(file) in IMAGE_ENDINGS else file
     file_name = indices[parent].unusable.get(stem)
     return file_name and f"{origin}: {name} exists only as {folder / parent / file_name}: {_refusal_reason(file_name)}"
 
 
 def _find_mask(name: str, image: str, indices: Mapping[str, _FolderIndex]) -> str:
-    index = indices[name.rpartition("/")[0]]
-    file = index.masks.get(Path(image).stem)
+    index = indices[comparable(name).rpartition("/")[0]]
+    file = index.masks.get(comparable(Path(image).stem))
     return f"{index.folder.path}{os.sep}{file}" if file else ""
 
 

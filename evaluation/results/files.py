@@ -27,6 +27,7 @@ from evaluation.results.result import Result
 from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError, counted, first_few
 from foundation.files import csv_text, file_sha256, read_text
+from foundation.names import comparable
 
 ERRORS_FILE = "errors.csv"  # Its name in a results folder
 
@@ -214,12 +215,13 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
     """Return the estimates of a file for the images of a data set; every image needs exactly one line."""
     text = read_text(path, f"give a CSV file of estimates, {_ESTIMATES_TEXT}")
     by_stem = _by_stem(images)
-    image_names = set(images)
+    image_names = {comparable(image): image for image in images}
     lights: dict[str, npt.NDArray[np.float64]] = {}
     unknown: list[str] = []
     repeated: dict[str, None] = {}
     for image_name, light in _parse_estimates(path, text):
-        image = image_name if image_name in image_names else by_stem.get(image_name, by_stem.get(_stem(image_name)))
+        name_in_file = comparable(image_name)
+        image = image_names.get(name_in_file) or by_stem.get(name_in_file, by_stem.get(_stem(name_in_file)))
         if image is None:
             unknown.append(image_name)
         elif image in lights:
@@ -245,7 +247,7 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
 def _by_stem(images: Sequence[str]) -> dict[str, str]:
     stems: defaultdict[str, list[str]] = defaultdict(list)
     for image in images:
-        stems[_stem(image)].append(image)
+        stems[_stem(comparable(image))].append(image)
     return {stem: stem_images[0] for stem, stem_images in stems.items() if len(stem_images) == 1}
 
 

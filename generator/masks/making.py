@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from foundation.compiled import compiled, inlined
 from foundation.errors import FormatError, InputError, first_few
-from foundation.natural_order import in_natural_order
+from foundation.names import in_natural_order
 from generator import philox
 from generator.files import read_native, require_plausible, upright
 from generator.named_numbers import Range, parse_numbers

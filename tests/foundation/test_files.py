@@ -270,14 +270,32 @@ def test_refuses_bad_csv_with_remedy(tmp_path: Path, content: bytes | None) -> N
 
 @pytest.mark.parametrize(
     ("content", "reported"),
-    [("a\nglacé".encode("latin-1"), "line 2 has the byte 0xe9"), ("glacé".encode("utf-16"), "UTF-16")],
+    [
+        ("a\nglacé".encode("latin-1"), "line 2 has the byte 0xe9"),
+        (b"a\xff\0", "binary data"),
+        (b"\xff\xfe\x80", "binary"),
+    ],
 )
 def test_reports_other_encodings(tmp_path: Path, content: bytes, reported: str) -> None:
     path = tmp_path / "some.csv"
     path.write_bytes(content)
-    with pytest.raises(FormatError, match=reported) as caught:
+    with pytest.raises(FormatError, match=f"{reported}.*expected text in UTF-8"):
         read_csv(path, "mend it")
-    assert "UTF-8" in caught.value.remedy
+
+
+def test_reads_unicode_text_of_spreadsheets(tmp_path: Path) -> None:
+    # Excel: "Unicode text" is UTF-16 with a byte order mark, "CSV UTF-8" has a byte order mark too.
+    path = tmp_path / "some.csv"
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        path.write_bytes("name,n\r\nBüro,1\r\n".encode(encoding))
+        assert read_csv(path, "mend it") == (["name", "n"], [{"name": "Büro", "n": "1"}])
+
+
+@pytest.mark.parametrize("name", ["x" * 250, "x" * 255, 84 * "图"])
+def test_longest_names_can_be_written(tmp_path: Path, name: str) -> None:
+    write_atomic(tmp_path / name, b"content")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert is_partial(partial_path(tmp_path / name).name)
 
 
 @pytest.mark.parametrize(("number", "remedy"), [(errno.EROFS, "mount it for writing"), (errno.EACCES, "ask its owner")])

@@ -148,6 +148,8 @@ def open_lsmi(location: str, options: DataOptions, scanned_folder: Folder | None
             scenes.extend(camera_scenes)
             mixed_count = sum(isinstance(scene, LsmiMixedScene) for scene in camera_scenes)
             notes.append(f"{name} {len(camera_scenes)}, {mixed_count} under several illuminants")
+            if reader.excluded:
+                notes.append(f"{len(reader.excluded)} without ground truth are excluded ({first_few(reader.excluded)})")
             levels.append(reader.describe_levels())
     if not scenes:
         raise FormatError(f"{location} has no .tiff of {options.subset or 'any place'}; make them with 0_cvt2tiff.py")
@@ -216,6 +218,7 @@ class _Camera:
     folder: Folder
     meta: Mapping[str, Any]
     options: DataOptions
+    excluded: list[str] = field(default_factory=list[str])  # images without ground truth, with --read partial
 
     @property
     def is_preprocessed(self) -> bool:
@@ -288,8 +291,15 @@ class _Camera:
                 missing.append(place)
                 continue
             for image, lights in images:
-                if len(lights) in counts:
+                if len(lights) not in counts:
+                    continue
+                try:
                     yield self._scene(folder, place, image, lights, black, white)
+                except FormatError:
+                    # The authors' meta.json has NaN as the illuminant of some places.
+                    if not self.options.partial:
+                        raise
+                    self.excluded.append(image)
         if missing and not self.options.partial:
             raise FormatError(
                 f"{self.folder.path} lacks the .tiff files of {len(missing)} of {len(places)} places "
@@ -316,7 +326,11 @@ class _Camera:
         if not isinstance(values, list):
             raise FormatError(f"{origin} has no Light{number}, expected red, green, blue; run 1_make_mixture_map.py")
         try:
-            return check_light([float(value) for value in cast("list[Any]", values)], f"{origin}, Light{number}")
+            return check_light(
+                [float(value) for value in cast("list[Any]", values)],
+                f"{origin}, Light{number}",
+                "restore the file, or exclude the images without ground truth with --read partial",
+            )
         except (TypeError, ValueError) as error:
             raise FormatError(f"{origin}: Light{number} is {values}, expected three numbers; restore it") from error
 

@@ -33,6 +33,11 @@ def test_reads_thumbnails_of_8_and_16_bits(copy: Path) -> None:
     assert deep.saturation is None
 
 
+def test_reads_texts_in_capitals(copy: Path) -> None:
+    (copy / "folder_2/000001.txt").rename(copy / "folder_2/000001.TXT")
+    assert open_scenes(copy).scenes[1].truth.tolist() == [0.1, 0.2, 0.3]
+
+
 def test_refuses_files_without_partner(copy: Path) -> None:
     write_png(copy / "folder_1" / "2.png", image_of(2, 2))
     with pytest.raises(FormatError, match=r"2.*1.*2\.png.*0"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from pathlib import Path
 from typing import Any
 
@@ -85,10 +86,39 @@ def test_warns_if_black_level_may_be_missing(tmp_path: Path) -> None:
     assert "inspected" not in black_treatment(folder)
 
 
-def test_refuses_table_with_semicolons(copy: Path) -> None:
-    (copy / "gt.csv").write_text("image;r;g;b\na;1;2;1\n")
-    with pytest.raises(FormatError, match=r"gt\.csv.*image,r,g,b \(its first line: image;r;g;b\)"):
-        open_scenes(copy)
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_reads_table_as_spreadsheets_save_it(tmp_path: Path, separator: str, encoding: str) -> None:
+    write_png(tmp_path / "Büro.png", image_of(6, 8))
+    rows = (("image", "r", "g", "b"), ("Büro.png", "1", "2", "1"))
+    (tmp_path / "gt.csv").write_bytes("\r\n".join(separator.join(row) for row in rows).encode(encoding))
+    assert open_scenes(tmp_path).scenes[0].truth.tolist() == [1, 2, 1]
+
+
+def test_refuses_table_in_another_encoding(tmp_path: Path) -> None:
+    write_png(tmp_path / "Büro.png", image_of(6, 8))
+    (tmp_path / "gt.csv").write_bytes("image,r,g,b\nBüro.png,1,2,1\n".encode("cp1252"))
+    with pytest.raises(FormatError, match=r"gt\.csv: line 2 has the byte 0xfc"):
+        open_scenes(tmp_path)
+
+
+@pytest.mark.parametrize(("file_form", "table_form"), [("NFD", "NFC"), ("NFC", "NFD")])
+def test_compares_names_in_normal_form(tmp_path: Path, file_form: Any, table_form: Any) -> None:
+    # macOS programs write names in form D (UAX #15).
+    name = unicodedata.normalize(file_form, "Büro")
+    write_png(tmp_path / f"{name}.png", image_of(6, 8))
+    np.save(tmp_path / f"{name}_mask.npy", np.ones((6, 8)))
+    listed = unicodedata.normalize(table_form, "Büro")
+    write_table(tmp_path, f"{listed},1,1,1,{name}_mask.npy", header="image,r,g,b,mask")
+    assert open_scenes(tmp_path).scenes[0].read()[1].all()
+
+
+@pytest.mark.parametrize("name", ["a.exr", "a.jxl", "a.fits", "a"])
+def test_reports_types_that_are_not_read(tmp_path: Path, name: str) -> None:
+    (tmp_path / Path(name).with_suffix(Path(name).suffix or ".exr")).touch()
+    write_table(tmp_path, f"{name},1,2,1")
+    with pytest.raises(FormatError, match=r"type \.\w+, which is not read; expected .*\.png"):
+        open_scenes(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -135,6 +135,21 @@ def test_refuses_missing_files(copy: Path) -> None:
     assert [scene.name for scene in data.scenes] == ["sony/Place2_1.tiff", "sony/Place2_123.tiff"]
 
 
+def test_excludes_images_without_ground_truth(copy: Path) -> None:
+    # The published meta.json of the Sony has NaN illuminants (github.com/DY112/LSMI-dataset, issue 9).
+    path = copy / "sony" / "meta.json"
+    meta = json.loads(path.read_text())
+    meta["Place1"]["Light2"] = [float("nan"), 1.0, float("nan")]
+    path.write_text(json.dumps(meta))
+    with pytest.raises(FormatError, match=r"Place1, Light2.*--read partial"):
+        open_scenes(copy)
+    data = open_scenes(copy, options=DataOptions(partial=True))
+    names = [scene.name for scene in data.scenes]
+    assert "sony/Place2_1.tiff" in names
+    assert "sony/Place1_12.tiff" not in names
+    assert "1 without ground truth are excluded (Place1_12.tiff)" in data.treatment["images"]
+
+
 @pytest.mark.parametrize(
     "shares", [np.ones((8, 10)), np.ones((8, 10, 3)), np.ones((8, 10, 2), int), -np.ones((8, 10, 2))]
 )

@@ -1,6 +1,6 @@
-"""Natural order of names."""
+"""Order and comparison of names."""
 
-from foundation.natural_order import natural_sort_key
+from foundation.names import natural_sort_key
 
 
 def test_sorts_numbers_in_names_by_value() -> None:

@@ -1,8 +1,9 @@
-"""Sort names with numbers in them by value, so that `img2` comes before `img10`."""
+"""Names of files: sort them with numbers by value, and compare them in any normal form of Unicode."""
 
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable
 
 
@@ -35,3 +36,17 @@ def natural_sort_key(name: str) -> list[str | int]:
     segments: list[str | int] = list(re.split(r"([0-9]+)", name))  # text and digits alternate, text first
     segments[1::2] = [int(digits) for digits in segments[1::2]]
     return segments
+
+
+def comparable(name: str) -> str:
+    """Return a name in normal form C of Unicode (UAX #15).
+
+    macOS programs write an accented letter as two characters, other programs as one. Such names look equal, so they
+    are compared in this form.
+
+    Examples
+    --------
+    >>> comparable("Bu\u0308ro.png") == "Büro.png"
+    True
+    """
+    return unicodedata.normalize("NFC", name)
