@@ -1,19 +1,28 @@
 r"""Compare variants of rendering on three real cameras in minutes, without LUTs on disk: a fast version of worth.sh.
 
 The camera response to each patch of the simulated print is computed for the three primaries of the projector. An
-illuminant of a given chromaticity is a mixture of them. A pixel of a thumbnail is the mean of the patches that
-dithering would use, so there is no dithering noise and no sensor noise. All else is as in the commands: illuminants of
-the other half of the camera's images, learners of the suite, cross-validation over the whole camera, pooled ratios with
-bootstrap intervals paired by image, means over the seeds.
+illuminant of a given chromaticity is a mixture of these primaries. A pixel of a thumbnail is the mean of several
+patches, so there is no dithering noise and no sensor noise.
+
+Everything else is as in the commands. Illuminants come from the half of the camera's images that is not tested. The
+learned methods are those of `evaluate`. They are compared with cross-validation on all real images of the camera.
+Ratios are pooled over the cameras, with bootstrap intervals over the images, and averaged over the seeds.
 
     python examples/screening.py --pictures BSDS500/data/images --pictures imagenet-sample-images \
         --archives ARCHIVES --lever naive-matrix --lever random-like
 
 ARCHIVES is the folder with the thumbnails of the three cameras, as in examples/worth.sh.
 
-Levers: naive, naive-matrix; codes; and keep, compensate, random (the print's black) of colorimetric rendering under the
-projector's white, each optionally with -neutral (the 75 % of the pictures with the most neutral mean) or -like
-(pictures weighted to the grey-world offsets of the other half's images); relit: real scenes of the other cameras.
+A lever is a variant of the training images:
+
+- naive, naive-matrix: without a print, as in `evaluate transfer --naive`;
+- codes: rendering by codes;
+- keep, compensate, random: rendering by colour under the projector's white, with this treatment of the print's black;
+- relit: real scenes of the other cameras under other illuminants.
+
+With the suffix -neutral, keep, compensate and random use only the 75 % of the pictures with the most neutral mean. With
+the suffix -like, pictures are drawn so that the distribution of their grey-world offsets is like that of the real
+images.
 """
 
 from __future__ import annotations
@@ -52,7 +61,7 @@ LINEAR = decode_srgb(np.arange(256) / 255)
 WIDTH = 32
 CODES = np.rint(np.arange(WIDTH) * 255 / (WIDTH - 1)).astype(np.int64)
 SIDE, SMALL = 128, 64
-# White point of the target / paper white, and the largest share of the print's black that is subtracted.
+# White of the target colours relative to paper, and the largest share of the print's black that is subtracted.
 WHITE, VEIL = 0.97, 0.97
 
 
@@ -155,7 +164,7 @@ class Print:
 
 
 def nodes_of(picture: Floats, rng: np.random.Generator, linear: bool) -> Floats:
-    """Return a random node for each pixel (H, W) of a picture (H, W, 3) uint8 that preserves the mean."""
+    """Return a random node for each pixel (H, W) of a picture (H, W, 3) uint8; the mean colour is preserved."""
     if not linear:
         level = np.clip(np.floor(picture.astype(np.float32) * 31 / 255.0 + rng.random(picture.shape)), 0, 31).astype(
             int
@@ -230,7 +239,7 @@ class Training:
 
 
 def features_of(learner: FeatureLearner, images: Sequence[Floats], masked: bool) -> Floats:
-    """Return the features of images; if `masked`, pixels that are zero are excluded."""
+    """Return the features of images; if `masked`, pixels with the value zero are excluded."""
     rows: list[Any] = [learner.features(image, None, (image == 0).all(axis=2) if masked else None) for image in images]
     return np.stack(rows)
 
@@ -288,7 +297,7 @@ def main() -> None:
 def ratios_of(first: Floats, second: Floats) -> list[tuple[float, float, float]]:
     """Return the ratio of each statistic of errors (seeds, N), averaged over the seeds, with its interval.
 
-    Images are resampled, and a drawn image counts in every seed, as in `evaluate transfer`.
+    The bootstrap draws images; a drawn image counts with its errors of all seeds, as in `evaluate transfer`.
     """
     samples = [[ErrorSample.of(errors) for errors in by_seed] for by_seed in (first, second)]
 
