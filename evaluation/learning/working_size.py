@@ -8,8 +8,8 @@ import numpy.typing as npt
 from evaluation.methods.prepared import PreparedImage
 from evaluation.scene import Image
 
-# Smallest fraction of usable pixels in a block. With less, single pixels at the edge of a masked chart or a clipped sky
-# would be used.
+# Smallest fraction of usable pixels in a block. A smaller limit would include single pixels at the edge of a masked
+# chart or a clipped sky.
 _MIN_USABLE_SHARE = 0.5
 
 
@@ -90,5 +90,5 @@ def lights_from_chromaticities(red_green: npt.NDArray[np.float64]) -> npt.NDArra
     return clipped / clipped.sum(axis=1, keepdims=True)
 
 
-# Smallest chromaticity of an estimate: extrapolating models may return impossible colours.
+# Smallest chromaticity of an estimate, because models that extrapolate may return negative values.
 _MIN_CHROMATICITY = 1e-6

@@ -1,1 +1,1 @@
-"""Benefit of generated training images: methods are trained on them, tested on real images, and compared with baselines."""
+"""Benefit of generated training images: methods are trained on them, and tested on real images with baselines."""
