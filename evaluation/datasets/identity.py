@@ -45,7 +45,7 @@ def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:
 
 
 def find_training_images(scenes: Sequence[Scene], training_identities: npt.NDArray[np.uint64]) -> tuple[str, ...]:
-    """Return the names of the scenes that are also training images; `training_identities` are their `identities`."""
+    """Return the names of the scenes that are among the training images with these identities, (N, 2) uint64."""
     images = {int(number) for number in training_identities[:, 0]}
     names = {int(number) for number in training_identities[:, 1]}
     recognised_names: list[str] = []

@@ -165,7 +165,7 @@ def _find_table(location: Path, scanned_folder: Folder | None) -> Path:
 
 
 def refuse_unusable_table(folder: Folder) -> None:
-    """Raise FormatError if a folder with images has one table, which lacks required columns."""
+    """Raise FormatError if a folder with images has only one table, and required columns are missing there."""
     headers = _headers(folder)
     if len(headers) == 1 and folder.images(IMAGE_ENDINGS):
         ((name, header),) = headers.items()

@@ -21,7 +21,7 @@ from scipy import stats
 
 from foundation.errors import InputError
 
-# Errors with a smaller difference are equal, degrees: two units of the last decimal in files.
+# Errors that differ by less than this are equal, degrees: two units of the last decimal in files.
 TIE_DEG: Final = 2e-6
 
 # Largest number of counts (resamples × images) at a time. Arrays of 1.6 MB stay in the processor's cache.
@@ -107,7 +107,7 @@ def bounded_figures(
             method="BCa",
             rng=np.random.default_rng(seed),
         )
-        # BCa has no ends if all resamples are equal, or if a ratio is infinite in some. Percentiles replace it then.
+        # BCa has no ends if all resamples are equal, or if a ratio is infinite in some. Percentiles are then used.
         probabilities = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
         percentile_ends = np.quantile(bootstrap.bootstrap_distribution, probabilities, axis=-1, method="inverted_cdf")
     ends = np.where(np.isnan(bootstrap.confidence_interval), percentile_ends, bootstrap.confidence_interval)

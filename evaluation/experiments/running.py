@@ -40,7 +40,7 @@ class SceneMethod(Protocol):
         ...
 
     def estimate_scene(self, scene: Scene) -> npt.NDArray[np.float64] | None:
-        """Return the estimate (3,) float64 for a scene, camera RGB of any length; None if it has no estimate."""
+        """Return the estimate (3,) float64 for a scene, camera RGB of any length; None without an estimate."""
         ...
 
 

@@ -77,8 +77,7 @@ def adapt(pretrained: LearnedMethod, local_fit: LocalFit, worth: float = PRETRAI
     share = worth / (worth + count) if tuned is model else 1.0
     if local_fit.held_out is not None:
         share = stacked_share(model.lights(local_fit.features), local_fit.held_out, local_fit.truths, share)
-    # A pretrained model does not improve with N. Its weight is therefore small from N = 2 W, even if stacking returns
-    # 1.
+    # A pretrained model does not improve with N. From N = 2 W, its weight is small even if stacking returns 1.
     share *= worth**4 / (worth**4 + count**4)
     return replace(pretrained, model=BlendedModel(tuned, local_fit.method.model, np.array(share)))
 

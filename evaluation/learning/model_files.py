@@ -1,7 +1,8 @@
 """Read and write model files: arrays of a fitted method with a record of its training.
 
 A model file is a NumPy `.npz` without pickled objects, so opening it runs no code. It has the arrays of the model by
-name. The array `about` is a JSON text with the method, its settings and the provenance. A reader checks all parts.
+name. The array `about` is a JSON text with the method, its settings and the provenance. All parts are checked when
+read.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ The derivative of order 2 is √(f_xx² + 4 f_xy² + f_yy²).
 
 A vector has 16 float32, one cache line. Neighbouring pixels along the filtered axis belong to different vectors, so
 that all loads are aligned. Therefore 16 rows are transposed before the filter along x, except with the shortest kernels
-of order 2. Its results are stored as (columns, rows, 16) for the filter along y: each column has 16 numbers of every
-row. A tile reuses the rows that it shares with the tile above.
+of order 2. For the filter along y, the rows filtered along x are stored as (columns, rows, 16): a column has 16 numbers
+of every row. A tile reuses the rows that it shares with the tile above.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from generator.kernels.vector import (
     store,
 )
 
-# Number of vectors that are computed together. A multiplication takes this number of cycles, so no sum waits for it.
+# Number of vectors that are computed together: the cycles of a multiplication, so that no sum has to wait.
 OUTPUTS: Final = 4
 _FLOAT: Final = 4  # bytes of a float32
 INTERLEAVED_PIXELS: Final = 16  # pixels of a row that fill three vectors with interleaved R, G, B
@@ -445,7 +445,7 @@ def filter_columns(
     rows: int,
     out: npt.NDArray[np.float32],
 ) -> None:
-    """Filter rows along y that are already filtered along x, and write the size of the derivative to `out`.
+    """Filter the rows of `filter_rows` along y, and write the magnitude of the derivative to `out`.
 
     `columns`: (order + 1, Q / 16, R, 16) float32 from `filter_rows`, R ≥ rows + 2 radius, rows a multiple of 4.
     `weights`: as in `filter_rows`. `out`: (rows, Q) or longer float32, starts at a cache line.

@@ -70,7 +70,7 @@ def logarithm(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def index_map(prepared: PreparedImage, index: Index) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """Return the smoothed index of each pixel, (H, W) float32, and (H, W) bool, True for selectable pixels."""
+    """Return the smoothed index of each pixel, (H, W) float32, and (H, W) bool, True if selectable."""
     index_values = np.empty((prepared.height, prepared.width), dtype=np.float32)
     usable = prepared.usable(0).copy()
     for rows, inner, strip in _strips(prepared):
@@ -223,8 +223,8 @@ _LARGEST_DISTANCE = 0.01 * BANDWIDTH  # colours within it are near a mean: angle
 _SMALLEST_STEP = 1e-3 * BANDWIDTH  # a mean that moves less is final: distance times angle (radians)
 _MERGING_DISTANCE = BANDWIDTH / 2  # means within it are one cluster: distance times angle (radians)
 _MAX_STEPS = 100  # limit for steps of a mean, which needs far fewer
-# A channel with at most this derivative of its logarithm is flat. Rounding to float32 alone can cause it. A step of one
-# 16-bit count near white causes 3e-6.
+# A channel with at most this derivative of its logarithm is flat. Rounding to float32 can cause this value. A step of
+# one 16-bit count near white causes 3e-6.
 _FLAT_SLOPE = 2e-6
 
 
@@ -232,7 +232,7 @@ def angle_to_grey(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float3
     """Return the angle between log derivatives and (1, 1, 1), radians, and the pixels without gradient, see `Index`."""
     slopes = gradient_length(logarithm(strip))
     red, green, blue = (slopes[..., channel] for channel in range(3))
-    # arctan2, because an arc cosine near 1 resolves only angles above 3e-4; below, rounding of the processor decides.
+    # arctan2 is used, because an arc cosine near 1 cannot resolve angles below 3e-4.
     distance = np.sqrt((green - blue) ** 2 + (blue - red) ** 2 + (red - green) ** 2)
     return np.arctan2(distance, slopes.sum(axis=2)), np.asarray((slopes <= _FLAT_SLOPE).all(axis=2), dtype=bool)
 

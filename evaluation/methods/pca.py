@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 
-# The pixels at either end are those beyond two limits of their projections. In images with at least this number of
-# usable pixels, the limits are first estimated from a sample.
+# Pixels are used if their projection is below a lower or above an upper limit. With at least this number of usable
+# pixels, the limits are first estimated from a sample.
 _SPARSE_COUNT = 1 << 16
 _SPARSE_INTERVAL = 16  # one of this number of pixels is sampled
 # Margin of an estimated limit, in standard deviations of its rank for randomly drawn pixels. If a limit is outside its

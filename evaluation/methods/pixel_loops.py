@@ -292,8 +292,8 @@ def sum_powers(
             sums[j % 3] += sums_by_position[j]
 
 
-# Number of equal bins of projections, from 0 to the largest possible projection. Even in an image of 18 megapixels, a
-# bin has only a few thousand pixels.
+# Number of equal bins of projections, from 0 to the largest possible projection. In an image of 18 megapixels, the bins
+# that are sorted have a few thousand pixels.
 BINS = 4096
 # The first counted pixel moves by this number of columns from row to row, so that all columns are counted.
 _ROW_SHIFT = 5

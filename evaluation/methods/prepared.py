@@ -23,8 +23,8 @@ import numpy.typing as npt
 from evaluation.methods.method import Method
 from evaluation.scene import Image
 
-# Estimate (3,) float64 if no pixel is usable or all pixels are black. Methods return this object itself. Callers
-# compare with `is` to distinguish it from an image that is really grey.
+# Estimate (3,) float64 if no pixel is usable or all pixels are black. Methods return this object itself. Callers use
+# `is` to distinguish it from the estimate of a grey image.
 GREY = np.full(3, 3**-0.5)
 GREY.setflags(write=False)
 
@@ -92,8 +92,8 @@ def shrink(
 
 CACHED_PIXELS = 1 << 20  # largest image whose derivatives are kept, px; each takes up to 12 MB
 
-# Up to this p, values are divided by the largest value of the image: even 1e-19 to this power is in the range of
-# float64. For larger p, a first pass finds the largest used value, by which values are divided instead.
+# Up to this p, values are divided by the largest value of the image, because even 1e-19 to this power is in the range
+# of float64. For larger p, they are divided by the largest usable value, which needs a second pass.
 SAFE_POWER = 16
 
 _ALL_USABLE = np.zeros((0, 0), dtype=bool)  # stands for a mask with all pixels usable
@@ -269,7 +269,7 @@ class PreparedImage:
         return sums
 
     def derivative(self, order: int, sigma: float) -> npt.NDArray[np.float32]:
-        """Return the size of the Gaussian derivative, (H, W, 3) float32, multiplied by `scale`.
+        """Return the magnitude of the Gaussian derivative, (H, W, 3) float32, multiplied by `scale`.
 
         Order 0 is the smoothed image, order 1 the length of the gradient, order 2 √(f_xx² + 4 f_xy² + f_yy²). Positions
         outside the image have the value of the nearest pixel.

@@ -32,7 +32,7 @@ class PatchwiseMethod:
     """A global method that is applied to each patch of a grid; `estimate` uses the whole image.
 
     - `method`: the global method.
-    - `patches`: patches along the shorter side; patches are nearly square.
+    - `patches`: number of patches along the shorter side; they are nearly square.
 
     Examples
     --------

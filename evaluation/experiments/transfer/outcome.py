@@ -49,7 +49,7 @@ class RowFigures:
 
 @dataclass(frozen=True)
 class RowRatio:
-    """Statistics of a row relative to those of another row with the same method, paired by image."""
+    """Statistics of a row divided by the statistics of another row with the same method, paired by image."""
 
     # Numerator and denominator of the ratios
     row: TransferRow

@@ -336,7 +336,7 @@ class TransferPlan:
 
 
 def is_generated(scene_set: SceneSet) -> bool:
-    """Return whether images of the set were made by `generate`."""
+    """Return True if images of the set were made by `generate`."""
     return any(isinstance(scene, GeneratedScene) for scene in scene_set.scenes)
 
 

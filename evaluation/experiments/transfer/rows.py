@@ -62,7 +62,7 @@ class TransferRow:
     method: str
     kind: Training  # Its training data
     data: str  # Name of the training data set; for cross-validation only if the test set was generated
-    images: int  # Number of training images; cross-validation: of the smallest training part; no training: 0
+    images: int  # Number of training images; cross-validation: in the smallest training part; no training: 0
     # One result for each seed, or only one if the seed has no influence
     results: tuple[Result, ...]
     # Use and number ("all" or digits) of real images of the other folds; both are empty if no real images were used.
