@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features, LightModel, require_installed
-from evaluation.learning.working_size import reduce
+from evaluation.learning.working_size import reduce_image
 from evaluation.scene import Image
 from foundation.errors import InputError
 
@@ -60,7 +60,7 @@ class ConvNet(FeatureLearner):
 
         Smaller images are padded with unusable black pixels. See `FeatureLearner.features`.
         """
-        small, used = reduce(image, saturation, mask, self.working_size)
+        small, used = reduce_image(image, saturation, mask, self.working_size)
         if not small[used].any():
             return None
         height, width = used.shape

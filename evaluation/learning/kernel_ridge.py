@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features, LightModel
-from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
+from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce_image
 from evaluation.scene import Image
 
 BINS = 64  # bins of r and of g, each 0 … 1; near usual illuminants a bin is 2° to 4° wide
@@ -61,7 +61,7 @@ class KernelRidge(FeatureLearner):
 
         Black pixels are excluded. If pixels are weighted by brightness, the sum of the counts is 65535 before rounding.
         """
-        small, used = reduce(image, saturation, mask, self.working_size)
+        small, used = reduce_image(image, saturation, mask, self.working_size)
         pixels = small[used & small.any(axis=2)]
         if not len(pixels):
             return None

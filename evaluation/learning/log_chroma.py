@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features, LightModel
-from evaluation.learning.working_size import reduce
+from evaluation.learning.working_size import reduce_image
 from evaluation.scene import Image
 from foundation.errors import InputError
 
@@ -267,7 +267,7 @@ class LogChroma(FeatureLearner):
 
         See `FeatureLearner.features`.
         """
-        small, used = reduce(image, saturation, mask, self.working_size)
+        small, used = reduce_image(image, saturation, mask, self.working_size)
         counts = _histogram(small[used], self.least)
         if not counts.any():
             return None

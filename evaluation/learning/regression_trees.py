@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features, require_installed
-from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
+from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce_image
 from evaluation.scene import Image
 
 _FEATURES = 4  # mean, brightest, dominant and palette mode (section 3.1)
@@ -65,7 +65,7 @@ class RegressionTrees(FeatureLearner):
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float32] | None:
         """Return four chromaticities (r, g), (8,) float32; see `FeatureLearner.features`."""
-        small, used = reduce(image, saturation, mask, self.working_size)
+        small, used = reduce_image(image, saturation, mask, self.working_size)
         pixels = small[used]
         if not pixels.any():
             return None

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features
-from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
+from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce_image
 from evaluation.metrics import recovery_error
 from evaluation.scene import Image
 
@@ -56,7 +56,7 @@ class SmartColorCat(FeatureLearner):
 
         Black pixels are excluded.
         """
-        small, used = reduce(image, saturation, mask, self.working_size)
+        small, used = reduce_image(image, saturation, mask, self.working_size)
         pixels = small[used & small.any(axis=2)]
         if not len(pixels):
             return None
