@@ -214,7 +214,7 @@ def read_light(path: Path | str) -> Light:
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield for each row of a table its file and line number, for messages, and its fields by column."""
+    """Yield the fields of each row of a table by column, after its file and line number for messages."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.reader(file, skipinitialspace=True)
@@ -316,7 +316,7 @@ def require_black_below_peak(scenes: Iterable[RawScene]) -> None:
         )
 
 
-_INSPECTED_IMAGES = 16  # number of images in which a black level is searched
+_INSPECTED_IMAGES = 16  # largest number of images that `black_level_warning` reads
 
 # If black was subtracted, an image has pixels below this fraction of its largest value. Black levels of cameras are 3 %
 # of saturation or more.
@@ -336,7 +336,7 @@ def black_level_warning(scenes: Sequence[RawScene]) -> str:
             return ""
         minima.append(float(usable.min()))
     inspected = "the image" if len(minima) == 1 else f"the {len(minima)} inspected images"
-    return f"; but the smallest value of {inspected} is {min(minima):g}, expected 0; give it with --read black=LEVEL"
+    return f"; but the smallest value of {inspected} is {min(minima):g}, expected 0; give --read black=LEVEL"
 
 
 @dataclass(frozen=True, slots=True)

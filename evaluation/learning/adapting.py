@@ -20,7 +20,7 @@ from evaluation.learning.feature_learner import FeatureLearner, Features, Learne
 from evaluation.metrics import recovery_error
 
 PRETRAINED_WORTH: Final = 200.0  # W: number of local images to which a pretrained model is equivalent
-PRIOR_IMAGES: Final = 25.0  # the expected w counts as much as this number of images
+PRIOR_IMAGES: Final = 25.0  # weight of the prior for w, as a number of images
 _SHARES: Final = np.linspace(0, 1, 101)  # candidates for w
 _FOLDS: Final = 3  # folds of the N images for cross-validation; few, because each fold requires a fit
 
@@ -96,7 +96,7 @@ def stacked_share(
     [0.0, 0.5, 1.0]
     """
     # Stacking: L. Breiman, "Stacked regressions", Machine Learning 24, 1996. A prior is added, because twenty images
-    # are too few to select the weight. The compared models also differ from the final, better ones.
+    # are too few to select the weight. The final models are also better than the models compared here.
     if not len(truths):
         return expected
     errors = np.array([recovery_error(_log_mean(first, second, share), truths).sum() for share in _SHARES])

@@ -5,7 +5,7 @@ fully convolutional network returns four channels: a local illuminant and its co
 over the image, scaled to length 1, is the estimate (equations 4 to 6). The angular error is the loss (equation 7).
 
 *Differences to the paper.* Three convolutions on thumbnails replace AlexNet or SqueezeNet pretrained on ImageNet, so
-that training takes a minute on a processor. The input is the square root of the image divided by its mean, and a mask
+that training takes a minute on a processor. The image is divided by its mean. The input is its square root and a mask
 of usable pixels. Local illuminants are exponentials of three channels. Images are flipped and get random gains as in
 section 5.1, but gains change a channel by at most 10 %.
 """

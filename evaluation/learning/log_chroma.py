@@ -151,8 +151,8 @@ def train(
     of iterations, weight of the cross-entropy and weight of the likelihood.
     """
     # Penalties are diagonal in Fourier space. L-BFGS uses parameters scaled so that the penalty is half their squared
-    # length (preconditioning, section 4.2). Scaled parameters are stored by bin, so that the packing of the paper is
-    # unnecessary. Each batch is calculated in single precision, so that it fits into the cache.
+    # length (preconditioning, section 4.2). Each batch is calculated in single precision, so that it fits into the
+    # cache.
     import scipy.fft
     import scipy.optimize
 
@@ -318,8 +318,8 @@ class LogChroma(FeatureLearner):
             penalties,
             ((self.pretraining, self.crossentropy, 0.0), (self.training, 0.0, self.likelihood)),
         )
-        # The torus is cut opposite to this centre, so it is the middle of the range, not the median. If tungsten is
-        # rare, the median is near one end of the range, and the cut could be inside the range.
+        # The torus is cut opposite to the centre. The centre is the middle of the range, because the median can be near
+        # one end. The cut could then be inside the range.
         centre = (chromas.min(axis=0) + chromas.max(axis=0)) / 2
         return LogChromaModel(filters, bias, centre, np.array(grid))
 

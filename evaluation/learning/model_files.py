@@ -192,7 +192,7 @@ def _damaged_file_error(path: Path, reason: str) -> FormatError:
 
 def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
-        # This check comes first, because numpy.load would unpickle other files, and checks an array only on reading.
+        # This check comes first, because numpy.load does not check the whole archive.
         if (damaged := archive.testzip()) is not None:
             raise ValueError(f"{damaged} is damaged")
     with np.load(path, allow_pickle=False) as content:

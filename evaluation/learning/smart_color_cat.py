@@ -25,7 +25,7 @@ from evaluation.metrics import recovery_error
 from evaluation.scene import Image
 
 FINE_BINS = 720  # bins of the extracted histograms, 0 … 1; a multiple of every number in `BIN_CHOICES`
-# Candidate numbers of bins: from too few to separate illuminants to too many for the data of the paper.
+# Candidate numbers of bins. The smallest cannot separate illuminants; the largest overfit the data of the paper.
 BIN_CHOICES = (3, 4, 5, 6, 8, 9, 10, 12, 15, 16, 18, 20, 24, 30, 36, 40, 48, 60)
 _FOLDS = 5  # folds of the training images, for the selection of the number of bins
 _MIN_IMAGES = 2 * _FOLDS  # smallest number of training images for a selection

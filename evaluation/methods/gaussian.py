@@ -39,7 +39,7 @@ from generator.kernels.vector import (
     store,
 )
 
-# Number of vectors that are computed together: the cycles of a multiplication, so that no sum has to wait.
+# Number of vectors that are computed together. Their independent sums hide the latency of a multiplication.
 OUTPUTS: Final = 4
 _FLOAT: Final = 4  # bytes of a float32
 INTERLEAVED_PIXELS: Final = 16  # pixels of a row that fill three vectors with interleaved R, G, B
@@ -90,9 +90,9 @@ def _emit_filter(
     def times(number: Any, count: int) -> Any:
         return builder.mul(number, ir.Constant(I64, count))
 
-    # Each kernel position uses the same neighbours as the position before, moved by one vector. So it loads only two
-    # new vectors, and arithmetic, not loading, limits the speed. Values at k and -k are combined before multiplication,
-    # so that derivatives of constant whole numbers are exactly zero.
+    # Without `side_by_side`, neighbours of successive kernel positions differ by one vector on each side, so that only
+    # two vectors are loaded. Values at k and -k are combined before multiplication, so that derivatives of constant
+    # whole numbers are exactly zero.
     outputs = range(3 if side_by_side else OUTPUTS)
     spacing = ir.Constant(I64, LINE) if side_by_side else stride
     centre = [load(builder, builder.add(source, times(spacing, i)), 0, FLOATS) for i in outputs]

@@ -219,13 +219,13 @@ def _k_means(positions: npt.NDArray[np.float64], count: int) -> tuple[npt.NDArra
 # are sampled evenly in reading order. An image of 0.2 megapixels has this number.
 MAX_CANDIDATES = 2000
 BANDWIDTH = 0.1  # h of the mean shift (the authors' `bandwidth`)
-_LARGEST_DISTANCE = 0.01 * BANDWIDTH  # colours within it are near a mean: angle (radians) times squared distance
+_LARGEST_DISTANCE = 0.01 * BANDWIDTH  # limit for colours near a mean: angle (radians) times squared distance
 _SMALLEST_STEP = 1e-3 * BANDWIDTH  # a mean that moves less is final: distance times angle (radians)
 _MERGING_DISTANCE = BANDWIDTH / 2  # means within it are one cluster: distance times angle (radians)
 _MAX_STEPS = 100  # limit for steps of a mean, which needs far fewer
 # A channel with at most this derivative of its logarithm is flat. Rounding to float32 can cause this value. A step of
 # one 16-bit count near white causes 3e-6.
-_FLAT_SLOPE = 2e-6
+_FLAT_LOG_SLOPE = 2e-6
 
 
 def angle_to_grey(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
@@ -234,7 +234,7 @@ def angle_to_grey(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float3
     red, green, blue = (slopes[..., channel] for channel in range(3))
     # arctan2 is used, because an arc cosine near 1 cannot resolve angles below 3e-4.
     distance = np.sqrt((green - blue) ** 2 + (blue - red) ** 2 + (red - green) ** 2)
-    return np.arctan2(distance, slopes.sum(axis=2)), np.asarray((slopes <= _FLAT_SLOPE).all(axis=2), dtype=bool)
+    return np.arctan2(distance, slopes.sum(axis=2)), np.asarray((slopes <= _FLAT_LOG_SLOPE).all(axis=2), dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -266,8 +266,8 @@ class MeanShiftedGrayPixel(PreparedMethod):
 def largest_cluster(colours: npt.NDArray[np.float64], order: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     """Return (N,) bool, True for the colours of the largest mean-shift cluster.
 
-    `colours`: (N, 3) float64, largest value 1. `order`: (N,) float32. A mean starts at each colour that no earlier mean
-    was near, in ascending order of these values.
+    `colours`: (N, 3) float64, largest value 1. `order`: (N,) float32. In ascending order of these values, a mean starts
+    at each colour, except at colours near an earlier mean.
 
     Examples
     --------

@@ -230,7 +230,7 @@ def _load_module(name: str) -> ModuleType:
 
 
 def _describe_failure(error: BaseException, file: Path | None = None) -> str:
-    """Return an error message with the last traceback line in `file`; without `file`, with the last file and line."""
+    """Return the error with its last line in `file`. Without `file`, return it with its last file and line."""
     # Lines of naming.py itself do not help the author of the method.
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"

@@ -19,8 +19,8 @@ from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, uni
 # pixels, the limits are first estimated from a sample.
 _SPARSE_COUNT = 1 << 16
 _SPARSE_INTERVAL = 16  # one of this number of pixels is sampled
-# Margin of an estimated limit, in standard deviations of its rank for randomly drawn pixels. If a limit is outside its
-# margin, all pixels are counted.
+# A limit is searched within this number of standard deviations around its estimated rank. If it is not there, all
+# pixels are counted.
 _MARGIN_SIGMAS = 4.0
 
 

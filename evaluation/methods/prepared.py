@@ -92,8 +92,8 @@ def shrink(
 
 CACHED_PIXELS = 1 << 20  # largest image whose derivatives are kept, px; each takes up to 12 MB
 
-# Up to this p, values are divided by the largest value of the image, because even 1e-19 to this power is in the range
-# of float64. For larger p, they are divided by the largest usable value, which needs a second pass.
+# Up to this p, values are divided by the largest value of the image, because powers of ratios above 1e-19 do not
+# underflow. For larger p, values are divided by the largest usable value, which needs a second pass.
 SAFE_POWER = 16
 
 _ALL_USABLE = np.zeros((0, 0), dtype=bool)  # stands for a mask with all pixels usable

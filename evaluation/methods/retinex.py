@@ -14,8 +14,9 @@ Improved White-Patch
 Local Surface Reflectance statistics
     S.-B. Gao, W. Han, K. Yang, C. Li, Y. Li, "Efficient color constancy with local surface reflectance statistics",
     ECCV 2014. The estimate of a channel is the sum of its values divided by the sum of its locally normalised values:
-    the values of each image patch divided by their maximum. For reflectances, this ratio is nearly achromatic. The
-    paper tunes the number of patches and smooths images; here the number is fixed, and images are not smoothed.
+    the values of each image patch divided by their maximum. The same ratio of surface reflectances is nearly
+    achromatic. The paper tunes the number of patches and smooths images; here the number is fixed, and images are not
+    smoothed.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ mean-shifted gray pixel (`gray_pixels`), and Gray-world of OpenCV (`OpenCvGrayWo
 
 The CroP paper (`experiments.paper.published`) uses the first three methods, with p = 2 for Shades-of-Gray. Other
 constants are from the tables of the NUS data set. Methods of the Gray-Edge framework apply only its equation.
-Preprocessing by their sources is omitted, for example the median filter before White-Patch.
+Preprocessing steps of the papers are omitted, for example the median filter before White-Patch.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _STRIP_ROWS = 256  # rows that are scaled together, to avoid a float64 copy of a
 class OpenCvGrayWorld(PreparedMethod):
     """Gray-world of OpenCV's xphoto, which ignores strongly coloured pixels.
 
-    `GrayworldWB` corrects an image. The estimate of a channel is its sum before divided by its sum after correction.
+    `GrayworldWB` corrects an image. The estimate of a channel is the ratio of its sums before and after correction.
     Masked and saturated pixels are passed as black.
 
     - `name`: name in tables.

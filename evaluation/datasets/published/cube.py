@@ -108,7 +108,7 @@ BLACK = 2048
 # Upper left corner of the masked rectangle, which extends to the lower right corner, px; the data set's page.
 CUBE_ROW, CUBE_COLUMN = 1050, 2050
 
-# File of ground truths to name of the data set and number of images; arXiv:1712.00436.
+# Name and number of images of each data set, by its file of ground truths; arXiv:1712.00436.
 _PUBLISHED_CUBES = {"cube+_gt.txt": ("Cube+", 1707), "cube_gt.txt": ("Cube", 1365)}
 
 

@@ -2,7 +2,7 @@
 
     8D5U5524.png …           86 images of a Canon EOS-1Ds ("1D"), 12-bit values in 16-bit files, black not subtracted
     IMG_0281.png …           482 images of a Canon EOS 5D
-    coordinates/NAME_macbeth.txt   size of the annotated image, then four corners of the chart, row by row
+    coordinates/NAME_macbeth.txt   size of the annotated image, then four chart corners in reading order
     ColorCheckerData.mat     REC_groundtruth (568, 3): recommended ground truth; REC_groundtruth.mat is read too
     real_illum_568..mat      real_rgb (568, 3): Shi's ground truth of 2010
 

@@ -1,4 +1,4 @@
-"""Read INTEL-TAU: 7022 images of three cameras as processed 1080p files. Half of the images show the same scenes.
+"""Read INTEL-TAU: 7022 images of three cameras as processed 1080p files.
 
     CAMERA/field_1_cameras/NAME_12.tiff   16 bits, black subtracted and scaled by the authors, privacy masked
     CAMERA/field_1_cameras/NAME_12.wp     ground truth: red, green, blue (or with leading zeros: NAME_012.wp)

@@ -34,7 +34,7 @@ GRAY_EDGE_SIGMA: Final = 6.0  # Scale of Gray-Edge in the NUS tables, px, for im
 def reduce_colours(
     image: Image, bits: int | Sequence[int], mask: npt.NDArray[np.bool_] | None = None
 ) -> list[npt.NDArray[np.float32]]:
-    """Return one linear image for each number of bits that is set to zero in its codes, see the module docstring.
+    """Return a linear image for each number in `bits`, after this number of bits of its codes was set to zero.
 
     `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit. `bits`: one or several numbers.
     `mask`: (H, W) bool, True for pixels to which Flash is not fitted. The images are (H, W, 3) float32, relative to the

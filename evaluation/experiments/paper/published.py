@@ -96,7 +96,9 @@ def is_c1(images: Sequence[str]) -> bool:
 
 
 def cell_name(name: str, images: Sequence[str]) -> str:
-    """Return the name of pictures or illuminants in table 1. Only real C1 images are C1 without quotes.
+    """Return the name of pictures or illuminants in table 1.
+
+    Images of C1 get the name C1. Other images with the name C1 or Random get this name in quotes.
 
     Examples
     --------

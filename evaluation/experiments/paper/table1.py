@@ -269,7 +269,7 @@ def size_table(rows: Sequence[SizeRow]) -> Table:
     )
 
 
-# Learners of table 2: name in this suite to name in the paper.
+# Names of the learners of table 2 in the paper, by their names in this suite.
 LEARNERS: Final[Mapping[str, str]] = {
     "regression-trees": "Regression trees (simple features)",
     "smart-color-cat": "Smart Color Cat",

@@ -101,7 +101,7 @@ def _batches(figures: Sequence[BoundedFigure]) -> Iterator[tuple[BoundedFigure, 
 
 
 def _pairs(rows: Sequence[TransferRow], means: Sequence[float]) -> dict[str, list[tuple[int, int]]]:
-    """Return for each field of `TransferFigures` with ratios the indices of rows and their base rows."""
+    """Return the indices of rows and their base rows, for each field of `TransferFigures` with ratios."""
     pairs: dict[str, list[tuple[int, int]]] = {"to_real": [], "to_naive": [], "to_better": [], "to_naive_adapted": []}
     for index, row in enumerate(rows):
         for base, base_row in enumerate(rows):
@@ -138,12 +138,12 @@ def _spread(seeds: Sequence[ErrorSample]) -> tuple[float, ...] | None:
     return tuple(float(deviation) for deviation in deviations)
 
 
-# All tables have all six statistics, because a single statistic can mislead.
+# All six statistics, because a single statistic can mislead.
 STATISTIC_HEADS: Final = PAPER_COLUMNS[1:]
 
 
 def errors_table(figures: TransferFigures, name: str, images: int) -> Table:
-    """Return the statistics of every row; with several seeds, their means."""
+    """Return the statistics of all rows without `real_use`; with several seeds, their means."""
     unadapted = [row for row in figures.rows if not row.row.real_use]
     notes = [
         f"{row.row.method}, {row.row.training}: no estimate for {guessed.sum()} images; grey was used instead"
@@ -164,7 +164,7 @@ def errors_table(figures: TransferFigures, name: str, images: int) -> Table:
 
 
 def intervals_table(figures: TransferFigures, name: str) -> Table:
-    """Return the confidence intervals of every row's statistics."""
+    """Return the confidence intervals of the statistics in `errors_table`."""
     return Table(
         f"{name}: {LEVEL * 100:.0f} % intervals of the {figures.error} angular error, degrees",
         ("Method", "Trained on", "Images", *STATISTIC_HEADS),
@@ -178,7 +178,7 @@ def intervals_table(figures: TransferFigures, name: str) -> Table:
 
 
 def real_ratios_table(figures: TransferFigures, name: str) -> Table:
-    """Return every row relative to cross-validation of the same method on the test images."""
+    """Return rows trained on other data, relative to cross-validation of the same method on the test images."""
     is_generated_base = any(ratio.base.data for ratio in figures.to_real)
     base_text = f"cross-validation on {name} (generated)" if is_generated_base else "real cross-validation"
     meaning = f"as good as {'images of the generated test set' if is_generated_base else 'real images'}"

@@ -35,9 +35,14 @@ from evaluation.results.result import Result, SceneAnswer
 from evaluation.scene import Scene
 from foundation.errors import InputError
 
-# Training data of a method. cross-validation: other folds of the test set. generated: a set made by `generate`. naive,
-# naive with matrix: its naive counterparts, see `plan`. relit: real scenes of another camera under the illuminants of
-# the set. other: a set that was not generated. real: only N images of other folds of the test set. none: no training.
+# Training data of a method:
+# - cross-validation: other folds of the test set;
+# - generated: a set made by `generate`;
+# - naive, naive with matrix: naive counterparts of the generated set, see `plan`;
+# - relit: real scenes of another camera under the illuminants of the generated set;
+# - other: a set that was not generated;
+# - real: only N images of other folds of the test set;
+# - none: no training.
 Training = Literal["cross-validation", "generated", "naive", "naive with matrix", "relit", "other", "real", "none"]
 
 # Use of N real images: none; training on them alone; adaptation to them after training on a set.
@@ -61,8 +66,8 @@ class TransferRow:
 
     method: str
     kind: Training  # Its training data
-    data: str  # Name of the training data set; for cross-validation only if the test set was generated
-    images: int  # Number of training images; cross-validation: in the smallest training part; no training: 0
+    data: str  # Name of the training data set; empty for images of a real test set, and without training
+    images: int  # Number of training images, 0 without training; for cross-validation, the minimum over folds and seeds
     # One result for each seed, or only one if the seed has no influence
     results: tuple[Result, ...]
     # Use and number ("all" or digits) of real images of the other folds; both are empty if no real images were used.
