@@ -58,8 +58,8 @@ def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SE
     table_speed = base if match is None or match[2] is None else float(match[2])
     if match is None or table_speed is None:
         raise InputError(
-            f"the ISO speed is {text!r}, expected a number; if the LUT records no ISO speed, write the speeds of images and "
-            "LUT, such as 1600/100"
+            f"the ISO speed is {text!r}, expected a number; if the LUT records no ISO speed, write "
+            "the speeds of images and LUT, such as 1600/100"
         )
     if base is not None and table_speed != base:
         raise InputError(
