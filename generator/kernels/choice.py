@@ -261,9 +261,7 @@ def channel_bits(colours: int) -> int:
     for bits in range(1, 6):
         if colours == 8**bits:
             return bits
-    raise InputError(
-        f"the samples have {colours} colours, expected 8, 64, 512, 4096 or 32768; pass the samples of a LUT"
-    )
+    raise InputError(f"the samples have {colours} colours, expected 8, 64, 512, 4096 or 32768; pass LUT samples")
 
 
 def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
