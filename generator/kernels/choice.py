@@ -170,7 +170,7 @@ def write_colours(
 def choose_for_colours(
     builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
 ) -> None:
-    """Do the same as `choose`, given the offset of the first sample of each pixel's colour at `colours`."""
+    """Do the same as `choose`; `colours` is the address of the offset of the first sample of each pixel's colour."""
     for half, choices in enumerate(_choices_of_words(builder, _hashed(builder, word, (k0, k1, k2)), count)):
         colour_offsets = load(builder, colours, 4 * LANES * half, WORDS)
         offsets = builder.add(colour_offsets, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))

@@ -3,8 +3,8 @@
 Light is additive. If m_i is the mean of a colour under illuminant i alone, the mean under all illuminants with weights
 w_i is Σ w_i m_i. A sample is x_i = m_i + n_i. Its noise n_i has the variance g m_i + r², with photon noise at gain g,
 and read noise r. One exposure under all illuminants has the variance g Σ w_i m_i + r². A weighted mean of samples has
-too little photon noise: its variance is only g Σ w_i² m_i, which is half for two equal illuminants. Therefore the noise
-of each sample is multiplied by √w_i::
+too little photon noise: its variance is only g Σ w_i² m_i, half the true value for two equal illuminants. Therefore the
+noise of each sample is multiplied by √w_i::
 
     y = Σ w_i m_i + Σ √w_i (x_i − m_i),   x_i drawn independently for each illuminant
 
@@ -240,7 +240,8 @@ def _draw_segment(
     lines_per_group: int,
     base: int,
 ) -> None:
-    # One loop over rows with this code and that of `_mix_segment` would need too many processor registers.
+    # This code and `_mix_segment` are separate functions, because a loop over rows with both would need too many
+    # registers.
     choose_first_groups(row, width, keys, count, bits, scratch, low, high)
     draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, prefetch_from, lines_per_group, base)
 
@@ -269,8 +270,9 @@ def _mix_segment(
     """Mix the groups `low` … `high` − 1 of a row, `pixels` in all, under several illuminants.
 
     `pair_weights` are the addresses of the weights of each pair. Scratch memory holds, in this order: the incomplete
-    group, the fault marks, the offsets of colours in the means and in the samples, then the weights and offsets of each
-    pair. Cache lines with later weights are prefetched from `prefetch_from`, `lines_per_group` with each group.
+    group, the fault marks (NaN if a weight is invalid), the offsets of colours in the means and in the samples, then
+    the weights and offsets of each pair. Cache lines with later weights are prefetched from `prefetch_from`,
+    `lines_per_group` with each group.
     """
     pairs = len(pair_weights)
     faults = scratch + SCRATCH_BYTES
@@ -320,7 +322,7 @@ def _mix_pixels(
     weights: int,
     weight_steps: Any,
     white: Any,
-    within: Any,
+    is_unclipped: Any,
     seed: Any,
     image: int,
     first_row: int,
@@ -335,7 +337,7 @@ def _mix_pixels(
     streamed: bool,
 ) -> None:
     # Rows have at least eight pixels. `weight_steps` are the distances of weights in bytes: to the next row, pixel and
-    # illuminant. `within` marks illuminants without samples above the saturation level.
+    # illuminant. `is_unclipped` marks illuminants without samples above the saturation level.
     lights, pairs = len(tables), len(pair_weights)
     lines = scratch + SCRATCH_BYTES + FAULT_BYTES + 2 * SEGMENT_BYTES
     line_buffer = first_line(lines + PAIR_BYTES * pairs)
@@ -376,7 +378,7 @@ def _mix_pixels(
             single = _single_light(pair_weights, BLOCK)
             if single >= 0:
                 single = _single_light(pair_weights, pixels)
-            if single >= 0 and within[single]:
+            if single >= 0 and is_unclipped[single]:
                 light_keys = keys[single, 0], keys[single, 1], keys[single, 2]
                 base = segment_target - SAMPLE_BYTES * start
                 _draw_segment(
@@ -508,7 +510,7 @@ def mix_samples(
         _fill_means(samples.ctypes.data, chosen_colours, count, means[:, light].ctypes.data, means.strides[0])
         for light, samples in enumerate(tables_in_memory)
     ]
-    within = np.array(largest) <= white_level
+    is_unclipped = np.array(largest) <= white_level
     faults: list[bool] = []
     no_weight = np.zeros(1, np.float32)
 
@@ -529,7 +531,7 @@ def mix_samples(
             pixel_weights[top:].ctypes.data,
             np.array(pixel_weights.strides),
             np.uint16(white_level),
-            within,
+            is_unclipped,
             key,
             image,
             first_row + top,

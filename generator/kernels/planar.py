@@ -150,8 +150,7 @@ def draw_batch(
     white_level
         Saturation level, 1 … 65535 counts. It is scaled to 1.
     flips
-        (N,) bool, or one value for all: mirror the crop left to right. Mirroring does not change the samples of the
-        pixels.
+        (N,) bool, or one value for all: mirror the crop left to right. Mirrored pixels keep their samples.
     gains
         (N,) float ≥ 0, or one value for all: factor on the values before clipping.
     seeds, images

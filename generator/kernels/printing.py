@@ -1,7 +1,7 @@
 """Draw images by colour: each pixel is the interpolated mean of the print plus recorded noise.
 
-The print under an illuminant is described at nodes, colours with one of 17 codes per channel: 0, 16 … 240, 255. A node
-has the counts m that the camera records of its colour on the chart, and a nearest patch
+The print under an illuminant is described at nodes. A node is a colour with one of 17 codes in each channel: 0, 16 …
+240, 255. Each node has the counts m that the camera records of this colour on the chart, and a nearest patch
 (`generator.rendering.colorimetric`). The rule is part of the data set format. A pixel with codes v becomes ::
 
     m(v) + k σ(v) (x - b)
@@ -168,11 +168,10 @@ _PLAN_ROWS: Final = 8
 _ROW: Final = 4 * PRINTED_BLOCK  # Bytes of a row of the plan: one 32-bit number per pixel
 _PLAN_BYTES: Final = _ROW * _PLAN_ROWS
 _LINE_BYTES: Final = 16 * PRINTED_BLOCK  # Bytes of the pixels of a block: red, green, blue and noise, float32
-# Blocks of a segment. A segment is planned, and its samples are prefetched, before the previous segment is
-# interpolated.
+# Blocks per segment. A segment is planned, and its samples are prefetched, before the previous segment is interpolated.
 _SEGMENT: Final = 8
 _ROWS_AHEAD: Final = 2  # The picture is prefetched this many rows before it is planned
-# Largest number of groups (32 pixels whose samples are chosen together) that a segment meets.
+# Largest number of groups (32 pixels whose samples are chosen together) that overlap a segment.
 _SEGMENT_GROUPS: Final = _SEGMENT * PRINTED_BLOCK // GROUP + 2
 
 
@@ -538,9 +537,10 @@ class PrintMemory:
 class PrintedMembers:
     """Members of all illuminants of an image or batch, for compiled code.
 
-    A member is an illuminant of the LUT in the mixture that makes one of the M illuminants. `arrays` holds the address
-    of the samples of each member, the square root of its weight, and the index of its illuminant. `starts` (M + 1,)
-    int64 is the first member of each illuminant, and the end. The addresses are valid as long as this object exists.
+    Each of the M illuminants is a mixture. Its members are the illuminants of the LUT in this mixture. `arrays` holds
+    the address of the samples of each member, the square root of its weight, and the index of its illuminant. `starts`
+    (M + 1,) int64 is the first member of each illuminant, and the end. The addresses are valid as long as this object
+    exists.
     """
 
     def __init__(self, samples: npt.NDArray[np.uint16], lights: Sequence[PrintedLight]) -> None:

@@ -5,7 +5,7 @@ module do both; only compiled functions can call them. LLVM maps a vector to the
 AVX-512, two of AVX2 or four of NEON. Bytes are shuffled within 16 bytes, which all of these can do.
 
 Addresses are plain integers, and the caller must ensure that they are valid. Docstrings report bytes that are read or
-written in addition to the result. Large images are streamed: written past the caches, so that these keep the samples.
+written in addition to the result. Large images are streamed: written past the caches, which then keep the samples.
 """
 
 from __future__ import annotations
@@ -89,18 +89,18 @@ def pixel_codes(builder: Builder, picture: Value) -> Value:
     return builder.bitcast(builder.shuffle_vector(loaded, zeros, mask), WORDS)
 
 
-def signature(returned: str, *kinds: str) -> Any:
+def signature(returned: str, *type_names: str) -> Any:
     """Return numba's function type, from the names of the return type and the argument types."""
     from numba import types
 
     numba_types: Any = types
-    return getattr(numba_types, returned)(*(getattr(numba_types, ir_type) for ir_type in kinds))
+    return getattr(numba_types, returned)(*(getattr(numba_types, ir_type) for ir_type in type_names))
 
 
-def step(*kinds: str, returned: str = "void") -> Callable[[Callable[..., Any]], Any]:
+def step(*type_names: str, returned: str = "void") -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that turns an emitter of LLVM code into a function callable from compiled functions.
 
-    The emitter takes a builder and one value for each of `kinds` (numba type names), and returns the result of the
+    The emitter takes a builder and one value for each of `type_names` (numba type names), and returns the result of the
     step.
     """
 
@@ -113,7 +113,7 @@ def step(*kinds: str, returned: str = "void") -> Callable[[Callable[..., Any]], 
         @wraps(emit)
         def typed(typing: Any, *arguments: Any) -> Any:
             del typing, arguments
-            return signature(returned, *kinds), generate
+            return signature(returned, *type_names), generate
 
         return intrinsic(typed)
 

@@ -100,10 +100,10 @@ class DrawnLights:
     def __post_init__(self) -> None:
         if self.lights_each < 1:
             raise InputError(f"illuminants of each picture: {self.lights_each}, expected 1 or more; correct it")
-        within = np.mean([self._batch(trial, 0, 0)[1].mean() for trial in range(128)])
-        if within < _LEAST_WITHIN:
+        inside = np.mean([self._batch(trial, 0, 0)[1].mean() for trial in range(128)])
+        if inside < _LEAST_WITHIN:
             raise InputError(
-                f"{within:.1%} of the distribution is in the gamut of {self.gamut.table}, expected {_LEAST_WITHIN:.1%} "
+                f"{inside:.1%} of the distribution is in the gamut of {self.gamut.table}, expected {_LEAST_WITHIN:.1%} "
                 f"or more; choose a distribution nearer to the illuminants, which have the mean "
                 "r={:.3f}, b={:.3f}".format(*self.gamut.rb.mean(axis=0))
             )
@@ -118,9 +118,9 @@ class DrawnLights:
 
     def _light(self, position: int, light: int) -> Mixture:
         for batch in range(_BATCHES):
-            drawn, within = self._batch(batch, light, position)
-            if within.any():
-                return self.gamut.match(rgb_of(drawn[int(within.argmax())])).mixture
+            drawn, is_inside = self._batch(batch, light, position)
+            if is_inside.any():
+                return self.gamut.match(rgb_of(drawn[int(is_inside.argmax())])).mixture
         raise InputError(f"{_BATCH * _BATCHES} draws are all outside {self.gamut.table}; choose another distribution")
 
     def _batch(self, batch: int, light: int, position: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
@@ -261,7 +261,7 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
 
 
 def light_of(light: int | str | Mixture, lut: Lut) -> Mixture:
-    """Return the mixture of an illuminant given by number, by a text for `parse_light`, or as a mixture."""
+    """Return the mixture for an illuminant: for its number, for a text as in `parse_light`, or the mixture itself."""
     if isinstance(light, str):
         return parse_light(light, lut)
     if isinstance(light, Mixture):

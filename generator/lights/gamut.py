@@ -70,7 +70,7 @@ class Gamut:
 
     @cached_property
     def directions(self) -> _Array:
-        """(L, 3) float64, the ground truths, of length 1."""
+        """(L, 3) float64, the ground truths scaled to length 1."""
         return _unit(self.white)
 
     @cached_property
@@ -117,10 +117,10 @@ class Gamut:
             best = int(near[(u * v).sum(axis=1).argmax()])
             return self._match_of(pairs[best], shares[best], target)
         if len(self.triangles):
-            within = self._inverses @ target
-            best = int(within.min(axis=1).argmax())
-            if within[best].min() >= 0:
-                return self._match_of(self.triangles[best], within[best], target)
+            triangle_shares = self._inverses @ target
+            best = int(triangle_shares.min(axis=1).argmax())
+            if triangle_shares[best].min() >= 0:
+                return self._match_of(self.triangles[best], triangle_shares[best], target)
         if len(pairs) and angles.min() < nearest.angle:
             best = int(angles.argmin())
             nearest = self._match_of(pairs[best], shares[best], target)

@@ -34,7 +34,7 @@ from generator import philox
 from generator.files import require_plausible
 from generator.named_numbers import Range, parse_numbers
 
-# The arrays are float32, because numpy keeps float32 if arrays are combined with Python numbers.
+# The arrays are float32: numpy keeps this type if arrays are combined with Python numbers.
 Array = npt.NDArray[np.floating[Any]]
 _ZERO: Final = np.float32(0)
 _HALF: Final = np.float32(0.5)

@@ -2,8 +2,8 @@
 
 A count x of a look-up table (LUT) has the mean m and the variance read² + shot · m (`sensor_noise`). The new exposure
 has a times the counts, at k times the ISO speed of the LUT, with k ≥ a. Its mean is a m and its variance
-read_k² + k · shot · a m. The product a x has too little noise: its variance is a² read² + a · shot · a m. The missing
-noise is added, with a standard normal deviate z:
+read_k² + k · shot · a m, where read_k is the read noise at this speed. The product a x has too little noise: its
+variance is a² read² + a · shot · a m. The missing noise is added, with a standard normal deviate z:
 
     y = a x + √max(0, (read_k² − a² read²) + (k − a) shot · a x) · z
 

@@ -289,7 +289,8 @@ def _uniform(seed: int, number: int) -> float:
 
 
 # Trial exposures of automatic exposure, because noise lets more pixels reach the level. For 60 photographs at ISO 3200
-# and a share of 0.02, two trials gave the share within 0.5 %. Without trials, it was up to 3.8 times too large.
+# and a share of 0.02, two trials gave the share within 0.5 %. Without trials, up to 3.8 times as many pixels reached
+# it.
 _TRIALS: Final = 2
 _LARGEST_COUNT: Final = 65535  # Largest 16-bit count
 _EVEN_LIGHT: Final[Three] = (1.0, 1.0, 1.0)  # Far end of even light
@@ -319,9 +320,9 @@ class AppliedVariation:
 class Variation:
     """Differences between images; at least one of the first three is set.
 
-    - `exposure`: amount of light; None for that of the LUT.
+    - `exposure`: amount of light; None for the exposure of the LUT.
     - `gradient`: fall-off over the image; None for even light.
-    - `iso`: ISO speed that determines the noise; None for that of the LUT.
+    - `iso`: ISO speed that determines the noise; None for the speed of the LUT.
     - `noise`: noise of the samples of the LUT; see `variation_of`.
     """
 
