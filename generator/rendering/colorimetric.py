@@ -61,7 +61,7 @@ REFERENCE_K: Final = 5600.0
 # contain light of all channels.
 _LEAST_RATIO: Final = 0.2
 
-# A colour is in the gamut if target and print differ by no more than this in each channel, relative: 1/5 of the
+# A colour is in the gamut if target and print differ by at most this relative amount in each channel. It is 1/5 of the
 # difference between neighbouring patches of a 5-bit chart.
 GAMUT_TOLERANCE: Final = 0.02
 
@@ -231,7 +231,7 @@ def compute_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
     black = black_point(profile, colours, bits)
     source = source_colours(matrix)
     targets = black + (profile.white - black) * source
-    # The last digits differ between processors and libraries. Rounding makes pixels equal.
+    # The last digits differ between processors and libraries. Rounding makes pixels equal on all of them.
     positions = _rounded(invert(colours, targets.mean(axis=1), targets, bits))
     around, weights = corners(positions, bits)
     weights = weights * usable[around]
@@ -298,9 +298,9 @@ def _nearest(positions: npt.NDArray[Any], cells: npt.NDArray[np.int64], bits: in
 def black_point(profile: PrintProfile, colours: _Array, bits: int) -> float:
     """Return the grey to which black is mapped, 1 = ideal white.
 
-    It is the darkest grey that the print shows within `BLACK_WITHIN_DEG`, at 1 to 1.25 times the print's own black. If
-    there is no such grey, it is the print's own black. `colours`: (8**bits, 3) float64, colours of the profile, with
-    replacements for unusable patches.
+    It is the darkest grey that the print shows with an angle to grey of up to `BLACK_WITHIN_DEG`, at 1 to 1.25 times
+    the print's own black. If there is none, it is the print's own black. `colours`: (8**bits, 3) float64, colours of
+    the profile, with replacements for unusable patches.
     """
     levels = profile.black * np.linspace(1.0, MOST_LIFT, 26)
     levels = levels[levels <= profile.white]

@@ -3,8 +3,6 @@
 The print is treated as continuous: colours are interpolated between patches. A position p is a code per channel from 0
 to 2ⁿ - 1, not necessarily whole. R(p) is what the camera records there under a reference illuminant, relative to its
 white: trilinear interpolation of the means of the eight patches around p. The position of a colour t minimises ::
-- 1, not necessarily whole. R(p) is what the camera records there under a reference illuminant, relative to its white:
-trilinear interpolation of the means of the eight patches around p. The position of a colour t minimises ::
 
     |S (log R(p) - log t)|²,   0 ≤ p ≤ 2ⁿ - 1
 

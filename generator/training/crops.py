@@ -2,10 +2,10 @@
 
 `Crops` draws any number of crops from a look-up table (LUT) and a gallery. Item i of an epoch depends only on seed,
 epoch and i. Its random numbers are the words of Philox4x32-10 with counter (i, epoch, k, 7). k = 0: picture, column,
-row, illuminant; k = 1: mirroring, gain, share of the subtracted black; k = 2: seed of the kernel. Items do not depend
+row, illuminant; k = 1: mirroring, gain, share of the subtracted black; k = 2: seed of the samples. Items do not depend
 on the number of workers.
 
-Only `torch_crops`, with data sets for PyTorch, needs PyTorch::
+Only `torch_crops` needs PyTorch; it has data sets for PyTorch::
 
     from torch.utils.data import DataLoader
     from generator.training import Crops, open_gallery
