@@ -57,7 +57,7 @@ from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES, key_of
 # Offsets are chosen this many groups before their samples are read, which hides the latency of memory.
 LEAD: Final = 2
 OFFSETS_BYTES: Final = 4 * GROUP  # Size of the offsets of a group, uint32 each
-# The picture is prefetched this many bytes before it is read, which hides the latency of memory.
+# The picture is prefetched this many bytes before it is read.
 _PREFETCH_BYTES: Final = 2048
 # Scratch memory for the last, incomplete group of a row, in bytes: 96, rounded up to whole cache lines.
 EDGE_BYTES: Final = 128
@@ -72,7 +72,7 @@ _WORD_BITS: Final = np.uint64(32)
 _PURPOSE: Final = np.uint32(SAMPLES)
 _PAIRS: Final = ir.VectorType(I64, LANES // 2)
 # Odd multipliers of the three rounds: C. Wellons, "Prospecting for hash functions", 2018, and its list of improved
-# constants. They let each bit of the input change many bits of the result.
+# constants.
 _MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
 
 
@@ -89,8 +89,8 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
 
 
 def _hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
-    # With fewer than three rounds the choices are not random enough. After one round, the images of two seeds differ
-    # only by swapped neighbours. After two rounds, pixels at distances near a power of two are correlated.
+    # After one round, the images of two seeds would differ only by swapped neighbours. After two rounds, pixels at
+    # distances near a power of two would be correlated.
     numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
     h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
     h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
@@ -274,7 +274,7 @@ def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
 Samples = npt.NDArray[np.uint16]
 Picture = npt.NDArray[np.uint8]
 
-# Smallest memory page of x86-64 and arm64, in bytes. The right to read is the same on a whole page.
+# Smallest memory page of x86-64 and arm64, in bytes; a whole page has the same access rights.
 _PAGE_BYTES: Final = 4096
 _MOST_BYTES: Final = 0xFFFFFFFF  # Largest size of the samples of one illuminant: offsets have 32 bits
 

@@ -132,9 +132,8 @@ def mixed_table(
 ) -> Samples:
     """Mix the samples of several illuminants into those of one illuminant; the module docstring has the formula.
 
-    The result is used like the samples of one illuminant: `draw_samples(mixed_table(...), picture)`. Within a colour,
-    the samples of the first illuminant with a weight keep their order. The samples of each further illuminant are
-    shuffled independently, so that their noise is uncorrelated.
+    Within a colour, the samples of the first illuminant with a weight keep their order. The samples of each further
+    illuminant are shuffled independently, so that their noise is uncorrelated.
 
     Parameters
     ----------
@@ -189,7 +188,7 @@ def mixed_table(
 # A row is mixed in segments of this many pixels, a multiple of a group. Their weights and offsets fit into the
 # second-level cache.
 SEGMENT_PIXELS: Final = 512
-# Weights are prefetched this many pixels before they are read, which hides the latency of memory.
+# Weights are prefetched this many pixels before they are read.
 _PREFETCH_PIXELS: Final = 4096
 # Size of the offsets of a segment, or of its weights of one illuminant, in bytes. The last segment of a row has up to
 # seven more pixels.
@@ -197,7 +196,7 @@ SEGMENT_BYTES: Final = OFFSETS_BYTES * (SEGMENT_PIXELS // GROUP + 1)
 # Scratch memory of a segment for a pair of illuminants, in bytes: weights in pixel order, weights in the order of
 # `mix`, and offsets.
 PAIR_BYTES: Final = 6 * SEGMENT_BYTES
-# Size of the buffer in which a segment is collected before it is streamed (written past the caches), in bytes.
+# Size of the buffer of a segment before it is streamed (written past the caches), in bytes.
 _LINES_BYTES: Final = line_buffer_bytes(SAMPLE_BYTES * (SEGMENT_PIXELS + BLOCK))
 
 

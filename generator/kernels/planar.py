@@ -64,9 +64,9 @@ def _crop(
     end: int,
     scratch: int,
 ) -> None:
-    # The columns of `plan` (N, 9) int64 are unpacked below. `lines` is the address of `scales` (N, 7) float32. `last`
-    # is the address of the samples of the last illuminant, from `choice.readable`. The samples of a row are chosen and
-    # prefetched while the previous row is written, because they may be in no cache.
+    # `lines` is the address of `scales` (N, 7) float32. `last` is the address of the samples of the last illuminant,
+    # from `choice.readable`. Samples of a row are prefetched while the previous row is written, because they may be in
+    # no cache.
     row_bytes = OFFSETS_BYTES * (width // GROUP + 2)
     for item in range(first, end):
         light, picture, pitch, picture_width, x0, y0, flip, image, lights = plan[item]

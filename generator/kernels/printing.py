@@ -301,8 +301,8 @@ def draw_block(
 ) -> None:
     """Write the pixels of a block to `line`, four float32 each: interpolated means plus deviations.
 
-    A deviation is the sample minus b, times k and the noise of the pixel. It is also multiplied by the float32 of the
-    pixel at `factors`. For the fourth number, k is 0.
+    A deviation is the sample minus b, times k, the noise of the pixel, and the float32 of the pixel at `factors`. For
+    the fourth number, k is 0.
     """
     for first_pixel in range(0, PRINTED_BLOCK, 4):
         values = _interpolated(builder, plan, means, first_pixel)

@@ -74,7 +74,7 @@ def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool
 
 @compiled
 def _mark_colours(pixels: int, count: int, bits: Any, is_present: int, scratch: int) -> None:
-    # For each colour that occurs, copies a byte of value 1, the last byte of scratch memory, to `is_present`.
+    # For each colour that occurs, copies the last byte of scratch memory, a 1, to `is_present`.
     indices, unused = scratch + EDGE_BYTES, scratch + EDGE_BYTES + OFFSETS_BYTES
     one_byte = unused + OFFSETS_BYTES
     for group in range((count + GROUP - 1) // GROUP):

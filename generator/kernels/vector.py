@@ -172,8 +172,7 @@ def copy1(builder: Builder, source: Value, target: Value) -> None:
 
 
 def _channels(builder: Builder, samples: Value, offsets: Value, step: int) -> list[Value]:
-    # Returns red, green and blue of eight samples, eight float32 each. The offsets of the samples are `step` bytes
-    # apart.
+    # Returns red, green and blue of eight samples, eight float32 each; the offsets are `step` bytes apart.
     pairs = [
         [
             load(
