@@ -44,7 +44,7 @@ def compare(
         list[str] | None,
         option(
             "NAME",
-            "Method to compare, by its name in the tables or for evaluate run; repeat the option for several methods. "
+            "Method to compare, by its name in the tables or in evaluate run; repeat the option for several methods. "
             "With two RESULTS, FIRST=SECOND compares methods of different names. \\[default: all]",
         ),
     ] = None,
@@ -114,7 +114,7 @@ def _run_method(run: Mapping[str, MethodErrors], name: str, location: str) -> st
 
 
 def _table_name(name: str) -> str:
-    """Return the name in tables of a method of this suite, such as "pca"; other names are returned unchanged."""
+    """Return the name in tables for an option value such as "pca"; return other names unchanged."""
     for choose in (choose_methods, choose_learners):
         with suppress(InputError):
             return choose([name])[0].name

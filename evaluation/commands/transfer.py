@@ -48,7 +48,7 @@ Reads data sets in any layout of evaluate run. Trains each method on each TRAIN 
 cross-validation of the same method on TEST, the constant illuminant (median of the training illuminants), and methods
 without training. --naive adds training without a look-up table: linear sRGB of the same pictures times the same
 illuminants, with and without the camera's colour matrix. --real adds two trainings with N real images of the other
-folds: on these images alone, and on each set with adaptation to these images. Prints mean, median, trimean, best and
+folds: on these images alone, and on each TRAIN with adaptation to these images. Prints mean, median, trimean, best and
 worst 25 %, bootstrap intervals, and ratios to the cross-validation, paired by image. Training images that share a
 picture with the test set, by name or content, are excluded. Writes files only with --out.
 

@@ -59,7 +59,7 @@ def _draw_curves(figure: Any, results: Sequence[Result], metric: ErrorKind) -> N
         indices = np.ceil(shares / 100 * len(errors)).astype(int) - 1
         reached_errors = np.where(indices < 0, 0.0, errors[np.maximum(indices, 0)])
         axes.plot(reached_errors, shares, label=legend_label(result.method), linewidth=1.6, **series_style(number))
-    axes.set(xlim=(0, axis_end), ylim=(0, 100), xlabel=f"{metric} angular error, degrees", ylabel="images up to it, %")
+    axes.set(xlim=(0, axis_end), ylim=(0, 100), xlabel=f"{metric} angular error, degrees", ylabel="share of images, %")
     figure.legend(loc="outside lower left", ncols=2, handlelength=3)
 
 
@@ -122,7 +122,7 @@ _PICTURE_HEIGHT = 170  # Height of a picture, px: three next to each other fill 
 
 _MAX_PICTURE_WIDTH = 300  # Largest width of a picture, px; a panorama would make the pictures next to it tiny
 
-# Percentile of the brightest channel, under the true illuminant, that becomes white; brighter pixels are highlights.
+# After correction by the ground truth, this percentile of the pixels' largest channels becomes white.
 _WHITE_PERCENTILE = 98.0
 
 _GAP = 6  # White gap between pictures, px

@@ -71,7 +71,7 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
             "evaluate run again"
         )
     if len(set(columns)) < len(columns):
-        raise FormatError(f"{path} has the columns {', '.join(columns)}, expected each once; remove the others")
+        raise FormatError(f"{path} has the columns {', '.join(columns)}, expected each once; remove the repeated ones")
     lines_by_method: dict[str, dict[str, _Line]] = {}
     for row in rows:
         line_name = f"{path}, line {rows.line_num}"

@@ -1,16 +1,16 @@
 """Choose a random sample for each pixel, and check the arguments of all kernels.
 
 The look-up table (LUT) holds S samples of each patch colour. A pixel receives one sample of its colour. The choice
-depends only on the seed, image number, stream, x and y, so tiles, threads and workers cannot change it. The rule is
-part of the data set format (reasons: `docs/decisions/0010-compiled-kernel.md`). All arithmetic is modulo 2³² except for
-p and q::
+depends only on the seed, image number, stream (see below), x and y, so tiles, threads and workers cannot change it. The
+rule is part of the data set format (reasons: `docs/decisions/0010-compiled-kernel.md`). All arithmetic is modulo 2³²
+except for p and q::
 
     keys     k0, k1, k2: first words of Philox4x32-10 with counter (y, stream, image, 0) and the seed as key
     word     i = 8 ⌊x/16⌋ + x mod 8,  h = (i ⊕ k0) · 0x21F0AAAD ⊕ k1,  h = (h ⊕ ⌊h/2¹⁶⌋) · 0x735A2D97 ⊕ k2,
              h = (h ⊕ ⌊h/2¹⁵⌋) · 0x31848BAB
     sample   p = h S,  q = (p mod 2³²) S,  index of the sample: ⌊p/2³²⌋ if x mod 16 < 8, else ⌊q/2³²⌋
 
-The stream is 0 for one illuminant. If several illuminants are mixed per pixel, it is the index of the illuminant.
+`stream` is 0 for one illuminant. If several illuminants are mixed per pixel, it is the index of the illuminant.
 
 A group is 32 consecutive pixels of a row. The offset of a sample is its distance from the start of the samples, in
 bytes. Functions decorated with `step` emit LLVM vector code (`kernels/vector.py`); only compiled functions can call
@@ -61,7 +61,7 @@ OFFSETS_BYTES: Final = 4 * GROUP  # Size of the offsets of a group, uint32 each
 _PREFETCH_BYTES: Final = 2048
 # Scratch memory for the last, incomplete group of a row, in bytes: 96, rounded up to whole cache lines.
 EDGE_BYTES: Final = 128
-# Scratch memory per thread, in bytes: the incomplete group, and the offsets of four groups. Only LEAD + 1 are in use.
+# Scratch memory per thread, in bytes: the incomplete group, and the offsets of four groups, of which LEAD + 1 are used.
 SCRATCH_BYTES: Final = EDGE_BYTES + 4 * OFFSETS_BYTES
 
 _P0: Final = np.uint64(MULTIPLIERS[0])
@@ -69,7 +69,7 @@ _P1: Final = np.uint64(MULTIPLIERS[1])
 _W0: Final = np.uint32(KEY_STEPS[0])
 _W1: Final = np.uint32(KEY_STEPS[1])
 _WORD_BITS: Final = np.uint64(32)
-_PURPOSE: Final = np.uint32(SAMPLES)
+_SAMPLES_PURPOSE: Final = np.uint32(SAMPLES)
 _PAIRS: Final = ir.VectorType(I64, LANES // 2)
 # Odd multipliers of the three rounds: C. Wellons, "Prospecting for hash functions", 2018, and its list of improved
 # constants.
@@ -89,8 +89,8 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
 
 
 def _hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
-    # After one round, the images of two seeds would differ only by swapped neighbours. After two rounds, pixels at
-    # distances near a power of two would be correlated.
+    # Three rounds are needed. After one, images of two seeds would differ only by swapped neighbours. After two, pixels
+    # at distances near a power of two would be correlated.
     numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
     h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
     h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
@@ -170,7 +170,10 @@ def write_colours(
 def choose_for_colours(
     builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
 ) -> None:
-    """Do the same as `choose`; `colours` is the address of the offset of the first sample of each pixel's colour."""
+    """Do the same as `choose`, with one offset (uint32) for each pixel at `colours`.
+
+    The samples of the pixel's colour begin at this offset.
+    """
     for half, choices in enumerate(_choices_of_words(builder, _hashed(builder, word, (k0, k1, k2)), count)):
         colour_offsets = load(builder, colours, 4 * LANES * half, WORDS)
         offsets = builder.add(colour_offsets, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
@@ -217,7 +220,7 @@ def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
 @inlined
 def row_keys(y: Any, stream: Any, image: Any, seed: Any) -> Any:
     """Return the three keys (uint32) of row `y`; `seed` is uint64."""
-    k0, k1, k2, _ = philox4x32(uint32(y), uint32(stream), uint32(image), _PURPOSE, seed)
+    k0, k1, k2, _ = philox4x32(uint32(y), uint32(stream), uint32(image), _SAMPLES_PURPOSE, seed)
     return k0, k1, k2
 
 
@@ -274,7 +277,7 @@ def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
 Samples = npt.NDArray[np.uint16]
 Picture = npt.NDArray[np.uint8]
 
-# Smallest memory page of x86-64 and arm64, in bytes; a whole page has the same access rights.
+# Smallest memory page of x86-64 and arm64, in bytes. If one byte of a page is readable, all are.
 _PAGE_BYTES: Final = 4096
 _MOST_BYTES: Final = 0xFFFFFFFF  # Largest size of the samples of one illuminant: offsets have 32 bits
 

@@ -14,8 +14,8 @@ to 1, otherwise it is √(Σ w_i) times its true value. A single illuminant of w
 There are three approximations:
 
 - m_i is the mean of S samples, not of the whole patch.
-- Differences within the print and between photosites are proportional to the light, but are scaled like noise. For
-  illuminants of equal brightness they are 1/√(Σ w_i) of their true value.
+- Differences within the print and between photosites are proportional to the light, but here they are multiplied by
+  √w_i. For illuminants of equal brightness they are 1/√(Σ w_i) of their true value.
 - Samples clipped by the sensor stay clipped.
 """
 
@@ -239,8 +239,7 @@ def _draw_segment(
     lines_per_group: int,
     base: int,
 ) -> None:
-    # This code and `_mix_segment` are separate functions, because a loop over rows with both would need too many
-    # registers.
+    # This code is not part of `_mix_pixels`, because its loop would then need too many registers.
     choose_first_groups(row, width, keys, count, bits, scratch, low, high)
     draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, prefetch_from, lines_per_group, base)
 
@@ -269,9 +268,9 @@ def _mix_segment(
     """Mix the groups `low` … `high` − 1 of a row, `pixels` in all, under several illuminants.
 
     `pair_weights` are the addresses of the weights of each pair. Scratch memory holds, in this order: the incomplete
-    group, the fault marks (NaN if a weight is invalid), the offsets of colours in the means and in the samples, then
-    the weights and offsets of each pair. Cache lines with later weights are prefetched from `prefetch_from`,
-    `lines_per_group` with each group.
+    group, the fault marks (NaN if a weight is invalid), each pixel's offset in the means and in the samples, then the
+    weights and offsets of each pair. With each group, `lines_per_group` cache lines of later weights are prefetched,
+    starting at `prefetch_from`.
     """
     pairs = len(pair_weights)
     faults = scratch + SCRATCH_BYTES
@@ -438,7 +437,7 @@ def mix_samples(
     """Draw the raw linear image of `picture` under several illuminants with one weight per pixel and illuminant.
 
     The module docstring has the formula. `choice.py` chooses the sample of each illuminant; the stream is the index of
-    the illuminant in `tables`. A pixel with weight 1 of illuminant 0 and no other is the same as from `draw_samples`.
+    the illuminant in `tables`. With weights 1, 0, 0 …, a pixel is the same as from `draw_samples`.
 
     Parameters
     ----------

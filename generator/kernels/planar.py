@@ -50,7 +50,7 @@ def _crop(
     plan: Any,
     seeds: Any,
     scales: Any,
-    lines: int,
+    scales_address: int,
     tables: int,
     light_bytes: int,
     last: int,
@@ -64,14 +64,14 @@ def _crop(
     end: int,
     scratch: int,
 ) -> None:
-    # `lines` is the address of `scales` (N, 7) float32. `last` is the address of the samples of the last illuminant,
-    # from `choice.readable`. Samples of a row are prefetched while the previous row is written, because they may be in
-    # no cache.
+    # `scales_address` is the address of `scales` (N, 7) float32. `last` is the address of the samples of the last
+    # illuminant, from `choice.readable`. Samples of a row are prefetched while the previous row is written, because
+    # they may be in no cache.
     row_bytes = OFFSETS_BYTES * (width // GROUP + 2)
     for item in range(first, end):
         light, picture, pitch, picture_width, x0, y0, flip, image, lights = plan[item]
         samples = last if light == lights - 1 else tables + light * light_bytes
-        line = lines + 4 * SCALES * item
+        scales_at = scales_address + 4 * SCALES * item
         low, high = x0 // GROUP, (x0 + width - 1) // GROUP
         for y in range(height + 1):
             if y < height:
@@ -101,9 +101,9 @@ def _crop(
                     # If the width is no multiple of eight, the last eight pixels overlap the previous ones.
                     x = min(start, width - EIGHT)
                     if flip:
-                        planes8_mirrored(samples, offsets - 4 * x, line, red + 4 * x, green + 4 * x, blue + 4 * x)
+                        planes8_mirrored(samples, offsets - 4 * x, scales_at, red + 4 * x, green + 4 * x, blue + 4 * x)
                     else:
-                        planes8(samples, offsets + 4 * x, line, red + 4 * x, green + 4 * x, blue + 4 * x)
+                        planes8(samples, offsets + 4 * x, scales_at, red + 4 * x, green + 4 * x, blue + 4 * x)
 
 
 def _checked_window(window: Sequence[int], picture: npt.NDArray[np.uint8]) -> Window:

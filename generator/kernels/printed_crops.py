@@ -39,7 +39,7 @@ def _print_crops(
     scales: int,
 ) -> None:
     # Columns of `plan` (N, 9) int64: address and row pitch of the window, x, y, flip, addresses of means and bases, and
-    # the range of the crop's members.
+    # the range (first, end) of the crop in `PrintedMembers`.
     member_samples, roots, owners = members
     for item in range(first, end):
         source, pitch, x, y, flip, means, bases, begin, stop = plan[item]

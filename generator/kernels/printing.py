@@ -301,8 +301,8 @@ def draw_block(
 ) -> None:
     """Write the pixels of a block to `line`, four float32 each: interpolated means plus deviations.
 
-    A deviation is the sample minus b, times k, the noise of the pixel, and the float32 of the pixel at `factors`. For
-    the fourth number, k is 0.
+    A deviation is (sample − b) · k · σ · factor; `factors` is the address of one float32 per pixel. For the fourth
+    number, k is 0.
     """
     for first_pixel in range(0, PRINTED_BLOCK, 4):
         values = _interpolated(builder, plan, means, first_pixel)
@@ -339,7 +339,7 @@ def _write_planes(builder: Builder, line: Value, scales: Value, targets: Sequenc
 
 @step(*[ADDRESS] * 5)
 def write_planes(builder: Builder, line: Value, scales: Value, red: Value, green: Value, blue: Value) -> None:
-    """Write a block as float32 to three planes; `scales` is the same as `line` of `vector.planes8`."""
+    """Write a block as float32 to three planes; `scales` is the same as for `vector.planes8`."""
     _write_planes(builder, line, scales, (red, green, blue), mirrored=False)
 
 
@@ -560,7 +560,7 @@ _ZEROS: Final = np.zeros(GROUP, np.uint32)  # With these colour offsets, `choose
 
 
 class SharedTables:
-    """Addresses of arrays that serve all illuminants: sample offsets of nodes, node fractions of codes, and zeros."""
+    """Addresses of arrays for all illuminants: offset of each node's samples, `_node_fractions`, and zeros."""
 
     def __init__(self, samples: npt.NDArray[np.uint16], cells: npt.NDArray[np.uint32]) -> None:
         self._kept = (cells * (SAMPLE_BYTES * samples.shape[2])).astype(np.uint32), _node_fractions(), _ZEROS

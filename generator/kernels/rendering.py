@@ -84,9 +84,9 @@ def draw_groups(
 ) -> None:
     """Write the samples of groups `begin` … `end` − 1 of a row; `base` is the target address of the row's first pixel.
 
-    Offsets are chosen `LEAD` groups before their samples are read, for groups up to `limit` − 1. Memory that is needed
-    later is prefetched from `prefetch_from`, `lines_per_group` cache lines with each group. The two bytes after the
-    last pixel are overwritten, except at the end of the row.
+    Offsets are chosen `LEAD` groups before their samples are read, for groups up to `limit` − 1. With each group,
+    `lines_per_group` cache lines that are needed later are prefetched, starting at `prefetch_from`. The two bytes after
+    the last pixel are overwritten, except at the end of the row.
     """
     group, whole_groups = begin, min(limit, width // GROUP)
     while group < end:

@@ -1,8 +1,8 @@
 """Kernel steps written as LLVM code: vectors of 16 numbers of 32 bits, and loads and stores by address.
 
-numba does not vectorise pixel loops that shuffle bytes, and cannot load eight bytes from any address. The steps of this
-module do both; only compiled functions can call them. LLVM maps a vector to the registers of the processor: one of
-AVX-512, two of AVX2 or four of NEON. Bytes are shuffled within 16 bytes, which all of these can do.
+numba does not vectorise pixel loops that shuffle bytes, and cannot load eight bytes from an arbitrary address. The
+steps of this module do both; only compiled functions can call them. LLVM maps a vector to the registers of the
+processor: one of AVX-512, two of AVX2 or four of NEON. Bytes are shuffled within 16 bytes, which all of these can do.
 
 Addresses are plain integers, and the caller must ensure that they are valid. Docstrings report bytes that are read or
 written in addition to the result. Large images are streamed: written past the caches, which then keep the samples.
@@ -202,11 +202,11 @@ def minimum(builder: Builder, first: Value, second: Value) -> Value:
 
 
 def _write_planes8(
-    builder: Builder, samples: Value, offsets: Value, stride: int, line: Value, targets: Sequence[Value]
+    builder: Builder, samples: Value, offsets: Value, stride: int, scales: Value, targets: Sequence[Value]
 ) -> None:
 
     def broadcast_value(index: int) -> Value:
-        return broadcast(builder, load(builder, line, 4 * index, F32), _EIGHT_FLOATS)
+        return broadcast(builder, load(builder, scales, 4 * index, F32), _EIGHT_FLOATS)
 
     for index, (channel, target) in enumerate(zip(_channels(builder, samples, offsets, stride), targets, strict=True)):
         value = builder.fadd(builder.fmul(channel, broadcast_value(index)), broadcast_value(3 + index))
@@ -215,21 +215,21 @@ def _write_planes8(
 
 @step(*[ADDRESS] * 6)
 def planes8(
-    builder: Builder, samples: Value, offsets: Value, line: Value, red: Value, green: Value, blue: Value
+    builder: Builder, samples: Value, offsets: Value, scales: Value, red: Value, green: Value, blue: Value
 ) -> None:
     """Write eight pixels as float32 to three planes: min(sample · factor + summand, limit).
 
-    `line` is the address of seven float32: factors and summands of red, green and blue, and the limit.
+    `scales` is the address of seven float32: factors and summands of red, green and blue, and the limit.
     """
-    _write_planes8(builder, samples, offsets, 4, line, (red, green, blue))
+    _write_planes8(builder, samples, offsets, 4, scales, (red, green, blue))
 
 
 @step(*[ADDRESS] * 6)
 def planes8_mirrored(
-    builder: Builder, samples: Value, offsets: Value, line: Value, red: Value, green: Value, blue: Value
+    builder: Builder, samples: Value, offsets: Value, scales: Value, red: Value, green: Value, blue: Value
 ) -> None:
     """Write eight pixels mirrored, as `planes8` does; `offsets` is the address of the last of eight offsets."""
-    _write_planes8(builder, samples, offsets, -4, line, (red, green, blue))
+    _write_planes8(builder, samples, offsets, -4, scales, (red, green, blue))
 
 
 @step(ADDRESS, "float32", "float32", "float32", ADDRESS)

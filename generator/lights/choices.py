@@ -35,10 +35,10 @@ _BATCH: Final = 32
 _BATCHES: Final = 2048
 # Smallest allowed share of a distribution in the gamut. With less, an illuminant would need thousands of draws.
 _LEAST_WITHIN: Final = 1e-3
-# A ground truth is far if its angle to the nearest mixture exceeds this value, in degrees. Such a mixture is a
-# different illuminant: the angle is larger than the error of good methods, 2 degrees.
+# A ground truth is far if its angle to the nearest mixture exceeds this value, in degrees. Errors of good methods are
+# smaller, about 2 degrees.
 _FAR_DEG: Final = 3.0
-# A file is refused if a larger share of its ground truths is far. A few may be far at the edge of a data set. Many
+# A file is refused if a larger share of its ground truths is far. A few unusual illuminants may be far. Many
 # indicate another order of the channels or another camera.
 _MOST_FAR: Final = 0.25
 _MOST_DEG: Final = 10.0  # Largest angle in degrees for a ground truth of the same camera
@@ -309,8 +309,8 @@ def matched_lights(
         raise InputError(
             f"{len(far)} of the {len(truths)} ground truths of {file} are more than {_FAR_DEG:g} degrees outside the "
             f"gamut of {gamut.table}, by up to {choice.largest_deg:.2f} degrees (first in line {far[0]}), expected "
-            f"{_MOST_FAR:.0%} or less, and 0 beyond {_MOST_DEG:g} degrees; check that the channels are in the order "
-            "R, G, B and that the file belongs to the camera of the LUT, or use a LUT with a wider gamut"
+            f"at most {_MOST_FAR:.0%} of them, and no angle above {_MOST_DEG:g} degrees; check that the channels are "
+            "in the order R, G, B and that the file belongs to the camera of the LUT, or use a LUT with a wider gamut"
         )
     return choice
 

@@ -38,7 +38,7 @@ TOLERANCE_DEG: Final = 0.01
 OutsideGamut = Literal["refuse", "nearest"]
 
 _Array = npt.NDArray[np.float64]
-# Illuminants are on a line if the ratio of the singular values of their chromaticities is smaller. The limit is far
+# Illuminants are on a line if the singular values of their chromaticities have a ratio below this limit. It is far
 # above rounding errors and far below the ratio for three illuminants of a projector.
 _THIN: Final = 1e-6
 
@@ -207,8 +207,8 @@ def black_body(lut: Lut, cct_k: float) -> Mixture:
     observer sees the colour of the black body (`experiment.lights.blackbody_light`). The camera is not this observer,
     so the ground truth differs from its response to the real black body.
     """
-    # Chromaticities of black bodies are nearly linear in mired (10⁶ / K). For steps of 200 K the error is 0.05° in the
-    # median and 0.2° at most, as for a cubic spline, and below the quantisation of 8-bit projector codes.
+    # Chromaticities of black bodies are nearly linear in mired (10⁶ / K). For steps of 200 K the error is at most 0.2°.
+    # This is less than the quantisation of 8-bit projector codes; a cubic spline is not better.
     bodies = sorted((light.cct_k, light.index) for light in lut.illuminations if light.cct_k is not None)
     if not bodies:
         raise InputError(f"the LUT {lut.folder} has no black bodies; give a chromaticity r=…,b=… instead")

@@ -73,8 +73,8 @@ def random_positions(
     number are the first three words of the SHA-256 of the name of the picture. The first crop is at candidate 0, or at
     `first`. For each further crop, the next 8 candidates are compared: the one with the least overlap with existing
     crops is used, or the first of several equal ones. This is best-candidate sampling (D. Mitchell, "Spectrally optimal
-    sampling for distribution ray tracing", SIGGRAPH 1991). If crops are already at all 8, the first free position after
-    the last of them is used, row by row.
+    sampling for distribution ray tracing", SIGGRAPH 1991). If all 8 positions are taken, the first free position after
+    the eighth is used, row by row.
 
     `starts`: numbers of columns and rows at which a crop can begin, with a product of at least `count`. `size`: width
     and height of a crop, px. `first`: column and row of the first crop, px; None for a random position.
@@ -555,8 +555,7 @@ class PictureFile:
     def name(self) -> str:
         r"""Name in the data set: path below the folder, with \xNN for bytes that are not text.
 
-        Different paths have different names: backslashes before such a byte, or before text that looks like one, are
-        doubled.
+        To keep names distinct, backslashes are doubled before such a byte and before text such as ``x8a``.
         """
         name = self.relative_path or PurePosixPath(masked(self.root).replace(os.sep, "/")).name
         name = _BYTE_LIKE.sub(lambda match: 2 * match[0], name)
@@ -805,7 +804,7 @@ def _below_folder(folder: str, search: _Search, prefix: str = "") -> Iterator[st
     except OSError as error:
         raise InputError(f"cannot list {folder}: {error.strerror}; name a readable folder") from error
     if DESCRIPTION in names:
-        # The folder is a data set, perhaps made from these pictures. Its images are not sources.
+        # A data set below the searched folder, perhaps made from these pictures, is skipped.
         if prefix:
             return
         names.remove(DESCRIPTION)

@@ -76,8 +76,8 @@ MOST_LIFT: Final = 1.25
 # cause larger factors.
 MOST_TINT: Final = 1.5
 
-# Limit of the factors that scale recorded deviations to the expected noise. The standard deviation of 25 samples has an
-# uncertainty of 1/7, and the nearest patch has a different level.
+# Limit of the factors that scale recorded deviations to the expected noise. Factors differ from 1, because 25 samples
+# give their standard deviation only to 1/7, and because the nearest patch has another level.
 MOST_SPREAD: Final = 2.0
 
 # After subtraction of black, noise is reduced until the mean is this many standard deviations above 0. Clipping at 0
@@ -270,8 +270,8 @@ def _require_contrast(lut: Lut, light: int | str, black: float, white: float) ->
 
 
 def _usable_elsewhere(lut: Lut, reference: int) -> npt.NDArray[np.bool_]:
-    # Patches with hot photosites are excluded where they are most visible, under the illuminants that are darkest in a
-    # channel.
+    # Hot photosites are most visible under the illuminants that are darkest in a channel. Patches that are unreliable
+    # there are excluded.
     darkest_lights = {int(light) for light in lut.white.argmin(axis=0)} - {reference}
     usable = np.ones(8**lut.provenance.bits, bool)
     for light in darkest_lights:
@@ -298,9 +298,9 @@ def _nearest(positions: npt.NDArray[Any], cells: npt.NDArray[np.int64], bits: in
 def black_point(profile: PrintProfile, colours: _Array, bits: int) -> float:
     """Return the grey to which black is mapped, 1 = ideal white.
 
-    It is the darkest grey that the print shows with an angle to grey of up to `BLACK_WITHIN_DEG`, at 1 to 1.25 times
-    the print's own black. If there is none, it is the print's own black. `colours`: (8**bits, 3) float64, colours of
-    the profile, with replacements for unusable patches.
+    Candidates are 1 to 1.25 times the print's own black. The darkest candidate that the print shows within
+    `BLACK_WITHIN_DEG` of grey is used; if there is none, the print's own black. `colours`: (8**bits, 3) float64,
+    colours of the profile, with replacements for unusable patches.
     """
     levels = profile.black * np.linspace(1.0, MOST_LIFT, 26)
     levels = levels[levels <= profile.white]

@@ -167,9 +167,9 @@ def fitted_matrix(lut: Lut) -> ColourMatrix:
 def fit_matrix(profile: PrintProfile) -> tuple[npt.NDArray[np.float64], float]:
     """Return the matrix (3, 3) float64 with rows of sum 1 from linear sRGB codes to colours, and its residual, degrees.
 
-    Colours are scaled between the print's black and paper, channel by channel. Differences to green are fitted by least
-    squares, a - G = c_r (R - G) + c_b (B - G), because this makes the sums of rows 1. The residual is the median angle
-    between predicted and recorded colours.
+    Colours are scaled between the print's black and paper, channel by channel. For a scaled channel a, least squares
+    fit a - G = c_r (R - G) + c_b (B - G), which makes the sums of rows 1. R, G and B are linear sRGB.
+    The residual is the median angle between predicted and recorded colours.
     """
     bits = profile.bits
     codes = channels_of(np.flatnonzero(profile.usable), bits) / (2.0**bits - 1)

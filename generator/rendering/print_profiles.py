@@ -22,9 +22,9 @@ from generator.lights.lighting import single_mixture
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-# The mean of a patch is unreliable if it is more than this many standard errors from the median. Normal samples of
-# 100 000 patches stay far below, although 25 samples give the standard error only to 1/7. One clipped photosite of 25
-# in a patch at 0.1 of saturation moves the mean by more.
+# The mean of a patch is unreliable if it is more than this many standard errors from the median. With normally
+# distributed samples, the means of 100 000 patches are much nearer. One clipped photosite of 25 in a patch at 0.1 of
+# saturation moves the mean by more.
 ODD_SIGMAS: Final = 8.0
 
 ODD_SHIFT: Final = 0.02  # Smallest relevant shift of a mean, relative to the median: 0.02 changes the hue by 1° at most
@@ -33,7 +33,7 @@ ODD_SHIFT: Final = 0.02  # Smallest relevant shift of a mean, relative to the me
 # colours would have to be mixed. With this margin, greys near white of simulated unmanaged prints are within 0.1°.
 WHITE_MARGIN: Final = 0.99
 
-# Largest white point relative to the mean of the paper. White is then also interpolated between several patches.
+# Largest white point relative to the mean of the paper. Below 1, white is interpolated between several patches, too.
 PAPER_MARGIN: Final = 0.97
 
 _Array = npt.NDArray[np.float64]

@@ -72,8 +72,8 @@ class RecycledMemory:
         """Return an array (...) float32 in C order, with arbitrary content."""
         size = 4 * int(np.prod(shape))
         memory = self._memory(size)
-        # All views refer to `values`, because its own base is not an array. `values` therefore exists as long as a view
-        # does.
+        # All views refer to `values`, because the base of `values` is not an array. Thus `values` exists as long as any
+        # view.
         values = np.frombuffer(memory, dtype=np.float32)
         weakref.finalize(values, self._free.append, memory).atexit = False
         return values.reshape(shape)

@@ -1,7 +1,7 @@
 """Change the exposure of a raw image: scale its counts and add the noise of a camera at the new exposure.
 
 A count x of a look-up table (LUT) has the mean m and the variance read² + shot · m (`sensor_noise`). The new exposure
-has a times the counts, at k times the ISO speed of the LUT, with k ≥ a. Its mean is a m and its variance
+multiplies counts by a, at k times the ISO speed of the LUT, with k ≥ a. Its mean is a m and its variance
 read_k² + k · shot · a m, where read_k is the read noise at this speed. The product a x has too little noise: its
 variance is a² read² + a · shot · a m. The missing noise is added, with a standard normal deviate z:
 
@@ -9,7 +9,7 @@ variance is a² read² + a · shot · a m. The missing noise is added, with a st
 
 y has the correct mean. Its variance is correct on average, because the second term is linear in x. For example, shot
 noise at half the light is 1.41 times the shot noise of halved counts. If a > k, noise would have to be removed, which
-is impossible. The image then has the noise of a times the ISO speed of the LUT.
+is impossible, so k = a is used instead.
 
 y is rounded to the nearest whole number, halves to even, so that rounding has no bias. It is clipped to 0 … saturation
 level.

@@ -22,7 +22,7 @@ class IsoSpeed:
     - `base`: ISO speed at which the LUT was photographed.
     - `sensor_electrons`: read noise of a photosite that arises before the amplifier, electrons; see `sensor_noise`.
 
-    Raises `InputError` if the speed is below that of the LUT, or if a value is not above 0.
+    Raises `InputError` if the speed is below that of the LUT, or if a value is out of range.
     """
 
     speed: float
@@ -33,7 +33,7 @@ class IsoSpeed:
         if not (0 < self.base < float("inf") and 0 < self.speed < float("inf") and 0 <= self.sensor_electrons < 1e6):
             raise InputError(
                 f"the ISO speed is {self.speed:g} for a LUT of ISO {self.base:g} with {self.sensor_electrons:g} "
-                "electrons of read noise, expected numbers > 0"
+                "electrons of read noise, expected speeds > 0 and electrons ≥ 0"
             )
         if self.speed < self.base:
             raise InputError(

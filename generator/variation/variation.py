@@ -145,8 +145,8 @@ class DrawnExposure:
     def factor(self, seed: int, number: int, brightness: float) -> float:
         """Return the factor > 0 of image `number`.
 
-        `brightness`: largest channel, relative to saturation, that the share `metered_share` of the pixels reaches;
-        ignored if that is None.
+        `brightness`: value relative to saturation that the largest channel reaches in the share `metered_share` of the
+        pixels; ignored if this share is None.
         """
         del brightness
         return 2.0 ** _quantile(self.stops, _uniform(seed, number))
@@ -288,9 +288,9 @@ def _uniform(seed: int, number: int) -> float:
     return (int(philox.words(seed, 0, 0, number, philox.EXPOSURES)[0]) + 0.5) / (1 << 32)
 
 
-# Trial exposures of automatic exposure, because noise lets more pixels reach the level. For 60 photographs at ISO 3200
-# and a share of 0.02, two trials gave the share within 0.5 %. Without trials, up to 3.8 times as many pixels reached
-# it.
+# Number of trials of automatic exposure. They are needed because noise lets more pixels reach the level. For 60
+# photographs at ISO 3200 and a share of 0.02, two trials gave the share within 0.5 %. Without trials, up to 3.8 times
+# as many pixels reached the level.
 _TRIALS: Final = 2
 _LARGEST_COUNT: Final = 65535  # Largest 16-bit count
 _EVEN_LIGHT: Final[Three] = (1.0, 1.0, 1.0)  # Far end of even light
