@@ -77,10 +77,7 @@ class SteadyClock:
         self._offset_s = -self.behind_s
 
     def step_s(self) -> float:
-        """Return by how many seconds the date of `clock` was changed since the last reported change, or 0.
-
-        Changes below `MIN_STEP_S` are not reported.
-        """
+        """Return by how many seconds the date of `clock` was changed since the last result; 0 below `MIN_STEP_S`."""
         offset_s = (self._clock.now() - self.now()).total_seconds()
         step_s = offset_s - self._offset_s
         if abs(step_s) < MIN_STEP_S:

@@ -1,9 +1,8 @@
 """Compile functions with numba, cache their machine code on disk, and run functions in several threads.
 
 Compiled functions have no state and release Python's interpreter lock (GIL). Cached code is used only if the source
-code, numba's settings, the processor and the library versions are the same, and if the hash of the code is correct.
-The cache folder is `NUMBA_CACHE_DIR`. If it is not set, it is `__pycache__` next to the source file, or the user's
-cache folder if `__pycache__` cannot be written (decisions 0010 and 0039).
+code, numba's settings, the processor and the library versions are unchanged. The cache is in `NUMBA_CACHE_DIR`, or else
+in the first folder that can be written: `__pycache__` next to the source, or the user's cache (decisions 0010, 0039).
 """
 
 from __future__ import annotations
@@ -49,8 +48,7 @@ class _LazyFunction:
         return (self._compiled or self.compile())(*arguments)
 
     def __reduce__(self) -> str:
-        # Objects that contain compiled functions are sent to other processes. Pickle stores only the function's name,
-        # as for other functions.
+        # Pickle stores only the name, as for other functions, to send objects with this function to other processes.
         return self._function.__qualname__
 
     @property
@@ -87,15 +85,14 @@ def _make_dispatcher(function: FunctionType) -> Any:
     try:
         dispatcher._cache = cache_class(dispatcher.py_func)  # noqa: SLF001 - as numba itself sets it
     except RuntimeError:
-        # No cache folder of numba is writable, so every start of a program compiles again, which takes seconds.
+        # No cache folder can be written, so each start of a program compiles again, which takes seconds.
         logging.getLogger(__name__).debug("no writable folder for the compiled code of %s", function.__qualname__)
     return dispatcher
 
 
 def _numba_input(function: FunctionType) -> FunctionType:
     """Return a copy of `function` that calls compiled functions and has a closure variable `origin`."""
-    # numba's cache key contains the closure variables. `origin` holds the hash of the sources and numba's settings, so
-    # old code is not used if one of them changes.
+    # numba's cache key contains closure variables, so a change of the sources or settings in `origin` invalidates it.
     code = function.__code__
     if code.co_freevars:
         raise ValueError(f"{function.__qualname__} uses outer variables {code.co_freevars}; pass them as arguments")
@@ -170,7 +167,7 @@ def _numba() -> Any:
         def on_end(self, event: event.Event) -> None:
             pass
 
-    # numba sends this event only if the code of a function is not in the cache.
+    # This event occurs only if the code of a function is not in the cache.
     event.register("numba:compile", Announcement())
     return numba
 

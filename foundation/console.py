@@ -594,10 +594,9 @@ class JsonOutput:
 
 @contextmanager
 def json_output(command: str, is_requested: bool) -> Generator[JsonOutput]:
-    """Collect values in the block and, if requested, print them when it ends.
+    """Collect values in the block and, if requested, print them when it ends, also after an error.
 
-    If values are requested, the block prints all other output to stderr. The values are also printed if an error ends
-    the block; the exit code and stderr report the error.
+    If values are requested, all other output of the block goes to stderr.
     """
     output = JsonOutput(command, is_requested)
     if not is_requested:

@@ -52,8 +52,8 @@ class CropError(Exception):
     about
         File, folder or device with the fault, the first part of the message. None if `problem` names it.
     remedy
-        What the user should do, the last part of the message. If empty, the text after the first semicolon of
-        `problem` is the remedy.
+        What the user should do, the last part of the message. If empty, the part of `problem` after its first
+        semicolon.
     value, expected
         Value found and value expected, for programs.
 

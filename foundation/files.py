@@ -5,8 +5,7 @@ incomplete file may remain under the hidden name, but never under the final name
 
 Functions that read raise a `FormatError` if a file breaks one of these rules:
 
-- A file name that was read from a file must lead to a file in the same folder or below. It has no ``..``, is no
-  absolute path, and is no link to the outside.
+- A file name that was read from a file must lead to a file inside the folder, without ``..`` and absolute paths.
 - Only regular files are opened. The data of a device or pipe may never end, and some devices change when they are read.
 - A file that is read as a whole has a size limit. A file that is read line by line has a limit for each line.
 
@@ -69,13 +68,11 @@ _DISK_REMEDIES = {
     "ENFILE": f"close other programs, {RUN_AGAIN}",
 }
 _DISK_FAULTS = {getattr(errno, name): remedy for name, remedy in _DISK_REMEDIES.items() if hasattr(errno, name)}
-# Errors of a write to an open file. They contain no file name. An error with one of the excluded numbers may come from
-# a socket, or from another file that is being read.
+# Errors of a write to an open file, which contain no file name. Errors that sockets or reads may also cause are
+# excluded.
 _NAMELESS_WRITE_ERRORS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT, errno.ENOTCONN}
 
-# Number of attempts to make a folder, because another program may remove it at the same time. Usually two or three
-# attempts are enough. On special file systems such as /proc, all attempts fail.
-FOLDER_ATTEMPTS = 1000
+FOLDER_ATTEMPTS = 1000  # Attempts to make a folder, because another program may remove it at the same time
 
 
 def partial_path(path: Path) -> Path:
@@ -313,8 +310,7 @@ class HashingWriter(io.RawIOBase):
         return self._digest.hexdigest()
 
 
-# Largest accepted JSON file, in bytes. The description of a data set with a million skipped images has a third of this
-# size.
+# Largest accepted JSON file, in bytes. A data set with a million skipped images needs a third of this size.
 MAX_JSON_BYTES: Final = 256 << 20
 
 # Longest accepted line of a file that is read line by line, in bytes. Our own lines have a few hundred bytes.
@@ -322,8 +318,7 @@ MAX_LINE_BYTES: Final = 1 << 20
 
 _MAX_NAME_LENGTH: Final = 4096  # PATH_MAX of Linux, in characters
 
-# Largest accepted sum of the holes of a file, in bytes. A hole is a range of zeros without blocks on the disk. A copy
-# of a black picture may also have holes.
+# Largest accepted sum of the holes of a file, in bytes. A hole is a range of zeros without blocks on the disk.
 _MAX_HOLE_BYTES: Final = 1 << 30
 
 # Number of holes that are measured. There is a block with data between two holes.

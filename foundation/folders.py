@@ -36,8 +36,7 @@ from foundation.files import (
 def cache_folder() -> Path | None:
     """Return the user's cache folder of CroP, or None if the user has no home folder.
 
-    The folder is `$XDG_CACHE_HOME/croplab`. If this variable is not set, it is `~/.cache/croplab`, or
-    `~/Library/Caches/croplab` on macOS.
+    The folder is `$XDG_CACHE_HOME/croplab`, or `~/.cache/croplab` (macOS: `~/Library/Caches/croplab`).
     """
     # XDG Base Directory Specification 0.8: relative paths are ignored.
     cache_home = Path(os.environ.get("XDG_CACHE_HOME", ""))
@@ -124,7 +123,7 @@ MOUNTS: Final = Path("/proc/self/mounts")  # Disks that are mounted now
 def unmounted_folder(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
     """Return the mount point at or above `path` whose disk is not mounted, or None if there is none.
 
-    `fstab`, `mounts`: lists of all disks and of mounted disks (fstab(5), proc(5)). If one is missing, return None.
+    `fstab`, `mounts`: lists of all disks and of mounted disks (fstab(5), proc(5)).
     """
     try:
         disks, mounted = ({_mount_point(line) for line in table.read_text().splitlines()} for table in (fstab, mounts))
@@ -181,9 +180,9 @@ def locked_folder(
 ) -> Generator[FolderLock]:
     """Lock a folder while the block runs; a missing folder is made.
 
-    If another program has the lock, an InputError with the message `busy` is raised. With `share_if`, the function
-    waits instead until the other program allows sharing (`FolderLock.share`). If `share_if()` is then true, the lock is
-    shared, otherwise the function tries again. Messages name `target`, by default the folder.
+    If another program has the lock, an InputError with the message `busy` is raised. With `share_if`, wait instead
+    until the other program allows sharing (`FolderLock.share`). If `share_if()` is then true, share the lock, otherwise
+    try again. Messages name `target`, by default the folder.
     """
     for _ in range(FOLDER_ATTEMPTS):
         make_folder(folder, target)
@@ -255,8 +254,8 @@ def _is_lock_file(file: int, folder_handle: int) -> bool:
 
 
 def _release_lock_file(file: int, folder_handle: int) -> None:
-    # The file is kept if another program shares the lock, because then the exclusive lock fails. The folder may have
-    # been renamed, so its handle is used, not its path.
+    # If another program shares the lock, the exclusive lock fails and the file is kept. The folder may have been
+    # renamed, so its handle is used.
     with contextlib.suppress(OSError):
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         _remove_lock_file(folder_handle)
@@ -268,10 +267,7 @@ def _remove_lock_file(folder_handle: int) -> None:
 
 
 def _lock(handle: int, wait: bool) -> bool:
-    """Take an exclusive lock; return False.
-
-    If another program has the lock and `wait` is true, wait until it allows sharing, share the lock and return True.
-    """
+    """Lock exclusively, or, if another program has the lock, wait and share it; return whether the lock is shared."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -1,13 +1,12 @@
 """HTTP server of one page on this machine; `Access` decides which requests are answered.
 
-A server on the loopback address uses no token, because users of this machine can read the files anyway. It refuses
-requests under foreign host names (DNS rebinding) and data from pages of other sites. A server for other machines also
-requires a token as the first part of the path. Relative addresses of the page then contain the token, too. The terminal
-shows the address as a QR code for phones.
+The server refuses requests under foreign host names (DNS rebinding) and data from pages of other sites. On the loopback
+address it needs no token, because users of this machine can read the files anyway. For other machines, the first part
+of the path is a token, which relative addresses of the page then contain as well. The terminal shows the address as a
+QR code for phones.
 
-Everybody can connect, even without the token, so the number and the duration of connections are limited. The head of a
-request must be complete `HEAD_S` after its first byte. If too many connections are open, a new one replaces an inactive
-one.
+Everybody can connect, even without the token, so the number and the duration of connections are limited. If too many
+are open, a new connection replaces an inactive one.
 """
 
 from __future__ import annotations
@@ -118,8 +117,7 @@ class Connections:
             self._open.pop(id(link), None)
 
     def _replaceable(self) -> _Connection | None:
-        # Choose a connection of the address that has most connections. A connection without a request is closed first,
-        # then an idle one, then a slow one.
+        # Of the address with most connections, choose one without a request, then an idle one, then a slow one.
         earliest_start = self._now() - ANSWER_S
         ranks = {"new": 0, "idle": 1, "answered": 2}
         connections = [c for c in self._open.values() if c.state != "answered" or c.since < earliest_start]

@@ -161,8 +161,8 @@ def draw_squares(
 ) -> Any:
     """Draw values (N,) as coloured squares at positions (N, 2) on the chart page.
 
-    `inches` is the approximate width of the axes. `colours` are Matplotlib's keywords `cmap`, `vmin` and `vmax`. The
-    result is the collection of squares, from which a colour bar can be made.
+    `inches` is the approximate width of the axes. `colours` are Matplotlib's keywords `cmap`, `vmin` and `vmax`. Return
+    the squares, for a colour bar.
     """
     width, height = page_mm
     # Matplotlib expects the area of a marker in square points; an inch has 72 points.

@@ -67,7 +67,7 @@ def _adapter(record_type: Any) -> TypeAdapter[Any]:
 def to_plain(record: Any, record_type: Any = None) -> Any:
     """Convert a record, or a dataclass with typed fields, to dictionaries, lists and numbers for JSON.
 
-    `record_type` is needed if the class of the object does not give the types inside, as for `tuple[Frame, ...]`.
+    `record_type` is needed if the class of the object does not give all types, as for `tuple[Frame, ...]`.
     """
     return _adapter(record_type or cast("Any", type(record))).dump_python(record, mode="json")
 
@@ -142,7 +142,7 @@ def find_mistakes(
         if detail["type"] == "extra_forbidden" and table is not None:
             mistakes[key] = unknown_key(key, table.model_fields)
         elif detail["type"] == "missing" and table is not None:
-            # A misspelt key is reported only as unknown. The correct key is then not reported as missing.
+            # If a key is misspelt, the correct key is not reported as missing.
             questions = (
                 nearest_names(str(loc[-1]), table.model_fields) for loc in unknown if loc[:-1] == location[:-1]
             )
@@ -163,8 +163,8 @@ def find_mistakes(
 
 
 def _file_key(location: tuple[int | str, ...], document: Any) -> str:
-    # pydantic adds components that are not in the file: an index for a single value that is read as a list, the type
-    # for a field with several types, and "[key]" for a wrong key of a table. They are left out here.
+    # Leave out components that pydantic adds: an index for a single value that is read as a list, the type for a field
+    # with several types, and "[key]" for a wrong key.
     components: list[str] = []
     for component in location:
         if component == "[key]" or not isinstance(document, list if isinstance(component, int) else dict):
@@ -185,7 +185,7 @@ def _missing(key: str, table: type[BaseModel] | None) -> str:
 
 
 def _expectation(key: str, error: ErrorDetails, is_secret: bool = False, hidden_choice: str = "") -> str:
-    """Describe the expected value of a key in words that a user understands without knowing pydantic."""
+    """Describe the expected value of a key without the terms of pydantic."""
     value, limits = error["input"], error.get("ctx", {})
     match error["type"]:
         case "literal_error" | "enum":
@@ -254,8 +254,8 @@ def from_settings(
 ) -> T:
     """Make a dataclass from the `values` that a user set and the `fixed` values of the other fields.
 
-    The user may set only the fields in `known_names`. An unknown name or a wrong value raises a ConfigurationError,
-    whose message contains the file (`where`) and the table in the file (`key`).
+    The user may set only the fields in `known_names`. The message of a ConfigurationError contains the file (`where`)
+    and the table (`key`).
     """
     for name in values:
         if name not in known_names:

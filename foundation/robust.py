@@ -27,7 +27,7 @@ def sigma_by_level(
 ) -> npt.NDArray[np.float64]:
     """Return, for each residual, the robust standard deviation of the residuals with a similar level, (N,) float64.
 
-    `residual` and `level` have shape (N,). Residuals are sorted by level and divided into `groups` equal groups.
+    `residual`, `level`: (N,). Residuals are sorted by level and divided into `groups` equal groups.
     """
     sigma = np.empty(len(residual))
     for members in np.array_split(np.argsort(level, kind="stable"), groups):
