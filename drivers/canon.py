@@ -202,7 +202,7 @@ _TIME_LENGTH: Final = 4  # Bytes of the time field, in seconds since 1970
 
 @dataclass(frozen=True)
 class ObjectEntry:
-    """A file or folder on the card, as described in the reply to GetObjectInfoEx and in events.
+    """A file or folder of the camera, as described in the reply to GetObjectInfoEx and in events.
 
     - `group`: a second handle, which is equal for files that belong together.
     - `name`: at most `name_width` characters.
@@ -287,10 +287,9 @@ class DeviceInfoEx:
         return encode_integer(4 + len(arrays), 4) + arrays
 
 
-# Longest accepted reply to GetEvent, bytes. A body that is not polled for a day queues about 250 kB.
-MAX_EVENTS: Final = 4 << 20
+MAX_EVENTS: Final = 4 << 20  # Longest accepted reply to GetEvent, bytes; in a day without polling it grows to 250 kB
 
-# Most records of one reply. Without polling, about 8000 are queued in 12 h (reports of libgphoto2 users).
+# Most records of one reply. In 12 h without polling, about 8000 are queued (reports of libgphoto2 users).
 MAX_RECORDS: Final = 1 << 16
 
 _HEADER_LENGTH: Final = 8  # Bytes of the header of a record: size and type
@@ -410,7 +409,7 @@ def decode_events(data: bytes) -> tuple[Record, ...]:
     records: list[Record] = []
     while True:
         start = cursor.position
-        # Some chains end with NULs or without the closing record. The reply is complete, as transports check that.
+        # Some chains end with NULs or without the closing record. Transports return only complete replies.
         if not any(data[start : start + _HEADER_LENGTH]) and not any(data[start:]):
             return tuple(records)
         if len(records) == MAX_RECORDS:
@@ -897,7 +896,7 @@ _WITHOUT_AF = 1  # Second parameter of RemoteReleaseOn: a release without autofo
 _HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
 _PAUSES_S = (0.05, 0.1, 0.15, 0.2)  # Pauses between polls, seconds, as in libgphoto2
 _PIECE_TRIES = 5  # Most requests for one piece, because a transient fault may last 1 s
-_FREE_TRIES = 3  # Requests to free an object in the camera's memory; the next `make_ready` repeats them
+_FREE_TRIES = 3  # Requests to free an object in the camera's memory
 # Operations that return a part of an object, the preferred one first.
 _PARTIAL_READS = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
 # Responses to an operation that a body lists but does not support.
@@ -990,7 +989,7 @@ class EosBody:
         """Return battery charge and free space on the cards, if the body reports them."""
         self.drain()
         level = self._battery_level()
-        # Bodies may report a battery although they use mains power, so other values do not exclude mains power.
+        # Bodies may report a battery on mains power as well, so other values do not exclude mains power.
         mains = True if self.state.number(Property.EOS_BATTERY_POWER) == _BATTERY_MAINS else None
         saves_to_host = self.state.has_value(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.HOST))
         return Supplies(level, mains, self._card_free_bytes(), saves_to_host)
@@ -1288,7 +1287,7 @@ class EosBody:
 # Most renewals of the connection in one call. Chosen without measurement.
 RECOVERIES = 3
 # Time after the first fault of a call in which the connection may be renewed, seconds. A body that was switched off
-# and on, or plugged in again, is ready within 10 s. Chosen without measurement.
+# and on is ready within 10 s. Chosen without measurement.
 RECOVERY_S = 30.0
 # Time in which a frame must be announced after the exposure, seconds. The shutter time is added to it, because some
 # bodies take a dark frame of the same length. Chosen without measurement.

@@ -208,7 +208,7 @@ def battery_level(text: str) -> float | None:
 
 
 def _select(setting: BodySetting | None, labels: tuple[str, ...], values: dict[str, str], faults: list[str]) -> None:
-    """Add the first offered label to `values`; if none is offered and the setting has none, add a fault."""
+    """Add the first offered label to `values`; if no label is offered or already set, add a fault."""
     if setting is None:
         return
     offered_label = next((label for label in labels if label in setting.choices), None)
@@ -224,8 +224,7 @@ def _select(setting: BodySetting | None, labels: tuple[str, ...], values: dict[s
 # Time in which a body must report a new value, seconds. A Sony body changes values step by step.
 SETTLE_LIMIT_S = 5.0
 
-# Most requests for a file while the body is busy, because it may still be writing the file.
-BUSY_TRIES = 5
+BUSY_TRIES = 5  # Most requests for a file from a body that is busy, because it may still be writing
 BUSY_PAUSE_S = 1.0  # Pause between two of these requests, seconds
 _POLL_S = 0.1  # Pause between two readings of a new value, seconds
 

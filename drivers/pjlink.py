@@ -327,8 +327,7 @@ DEFAULT_TIMEOUT_S = 5.0
 _SILENCE_REMEDY = "check that it is on the network, and that PJLink is enabled on it, also in standby"
 _PORT_REMEDY = "check that a projector answers at this port"
 
-# Time limit for the reply of a server that is no projector, seconds. On a local network, a reply takes milliseconds.
-_OTHER_SERVER_TIMEOUT_S = 2.0
+_OTHER_SERVER_TIMEOUT_S = 2.0  # Time limit for the reply of a server that is no projector, seconds
 _HTTP_REQUEST = b"GET / HTTP/1.0\r\n\r\n"
 _HTTP_REPLY_STARTS = (b"http/", b"rtsp/", b"<!doc", b"<html")
 # InitCommandRequest: length, type, an identifier of zeros, name, version (CIPA DC-005, 2.3.1).
@@ -575,8 +574,7 @@ class PjLinkProjector:
         return DeviceRefused(f"{self._label} refuses the password; set the PJLink password of its menu")
 
 
-# The search request is sent several times, because datagrams may be lost. A projector may reply to each request.
-SEARCH_COUNT = 3
+SEARCH_COUNT = 3  # Number of search requests, because datagrams may be lost
 SEARCH_INTERVAL_S = 1.0  # Time between two requests, seconds, so that one network fault does not affect both
 
 _MAC = re.compile("[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")

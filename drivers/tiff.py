@@ -100,7 +100,7 @@ class TiffDamaged(ValueError):
     """The bytes are not a TIFF, or a directory points beyond their end."""
 
 
-_MAX_DIRECTORIES: Final = 64  # Most directories that are read, for damaged files; camera files have fewer than ten
+_MAX_DIRECTORIES: Final = 64  # Most directories that are read; camera files have fewer than ten
 
 _MAX_ENTRIES: Final = 512  # Most entries of a directory, as in LibRaw; camera files have fewer than 100
 
@@ -314,9 +314,7 @@ _LETTERS: Final = {
     ValueType.SRATIONAL: "ii",
 }
 _HEADER: Final = struct.pack("<2sHI", b"II", 42, 8)
-_ALIGNMENT: Final = (
-    16  # The pixels start at a multiple of this number of bytes, so that samples of any type are aligned
-)
+_ALIGNMENT: Final = 16  # The pixels start at a multiple of 16 bytes, so that samples of any type are aligned
 
 
 def text(value: str) -> Value:

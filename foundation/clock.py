@@ -45,24 +45,23 @@ SYSTEM_CLOCK: Final = SystemClock()  # Default clock
 
 
 def elapsed_s() -> float:
-    """Return seconds since an arbitrary origin; on Linux, the time in suspend mode counts as well."""
+    """Return seconds since an arbitrary origin, including the time in suspend mode."""
     # time.monotonic() stops while a Linux machine is suspended.
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
-# Smallest change of the system date that counts as made by hand, s. Network time changes the date less in one night.
+# Smallest adjustment of the system date that counts as made by hand, s. Network time adjusts it less in one night.
 MIN_STEP_S = 10.0
 
 
 class SteadyClock:
-    """Clock whose date advances with elapsed time and never goes back, even if the system date is set.
+    """Clock whose date advances with elapsed time and never goes back, even if the system date is set back.
 
     White frames are interpolated in time. If the date went back during a session, frames would be interpolated between
     the wrong white frames.
 
-    The start date is the date of `clock`, or `not_before` if that is later. `sleep` uses `clock`. `elapsed` returns
-    seconds since any origin, which never decrease. `behind_s` is how far `clock` was behind `not_before` at the start,
-    in seconds, or 0.
+    The start date is the date of `clock`, or `not_before` if that is later. `behind_s` is the difference in seconds.
+    `sleep` uses `clock`. `elapsed` returns seconds since any origin, which never decrease.
     """
 
     def __init__(
@@ -77,7 +76,7 @@ class SteadyClock:
         self._offset_s = -self.behind_s
 
     def step_s(self) -> float:
-        """Return by how many seconds the date of `clock` was changed since the last result; 0 below `MIN_STEP_S`."""
+        """Return by how many seconds the date of `clock` was adjusted since the last result; 0 below `MIN_STEP_S`."""
         offset_s = (self._clock.now() - self.now()).total_seconds()
         step_s = offset_s - self._offset_s
         if abs(step_s) < MIN_STEP_S:

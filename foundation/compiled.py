@@ -48,7 +48,7 @@ class _LazyFunction:
         return (self._compiled or self.compile())(*arguments)
 
     def __reduce__(self) -> str:
-        # Pickle stores only the name, as for other functions, to send objects with this function to other processes.
+        # Pickle stores only the name, as for other functions. Objects with this function are sent to other processes.
         return self._function.__qualname__
 
     @property
@@ -92,7 +92,7 @@ def _make_dispatcher(function: FunctionType) -> Any:
 
 def _numba_input(function: FunctionType) -> FunctionType:
     """Return a copy of `function` that calls compiled functions and has a closure variable `origin`."""
-    # numba's cache key contains closure variables, so a change of the sources or settings in `origin` invalidates it.
+    # numba's cache key contains closure variables, so code that was made from other sources or settings is not used.
     code = function.__code__
     if code.co_freevars:
         raise ValueError(f"{function.__qualname__} uses outer variables {code.co_freevars}; pass them as arguments")
@@ -221,7 +221,7 @@ def processor_count() -> int:
 
 
 def ordered_map(function: Callable[[_In], _Out], items: Iterable[_In], workers: int) -> Iterator[_Out]:
-    """Yield `function(item)` in the order of the items, computed in `workers` threads; 1 is the calling thread.
+    """Yield `function(item)` in the order of the items, from `workers` threads, or from the calling thread if 1.
 
     Examples
     --------

@@ -411,7 +411,7 @@ _METAVARS = {"int": "N", "integer": "N", "float": "X", "str": "TEXT", "text": "T
 
 
 def _apply_style(command: Any) -> None:
-    """Change the help of a command: placeholders in capitals, no Python types, no line ends inside paragraphs."""
+    """Change the help of a command: capital placeholders, no Python types, no line ends inside paragraphs."""
     for parameter in command.params:
         if getattr(parameter, "is_flag", False) or getattr(parameter, "count", False):
             parameter.metavar = ""
@@ -464,7 +464,7 @@ class StyledCommand(_Styled, TyperCommand):
 
 
 class _StyledGroup(_Styled, TyperGroup):
-    """Group of commands with our style of help."""
+    """Group of commands with our help."""
 
 
 class _StyledTyper(typer.Typer):

@@ -38,7 +38,7 @@ EXIT_INTERRUPTED = 130
 # Last part of a remedy. A waiting command resumes by itself, so `CropError.while_waiting` leaves this part out.
 RUN_AGAIN: Final = "then run the same command again"
 
-# Longest message, in characters. Without a limit, a very long name or value in a file would make it unreadable.
+# Longest message, in characters. Names and values in files from other people can have any length.
 _MAX_LENGTH = 8000
 
 
@@ -113,7 +113,7 @@ class FormatError(InputError):
 
 
 class DeviceError(CropError):
-    """A device cannot be used; files that were complete before are unchanged."""
+    """A device cannot be used; data recorded earlier are safe."""
 
     exit_code = 3
 

@@ -68,8 +68,7 @@ _DISK_REMEDIES = {
     "ENFILE": f"close other programs, {RUN_AGAIN}",
 }
 _DISK_FAULTS = {getattr(errno, name): remedy for name, remedy in _DISK_REMEDIES.items() if hasattr(errno, name)}
-# Errors of a write to an open file, which contain no file name. Errors that sockets or reads may also cause are
-# excluded.
+# Errors of a write to an open file contain no file name. Errors that sockets or reads may also cause are excluded.
 _NAMELESS_WRITE_ERRORS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT, errno.ENOTCONN}
 
 FOLDER_ATTEMPTS = 1000  # Attempts to make a folder, because another program may remove it at the same time
@@ -106,7 +105,7 @@ def storage_error(path: Path, error: OSError, action: str = "write") -> InputErr
 
 
 def _write_error(path: Path, error: OSError) -> InputError | StorageError:
-    # If the folder exists, the disk is connected, so the file system allows no new files; an example is /proc.
+    # If the folder exists, its disk is connected. Then the file system allows no new files, as /proc.
     missing_name = error.filename if error.errno == errno.ENOENT and error.filename2 is None else None
     if isinstance(missing_name, str | bytes) and Path(os.fsdecode(missing_name)).parent.is_dir():
         return InputError(
@@ -243,7 +242,7 @@ def read_buffer(path: Path) -> memoryview:
     import numpy as np
 
     with path.open("rb", buffering=0) as stream:
-        # numpy allocates large memory pages. This is faster than `bytes`, because there are fewer page faults.
+        # numpy uses large memory pages, so it is faster than `bytes`.
         buffer = np.empty(os.fstat(stream.fileno()).st_size, np.uint8).data
         filled = 0
         while filled < len(buffer) and (count := stream.readinto(buffer[filled:])):
@@ -281,7 +280,7 @@ def file_sha256(path: Path) -> str:
 
 
 class HashingWriter(io.RawIOBase):
-    """Stream that writes to `stream`, a buffered file, and hashes and counts the bytes; it does not close the file."""
+    """Stream that writes to a buffered file and hashes and counts the bytes; it does not close the file."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -321,8 +320,7 @@ _MAX_NAME_LENGTH: Final = 4096  # PATH_MAX of Linux, in characters
 # Largest accepted sum of the holes of a file, in bytes. A hole is a range of zeros without blocks on the disk.
 _MAX_HOLE_BYTES: Final = 1 << 30
 
-# Number of holes that are measured. There is a block with data between two holes.
-_MAX_HOLES: Final = 4096
+_MAX_HOLES: Final = 4096  # Number of holes that are measured; between two holes is a block with data
 
 _COPY_REMEDY: Final = "ask the author for a copy of the folder without it, or copy the folder with cp -rL (no links)"
 

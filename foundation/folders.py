@@ -78,7 +78,7 @@ def require_free_file(path: Path, content: str) -> None:
         raise InputError(f"{path} already exists; choose another place for {content}, or remove it")
     if must_probe:
         try:
-            # Permissions and mount options do not prove that a folder can be written. A temporary file does.
+            # Only a temporary file proves that a folder can be written; permissions and mount options do not.
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             raise storage_error(path, error) from error
@@ -116,15 +116,12 @@ def atomic_folder(path: Path, content: str) -> Generator[Path]:
         raise
 
 
-FSTAB: Final = Path("/etc/fstab")  # Disks of a Linux machine
-MOUNTS: Final = Path("/proc/self/mounts")  # Disks that are mounted now
+FSTAB: Final = Path("/etc/fstab")  # List of the disks of a Linux machine
+MOUNTS: Final = Path("/proc/self/mounts")  # List of the disks that are mounted now
 
 
 def unmounted_folder(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
-    """Return the mount point at or above `path` whose disk is not mounted, or None if there is none.
-
-    `fstab`, `mounts`: lists of all disks and of mounted disks (fstab(5), proc(5)).
-    """
+    """Return the mount point at or above `path` whose disk is not mounted, or None if there is none."""
     try:
         disks, mounted = ({_mount_point(line) for line in table.read_text().splitlines()} for table in (fstab, mounts))
     except OSError:

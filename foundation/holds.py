@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 
 from foundation.errors import DeviceRefused
 
-# Number of refused processes that can read the process number of the lock's owner. Later ones report no number.
+# Number of refused processes that can get the process number of the owner; later ones do not get it.
 _QUEUE_LENGTH = 128
 
 

@@ -144,7 +144,7 @@ def _shut_down(link: socket.socket) -> None:
 
 
 class _TimedLink(io.RawIOBase):
-    """Connection for `http.server` that waits `idle_s` for the first byte of a request and `head_s` for its head."""
+    """Connection for `http.server` with time limits for the first byte of a request and for its head."""
 
     def __init__(self, link: socket.socket, head_s: float, idle_s: float) -> None:
         self.link = link
@@ -345,7 +345,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server.command
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing: the terminal belongs to the user."""
+        """Log nothing, to keep the terminal free."""
 
 
 @dataclass(frozen=True)
@@ -370,7 +370,7 @@ class Access:
         """
         if not self._is_own_name(host):
             return Refusal(421, f"unknown host name; open the address that {self.command} printed")
-        # With a PUT, browsers send the origin of the page that made the request.
+        # Browsers send the origin of the requesting page with a PUT.
         if origin is not None and origin.lower() != f"http://{host}".lower():
             return Refusal(403, "data from a page of another server; use the page of this server")
         path, _, query = target.removeprefix("/").partition("?")
@@ -415,8 +415,8 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
     if not number.is_unspecified:
         return (f"[{host}]" if number.version == 6 else host,)
     addresses: list[str] = []
-    # To connect a datagram socket sends nothing, but selects an address of this machine. The destinations are reserved
-    # for documentation (RFC 5737, RFC 3849), so the system selects the default route.
+    # A datagram socket that is connected sends nothing, but gets an address of this machine. The destinations are
+    # reserved for documentation (RFC 5737, RFC 3849), so the system uses the default route.
     for family, destination in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
         if family == socket.AF_INET6 and number.version == 4:
             continue

@@ -31,7 +31,7 @@ _UNBREAKABLE = re.compile(r"(?<![\w-])--[a-z][\w-]*|[-−]?\d[\d.]* – [-−]?\
 
 @dataclass(frozen=True)
 class RenderedPage:
-    """HTML text of a page, and its content security policy, which a server also sends as a header."""
+    """HTML text of a page, and its content security policy as the value of an HTTP header."""
 
     text: str
     policy: str

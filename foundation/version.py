@@ -36,7 +36,7 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 
 
 def require_own_packages() -> None:
-    """Import each package; raise an InputError if a file of the user was imported in its place."""
+    """Import each package; raise an InputError if Python imports a file of the user instead."""
     # Our package names are common words. Python imports a user's generator.py before our package `generator`.
     for name in PACKAGES:
         module = import_module(name)

@@ -83,7 +83,7 @@ def choose_display(displays: tuple[Display, ...], selection: str | int | None = 
     elif isinstance(selection, int):
         matches = [display for display in displays if display.number == selection]
     elif selection in ("left", "right"):
-        # The only display may be the wrong one, if the projector is disconnected.
+        # A single display may be the wrong one, because the projector may be disconnected.
         x_positions = [display.x for display in displays]
         if len(set(x_positions)) < 2:
             raise ConfigurationError(
@@ -563,7 +563,7 @@ def _describe_ramp_fault(glfw: Any, monitor: Any) -> str:
         return ""
     for name, values in zip(("red", "green", "blue"), channels, strict=True):
         if not values.any():
-            # A server without gamma ramps returns zeros. These are no real ramp, which would make the display black.
+            # A server without gamma ramps returns zeros, which are no real ramp.
             continue
         deviation = values - np.linspace(0, 1, values.size)
         worst_index = int(np.argmax(np.abs(deviation)))

@@ -166,10 +166,8 @@ class TcpServer(ClosedAtEnd):
                 self._links.discard(link)
 
 
-# Interval at which a simulated device is polled for delayed replies, seconds. Drivers wait much longer for a reply.
-POLLING_S = 0.02
-# Longest wait until the driver accepts a reply, seconds.
-_TIMEOUT_S = 30.0
+POLLING_S = 0.02  # Interval at which a simulated device is polled for delayed replies, seconds
+_TIMEOUT_S = 30.0  # Longest wait until the driver accepts a reply, seconds
 
 
 def serve_peer(new_peer: Callable[[], Peer], port: int = 0) -> TcpServer:
@@ -191,8 +189,7 @@ def serve_peer(new_peer: Callable[[], Peer], port: int = 0) -> TcpServer:
 
 ANY_HOST = "0.0.0.0"
 BROADCAST = "255.255.255.255"
-# Longest datagram, bytes. The length field of UDP has 16 bits (RFC 768), so no datagram is longer.
-MAX_DATAGRAM = 65535
+MAX_DATAGRAM = 65535  # Longest datagram, bytes; the length field of UDP has 16 bits (RFC 768)
 
 Address = tuple[str, int]
 

@@ -43,8 +43,7 @@ VERSION = 0x00010000  # PTP/IP 1.0
 _HEADER: Final = struct.Struct("<II")  # Length and type of a packet (clause 2.3)
 HEADER_LENGTH: Final = _HEADER.size  # Bytes
 _DATA_HEADER: Final = struct.Struct("<III")  # Length, type and transaction of a data packet
-# Longest accepted packet without data, bytes. Real packets are shorter; the longest one holds a name of 40 characters.
-MAX_PACKET = 4096
+MAX_PACKET = 4096  # Longest accepted packet without data, bytes; real packets hold at most a name of 40 characters
 MAX_NAME_UNITS = 255  # Longest accepted name, UTF-16 units; the standard permits 39
 UNKNOWN_TOTAL = 0xFFFFFFFFFFFFFFFF  # Total length in `StartData` if the length of the data is unknown
 GUID_LENGTH = 16  # Bytes of a GUID
@@ -197,7 +196,7 @@ class Data(PtpDataset):
 
 @dataclass(frozen=True)
 class EndData(PtpDataset):
-    """The last bytes of a data phase. They may be empty, or may be all bytes of the phase."""
+    """The last bytes of a data phase, which may be none or all of its bytes."""
 
     transaction: U32
     data: Rest = b""
@@ -251,7 +250,7 @@ def encode(packet: Packet) -> bytes:
 
 
 def encode_data(transaction: int, data: bytes | memoryview, *, last: bool) -> bytes:
-    """Return the bytes of a `Data` packet, or of the `EndData` packet if `last`; the data are copied only once."""
+    """Return the bytes of a `Data` packet, or of an `EndData` packet if `last`; the data are copied once."""
     length = _DATA_HEADER.size + len(data)
     packet_type = PacketType.END_DATA if last else PacketType.DATA
     return b"".join((encode_integer(length, 4), encode_integer(packet_type, 4), encode_integer(transaction, 4), data))
@@ -590,5 +589,5 @@ class IpTransport(CableTransport):
 # Message about each reason of a refusal, with a remedy.
 _REFUSALS: dict[int, str] = {
     FailReason.REJECTED: "is not paired with this computer; pair it again in the camera's wireless menu",
-    FailReason.BUSY: "is in use by another program or computer; disconnect the other, or switch the camera off and on",
+    FailReason.BUSY: "is in use by another program or computer; disconnect that one, or switch the camera off and on",
 }

@@ -247,8 +247,7 @@ _CONTROL_S = 1.0  # Timeout of a control request, seconds; a reply takes millise
 _READY_TRIES = 40  # Most status requests after a cancellation or reset
 _READY_EVERY_S = 0.05  # Pause between two status requests, seconds
 _DRAIN_S = 0.05  # If nothing arrives for this time, seconds, all old data have been discarded
-# Most pieces that are discarded. They are more than a raw frame, but a faulty device may never stop sending.
-_DRAIN_READS = 256
+_DRAIN_READS = 256  # Most pieces that are discarded, because a faulty device may never stop sending
 _EMPTY_READS = 16  # Most empty packets in a row; one may follow a full packet, more are a fault of the device
 
 

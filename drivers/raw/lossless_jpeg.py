@@ -96,7 +96,8 @@ def jpeg_size(stream: bytes | memoryview) -> JpegSize | None:
 def lossless_fault(stream: bytes | memoryview) -> str | None:
     """Describe the damage of a strip or tile; None if it is intact, or if it is not checked.
 
-    Only Huffman-coded lossless JPEG with components of equal size is checked; other raw files are no Bayer data.
+    Only Huffman-coded lossless JPEG is checked, if its components have equal size. Canon's small raw files have other
+    components, but are no Bayer data.
     """
     try:
         header = _read_header(stream)

@@ -122,7 +122,7 @@ def _first_text(directories: Sequence[Directory], tags: Sequence[TiffTag]) -> st
 
 
 def _read_canon_note(data: bytes | memoryview) -> tuple[str, str]:
-    """Return the serial number and lens model from Canon's maker note in a CR2; empty if they are not there."""
+    """Return the serial number and lens model from Canon's maker note in a CR2; empty if not stated."""
     if bytes(data[:2]) not in (b"II", b"MM") or bytes(data[8:10]) != b"CR":
         return "", ""
     order = "<" if bytes(data[:2]) == b"II" else ">"
@@ -819,7 +819,6 @@ def _count_silencers(step: int) -> None:
 
 @cache
 def _null_stream() -> int | None:
-    """Return a C stream to /dev/null; None if it cannot be opened."""
     # The stream is never closed, because a C++ library that is loaded meanwhile may use it until the program ends.
     libc = ctypes.CDLL(None)
     libc.fopen.restype = ctypes.c_void_p
