@@ -295,7 +295,7 @@ MAX_RECORDS: Final = 1 << 16
 _HEADER_LENGTH: Final = 8  # Bytes of the header of a record: size and type
 
 _END: Final = struct.pack("<II", _HEADER_LENGTH, EosEvent.END)
-_LIST: Final = 3  # Kind of a list of available values that has items; kinds 1 and 7 are empty lists
+_FILLED_LIST: Final = 3  # Kind of a list with values; kinds 1 and 7 are empty lists
 
 
 @dataclass(frozen=True)
@@ -312,7 +312,7 @@ class AvailableValues:
 
     code: int
     values: tuple[int, ...] = ()
-    kind: int = _LIST
+    kind: int = _FILLED_LIST
 
 
 @dataclass(frozen=True)
@@ -321,7 +321,7 @@ class AvailableFormats:
 
     code: int
     formats: tuple[ImageFormat, ...] = ()
-    kind: int = _LIST
+    kind: int = _FILLED_LIST
 
 
 @dataclass(frozen=True)
@@ -334,7 +334,7 @@ class ObjectEvent:
 
 @dataclass(frozen=True)
 class TransferRequest:
-    """Announcement of an object in the camera's memory, which it occupies until TransferComplete (0xc186, 0xc1a9).
+    """Announcement of an object, which stays in the camera's memory until TransferComplete (0xc186, 0xc1a9).
 
     `extra` holds the numbers between size and name; empty if all are 0. In records of type 0xc1b8 they are the parent
     and an unknown number.
@@ -409,7 +409,7 @@ def decode_events(data: bytes) -> tuple[Record, ...]:
     records: list[Record] = []
     while True:
         start = cursor.position
-        # Some chains end with NULs or without the closing record. Transports return only complete replies.
+        # Some chains end with NULs or without the closing record, although the transport returns complete replies.
         if not any(data[start : start + _HEADER_LENGTH]) and not any(data[start:]):
             return tuple(records)
         if len(records) == MAX_RECORDS:
@@ -453,7 +453,7 @@ def _decode_record(record_type: int, body: bytes) -> Record:
 def _decode_list(cursor: Cursor, body: bytes) -> Record:
     code, list_kind, count = cursor.u32("property"), cursor.u32("kind of list"), cursor.u32("count")
     cursor.name = f"{cursor.name} for {describe(Property, code)}"
-    if list_kind != _LIST:
+    if list_kind != _FILLED_LIST:
         is_empty = not count and not cursor.remaining
         return AvailableValues(code, (), list_kind) if is_empty else OtherRecord(EosEvent.AVAILABLE_LIST_CHANGED, body)
     if code in IMAGE_FORMAT_PROPERTIES:
@@ -464,9 +464,9 @@ def _decode_list(cursor: Cursor, body: bytes) -> Record:
     return OtherRecord(EosEvent.AVAILABLE_LIST_CHANGED, body) if cursor.remaining else record
 
 
-def _decode_transfer_request(cursor: Cursor, kind: int) -> TransferRequest:
-    size_length, extra_count = _TRANSFER_REQUESTS[kind]
-    handle, object_format, reserved = cursor.u32("handle"), cursor.u32("format"), cursor.u32("reserved")
+def _decode_transfer_request(cursor: Cursor, record_type: int) -> TransferRequest:
+    size_length, extra_count = _TRANSFER_REQUESTS[record_type]
+    handle, format_code, reserved = cursor.u32("handle"), cursor.u32("format"), cursor.u32("reserved")
     size = cursor.integer(size_length, "size")
     extra = cursor.integers(extra_count, 4, "the numbers before the name")
     octets = cursor.rest()
@@ -474,18 +474,18 @@ def _decode_transfer_request(cursor: Cursor, kind: int) -> TransferRequest:
     if len(octets) == len(name):
         raise cursor.fault("the name", "closed by NUL", repr(octets[:40]))
     padding = len(octets) - len(name) - 1
-    return TransferRequest(handle, object_format, size, name, kind, reserved, extra if any(extra) else (), padding)
+    return TransferRequest(handle, format_code, size, name, record_type, reserved, extra if any(extra) else (), padding)
 
 
 def _encode_record(record: Record) -> tuple[int, bytes]:
     match record:
         case PropertyChanged(code, value):
             return EosEvent.PROPERTY_CHANGED, encode_integer(code, 4) + bytes(value)
-        case AvailableValues(code, values, record_type):
-            header = encode_integer(code, 4) + encode_integer(record_type, 4)
+        case AvailableValues(code, values, list_kind):
+            header = encode_integer(code, 4) + encode_integer(list_kind, 4)
             return EosEvent.AVAILABLE_LIST_CHANGED, header + encode_array(values, 4)
-        case AvailableFormats(code, formats, record_type):
-            numbers = b"".join(encode_integer(number, 4) for number in (code, record_type, len(formats)))
+        case AvailableFormats(code, formats, list_kind):
+            numbers = b"".join(encode_integer(number, 4) for number in (code, list_kind, len(formats)))
             return EosEvent.AVAILABLE_LIST_CHANGED, numbers + b"".join(item.encode() for item in formats)
         case ObjectEvent(record_type, entry):
             return record_type, entry.encode(_OBJECT_EVENTS[record_type])
@@ -1008,7 +1008,7 @@ class EosBody:
     def poll(self) -> bool:
         """Read new events once; return whether there were any."""
         with contextlib.suppress(ProtocolError):
-            self._session.events()  # announce only that there are new records, which are requested anyway
+            self._session.events()  # these events only announce records, which the next line requests
         _, data = self._session.call(Operation.EOS_GET_EVENT)
         records = decode_events(data)
         self.state.update(records)
@@ -1178,7 +1178,7 @@ class EosBody:
 
     def _send_frames_to_host(self) -> None:
         host = host_destination(self.state)
-        # If an earlier program was killed, the body is still set to the host. The user's setting was then the card.
+        # If an earlier program was killed, the body is still set to the host. At the end it is then set to the card.
         self._user_destination = number_value(CaptureDestination.CARD)
         if not self.state.has_value(Property.EOS_CAPTURE_DESTINATION, host):
             self._user_destination = self.state.values.get(Property.EOS_CAPTURE_DESTINATION, self._user_destination)

@@ -3,9 +3,9 @@
 python-gphoto2 is optional and imported only when a camera is opened. After a fault the connection is closed, and the
 next call opens a new one. A frame that was being transferred is lost and may be taken again.
 
-libgphoto2 has several names for some settings; the first name that a body has is used. The values are labels of
-libgphoto2 in English. Every setting is read back. A body is refused if it offers no raw format, focuses automatically,
-or has another setting that would spoil a series of frames. Settings that a body does not report are ignored.
+libgphoto2 has several names for some settings; see `first_setting`. The values are labels of libgphoto2 in English.
+Every setting is read back. A body is refused if it offers no raw format, focuses automatically, or has another setting
+that would spoil a series of frames. Settings that a body does not report are ignored.
 
 Source: libgphoto2 2.5.34, camlibs/ptp2/config.c (names and labels), camlibs/ptp2/cameras (settings of bodies).
 """
@@ -45,7 +45,7 @@ HOST_TARGETS = ("Internal RAM", "sdram")  # Labels of TARGET that send frames on
 _RAW_LABELS = ("RAW", "NEF (Raw)", "Raw", "NEF", "RAW (Uncompressed)", "RAW (Lossless)")
 _NOT_RAW_SUFFIXES = (".jpg", ".jpeg", ".hif", ".heif", ".heic", ".tif", ".tiff", ".mov", ".mp4")
 # Settings that the user makes on the camera: names in libgphoto2, accepted labels, remedy. A body may have both names.
-_STATES: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
+_USER_SETTINGS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (("autoexposuremode", "expprogram"), ("Manual", "M"), "turn the mode dial to M"),
     (
         ("focusmode", "focusmode2"),
@@ -59,7 +59,7 @@ _STATES: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     ),
 )
 # Settings that would change the raw values: name in libgphoto2, accepted labels, effect of the other labels.
-_SWITCHES: tuple[tuple[str, tuple[str, ...], str], ...] = (
+_DISTURBING_SETTINGS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("isoauto", ("Off",), "the body would choose the ISO speed"),
     ("autoiso", ("Off",), "the body would choose the ISO speed"),
     ("bracketing", ("Off",), "every frame would be exposed differently"),
@@ -113,11 +113,11 @@ def plan_settings(body: Body, settings: ExposureSettings) -> dict[str, str]:
     """Return the values of the settings for a series of raw frames, in the order in which they are set."""
     faults: list[str] = []
     values: dict[str, str] = {}
-    for names, allowed, remedy in _STATES:
+    for names, allowed, remedy in _USER_SETTINGS:
         states = [setting for name in names if (setting := body(name)) is not None and setting.value]
         if states and not any(setting.value in allowed for setting in states):
             faults.append(f"{states[0].name} is {states[0].value}: {remedy}")
-    for name, labels, effect in _SWITCHES:
+    for name, labels, effect in _DISTURBING_SETTINGS:
         setting = body(name)
         if setting is None or setting.value in labels or not setting.choices:
             continue

@@ -1,7 +1,7 @@
 """PJLink over TCP: messages, a projector driver, and the search for projectors in the network.
 
-The driver sends only lines that the standard defines. It accepts some that it does not: lower case, lines that end with
-LF or CR LF, empty lines, and NUL between lines (some projectors fill their packets with NUL). Datagrams may come from
+The driver sends only lines that the standard defines. It accepts these deviations: lower case, lines that end with LF
+or CR LF, empty lines, and NUL between lines (some projectors fill their packets with NUL). Datagrams may come from
 any sender, so a datagram without a valid reply is ignored.
 
 Source: JBMIA, PJLink Specifications 1.04 (class 1) and 2.00 (class 2, whose lines have the digit 2; 3.2 search, 3.3

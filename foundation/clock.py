@@ -60,8 +60,9 @@ class SteadyClock:
     White frames are interpolated in time. If the date went back during a session, frames would be interpolated between
     the wrong white frames.
 
-    The start date is the date of `clock`, or `not_before` if that is later. `behind_s` is the difference in seconds.
-    `sleep` uses `clock`. `elapsed` returns seconds since any origin, which never decrease.
+    The start date is the date of `clock`, or `not_before` if that is later. `clock` was
+    `behind_s` seconds behind the start date. `sleep` uses `clock`. `elapsed` returns seconds since any origin, which
+    never decrease.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class SteadyClock:
         self._offset_s = -self.behind_s
 
     def step_s(self) -> float:
-        """Return by how many seconds the date of `clock` was adjusted since the last result; 0 below `MIN_STEP_S`."""
+        """Return the adjustment of the date of `clock` since the last one returned, in s; 0 below `MIN_STEP_S`."""
         offset_s = (self._clock.now() - self.now()).total_seconds()
         step_s = offset_s - self._offset_s
         if abs(step_s) < MIN_STEP_S:

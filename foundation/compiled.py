@@ -91,7 +91,7 @@ def _make_dispatcher(function: FunctionType) -> Any:
 
 
 def _numba_input(function: FunctionType) -> FunctionType:
-    """Return a copy of `function` that calls compiled functions and has a closure variable `origin`."""
+    """Return a copy that calls compiled functions; its closure variable `origin` holds source hash and settings."""
     # numba's cache key contains closure variables, so code that was made from other sources or settings is not used.
     code = function.__code__
     if code.co_freevars:
@@ -221,7 +221,7 @@ def processor_count() -> int:
 
 
 def ordered_map(function: Callable[[_In], _Out], items: Iterable[_In], workers: int) -> Iterator[_Out]:
-    """Yield `function(item)` in the order of the items, from `workers` threads, or from the calling thread if 1.
+    """Yield `function(item)` in the order of the items, from `workers` threads; 1 means the calling thread.
 
     Examples
     --------

@@ -618,7 +618,7 @@ def option(metavar: str | None, text: str, *names: str, panel: str | None = None
 
 
 def with_option_groups(function: Callable[..., None]) -> Callable[..., None]:
-    """Replace each parameter of a command that is a group of options by the options of the group.
+    """Replace each group of options among the parameters of a command by its options.
 
     A group is a frozen dataclass. Its fields are ``Annotated`` with ``Option`` or ``Argument`` of typer, and have
     defaults. A field name must occur only once in a command.

@@ -3,7 +3,7 @@
 A file is written under a hidden name in its final folder, flushed to the disk, then renamed. After a crash, an
 incomplete file may remain under the hidden name, but never under the final name. Hashes are SHA-256 (FIPS 180-4).
 
-Functions that read raise a `FormatError` if a file breaks one of these rules:
+Functions for folders from other people raise a `FormatError` if a file breaks one of these rules:
 
 - A file name that was read from a file must lead to a file inside the folder, without ``..`` and absolute paths.
 - Only regular files are opened. The data of a device or pipe may never end, and some devices change when they are read.
@@ -105,7 +105,7 @@ def storage_error(path: Path, error: OSError, action: str = "write") -> InputErr
 
 
 def _write_error(path: Path, error: OSError) -> InputError | StorageError:
-    # If the folder exists, its disk is connected. Then the file system allows no new files, as /proc.
+    # If a file is missing although its folder exists, the file system allows no new files there, as in /proc.
     missing_name = error.filename if error.errno == errno.ENOENT and error.filename2 is None else None
     if isinstance(missing_name, str | bytes) and Path(os.fsdecode(missing_name)).parent.is_dir():
         return InputError(
@@ -320,7 +320,7 @@ _MAX_NAME_LENGTH: Final = 4096  # PATH_MAX of Linux, in characters
 # Largest accepted sum of the holes of a file, in bytes. A hole is a range of zeros without blocks on the disk.
 _MAX_HOLE_BYTES: Final = 1 << 30
 
-_MAX_HOLES: Final = 4096  # Number of holes that are measured; between two holes is a block with data
+_MAX_HOLES: Final = 4096  # Number of holes that are measured; the rest of the file counts as data
 
 _COPY_REMEDY: Final = "ask the author for a copy of the folder without it, or copy the folder with cp -rL (no links)"
 

@@ -2,8 +2,8 @@
 
 The server refuses requests under foreign host names (DNS rebinding) and data from pages of other sites. On the loopback
 address it needs no token, because users of this machine can read the files anyway. For other machines, the first part
-of the path is a token, which relative addresses of the page then contain as well. The terminal shows the address as a
-QR code for phones.
+of the path is a token. Relative addresses in the page keep the token. The terminal shows the address as a QR code for
+phones.
 
 Everybody can connect, even without the token, so the number and the duration of connections are limited. If too many
 are open, a new connection replaces an inactive one.
@@ -45,7 +45,7 @@ HEAD_S = 5.0
 
 BODY_S = 30.0  # Time limit for the body of a request, s, after its head
 
-ANSWER_S = 2.0  # If an answer takes longer, s, a new connection may replace this connection
+ANSWER_S = 2.0  # Time after which a new connection may replace one whose answer is unfinished, s
 
 # A connection without requests is closed after this time, s. A hidden page sends one every 10 s.
 IDLE_S = 30.0

@@ -25,7 +25,7 @@ from markupsafe import Markup, escape
 # Smallest width of a drawing. On a narrower screen it is scrolled sideways, because its text would become too small.
 _MIN_SVG_WIDTH: Final = "36rem"
 
-# Command options and intervals such as "1 – 2". Browsers break lines after hyphens and dashes, but not in these words.
+# Command options and intervals such as "1 – 2". Browsers would break lines after their hyphens and dashes.
 _UNBREAKABLE = re.compile(r"(?<![\w-])--[a-z][\w-]*|[-−]?\d[\d.]* – [-−]?\d[\d.]*")
 
 

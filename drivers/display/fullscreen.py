@@ -383,7 +383,7 @@ class FullScreen:
                 area = display.x, display.y, display.width, display.height
                 # The display may be disconnected again during these calls.
                 with contextlib.suppress(DeviceError, glfw.GLFWError):
-                    # Only a normal window can be moved to the display, before `_make_full_screen`.
+                    # A full-screen window cannot be moved to another display.
                     glfw.set_window_monitor(self._window, None, *area, glfw.DONT_CARE)
                     self._make_full_screen(self._window)
                     self._wait_until_full()
@@ -580,7 +580,7 @@ def _profile_property(glfw: Any, monitor: Any) -> str:
 
 
 def _is_noise(ramp: npt.NDArray[np.float64]) -> bool:
-    """Return whether a gamma ramp goes up and down, because some X servers never set it."""
+    """Return whether a gamma ramp goes up and down; it is then memory that the X server never set."""
     total_variation = float(np.abs(np.diff(ramp)).sum())
     return total_variation > 2 * float(np.ptp(ramp)) and total_variation > 0.1
 

@@ -2,7 +2,7 @@
 
 A packet has its length with header (32 bits), its type (32 bits), and the fields of the type. The initiator opens the
 command channel with `InitCommandRequest`. The reply `InitCommandAck` has a connection number, with which the initiator
-opens the event channel (`InitEventRequest`, reply `InitEventAck`). A camera that refuses replies `InitFail`.
+opens the event channel (`InitEventRequest`, reply `InitEventAck`). To refuse, the camera replies `InitFail`.
 Transactions use the command channel. Events, `Ping` and `Pong` use the event channel. There is no thread: a call that
 waits for a reply also answers the pings of the camera.
 

@@ -246,7 +246,7 @@ MAX_EVENTS = 4096  # Most events that one call returns, because a faulty device 
 _CONTROL_S = 1.0  # Timeout of a control request, seconds; a reply takes milliseconds
 _READY_TRIES = 40  # Most status requests after a cancellation or reset
 _READY_EVERY_S = 0.05  # Pause between two status requests, seconds
-_DRAIN_S = 0.05  # If nothing arrives for this time, seconds, all old data have been discarded
+_DRAIN_S = 0.05  # Time without data after which all old data have been discarded, seconds
 _DRAIN_READS = 256  # Most pieces that are discarded, because a faulty device may never stop sending
 _EMPTY_READS = 16  # Most empty packets in a row; one may follow a full packet, more are a fault of the device
 

@@ -26,7 +26,8 @@ _SOI, _EOI, _SOF0, _SOF1, _SOF3, _DHT, _DQT, _DRI, _SOS = 0xD8, 0xD9, 0xC0, 0xC1
 # ignored only if all are equal.
 _PADDING: Final = 4
 
-# Zero bytes that cannot be image data if zero bits mean a difference: a dozen samples would change by equal steps.
+# Run of zero bytes. If zero bits are the code of a difference, the run is damage, because a dozen samples never change
+# by equal steps.
 _GAP: Final = bytes(16)
 
 _END: Final = bytes((0xFF, _EOI))
@@ -75,8 +76,8 @@ class JpegSize(NamedTuple):
 def jpeg_size(stream: bytes | memoryview) -> JpegSize | None:
     """Return the frame header of a lossless or sequential DCT JPEG; None for other streams.
 
-    A DCT stream must have 8 or 12 bits and quantisation tables (T.81, tables B.2 and B.4). LibRaw decodes no other DCT
-    stream, and returns memory that was never set.
+    A DCT stream must have 8 or 12 bits and quantisation tables (T.81, tables B.2 and B.4). For other DCT streams,
+    LibRaw returns memory that was never set.
     """
     size, is_quantised, position = None, False, 2
     while bytes(stream[:2]) == bytes((0xFF, _SOI)) and position + 10 <= len(stream) and stream[position] == 0xFF:

@@ -246,9 +246,9 @@ class Mosaic:
         Returns
         -------
         (2, 2) float64, counts, or None
-            Mean for each position of the top left visible block, not truncated to an integer. The first four columns
-            of each area are left out, and photosites more than six robust standard deviations from the median. None if
-            the masked areas are too small.
+            Mean for each position of the top left visible block, not truncated to an integer. The mean excludes the
+            first four columns of each area, and photosites more than six robust standard deviations from the median.
+            None if the masked areas are too small.
         """
         means = np.empty((2, 2))
         for row in range(2):
@@ -386,7 +386,7 @@ _UNCOMPRESSED, _OLD_JPEG, _JPEG, _SONY, _LOSSY_JPEG = 1, 6, 7, 32767, 34892
 # Compressions of DNG that our LibRaw does not support (DNG 1.7.1, chapter 3; 32946 is Adobe's older code).
 _UNSUPPORTED = {8: "Deflate", 32946: "Deflate", 9: "VC-5", 52546: "JPEG XL"}
 
-# Makers whose TIFF files state size and position of the raw pixels in standard tags: start of the name.
+# Starts of the names of makers whose TIFF files state size and position of the raw pixels in standard tags.
 _MAKERS = ("nikon", "sony", "pentax", "ricoh", "olympus", "om digital", "samsung", "hasselblad")
 
 # Tags of tables through which LibRaw maps the stored values.
@@ -560,8 +560,8 @@ def _maker_frame(data: bytes | memoryview, directory: Directory, extents: tuple[
         if not _are_contiguous(extents):
             raise RawUnsupported("its strips are not contiguous")
         is_grey = directory.first(TiffTag.PHOTOMETRIC_INTERPRETATION) != CFA
-        # LibRaw accepts compressed grey pixels from 8/7 bits per photosite on. It reads 14 bits as 16 bits, unless the
-        # size is exactly that of rows of 14 bits in whole blocks of 16 bytes.
+        # LibRaw accepts compressed grey pixels from 8/7 bits per photosite on. It reads 16 bits for each photosite of
+        # 14 bits, unless the pixels have exactly the size of packed rows that are padded to blocks of 16 bytes.
         size_of_14_bits = rows * -(-columns * 7 // 64) * 16 if columns % 4 == 0 else 0
         least_bits = 8 / 7 if is_grey and bits == 16 else 16 if bits > 12 and size != size_of_14_bits else bits
     elif compression in (_OLD_JPEG, _JPEG):
@@ -593,7 +593,7 @@ def _mosaic_from_libraw(path: Path, raw: RawPy, data: bytes | memoryview, conten
             f"{contents.frames[0].columns}×{contents.frames[0].rows} are stored",
         )
     sensor = raw.raw_image
-    # A view must keep LibRaw's object alive, because the counts are in its memory. Otherwise copy the counts.
+    # The counts are in the memory of LibRaw's object. If the view does not keep this object alive, copy them.
     if sensor.base is not raw or sensor.dtype != np.uint16:
         sensor = np.array(sensor, dtype=np.uint16)
     sensor.setflags(write=False)
@@ -910,8 +910,7 @@ def _stated_areas(directory: Directory | None, tag: TiffTag, sensor: tuple[int, 
     )
 
 
-# Smallest black level, counts, from which counts below half of it are impossible. With a lower level, noise is clipped
-# at zero.
+# Black level, counts, from which no photosite has less than half of it. At lower levels, noise is clipped at zero.
 _MIN_BLACK = 16
 
 _TILE = (32, 256)  # Rows and columns of the smallest part that is checked; files store no smaller parts
@@ -934,9 +933,9 @@ def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, 
 def filled_fault(counts: NDArray[np.uint16], black: NDArray[np.float64], white_level: int) -> str | None:
     """Describe the part of a frame that was filled with equal bytes, as after a truncation; None if there is none.
 
-    `counts`: (H, W) of the visible area; `black`: (2, 2) counts. Rows, and tiles of 32×256 photosites, are checked. A
-    real one has a photosite of at least half of the black level, or one count if the black level is near zero. If the
-    white level is at most half of 65535, a real one has also a smaller count than 65535.
+    `counts`: (H, W) of the visible area; `black`: (2, 2) counts. Rows, and tiles of 32×256 photosites, are checked.
+    Each measured row or tile has a count of at least half of the black level, or 1 if the black level is near zero. If
+    the white level is at most half of 65535, it also has a count below 65535.
     """
     level = float(black.min())
     floor = level / 2 if level >= _MIN_BLACK else 1

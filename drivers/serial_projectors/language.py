@@ -105,7 +105,7 @@ class LineFormat(_Table):
     ends: Annotated[Words, Field(min_length=1)]
     """Characters that end a reply."""
     unended: Texts = ()
-    """Replies that may arrive without one of these characters."""
+    """Replies that may arrive without any character of `ends`."""
     echo: bool = False
     """True if the projector may repeat a command before its reply."""
     prompt: Words = ""
