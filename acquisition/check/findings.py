@@ -1,4 +1,4 @@
-"""Findings of `acquire check`: one frozen value for each measured quantity, graded by its limit, as text and as JSON.
+"""Findings of `acquire check`, as text and as JSON. Each finding is the grade of one quantity.
 
 Grades follow the verdicts of `build-lut` (`calibration.figures.figure.Limit`): accepted values are good, values
 accepted with remarks are remarks, refused values are faults. A quantity that could not be measured is `not checked`.
@@ -20,16 +20,16 @@ _GRADES: Mapping[Outcome, Grade] = {"accept": "good", "accept with remarks": "re
 
 @dataclass(frozen=True)
 class Finding:
-    """Verdict on one quantity. The fields are the keys of `--json`.
+    """Grade of one quantity. The fields are the keys of `--json`.
 
-    - `name`: of the figure or limit, or of the checked object, such as "chart".
+    - `name`: name of the figure or limit, or of the checked object, such as "chart".
     - `grade`: good, remark, fault or not checked.
     - `said`: the measured value in words, or the reason why it could not be measured.
     - `value`: the judged value; None without a value.
     - `unit`: unit of the value and the limits, as in `Limit`.
     - `good`, `tolerable`: ranges that are accepted, and accepted with remarks.
-    - `reason`: the expected value, and the consequence of others; empty if the value is good.
-    - `remedy`: what to do; empty if nothing needs to be done.
+    - `reason`: the expected value, and the harm of other values; empty if the value is good.
+    - `remedy`: action of the user; empty if nothing needs to be done.
     - `details`: further values by name, for programs.
     """
 
@@ -60,8 +60,8 @@ class CheckReport:
 
     - `devices`: one line for each device.
     - `findings`: in the order of measurement.
-    - `forecast`: verdict of `build-lut` on the figures that a check measures; None if the chart was not detected, or
-      the trial frames were not exposed as the settings state.
+    - `forecast`: verdict of `build-lut` on the figures that a check measures; None if the chart was not detected, or if
+      the trial frames had another shutter time than the settings.
     - `figures`: measured figures by their names in `report.json`.
     - `not_known`: names of the figures that only a session can measure.
     - `first_s`: shutter time of the trial frames, s, if the settings have another one; None otherwise.
@@ -117,7 +117,7 @@ class CheckReport:
 def judge_value(
     limit: Limit, value: float, sentence: str = "", remedy: str = "", details: Mapping[str, Any] | None = None
 ) -> Finding:
-    """Judge a value by its limit; by default the sentence has the title and the remedy of the limit."""
+    """Judge a value by its limit; the sentence and the remedy of the limit are used if none are given."""
     grade, (good, tolerable) = _GRADES[limit.outcome(value)], limit.ranges
     is_good = grade == "good"
     expected = f", expected {limit.expected}" if is_good else ""
