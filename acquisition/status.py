@@ -140,7 +140,7 @@ def check_text(check: Check) -> str:
     sign = "+" if check.low is not None and check.low < 0 else ""
     match check.low, check.high:
         case None, None:
-            allowed = "; no limits until its scatter is known" if check.name == "off_brightness" else ""
+            allowed = "; no limits until the scatter of the lamp is known" if check.name == "off_brightness" else ""
         case None, high:
             allowed = f", at most {high:.4g}{unit}"
         case low, None:

@@ -368,9 +368,8 @@ SURFACE_REFLECTANCE = 0.03  # Share of the light that the surface of plain matt 
 
 MATT_SURFACE = 0.0165  # The same for coated matt photo paper; its measured black reflects 0.016 to 0.026.
 
-GLOSSY_SURFACE = (
-    0.0035  # The same for glossy paper outside of the mirror direction; its black reflects at least 0.0038.
-)
+# The same for glossy paper outside of the mirror direction; its black reflects at least 0.0038.
+GLOSSY_SURFACE = 0.0035
 
 # Density of solid matt black without the reflection of the surface. With it, the density equals the measured one.
 MATT_BLACK = 1.8
@@ -514,7 +513,7 @@ def sensitivities(name: str) -> NDArray[np.float64]:
     return curves
 
 
-ProfileName = Literal["unmanaged", "managed"]  # Conversion of codes to ink codes.
+ProfileName = Literal["unmanaged", "managed"]  # Conversion of codes of the file to ink codes.
 
 NODES = 33  # Nodes per channel of the table, as in ICC output profiles.
 

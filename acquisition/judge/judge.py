@@ -4,9 +4,10 @@ Each check returns its value and limits, and a message if it fails. The value is
 frame fails several checks, only the cause has a message (`CAUSES`), not its consequences.
 
 The amounts of the three primaries in a frame (`acquisition.judge.state`) are compared with a prediction from the
-ordered codes. Colour is compared independently of lamp brightness, which has its own check. If the colour is wrong, the
-frame is compared with the previous illuminant, with other illuminants of the plan, and with the ordered illuminant plus
-other light. Tiles and rows that deviate from the rest of the frame are covered, show another picture, or are damaged.
+ordered codes, which the projector should show. Colour is compared independently of lamp brightness, which has its own
+check. If the colour is wrong, the frame is compared with the previous illuminant, with other illuminants of the plan,
+and with the ordered illuminant plus other light. Tiles and rows that deviate from the rest of the frame are covered,
+show another picture, or are damaged.
 """
 
 from __future__ import annotations
@@ -394,9 +395,9 @@ def _judge_movement(
     moved = float(np.hypot(*change))
     reason = ""
     if moved > judge.moved_px:
-        steady = float(np.hypot(*(position - np.array(state.to_confirm[1:])))) <= limits.SAME_POSITION_PX
-        followed = steady and float(np.hypot(*position)) <= limits.MOVEMENT_ACCEPTED_PX
-        reason = "" if followed or state.resumed else _movement_reason(change.tolist(), judge.moved_px)
+        is_repeated = float(np.hypot(*(position - np.array(state.to_confirm[1:])))) <= limits.SAME_POSITION_PX
+        is_confirmed = is_repeated and float(np.hypot(*position)) <= limits.MOVEMENT_ACCEPTED_PX
+        reason = "" if is_confirmed or state.resumed else _movement_reason(change.tolist(), judge.moved_px)
     checks = [Check("movement", round(moved, 3), None, judge.moved_px, "px", reason)]
     if paper < limits.MIN_PAPER_FOR_BLUR_DN:
         return [*checks, Check("blur", None, None, judge.blur_px, "px")], position
@@ -1055,8 +1056,8 @@ def _judge_evenness(
     worst = int(excess.argmax())
     # The coarse basis from white describes single tiles badly, so more of them must deviate.
     least_tiles = 1 if basis.shows_primaries else max(1, round(limits.UNEVEN_TILES * len(deviating)))
-    late = _share_of_previous(basis, light, frame, deviating, previous)
-    reason = _uneven_reason(residuals, deviating, late) if deviating.sum() >= least_tiles else ""
+    previous_share = _share_of_previous(basis, light, frame, deviating, previous)
+    reason = _uneven_reason(residuals, deviating, previous_share) if deviating.sum() >= least_tiles else ""
     value, limit = (100 * float(np.nan_to_num(number)) for number in (residuals.relative[worst], allowed[worst]))
     checks = [Check(UNIFORMITY.name, round(value, 2), None, round(limit, 2), "%", reason)]
     if len(frame.strips):
@@ -1159,16 +1160,16 @@ def _wrong_rows(basis: Basis, residuals: Residuals, moved_px: _Array) -> npt.NDA
     return np.asarray(np.abs(np.where(is_measured, residuals.signed, 0.0)) > limit)
 
 
-def _uneven_reason(residuals: Residuals, deviating: npt.NDArray[np.bool_], late: float) -> str:
+def _uneven_reason(residuals: Residuals, deviating: npt.NDArray[np.bool_], previous_share: float) -> str:
     lit = np.isfinite(residuals.relative)
     share = float(deviating.sum() / max(int(lit.sum()), 1))
     median = float(np.median(residuals.signed[deviating]))
     amount = f"{max(share, 0.01):.0%} of the frame, {_position_text(deviating)},"
-    if late:
+    if previous_share:
         return (
-            f"{amount} still showed the previous illuminant for {max(late, 0.01):.0%} of the exposure: only part of "
-            "the projected image had changed, or a window of that colour covers it; increase sequence.settle_s, and "
-            "close other programs that draw on the screen"
+            f"{amount} still showed the previous illuminant for {max(previous_share, 0.01):.0%} of the exposure: only "
+            "part of the projected image had changed, or a window of that colour covers it; increase "
+            "sequence.settle_s, and close other programs that draw on the screen"
         )
     if share > _WHOLE_FRAME:
         return (

@@ -331,8 +331,8 @@ _MIN_LIT_SHARE = 0.01
 
 _SYSTEMATIC = 0.003  # Relative error of the counts of a tile, which is added to their noise.
 
-# Standard deviation of the black level of a frame in each channel, counts. It differs from the mean of optical black by
-# some tenths of a count, which matters if white has only some hundred counts.
+# Standard deviation of the black level of a frame in each channel, counts. The black level of the image differs from
+# the mean of optical black by some tenths of a count, which matters in dim frames.
 BLACK_DN = 0.3
 
 # Deviations of dark tiles are divided by this share of the median signal, because a glint on a dark backdrop is
@@ -464,7 +464,7 @@ class Basis:
 
 
 def _mean_variance(level: _Array, noise: Noise, blocks: _Array) -> _Array:
-    """Return the variance (N, 3) of means over `blocks` (N, 1) blocks of 2×2 photosites, at levels (N, 3)."""
+    """Return the variance (N, 3) of means over `blocks` (N, 1) 2×2 blocks at levels (N, 3); a block has two greens."""
     return noise.variance(level) / (blocks * np.array([1.0, 2.0, 1.0]))
 
 

@@ -253,7 +253,7 @@ def label_map(sheet: Print) -> LabelMap:
 
 
 def _lines(ends: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
-    """Return the sorted distinct coordinates of (N, 2) ends, and the indices of starts and ends in them.
+    """Return the sorted distinct coordinates of (N, 2) starts and ends, and the indices of starts and ends in them.
 
     Coordinates within 1 µm are replaced by their mean. If more than `_MAX_LINES` remain, this distance is increased.
     """

@@ -42,8 +42,8 @@ class Rectangle(NamedTuple):
 class Body:
     """Sensor, colour filters and noise of a camera."""
 
-    maker: str  # As in its files, for example ``Canon``
-    model: str  # As in its files, for example ``Canon EOS 550D``
+    maker: str  # As in raw files, for example ``Canon``
+    model: str  # As in raw files, for example ``Canon EOS 550D``
     sensor: tuple[int, int]  # Rows and columns of the raw frame, including masked borders
     visible: Rectangle  # Photosites that receive light, as defined by raw converters
     pattern: str  # Colour filters of the 2×2 block at the top left of `visible`, by rows, for example ``RGGB``
@@ -67,7 +67,7 @@ class Body:
 
     @property
     def camera(self) -> str:
-        """Maker and model without repetition, as `drivers.raw.rawfile` reads them from its files."""
+        """Maker and model without repetition, as `drivers.raw.rawfile` reads them from raw files."""
         words = self.model.split(" ")
         has_maker = not self.maker or words[0].casefold() == self.maker.split(" ")[0].casefold()
         return self.model if has_maker else f"{self.maker} {self.model}"
