@@ -350,10 +350,10 @@ def status(
 ) -> None:
     """Show the progress of a session: state, remaining time, last measurements, and refused frames.
 
-    Reads SESSION, also during a run; writes nothing. Ends with 0 if a run is active, or the session is complete. Ends
-    with 3 if a step is late, if the run was killed or no longer reports its state, or if it is paused or ended because
-    of a device. Ends with 4 if it is paused because of its frames, if frames are missing at the end, or if files, chart
-    or illuminants are lost. Ends with 5 if the disk is full or faulty.
+    Reads SESSION, also during a run; writes nothing. Ends with 0 if a run is active or the session is complete. Ends
+    with 3 if a device delays, pauses or ended the run, or if the run hangs or was killed. Ends with 4 if refused frames
+    pause the run, if frames are missing at its end, or if files, chart or illuminants are lost. Ends with 5 if the disk
+    is full or faulty.
     """
     from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path

@@ -152,7 +152,7 @@ def camera(
     )
     with ExitStack() as resources:
         film = resources.enter_context(_film(world, watch_screen, watch_projector))
-        # A frame may be exposed while earlier frames are still developed.
+        # A frame may be exposed while earlier frames are still calculated.
         executor = resources.enter_context(ThreadPoolExecutor(3, "developing"))
         eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, executor=executor)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))

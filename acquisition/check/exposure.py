@@ -46,7 +46,7 @@ class Shot:
 
 
 class Photographer:
-    """Takes frames with the devices of a rig; never changes ISO speed or aperture."""
+    """Takes frames with the devices of the laboratory; never changes ISO speed or aperture."""
 
     def __init__(self, devices: Devices, settings: LabSettings, scratch: Path) -> None:
         self._devices = devices
@@ -205,7 +205,7 @@ def measure_level(shot: Shot, saturation: Saturation, white: _Array | None = Non
 
 
 def search(first: TriedTime, measure: Callable[[float], TriedTime], times_s: Sequence[float]) -> tuple[TriedTime, ...]:
-    """Try shutter times until the best offered one is among them; return all trials, `first` included.
+    """Try shutter times until the best offered time has been tried; return all trials, including `first`.
 
     `measure`: takes a frame at a shutter time, s, and returns its white level.
     """

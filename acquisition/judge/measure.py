@@ -219,7 +219,7 @@ VERSION = 1  # Version of the byte format
 class Frame:
     """Measurements of a frame.
 
-    - `measured`: measurements of its light; `strips` is empty if they were not stored.
+    - `measured`: measurements of the light; `strips` is empty if strips were not stored.
     - `paper`: (3,) float64, RGB counts of white paper above black; NaN without white references.
     - `moved_px`: (2,) displacement of the chart from the anchor, half-size px right and down; NaN if not measured.
     - `anchor`: position of the chart, if later frames are compared with this frame.

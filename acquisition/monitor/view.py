@@ -507,7 +507,7 @@ class SessionWatch:
 
 
 def _numbered(inode: int, view: SessionView, earlier: _Numbered | None) -> _Numbered:
-    """Return a view with numbered changes; a replaced session is new, with all its content."""
+    """Return a view with numbered changes; after a session was replaced, all its content is new."""
     whites = view.whites()
     has_lost = earlier is not None and not earlier.attempts.keys() <= whites.keys()
     if earlier is None or has_lost or (view.steps, view.records) != (earlier.view.steps, earlier.view.records):
@@ -547,7 +547,7 @@ def _session_json(view: SessionView) -> Json:
     kinds = {light.index: (light.kind, light.cct_k) for light in view.lights}
     colours = {step.illumination: step.colour for step in view.steps if step.illumination is not None}
     codes = dict(sorted(colours.items()))
-    chromaticities = planned_places(list(codes.values()))
+    chromaticities = planned_chromaticities(list(codes.values()))
     return {
         "name": view.name,
         "steps": [[step.number, step.kind, step.illumination, *step.colour] for step in view.steps],
@@ -559,13 +559,13 @@ def _session_json(view: SessionView) -> Json:
     }
 
 
-def planned_places(codes: Sequence[tuple[int, int, int]]) -> list[list[float] | None]:
+def planned_chromaticities(codes: Sequence[tuple[int, int, int]]) -> list[list[float] | None]:
     """Return the chromaticities [r, b] (0 … 1) of the linear light of codes; None for black."""
     linear = decode_srgb(np.array(codes, dtype=np.float64).reshape(-1, 3) / 255)
-    return [place_of(red, green, blue) for red, green, blue in linear.tolist()]
+    return [rb_of(red, green, blue) for red, green, blue in linear.tolist()]
 
 
-def place_of(red: float, green: float, blue: float) -> list[float] | None:
+def rb_of(red: float, green: float, blue: float) -> list[float] | None:
     """Return the chromaticity [r, b] of linear values; None if their sum is not positive."""
     total = red + green + blue
     if not math.isfinite(total) or total <= 0:
@@ -575,7 +575,7 @@ def place_of(red: float, green: float, blue: float) -> list[float] | None:
 
 def _attempt_json(view: AttemptView, white: tuple[float, float, float] | None, preview: int | None) -> Json:
     seen = view.seen
-    chromaticity = place_of(*(rgb / w for rgb, w in zip(seen, white, strict=True))) if seen and white else None
+    chromaticity = rb_of(*(rgb / w for rgb, w in zip(seen, white, strict=True))) if seen and white else None
     values: Json = {
         "id": view.id,
         "step": view.step,
