@@ -112,7 +112,7 @@ def camera(
         option("SCREEN", "X display or part of it that illuminates the chart: :1, 640x360+0+0, or :1,640x360+0+0."),
     ] = None,
     watch_projector: Annotated[
-        str | None, option("HOST:PORT", "PJLink projector that shows this screen; by default a constant lamp.")
+        str | None, option("HOST:PORT", "PJLink projector of the watched screen; by default a constant lamp.")
     ] = None,
 ) -> None:
     """Serve a simulated Canon EOS on a TCP port; by default it photographs grey squares under white light.
@@ -238,7 +238,7 @@ def _host_and_port(text: str) -> tuple[str, int]:
 
 
 def _until_interrupted(announcement: str) -> None:
-    """Print the address and serve until Ctrl-C or SIGTERM, even if a shell ignores these signals."""
+    """Print the address and serve until Ctrl-C or SIGTERM, even if the parent process ignores them."""
     signals = queue.SimpleQueue[int]()
     for request in (signal.SIGINT, signal.SIGTERM):
         signal.signal(request, lambda number, _: signals.put(number))

@@ -64,7 +64,7 @@ MILD_SHOULDERS: Final = {"blur_px": 0.46, "shoulder_share": 0.0116, "shoulder_px
 # Settings for a worse lens, with an MTF of 0.93 and 0.64 at the same frequencies.
 STRONG_SHOULDERS: Final = {"blur_px": 0.535, "shoulder_share": 0.0452, "shoulder_px": 3.0}
 
-# Radius of the kernel, relative to a. The light outside, 0.12 %, is added to the kernel by its normalisation.
+# Radius of the kernel, relative to the length a. The kernel is normalised, which adds the light outside, 0.12 %.
 _KERNEL_RADIUS: Final = 9.0
 
 # Points per pixel and axis over which the kernel is averaged, because its peak is narrower than a pixel.

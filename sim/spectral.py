@@ -117,7 +117,7 @@ def resampled(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array
             values[:, number] = np.interp(onto_nm, wavelengths_nm, curves[:, number], left=0, right=0)
         return values
     if float(np.diff(wavelengths_nm).max()) > 0.999 * step:
-        # Otherwise, the last wavelength before a wide step would also represent the grid points inside the step.
+        # Otherwise, grid points inside a wide step would be 0, and those at its ends too large.
         wavelengths_nm, curves = _densified(wavelengths_nm, curves, step)
     # Each wavelength represents half the distance to its neighbours.
     edges = np.concatenate([wavelengths_nm[:1], (wavelengths_nm[1:] + wavelengths_nm[:-1]) / 2, wavelengths_nm[-1:]])
@@ -190,8 +190,8 @@ def _read(name: str) -> dict[str, PublishedSpectrum]:
 # End of the file names in `sim.data`: first and last wavelength and step, as in rawtoaces-data.
 SUFFIX: Final = "_380_780_5.json"
 
-# Highest response at the first and last wavelength of a file, relative to the peak (chosen). Less than 1 % of the light
-# is then missing.
+# Highest allowed response at the first and last wavelength of a file, relative to the peak (chosen). Less than 1 % of
+# the light is then missing.
 EDGE_SHARE: Final = 0.05
 
 _CHANNELS: Final = ("R", "G", "B")
@@ -371,7 +371,7 @@ MATT_SURFACE = 0.0165  # The same for coated matt photo paper; its measured blac
 # The same for glossy paper outside of the mirror direction; its black reflects at least 0.0038.
 GLOSSY_SURFACE = 0.0035
 
-# Density of solid matt black without the reflection of the surface. With it, the density equals the measured one.
+# Density of solid matt black without the reflection of the surface. With this reflection, it equals the measured one.
 MATT_BLACK = 1.8
 
 GLOSSY_BLACK = 2.0  # The same for solid photo black on glossy paper.

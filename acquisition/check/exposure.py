@@ -108,8 +108,8 @@ LONGEST_S = 30.0  # Longest shutter time to try, s. Longer exposures have more h
 # because cameras report nominal shutter times (0.3 s for 0.315 s).
 PROPORTIONAL = 0.9
 
-# Counts below this share of the stated range cannot be saturation. Noise in the dark is not proportional to exposure
-# either.
+# Counts below this share of the stated range cannot be saturation. They may be noise, and noise does not
+# follow the exposure.
 LEAST_RANGE = 0.25
 
 _Array = npt.NDArray[np.float64]

@@ -64,7 +64,7 @@ class CheckReport:
       the trial frames had another shutter time than the settings.
     - `figures`: measured figures by their names in `report.json`.
     - `not_known`: names of the figures that only a session can measure.
-    - `first_s`: shutter time of the trial frames, s, if the settings have another one; None otherwise.
+    - `shutter_s`: shutter time of the trial frames, s; None if it is the one of the settings.
     """
 
     devices: tuple[str, ...]
@@ -72,7 +72,7 @@ class CheckReport:
     forecast: Outcome | None = None
     figures: Mapping[str, float] = field(default_factory=dict[str, float])
     not_known: tuple[str, ...] = ()
-    first_s: float | None = None
+    shutter_s: float | None = None
 
     def sorted(self) -> list[Finding]:
         """Return the findings by grade, faults first."""
@@ -91,8 +91,8 @@ class CheckReport:
             return []
         names = ", ".join(name.replace("_", " ") for name in self.not_known)
         forecast = f"build-lut would return {self.forecast!r} on the {len(self.figures)} figures of this check"
-        if self.first_s is not None:
-            forecast = f"no forecast: the frames were exposed {self.first_s:.4g} s; set camera.shutter_s to this value"
+        if self.shutter_s is not None:
+            forecast = f"no forecast: frames were exposed {self.shutter_s:.4g} s; set camera.shutter_s to this value"
         return [
             f"LUT         {forecast}",
             f"            figures that only a session can measure: {names}",
@@ -102,7 +102,7 @@ class CheckReport:
         """Return the report for programs: `devices`, `faults` (their number), `findings`, `table`."""
         table = {
             "outcome": self.forecast,
-            "shutter_s": self.first_s,
+            "shutter_s": self.shutter_s,
             "figures": self.figures,
             "not_known": self.not_known,
         }

@@ -87,6 +87,6 @@ def judge_noise_reduction(timings: Sequence[tuple[float, float]]) -> Finding:
     return judge_value(
         NOISE_REDUCTION,
         growth,
-        f"after an exposure of {times[-1][0]:.4g} s a frame takes {longest:.1f} s more, after {times[0][0]:.4g} s "
-        f"{shortest:.1f} s",
+        f"a frame is ready {longest:.1f} s after an exposure of {times[-1][0]:.4g} s, and "
+        f"{shortest:.1f} s after one of {times[0][0]:.4g} s",
     )

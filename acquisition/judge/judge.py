@@ -66,7 +66,7 @@ from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError, RegistrationError, counted
 from foundation.robust import robust_sigma
 
-_BEFORE_RESTART = "this frame was exposed before earlier frames proved inconsistent; those frames are repeated first"
+_BEFORE_RESTART = "an error in the first frames was found after the exposure of this frame; they are repeated first"
 
 _UNPREDICTABLE = (
     "this illuminant cannot be predicted, expected accepted frames of black and of each primary; remove the causes of "
@@ -256,7 +256,7 @@ def _paper_rgb(paper: npt.NDArray[np.float64]) -> tuple[float, float, float] | N
 
 
 def _judge_basis(state: JudgeState, following: JudgeState) -> Check | None:
-    # A partly covered chart cannot be detected in the frame of one primary, but it would falsify all later comparisons.
+    # A frame of one primary cannot show that the chart is partly covered, but would falsify all later comparisons.
     if state.has_primaries or not following.has_primaries or state.white_or_grey is None or following.basis is None:
         return None
     moved = np.zeros(2) if following.moved_px is None else following.moved_px
@@ -643,8 +643,8 @@ CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
     }
 )
 
-# Ratio of the deviation of a tile to its limit above which uneven light explains a small movement or blur. A blur of
-# 0.5 px alone rarely makes a tile exceed its limit (simulated).
+# Uneven light explains a small movement or blur if a tile deviates by this multiple of its limit. A blur of 0.5 px
+# alone rarely makes a tile exceed its limit (simulated).
 _CLEARLY_UNEVEN = 2.0
 
 # Blur, px, below which rows still match (simulated). If rows deviate with less blur, wrong rows explain the blur.
@@ -687,7 +687,7 @@ def _voids_others(state: JudgeState, cause: str) -> bool:
 
 
 def _is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
-    # A lamp that has changed before the start of a run is lasting. Otherwise all illuminants before the next white
+    # A change of the lamp before the start of a run is lasting. Otherwise all illuminants before the next white
     # frame would be lost.
     is_changed_lamp = cause == WHITE_DRIFT.name and is_brightest_grey(step)
     # If the first frame of a session is overexposed, so is its repetition.
@@ -755,7 +755,7 @@ def _judge_light(
 def lamp_check(brightness: float, margin: float, reason: str) -> Check:
     """Return the check of `brightness`, the logarithm of measured over predicted brightness, with limit `margin`.
 
-    A limit above that of a session is not stated. It only means that the scatter of the lamp is still unknown.
+    A limit above `MAX_WHITE_DRIFT` is not stated. It only means that the scatter of the lamp is still unknown.
     """
     allowed = round(100 * margin, 2) if 100 * margin < limits.MAX_WHITE_DRIFT else None
     low = None if allowed is None else -allowed
@@ -1023,7 +1023,7 @@ _MIN_BLURRED = 0.02
 
 _EDGE_CONTRAST = 2.0  # Relative contrast of the chart (tags, paper, patches) at the edges of a tile.
 
-# Brighter and darker rows must both have at least this share of deviating rows if the rows are from other places.
+# If rows are from other places, at least this share of the deviating rows is brighter, and at least this share darker.
 _RARER_SIGN_SHARE = 0.1
 
 # Ratio of the median step between neighbouring rows to the median deviation, above which rows are from several places.

@@ -19,15 +19,15 @@ LIGHT_SIGMAS: Final = 5.5
 BRIGHTNESS_SIGMAS: Final = 6.0
 
 # Least light added to two or three frames together, in standard deviations, that is reported. In undisturbed sessions,
-# light above `MIN_ADDED_LIGHT` has less than 0.9 (`benchmarks.detection`).
+# light above `MIN_ADDED_LIGHT` has less than 0.9 standard deviations (`benchmarks.detection`).
 ADDED_SIGMAS: Final = 4.5
 
 # Deviation of colour, in standard deviations, from which a frame is compared with the previous illuminant. About one
 # correct frame in 500 exceeds it by chance.
 STALE_SIGMAS: Final = 3.5
 
-# The previous illuminant is reported if its squared distance is smaller by this number of squared standard deviations.
-# This is a factor of 1000 in likelihood.
+# The previous illuminant is reported if its squared distance is smaller than that of the ordered one by this number
+# of squared standard deviations. This is a factor of 1000 in likelihood.
 STALE_ADVANTAGE: Final = 13.8
 
 # The same for any other illuminant of the plan. The factor is 22 000, because the plan has hundreds of illuminants.
@@ -86,7 +86,8 @@ MIN_PAPER_DN: Final = 40.0
 # The same for blur. Blur depends on the second derivative of the image, which hot photosites disturb in dim frames.
 MIN_PAPER_FOR_BLUR_DN: Final = 500.0
 
-SHARPENING_RATIO: Final = 2.0  # Limit of a decrease of blur, which harms no sample, relative to that of an increase.
+# Blur may decrease by this multiple of its allowed increase, because less blur is harmless.
+SHARPENING_RATIO: Final = 2.0
 
 # Number of successive refusals for the same cause after which the cause counts as lasting. It is the default number of
 # attempts.

@@ -57,7 +57,7 @@ _TEXTURE_GRID = (4, 2)  # Number of textured areas along width and height.
 # may shift references that far.
 _PAPER_SEARCH_PX = 4
 
-# Smallest level of paper, relative to the brightest references. The flat field falls off by about as much.
+# Smallest level of paper, relative to the brightest references. The flat field falls off to about this level.
 _PAPER_LEVEL = 0.7
 
 # Side of the brightest square in a reference of 10 px, half-size px. A smaller square would be bright by chance, and

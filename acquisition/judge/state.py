@@ -223,10 +223,10 @@ class ProjectorModel:
         amounts[:, 0] = 0
         return np.asarray(amounts, dtype=np.float64)
 
-    def compare(self, amounts: _Array, codes: Codes, added: _Array | None = None) -> Fit:
-        """Compare measured amounts (3,) float64 with the prediction from codes; `added` (3, 3): their covariance."""
+    def compare(self, amounts: _Array, codes: Codes, own_covariance: _Array | None = None) -> Fit:
+        """Compare amounts (3,) float64, measured with `own_covariance` (3, 3), with the prediction from codes."""
         expected = self.predict(codes)
-        own = np.zeros((3, 3)) if added is None else added
+        own = np.zeros((3, 3)) if own_covariance is None else own_covariance
         weight = np.linalg.inv(expected.covariance + own)
         predicted = expected.amounts
         power = max(float(predicted @ weight @ predicted), 1e-12)
@@ -240,11 +240,11 @@ class ProjectorModel:
         sd = (float(share @ (expected.with_lamp + own) @ share) + self.brightness_sd**2 + LAMP_SIGMA**2) ** 0.5
         return Fit(distance, angle, brightness, sd)
 
-    def learn(self, amounts: _Array, codes: Codes, added: _Array | None = None) -> ProjectorModel:
+    def learn(self, amounts: _Array, codes: Codes, own_covariance: _Array | None = None) -> ProjectorModel:
         """Return the model updated by a frame of `codes` with measured `amounts` (3,) float64; see `compare`."""
         covariance = self.covariance.copy()
         covariance[_LAMP, _LAMP] += LAMP_SIGMA**2
-        absolute = _DARK_SIGMA**2 * np.eye(3) + (0 if added is None else added)
+        absolute = _DARK_SIGMA**2 * np.eye(3) + (0 if own_covariance is None else own_covariance)
         is_used = (np.array(codes) > 0) & (amounts > 5 * np.sqrt(np.diag(absolute)))
         if not is_used.any():
             return replace(self, covariance=covariance)

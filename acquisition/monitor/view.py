@@ -74,8 +74,8 @@ LEAST_FREE_BYTES = 1 << 20
 
 LOOK = "check the camera, its cable and the computer"  # Remedy if a run reports nothing.
 
-# Largest difference, s, between the time of the newest attempt and the last sign of life at which the end is shown as a
-# time of day. In a simulated lab, time passes at another rate.
+# The expected end is shown as a time of day only if the newest attempt and the last sign of life are nearer, s. In a
+# simulated lab, time passes at another rate.
 LAB_CLOCK_S = 600.0
 
 

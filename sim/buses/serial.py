@@ -35,7 +35,7 @@ class PseudoTerminal(ClosedAtEnd):
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
-        self._bell, self._ringer = os.pipe()
+        self._wake_read, self._wake_write = os.pipe()
         self._caught_up = threading.Event()
         self._closed = False
         self._thread = threading.Thread(target=self._serve, name=f"serving {self.path}", daemon=True)
@@ -44,7 +44,7 @@ class PseudoTerminal(ClosedAtEnd):
     def catch_up(self) -> None:
         """Wait until all input is answered. Call this before and after each step of a simulated clock."""
         self._caught_up.clear()
-        os.write(self._ringer, _WAKE)
+        os.write(self._wake_write, _WAKE)
         self._caught_up.wait(_TIMEOUT_S)
 
     def close(self) -> None:
@@ -52,17 +52,17 @@ class PseudoTerminal(ClosedAtEnd):
         if self._closed:
             return
         self._closed = True
-        os.write(self._ringer, _END)
+        os.write(self._wake_write, _END)
         self._thread.join()
-        for end in (self._master, self._slave, self._bell, self._ringer):
+        for end in (self._master, self._slave, self._wake_read, self._wake_write):
             os.close(end)
 
     def _serve(self) -> None:
         self._send(self._peer.connect())
         is_awaited = False
         while True:
-            ready, _, _ = select.select([self._master, self._bell], [], [], POLLING_S)
-            signal = os.read(self._bell, 1) if self._bell in ready else b""
+            ready, _, _ = select.select([self._master, self._wake_read], [], [], POLLING_S)
+            signal = os.read(self._wake_read, 1) if self._wake_read in ready else b""
             if signal == _END:
                 return
             is_awaited = is_awaited or signal == _WAKE

@@ -37,7 +37,7 @@ WARMING_SHARE: Final = 0.5
 
 _INSTANT_S: Final = 1e-4  # Remaining exposure times below this, s, are treated as 0.
 
-# Largest difference of light in a uniform picture. It is a quarter of the difference between the two highest codes.
+# Largest difference of light in a uniform picture. It is a ninth of the difference between the two highest codes.
 _UNIFORM_TOLERANCE: Final = 1e-3
 
 _PLACE = re.compile(r"(?P<display>[^,]*:\d+(?:\.\d+)?)?(?:,|^)?(?P<region>\d+x\d+\+\d+\+\d+)?")

@@ -209,7 +209,7 @@ class LampDrift(_Gradual):
 
 @dataclass(frozen=True)
 class AmbientStep(Disturbance):
-    """A lamp in the room is switched on. For each primary, its light is `percent` times `rgb` of the full light."""
+    """A lamp in the room is switched on. It adds `percent` of the full light to each primary, multiplied by `rgb`."""
 
     what: Literal["ambient step"] = "ambient step"
     percent: float = 1.0

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from foundation.compiled import compiled
 
-_RIPPLE: Final = 0.1  # Height of the weak waves, relative to the strong wave (chosen).
+_RIPPLE: Final = 0.1  # With `wave_mm`, height of the weak waves relative to the strong wave (chosen).
 
-_NEWTON_STEPS = 6  # Maximum number of steps; they end earlier if all errors are below 10⁻⁷ px.
+_NEWTON_STEPS = 6  # Maximum number of steps of `View.locate`, which ends earlier if all errors are below 10⁻⁷ px.
 
 # Half step of the numerical derivatives, mm: small compared with folds, but large compared with rounding errors.
 _STEP_MM = 0.05
@@ -360,7 +360,7 @@ def light(
     Parameters
     ----------
     first_row
-        Row of the first row of `out` in the visible frame.
+        Row of the visible frame where `out` starts.
     nodes
         (1 or 3, ny, nx, 2) float64, mm. Entry [:, j, i] is the point on the print that the photosite in column
         16 (i − 1) and row 16 (j − 1) sees. The first axis has one entry for all channels, or one for each channel.

@@ -318,7 +318,7 @@ def counts(
     Parameters
     ----------
     light
-        (3, rows, visible columns) float32, from `sim.world.rendering.light`. Rows of the masked border have no columns.
+        (3, rows, visible columns) float32, from `sim.world.rendering.light`. For masked rows, an array with 0 columns.
     weights
         (3,) float32, exposure to each primary.
     noise

@@ -112,7 +112,7 @@ class Room:
     black_leak
         Relative light of a primary at code 0: 1 / contrast.
     ambient
-        Ambient light of the projector's colour, relative to its white.
+        Ambient light with the colour of projector white, relative to full white.
     white_level_share
         Signal of bare paper under full white at `REFERENCE_EXPOSURE`, strongest channel, relative to saturation −
         black.
@@ -509,7 +509,7 @@ class World:
         frame: NDArray[np.uint16],
         noise: NDArray[np.float32],
         light: NDArray[np.float32],
-        drive: NDArray[np.float32],
+        weights: NDArray[np.float32],
         settings: ExposureSettings,
         first: int,
     ) -> None:
@@ -518,7 +518,7 @@ class World:
         y, x = hot.rows + first - visible.top, hot.columns - visible.left
         is_visible = (y >= 0) & (y < visible.height) & (x >= 0) & (x < visible.width)
         hot_light = np.zeros(len(hot.rows))
-        hot_light[is_visible] = drive.astype(np.float64) @ light[:, y[is_visible], x[is_visible]]
+        hot_light[is_visible] = weights.astype(np.float64) @ light[:, y[is_visible], x[is_visible]]
         hot.raise_counts(frame, noise, hot_light, self.body, settings.iso, settings.shutter_s)
 
     def _lighting(
@@ -568,8 +568,8 @@ class World:
 
         It includes the response of each photosite, but no noise, hot photosites, clipping or colour wheel.
         """
-        light, drive = self._lighting(colour, settings, lamp * np.array(situation.lamp), situation)
-        return np.tensordot(drive, light, 1)
+        light, weights = self._lighting(colour, settings, lamp * np.array(situation.lamp), situation)
+        return np.tensordot(weights, light, 1)
 
     def project(
         self, points_mm: NDArray[np.float64], channel: str = "G", situation: Situation = UNDISTURBED
@@ -581,13 +581,13 @@ class World:
         return self.lens.shifted(self.view.project(points), channel)
 
     def white(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
-        """Return R, G, B (3,) float64 of bare paper at a point with a `field` of 1, DN above black, unclipped."""
+        """Return R, G, B (3,) float64 of bare paper without fall-off (`field` = 1), DN above black, unclipped."""
         return self.reflected([PAPER], colour, settings, lamp)[0]
 
     def reflected(
         self, rgb: ArrayLike, colour: Colour, settings: ExposureSettings, lamp: float = 1.0
     ) -> NDArray[np.float64]:
-        """Return the exact linear camera RGB (N, 3) float64 of printed codes at a point with a `field` of 1.
+        """Return the exact linear camera RGB (N, 3) float64 of printed codes without fall-off (`field` = 1).
 
         `rgb`: (N, 3) codes 0 to 255. The result is in DN above black. It includes black leak and ambient light, and is
         not clipped.
