@@ -1,1 +1,1 @@
-"""The experiment's execution: the lab is checked, a session is planned, taken, judged and watched."""
+"""Acquisition of a session: the laboratory is checked, and frames are planned, taken, judged and shown."""

@@ -60,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def init(
     lab: Annotated[Path, typer.Argument(metavar="LAB", help="Folder of the lab; created if it does not exist.")],
     rig: Annotated[
-        Rig, typer.Option(help="lab: camera and projector, to be entered in LAB.toml; simulated: no hardware.")
+        Rig, typer.Option(help="lab: real devices, which you enter in LAB.toml; simulated: no hardware.")
     ] = Rig.LAB,
 ) -> None:
     """Create a lab: a commented LAB.toml, the chart to print and the 707 illuminants.
@@ -106,7 +106,7 @@ def chart(
     Reads no file. Writes OUT/chart.json (for calibration), chart.pdf (vector, PDF/X-4), chart.tif (600 dpi),
     preview.png, proof.pdf (an A4 page to test the printer) and PRINTING.txt. Print the PDF or the TIFF on matte paper
     at 100 %, with the printer's colour management off. Prints a warning to stderr if patches are too small for the
-    cameras of the paper.
+    cameras of the publication (Banić et al. 2019).
     """
     from experiment.chart.layout import design_chart, paper_chart
     from experiment.chart.printing import save_pdf, save_preview, save_tiff
@@ -232,10 +232,10 @@ def check(
     """Check whether the lab is ready: exposure, light, sharpness, print, sensor and supplies; record nothing.
 
     Reads LAB.toml, its chart and its illuminants. Takes about 25 frames and deletes them. Tries shutter times until one
-    is suitable, then judges white, dark, primary and grey frames by the figures of build-lut. Each verdict is good, a
-    remark, a fault, or not checked, with value, limit, reason and remedy. Writes nothing except the file of --picture.
-    Ends with 4 if there is a fault. If devices cannot be used, reports all of them with remedies, and ends with 3, or
-    with 2 if LAB.toml or a language file is wrong.
+    is suitable, then judges white, dark, primary and grey frames by the same figures as build-lut. Each quantity is
+    good, a remark, a fault, or not checked, and has a value, a limit, a reason and a remedy. Writes only the file of
+    --picture. Ends with 4 if there is a fault. Ends with 3 if devices cannot be used, and reports all of them with
+    remedies. Ends with 2 if LAB.toml or a language file is wrong.
     """
     from acquisition.check.check import check_lab
     from experiment.config import load_lab
@@ -350,10 +350,10 @@ def status(
 ) -> None:
     """Show the progress of a session: state, remaining time, last measurements, and refused frames.
 
-    Reads SESSION, also during a run; writes nothing. Ends with 0 if a run is active, or the session is complete. Ends
-    with 3 if a step is late, if the run was killed or no longer reports its state, or if it is paused or ended because
-    of a device. Ends with 4 if it is paused because of its frames, if frames are missing at the end, or if files, chart
-    or illuminants are lost. Ends with 5 if the disk is full or faulty.
+    Reads SESSION, also during a run; writes nothing. Ends with 0 if a run is active or the session is complete. Ends
+    with 3 if a device delays, pauses or ended the run, or if the run hangs or was killed. Ends with 4 if refused frames
+    pause the run, if frames are missing at its end, or if files, chart or illuminants are lost. Ends with 5 if the disk
+    is full or faulty.
     """
     from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path
@@ -398,9 +398,9 @@ def monitor(
 ) -> None:
     """Show a session as a live web page, until interrupted.
 
-    Reads SESSION, also during a run; writes nothing and never delays a run. With --host the address contains a new
-    token: everybody who has the address can view the session, but nobody can change anything. It is also printed as a
-    QR code.
+    Reads SESSION, also during a run; writes nothing and never delays a run. With --host, the address contains a new
+    secret token. Everybody who has the address can view the session, but nobody can change anything. The address is
+    also printed as a QR code.
     """
     from acquisition.monitor.serving import open_monitor
 
@@ -417,7 +417,7 @@ def report(
         Path | None, typer.Argument(help="HTML file, replaced if it exists; SESSION/report.html by default.")
     ] = None,
 ) -> None:
-    """Write the monitor's page with its pictures as one HTML file.
+    """Write the page of acquire monitor with its pictures as one HTML file.
 
     Reads SESSION, also during a run. acquire run writes the same file when it ends.
     """
@@ -441,7 +441,7 @@ def import_(
     """Make a session from raw files taken by other means; every file is copied and judged.
 
     Reads FRAMES, illuminations.csv next to it, CHART and the raw files. Writes SESSION, like acquire run. Ends with 4
-    if an illuminant, or every white or dark frame, has no accepted frame; the session is written anyway.
+    if an illuminant has no accepted frame, or if no white or no dark frame was accepted; SESSION is written anyway.
     """
     from acquisition.run.importing import import_session
 

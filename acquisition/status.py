@@ -1,4 +1,4 @@
-"""Text and JSON of `acquire status`: the same content as the page of `acquire monitor`."""
+"""Text and JSON of `acquire status`, which reports the same as the page of `acquire monitor`."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, Check, doubts_of, duration_text
 from foundation.errors import CropError, counted
 
-LAST = 5  # Verdicts and events to show: chosen, as many as fit on a screen
+LAST = 5  # Number of verdicts and events to show (chosen).
 
 
-# Mark of a value beyond its limits that did not refuse the frame.
+# Added to a value beyond its limits for which the frame was not refused.
 BEYOND = " (beyond its limit, but accepted, or explained by another cause)"
 
 # Meanings of the checks, as in docs/how-to/night-run.md.
@@ -41,7 +41,7 @@ MEANINGS = {
 
 
 def read_status(folder: Path, now: datetime) -> SessionView:
-    """Return the view of a session; a complete one is also opened, to detect faults that would stop build-lut."""
+    """Return the view of a session. A complete session is also opened, to detect faults that would stop build-lut."""
     view = read_session(folder)
     if view.head(now).state == "complete":
         try:
@@ -74,7 +74,7 @@ def status_lines(view: SessionView, now: datetime) -> list[str]:
 
 
 def status_json(view: SessionView, now: datetime) -> dict[str, Any]:
-    """Return the state of a session for programs: the fields of `Head`, measured values and refusals; times as text."""
+    """Return the state of a session for programs: fields of `Head`, measured values, and refusals. Times are text."""
     head = view.head(now)
     values = head.to_plain()
     if not head.alive:
@@ -140,7 +140,7 @@ def check_text(check: Check) -> str:
     sign = "+" if check.low is not None and check.low < 0 else ""
     match check.low, check.high:
         case None, None:
-            allowed = "; no limits until its scatter is known" if check.name == "off_brightness" else ""
+            allowed = "; no limits until the scatter of the lamp is known" if check.name == "off_brightness" else ""
         case None, high:
             allowed = f", at most {high:.4g}{unit}"
         case low, None:

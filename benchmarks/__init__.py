@@ -1,4 +1,4 @@
-"""Performance and accuracy benchmarks: `python -m benchmarks.NAME` prints one JSON object per figure and line."""
+"""Performance and accuracy benchmarks: `python -m benchmarks.NAME` prints one JSON object per line."""
 
 from __future__ import annotations
 

@@ -1,12 +1,13 @@
 """Accuracy of a LUT that is built from sessions of full-size frames in simulated rooms.
 
-`python -m benchmarks.accuracy` prints one JSON object per figure and line. It measures both cameras in the default
-room. It then adds a fading lamp (3 %) with a projector fall-off of 30 %, and last primaries with different fall-offs,
-which white paper alone cannot show. It takes about ten minutes.
+`python -m benchmarks.accuracy` prints one JSON object per result, each on its own line. It measures both cameras in the
+default room. One camera is also measured in two other rooms: in the first the lamp fades by 3 % and the projector has a
+fall-off of 30 %; in the second the primaries have different fall-offs, which white paper alone cannot show. It takes
+about ten minutes.
 
-A mean of 25 samples has noise: 1 % at 300 counts. Every LUT has this noise, so only the error in excess of it counts.
-The noise of light and sensor is predicted for every patch. The systematic error is the root of the mean square error
-minus the mean square noise (`beyond_noise`). Its uncertainty comes from the scatter over illuminants, because errors
+The mean of 25 samples has noise of 1 % at 300 counts. Every LUT has this noise, so only errors beyond the noise count.
+The noise of light and sensor is predicted for every patch. The systematic error is the square root of the mean square
+error minus the mean square noise (`beyond_noise`). Its uncertainty is the scatter over illuminants, because errors
 under one illuminant are correlated.
 """
 
@@ -132,7 +133,7 @@ def repeated_variance(
     """Return the variance between two frames of one illuminant, divided by that of photons and read noise: (C, 3).
 
     The difference of two frames contains no fixed pattern (response, bleed, fall-off). The samples are (C, 25, 3);
-    `counts` (C, 3) are the true counts including the flat field.
+    `counts` (C, 3) are the true counts before division by the flat field.
     """
     measured = (first_samples.astype(np.float64) - second_samples).var(axis=1, ddof=1) / 2
     return measured / (sample_variance(counts, body, iso) / field**2 + 1 / 12)

@@ -1,8 +1,8 @@
 """Speed of drawing training crops: `python -m benchmarks.batches [--lut LUT]` prints one JSON object per line.
 
-Crops of 128 × 128 px are read from a LUT on disk; each crop has its own illuminant. Without `--lut`, a full-size LUT of
-shot noise (707 illuminants, 3.5 GB) is first written to a temporary folder. Programs and modes (by codes, by colour)
-take turns in one run. With one thread the time is processor time, otherwise wall time.
+Crops of 128 × 128 px are drawn from a LUT on disk; each crop has its own illuminant. Without `--lut`, a full-size LUT
+with photon noise only (707 illuminants, 3.5 GB) is first written to a temporary folder. CroP by codes, CroP by colour
+and a NumPy program are run alternately. With one thread the measured time is processor time, otherwise wall time.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def measure(lut: Lut) -> None:
         numpy_s.append(time.thread_time() - start)
         for threads, crops in crops_by_threads.items():
             clock = time.thread_time if threads == 1 else time.perf_counter
-            # Do not count the first batch of a row: the cache still holds data of the other program.
+            # The first batch of each program does not count, because the caches still hold data of the other program.
             for number in range(turn * IN_A_ROW, (turn + 1) * IN_A_ROW):
                 for mode, times in ((crops, seconds_by_codes), (colour_crops[threads], seconds_by_colour)):
                     start = clock()

@@ -1,15 +1,15 @@
-"""Cost of building a LUT: `python -m benchmarks.build_lut [PART …]` prints one JSON object per figure and line.
+"""Cost of building a LUT: `python -m benchmarks.build_lut [PART …]` prints one JSON object per result and line.
 
 Parts are `memory`, `chart`, `DNG` and `CR2`. Without a part all are measured, which takes some minutes.
 
-A short session of full-size EOS 550D frames is built as `build-lut` does: once from the uncompressed DNG of the
-simulated camera, once from the same counts as CR2 (lossless JPEG, like the real body). Each build takes turns with a
-simple pass over the same files, so that the speed of the machine cancels: unpacking by rawpy with as many threads as
-the build, and dcraw if it is installed.
+A LUT is built from a short session of full-size EOS 550D frames: once from uncompressed DNG files of the simulated
+camera, once from the same counts in CR2 files (lossless JPEG, like the real body). Builds alternate with simpler
+programs on the same files, so that the speed of the machine cancels in the ratio. These programs are rawpy, which
+unpacks the files with as many threads as the build, and dcraw if it is installed.
 
-The cost of lens correction and patch comparison is the processor time of the build over that of a build without them,
-per frame. The lens is measured once per session; this cost is divided by the frames of 707 illuminants. A session of
-ten illuminants takes a quarter longer because of it. Memory is measured with the command itself on frames of the EOS 6D
+The cost of lens correction and patch comparison is the additional processor time per frame, relative to a build without
+them. The lens is measured once per session, so this cost is divided by the frames of a session with 707 illuminants. It
+makes a session of ten illuminants a quarter longer. Memory is measured with the command itself on frames of the EOS 6D
 Mark II, with few and with more illuminants.
 """
 

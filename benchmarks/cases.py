@@ -1,14 +1,17 @@
 """Difficult lenses and careless laboratories as named cases: rooms and frames with a known fault.
 
-Each `NamedCase` has a room, frames that differ from the plan, and the causes that a verdict may name: right and wrong
-ones, as regular expressions. `try_case` takes a short session, builds its LUT and compares it with the truth:
+Each `NamedCase` has a room, frames that differ from the plan, and two regular expressions: for right causes and for
+wrong causes that a verdict may name. `try_case` takes a short session, builds its LUT, compares it with the truth and
+reports one of these failures:
 
-- *silent*: the LUT is wrong, and the verdict accepts it or names no right cause. Wrong means: a ground truth is off by
-  `WRONG_DEG`, or a patch mean of at least 300 counts (brightness error included) by `WRONG_SHARE`, and by more than
-  twice the reported uncertainty (k = 2);
+- *silent*: the LUT is wrong, and the verdict accepts it or names no right cause;
 - *wrong cause*: the verdict names a wrong cause or no right cause, with or without a LUT;
-- *false remark*: a remark although nothing is wrong;
+- *false remark*: there is a remark although nothing is wrong;
 - *unsaid*: the LUT is right, but an expected remark is missing.
+
+A LUT is wrong if the error of a ground truth exceeds `WRONG_DEG`, or if the error of a patch mean of at least 300
+counts (brightness error included) exceeds `WRONG_SHARE`. The error must also exceed twice the reported uncertainty (k =
+2).
 """
 
 from __future__ import annotations
@@ -520,7 +523,7 @@ def chart_of(small: bool, seed: int = 1) -> Chart:
 # Figure of a verdict: error remaining after lens correction.
 LENS_LEFT: Final = "correction_residual"
 
-# The reported RMS error counts as correct if the RMS error of the LUT is within this many standard errors.
+# The reported RMS error counts as correct if it differs from the RMS error of the LUT by fewer standard errors.
 _TRUE_WITHIN: Final = 2.0
 
 
@@ -538,7 +541,7 @@ class Outcome:
     def remarks_without_lens(self) -> tuple[str, ...]:
         """Remarks without the one about the remaining lens error, if that figure is correct.
 
-        A chart of few colours cannot show veiling glare and reports so in any case.
+        With a chart of few colours, veiling glare cannot be measured, and this remark is always made.
         """
         is_correct = self.truth is None or self.truth.rms <= _TRUE_WITHIN * self.lens_left
         if not is_correct or len(self.rows) != len(self.says):
@@ -609,7 +612,7 @@ def try_case(case: NamedCase, *, small: bool, seed: int = 1, body: str = "EOS 55
     judged = replace(outcome, says=outcome.remarks_without_lens if small else outcome.says)
     names_right, names_wrong = outcome.mentions(case.right), judged.mentions(case.wrong)
     if LENS_LEFT in outcome.rows and len(outcome.remarks_without_lens) == len(outcome.says):
-        # A figure that is smaller than the true error does not explain it.
+        # If the reported error is smaller than the true error, it does not explain the true error.
         names_right = False
     row: dict[str, Any] = {"case": case.name, "what": case.what} | outcome.to_json()
     row["silent"] = outcome.is_wrong and not names_right

@@ -23,8 +23,8 @@ from experiment.lights import plan_illuminants, save_illuminants
 # Seeds of the good rooms.
 SEEDS = range(30)
 
-# Figure of interest, bits of the chart, and differences from the default room (`shutter_s` of the camera, with lamp
-# brightness to match).
+# Figure of interest, bits of the chart, and differences from the default room. If the shutter time `shutter_s` differs,
+# lamp brightness is changed so that the exposure is the same.
 ROOMS: tuple[tuple[str, int, dict[str, Any]], ...] = (
     *(
         ("brightest_share", 2, {"white_level_share": share})

@@ -1,10 +1,15 @@
 """Uniformity and independence of the sample choices: `python -m benchmarks.choices [DRAWS]`, 10⁸ draws by default.
 
-Chi-square statistics are computed for the 25 samples, for each position that shares a random word, and for all 625
-pairs of two pixels. The pairs are: pixels in a row at distances near and at powers of two (weak generators fail there),
-pixels above each other, consecutive images and seeds, and swapped neighbours of two seeds. Each statistic is reported
-in standard deviations of a normal distribution (cube root of Wilson and Hilferty). One run in 10⁵ exceeds LIMIT by
-chance. The exit code is 1 if a statistic exceeds it.
+Chi-square statistics are computed for the 25 samples, separately for each pixel position that shares a random word, and
+for the 625 combinations of the samples of two pixels. Pairs of pixels are taken:
+
+- in a row, at distances that are powers of two or nearly so, because weak generators fail there;
+- above each other;
+- from consecutive images and from consecutive seeds;
+- from swapped neighbours with two seeds.
+
+Each statistic is reported in standard deviations of a normal distribution (cube root of Wilson and Hilferty). By
+chance, a statistic exceeds LIMIT in one of 10⁵ runs. The exit code is then 1.
 """
 
 from __future__ import annotations

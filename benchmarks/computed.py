@@ -1,13 +1,12 @@
 """Differences between a computed and a photographed LUT of the same camera and chart, relative to their noise.
 
-`python -m benchmarks.computed [COMPUTED PHOTOGRAPHED] [--every N]` prints one JSON object per figure and line.
-Without LUTs it takes a session of 13 illuminants in a simulated room (chart of 512 colours, small body) and computes
-the same LUT; this takes a minute.
+`python -m benchmarks.computed [COMPUTED PHOTOGRAPHED] [--every N]` prints one JSON object per result and line. Without
+LUTs it takes a session of 13 illuminants in a simulated room (chart of 512 colours, small body) and computes the same
+LUT; this takes a minute.
 
-The patch means of both LUTs are compared under every N-th illuminant. Brightness differences of the illuminants are
-removed with the green ground truth, because the lamp of a photographed session ages. If two LUTs differ by noise
-alone, difference / standard error follows Student's t: mean 0, standard deviation 1.02 with 2 · 24 degrees of
-freedom.
+The patch means of both LUTs are compared under every N-th illuminant. The lamp of a photographed session ages, so both
+LUTs are first scaled to the same green value of white. If two LUTs differ by noise alone, difference / standard error
+has Student's t distribution with 2 · 24 degrees of freedom: mean 0, standard deviation 1.02.
 """
 
 from __future__ import annotations

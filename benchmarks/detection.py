@@ -3,7 +3,8 @@
 It prints four Markdown tables:
 
 - detection: each disturbance and size is tried in several simulated rooms and under several illuminants (also deep
-  blue, white and dark frames). The table counts detections at the same frame, at the next one or never, and the causes;
+  blue, white and dark frames). The table counts detections in the same frame, in the next frame or never, and the
+  causes;
 - false alarms: refused frames in undisturbed sessions, one room each. Some rooms have a drifting lamp and a warming
   sensor, or a projector that is not additive, depends on the previous image or flickers;
 - neighbours: illuminants of the plan (707) that could replace each other undetected;
@@ -36,7 +37,7 @@ from sim.world.world import Room
 
 
 def neighbours(model: ProjectorModel, plan: Sequence[Illuminant]) -> tuple[int, int, list[str]]:
-    """Count illuminants that cannot be distinguished from another one, and from the next of the plan; list the pairs.
+    """Count illuminants that look like another one of the plan, or like the next one, and list the pairs.
 
     Two illuminants are distinguished if a swap exceeds the limits `limits.STALE_SIGMAS` and `STALE_ADVANTAGE` on
     average.

@@ -34,7 +34,7 @@ LIGHT, ANY, LIT, TWO_COLOURED = "lights", "any", "lit", "lights with more of red
 
 @dataclass(frozen=True)
 class Trial:
-    """A disturbance of one frame; `NAMED` holds the pattern that a message with the right cause matches."""
+    """A disturbance of one frame. A message with the right cause matches its pattern in `NAMED`."""
 
     name: str
     size: str  # description of its strength
@@ -97,7 +97,7 @@ TRIALS = (
 _ANOTHER_LIGHT = "still shows the previous|shows another illuminant|is not the ordered"
 _ELSEWHERE = "darken the room|other light than|other light falls on the chart|the room light has changed"
 
-# Pattern of the right cause for each disturbance; causes that one frame cannot distinguish are alternatives.
+# Pattern of the right cause for each disturbance, with alternatives if one frame cannot distinguish several causes.
 NAMED = {
     "frozen screen, from a frame on": _ANOTHER_LIGHT,
     "stale frame": _ANOTHER_LIGHT,
@@ -124,7 +124,7 @@ NAMED = {
 
 @dataclass
 class Tally:
-    """Counts of one disturbance: detected at the same frame, at the next, never; wrong causes; causes."""
+    """Counts for one disturbance: detected in the same frame, in the next frame, never; wrong causes; causes."""
 
     at_once: int = 0
     next: int = 0

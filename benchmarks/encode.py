@@ -1,8 +1,8 @@
 """Speed of writing image files, and their size: `python -m benchmarks.encode` prints one JSON object per line.
 
-Calls alternate with `cv2.imencode` of the same image and the fastest of each counts, so the ratios are valid on a
-machine with other load. Three images are drawn from a LUT: a photograph of 512 px, the same enlarged to 18 Mpx with
-camera grain, and a smooth picture of that size in which few pixels share a colour.
+Our encoder and `cv2.imencode` encode the same image in turns. The fastest call of each counts, so the ratios are valid
+on a machine with other load. Three images are drawn from a LUT: a photograph of 512 px, the same photograph enlarged to
+18 Mpx with camera grain, and a smooth picture of 18 Mpx in which few pixels have the same colour.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
 """Speed of the methods: `python -m benchmarks.evaluation` prints one JSON object per line.
 
-Each method takes turns with a short NumPy and OpenCV version of itself, on one thread; the fastest turn of each counts,
-in processor time. Both versions do the same work with the same exclusions: saturated pixels and their neighbours are
-left out (0.1 % of the image are saturated). The versions use float32 and `cv2.mean`, which are fastest in OpenCV.
+Each method is compared with a short NumPy and OpenCV version of the same method, on one thread. Both run in turns, and
+the shortest processor time of each counts. Both exclude saturated pixels and their neighbours; 0.1 % of the image are
+saturated. The short versions use float32 and `cv2.mean`, which are the fastest choice in OpenCV.
 
-"Files to results" compares `evaluate` on the PNG files of a generated data set with reading the same files only, with
-as many threads as processors, also in turns. It takes three to four minutes.
+"Files to results" compares two times, also in turns and with as many threads as processors: the time of `evaluate` for
+the PNG files of a generated data set, and the time of only reading these files. The benchmark takes three to four
+minutes.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def main() -> None:
 
 
 def report_methods(size: str, image: Image) -> None:
-    """Report each method against its short version, and the gain of shared intermediate images."""
+    """Report the speed of each method relative to its short version, and the gain by shared intermediate images."""
     pixels = image.size / 3e6
     turns = 15 if pixels < 1 else 3
     methods: list[Method] = []

@@ -1,9 +1,10 @@
 """Response times of the page of a LUT while an illuminant is dragged over the plane.
 
-`python -m benchmarks.explore [LUT]` prints one JSON object per line: median and slowest time of each answer over
-loopback at 1000 × 750 px, and of the three answers that a page needs for an illuminant, one after another. Without an
-argument the demo LUT is used. Each illuminant is requested once, so no cache holds it, except for the illuminants of
-the LUT. If Chromium is installed, the last line is the time from choosing an illuminant to both drawn images.
+`python -m benchmarks.explore [LUT]` prints one JSON object per line: the median and the longest time of each answer of
+the server, over loopback, for a picture of 1000 × 750 px. It also prints the total time of the three answers that a
+page needs for one illuminant. Without an argument the demo LUT is used. Each mixed illuminant is requested only once,
+so no cache contains it. If Chromium is installed, the last line is the time from the choice of an illuminant until both
+images are drawn.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from tests.acquisition.monitor.browser import CHROMIUM, browser_tab
 # Number of requested illuminants.
 PLACES = 40
 
-# Moves the illuminant on the page from place to place and returns each time, in ms.
+# Moves the illuminant on the page from place to place and returns the time of each move, in ms.
 DRAGGED = """
 (async () => {
   const times = [];
@@ -96,7 +97,8 @@ def main() -> None:
                 colour_s, _ = _request(f"{base}counts", picture=0, light=light, rendering="colorimetric")
                 pixel_s, _ = _request(f"{base}pixel.json", picture=0, light=light, x=500, y=400)
                 assert len(image) == 8 + 6 * SIZE[0] * SIZE[1]
-                # The first request compiles, and computes the colour map of the print, which is kept on disk.
+                # The first request does not count: it compiles, and computes the map of the print, which is then kept
+                # on disk.
                 if number:
                     for name, seconds in zip(times, (place_s, codes_s, colour_s, pixel_s), strict=True):
                         times[name].append(1000 * seconds)

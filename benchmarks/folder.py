@@ -1,15 +1,20 @@
 """Speed of JPEG folders to 16-bit PNG: `python -m benchmarks.folder [--small]` prints one JSON object per line.
 
-It is compared with a simple program (OpenCV reads and writes, NumPy draws), in one process and in as many processes
-as workers. These processes are started and have opened the LUT before the clock runs. It is also compared with the
-encoder alone on the finished images, with as many threads: once writing its files, once in memory. Neither of these
-two hashes data or waits for the disk, as a data set does. If all processors are busy, other work cannot overlap with
-encoding, so the ratio of processor times is reported too; it is the limit. A faster encoder leaves less time to
-overlap, so the fastest one of our libraries is also measured: ISA-L's deflate at level 1, without PNG filters.
+`generate` is compared with three other programs:
 
-Runs alternate and the fastest of each counts. Files of an earlier run are truncated and moved away before the clock
-runs, and removed at the end. Without a journal, ext4 searches past every recently freed inode for a new file, which
-doubled the system time of programs that write many files.
+- a simple program in which OpenCV reads and writes and NumPy draws, in one process and in as many processes as workers.
+  Processes are started and have opened the LUT before the measurement starts;
+- the encoder alone with the finished images, with as many threads: once with writing of the files, once in memory. In
+  contrast to a data set, no data are hashed and nothing waits for the disk;
+- the fastest encoder of our libraries, which is ISA-L's deflate at level 1 without PNG filters. With a faster encoder,
+  less of the other work can overlap with encoding.
+
+If all processors are busy, other work cannot overlap with encoding. The ratio of processor times, which is also
+reported, is then the limit.
+
+Runs alternate and the fastest run of each program counts. Files of an earlier run are truncated and moved away before
+the measurement, and removed at the end. The reason is that without a journal, ext4 searches past every recently freed
+inode for a new file. This doubled the system time of programs that write many files.
 """
 
 from __future__ import annotations
@@ -41,7 +46,7 @@ from generator.pictures.sources import find_pictures
 from generator.rendering import Rendering
 from generator.stores import LocalStore
 
-# Number of 512 px pictures; with so many, the start and end of a data set take little of the time.
+# Number of 512 px pictures; with so many, the start and the end of a data set take a small part of the time.
 SMALL_PICTURES = 400
 
 LARGE_REPEATS = 3
@@ -53,7 +58,7 @@ def fastest(
 ) -> dict[str, tuple[float, float]]:
     """Return the shortest wall and processor times of the calls, in seconds; the calls take turns.
 
-    `prepare` is called before each, outside the measured time.
+    `prepare` is called before each call, outside the measured time.
     """
     fastest_s = dict.fromkeys(calls, (float("inf"), float("inf")))
     for _ in range(repeats):

@@ -1,17 +1,18 @@
 """Speed of the kernels: `python -m benchmarks.generator` prints one JSON object per line. It takes some minutes.
 
-The limit is a streaming copy of the same picture, 3 bytes in and 6 bytes out, with as many threads. All calls take
-turns with the whole picture, which no cache can hold, and the fastest turn counts. With one thread the time is
-processor time, otherwise wall time. Ratios are therefore valid on a machine with other load, less so with threads.
+Each kernel is compared with the fastest possible memory traffic: a streaming copy of the same picture with as many
+threads, which reads 3 bytes and writes 6 bytes per pixel. All calls take turns with the whole picture, which no cache
+can hold, and the fastest turn counts. With one thread the time is processor time, otherwise wall time. Therefore the
+ratios for one thread are valid on a machine with other load; the ratios for several threads are less certain.
 
-Two illuminants are mixed with random weights per pixel, which is the most work, and with two kinds of masks. Reading
-the weights (8 bytes per pixel) comes on top of the traffic of the copy.
+Two illuminants are mixed with random weights per pixel, which is the most work, and with two kinds of masks. The kernel
+must also read the weights (8 bytes per pixel), which the copy does not.
 
-By colour, each pixel is interpolated between four nodes and has a recorded deviation. The ratio is to the kernel by
-codes in the same turns. Means and deviations are random numbers here, which takes the same time.
+By colour, each pixel is interpolated between four nodes and has a recorded deviation. This kernel is compared with the
+kernel by codes in the same turns. Means and deviations are random numbers here, which takes the same time.
 
-The bound of fetching is a compiled loop that only copies the samples drawn by the kernel to one place in the nearest
-cache; their positions are given. It shows the limit of the caches. Two illuminants have one sample each.
+The result "fetching" is the limit of the caches: a compiled loop only copies the samples that the kernel uses, from
+given positions to one place in the nearest cache. With two illuminants, it copies one sample of each.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def natural_picture(width: int, height: int) -> npt.NDArray[np.uint8]:
 
 
 def noisy_table(folder: Path, lights: int) -> Lut:
-    """Return a LUT of 32768 colours with shot noise."""
+    """Return a LUT of 32768 colours with photon noise."""
     from experiment.lights import Illuminant
 
     index = np.arange(32768)

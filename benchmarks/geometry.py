@@ -1,18 +1,19 @@
 """Error of patch positions per channel: `python -m benchmarks.geometry [--rooms N] [--first SEED] [--room NAME]`.
 
-In each room, one white frame of the whole chart is taken with each body and registered. The positions are compared with
-the true patch centres in each channel. The output is one JSON object per line. All rooms have the usual waves of 3 mm
-and the usual lens distortion of the simulated laboratory. Rooms:
+In each room, one white frame of the whole chart is taken with each body and registered. The registered positions are
+compared with the true patch centres in each channel. The output is one JSON object per line. All rooms have the lens
+distortion and the waves of 3 mm of the default room. Rooms:
 
 - `lateral`: lateral chromatic aberration of 1 px at the corner, red outwards and blue inwards;
 - `waves`: additionally waves of 150 mm length and 6 mm height, and a curl of 25 mm, with a wide-angle lens;
-- `tagless`: as `lateral`, with the chart of the publication, which has no tags. Only the outline of its field and the
-  small steps between neighbouring colours can be used;
-- `tagless-curl`: that chart with a curl of 25 mm and a wide-angle lens.
+- `tagless`: as `lateral`, with the chart of the publication, which has no tags. Registration can only use the outline
+  of the patch area and the small steps between neighbouring colours;
+- `tagless-curl`: the chart of `tagless` with a curl of 25 mm and a wide-angle lens.
 
-Patches that the registration lists as uncertain or covered are excluded and counted. The exit code is 1 if another
-patch is off by more than `MOST_PX`, or a channel by more than `MOST_RMS_PX` (without tags `MOST_PLAIN_RMS_PX`). A
-refused frame is reported, but is no failure. A room takes about 10 s on one core, without tags 30 s.
+Patches that the registration lists as uncertain or covered are excluded and counted. The exit code is 1 if the position
+of any other patch is wrong by more than `MOST_PX`, or the RMS error of a channel exceeds `MOST_RMS_PX` (without tags
+`MOST_PLAIN_RMS_PX`). A refused frame is reported, but is not a failure. A room takes about 10 s on one core, without
+tags 30 s.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ from sim.world.world import Room
 # RMS error of the positions allowed in a channel, half-size px (a requirement).
 MOST_RMS_PX: Final = 0.04
 
-# Allowed without tags. The model of the smooth colour order is imprecise; simulated frames had up to 0.06 px with
-# patches of 10 px and 0.045 px with patches of 8 px.
+# Allowed RMS error without tags. With colours in smooth order, positions are less precise: errors in simulated frames
+# were up to 0.06 px with patches of 10 px, and up to 0.045 px with patches of 8 px.
 MOST_PLAIN_RMS_PX: Final = 0.07
 
 # Error allowed for a patch that is not listed, half-size px: the margin of the sample windows.

@@ -1,9 +1,14 @@
 """Greys rendered by colour: `python -m benchmarks.greys LUT ...` prints one JSON object per line for each LUT.
 
-Under each illuminant of a LUT all 256 greys are rendered by colour, each 4096 times. The figures are: the angle between
-their means and the illuminant; their noise relative to the photon-transfer curve of the LUT; the smallest rise from one
-code to the next, divided by its standard error; and the share of the 4913 source colours that the print cannot show. It
-takes a few seconds per LUT.
+Under each illuminant of a LUT, each of the 256 greys is rendered by colour 4096 times. The results are:
+
+- the angle between the mean of a grey and the illuminant;
+- the noise of a grey, relative to the photon-transfer curve of the LUT;
+- the smallest rise from one grey code to the next, divided by its standard error;
+- the share of codes at which the slope of the brightness over codes changes by more than three standard errors (bends);
+- the share of the 4913 source colours that the print cannot show.
+
+The benchmark takes a few seconds per LUT.
 """
 
 from __future__ import annotations
@@ -26,10 +31,10 @@ from generator.rendering.colorimetric import rendering_with
 from generator.rendering.matrices import matrix_for
 
 REPEATS = 4096
-# Greys in the noise figures: the noise of darker and brighter greys may be clipped.
+# Greys of which the noise is measured: the noise of darker and brighter greys may be clipped.
 NOISE = slice(20, 231)
-# First code for bends of the ramp, because light does not rise evenly with codes. If all black is subtracted, it is
-# also the first code for the other figures.
+# First code of which the bend is measured: the slope of brightness over dark codes changes by itself. If all black is
+# subtracted, this is also the first code for angle and rise.
 BRIGHT_FROM = 64
 
 

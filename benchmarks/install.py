@@ -2,8 +2,8 @@
 
 `python -m benchmarks.install [--python PYTHON]… [--keep FOLDER]` builds the wheel, installs it with pip into a fresh
 environment and runs the commands of the tutorial there, without the repository. It prints one JSON object per line: the
-size of each large package, the import times next to those of numpy and OpenCV, the time of `generate` for one picture,
-and of each step of the tutorial. It needs a package index and 2 GB of disk space.
+size of each large package, the import times of our packages, of numpy and of OpenCV, the time of `generate` for one
+picture, and the time of each step of the tutorial. It needs a package index and 2 GB of disk space.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def _tutorial(version: str, binaries: Path, folder: Path) -> bool:
 
 
 def commands_of_the_tutorial() -> Iterator[str]:
-    """Yield the tutorial's commands from the first that makes something, without those that need the repository."""
+    """Yield the commands of the tutorial after the installation, without commands that need the repository."""
     text = (ROOT / "docs" / "tutorials" / "first-dataset.md").read_text(encoding="utf-8")
     for line in re.findall(r"^    (\S.*)$", text, re.MULTILINE):
         if re.match(r"(acquire|build-lut|generate|evaluate|python|cp) ", line):
@@ -135,7 +135,7 @@ def commands_of_the_tutorial() -> Iterator[str]:
 
 
 def _photographs(folder: Path) -> None:
-    """Copy two pictures; those of the tutorial come with a library that a plain installation lacks."""
+    """Copy two pictures, because the photographs of the tutorial need a library that is not installed here."""
     shutil.copytree(ROOT / "docs" / "images", folder, ignore=shutil.ignore_patterns("*.svg"))
 
 

@@ -35,7 +35,7 @@ Projector = Callable[[Colour, Colour], npt.NDArray[np.float64]]
 
 @dataclass
 class Lab:
-    """A room, its judge, and the frames taken so far."""
+    """A room with its judge and the frames taken so far."""
 
     world: World
     chart: Chart

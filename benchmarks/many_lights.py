@@ -1,8 +1,9 @@
 """Images under two illuminants with their maps: `python -m benchmarks.many_lights` prints one JSON object per line.
 
-A simple program does the same with NumPy and OpenCV: a soft edge, mixed samples of both illuminants with their noise,
-the illuminant of each pixel, and four PNG files in memory. Calls take turns, the fastest counts, in processor time of
-one thread. The time of each step is reported as a share. It takes about two minutes.
+CroP is compared with a simple NumPy and OpenCV program that makes the same data: a soft edge, mixed samples of both
+illuminants with their noise, the illuminant of each pixel, and four PNG files in memory. Both run in turns on one
+thread, and the shortest processor time of each counts. The time of each step is reported as a share. The benchmark
+takes about two minutes.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 """Accuracy of mixed illuminants: each illuminant of a LUT is predicted from the others and compared with its frames.
 
-`python -m benchmarks.mixtures [LUT]` prints one JSON object per figure and line. Without a LUT it takes a session of
+`python -m benchmarks.mixtures [LUT]` prints one JSON object per result and line. Without a LUT it takes a session of
 all 707 illuminants in the simulated room, with a chart of 512 colours and the small body, which takes minutes.
 
-There are two methods. Both use the frames of the predicted illuminant only for the comparison:
+Two methods predict an illuminant from its neighbours. Both use the frames of this illuminant only for the comparison:
 
-codes    mixes the neighbours so that the proportions of the three primaries are right. The proportions follow from the
-         codes and the transfer function (sRGB). White and colours are predicted.
-match    mixes the neighbours so that the ground truth is right, as a user would. Only the colours are predicted. The
-         prediction fails if illuminants of the same white have different spectra (metamerism).
+codes    mixes the neighbours so that the proportions of the three primaries are equal to those of the illuminant. They
+         are calculated from the codes and the transfer function (sRGB). White and colours are predicted.
+match    mixes the neighbours so that the mixture has the ground truth of the illuminant, as a user would. Only the
+         colours are predicted. The prediction fails if illuminants with equal white have other spectra (metamerism).
 
 Illuminants at the corners of the gamut are excluded, because no mixture of the others can reach them.
 """

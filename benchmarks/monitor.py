@@ -1,11 +1,12 @@
-"""Cost of the monitor's page for a machine that takes a session: processor time and bytes of each answer.
+"""Cost of the monitor page for a machine that takes a session: processor time and bytes of each answer.
 
-`python -m benchmarks.monitor` prints one JSON object per line: the page itself; a whole session of 707 illuminants with
-800 attempts and 12 checks each, which a page requests once; one more frame; a heartbeat; and the answer without news,
-which is the most frequent. A page sends a request every two seconds.
+`python -m benchmarks.monitor` prints one JSON object for each kind of answer: the page itself; a whole session of 707
+illuminants with 800 attempts and 12 checks each, which a page requests once; one more frame; a heartbeat; and the
+answer without news, which is the most frequent. A page sends a request every two seconds.
 
-The last figure is the waiting time of viewers during an attack from their own address. Some attacking connections send
-a byte per second, others send nothing; each is opened again when it is closed. Viewers open a connection per answer.
+The last result is the waiting time of viewers during an attack from the address of the viewers. Some attacking
+connections send a byte per second, others send nothing. Each attacking connection is opened again when it is closed.
+Viewers open a connection per answer.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Accuracy of patch positions without tags: the grid of the paper (256 × 128 patches on A0) on sheets with waves.
 
-`python -m benchmarks.plain [--rooms N]` registers N rooms for each camera and waviness. It prints one JSON object per
-line: RMS and largest distance of the patch centres from `World.project`, in the worst room. The exit code is 1 if a
-limit (`LIMITS_PX`) is exceeded. A room takes about half a minute on one core.
+`python -m benchmarks.plain [--rooms N]` registers a frame in each of N rooms, for each camera and waviness. It prints
+one JSON object per line: the RMS and the largest distance of the registered patch centres from the true ones
+(`World.project`), in the worst room. The exit code is 1 if a limit (`LIMITS_PX`) is exceeded. A room takes about half a
+minute on one core.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
-"""Power cuts during a run: flushed data survive, and the session ends with the frames of an undisturbed one.
+"""Power cuts during a run: flushed data survive, and the session ends with the frames of an undisturbed session.
 
 `python -m benchmarks.power_cuts [CUTS [SEED]]` prints one JSON object per line. It needs Linux, root, `mkfs.ext4`,
 libfuse 2 and `pip install fusepy`. If one is missing, it reports that and measures nothing.
 
-A session is taken on an ext4 file system on a loop device over a file that this program serves by FUSE. The file
-records the sectors written since the last flush. At a random operation (see `benchmarks.session_kills`) the run is
-killed. Each sector that was not flushed survives with a probability of one half, as in a drive with a cache. The disk
-is mounted, which recovers its journal. The session is completed on it and compared: bytes, hashes, times, rows.
+A session is taken on a simulated disk: an ext4 file system on a loop device, whose file this program serves by FUSE.
+The program records the sectors written since the last flush. At a random operation (see `benchmarks.session_kills`) the
+run is killed. Each sector that was not flushed survives with a probability of one half, as in a drive with a cache.
+Then the disk is mounted again, which recovers the journal of ext4. The session is completed on this disk and compared
+with an undisturbed session: bytes, hashes, times, rows.
 
-A control follows, with a tenth as many cuts of runs whose raw files are never flushed. If their sessions do not differ,
-the disk forgets nothing, and the other figures are meaningless.
+A control follows, with a tenth of the number of cuts. In the control, raw files are never flushed. If its sessions do
+not differ from undisturbed ones, the simulated disk loses nothing in a cut, and the other results are meaningless.
 
 Simplifications: files are small, sectors are never torn, and the disk reports flushes truthfully.
 """
@@ -52,7 +53,7 @@ NAME = "/disk"
 
 
 class CachedDisk:
-    """A disk with a cache: reads see all data; a cut keeps the flushed sectors and some of the others."""
+    """A disk with a cache. Reads return all data; after a power cut only flushed and some other sectors remain."""
 
     def __init__(self, content: bytes) -> None:
         self._flushed = bytearray(content)
@@ -204,7 +205,7 @@ class CutSessions:
 
         def at_cut() -> None:
             image.write_bytes(disk.cut(chance))
-            # Rename the file when it is complete, so that the waiting process never reads an empty one.
+            # Rename the file when it is complete, so that the waiting process never reads an empty file.
             partial = ready.with_suffix(".partial")
             partial.write_text(str(disk.flushes))
             partial.replace(ready)

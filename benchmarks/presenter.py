@@ -1,8 +1,8 @@
-"""Cost of a confirmed colour: `FullScreen.show` of all 707 illuminants, compared with empty swaps of the same size.
+"""Time to show and verify a colour: `FullScreen.show` of all 707 illuminants, compared with empty swaps of this size.
 
-`python -m benchmarks.presenter` prints one JSON object per figure and line. It uses the display in DISPLAY. Without one
-it starts Xvfb, where swaps do not wait for a refresh and OpenGL runs in software. If the slowest show took much longer
-than its processor time, it waited for other programs.
+`python -m benchmarks.presenter` prints one JSON object per result and line. It uses the display in DISPLAY. If DISPLAY
+is not set, it starts Xvfb, where swaps do not wait for a refresh and OpenGL runs in software. If the slowest call took
+much longer than its processor time, it waited for other programs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Speed of PTP over CroP's cables: `python -m benchmarks.ptp` prints one JSON object per line.
 
-Both ends run in this process and share its processor, on loopback and on the simulated bus. Each measurement takes
-turns with its comparison. Speeds are the best of all turns, ratios the median over the turns.
+Camera and computer are simulated in this process and share its processor. They are connected over loopback and over the
+simulated USB bus. Each measurement takes turns with the program that it is compared with. Speeds are the best of all
+turns; ratios are the median over the turns.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Store:
 
 
 class Plain:
-    """A socket that answers each byte with the object, and a ``1`` with one byte."""
+    """A socket that answers a ``1`` with one byte, and any other byte with the object."""
 
     def __init__(self) -> None:
         self._listener = socket.create_server((LOOPBACK, 0))

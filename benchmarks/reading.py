@@ -1,14 +1,15 @@
 """Count the modules that one illuminant passes in each command, and the size of the code.
 
-`python -m benchmarks.reading [--files] [--size]` prints one JSON object per figure and line. `--files` lists the
-modules of each figure in the order of first use. `--size` counts packages and tests instead: modules with code, lines,
-lines of code (no docstrings, comments and blank lines), and the mean length of functions and lines. It takes a minute,
-`--size` a second or two.
+`python -m benchmarks.reading [--files] [--size]` prints one JSON object per result and line. `--files` lists the
+modules of each command in the order of first use. `--size` counts the code of packages and tests instead: modules with
+code, lines, lines of code (no docstrings, comments and blank lines), and the mean length of functions and lines. The
+benchmark takes a minute, with `--size` a second or two.
 
 Each command does the same small work twice, the second time with one more illuminant (`generate`: one more picture). A
-module counts if one of its functions ran more often the second time. Only named functions and methods count, not
-lambdas and comprehensions; functions compiled by numba count as others. Work that happens once per command (settings,
-registration, the report) is therefore excluded. No module name is used here, so layouts of the code can be compared.
+module counts if one of its functions ran more often in the second call. Work that happens once per command (settings,
+registration, the report) is therefore excluded. Only named functions and methods count, not lambdas and comprehensions.
+Functions compiled by numba count like other functions. The benchmark does not depend on module names, so that different
+layouts of the code can be compared.
 """
 
 from __future__ import annotations
@@ -200,8 +201,8 @@ def measure(folder: Path) -> dict[str, list[str]]:
     for command, arguments in (
         ("acquire", ("run", "{}.toml", "{}_session")),
         ("build-lut", ("{}_session", "{}_lut")),
-        # The smaller run comes first, so that compiled and cached data do not count for the larger run. One worker,
-        # because with several it is random which one waits.
+        # The smaller run comes first, so that compilation and caching do not count for the larger run. There is one
+        # worker, because with several workers it is random which worker waits.
         ("generate", ("more_lut", "{}_dataset", "--sources", "{}_pictures", "--workers", "1")),
     ):
         base_calls = called(folder, command, *(argument.format("fewer") for argument in arguments))

@@ -1,17 +1,18 @@
-"""Random rooms, for which nothing was tuned: short sessions are taken and their LUTs compared with the truth.
+"""Random rooms, for which nothing was tuned: short sessions are taken, and their LUTs are compared with the truth.
 
 `python -m benchmarks.rooms [--rooms N] [--first SEED] [--calm N]` takes a session of eight illuminants in each of N
-random rooms and in a number of calm rooms, builds the LUT and prints one JSON object per room, then a summary. A random
-room has short or long waves, a curl, a lens with shoulders, veiling glare and lateral colour, uneven light and hot
-photosites. A calm room has less of each than a careful laboratory tolerates.
+random rooms and in a number of calm rooms, builds the LUTs and prints one JSON object per room, then a summary. A
+random room has short or long waves, a curl, uneven light, hot photosites, and a lens with shoulders (a wide part of the
+point spread), veiling glare and lateral colour. A calm room has less of each fault than a careful laboratory tolerates.
 
-If registration or the verdict refuses a room, that is allowed. A failure is silent if the LUT is wrong (a ground truth
-by 0.1°, or a patch mean of at least 300 counts by 3 %) and the verdict accepts it or names another fault. Errors of up
-to twice the reported uncertainty are not silent. In a calm room, a remark on a correct LUT is false, except about small
-patches if they are small.
+Registration or the verdict may refuse a room. A failure is silent if the LUT is wrong and the verdict accepts it or
+names another fault. A LUT is wrong if a ground truth has an error of 0.1°, or a patch mean of at least 300 counts an
+error of 3 %, and the error exceeds twice the reported uncertainty. In a calm room, every remark on a correct LUT is
+false, except a remark about patches that are really small.
 
-`--case NAME` takes a named case instead (`benchmarks.cases`; `--case all` takes all): a lens, exchanged files, a hand,
-a leak, and the verdict about it. `--small` uses charts of 512 colours and small frames.
+`--case NAME` takes a named case of `benchmarks.cases` instead, for example a lens, exchanged files or a hand in front
+of the chart, and checks the verdict; `--case all` takes all cases. `--small` uses charts of 512 colours and small
+frames.
 
 On one core a room of 18 megapixels takes about 40 s, a small one 3 s. The exit code is 1 after a silent failure, a
 wrong cause or a false remark.
@@ -108,7 +109,7 @@ def random_case(seed: int) -> Case:
 
 
 def _with_lens(seed: int, room: Room) -> Room:
-    """Add what a Gaussian lens and long paper waves lack, from a separate random sequence."""
+    """Add faults beyond a Gaussian lens and long paper waves, from a separate random sequence."""
     random = np.random.default_rng([21, seed])
     short, curled, spread = random.random(3) < (0.33, 0.5, 0.75)
     return replace(
@@ -138,7 +139,7 @@ def natural_vignetting(focal_diagonals: float) -> float:
 
 
 def calm_case(seed: int) -> Case:
-    """Return the room of a seed with all faults limited to what a careful laboratory tolerates.
+    """Return the room of a seed; all faults are within the limits that a careful laboratory tolerates.
 
     The corners are as dark as with any lens: under more even light, a lens with veiling glare cannot be recognised,
     which causes a remark (`natural_vignetting`).

@@ -1,22 +1,23 @@
-"""Efficiency of a session compared with the time for exposure, settling and download, and the cost of saving.
+"""Efficiency of a session: unavoidable time for exposure, settling and download, divided by the time taken.
 
-`python -m benchmarks.sequencer` prints one JSON object per figure and line:
+`python -m benchmarks.sequencer` prints one JSON object per result and line:
 
-- in simulated time, 767 frames (707 illuminants with references) in the layout of EOS 550D CR2 files, with latencies of
-  a camera, a screen and a projector. Each file is written, flushed, hashed and decoded;
-- in real time on this machine, frames of 25 MB at 30 MB/s, exposure 0.5 s, settling 0.2 s, decoded and judged;
-- the time to save, hash and judge a frame, compared with a few lines that write, flush and hash the same bytes.
+- the efficiency in simulated time, for 767 frames (707 illuminants with references) in the layout of EOS 550D CR2
+  files, with latencies of a camera, a screen and a projector. Each file is written, flushed, hashed and decoded;
+- the efficiency in real time on this machine, for frames of 25 MB at 30 MB/s, an exposure of 0.5 s and settling of 0.2
+  s. Each file is decoded and judged;
+- the time to save, hash and judge a frame, compared with a few lines of code that write, flush and hash the same bytes.
 
 ``quick`` takes a tenth of the frames in simulated time, in some minutes. Frames are judged as in a session
 (`acquisition.judge.judge.LiveJudge`); with the word ``exposure`` only their exposure is judged.
 
-The unavoidable time of a frame is release, exposure and readout, plus the longer of settling and download. A camera
-does not expose while it sends a file, and the illuminant may change when it has announced the frame.
+The unavoidable time of a frame is the time for release, exposure and readout, plus the longer of settling and download.
+A camera does not expose while it sends a file. The illuminant may change when the camera has announced the frame.
 
-Simplifications: two files (a dark and a lit one, with the slices of a 550D, without previews) are prepared. Cable and
-camera use no processor time, latencies are constant, and no frame is refused. The judge measures and compares each
-frame as in a session without primaries; its message that the illuminant does not change is ignored. In simulated time,
-work of this machine takes no time; the figures in real time include it.
+Simplifications: All frames are copies of two prepared files, a dark and a lit one, with the slices of a 550D and
+without previews. Cable and camera use no processor time, latencies are constant, and no frame is refused. The judge
+measures and compares each frame as in a session without primaries; its message that the illuminant does not change is
+ignored. In simulated time, work of this machine takes no time. The results in real time include this work.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ class PacedProjector:
         """Do nothing."""
 
     def switch_off(self) -> None:
-        """Start cooling: a projector that stays on is watched for five seconds, a tenth of a short session."""
+        """Start cooling. If the projector stayed on, the run would wait five seconds, a tenth of a short session."""
         self.state = Power.COOLING
 
     def muted(self) -> bool:

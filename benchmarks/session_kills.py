@@ -1,21 +1,23 @@
-"""Kills of a run at random operations and times: the session must end with the frames of an undisturbed one.
+"""Kills of a run at random operations and times: the session must end with the frames of an undisturbed session.
 
 `python -m benchmarks.session_kills [KILLS [SEED]]` kills 10 000 runs and prints one JSON object per line. Each run is a
 separate process that is killed by SIGKILL. Half of the kills happen before or after the n-th operation (a call that
 writes, flushes, renames, journals, shows, exposes or downloads), half by a timer at any moment. After a few kills the
 session is completed. Its frames, the accepted rows of its journal and `frames.csv` are compared with an undisturbed
-run: bytes, hashes, times. A LUT depends on these alone. Ctrl-C ends the program with the figures so far. A kill takes
-about 50 ms of one core.
+run: bytes, hashes, times. A LUT depends only on these data. Ctrl-C ends the program and prints the results so far. A
+kill takes about 50 ms of one core.
 
-`python -m benchmarks.session_kills troubled [KILLS [SEED]]` kills runs with continuous faults: refused and repeated
+`python -m benchmarks.session_kills troubled [KILLS [SEED]]` kills runs with many other faults: refused and repeated
 frames, a failing camera, power cuts, a lamp that is lit again, a deleted or cut journal that is rebuilt. Kills are
-counted by the phase of the run. Times differ with each kill. Required: no counted frame is lost, each step has one
-frame of its own illuminant in the end, and no exposure counts twice. `… programs [KILLS [SEED]]` kills `acquire run`
-itself, started as a separate program.
+counted by the phase of the run. These sessions cannot be compared with an undisturbed run, because their times differ
+with each kill. Instead, three conditions are checked: no accepted frame is lost, each step has one frame of its own
+illuminant in the end, and no exposure counts twice.
 
-Camera and screen are minimal implementations of the contracts. Their files contain the illuminant, its number and the
-release time, so lost, doubled and exchanged frames differ. Simplifications: a kill is no power cut (data that were
-written but not flushed survive), and the files are small.
+`python -m benchmarks.session_kills programs [KILLS [SEED]]` kills the program `acquire run` itself.
+
+Camera and screen are minimal implementations of the contracts. The files of the camera contain the illuminant, the
+number of exposures of this illuminant and the release time, so that lost, doubled and exchanged frames are detected.
+Simplifications: data that were written but not flushed survive a kill, unlike a power cut, and the files are small.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Short simulated sessions with frames that differ from the plan, and the comparison of their LUTs with the truth.
 
-A `FrameChange` describes the differences of one frame: another illuminant or camera, another exposure or file header, a
-disturbance in the room, changed counts. `frame_file` makes the file of a step and `record_session` a whole session.
-`compare` compares a LUT with the room that it should show: camera, room and chart of the session without changes.
+A `FrameChange` describes how one frame differs from the plan: another illuminant or camera, another exposure or file
+header, a disturbance in the room, changed counts. `frame_file` makes the file of a step and `record_session` a whole
+session. `compare` compares a LUT with the truth: camera, room and chart of the session without any change.
 
-Noise is no error of a LUT. The counts of each frame without noise are known here, so the noise of each patch mean can
-be subtracted. The rest is systematic and includes hot photosites.
+Noise does not count as an error of a LUT. The counts of each frame without noise are known here, so the noise of each
+patch mean can be subtracted. The remaining error is systematic and includes hot photosites.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Time for a simulated 18 Mpx frame: `python -m benchmarks.sim_frame` prints one JSON object per line.
 
-Times are processor seconds of all threads, the shortest of several runs, so that other load matters little. Each is
-also given relative to a simple pass of the same size in the same run.
+Times are processor seconds of all threads, the shortest of several runs, so that other load has little effect. Each
+time is also given relative to a simple calculation on the same number of pixels.
 """
 
 from __future__ import annotations

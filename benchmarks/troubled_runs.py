@@ -2,11 +2,11 @@
 
 `python -m benchmarks.troubled_runs night [GRID [FOLDER]]` takes a night without an operator, builds its LUT and prints
 one JSON object per line (a grid of 33 steps has 597 illuminants). `python -m benchmarks.troubled_runs causes` and
-`benchmarks.detection` print the table of causes. All code is that of `acquire run`; clock, body, projector and cables
+`benchmarks.detection` print the table of causes. The code of `acquire run` is used. Clock, body, projector and cables
 of the simulated laboratory are replaced, so that faults can happen at given times.
 
-Simplifications: a full disk affects flushing, but not SQLite. Time passes at once. Somebody changes the battery and
-empties the card in time. A service manager restarts the command after a power cut.
+Simplifications: a full disk affects flushing, but not SQLite. Waiting takes no real time. Somebody changes the battery
+and empties the card in time. A service manager restarts the command after a power cut.
 """
 
 from __future__ import annotations
@@ -291,7 +291,7 @@ def make_lab(folder: Path, grid: int, events: Sequence[str] = (), **changes: obj
 
 @dataclass(frozen=True)
 class Cause:
-    """A fault during a run and its documented effect (docs/how-to/night-run.md)."""
+    """A fault during a run and its documented effect (docs/how-to/events.md)."""
 
     name: str
     # called with the lab and the session folder
@@ -376,7 +376,7 @@ CAUSES: tuple[Cause, ...] = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of one cause: a row of the table. `is_as_documented`: the effect is that of the how-to."""
+    """Result of one cause: a row of the table. `is_as_documented`: the effect is as in the how-to."""
 
     cause: Cause
     ended: str

@@ -1,19 +1,20 @@
 """Check of the reported uncertainties in rooms with optics, dark light and sensors that differ from the assumptions.
 
-`python -m benchmarks.troubles [--rooms N] [--first SEED] [--full]` takes a session of eight illuminants on a chart
-of 512 colours (`--full`: 32 768) in each of N random rooms and builds its LUT. It prints one JSON object per room
-(the troubles, the verdict, the error and the reported uncertainty of each ground truth), then a summary of the LUTs.
-A third of the rooms has no trouble; in the others each trouble occurs with a probability of one third.
+`python -m benchmarks.troubles [--rooms N] [--first SEED] [--full]` takes a session of eight illuminants on a chart of
+512 colours (`--full`: 32 768) in each of N random rooms and builds its LUT. It prints one JSON object per room (the
+troubles, the verdict, the error and the reported uncertainty of each ground truth), then a summary of the LUTs. A third
+of the rooms has no trouble. In the other rooms each trouble occurs with a probability of one third.
 
-The optics differ in form from the correction. Each channel is spread by a power law of the distance, r^-2 or r^-3,
-with Fourier transforms of the whole frame, and has its own veiling glare. Sensors compress near white or lose counts
-near black. Dark frames contain light that other frames lack. Photosites differ, rows have offsets, the print
-reflects light, and a colour wheel makes a fractional number of turns per exposure.
+The simulated optics differ in form from the model of the correction. Each channel has its own veiling glare and its own
+point spread, which follows a power law of the distance, r^-2 or r^-3 (calculated by Fourier transforms of the whole
+frame). Sensors compress near white or lose counts near black. Dark frames contain light that other frames do not
+contain. Photosites differ in response, rows have offsets, the print reflects light, and a colour wheel makes a
+fractional number of turns per exposure.
 
-The true ground truth is the mean light of bare paper over the patches, as divided out by the flat field, with the
-light that the wheel passed during the exposure. Required: the true errors of 95 % of ground truths and patches are
-within the expanded uncertainty, no ground truth error exceeds twice it, and the median of uncertainty / true error
-is below 3.
+The true ground truth is the mean light of bare paper over the patches, including the light that the wheel passed during
+this exposure. Three conditions are required: 95 % of the true errors of ground truths and patches are within the
+expanded uncertainty; no error of a ground truth exceeds twice this uncertainty; and the median of uncertainty / true
+error is below 3.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Cost of variation: `python -m benchmarks.variation` prints one JSON object per line.
+"""Time for variation of images: `python -m benchmarks.variation` prints one JSON object per line.
 
-For a photograph of 6 Mpx and one thread it measures drawing the samples, drawing and varying them in each way, and
-writing the image as PNG, which most data sets also do. All calls take turns; the fastest turn counts, in processor
-time.
+For a photograph of 6 Mpx and one thread it measures three processor times: drawing the samples; drawing the samples and
+varying them, for each kind of variation; and writing the image as PNG, which is done for most data sets. All calls take
+turns, and the fastest turn counts.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Device protocols, buses, displays and raw files; imports only `foundation`."""
+"""Drivers of cameras, projectors and displays, and readers of raw files; these modules import only `foundation`."""

@@ -1,7 +1,7 @@
 """Interface of a tethered camera, and the values that it takes and returns.
 
-A camera is configured first. Then `Camera.expose` and `Camera.download` take one raw frame after another. They are two
-calls, so that the projector can show the next illuminant while the frame is transferred.
+`Camera.configure` sets the exposure. Then `Camera.expose` and `Camera.download` take one raw frame after another. They
+are two calls, so that the projector can show the next illuminant while the frame is transferred.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class CameraIdentity:
     Attributes
     ----------
     maker, model, serial, firmware
-        Texts as the body reports them; empty if it does not report them.
+        Texts that the body reports; an empty text if it does not report the value.
     """
 
     maker: str
@@ -28,7 +28,7 @@ class CameraIdentity:
 
     @property
     def name(self) -> str:
-        """Maker and model; the model alone if it begins with the maker."""
+        """Maker and model; only the model if it begins with the maker."""
         maker_word, model_word = (words.casefold().split()[:1] for words in (self.maker, self.model))
         return self.model if maker_word == model_word else f"{self.maker} {self.model}".strip()
 
@@ -42,7 +42,7 @@ class ExposureSettings:
     iso
         ISO speed.
     aperture
-        f-number; None if the body cannot set it (lens without contacts).
+        f-number; None if the body cannot set it, as for a lens without contacts.
     shutter_s
         Shutter time, seconds.
     """
@@ -58,7 +58,7 @@ class ExposureSettings:
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """One raw frame that has arrived completely.
+    """One raw frame that was transferred completely.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Camera(Protocol):
         """Return maker, model, serial number and firmware."""
 
     def configure(self, settings: ExposureSettings) -> None:
-        """Set the exposure, raw format and manual mode, and read them back.
+        """Set exposure and raw format, and read them back; require manual mode.
 
         Parameters
         ----------
@@ -92,7 +92,7 @@ class Camera(Protocol):
         Raises
         ------
         DeviceRefused
-            The body does not offer a value; the message lists the values that it offers.
+            The body does not offer a value, or is not in manual mode. The message gives the offered values.
         """
 
     def shutter_speeds(self) -> tuple[float, ...]:
@@ -122,7 +122,7 @@ class Camera(Protocol):
         Raises
         ------
         DeviceRefused
-            The body was not configured, or refuses to release.
+            `configure` was not called, or the body refuses to release.
         DeviceError
             No frame was taken; the caller may expose again.
         """
@@ -130,7 +130,7 @@ class Camera(Protocol):
     def download(self, into: BinaryIO) -> CapturedFrame:
         """Write the raw file of the last exposure to a stream, complete and unchanged.
 
-        After an error, call again with a new stream; the same frame is written.
+        After an error, call the method again with a new stream, to get the same frame.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class Camera(Protocol):
         Raises
         ------
         DeviceError
-            The transfer failed. If the body no longer holds the frame, the message asks for a new exposure.
+            The transfer failed. If the body does not have the frame any more, the message asks for a new exposure.
         """
 
     def close(self) -> None:
@@ -154,7 +154,7 @@ class Camera(Protocol):
 
 @dataclass(frozen=True)
 class Supplies:
-    """Remaining battery and card capacity; None if the camera does not report a value.
+    """Battery charge and free space on the cards; a value is None if the camera does not report it.
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ class Supplies:
     card_free_bytes
         Free space for frames, bytes; the sum over all cards.
     saves_to_host
-        True if a configured camera sends frames to the host only.
+        True if the camera, once configured, sends frames only to the computer.
     """
 
     battery: float | None = None
@@ -190,7 +190,7 @@ class ReportsSupplies(Protocol):
 
 @runtime_checkable
 class NeedsKeepAlive(Protocol):
-    """A camera that must be polled during pauses, to stay awake and to empty its event queue."""
+    """A camera that must be polled during pauses; otherwise it goes to sleep, or its event queue fills up."""
 
     def idle(self) -> None:
         """Poll the camera once; call this every few seconds of a pause."""
@@ -209,6 +209,6 @@ def capture(camera: Camera, into: BinaryIO) -> CapturedFrame:
 
 
 def keep_awake(camera: Camera) -> None:
-    """Poll a camera that needs it; call this every few seconds of a pause."""
+    """Poll the camera if it needs polling; call this every few seconds of a pause."""
     if isinstance(camera, NeedsKeepAlive):
         camera.idle()

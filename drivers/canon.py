@@ -1,15 +1,18 @@
-"""A Canon EOS body as a `drivers.camera.Camera` over PTP, for hours of unattended exposures.
+"""Driver of Canon EOS bodies over PTP, for hours of unattended exposures; see `drivers.camera.Camera`.
 
-`EosState` holds the reports of the body, `EosBody` one connection, `CanonEos` the camera across connections. GetEvent
-returns a chain of records: size with header (32 bits), type (32 bits), body. A record of size 8 and type 0 ends the
-chain; some bodies leave it out. The first reply after SetEventMode holds the whole state, later replies the changes.
-Property values are bytes: 32 bits for a number, text with a closing NUL, structures for a few. ``decode`` and
-``encode`` are inverse on well-formed bytes. Records of unknown type or form are kept in `OtherRecord`; inconsistent
+`CanonEos` is the camera, `EosBody` one connection to it, and `EosState` holds the values that the body has reported.
+
+The operation GetEvent returns a chain of records. A record has its size with header (32 bits), its type (32 bits) and
+its content. A record of size 8 and type 0 ends the chain, but some bodies leave it out. The first reply contains the
+whole state of the body, and later replies only changes. A property value is a number of 32 bits, a text that ends with
+NUL, or in a few cases a structure.
+
+``decode`` reads bytes, and ``encode`` writes them. Records of unknown type or form become `OtherRecord`. Inconsistent
 records raise `ProtocolError`.
 
-Sources: there is no public standard. Layouts and conversations were recorded from an EOS 60D and an EOS 400D. Their
-meaning and the order of a release are from libgphoto2 2.5.34, the number of mirror lockup from ExifTool
-(CanonCustom::Functions2).
+Sources: there is no public standard. Formats and conversations were recorded from an EOS 60D and an EOS 400D. Their
+meaning and the sequence of a release are from libgphoto2 2.5.34. The number of the mirror lockup function is from
+ExifTool (CanonCustom::Functions2).
 """
 
 from __future__ import annotations
@@ -62,20 +65,20 @@ _LOSSLESS: Final = 4  # `ImageFile.compression` of a lossless raw file
 
 _JPEG_SIZES: Final = {0: "L", 1: "M", 2: "S", 5: "M1", 6: "M2", 14: "S1", 15: "S2", 16: "S3"}
 
-_IMAGE_FILE_LENGTH: Final = 16  # Bytes of one format: this length, kind, size and compression, 32 bits each
+_IMAGE_FILE_LENGTH: Final = 16  # Bytes of the format of one file: this length, kind, size, compression; 32 bits each
 
-_MAX_IMAGE_FILES: Final = 2  # Files of one release: a raw file and a JPEG
+_MAX_IMAGE_FILES: Final = 2  # Most files of one release: a raw file and a JPEG
 
-_SETTING_HEADER: Final = 8  # Bytes before a new value: length and property
+_SETTING_HEADER: Final = 8  # Bytes before a new property value: length and property code
 
 
 def number_value(number: int) -> bytes:
-    """Return the property value of a number; negative numbers as two's complement of 32 bits."""
+    """Encode a number as a property value; a negative number as two's complement of 32 bits."""
     return encode_integer(number & 0xFFFFFFFF if -(1 << 31) <= number < 0 else number, 4)
 
 
 def text_value(text: str) -> bytes:
-    """Return the property value of a text, closed by NUL."""
+    """Encode a text as a property value, which ends with NUL."""
     octets = text.encode("latin-1", "replace")
     if b"\0" in octets:
         raise ValueError(f"{text[:40]!r} contains a NUL, which ends a text")
@@ -94,11 +97,11 @@ def text_of(value: bytes) -> str:
 
 @dataclass(frozen=True)
 class ImageFile:
-    """One of the files written by a release.
+    """Format of one of the files that a release writes.
 
     - `kind`: 1 JPEG, 6 raw.
-    - `size`: 0 large, 1 medium (raw: mRAW), 2 small (raw: sRAW), 5 and 6 M1 and M2, 14 to 16 S1 to S3.
-    - `compression`: JPEG: 2 normal, 3 fine; raw: 4 lossless, 3 lossy.
+    - `size`: 0 large, 1 medium (mRAW), 2 small (sRAW), 5 M1, 6 M2, 14 S1, 15 S2, 16 S3.
+    - `compression`: 2 normal or 3 fine for a JPEG; 4 lossless or 3 lossy for a raw file.
     """
 
     kind: int
@@ -121,13 +124,13 @@ class ImageFile:
 
 @dataclass(frozen=True)
 class ImageFormat:
-    """The one or two files of a release; value of properties 0xd120 to 0xd123."""
+    """Formats of the one or two files of a release; value of properties 0xd120 to 0xd123."""
 
     files: tuple[ImageFile, ...]
 
     @classmethod
     def read(cls, cursor: Cursor) -> ImageFormat:
-        """Return the next image format at a cursor."""
+        """Read an image format at the position of a cursor."""
         count = cursor.u32("the count of files")
         if not 1 <= count <= _MAX_IMAGE_FILES:
             raise cursor.fault("the count of files", f"1 or {_MAX_IMAGE_FILES}", count)
@@ -158,9 +161,9 @@ class ImageFormat:
         return " + ".join(str(file) for file in self.files)
 
 
-RAW_ONLY = ImageFormat((ImageFile(_RAW, 0, _LOSSLESS),))  # One full-size raw file, as required for measurements
+RAW_ONLY = ImageFormat((ImageFile(_RAW, 0, _LOSSLESS),))  # One full-size raw file, required for measurements
 
-# Properties whose value is an `ImageFormat`.
+# Properties that have an `ImageFormat` as value.
 IMAGE_FORMAT_PROPERTIES = frozenset(
     {
         Property.EOS_IMAGE_FORMAT,
@@ -173,7 +176,7 @@ IMAGE_FORMAT_PROPERTIES = frozenset(
 
 @dataclass(frozen=True)
 class PropertySetting:
-    """Data of SetDevicePropValueEx (0x9110): the new value of a property, see `number_value`, `text_value`."""
+    """Data of SetDevicePropValueEx (0x9110): a property, and its value from `number_value` or `text_value`."""
 
     code: int
     value: bytes
@@ -192,18 +195,18 @@ class PropertySetting:
         return encode_integer(_SETTING_HEADER + len(self.value), 4) + encode_integer(self.code, 4) + bytes(self.value)
 
 
-_NAME_WIDTH: Final = 16  # Bytes of a name's field: 8.3 characters and padding
+_NAME_WIDTH: Final = 16  # Bytes of the name field: a name of 8.3 characters and padding
 
-_TIME_LENGTH: Final = 4  # Bytes of a time, seconds since 1970
+_TIME_LENGTH: Final = 4  # Bytes of the time field, in seconds since 1970
 
 
 @dataclass(frozen=True)
 class ObjectEntry:
-    """An object as listed in GetObjectInfoEx and in events.
+    """A file or folder of the camera, as described in the reply to GetObjectInfoEx and in events.
 
-    - `group`: second handle; equal for files that belong together, else often the same as `handle`.
+    - `group`: a second handle, which is equal for files that belong together.
     - `name`: at most `name_width` characters.
-    - `time`: seconds since 1970 on the camera's clock; None if the body leaves it out.
+    - `time`: seconds since 1970 on the camera's clock; None if the body sends no time.
     - `name_width`: bytes of the name field, padded with NUL; 16 on all recorded bodies.
     """
 
@@ -221,7 +224,7 @@ class ObjectEntry:
 
     @classmethod
     def read(cls, cursor: Cursor, size_length: int = 4) -> ObjectEntry:
-        """Return the object in the rest of a record; `size_length` is 8 on bodies with 64-bit sizes."""
+        """Read an object from the rest of a record; `size_length`: bytes of the size field, 4 or 8."""
         handle, storage, object_format = cursor.u32("handle"), cursor.u32("storage"), cursor.u32("format")
         reserved, flags = cursor.u32("reserved"), cursor.u32("flags")
         size = cursor.integer(size_length, "size")
@@ -256,7 +259,7 @@ class ObjectEntry:
 
 
 def encode_object_entries(entries: Iterable[ObjectEntry]) -> bytes:
-    """Return the reply to GetObjectInfoEx."""
+    """Return the bytes of a reply to GetObjectInfoEx."""
     bodies = [entry.encode() for entry in entries]
     return encode_integer(len(bodies), 4) + b"".join(encode_integer(4 + len(body), 4) + body for body in bodies)
 
@@ -284,16 +287,15 @@ class DeviceInfoEx:
         return encode_integer(4 + len(arrays), 4) + arrays
 
 
-# Longest accepted reply to GetEvent, bytes; a body that is not polled for a day queues about 250 kB.
-MAX_EVENTS: Final = 4 << 20
+MAX_EVENTS: Final = 4 << 20  # Longest accepted reply to GetEvent, bytes; in a day without polling it grows to 250 kB
 
-# Largest number of records of one reply; about 8000 are queued in 12 h without polling (reports of libgphoto2 users).
+# Most records of one reply. In 12 h without polling, about 8000 are queued (reports of libgphoto2 users).
 MAX_RECORDS: Final = 1 << 16
 
-_HEADER_LENGTH: Final = 8  # Bytes of size and type of a record
+_HEADER_LENGTH: Final = 8  # Bytes of the header of a record: size and type
 
 _END: Final = struct.pack("<II", _HEADER_LENGTH, EosEvent.END)
-_LIST: Final = 3  # Kind of an available list with items; 1 and 7 mean an empty list
+_FILLED_LIST: Final = 3  # Kind of a list with values; kinds 1 and 7 are empty lists
 
 
 @dataclass(frozen=True)
@@ -306,11 +308,11 @@ class PropertyChanged:
 
 @dataclass(frozen=True)
 class AvailableValues:
-    """Values that a property accepts now (0xc18a); none if the list is empty."""
+    """Values that a property accepts now (0xc18a); if empty, the property cannot be set now."""
 
     code: int
     values: tuple[int, ...] = ()
-    kind: int = _LIST
+    kind: int = _FILLED_LIST
 
 
 @dataclass(frozen=True)
@@ -319,7 +321,7 @@ class AvailableFormats:
 
     code: int
     formats: tuple[ImageFormat, ...] = ()
-    kind: int = _LIST
+    kind: int = _FILLED_LIST
 
 
 @dataclass(frozen=True)
@@ -332,9 +334,9 @@ class ObjectEvent:
 
 @dataclass(frozen=True)
 class TransferRequest:
-    """An object in the camera's memory; it occupies the memory until TransferComplete (0xc186, 0xc1a9).
+    """Announcement of an object, which stays in the camera's memory until TransferComplete (0xc186, 0xc1a9).
 
-    `extra` holds the numbers between size and name, empty if all are 0. On bodies that send 0xc1b8 they are the parent
+    `extra` holds the numbers between size and name; empty if all are 0. In records of type 0xc1b8 they are the parent
     and an unknown number.
     """
 
@@ -350,7 +352,7 @@ class TransferRequest:
 
 @dataclass(frozen=True)
 class Notice:
-    """A record of one number: a handle, a storage, a status, or seconds; `rest` holds additional bytes."""
+    """A record of one number: a handle, a storage id, a status, or seconds; `rest` holds any further bytes."""
 
     type: int
     number: int
@@ -359,7 +361,7 @@ class Notice:
 
 @dataclass(frozen=True)
 class OtherRecord:
-    """A record of unknown type or form, unchanged."""
+    """A record of unknown type or form, with its content unchanged."""
 
     type: int
     body: bytes = b""
@@ -374,7 +376,7 @@ _OBJECT_EVENTS: dict[int, int] = {
     EosEvent.OBJECT_ADDED_64: 8,
     EosEvent.OBJECT_INFO_CHANGED_64: 8,
 }
-# Bytes of the size field, and count of numbers between it and the name, in each type of transfer request.
+# For each type of transfer request: bytes of the size field, and count of the numbers between size and name.
 _TRANSFER_REQUESTS: dict[int, tuple[int, int]] = {
     EosEvent.REQUEST_OBJECT_TRANSFER: (4, 1),
     EosEvent.REQUEST_OBJECT_TRANSFER_64: (8, 0),
@@ -402,12 +404,12 @@ _NOTICES: frozenset[int] = frozenset(
 
 
 def decode_events(data: bytes) -> tuple[Record, ...]:
-    """Return the records in a reply to GetEvent (0x9116) without the closing record; none for an empty reply."""
+    """Return the records in a reply to GetEvent (0x9116), without the record that ends the chain."""
     cursor = Cursor(data, "GetEvent", MAX_EVENTS)
     records: list[Record] = []
     while True:
         start = cursor.position
-        # A chain may end without its closing record or with NULs. Transports return only complete replies.
+        # Some chains end with NULs or without the closing record, although the transport returns complete replies.
         if not any(data[start : start + _HEADER_LENGTH]) and not any(data[start:]):
             return tuple(records)
         if len(records) == MAX_RECORDS:
@@ -425,7 +427,7 @@ def decode_events(data: bytes) -> tuple[Record, ...]:
 
 
 def encode_events(records: Iterable[Record] = ()) -> bytes:
-    """Return the reply to GetEvent with its closing record; without records if nothing is new."""
+    """Return the bytes of a reply to GetEvent, with the record that ends the chain."""
     chain = bytearray()
     for record in records:
         record_type, body = _encode_record(record)
@@ -451,20 +453,20 @@ def _decode_record(record_type: int, body: bytes) -> Record:
 def _decode_list(cursor: Cursor, body: bytes) -> Record:
     code, list_kind, count = cursor.u32("property"), cursor.u32("kind of list"), cursor.u32("count")
     cursor.name = f"{cursor.name} for {describe(Property, code)}"
-    if list_kind != _LIST:
+    if list_kind != _FILLED_LIST:
         is_empty = not count and not cursor.remaining
         return AvailableValues(code, (), list_kind) if is_empty else OtherRecord(EosEvent.AVAILABLE_LIST_CHANGED, body)
     if code in IMAGE_FORMAT_PROPERTIES:
-        # A format has at least four bytes, so the remaining bytes limit the loop for any count.
+        # Each format takes at least four bytes, so the length of the data limits this loop.
         record = AvailableFormats(code, tuple(ImageFormat.read(cursor) for _ in range(count)))
     else:
         record = AvailableValues(code, cursor.integers(count, 4, "values"))
     return OtherRecord(EosEvent.AVAILABLE_LIST_CHANGED, body) if cursor.remaining else record
 
 
-def _decode_transfer_request(cursor: Cursor, kind: int) -> TransferRequest:
-    size_length, extra_count = _TRANSFER_REQUESTS[kind]
-    handle, object_format, reserved = cursor.u32("handle"), cursor.u32("format"), cursor.u32("reserved")
+def _decode_transfer_request(cursor: Cursor, record_type: int) -> TransferRequest:
+    size_length, extra_count = _TRANSFER_REQUESTS[record_type]
+    handle, format_code, reserved = cursor.u32("handle"), cursor.u32("format"), cursor.u32("reserved")
     size = cursor.integer(size_length, "size")
     extra = cursor.integers(extra_count, 4, "the numbers before the name")
     octets = cursor.rest()
@@ -472,18 +474,18 @@ def _decode_transfer_request(cursor: Cursor, kind: int) -> TransferRequest:
     if len(octets) == len(name):
         raise cursor.fault("the name", "closed by NUL", repr(octets[:40]))
     padding = len(octets) - len(name) - 1
-    return TransferRequest(handle, object_format, size, name, kind, reserved, extra if any(extra) else (), padding)
+    return TransferRequest(handle, format_code, size, name, record_type, reserved, extra if any(extra) else (), padding)
 
 
 def _encode_record(record: Record) -> tuple[int, bytes]:
     match record:
         case PropertyChanged(code, value):
             return EosEvent.PROPERTY_CHANGED, encode_integer(code, 4) + bytes(value)
-        case AvailableValues(code, values, record_type):
-            header = encode_integer(code, 4) + encode_integer(record_type, 4)
+        case AvailableValues(code, values, list_kind):
+            header = encode_integer(code, 4) + encode_integer(list_kind, 4)
             return EosEvent.AVAILABLE_LIST_CHANGED, header + encode_array(values, 4)
-        case AvailableFormats(code, formats, record_type):
-            numbers = b"".join(encode_integer(number, 4) for number in (code, record_type, len(formats)))
+        case AvailableFormats(code, formats, list_kind):
+            numbers = b"".join(encode_integer(number, 4) for number in (code, list_kind, len(formats)))
             return EosEvent.AVAILABLE_LIST_CHANGED, numbers + b"".join(item.encode() for item in formats)
         case ObjectEvent(record_type, entry):
             return record_type, entry.encode(_OBJECT_EVENTS[record_type])
@@ -516,7 +518,7 @@ TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class DialPosition:
-    """One position of a dial: code, label, and nominal value (s, f-number or ISO)."""
+    """One position of a dial of the camera: code, label, and nominal value (s, f-number or ISO speed)."""
 
     code: int
     label: str
@@ -525,21 +527,21 @@ class DialPosition:
 
 @dataclass(frozen=True)
 class Scale:
-    """A dial: its steps by ascending code, and special codes without a value."""
+    """A dial of the camera: its steps in order of their codes, and codes without a value."""
 
     name: str
     steps: tuple[DialPosition, ...]
     specials: dict[int, str]
 
     def label(self, code: int) -> str:
-        """Return the label of a code on the camera; "code 0x…" if it is unknown."""
+        """Return the label that the camera shows for a code; "code 0x…" if the code is unknown."""
         if code in self.specials:
             return self.specials[code]
         step = self._step(code)
         return f"code 0x{code:02x}" if step is None else step.label
 
     def value(self, code: int) -> float:
-        """Return the nominal value of a reported code."""
+        """Return the nominal value of a code that the camera reports."""
         step = self._step(code)
         if step is None:
             raise ProtocolError(
@@ -549,10 +551,10 @@ class Scale:
         return step.value
 
     def code(self, setting: float | str, available: Iterable[int] | None = None) -> int:
-        """Return the code of a nominal value or label; one of `available` if it is not None.
+        """Return the code of a nominal value or label.
 
         `setting` is a number (seconds, f-number or ISO speed), or a text as on the dial: ``1/60``, ``30``, ``auto``,
-        ``bulb``.
+        ``bulb``. If `available` is given, only these codes are considered.
         """
         codes = None if available is None else tuple(available)
         for code, label in self.specials.items():
@@ -563,7 +565,7 @@ class Scale:
         matches = [step for step in steps if number is not None and _is_close(number, step.value)]
         if not matches:
             raise self._not_offered_error(setting, number, steps)
-        # Third stops before half stops (code ≡ 4 mod 8), then the nearer nominal value, then the lower code.
+        # If several codes match, third stops are preferred to half stops (code ≡ 4 mod 8), then the nearest value.
         best = min(matches, key=lambda step: (step.code % 8 == 4, abs(step.value / (number or 1) - 1), step.code))
         return best.code
 
@@ -604,8 +606,8 @@ def _scale(name: str, table: str, specials: dict[int, str]) -> Scale:
     return Scale(name, tuple(sorted(steps, key=lambda step: step.code)), specials)
 
 
-# Shutter time in seconds (property 0xd102). Names of electronic shutter times up to 1/32000 s from Canon's EDSDK; the
-# last three are continued in eighths of a stop, to 1/64000 s of the EOS R3.
+# Shutter time in seconds (property 0xd102). The codes of electronic shutter times to 1/32000 s are from Canon's EDSDK.
+# The last three codes are extrapolated in eighths of a stop, to 1/64000 s of the EOS R3.
 SHUTTER = _scale(
     "shutter time",
     """
@@ -620,7 +622,7 @@ SHUTTER = _scale(
     {0x00: "auto", 0x0C: "bulb", 0x04: "bulb"},
 )
 
-# Aperture as f-number (property 0xd101). Code 0 is also reported for a lens without contacts.
+# Aperture as f-number (property 0xd101). Bodies also report code 0 for a lens without contacts.
 APERTURE = _scale(
     "aperture",
     """
@@ -645,19 +647,17 @@ ISO = _scale(
 
 MIRROR_LOCKUP_FUNCTION = 0x060F  # Custom function of mirror lockup, on bodies that have it
 
-MAX_PROPERTIES = 1024  # Largest number of stored properties; real bodies report 80 to 300
-# Longest stored property value, bytes; the longest known value, of focus points, has about 5000.
-MAX_VALUE = 1 << 14
-# Longest stored list of values; known lists have up to 31 (image formats) and 76 (colour temperatures).
-MAX_LIST = 1024
-_MAX_PENDING = 64  # Largest number of stored objects; more than a body's memory can hold
+MAX_PROPERTIES = 1024  # Most properties that are stored; real bodies report 80 to 300
+MAX_VALUE = 1 << 14  # Longest property value that is stored, bytes; the longest known value has about 5000
+MAX_LIST = 1024  # Longest list of permitted values that is stored; the longest known list has 76
+_MAX_PENDING = 64  # Most objects that are stored; the memory of a body holds fewer
 _NOT_RAW = (ObjectFormat.EXIF_JPEG, ObjectFormat.JFIF, ObjectFormat.MOV, ObjectFormat.MOV2)
 _NOT_RAW_SUFFIXES = (".jpg", ".jpeg", ".hif", ".mov", ".mp4")
 _SINGLE_SHOOTING = (DriveMode.SINGLE, DriveMode.SINGLE_SILENT)
 _BATTERY_LOW = 0  # EOS_BATTERY_POWER of a low battery (libgphoto2)
 # Charge for each EOS_BATTERY_POWER (libgphoto2); other numbers are unknown.
 _BATTERY_LEVELS = {_BATTERY_LOW: 0.0, 5: 0.25, 1: 0.5, 4: 0.75, 2: 1.0}
-# EOS_BATTERY_POWER on mains power, from Canon's EDSDK; never recorded from a device.
+# EOS_BATTERY_POWER on mains power, from Canon's EDSDK; we have not observed it.
 _BATTERY_MAINS = 0xFFFFFFFF
 
 _Value = TypeVar("_Value")
@@ -665,7 +665,7 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True)
 class PendingObject:
-    """An object in the camera's memory; `size` in bytes as announced, not verified."""
+    """An object in the camera's memory; `size` is the announced size in bytes, which may be wrong."""
 
     handle: int
     format: int
@@ -674,7 +674,7 @@ class PendingObject:
 
     @property
     def is_raw(self) -> bool:
-        """True for the raw frame, false for an image or film recorded with it."""
+        """True for a raw frame; false for a JPEG, HEIF or film."""
         return self.format not in _NOT_RAW and not self.name.lower().endswith(_NOT_RAW_SUFFIXES)
 
 
@@ -684,9 +684,9 @@ class EosState:
 
     - `values`: last reported value of each property.
     - `lists`, `formats`: permitted values of each property.
-    - `functions`: custom functions, number to first value.
-    - `busy`: the body reported that it exposes or writes.
-    - `pending`: objects by handle, in the order of their announcement.
+    - `functions`: first value of each custom function.
+    - `busy`: the last status of the body was "busy".
+    - `pending`: objects in the memory by handle, in the order of their announcement.
     """
 
     values: dict[int, bytes] = field(default_factory=dict[int, bytes])
@@ -733,18 +733,18 @@ class EosState:
 
     def has_value(self, code: int, value: bytes) -> bool:
         """Return whether a property has this value now."""
-        # Some bodies report more bytes than they accept.
+        # Some bodies report a longer value than was set.
         return code in self.values and self.values[code][: len(value)] == value
 
     def _add_pending(self, pending: PendingObject) -> None:
-        # An object announced twice keeps its position; if there are too many, the oldest are dropped.
+        # An object that is announced again keeps its position. If there are too many objects, the oldest are removed.
         self.pending[pending.handle] = pending
         while len(self.pending) > _MAX_PENDING:
             del self.pending[next(iter(self.pending))]
 
 
 def battery_level(state: EosState) -> float | None:
-    """Return the charge, 0 to 1 in quarters; None if it is not reported, or on mains power."""
+    """Return the battery charge, 0 to 1 in quarters; None if it is not reported, or on mains power."""
     power = state.number(Property.EOS_BATTERY_POWER)
     return None if power is None else _BATTERY_LEVELS.get(power)
 
@@ -755,11 +755,11 @@ def _store(store: dict[int, _Value], code: int, value: _Value) -> None:
 
 
 def custom_functions(value: bytes) -> dict[int, int]:
-    """Return the custom functions in a value of property 0xd1a0: number to first value.
+    """Return the first value of each custom function in a value of property 0xd1a0.
 
-    A value holds one group, in fields of 32 bits: its length, 1, the group number, the length of the rest, and the
-    count of functions. Then follow for each function its number, the count of its values, and the values. A malformed
-    rest is ignored.
+    The value has fields of 32 bits: its length, 1, the number of a group, the length of the rest, and the count of
+    functions. For each function follow its number, the count of its values, and the values. A malformed rest is
+    ignored.
     """
     cursor = Cursor(value, "custom functions")
     functions: dict[int, int] = {}
@@ -775,7 +775,7 @@ def custom_functions(value: bytes) -> dict[int, int]:
 
 
 def find_setting_faults(state: EosState) -> list[str]:
-    """Return all settings of a body that would spoil a series, each with its remedy."""
+    """Return a message with a remedy for each setting of the body that would spoil a series of frames."""
     faults: list[str] = []
     mode, focus, drive = (
         state.number(code) for code in (Property.EOS_AE_MODE, Property.EOS_FOCUS_MODE, Property.EOS_DRIVE_MODE)
@@ -801,7 +801,7 @@ def find_setting_faults(state: EosState) -> list[str]:
 
 
 def plan_settings(state: EosState, settings: ExposureSettings) -> dict[int, bytes]:
-    """Return the property values for a series of raw frames, in the order of setting."""
+    """Return the property values for a series of raw frames, in the order in which they are set."""
     faults = find_setting_faults(state)
     values: dict[int, bytes] = {}
     try:
@@ -829,19 +829,19 @@ def plan_settings(state: EosState, settings: ExposureSettings) -> dict[int, byte
     if faults:
         raise DeviceRefused("the camera cannot take the series", remedy="; ".join(faults))
     if WhiteBalance.DAYLIGHT in state.lists.get(Property.EOS_WHITE_BALANCE, ()):
-        # Raw values do not depend on it; a fixed value gives previews of the series the same colours.
+        # Raw values do not depend on the white balance. A fixed white balance gives all previews the same colours.
         values[Property.EOS_WHITE_BALANCE] = number_value(WhiteBalance.DAYLIGHT)
     return values
 
 
 def shutter_speeds(state: EosState) -> tuple[float, ...]:
-    """Return the nominal shutter times that a body lists, seconds, ascending; without bulb and unknown codes."""
+    """Return the nominal shutter times that a body lists, in seconds, ascending, without bulb and unknown codes."""
     values = {step.code: step.value for step in SHUTTER.steps}
     return tuple(sorted({values[code] for code in state.lists.get(Property.EOS_SHUTTER_SPEED, ()) if code in values}))
 
 
 def host_destination(state: EosState) -> bytes:
-    """Return the value of property 0xd11c for frames sent to the host; also if the body lists no values."""
+    """Return the value of property 0xd11c that sends frames to the host; refuse a body that does not offer it."""
     offered = state.lists.get(Property.EOS_CAPTURE_DESTINATION, ())
     values = (*offered, state.number(Property.EOS_CAPTURE_DESTINATION))
     if offered and CaptureDestination.HOST not in values:
@@ -864,7 +864,7 @@ def _raw_format(state: EosState) -> ImageFormat:
 
 
 def _offered_codes(state: EosState, code: int, scale: Scale) -> tuple[int, ...]:
-    """Return the codes that a body accepts; without a list only its present code, because none can be set."""
+    """Return the codes that a body accepts; if it lists none, only the present code, which cannot be changed."""
     current = state.number(code)
     current_codes = () if current is None or current in scale.specials else (current,)
     return state.lists.get(code) or current_codes
@@ -877,45 +877,38 @@ def _code_name(code_type: type[AeMode] | type[DriveMode], value: int) -> str:
         return f"0x{value:02x}"
 
 
-PIECE_BYTES = 1 << 20  # Bytes of one request; 5 MiB have crashed newer bodies
-MAX_FRAME_BYTES = 256 << 20  # Largest accepted frame; raw files of EOS bodies stay far below
-# Largest number of GetEvent requests of one drain. A few empty the queue, but some firmware repeats records endlessly.
-MAX_POLLS = 64
-KEEP_ALIVE_S = 10.0  # Interval of KeepDeviceOn requests, as in libgphoto2
-SETTLE_LIMIT_S = 5.0  # Time for a body to report a new value, or space for a frame
-# Longest accepted busy time at connection and at a release, seconds; an EOS 2000D is busy for seconds at both
-# (gphoto2, issue 382).
+PIECE_BYTES = 1 << 20  # Bytes that one request transfers; requests of 5 MiB have crashed newer bodies
+MAX_FRAME_BYTES = 256 << 20  # Largest accepted frame; raw files of EOS bodies are much smaller
+MAX_POLLS = 64  # Most GetEvent requests in a row, because some firmware repeats records without end
+KEEP_ALIVE_S = 10.0  # Interval of KeepDeviceOn requests, seconds, as in libgphoto2
+SETTLE_LIMIT_S = 5.0  # Time in which a body must report a new value, or memory for a frame, seconds
+# Longest accepted busy time after a connection or at a release, seconds (gphoto2, issue 382: EOS 2000D).
 BUSY_LIMIT_S = 30.0
-# Attempts of one release, spread over `TRANSIENT_LIMIT_S`: a busy state ends by itself, or when the events are read
-# between attempts.
-RELEASE_TRIES = 5
-# Timeout of a release, as in libgphoto2; some bodies expose before they reply.
-CAPTURE_TIMEOUT_S = 100.0
+RELEASE_TRIES = 5  # Attempts at one release, distributed over `TRANSIENT_LIMIT_S`, if the body is busy
+CAPTURE_TIMEOUT_S = 100.0  # Timeout of a release, seconds, as in libgphoto2; some bodies reply after the exposure
 
-_REMOTE_ON, _REMOTE_OFF = 1, 0  # Parameter of SetRemoteMode, as recorded and in libgphoto2
-# Bodies to which libgphoto2 sends 0x15 or 0x11 as remote mode, and live view before each frame (`is_canon_eos_m` in
-# its ptp-private.h): compact cameras and EOS M, except the M6 Mark II. "Canon EOS Kiss M" is the M50 in Japan.
-_OTHER_REMOTE_MODE = re.compile(r"Canon (?!EOS)|Canon EOS (Kiss )?M(?!6 Mark II\b)")
+_REMOTE_ON, _REMOTE_OFF = 1, 0  # Parameter of SetRemoteMode and SetEventMode, as recorded and in libgphoto2
+# Bodies that need another remote mode (0x15 or 0x11) and live view before each frame. These are compact cameras and EOS
+# M except the M6 Mark II (libgphoto2, ptp-private.h, `is_canon_eos_m`). "Canon EOS Kiss M" is the M50 in Japan.
+_OTHER_REMOTE_MODE_NAME = re.compile(r"Canon (?!EOS)|Canon EOS (Kiss )?M(?!6 Mark II\b)")
 _WITHOUT_AF = 1  # Second parameter of RemoteReleaseOn: a release without autofocus
-# Disk space announced to the body, clusters and bytes per cluster: 320 GiB, more than a session needs.
+# Disk space of the host, which is sent to the body: clusters, and bytes per cluster (320 GiB in total).
 _HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
-# Pauses between polls, seconds, as in libgphoto2; the first are short, because most replies come at once.
-_PAUSES_S = (0.05, 0.1, 0.15, 0.2)
-# Largest number of requests of one piece, with the longest pause after each: a transient fault may last 1 s.
-_PIECE_TRIES = 5
-_FREE_TRIES = 3  # Requests to free an object; the next `make_ready` repeats them
+_PAUSES_S = (0.05, 0.1, 0.15, 0.2)  # Pauses between polls, seconds, as in libgphoto2
+_PIECE_TRIES = 5  # Most requests for one piece, because a transient fault may last 1 s
+_FREE_TRIES = 3  # Requests to free an object in the camera's memory
 # Operations that return a part of an object, the preferred one first.
 _PARTIAL_READS = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
 # Responses to an operation that a body lists but does not support.
 _UNSUPPORTED = (ResponseCode.OPERATION_NOT_SUPPORTED, ResponseCode.EOS_UNKNOWN_COMMAND)
-# Responses to a request for a piece for which a repetition is useless.
-_PERMANENT = (
+# Responses after which the request for a piece is not repeated.
+_NOT_REPEATED = (
     *_UNSUPPORTED,
     ResponseCode.INVALID_OBJECT_HANDLE,
     ResponseCode.SESSION_NOT_OPEN,
     ResponseCode.DEVICE_BUSY,
 )
-# Responses to a request for a card or property that does not exist.
+# Responses to a request for a card or property that the body does not have.
 _NOT_PRESENT = (
     ResponseCode.PARAMETER_NOT_SUPPORTED,
     ResponseCode.INVALID_STORAGE_ID,
@@ -924,9 +917,9 @@ _NOT_PRESENT = (
     ResponseCode.STORE_NOT_AVAILABLE,
     ResponseCode.INVALID_PARAMETER,
 )
-_SLOT_FILLED = 0xFFFF  # Bits of a storage number; 0 for an empty slot (ISO 15740, 5.2.1)
-_MAX_CARDS = 8  # Largest number of cards to query; bodies have one or two
-# Parameter of the response to RemoteRelease; 0 is success.
+_SLOT_FILLED = 0xFFFF  # Bits of a storage id that are 0 if the card slot is empty (ISO 15740, 5.2.1)
+_MAX_CARDS = 8  # Most cards that are queried; bodies have one or two
+# Messages by the parameter of the response to RemoteRelease; 0 means success.
 _RELEASE_RESULTS = {
     1: "the autofocus failed; set the lens to MF",
     3: "its mirror is up; switch mirror lockup off",
@@ -938,9 +931,7 @@ _RELEASE_RESULTS = {
 class EosBody:
     """One connection to an EOS body.
 
-    - Each request was recorded from a host, or is sent by libgphoto2. No operation is sent that the body does not list.
-      If it lists an operation but rejects it as unknown, the connection continues without that operation if possible.
-    - Counts and sizes are checked before memory is used; the limits are far above those of real bodies.
+    - Optional operations are called only if the body lists them, and never again if the body rejects them as unknown.
     - A body keeps a frame in memory until TransferComplete, and refuses to release while the memory is full. Therefore
       every announced object is fetched or discarded, and then freed.
     """
@@ -960,7 +951,7 @@ class EosBody:
         return self._session.label
 
     def identity(self) -> CameraIdentity:
-        """Return maker, model, serial number and firmware; the engraved serial number if it is reported."""
+        """Return maker, model, serial number (the engraved one if it is reported) and firmware."""
         serial = self.state.text(Property.EOS_SERIAL_NUMBER) or self._info.serial_number
         return CameraIdentity(self._info.manufacturer, self._info.model, serial, self._info.device_version)
 
@@ -978,7 +969,7 @@ class EosBody:
                 f"{self.label} is a {self._info.manufacturer} {self._info.model}, expected a Canon EOS "
                 "body; connect one, or take the frames otherwise and use `acquire import`"
             )
-        if _OTHER_REMOTE_MODE.match(self._info.model):
+        if _OTHER_REMOTE_MODE_NAME.match(self._info.model):
             raise DeviceRefused(
                 f"{self.label} is a {self._info.model}, expected a body with the remote mode of EOS bodies, which EOS "
                 'M and compact bodies lack; set connection = "gphoto2" in [lab.camera], or take the frames otherwise '
@@ -987,7 +978,7 @@ class EosBody:
         self._session.call(Operation.EOS_SET_REMOTE_MODE, _REMOTE_ON)
         self._session.call(Operation.EOS_SET_EVENT_MODE, _REMOTE_ON)
         self.drain()
-        # As in libgphoto2: the first poll of newer bodies returns nothing.
+        # The first poll of newer bodies returns nothing, so polling continues, as in libgphoto2.
         if not self._poll_until(lambda: bool(self.state.values)):
             raise ProtocolError(f"{self.label} sent no state within {SETTLE_LIMIT_S:g} s; switch it off and on")
         if self._request_property(Property.EOS_SERIAL_NUMBER):
@@ -995,16 +986,16 @@ class EosBody:
         self._send_frames_to_host()
 
     def supplies(self) -> Supplies:
-        """Return battery and card capacity, as far as the body reports them."""
+        """Return battery charge and free space on the cards, if the body reports them."""
         self.drain()
         level = self._battery_level()
-        # A battery is also reported on mains power, so other values mean unknown, not false.
+        # Bodies may report a battery on mains power as well, so other values do not exclude mains power.
         mains = True if self.state.number(Property.EOS_BATTERY_POWER) == _BATTERY_MAINS else None
         saves_to_host = self.state.has_value(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.HOST))
         return Supplies(level, mains, self._card_free_bytes(), saves_to_host)
 
     def disconnect(self) -> None:
-        """Restore the initial state of the body and close the session; link faults are raised."""
+        """Restore the initial state of the body and close the session; faults of the connection are raised."""
         self.free_pending()
         if self._user_destination is not None:
             with contextlib.suppress(OperationDeclined):
@@ -1017,7 +1008,7 @@ class EosBody:
     def poll(self) -> bool:
         """Read new events once; return whether there were any."""
         with contextlib.suppress(ProtocolError):
-            self._session.events()  # only hints at new records, which are requested in any case
+            self._session.events()  # these events only announce records, which the next line requests
         _, data = self._session.call(Operation.EOS_GET_EVENT)
         records = decode_events(data)
         self.state.update(records)
@@ -1041,7 +1032,7 @@ class EosBody:
         """Empty the event queue and the memory, and wait until the body can take a frame."""
         self.drain()
         self.free_pending()
-        # The result is ignored, because the record "idle" may be lost; the release then fails if the body is busy.
+        # The result is ignored, because the record "idle" may be lost. If the body is really busy, the release fails.
         self._poll_until(lambda: not self.state.busy)
         self.free_pending()
         if not self._poll_until(lambda: self.state.number(Property.EOS_AVAILABLE_SHOTS) != 0):
@@ -1075,7 +1066,7 @@ class EosBody:
                 )
                 break
             except OperationDeclined as error:
-                # A body is busy here if its button is still pressed, or if events wait to be read.
+                # A body is busy if its button is still pressed, or if there are events that were not read.
                 self._release_button()
                 self.drain()
                 if error.code != ResponseCode.DEVICE_BUSY:
@@ -1088,14 +1079,14 @@ class EosBody:
         self._release_button()
 
     def wait_for_object(self, not_before: float, until: float, fits: Callable[[PendingObject], bool]) -> PendingObject:
-        """Return the newest pending object for which `fits` is true; objects before `not_before` are discarded."""
+        """Return the newest pending object for which `fits` is true; discard objects announced before `not_before`."""
         pauses = iter(_PAUSES_S)
         while True:
             if self.poll():
                 pauses = iter(_PAUSES_S)
             if self._clock.monotonic() < not_before:
                 self.free_pending()
-            # If there are two, the later one belongs to this release; the other was announced late.
+            # If two objects fit, the newer one belongs to this release. The older one was announced late.
             for candidate in reversed(list(self.state.pending.values())):
                 if fits(candidate):
                     return candidate
@@ -1104,7 +1095,7 @@ class EosBody:
             self._clock.sleep(next(pauses, _PAUSES_S[-1]))
 
     def fetch(self, pending: PendingObject, into: BinaryIO, offset: int = 0) -> None:
-        """Append the bytes of an object from `offset` on to `into`, piece by piece."""
+        """Append the bytes of an object from byte `offset` on to the stream `into`, piece by piece."""
         if not 0 < pending.size <= MAX_FRAME_BYTES:
             raise DeviceError(
                 f"{self.label} announces {pending.name!r} of {pending.size} bytes, 1 to {MAX_FRAME_BYTES} expected; "
@@ -1123,12 +1114,12 @@ class EosBody:
             self._keep_awake()
 
     def free(self, pending: PendingObject) -> None:
-        """Remove an object from the body's memory; if this fails, the next `make_ready` repeats it."""
+        """Remove an object from the body's memory; if this fails, the next `make_ready` tries again."""
         for remaining_tries in reversed(range(_FREE_TRIES)):
             try:
                 self._session.call(Operation.EOS_TRANSFER_COMPLETE, pending.handle)
             except OperationDeclined as error:
-                # A missing object is already free; a body without this operation frees objects automatically.
+                # If the handle is unknown, the object is free. Bodies without this operation free objects themselves.
                 is_freed = error.code == ResponseCode.INVALID_OBJECT_HANDLE
                 if not is_freed and not self._mark_unsupported(Operation.EOS_TRANSFER_COMPLETE, error):
                     if remaining_tries:
@@ -1143,7 +1134,7 @@ class EosBody:
             self.free(pending)
 
     def _fetch_whole(self, pending: PendingObject, into: BinaryIO, offset: int) -> None:
-        """Append an object from `offset` on; for bodies without partial reads, which send it from its start."""
+        """Append an object from byte `offset` on, for bodies without partial reads, which send the whole object."""
         received = 0
 
         def append(piece: bytes) -> None:
@@ -1160,20 +1151,20 @@ class EosBody:
             raise self._truncated_error(pending, received)
 
     def _fetch_piece(self, operation: Operation, pending: PendingObject, offset: int) -> bytes:
-        # Fewer bytes than requested are valid; the rest follows.
+        # The body may send fewer bytes than requested.
         limit = min(PIECE_BYTES, pending.size - offset)
         for remaining_tries in reversed(range(_PIECE_TRIES)):
             try:
                 parameters, data = self._session.call(operation, pending.handle, offset, limit)
             except OperationDeclined as error:
-                if not remaining_tries or error.code in _PERMANENT:
+                if not remaining_tries or error.code in _NOT_REPEATED:
                     raise
             else:
                 if len(data) > limit:
                     raise ProtocolError(
                         f"{self.label} sent {len(data)} bytes at {offset}, expected at most {limit}; repeat it"
                     )
-                # The standard's operation reports the number of sent bytes; the parameters of Canon's are unknown.
+                # The standard operation reports the number of sent bytes. Canon's own operation has other parameters.
                 count = parameters[0] if parameters and operation == Operation.GET_PARTIAL_OBJECT else len(data)
                 if data and count == len(data):
                     return data
@@ -1187,7 +1178,7 @@ class EosBody:
 
     def _send_frames_to_host(self) -> None:
         host = host_destination(self.state)
-        # After a killed run the body is still set to the host; restore the card for its user.
+        # If an earlier program was killed, the body is still set to the host. At the end it is then set to the card.
         self._user_destination = number_value(CaptureDestination.CARD)
         if not self.state.has_value(Property.EOS_CAPTURE_DESTINATION, host):
             self._user_destination = self.state.values.get(Property.EOS_CAPTURE_DESTINATION, self._user_destination)
@@ -1211,8 +1202,8 @@ class EosBody:
         )
 
     def _retry_while_busy(self, action: Callable[[], None]) -> None:
-        """Repeat `action` while the body is busy, for a limited time."""
-        # No new session here: the body would start its work again.
+        """Repeat `action` while the body is busy, for at most `BUSY_LIMIT_S`."""
+        # A new session would not help, because the body would start its work again.
         end = self._clock.monotonic() + BUSY_LIMIT_S
         while True:
             try:
@@ -1251,7 +1242,7 @@ class EosBody:
         level = battery_level(self.state)
         if level is None and Property.BATTERY_LEVEL in self._info.properties:
             answer = self._call_if_supported(Operation.GET_DEVICE_PROP_VALUE, Property.BATTERY_LEVEL)
-            # 0 may mean another power source (ISO 15740, 13.4.1); with an empty battery there is no reply.
+            # 0 may mean another power source (ISO 15740, 13.4.1). It is not an empty battery, which cannot reply.
             if answer is not None and answer[1][:1] not in (b"", b"\0"):
                 level = min(answer[1][0], 100) / 100
         return level
@@ -1272,7 +1263,7 @@ class EosBody:
         return self._call_if_supported(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, code) is not None
 
     def _call_if_supported(self, operation: Operation, *parameters: int) -> tuple[tuple[int, ...], bytes] | None:
-        """Return the reply to an operation; None if the body does not support it or these parameters."""
+        """Return the reply to an operation; None if the body does not support the operation or these parameters."""
         if not self._offers(operation):
             return None
         try:
@@ -1283,7 +1274,7 @@ class EosBody:
             return None
 
     def _mark_unsupported(self, operation: Operation, error: OperationDeclined) -> bool:
-        """Return whether `error` means an unsupported operation; it is then never called again."""
+        """Return whether `error` reports an unsupported operation, which is then never called again."""
         if error.code not in _UNSUPPORTED:
             return False
         self._unsupported.add(operation)
@@ -1293,20 +1284,19 @@ class EosBody:
         return operation in self._info.operations and operation not in self._unsupported
 
 
-# Renewals of the connection in one call; a fault that occurs more often is permanent. Chosen without measurement.
+# Most renewals of the connection in one call. Chosen without measurement.
 RECOVERIES = 3
 # Time after the first fault of a call in which the connection may be renewed, seconds. A body that was switched off
-# and on, or plugged in again, is ready within 10 s. Chosen without measurement.
+# and on is ready within 10 s. Chosen without measurement.
 RECOVERY_S = 30.0
-# Time for the announcement of a frame after the exposure, seconds. The shutter time is added once more, for the dark
-# frame that some bodies subtract. Chosen without measurement.
+# Time in which a frame must be announced after the exposure, seconds. The shutter time is added to it, because some
+# bodies take a dark frame of the same length. Chosen without measurement.
 FRAME_S = 30.0
-# Time for the announcement on a new connection, where the body sends its whole state at once, seconds.
+# Time in which a frame must be announced on a new connection, seconds. The body then sends its whole state at once.
 REDISCOVERY_S = 10.0
 
-_SHORTEST_RELATIVE_TIME = 0.9  # Shortest real shutter time / nominal time; 1/6 s is really 0.149 s
-# First and longest of the doubling pauses between attempts to reconnect, seconds: short for a cable that was plugged in
-# again, long enough not to disturb a body that starts up.
+_SHORTEST_RELATIVE_TIME = 0.9  # Smallest ratio of real and nominal shutter time; nominal 1/6 s is really 0.149 s
+# First and longest pause between attempts to reconnect, seconds. The pauses double.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 5.0
 # Responses after which a new session may help.
 _SESSION_FAULTS = (
@@ -1319,7 +1309,7 @@ _SESSION_FAULTS = (
     ResponseCode.TRANSACTION_CANCELLED,
 )
 _SUFFIXES: dict[int, str] = {ObjectFormat.CRW: ".CRW", ObjectFormat.CR2: ".CR2", ObjectFormat.CR3: ".CR3"}
-_REMEDY = (
+_CONNECTION_REMEDY = (
     "check its cable and battery, switch it off and on, and close other programs that use it (the photo importer of a "
     "desktop starts automatically)"
 )
@@ -1329,11 +1319,11 @@ _Result = TypeVar("_Result")
 
 @dataclass
 class _Release:
-    """A release that has happened, or may have happened.
+    """A release of the shutter that has happened, or may have happened.
 
     - `not_before`, `until`: clock times between which the frame may be announced.
-    - `announced`: the announced frame. `fetched`: the frame of an unfinished download.
-    - `absent`: handles that cannot be its frame.
+    - `announced`: the frame that was announced. `fetched`: the frame of an unfinished download.
+    - `excluded`: handles of other objects.
     """
 
     body: EosBody
@@ -1343,18 +1333,18 @@ class _Release:
     shutter_s: float
     announced: PendingObject | None = None
     fetched: PendingObject | None = None
-    absent: set[int] = field(default_factory=set[int])
+    excluded: set[int] = field(default_factory=set[int])
 
 
 class CanonEos:
-    """A `drivers.camera.Camera` over PTP on any cable; `open_transport` opens the cable for each connection.
+    """A Canon EOS camera over USB or a network; `open_transport` opens the cable for each connection.
 
-    - A failed connection is renewed, for a limited number of times and a limited time in one call. Then the call raises
-      its first cause; the caller decides about longer waits.
-    - A release is never repeated if it may have happened. After a fault the frame is searched in the camera's memory; a
-      missing frame is an error. Objects in memory before a release are discarded, so frames are never mixed up.
-    - The frame stays in memory until its download is complete, or until the next exposure. After a fault of the cable
-      or the file, only the download is repeated.
+    - A failed connection is renewed a few times in each call. If this does not help, the call raises an error with the
+      first fault, and the caller decides about longer waits.
+    - A release is never repeated if it may have happened. After a fault, the frame is searched in the camera's memory.
+      Objects that are in the memory before a release are discarded, so that an old frame is never taken for a new one.
+    - The frame stays in the memory until its download is complete, or until the next exposure. If the cable or the
+      written file fails, only the download must be repeated.
     """
 
     def __init__(self, open_transport: Callable[[], Transport], clock: Clock = SYSTEM_CLOCK) -> None:
@@ -1375,12 +1365,12 @@ class CanonEos:
         return self._run(EosBody.identity)
 
     def supplies(self) -> Supplies:
-        """Return battery and card capacity; see `drivers.camera.ReportsSupplies`."""
+        """Return battery charge and free space on the cards; see `drivers.camera.ReportsSupplies`."""
         self._start_call()
         return self._run(EosBody.supplies)
 
     def configure(self, settings: ExposureSettings) -> None:
-        """Set and verify exposure, raw format and destination; a frame without download is dropped."""
+        """Set and verify exposure, raw format and destination; a frame that was not downloaded is dropped."""
 
         def set_up(body: EosBody) -> None:
             body.make_ready()
@@ -1404,7 +1394,7 @@ class CanonEos:
     def expose(self) -> datetime:
         """Release the shutter without autofocus, and return the time of the release (UTC).
 
-        Wait until the body announces the frame. An earlier frame without download is dropped.
+        It returns when the body has announced the frame. An earlier frame that was not downloaded is dropped.
         """
         settings = self._settings
         if settings is None:
@@ -1423,7 +1413,7 @@ class CanonEos:
     def download(self, into: BinaryIO) -> CapturedFrame:
         """Write the raw file of the last exposure to `into`, complete and unchanged.
 
-        A failed download may be repeated with a new stream until the next exposure, or until the body is switched off.
+        A failed download may be repeated with a new stream, until the next exposure or until the body is switched off.
         """
         release = self._last_release
         if release is None:
@@ -1457,7 +1447,7 @@ class CanonEos:
         self._first_fault, self._renewal_deadline = None, math.inf
 
     def _run(self, action: Callable[[EosBody], _Result]) -> _Result:
-        """Return the result of `action` on a connected body; over a new connection if the present one fails."""
+        """Return the result of `action` on a connected body; if the connection fails, repeat it over a new one."""
         renewals = 0
         was_busy = False
         while True:
@@ -1468,7 +1458,7 @@ class CanonEos:
                 if not _may_recover(error):
                     raise
                 self._record_fault(error)
-                # A body that is busy in every session is busy because of its settings, not because of a fault.
+                # If a body is also busy in a new session, its settings are the cause, not the connection.
                 is_busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
                 is_late = self._clock.monotonic() >= self._renewal_deadline
                 if renewals == RECOVERIES or is_late or (is_busy and was_busy):
@@ -1480,8 +1470,7 @@ class CanonEos:
                 renewals += 1
 
     def _record_fault(self, fault: DeviceError) -> None:
-        """Drop a failed connection, and keep the first fault of a call as its cause."""
-        # Later faults, until a new connection is ready, are consequences of the first one and are not recorded.
+        """Drop a failed connection, and record the first fault of a call, which is the cause of the later ones."""
         if self._first_fault is None:
             self._first_fault = fault
             self._renewal_deadline = self._clock.monotonic() + RECOVERY_S
@@ -1489,19 +1478,19 @@ class CanonEos:
 
     def _failure_message(self, last_fault: DeviceError, attempts: str) -> str:
         first, latest = (fault.without_remedy() for fault in (self._first_fault or last_fault, last_fault))
-        return f"{first}, {attempts}{'' if latest == first else f', last fault: {latest}'}; {_REMEDY}"
+        return f"{first}, {attempts}{'' if latest == first else f', last fault: {latest}'}; {_CONNECTION_REMEDY}"
 
     def _release(self, settings: ExposureSettings) -> _Release:
-        """Release the shutter; return the release, which has happened or may have happened."""
+        """Release the shutter; after a fault during the release, it may have happened or not."""
 
         def press(body: EosBody) -> _Release:
             body.make_ready()
-            _apply(body, settings)  # sends nothing, unless somebody turned a dial
+            _apply(body, settings)  # sends only settings that were changed on the camera
             now = self._clock.monotonic()
             not_before = now + _SHORTEST_RELATIVE_TIME * settings.shutter_s
             until = now + 2 * settings.shutter_s + FRAME_S
             old_handles = set(body.state.pending)
-            pressed = _Release(body, self._clock.now(), not_before, until, settings.shutter_s, absent=old_handles)
+            pressed = _Release(body, self._clock.now(), not_before, until, settings.shutter_s, excluded=old_handles)
             try:
                 body.release()
             except (LinkError, ProtocolError) as error:
@@ -1511,21 +1500,21 @@ class CanonEos:
         return self._run(press)
 
     def _wait_for_frame(self, body: EosBody, release: _Release) -> PendingObject:
-        """Return the frame of a release once the body has announced it; the same frame in every call."""
+        """Wait until the body has announced the frame of a release; return the same frame in every call."""
         is_new_connection = body is not release.body
         until = self._clock.monotonic() + release.shutter_s + REDISCOVERY_S if is_new_connection else release.until
         announced = release.announced
 
         def is_frame(pending: PendingObject) -> bool:
             if announced is not None and (pending.name, pending.size) != (announced.name, announced.size):
-                return False  # released later, by hand on the camera
-            return pending.is_raw and pending.handle not in release.absent
+                return False  # another frame, released by hand on the camera
+            return pending.is_raw and pending.handle not in release.excluded
 
         try:
             release.announced = body.wait_for_object(release.not_before, until, is_frame)
         except LinkTimeout as error:
             if not is_new_connection:
-                raise  # the announcement may be lost; a new connection repeats it
+                raise  # the announcement may be lost; on a new connection the body repeats it
             self._last_release = None
             remedy = "switch it off and on, and expose again"
             raise DeviceError(f"{error.without_remedy()}, and its memory has none", remedy=remedy) from error
@@ -1534,7 +1523,7 @@ class CanonEos:
     def _receive_frame(self, body: EosBody, release: _Release, into: BinaryIO, start: int) -> PendingObject:
         while True:
             frame = self._wait_for_frame(body, release)
-            # Data of the same object before a fault are valid, because pieces are written whole.
+            # Pieces are written completely or not at all, so data of the same frame before a fault are valid.
             offset = into.tell() - start if frame == release.fetched else 0
             into.seek(start + offset)
             into.truncate()
@@ -1544,14 +1533,14 @@ class CanonEos:
             except OperationDeclined as error:
                 if error.code != ResponseCode.INVALID_OBJECT_HANDLE:
                     raise
-                release.absent.add(frame.handle)
+                release.excluded.add(frame.handle)
                 release.announced = None
                 body.free(frame)
                 continue
             return frame
 
     def _empty_memory(self) -> None:
-        """Free all pending objects; if this fails, the next call does it over a new connection."""
+        """Free all pending objects; if this fails, the next call repeats it over a new connection."""
         if self._body is not None:
             try:
                 self._body.free_pending()
@@ -1573,7 +1562,7 @@ class CanonEos:
             try:
                 return self._connect()
             except DeviceError as error:
-                # A body that restarts may be absent, or in use by the desktop.
+                # While a body restarts, it may be absent, or in use by the desktop.
                 may_recover = not is_first if self._transport is None else _may_recover(error)
                 self._drop_connection(error)
                 if not may_recover:
@@ -1621,7 +1610,7 @@ def _may_recover(error: DeviceError) -> bool:
 
 
 def _file_name(frame: PendingObject) -> str:
-    # Without characters that are invalid in file names.
+    # Replace characters that are invalid in file names.
     name = re.sub(r"[^A-Za-z0-9._-]", "_", frame.name).strip(".") or f"{frame.handle:08X}"
-    # Some bodies announce a file without name or suffix, but with its format.
+    # Some bodies announce a file without name or suffix. Its format then gives the suffix.
     return name if "." in name else name + _SUFFIXES.get(frame.format, "")

@@ -1,11 +1,11 @@
-"""Any camera of libgphoto2 as a `drivers.camera.Camera`, for makers without a driver of their own here.
+"""Driver of cameras through libgphoto2, for makers without a driver of our own; see `drivers.camera.Camera`.
 
 python-gphoto2 is optional and imported only when a camera is opened. After a fault the connection is closed, and the
-next call opens a new one; a frame in transfer is lost and may be repeated.
+next call opens a new one. A frame that was being transferred is lost and may be taken again.
 
-libgphoto2 has several names for one setting; the first name that a body has is used. Labels are from libgphoto2's
-tables, untranslated, and every setting is read back. A body is refused if it offers no raw format, focuses
-automatically, or has another setting that would spoil a series. Settings that a body does not show are ignored.
+libgphoto2 has several names for some settings; see `first_setting`. The values are labels of libgphoto2 in English.
+Every setting is read back. A body is refused if it offers no raw format, focuses automatically, or has another setting
+that would spoil a series of frames. Settings that a body does not report are ignored.
 
 Source: libgphoto2 2.5.34, camlibs/ptp2/config.c (names and labels), camlibs/ptp2/cameras (settings of bodies).
 """
@@ -27,24 +27,25 @@ if TYPE_CHECKING:
     import gphoto2
 
 
-# Accepted relative difference between a label and a requested value: libgphoto2 lists 6.3 s for 6 s on the dial.
+# Accepted relative difference between a label and a requested value. An example is 6 s, listed as 6.3 s by libgphoto2.
 TOLERANCE = 0.06
-# Accepted relative difference between two labels of one value: a Nikon's 1/60 is also listed as 0.0166 s, truncated.
+# Accepted relative difference between two labels of the same value. An example is 1/60 s, truncated to 0.0166 s.
 EQUAL_TOLERANCE = 0.011
-_MAX_LISTED = 30  # Most choices in a message
+_MAX_LISTED = 30  # Most choices that a message lists
 
-RAW_FORMAT = ("imageformat", "imagequality")  # The first on Canon, Fuji and Olympus, the second on Nikon and Sony
+# Names of settings in libgphoto2, the preferred name first.
+RAW_FORMAT = ("imageformat", "imagequality")  # Canon, Fuji and Olympus; Nikon and Sony
 ISO = ("iso",)
 APERTURE = ("aperture", "f-number")
-# Nikon bodies have both; only the first is exact, the second lists 1/6400 s as 0.0001 s.
+# Nikon bodies have both names. The second is not exact: it lists 1/6400 s as 0.0001 s.
 SHUTTER = ("shutterspeed2", "shutterspeed")
 TARGET = ("capturetarget",)
-HOST_TARGETS = ("Internal RAM", "sdram")  # Frames are sent to the host only, not to the card
+HOST_TARGETS = ("Internal RAM", "sdram")  # Labels of TARGET that send frames only to the host, not to the card
 
 _RAW_LABELS = ("RAW", "NEF (Raw)", "Raw", "NEF", "RAW (Uncompressed)", "RAW (Lossless)")
 _NOT_RAW_SUFFIXES = (".jpg", ".jpeg", ".hif", ".heif", ".heic", ".tif", ".tiff", ".mov", ".mp4")
-# Names of a state, its accepted labels, and the remedy; a body may show a state under two names.
-_STATES: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
+# Settings that the user makes on the camera: names in libgphoto2, accepted labels, remedy. A body may have both names.
+_USER_SETTINGS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (("autoexposuremode", "expprogram"), ("Manual", "M"), "turn the mode dial to M"),
     (
         ("focusmode", "focusmode2"),
@@ -57,8 +58,8 @@ _STATES: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
         "set single shooting",
     ),
 )
-# Settings that must be off, their accepted labels, and the effect otherwise.
-_SWITCHES: tuple[tuple[str, tuple[str, ...], str], ...] = (
+# Settings that would change the raw values: name in libgphoto2, accepted labels, effect of the other labels.
+_DISTURBING_SETTINGS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("isoauto", ("Off",), "the body would choose the ISO speed"),
     ("autoiso", ("Off",), "the body would choose the ISO speed"),
     ("bracketing", ("Off",), "every frame would be exposed differently"),
@@ -71,13 +72,13 @@ _BATTERY_WORDS = {"low": 0.0, "empty": 0.0, "full": 1.0}
 
 @dataclass(frozen=True)
 class BodySetting:
-    """Present state of a setting of a body.
+    """A setting of a body and its present value.
 
     - `name`: name in libgphoto2, such as ``f-number``.
     - `value`: a label, or a number as text.
     - `choices`: permitted labels; empty if the body lists none.
-    - `bounds`: smallest and largest number of a range, else None.
-    - `fixed`: the setting is read-only.
+    - `bounds`: smallest and largest permitted number, None if the setting is not a range.
+    - `fixed`: whether the setting is read-only.
     """
 
     name: str
@@ -99,24 +100,24 @@ class BodySetting:
         return labels or f"nothing (present value: {self.value or 'none'})"
 
 
-Body = Callable[[str], BodySetting | None]  # Returns the setting of a name; None if the body does not have it
+Body = Callable[[str], BodySetting | None]  # Returns the setting with a name; None if the body does not have it
 
 
 def first_setting(body: Body, names: Iterable[str]) -> BodySetting | None:
-    """Return the first setting of `names` that a body has; one with choices or bounds is preferred."""
+    """Return the first setting of `names` that a body has; settings with choices or bounds are preferred."""
     present = [setting for name in names if (setting := body(name)) is not None]
     return next((setting for setting in present if setting.choices or setting.bounds), present[0] if present else None)
 
 
 def plan_settings(body: Body, settings: ExposureSettings) -> dict[str, str]:
-    """Return the value of each setting for a series of raw frames, in the order of setting."""
+    """Return the values of the settings for a series of raw frames, in the order in which they are set."""
     faults: list[str] = []
     values: dict[str, str] = {}
-    for names, allowed, remedy in _STATES:
+    for names, allowed, remedy in _USER_SETTINGS:
         states = [setting for name in names if (setting := body(name)) is not None and setting.value]
         if states and not any(setting.value in allowed for setting in states):
             faults.append(f"{states[0].name} is {states[0].value}: {remedy}")
-    for name, labels, effect in _SWITCHES:
+    for name, labels, effect in _DISTURBING_SETTINGS:
         setting = body(name)
         if setting is None or setting.value in labels or not setting.choices:
             continue
@@ -161,14 +162,14 @@ def plan_settings(body: Body, settings: ExposureSettings) -> dict[str, str]:
 
 
 def find_label(setting: BodySetting, number: float) -> str | None:
-    """Return the label that sets a setting to `number`; None if none is close enough."""
+    """Return the label that sets a setting to `number`; None if no label is close enough."""
     if setting.fixed:
         return setting.value if are_equal(setting.value, f"{number:.9g}", TOLERANCE) else None
     if setting.bounds is not None:
         lowest, highest = setting.bounds
         return f"{number:.9g}" if lowest <= number <= highest else None
     if not setting.choices:
-        # Some bodies list no choices for a writable setting; the result is read back.
+        # Some bodies list no choices for a writable setting.
         return f"{number:.9g}"
     candidates = {label: candidate for label in setting.choices if (candidate := parse_number(label)) is not None}
     labels = [label for label, candidate in candidates.items() if abs(candidate / number - 1) <= TOLERANCE]
@@ -184,9 +185,9 @@ def are_equal(first: str, second: str, tolerance: float = EQUAL_TOLERANCE) -> bo
 
 
 def parse_number(label: str) -> float | None:
-    """Return the number in a label: ``f/5.6``, ``0,0400s``, ``32/10``, ``1/60``, ``100``; else None.
+    """Return the number in a label such as ``f/5.6``, ``0,0400s``, ``32/10``, ``1/60`` or ``100``.
 
-    Labels with other text, such as ``100 Multi Frame Noise Reduction`` or ``x 200``, are not numbers.
+    None for labels with other text, such as ``100 Multi Frame Noise Reduction`` or ``x 200``.
     """
     dividend, _, divisor = label.lower().replace(",", ".").removeprefix("f/").removesuffix("s").partition("/")
     try:
@@ -197,7 +198,7 @@ def parse_number(label: str) -> float | None:
 
 
 def battery_level(text: str) -> float | None:
-    """Return the charge in a label such as ``80%`` or ``Low``, 0 to 1; None if there is none."""
+    """Return the battery charge in a label such as ``80%`` or ``Low``, 0 to 1; None for another label."""
     label = text.strip().lower()
     if label in _BATTERY_WORDS:
         return _BATTERY_WORDS[label]
@@ -207,7 +208,7 @@ def battery_level(text: str) -> float | None:
 
 
 def _select(setting: BodySetting | None, labels: tuple[str, ...], values: dict[str, str], faults: list[str]) -> None:
-    """Set a setting to the first offered label in `labels`; a body that already has one need not offer it."""
+    """Add the first offered label to `values`; if no label is offered or already set, add a fault."""
     if setting is None:
         return
     offered_label = next((label for label in labels if label in setting.choices), None)
@@ -220,13 +221,12 @@ def _select(setting: BodySetting | None, labels: tuple[str, ...], values: dict[s
         )
 
 
-# Time for a body to report a new value, seconds: a Sony changes its dials step by step.
+# Time in which a body must report a new value, seconds. A Sony body changes values step by step.
 SETTLE_LIMIT_S = 5.0
 
-# Requests of a file from a busy body, which may still be writing. Any other fault loses connection and frame.
-BUSY_TRIES = 5
-BUSY_PAUSE_S = 1.0  # Pause between two requests
-_POLL_S = 0.1  # Pause between two readings of a new value; each is a request to the body
+BUSY_TRIES = 5  # Most requests for a file from a body that is busy, because it may still be writing
+BUSY_PAUSE_S = 1.0  # Pause between two of these requests, seconds
+_POLL_S = 0.1  # Pause between two readings of a new value, seconds
 
 _IDENTITY = {
     "maker": ("manufacturer",),
@@ -242,9 +242,10 @@ class Gphoto2Camera:
     Parameters
     ----------
     port
-        libgphoto2's name of the port, ``usb:001,005`` or ``ptpip:192.168.1.1``; None selects the first detected camera.
+        Port as named by libgphoto2, such as ``usb:001,005`` or ``ptpip:192.168.1.1``; None selects the first detected
+        camera.
     model
-        libgphoto2's name of the model, ``PTP/IP Camera`` on a network; None detects it, which works on USB.
+        Model as named by libgphoto2; ``PTP/IP Camera`` on a network. None detects the model, which works only on USB.
     """
 
     def __init__(self, port: str | None = None, model: str | None = None, clock: Clock = SYSTEM_CLOCK) -> None:
@@ -258,7 +259,7 @@ class Gphoto2Camera:
         load_library()
 
     def identity(self) -> CameraIdentity:
-        """Return maker, model, serial number and firmware; empty if the body does not report them."""
+        """Return maker, model, serial number and firmware; an empty text if the body does not report a value."""
         with self._connection() as camera:
             return CameraIdentity(**{field: _read_text(camera, names) for field, names in _IDENTITY.items()})
 
@@ -270,18 +271,18 @@ class Gphoto2Camera:
         self._settings = settings
 
     def shutter_speeds(self) -> tuple[float, ...]:
-        """Return the shutter times that libgphoto2 lists, seconds, rising; empty if it lists none."""
+        """Return the shutter times that libgphoto2 lists, in seconds, ascending; empty if it lists none."""
         with self._connection() as camera:
             setting = first_setting(lambda name: _read_setting(camera, name), SHUTTER)
             numbers = (parse_number(label) for label in (setting.choices if setting is not None else ()))
             return tuple(sorted({number for number in numbers if number is not None}))
 
     def supplies(self) -> Supplies:
-        """Return battery and card capacity, if libgphoto2 reports them; see `drivers.camera.ReportsSupplies`."""
+        """Return battery charge and free space on the cards; see `drivers.camera.ReportsSupplies`."""
         with self._connection() as camera:
             power = _read_text(camera, ("acpower",))
             target = first_setting(lambda name: _read_setting(camera, name), TARGET)
-            # If the host is not set yet but offered, `configure` sets it.
+            # If the host is not the present target but is offered, `configure` will set it.
             to_host = target is None or any(label in (target.value, *target.choices) for label in HOST_TARGETS)
             return Supplies(
                 battery_level(_read_text(camera, ("batterylevel",))),
@@ -291,9 +292,9 @@ class Gphoto2Camera:
             )
 
     def expose(self) -> datetime:
-        """Release the shutter, and return its time (UTC) once libgphoto2 reports the file.
+        """Release the shutter, wait until libgphoto2 reports the file, and return the time of the release (UTC).
 
-        An earlier frame without download is dropped.
+        An earlier frame that was not downloaded is dropped.
         """
         settings = self._settings
         if settings is None:
@@ -315,7 +316,7 @@ class Gphoto2Camera:
     def download(self, into: BinaryIO) -> CapturedFrame:
         """Write the raw file of the last exposure to `into`, complete and unchanged.
 
-        It may be repeated if writing failed. After a fault of the connection, libgphoto2 has lost the frame.
+        If only writing to `into` failed, the call may be repeated. A fault of the connection loses the frame.
         """
         if self._exposed is None:
             raise DeviceError("the camera has no exposed frame; expose again")
@@ -354,13 +355,13 @@ class Gphoto2Camera:
 
     def _close_connection(self) -> None:
         self._exposed = None
-        # libgphoto2 exits when the last reference is gone. An explicit `exit` that fails would be repeated then, and
-        # close file descriptors that belong to others.
+        # libgphoto2 disconnects when the last reference is gone. An explicit `exit` that fails would be repeated then,
+        # and could close file descriptors of other files.
         self._camera = None
 
     @contextmanager
     def _connection(self) -> Generator[gphoto2.Camera]:
-        """Yield the open camera, and translate errors of libgphoto2."""
+        """Yield the open camera, and convert errors of libgphoto2 to ours."""
         if self._closed:
             raise DeviceError("the camera has been closed; open the rig again")
         gp = load_library()
@@ -420,7 +421,7 @@ def load_library():
 
 @contextmanager
 def _translate_lookup_errors(subject: str, remedy: str) -> Generator[None]:
-    """Raise unknown ports and models as ConfigurationError that lists the detected cameras."""
+    """Convert the error for an unknown port or model to a ConfigurationError that lists the detected cameras."""
     gp = load_library()
     try:
         yield

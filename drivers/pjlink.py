@@ -1,11 +1,11 @@
-"""PJLink over TCP: messages, a projector driver, and the network search.
+"""PJLink over TCP: messages, a projector driver, and the search for projectors in the network.
 
-The driver sends only lines that the standard defines, and accepts more: any case, LF instead of CR or after it, empty
-lines, and NUL between lines (some projectors pad their packets with NUL). Datagrams may come from any sender; a
-datagram without a valid reply gives an empty result, not an error.
+The driver sends only lines that the standard defines. It accepts these deviations: lower case, lines that end with LF
+or CR LF, empty lines, and NUL between lines (some projectors fill their packets with NUL). Datagrams may come from
+any sender, so a datagram without a valid reply is ignored.
 
-Source: JBMIA, PJLink Specifications 1.04 (class 1) and 2.00 (class 2: same lines with digit 2; 3.2 search, 3.3 status
-notification).
+Source: JBMIA, PJLink Specifications 1.04 (class 1) and 2.00 (class 2, whose lines have the digit 2; 3.2 search, 3.3
+status notification).
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import RUN_AGAIN, DeviceFault, DeviceRefused, LinkError, LinkTimeout, ProtocolError
 
 PORT = 4352  # TCP and UDP port of PJLink (PJLink Specifications 1.04 and 2.00)
-MAX_LINE = 136  # Longest command or reply with its CR, bytes
+MAX_LINE = 136  # Longest command or reply including CR, bytes
 DIGEST_LENGTH = 32  # Characters of the MD5 digest before the first command (PJLink Specifications 1.04, 5.1)
-MAX_PASSWORD = 32  # Characters of a password (PJLink Specifications 1.04, authentication)
-IDLE_LIMIT_S = 30.0  # Projectors disconnect after about this time without a command
+MAX_PASSWORD = 32  # Most characters of a password (PJLink Specifications 1.04, authentication)
+IDLE_LIMIT_S = 30.0  # Projectors disconnect after about this time without a command, seconds
 
 QUERY = "?"
 OK = "OK"
@@ -47,7 +47,7 @@ class ErrorCode(Enum):
 
 
 class Refused(Enum):
-    """Reply to a wrong password, instead of a greeting or a usual reply."""
+    """Reply to a wrong password, sent instead of a greeting or another reply."""
 
     WRONG_PASSWORD = "PJLINK ERRA"
 
@@ -56,7 +56,8 @@ class Refused(Enum):
 class PjLinkRequest:
     """A command: four capital letters or digits, and a parameter or `QUERY`.
 
-    Only the first command on a connection may have a digest.
+    - `level`: PJLink class, 1 or 2.
+    - `digest`: only for the first command on a connection.
     """
 
     command: str
@@ -67,7 +68,7 @@ class PjLinkRequest:
 
 @dataclass(frozen=True)
 class PjLinkReply:
-    """A reply: the command, and its value, `OK` or an error code."""
+    """A reply: the command, the PJLink class (`level`), and a value, `OK` or an error code."""
 
     command: str
     value: str
@@ -75,7 +76,7 @@ class PjLinkReply:
 
     @property
     def error(self) -> ErrorCode | None:
-        """Error code; None if the value is no error."""
+        """Error code; None if the value is not an error code."""
         try:
             return ErrorCode(self.value.upper())
         except ValueError:
@@ -83,7 +84,7 @@ class PjLinkReply:
 
 
 def split_line(data: bytes, limit: int = MAX_LINE) -> tuple[bytes, int] | None:
-    """Return the first line without its end, and the number of bytes that were read; None if it is incomplete.
+    """Return the first line without its end, and the number of bytes up to its end; None if no line is complete.
 
     Empty lines and NUL are skipped.
     """
@@ -104,12 +105,12 @@ def authentication_digest(seed: str, password: str) -> str:
 
 
 def encode_greeting(seed: str | None) -> bytes:
-    """Return the projector's first line; `seed` is None if it requires no password."""
+    """Return the first line that the projector sends; `seed` is None if it requires no password."""
     return b"PJLINK 0\r" if seed is None else f"PJLINK 1 {seed}\r".encode("ascii")
 
 
 def parse_greeting(line: bytes) -> str | Refused | None:
-    """Return the seed in the projector's first line; None if it requires no password, `Refused` if it refuses one."""
+    """Return the seed in the projector's first line, None if it requires no password, or `Refused`."""
     text = line.decode("ascii", "replace").strip()
     words = text.split()
     match [words[0].upper(), *words[1:]] if words else []:
@@ -165,7 +166,7 @@ def encode_reply(reply: PjLinkReply | Refused) -> bytes:
 
 
 def parse_reply(line: bytes) -> PjLinkReply | Refused:
-    """Return the reply in a line without its end; the case of its value is kept."""
+    """Return the reply in a line without its end; upper and lower case of the value are unchanged."""
     if line.strip().upper() == b"PJLINK ERRA":
         return Refused.WRONG_PASSWORD
     match = re.fullmatch(rb"%([0-9])([0-9A-Za-z]{4})=(.{0,128})", line, re.DOTALL)
@@ -199,7 +200,7 @@ def format_mute(muted: bool) -> str:
 
 
 def parse_mute(value: str) -> bool:
-    """Return whether an AVMT code mutes the image; 21 mutes only the sound."""
+    """Return whether an AVMT code mutes the image; code 21 mutes only the sound."""
     if not re.fullmatch("[123][01]", value):
         raise _unexpected("AVMT", value, "11, 21, 31 or 30")
     return value in ("11", "31")
@@ -301,12 +302,12 @@ def _unexpected(command: str, value: str, expected: str) -> ProtocolError:
 
 
 SEARCH = b"%2SRCH\r"
-# Time for which search replies are collected; projectors delay them by up to 10 s (2.00, 3.2).
+# Time in which replies to a search are collected, seconds. Projectors wait up to 10 s before a reply (2.00, 3.2).
 COLLECT_S = 30.0
 
 
 def parse_datagram(datagram: bytes) -> tuple[PjLinkReply, ...]:
-    """Return the class 2 replies and notices of a datagram in order; ignore all other lines."""
+    """Return the replies and notices of class 2 in a datagram, in order; ignore all other lines."""
     replies: list[PjLinkReply] = []
     for line in re.split(rb"[\r\n\0]+", datagram):
         with contextlib.suppress(ProtocolError):
@@ -321,13 +322,12 @@ def is_startup_notice(line: bytes) -> bool:
     return any(reply.command == "LKUP" for reply in parse_datagram(line))
 
 
-# The standard requires a reply within 2 s; real projectors take longer during warm-up.
+# Time limit for a reply, seconds. The standard requires 2 s, but real projectors take longer during warm-up.
 DEFAULT_TIMEOUT_S = 5.0
 _SILENCE_REMEDY = "check that it is on the network, and that PJLink is enabled on it, also in standby"
 _PORT_REMEDY = "check that a projector answers at this port"
 
-# Time limit for the reply of another kind of server; on a local network a reply takes milliseconds.
-_OTHER_SERVER_TIMEOUT_S = 2.0
+_OTHER_SERVER_TIMEOUT_S = 2.0  # Time limit for the reply of a server that is no projector, seconds
 _HTTP_REQUEST = b"GET / HTTP/1.0\r\n\r\n"
 _HTTP_REPLY_STARTS = (b"http/", b"rtsp/", b"<!doc", b"<html")
 # InitCommandRequest: length, type, an identifier of zeros, name, version (CIPA DC-005, 2.3.1).
@@ -345,13 +345,13 @@ class PjLinkProjector:
     All queries and commands may raise `DeviceRefused` (unknown command, value not offered, not possible now, wrong
     password), `DeviceFault` (the projector reports a failure), `LinkError` and `ProtocolError`.
 
-    - `connect` opens a connection when it is first needed. Many projectors accept only one connection, and close it
-      after about 30 s without a command. If the connection was closed, the command is sent once more; this does no
-      harm.
+    - `connect` opens a connection when it is needed. Many projectors accept only one connection, and close it after
+      about 30 s without a command. The command is then sent again over a new connection. All commands can be repeated
+      without harm.
     - After an error the connection is closed, so that a late reply is not read as the reply to the next command.
-    - Many projectors implement only part of their class. A query answered with `ERR1` or `ERR2` returns None or an
-      empty value and is not repeated. After `ERR3` it may be repeated.
-    - `password` is None if the projector has none.
+    - Many projectors implement only a part of their class. After `ERR1` or `ERR2`, a query returns None or an empty
+      value and is not sent again. After `ERR3` it may be sent again.
+    - `password` is None if the projector has no password.
     """
 
     def __init__(
@@ -370,7 +370,7 @@ class PjLinkProjector:
         self._unsupported: set[PjLinkRequest] = set()
 
     def identity(self) -> ProjectorIdentity:
-        """Return maker, model and name; empty texts if the projector does not report them."""
+        """Return maker, model and name; an empty text if the projector does not report the value."""
         return ProjectorIdentity(self._query_name("INF1"), self._query_name("INF2"), self._query_name("NAME"))
 
     def power(self) -> Power:
@@ -386,19 +386,19 @@ class PjLinkProjector:
         self._set("POWR", "0")
 
     def muted(self) -> bool | None:
-        """Return whether mute blanks the image; None if it is not reported; refused unless the projector is on."""
+        """Return whether the image is muted, None if this is not reported; refused unless the projector is on."""
         value = self._query_if_supported("AVMT")
         return None if value is None else parse_mute(value)
 
     def set_muted(self, muted: bool) -> None:
-        """Blank image and sound, or show them; refused unless the projector is on."""
+        """Mute image and sound, or unmute both; refused unless the projector is on."""
         self._set("AVMT", format_mute(muted))
 
     def faults(self) -> tuple[Fault, ...]:
         """Return all present faults; empty if there are none, or if the projector does not report them now."""
         request = PjLinkRequest("ERST")
         if request in self._unsupported:
-            self.power()  # raises if the cable is unplugged, which must not look like a healthy projector
+            self.power()  # raises an error if the cable is unplugged; otherwise this would look like "no faults"
             return ()
         reply = self._exchange_request(request)
         if self._is_unsupported(request, reply) or reply.error is ErrorCode.UNAVAILABLE:
@@ -406,12 +406,12 @@ class PjLinkProjector:
         return parse_faults(self._value(reply))
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return all lamps; empty for a lampless projector, which does not support the query."""
+        """Return all lamps; empty for a projector without a lamp, which does not support the query."""
         value = self._query_if_supported("LAMP")
         return () if value is None else parse_lamps(value)
 
     def pjlink_class(self) -> int:
-        """Return the PJLink class of the projector; queried once."""
+        """Return the PJLink class of the projector; the query is sent only once."""
         if self._class is None:
             value = self._query_if_supported("CLSS")
             self._class = 1 if value is None else parse_class(value)
@@ -422,17 +422,17 @@ class PjLinkProjector:
         return parse_input(self._query("INPT", level=min(self.pjlink_class(), 2)))
 
     def input_resolution(self) -> Resolution | NoResolution | None:
-        """Return the resolution of the signal, or the reason if it is missing; None if not reported; class 2."""
+        """Return the resolution of the signal or the reason why it is missing; None if not reported (class 2)."""
         value = self._query_class_2("IRES")
         return None if value is None else parse_input_resolution(value)
 
     def frozen(self) -> bool | None:
-        """Return whether the image is frozen and ignores the signal; None if not reported; class 2."""
+        """Return whether the image is frozen and does not follow the signal; None if not reported (class 2)."""
         value = self._query_class_2("FREZ")
         return None if value is None else parse_freeze(value)
 
     def picture_fault(self) -> str | None:
-        """Return the fault if the image is frozen or no signal arrives; None if no fault is reported."""
+        """Return a message if the image is frozen or no signal arrives; None if no fault is reported."""
         if self._value_now(self.pjlink_class, 1) < 2:
             return None
         if self._value_now(self.frozen, None):
@@ -474,12 +474,12 @@ class PjLinkProjector:
         return is_unsupported
 
     def _value_now(self, query: Callable[[], _Value], default: _Value) -> _Value:
-        """Return the reply to a query, or `default` if the projector refuses it now."""
+        """Return the reply to a query, or `default` if the projector refuses the query now."""
         try:
             return query()
         except DeviceRefused:
             if not self._exchange.connected:
-                raise  # the projector refused the connection, not the query
+                raise  # The projector refused the connection, not only the query.
             return default
 
     def _set(self, command: str, parameter: str) -> None:
@@ -533,7 +533,7 @@ class PjLinkProjector:
             line = exchange.listen(split_line, is_startup_notice)
         except LinkTimeout as error:
             exchange.close()
-            # Only if no projector has answered before: a projector that starts up is silent, too.
+            # If a projector has answered before, it is probably starting up, and no other server is expected.
             server = None if self._has_greeted else self._detect_other_server()
             if server is None:
                 raise
@@ -574,16 +574,15 @@ class PjLinkProjector:
         return DeviceRefused(f"{self._label} refuses the password; set the PJLink password of its menu")
 
 
-# The search is repeated because datagrams may be lost; a projector may reply to each search.
-SEARCH_COUNT = 3
-SEARCH_INTERVAL_S = 1.0  # Long enough that one network disturbance does not affect two searches
+SEARCH_COUNT = 3  # Number of search requests, because datagrams may be lost
+SEARCH_INTERVAL_S = 1.0  # Time between two requests, seconds, so that one network fault does not affect both
 
 _MAC = re.compile("[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")
 
 
 @dataclass(frozen=True)
 class FoundProjector:
-    """A projector that replied to the search: address of its control port, and its MAC address."""
+    """A projector that replied to the search: host address and MAC address."""
 
     host: str
     mac: str
@@ -598,8 +597,8 @@ def search(
 ) -> tuple[FoundProjector, ...]:
     """Search for class 2 projectors by UDP broadcast; return them in the order of their replies within `seconds`.
 
-    The replies are not authenticated. Projectors also send notices of start-up, faults, power and input to the
-    controller that is set in their menu; these notices are ignored here.
+    The replies are not authenticated. Projectors may also send notices of start-up, faults, power and input to this
+    port; these notices are ignored.
     """
     projectors: dict[FoundProjector, None] = {}
     with open_socket(listen_port) as datagrams:

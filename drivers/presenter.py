@@ -6,12 +6,12 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 
 class Colour(NamedTuple):
-    """Codes of a uniform image as the projector receives them.
+    """Codes of a uniform image that is sent to the projector.
 
     Attributes
     ----------
     red, green, blue
-        0 to 255. The type does not check the range; readers of files do.
+        0 to 255. The class does not check this range.
     """
 
     red: int
@@ -27,7 +27,7 @@ class Presenter(Protocol):
     """A full-screen display of one uniform colour."""
 
     def show(self, colour: Colour) -> None:
-        """Display `colour` on the whole screen; return once it is on the screen.
+        """Display `colour` on the whole screen, and return when it is there.
 
         Raises
         ------
@@ -55,7 +55,7 @@ class ReadsBack(Protocol):
 
 @runtime_checkable
 class ReportsWarnings(Protocol):
-    """A presenter that reports what may change the displayed illuminant without changing the codes."""
+    """A presenter that reports settings that change the displayed colour although the codes are right."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return one sentence with its remedy for each such cause (e.g. a gamma ramp); empty if there is none."""
+        """Return one sentence with a remedy for each such setting, such as a gamma ramp; empty if there is none."""

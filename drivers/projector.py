@@ -1,7 +1,7 @@
 """Interface of a projector's control port: power, mute, lamp and faults.
 
-`drivers.presenter` sets the displayed image. Many projectors implement only part of their protocol. A query that a
-projector does not support returns None or an empty value, and raises no error.
+The displayed image is set elsewhere, in `drivers.presenter`. Many projectors implement only a part of their protocol. A
+query that a projector does not support raises no error, but returns None or an empty value.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Severity(Enum):
     ERROR = "error"
 
 
-# Components with a fault state, in the order of PJLink 1.04, ERST.
+# Components that can report a fault, in the order of PJLink 1.04, ERST.
 FAULT_PARTS: Final = ("fan", "lamp", "temperature", "cover", "filter", "other")
 
 
@@ -66,7 +66,7 @@ class Lamp:
 
 @dataclass(frozen=True)
 class ProjectorIdentity:
-    """Identity as the projector reports it; empty texts if it reports none."""
+    """Identity that the projector reports; an empty text if it does not report the value."""
 
     maker: str
     model: str
@@ -86,27 +86,27 @@ class Projector(Protocol):
 
     @abstractmethod
     def switch_on(self) -> None:
-        """Start to switch on; returns at once. `power` shows the progress."""
+        """Start to switch on, and return at once; `power` returns the progress."""
 
     @abstractmethod
     def switch_off(self) -> None:
-        """Start to switch off; returns at once. `power` shows the progress."""
+        """Start to switch off, and return at once; `power` returns the progress."""
 
     @abstractmethod
     def muted(self) -> bool | None:
-        """Return whether mute blanks the image; None if the projector is on and does not report it."""
+        """Return whether the image is muted (black); None if the projector is on and does not report this."""
 
     @abstractmethod
     def set_muted(self, muted: bool) -> None:
-        """Blank the image (True) or show it (False)."""
+        """Mute the image (True), so that it is black, or show it (False)."""
 
     @abstractmethod
     def faults(self) -> tuple[Fault, ...]:
-        """Return all present faults; empty if there are none or the projector does not report faults."""
+        """Return all present faults; empty if there are none, or if the projector does not report faults."""
 
     @abstractmethod
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return all lamps; empty for a lampless projector, or if it does not count hours."""
+        """Return all lamps; empty for a projector without a lamp (laser, LED), or if it reports no hours."""
 
     @abstractmethod
     def close(self) -> None:
@@ -115,7 +115,7 @@ class Projector(Protocol):
 
 @runtime_checkable
 class ReportsPictureFault(Protocol):
-    """A projector that reports if it does not display the signal it receives."""
+    """A projector that reports if it does not display the image that it receives."""
 
     def picture_fault(self) -> str | None:
-        """Return the reason of a difference between image and signal (frozen, no signal); None if none is reported."""
+        """Return why the received image is not displayed (frozen, no signal); None if no fault is reported."""

@@ -1,8 +1,8 @@
-"""TIFF files: reads their directories, and writes the header of a new file; pixels are not touched.
+"""Read the directories of TIFF files, and make the header of a new TIFF file; pixels are not read or written.
 
 Any bytes give a result or raise `TiffDamaged`. Only the tags in `_DECODED` are decoded; maker notes and previews are
-ignored. Magic numbers of makers (Olympus, Panasonic) are accepted, because the rest is TIFF. A new header describes one
-image in one uncompressed strip, little-endian; the pixels follow as in memory.
+ignored. The magic numbers of Olympus and Panasonic are also accepted, because the rest of these files is TIFF. A new
+header describes one image in one uncompressed strip, little-endian. The caller writes the pixels after it.
 
 Sources: TIFF 6.0, sections 2, 8 and 15 and supplement 1 (SubIFDs); TIFF/EP (ISO 12234-2) for the colour filter array;
 Exif 2.32, section 4.6; DNG 1.7.1, chapters 2 and 4. Tags of Canon, Panasonic and Fujifilm have no public standard:
@@ -20,7 +20,7 @@ from typing import Final
 
 
 class TiffTag(IntEnum):
-    """Tag codes of TIFF, TIFF/EP, Exif, DNG, and of makers."""
+    """Tag codes of TIFF, TIFF/EP, Exif, DNG and Canon."""
 
     # TIFF 6.0
     NEW_SUBFILE_TYPE = 254
@@ -93,26 +93,26 @@ RGB: Final = 2  # PhotometricInterpretation of red, green and blue (TIFF 6.0, se
 
 CFA: Final = 32803  # PhotometricInterpretation of a colour filter array (TIFF/EP)
 
-D65: Final = 21  # LightSource of daylight of 6504 K (Exif 2.32, section 4.6.5), as in DNG's CalibrationIlluminant
+D65: Final = 21  # Code of D65 in Exif's LightSource (Exif 2.32, section 4.6.5) and DNG's CalibrationIlluminant
 
 
 class TiffDamaged(ValueError):
     """The bytes are not a TIFF, or a directory points beyond their end."""
 
 
-_MAX_DIRECTORIES: Final = 64  # Most directories; camera files have fewer than ten, and a damaged chain must end
+_MAX_DIRECTORIES: Final = 64  # Most directories that are read; camera files have fewer than ten
 
 _MAX_ENTRIES: Final = 512  # Most entries of a directory, as in LibRaw; camera files have fewer than 100
 
-# Most values in a directory; the longest, a linearisation table, has at most 65 536.
+# Most values in a directory. The longest list of values, a linearisation table, has at most 65 536.
 _MAX_VALUES: Final = 1 << 18
 
-# Largest accepted floating-point number; integers above it are not exact, and no offset, size or level reaches it.
+# Largest accepted floating-point number. All smaller integers are exact, and real values are much smaller.
 _LARGEST: Final = 2.0**53
 
 _TEXT: Final = 2  # Type ASCII (TIFF 6.0, section 2)
 
-# `struct` formats by type (TIFF 6.0, section 2; 13, IFD: TIFF technical note 1); a rational is two numbers.
+# `struct` formats by type code (TIFF 6.0, section 2; type 13, IFD, TIFF technical note 1). A rational has two numbers.
 _FORMATS: Final = {
     1: "B",
     2: "s",
@@ -134,9 +134,9 @@ _OFFSETS: Final = frozenset({4, 13})
 _NUMBERS: Final = frozenset(_FORMATS) - {_TEXT}
 
 _T = TiffTag
-# Decoded tags, and the permitted types of each; other tags do not affect the pixels. A text of another type is ignored,
-# because writers differ and no pixel depends on it; a number of another type is damage. Integers may be UNDEFINED, as
-# for colour filters in Exif.
+# Decoded tags, and the permitted types of each. A number of another type means a damaged file. A text of another type
+# is ignored, because the pixels do not depend on it and programs write different types. Integers may have the type
+# UNDEFINED, as for colour filters in Exif.
 _DECODED: Final[dict[int, frozenset[int]]] = {
     tag: types
     for types, tags in (
@@ -209,7 +209,7 @@ class Directory:
 
 
 def is_tiff(data: bytes | memoryview) -> bool:
-    """Return whether `data` starts with the magic number of TIFF, or of a maker's variant."""
+    """Return whether `data` starts with the magic number of TIFF or of a variant (Olympus, Panasonic)."""
     return data[:4] in (b"II*\0", b"MM\0*", b"IIRO", b"IIRS", b"MMOR", b"IIU\0")
 
 
@@ -253,7 +253,7 @@ def _read_directory(order: str, data: bytes | memoryview, offset: int) -> tuple[
         elif _TEXT not in allowed:
             raise TiffDamaged(f"its tag {tag} is of type {value_type}, expected one of {sorted(allowed)}")
     end = offset + 2 + 12 * count
-    # Some writers leave out the final link of the chain if the directory ends the file.
+    # Some programs leave out the offset of the next directory (0 for none) at the end of the file.
     next_offset = _unpack(order, "I", data, end)[0] if end + 4 <= len(data) else 0
     return Directory(values), next_offset
 
@@ -314,22 +314,22 @@ _LETTERS: Final = {
     ValueType.SRATIONAL: "ii",
 }
 _HEADER: Final = struct.pack("<2sHI", b"II", 42, 8)
-_ALIGNMENT: Final = 16  # The pixels start at a multiple of these bytes, so that samples of any type are aligned
+_ALIGNMENT: Final = 16  # The pixels start at a multiple of 16 bytes, so that samples of any type are aligned
 
 
 def text(value: str) -> Value:
-    """Return the value of an ASCII tag; other characters become question marks."""
+    """Return the value of an ASCII tag; characters outside ASCII become question marks."""
     return ValueType.ASCII, value.encode("ascii", "replace") + b"\0"
 
 
 def rationals(*values: float | Fraction) -> Value:
-    """Return numbers ≥ 0 as the nearest fractions with denominators up to 100 000."""
+    """Return the value of a tag of rationals ≥ 0: the nearest fractions with denominators up to 100 000."""
     fractions = (Fraction(value).limit_denominator(100_000) for value in values)
     return ValueType.RATIONAL, [number for value in fractions for number in value.as_integer_ratio()]
 
 
 def head(main: Tags, strip: int, exif: Tags | None = None) -> bytes:
-    """Return all bytes before the `strip` bytes of pixels."""
+    """Return the bytes of a new file that precede the `strip` bytes of its pixels; `main`: tags of the image."""
     tags: Tags = {
         **main,
         TiffTag.STRIP_OFFSETS: (ValueType.LONG, [0]),
@@ -351,7 +351,7 @@ def head(main: Tags, strip: int, exif: Tags | None = None) -> bytes:
 
 
 def _directory(tags: Tags, at: int) -> bytes:
-    """Return a directory at byte `at` of the file with its longer values after it; its length is even."""
+    """Return the bytes of a directory that starts at byte `at` of the file, and its longer values after it."""
     entries = struct.pack("<H", len(tags))
     values = b""
     values_at = at + 2 + 12 * len(tags) + 4

@@ -1,1 +1,1 @@
-"""Methods, error metrics and the paper's tables, on generated and on real data."""
+"""Evaluate methods of illumination estimation on generated and real data, and make the tables of the paper."""

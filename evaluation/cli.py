@@ -35,7 +35,7 @@ app.command("tune", help=tune_command.HELP)(tune_command.tune)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with `argv`, by default that of the process; return one of `foundation.console.EXIT_CODES`."""
+    """Run the command with `argv`, by default the arguments of the process; return an exit code (`EXIT_CODES`)."""
     arguments = _with_command(sys.argv[1:] if argv is None else argv)
     return run(lambda: app(arguments, prog_name="evaluate"), is_resumable=False)
 

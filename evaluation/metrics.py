@@ -13,10 +13,10 @@ illumination", ICCV 2021, as computed by its authors' program (github.com/DY112/
 MAE_illum
     Recovery error of each pixel, averaged over the unmasked pixels of an image, then over images.
 MAE_rgb
-    Angle between a pixel after correction by the estimate, and by the ground truth, averaged in the same way.
+    Angle between two corrections of a pixel, by the estimate and by the ground truth, averaged in the same way.
 
-The error by region is our own definition: the mean over the pixels that receive more than half of their light from one
-illuminant. It also shows errors for illuminants that reach only a few pixels.
+The error by region is our own definition: the mean error of the pixels that receive more than half of their light from
+one illuminant. It also shows errors for illuminants that reach only a few pixels.
 """
 
 from __future__ import annotations
@@ -89,10 +89,11 @@ def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDA
 
 _Array = npt.NDArray[np.float64]
 
-# Fraction of a pixel's light above which the pixel belongs to an illuminant's region; above 0.5 regions cannot overlap.
+# A pixel belongs to the region of an illuminant that gives more than this fraction of its light. From 0.5 on, regions
+# cannot overlap.
 DOMINANT: Final = 0.5
 
-# Pixels computed at once: bounds intermediate results to about 100 MB for images of any size.
+# Pixels computed at once. Intermediate results then take about 100 MB for images of any size.
 _PIXELS_AT_ONCE: Final = 1 << 19
 
 
@@ -101,7 +102,7 @@ class RegionError:
     """Error of the region of one illuminant.
 
     - `light`: index of the illuminant, from 0.
-    - `share`: number of pixels of the region relative to all judged pixels, > 0.
+    - `share`: number of pixels of the region relative to all evaluated pixels, > 0.
     - `recovery`, `reproduction`: mean angular error of the region's pixels against this illuminant, degrees.
     """
 
@@ -113,7 +114,7 @@ class RegionError:
 
 @dataclass(frozen=True)
 class MapError:
-    """Errors of an estimate on an image under several illuminants, degrees; NaN if no pixel is judged.
+    """Errors of an estimate on an image under several illuminants, degrees; NaN if no pixel is evaluated.
 
     - `recovery`, `reproduction`: mean angular error by pixel; `recovery` is LSMI's MAE_illum.
     - `rgb`: LSMI's MAE_rgb.
@@ -142,7 +143,7 @@ def measure_map(
     estimate
         (3,) float for the whole image or (H, W, 3) float by pixel; linear camera RGB ≥ 0 of any length > 0.
     truth
-        (H, W, 3) float, illuminant of each pixel, of any length; pixels with NaN are not judged.
+        (H, W, 3) float, illuminant of each pixel, of any length; pixels with NaN are not evaluated.
     weights
         (H, W, K) float, fraction of each illuminant in each pixel, 0 … 1.
     lights
@@ -152,7 +153,7 @@ def measure_map(
     saturation
         Value at which a corrected pixel is clipped; None for no clipping.
     mask
-        (H, W) bool, True for pixels that are not judged.
+        (H, W) bool, True for pixels that are not evaluated.
 
     Examples
     --------
@@ -166,20 +167,20 @@ def measure_map(
     (9.74, [19.47, 0.0])
     """
     sums = np.zeros(3)
-    judged_count = 0
+    evaluated_count = 0
     region_sums = np.zeros((len(lights), 3))
     for rows in _row_bands(image.shape):
-        is_judged = np.isfinite(truth[rows]).all(axis=2)
+        is_evaluated = np.isfinite(truth[rows]).all(axis=2)
         if mask is not None:
-            is_judged &= ~mask[rows]
-        count = int(is_judged.sum())
-        judged_count += count
-        estimated = estimate[rows][is_judged] if estimate.ndim == 3 else np.broadcast_to(estimate, (count, 3))
-        estimated, actual = estimated.astype(np.float64), truth[rows][is_judged].astype(np.float64)
+            is_evaluated &= ~mask[rows]
+        count = int(is_evaluated.sum())
+        evaluated_count += count
+        estimated = estimate[rows][is_evaluated] if estimate.ndim == 3 else np.broadcast_to(estimate, (count, 3))
+        estimated, actual = estimated.astype(np.float64), truth[rows][is_evaluated].astype(np.float64)
         sums[0] += recovery_error(estimated, actual).sum()
         sums[1] += reproduction_error(estimated, actual).sum()
-        sums[2] += _rgb_errors(image[rows][is_judged].astype(np.float64), estimated, actual, saturation).sum()
-        shares = weights[rows][is_judged]
+        sums[2] += _rgb_errors(image[rows][is_evaluated].astype(np.float64), estimated, actual, saturation).sum()
+        shares = weights[rows][is_evaluated]
         for index, light in enumerate(lights):
             region_estimates = estimated[shares[:, index] > DOMINANT]
             region_sums[index] += (
@@ -187,14 +188,14 @@ def measure_map(
                 recovery_error(region_estimates, light).sum(),
                 reproduction_error(region_estimates, light).sum(),
             )
-    if not judged_count:
+    if not evaluated_count:
         return MapError(np.nan, np.nan, np.nan, ())
     regions = tuple(
-        RegionError(index, float(count / judged_count), float(recovery / count), float(reproduction / count))
+        RegionError(index, float(count / evaluated_count), float(recovery / count), float(reproduction / count))
         for index, (count, recovery, reproduction) in enumerate(region_sums)
         if count
     )
-    return MapError(*(float(mean) for mean in sums / judged_count), regions=regions)
+    return MapError(*(float(mean) for mean in sums / evaluated_count), regions=regions)
 
 
 def _row_bands(shape: tuple[int, ...]) -> Iterator[slice]:
@@ -298,7 +299,7 @@ def percentiles(errors: npt.ArrayLike, levels: tuple[float, ...]) -> npt.NDArray
     >>> percentiles([1, 2, 3, 4], (25, 50, 95))
     array([1.5, 2.5, 4. ])
     """
-    # NumPy calls MATLAB's definition "hazen"; its default gives quartiles closer to the extremes.
+    # NumPy calls MATLAB's definition "hazen". The default of NumPy gives quartiles closer to the extremes.
     return np.percentile(np.asarray(errors, dtype=np.float64), levels, method="hazen")
 
 

@@ -92,8 +92,9 @@ class SceneSet:
     scenes
         Images in the order of the data set; at least one.
     treatment
-        Printed with every result: "black level", "saturation", "mask" and "ground truth", each with the applied value
-        and its source; "reader" if the reader was never tested on a published copy.
+        How the images are treated, printed with every result: "black level", "saturation", "mask" and "ground truth",
+        each with the applied value and its source. "reader" is given if the reader was never tested on a published
+        copy.
     folds
         Fold of each scene, from 0, as the authors of the data set define it; None if they define no folds.
     truth_uncertainty_deg

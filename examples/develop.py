@@ -1,7 +1,8 @@
-"""Develop the raw images of a data set to sRGB source pictures, white balanced by their ground truths.
+"""Develop the raw images of a data set to sRGB source pictures with white balance by their ground truths.
 
-Usage: python examples/develop.py DATA FOLDER [--matrix CAMERA] [--side PX]. DATA is any data set that evaluate reads.
-The method is described in evaluation/experiments/paper/material.py. The pictures are PNG with the names of the images.
+Usage: python examples/develop.py DATA FOLDER [--matrix CAMERA] [--side PX]. DATA is any data set that `evaluate` reads.
+The pictures are PNG files with the names of the images. The method is described in
+evaluation/experiments/paper/material.py.
 """
 
 from __future__ import annotations

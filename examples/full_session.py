@@ -2,9 +2,9 @@
 
 The camera is an EOS 550D; ``--body`` selects the other camera of the paper, the EOS 6D Mark II.
 
-`make full-session` makes chart and illuminants, takes the session in the simulated laboratory, builds and verifies the
-LUT, and prints the time, memory and disk space of each step. The LUT stays; the raw files of the session, about 27 GB,
-are removed at the end by default. An interrupted session is resumed.
+`make full-session` makes chart and illuminants, takes the session in the simulated laboratory, and builds and verifies
+the LUT. It prints the time, memory and disk space of each step. At the end, the session with about 27 GB of raw files
+is removed, unless `--keep-session` is given. If the program is interrupted, the next call resumes the session.
 """
 
 from __future__ import annotations

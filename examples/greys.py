@@ -1,12 +1,16 @@
-"""Neutrality of a source's greys under the illuminants of a LUT, and preserved chroma, when rendered by colour.
+"""Neutrality of greys and chroma of colours that are rendered by colour under the illuminants of a LUT.
 
     python examples/greys.py LUT [--lights 0,35,665 | --every 50] [--picture cat.jpg ...]
 
-For each illuminant: the angle between the illuminant and 17 source greys, mean and largest, rendered by codes and by
-colour; the chroma preserved by colour, as slopes of ln R/G and ln B/G of the rendered colours, without the print's
-black, against the target colours; and the share of colours that the print cannot show. Chroma and shares are weighted
-by the colours of the pictures, or equally if there are none. Rendered colours are means of the samples, so there is no
-randomness.
+The program prints for each illuminant:
+
+- the mean and largest angle between the illuminant and 17 source greys, rendered by codes and by colour;
+- the remaining chroma by colour: the slopes of ln R/G and ln B/G of the rendered colours against the target colours,
+  without the black of the print. A slope of 1 means that all chroma remains;
+- the share of colours that the print cannot show.
+
+Chroma and shares are weighted by the frequency of the colours in the pictures; without pictures, all colours have the
+same weight. Rendered colours are means of the samples, so the results are not random.
 """
 
 from __future__ import annotations
@@ -44,7 +48,7 @@ def chroma_slopes(rendered: Array, target: Array, shares: Array) -> str:
 
 
 def row(rendering: ColorimetricRendering, light: int, shares: Array) -> list[str]:
-    """Return the figures of one illuminant."""
+    """Return the cells of one illuminant in the table."""
     lut, white = rendering.lut, rendering.lut.white[light]
     target, rendered = source_colours(rendering.matrix), rendering.node_means(single_mixture(light)) / white
     black = rendered[0]

@@ -1,10 +1,13 @@
-"""Split an archive of thumbnails at random: illuminants of one part for generating, the other images for testing.
+"""Split an archive of thumbnails at random, to generate with illuminants of one part and test on images of the other.
 
-`python examples/halves.py nus_canon_600d_64x64.npz [FOLDER] [--names PART] [--parts N]` writes for each half H (0, 1):
-`half_H.npz`, the images for `evaluate transfer`, and `lights_H.csv` (r,g,b per line, sum 1) for `generate --match`. A
-set generated with half 0 is tested on half 1 and vice versa, so each image is tested once, with illuminants that were
-not used. `--names` selects images with PART in their names. With N parts, `others_P.npz` and `others_P.csv` contain all
-images and illuminants except part P, which is `half_P.npz`.
+`python examples/halves.py nus_canon_600d_64x64.npz [FOLDER] [--names PART] [--parts N]` writes two files for each half
+H (0, 1). `half_H.npz` contains the images for `evaluate transfer`. `lights_H.csv` contains their illuminants for
+`generate --match`: r,g,b in each line, with the sum 1. Test a method on half 1 if its training images were generated
+with `lights_0.csv`, and on half 0 with `lights_1.csv`. Each image is then tested once, and its illuminant was not used
+in training.
+
+`--names` selects images with PART in their names. With N parts, `half_P.npz` is part P, and `others_P.npz` and
+`others_P.csv` contain the images and illuminants of all other parts.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-# Seed of the split; the figures in docs/transfer.md use the same.
+# Seed of the split, also used for the results in docs/transfer.md.
 SEED = 0
 
 

@@ -1,4 +1,4 @@
-"""Save a few real photographs as source pictures: those of scikit-image, as PNG.
+"""Save four photographs of scikit-image as PNG files, for use as source pictures.
 
 Usage: python examples/photographs.py FOLDER. Sources and licences are listed in data/README.txt of scikit-image; the
 photographs are not part of CroP.

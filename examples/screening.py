@@ -1,19 +1,27 @@
 r"""Compare variants of rendering on three real cameras in minutes, without LUTs on disk: a fast version of worth.sh.
 
 The camera response to each patch of the simulated print is computed for the three primaries of the projector. An
-illuminant of a given chromaticity is a mixture of them. A pixel of a thumbnail is the mean of the patches that
-dithering would use, so there is no dithering noise and no sensor noise. All else is as in the commands: illuminants of
-the other half of the camera's images, learners of the suite, cross-validation over the whole camera, pooled ratios with
-bootstrap intervals paired by image, means over the seeds.
+illuminant of a given chromaticity is a mixture of these primaries. A pixel of a thumbnail is the mean of several
+patches, so there is no dithering noise and no sensor noise.
+
+Everything else is as in the commands. Illuminants come from the half of the camera's images that is not tested. The
+learned methods are those of `evaluate`. They are compared with cross-validation on all real images of the camera.
+Ratios are pooled over the cameras, with bootstrap intervals over the images, and averaged over the seeds.
 
     python examples/screening.py --pictures BSDS500/data/images --pictures imagenet-sample-images \
         --archives ARCHIVES --lever naive-matrix --lever random-like
 
 ARCHIVES is the folder with the thumbnails of the three cameras, as in examples/worth.sh.
 
-Levers: naive, naive-matrix; codes; and keep, compensate, random (the print's black) of colorimetric rendering under the
-projector's white, each optionally with -neutral (the 75 % of the pictures with the most neutral mean) or -like
-(pictures weighted to the grey-world offsets of the other half's images); relit: real scenes of the other cameras.
+A lever is a variant of the training images:
+
+- naive, naive-matrix: without a print, as in `evaluate transfer --naive`;
+- codes: rendering by codes;
+- keep, compensate, random: rendering by colour under the projector's white, with this treatment of the print's black;
+- relit: real scenes of the other cameras under other illuminants.
+
+The suffix -neutral, as in keep-neutral, selects the 75 % of the pictures with the most neutral mean. With the suffix
+-like, pictures are drawn so that the distribution of their grey-world offsets is like that of the real images.
 """
 
 from __future__ import annotations
@@ -52,7 +60,7 @@ LINEAR = decode_srgb(np.arange(256) / 255)
 WIDTH = 32
 CODES = np.rint(np.arange(WIDTH) * 255 / (WIDTH - 1)).astype(np.int64)
 SIDE, SMALL = 128, 64
-# White point of the target / paper white, and the largest share of the print's black that is subtracted.
+# White of the target colours relative to paper, and the largest share of the print's black that is subtracted.
 WHITE, VEIL = 0.97, 0.97
 
 
@@ -155,7 +163,7 @@ class Print:
 
 
 def nodes_of(picture: Floats, rng: np.random.Generator, linear: bool) -> Floats:
-    """Return a random node for each pixel (H, W) of a picture (H, W, 3) uint8 that preserves the mean."""
+    """Return a random node for each pixel (H, W) of a picture (H, W, 3) uint8; the mean colour is preserved."""
     if not linear:
         level = np.clip(np.floor(picture.astype(np.float32) * 31 / 255.0 + rng.random(picture.shape)), 0, 31).astype(
             int
@@ -170,17 +178,17 @@ def nodes_of(picture: Floats, rng: np.random.Generator, linear: bool) -> Floats:
 class Training:
     """Training images of one lever for one camera."""
 
-    def __init__(self, lever: str, pictures: Floats, sensitivities: Print, real: Real, others: Sequence[Real]) -> None:
+    def __init__(self, lever: str, pictures: Floats, camera_print: Print, real: Real, others: Sequence[Real]) -> None:
         self.rendering, _, self.choice = lever.partition("-")
-        self.seen, self.real, self.others = sensitivities, real, others
+        self.camera_print, self.real, self.others = camera_print, real, others
         rng, made = np.random.default_rng(0), []
         if self.rendering == "naive":
-            matrix = sensitivities.matrix if self.choice == "matrix" else np.eye(3)
+            matrix = camera_print.matrix if self.choice == "matrix" else np.eye(3)
             linear = [np.maximum(LINEAR[picture] @ matrix.T, 0) for picture in pictures]
             made = [_halved(image) for image in linear]
         elif self.rendering != "relit":
             dithered = self.rendering != "codes"
-            responses = sensitivities.node_responses(dithered)
+            responses = camera_print.node_responses(dithered)
             made = [_halved(responses[nodes_of(picture, rng, dithered)]) for picture in pictures]
         # Relit images are made at each call.
         self.images: Floats = np.array(made).astype(np.float16)
@@ -190,7 +198,7 @@ class Training:
         if self.rendering == "relit":
             scenes = [x / light for some in self.others for x, light in zip(some.images, some.lights, strict=True)]
             order = np.concatenate([rng.permutation(len(scenes)) for _ in range(len(lights) // len(scenes) + 1)])
-            relit = [scenes[place] * light for place, light in zip(order, lights, strict=False)]
+            relit = [scenes[number] * light for number, light in zip(order, lights, strict=False)]
             return [(image / image.max()).astype(np.float32) for image in relit], lights
         count = len(self.images)
         if self.choice == "like":
@@ -203,26 +211,26 @@ class Training:
             if self.choice == "neutral":
                 pool = np.argsort(np.hypot(*self._offsets(VEIL).T))[: count * 3 // 4]
             chosen = np.concatenate([rng.permutation(pool) for _ in range(len(lights) // len(pool) + 1)])[: len(lights)]
-        pairs = [self._image(place, light, rng) for place, light in zip(chosen.tolist(), lights, strict=True)]
+        pairs = [self._image(number, light, rng) for number, light in zip(chosen.tolist(), lights, strict=True)]
         return [image for image, _ in pairs], np.array([truth for _, truth in pairs])
 
     def _offsets(self, veil: float) -> Floats:
-        weights = self.seen.weights(self.seen.paper.sum(axis=0) / self.seen.paper.sum())
-        white = weights @ self.seen.paper
-        black = np.tensordot(weights, self.seen.responses[:, 0], 1)
+        weights = self.camera_print.weights(self.camera_print.paper.sum(axis=0) / self.camera_print.paper.sum())
+        white = weights @ self.camera_print.paper
+        black = np.tensordot(weights, self.camera_print.responses[:, 0], 1)
         means = self.images.astype(np.float32).mean(axis=(1, 2)).reshape(-1, 3, 3)
         colours = np.tensordot(means, weights, ((1,), (0,)))
         return _offset((colours - veil * black) / (1 - veil * black / white) / white)
 
-    def _image(self, place: int, light: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    def _image(self, number: int, light: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
         if self.rendering == "naive":
-            return (self.images[place].astype(np.float32) * (light / light.max())).astype(
+            return (self.images[number].astype(np.float32) * (light / light.max())).astype(
                 np.float32
             ), light / light.sum()
-        weights = self.seen.weights(light)
-        white = weights @ self.seen.paper
-        black = np.tensordot(weights, self.seen.responses[:, 0], 1)
-        parts = self.images[place].astype(np.float32).reshape(SMALL, SMALL, 3, 3)
+        weights = self.camera_print.weights(light)
+        white = weights @ self.camera_print.paper
+        black = np.tensordot(weights, self.camera_print.responses[:, 0], 1)
+        parts = self.images[number].astype(np.float32).reshape(SMALL, SMALL, 3, 3)
         image = np.tensordot(parts, weights.astype(np.float32), ((2,), (0,)))
         share = {"keep": 0, "codes": 0, "compensate": VEIL, "random": rng.uniform(0, VEIL)}[self.rendering]
         image = np.maximum((image - share * black) / (1 - share * black / white), 0) / white.max()
@@ -230,7 +238,7 @@ class Training:
 
 
 def features_of(learner: FeatureLearner, images: Sequence[Floats], masked: bool) -> Floats:
-    """Return the features of images; if `masked`, pixels that are zero are excluded."""
+    """Return the features of images; if `masked`, pixels with the value zero are excluded."""
     rows: list[Any] = [learner.features(image, None, (image == 0).all(axis=2) if masked else None) for image in images]
     return np.stack(rows)
 
@@ -266,7 +274,7 @@ def main() -> None:
             test_errors = recovery_error(model.lights(inputs[camera, key][tested]), lights[tested])
             errors["real"][camera, key][seed, tested] = test_errors
     for lever in options.lever:
-        errors[lever] = {place: np.zeros_like(test_errors) for place, test_errors in errors["real"].items()}
+        errors[lever] = {pair: np.zeros_like(test_errors) for pair, test_errors in errors["real"].items()}
         for camera in cameras:
             others = [others for name, others in real.items() if name != camera]
             training = Training(lever, pictures, prints[camera], real[camera], others)
@@ -288,7 +296,7 @@ def main() -> None:
 def ratios_of(first: Floats, second: Floats) -> list[tuple[float, float, float]]:
     """Return the ratio of each statistic of errors (seeds, N), averaged over the seeds, with its interval.
 
-    Images are resampled, and a drawn image counts in every seed, as in `evaluate transfer`.
+    The bootstrap draws images; a drawn image counts with its errors of all seeds, as in `evaluate transfer`.
     """
     samples = [[ErrorSample.of(errors) for errors in by_seed] for by_seed in (first, second)]
 

@@ -1,11 +1,11 @@
-"""Train a small network to estimate the illuminant, in minutes on a CPU, and compare it with statistics-based methods.
+"""Train a small network that estimates the illuminant, and compare it with statistics-based methods.
 
     pip install torch
     python examples/train.py LUT [--train FOLDER --test FOLDER] [--steps 1500]
 
-Every fifth illuminant of the LUT and the test pictures are not used for training. Without folders, photographs of
-scikit-image are used; with more pictures the network gets better. At the end all methods are tested on the same crops
-of the test pictures under the held-out illuminants.
+The training takes minutes on a CPU. Every fifth illuminant of the LUT and the test pictures are not used for training.
+Without folders, photographs of scikit-image are used; more pictures make the network more accurate. At the end all
+methods are tested on the same crops of the test pictures under the illuminants that were not used.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def gallery_from(folder: Path) -> Gallery:
 
 
 def network() -> Any:
-    """Return a network from crops (N, 3, side, side) to four maps: a local illuminant and its confidence."""
+    """Return a network from crops (N, 3, side, side) to maps (N, 4, …): the local illuminant and its confidence."""
     nn = torch.nn
     return nn.Sequential(
         *(nn.Conv2d(3, 32, 5, stride=2), nn.ReLU()),
@@ -60,7 +60,7 @@ def network() -> Any:
 
 def light_of(model: Any, image: Any) -> Any:
     """Return the estimated illuminants (N, 3) of crops, of unit length."""
-    # Brightness tells nothing about the illuminant colour, so it is divided out. Square roots spread the dark values.
+    # Brightness has no information on the illuminant colour, so it is divided out. Square roots expand dark values.
     level = image.mean(dim=(1, 2, 3), keepdim=True).clamp_min(1e-6)
     maps = model((image / level).clamp(0, 8).sqrt())
     light = torch.nn.functional.softplus(maps[:, :3])
@@ -117,7 +117,7 @@ def main() -> None:
     batch = test_crops.batch(np.arange(len(test_crops)))
     with torch.no_grad():
         estimates = {"this network": light_of(model, torch.from_numpy(batch.images)).numpy()}
-    # Baseline: a constant estimate. A network must beat it to be of any use.
+    # Baseline: a constant estimate. A useful network has smaller errors.
     guess = np.stack([lut.ground_truth[light] for light in lights if light not in held_out]).mean(axis=0)
     estimates["constant mean illuminant"] = np.broadcast_to(guess, batch.illuminants.shape)
     pictures = batch.images.transpose(0, 2, 3, 1)

@@ -1,17 +1,17 @@
 #!/usr/bin/env bash
-# Measure the benefit of generated training images for three real cameras, with the settings of docs/how-to/transfer.md.
+# Measure how much generated training images help for three real cameras, as described in docs/how-to/transfer.md.
 #
 #   examples/worth.sh PICTURES ARCHIVES OUT [SEEDS]
 #
 # PICTURES  folder of sRGB photographs, such as BSDS500 and imagenet-sample-images, which are not part of this software
 # ARCHIVES  folder with nus_canon_600d_64x64.npz, nus_canon_1ds_mk3_64x64.npz and intel_tau_5dsr_64x64.npz
-# OUT       folder for LUTs (3.5 GB each), generated data sets and results; existing ones are kept, so run the same
-#           command again to resume
+# OUT       folder for LUTs (3.5 GB each), generated data sets and results; existing results are kept, so that the same
+#           command resumes an interrupted measurement
 # SEEDS     number of seeds of learners, training images and folds; 5 by default
 #
-# Environment variables: LEVERS lists the renderings, by default all of them. NAIVE=no omits the naive rows, which take
-# half of the time. LEARNERS lists the methods; log-chroma takes most of the time. REAL=20,100,all adds rows with so many
-# real images of the other parts.
+# Environment variables: LEVERS lists the renderings, by default all. NAIVE=no omits the naive rows, which take half of
+# the time. LEARNERS lists the methods; log-chroma takes most of the time. REAL=20,100,all adds rows for training with
+# these numbers of real images, which come from other parts than the test images.
 set -euo pipefail
 pictures=$(realpath "$1") archives=$(realpath "$2") out=$3 seeds=${4:-5}
 here=$(realpath "$(dirname "$0")")

@@ -1,1 +1,1 @@
-"""Basics for all packages: errors, clocks, command line, atomic files and folders, pages, plots, colorimetry."""
+"""Common functions of all packages: errors, clocks, command line, files and folders, HTML pages, plots, colorimetry."""

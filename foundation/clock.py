@@ -1,7 +1,7 @@
 """Clocks, real and simulated.
 
-Code that waits or records a time takes a `Clock` as a parameter. `SystemClock` is the clock of the machine,
-`SteadyClock` a clock whose date never goes back, `SimulatedClock` the clock of the simulated laboratory.
+Code that waits or records a time takes a `Clock` as a parameter. `SystemClock` is the clock of the machine. The date of
+a `SteadyClock` never goes back. `SimulatedClock` is the clock of the simulated laboratory.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final, Protocol
 
 
 class Clock(Protocol):
-    """Interface of a clock: date, elapsed seconds, waiting."""
+    """Interface of a clock, which gives the date and elapsed seconds, and waits."""
 
     def now(self) -> datetime:
         """Return the date, timezone-aware, UTC."""
@@ -45,24 +45,24 @@ SYSTEM_CLOCK: Final = SystemClock()  # Default clock
 
 
 def elapsed_s() -> float:
-    """Return seconds since an arbitrary origin; on Linux, they include time while the machine is suspended."""
+    """Return seconds since an arbitrary origin, including the time in suspend mode."""
     # time.monotonic() stops while a Linux machine is suspended.
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
-# Smallest step of the system date that counts as set by hand, s: network time corrections are smaller in one night.
+# Smallest adjustment of the system date that counts as made by hand, s. Network time adjusts it less in one night.
 MIN_STEP_S = 10.0
 
 
 class SteadyClock:
-    """Clock whose date advances with elapsed time and never goes back, even if the system date is set.
+    """Clock whose date advances with elapsed time and never goes back, even if the system date is set back.
 
-    White frames are interpolated in time. If the system date were set back during a session, illuminants would be
-    interpolated between the wrong white frames.
+    White frames are interpolated in time. If the date went back during a session, frames would be interpolated between
+    the wrong white frames.
 
-    The start date is the date of `clock`, or `not_before` if that is later. `clock` is also used to wait. `elapsed`
-    returns seconds since any origin, which never decrease. `behind_s`: seconds by which `clock` was behind
-    `not_before`, or 0.
+    The start date is the date of `clock`, or `not_before` if that is later. `clock` was
+    `behind_s` seconds behind the start date. `sleep` uses `clock`. `elapsed` returns seconds since any origin, which
+    never decrease.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class SteadyClock:
         self._offset_s = -self.behind_s
 
     def step_s(self) -> float:
-        """Return the seconds by which the date of `clock` was set since the last call; 0 below `MIN_STEP_S`."""
+        """Return the adjustment of the date of `clock` since the last one returned, in s; 0 below `MIN_STEP_S`."""
         offset_s = (self._clock.now() - self.now()).total_seconds()
         step_s = offset_s - self._offset_s
         if abs(step_s) < MIN_STEP_S:
@@ -90,7 +90,7 @@ class SteadyClock:
         return self._start + timedelta(seconds=self._elapsed() - self._origin)
 
     def monotonic(self) -> float:
-        """Return the seconds of `clock.monotonic`."""
+        """Return the seconds of `clock.monotonic()`."""
         return self._clock.monotonic()
 
     def sleep(self, seconds: float) -> None:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 _C1_W_M2: Final = 3.741771e-16  # First radiation constant of Planck's law, W m² (CODATA)
 
-# Second radiation constant of Planck's law, m K, with the digits of CIE 15:2018; CODATA gives more.
+# Second radiation constant of Planck's law, m K, as rounded in CIE 15:2018.
 _C2_M_K: Final = 1.4388e-2
 
 # Matrix from CIE XYZ to linear sRGB, (3, 3) float64 (IEC 61966-2-1:1999, equation 7).
@@ -26,7 +26,7 @@ _Array = npt.NDArray[np.float64]
 
 @cache
 def observer_cie_1931() -> tuple[_Array, _Array]:
-    """Return wavelengths (471,) float64, 360 to 830 nm, and x̄, ȳ, z̄ (471, 3) float64; both read-only."""
+    """Return wavelengths (471,) float64, 360 to 830 nm, and x̄, ȳ, z̄ (471, 3) float64. Both arrays are read-only."""
     with resources.files("foundation").joinpath("data/cie_1931_2_degree.csv").open(encoding="utf-8") as file:
         table = np.loadtxt(file, delimiter=",", skiprows=1)
     table.flags.writeable = False
@@ -36,7 +36,7 @@ def observer_cie_1931() -> tuple[_Array, _Array]:
 def planck(wavelengths_nm: npt.ArrayLike, temperature_k: float) -> _Array:
     """Return the spectral radiance of a black body in vacuum (Planck's law), W sr⁻¹ m⁻² nm⁻¹, float64.
 
-    `wavelengths_nm`: above 0, nm, of any shape, which is the shape of the result.
+    `wavelengths_nm`: positive numbers in any shape; the result has the same shape.
     """
     metres = np.asarray(wavelengths_nm, dtype=np.float64) * 1e-9
     return _C1_W_M2 * metres**-5 / np.pi / np.expm1(_C2_M_K / (metres * temperature_k)) * 1e-9
@@ -45,7 +45,8 @@ def planck(wavelengths_nm: npt.ArrayLike, temperature_k: float) -> _Array:
 def xyz_of(wavelengths_nm: _Array, power: _Array) -> _Array:
     """Return CIE XYZ (3,) float64 of a spectrum, scaled to Y = 1.
 
-    `power` (W,) is relative power per nm at ascending wavelengths (W,), interpolated linearly and 0 outside of them.
+    `power` (W,) is the relative power per nm at ascending wavelengths (W,). It is interpolated linearly, and is 0
+    outside their range.
     """
     grid, functions = observer_cie_1931()
     xyz = np.interp(grid, wavelengths_nm, power, left=0, right=0) @ functions
@@ -53,7 +54,7 @@ def xyz_of(wavelengths_nm: _Array, power: _Array) -> _Array:
 
 
 def linear_srgb(xyz: npt.ArrayLike) -> _Array:
-    """Return linear sRGB (..., 3) float64 of CIE XYZ (..., 3), white Y = 1; out-of-gamut values may be negative."""
+    """Return linear sRGB (..., 3) float64 of CIE XYZ (..., 3), with Y = 1 for white; negative outside the gamut."""
     return np.asarray(xyz, dtype=np.float64) @ XYZ_TO_SRGB.T
 
 

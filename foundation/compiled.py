@@ -1,8 +1,8 @@
-"""Functions compiled by numba and cached on disk, and `map` over several threads.
+"""Compile functions with numba, cache their machine code on disk, and run functions in several threads.
 
-Compiled functions have no state and release the interpreter lock. Cached code is used only with the sources, settings,
-processor and libraries that it was made with, and only if its hash is correct. It is in `NUMBA_CACHE_DIR`, else in
-`__pycache__` next to the source, else in the user's cache folder (decisions 0010 and 0039).
+Compiled functions have no state and release Python's interpreter lock (GIL). Cached code is used only if the source
+code, numba's settings, the processor and the library versions are unchanged. The cache is in `NUMBA_CACHE_DIR`, or else
+in the first folder that can be written: `__pycache__` next to the source, or the user's cache (decisions 0010, 0039).
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from foundation.files import atomic_file
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-_ROOT: Final = Path(__file__).parents[1]
-_IMPORT: Final = re.compile(r"^from ([a-z_][.\w]*) import (\([^)]*\)|.*)", re.MULTILINE)
-_COMPILING: Final = "compiling for this processor: done once, at most 30 s …"
+_SOURCE_ROOT: Final = Path(__file__).parents[1]
+_IMPORT_STATEMENT: Final = re.compile(r"^from ([a-z_][.\w]*) import (\([^)]*\)|.*)", re.MULTILINE)
+_COMPILING_MESSAGE: Final = "compiling functions for this processor; this is done once and takes at most 30 s …"
 _HASH_BYTES: Final = hashlib.sha256().digest_size
 _compile_lock: Final = RLock()  # Prevents several threads from compiling the same function
 
 
 class _LazyFunction:
-    """A function that is compiled when it is first called: importing numba takes 0.5 s."""
+    """Function that is compiled at its first call, because the import of numba alone takes 0.5 s."""
 
     def __init__(self, function: Callable[..., Any], compiler: Callable[[FunctionType], Any]) -> None:
         self._function = cast("FunctionType", function)
@@ -48,12 +48,12 @@ class _LazyFunction:
         return (self._compiled or self.compile())(*arguments)
 
     def __reduce__(self) -> str:
-        # Pickled by name, like any function: objects that contain compiled functions are sent to other processes.
+        # Pickle stores only the name, as for other functions. Objects with this function are sent to other processes.
         return self._function.__qualname__
 
     @property
     def py_func(self) -> Callable[..., Any]:
-        """The Python function, under the name that numba uses."""
+        """Python function before compilation; numba has the same attribute."""
         return self._function
 
     def compile(self) -> Any:
@@ -65,13 +65,13 @@ class _LazyFunction:
 
 
 def compiled(function: _Function) -> _Function:
-    """Compile `function`, which is called with positional arguments; cache the code if a folder is writable."""
-    return cast("_Function", _LazyFunction(function, _dispatcher))
+    """Return a compiled `function`, for positional arguments; its code is cached if a cache folder is writable."""
+    return cast("_Function", _LazyFunction(function, _make_dispatcher))
 
 
 def inlined(function: _Function) -> _Function:
     """Return `function` for use in compiled functions; its code is copied into them."""
-    return cast("_Function", _LazyFunction(function, lambda f: _numba().njit(inline="always")(_translated(f))))
+    return cast("_Function", _LazyFunction(function, lambda f: _numba().njit(inline="always")(_numba_input(f))))
 
 
 def intrinsic(function: Callable[..., Any]) -> Any:
@@ -79,25 +79,25 @@ def intrinsic(function: Callable[..., Any]) -> Any:
     return _LazyFunction(function, lambda f: _numba().extending.intrinsic(f))
 
 
-def _dispatcher(function: FunctionType) -> Any:
-    dispatcher = _numba().njit(nogil=True, error_model="numpy")(_translated(function))
+def _make_dispatcher(function: FunctionType) -> Any:
+    dispatcher = _numba().njit(nogil=True, error_model="numpy")(_numba_input(function))
     cache_class = _checked_cache()
     try:
         dispatcher._cache = cache_class(dispatcher.py_func)  # noqa: SLF001 - as numba itself sets it
     except RuntimeError:
-        # None of numba's folders is writable: compiling takes seconds at each start.
+        # No cache folder can be written, so each start of a program compiles again, which takes seconds.
         logging.getLogger(__name__).debug("no writable folder for the compiled code of %s", function.__qualname__)
     return dispatcher
 
 
-def _translated(function: FunctionType) -> FunctionType:
-    """Return a copy of `function` that calls compiled functions, with its hash and settings as a closure variable."""
-    # The key of numba's cache consists of the function's file and its closure variables.
+def _numba_input(function: FunctionType) -> FunctionType:
+    """Return a copy that calls compiled functions; its closure variable `origin` holds source hash and settings."""
+    # numba's cache key contains closure variables, so code that was made from other sources or settings is not used.
     code = function.__code__
     if code.co_freevars:
-        raise ValueError(f"{function.__qualname__} uses outer {code.co_freevars}, expected none; pass arguments")
+        raise ValueError(f"{function.__qualname__} uses outer variables {code.co_freevars}; pass them as arguments")
     scope = function.__globals__
-    callees = {name: scope[name].compile() for name in _names(code) if isinstance(scope.get(name), _LazyFunction)}
+    callees = {name: scope[name].compile() for name in _used_names(code) if isinstance(scope.get(name), _LazyFunction)}
     origin = (_digest_of(Path(code.co_filename)), *_settings())
     copy = FunctionType(
         code.replace(co_freevars=("origin",)),
@@ -110,14 +110,14 @@ def _translated(function: FunctionType) -> FunctionType:
     return copy
 
 
-def _names(code: CodeType) -> set[str]:
-    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
-    return set(code.co_names).union(*map(_names, inner))
+def _used_names(code: CodeType) -> set[str]:
+    inner_codes = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*map(_used_names, inner_codes))
 
 
 @cache
 def _settings() -> tuple[str, ...]:
-    # Compiled code depends on these, in addition to sources and processor.
+    # Compiled code depends on these versions and variables, and also on the sources and the processor.
     import llvmlite
 
     variables = {name: value for name, value in sorted(os.environ.items()) if name.startswith("NUMBA_")}
@@ -127,7 +127,7 @@ def _settings() -> tuple[str, ...]:
 
 @cache
 def _digest_of(file: Path) -> str:
-    """Return the SHA-256, hexadecimal, of `file` and all files of this software that it imports, also indirectly."""
+    """Return the SHA-256 (hexadecimal) of `file` and all files of CroP that it imports directly or indirectly."""
     sources, queue = {file}, [file]
     while queue:
         new = set(_source(queue.pop())[1]) - sources
@@ -141,11 +141,11 @@ def _digest_of(file: Path) -> str:
 
 @cache
 def _source(file: Path) -> tuple[bytes, tuple[Path, ...]]:
-    """Return a file's bytes, and the files of this software that it imports; cached, as many functions share them."""
+    """Return a file's bytes and the files of CroP that it imports; cached, because many functions share these files."""
     data = file.read_bytes() if file.is_file() else b""
     imported: list[Path] = []
-    for module, names in _IMPORT.findall(data.decode("utf-8")):
-        folder = _ROOT.joinpath(*module.split("."))
+    for module, names in _IMPORT_STATEMENT.findall(data.decode("utf-8")):
+        folder = _SOURCE_ROOT.joinpath(*module.split("."))
         submodules = (folder / f"{name}.py" for name in re.findall(r"\w+", names))
         imported += [path for path in (folder.with_suffix(".py"), *submodules) if path.is_file()]
     return data, tuple(imported)
@@ -162,20 +162,20 @@ def _numba() -> Any:
         def on_start(self, event: event.Event) -> None:
             if not self.was_printed and sys.stderr.isatty() and logging.getLogger().isEnabledFor(logging.WARNING):
                 self.was_printed = True
-                print(_COMPILING, file=sys.stderr)
+                print(_COMPILING_MESSAGE, file=sys.stderr)
 
         def on_end(self, event: event.Event) -> None:
             pass
 
-    # This event occurs only for functions without cached code.
+    # This event occurs only if the code of a function is not in the cache.
     event.register("numba:compile", Announcement())
     return numba
 
 
 @cache
 def _checked_cache() -> Any:
-    """Return a subclass of numba's cache with one file for each signature, which starts with a hash of its code."""
-    # numba's own cache raises an error if a file is damaged.
+    """Return a subclass of numba's cache that stores a hash and the code of each signature in a file."""
+    # numba's own cache raises an error if a file is damaged; this one compiles again.
     from numba.core import caching, serialize
 
     class CheckedCache(caching.FunctionCache):
@@ -198,7 +198,7 @@ def _checked_cache() -> Any:
                 file.write(self._hash(sig, data.codegen, code) + code)
 
         def _path(self, sig: Any, codegen: Any) -> Path:
-            # New code of the function replaces the old one: the name does not depend on the source.
+            # The file name does not depend on the source code, so new code of a function replaces old code.
             function, (_, processor, _) = self._py_func, codegen.magic_tuple()
             target = "|".join((function.__module__, str(sig), processor, sys.implementation.cache_tag))
             name = hashlib.sha256(target.encode()).hexdigest()[:12]
@@ -216,12 +216,12 @@ _Out = TypeVar("_Out")
 
 def processor_count() -> int:
     """Return the number of processors that this process may use, at least 1."""
-    # A scheduler or container may allow fewer than the machine has. Limits of processor time are not considered.
+    # A scheduler or container may allow fewer processors than the machine has. Quotas of processor time are ignored.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def ordered_map(function: Callable[[_In], _Out], items: Iterable[_In], workers: int) -> Iterator[_Out]:
-    """Yield `function(item)` in the order of the items, from `workers` threads; with 1, from the calling thread.
+    """Yield `function(item)` in the order of the items, from `workers` threads; 1 means the calling thread.
 
     Examples
     --------
@@ -236,7 +236,7 @@ def ordered_map(function: Callable[[_In], _Out], items: Iterable[_In], workers: 
     try:
         for item in items:
             futures.append(pool.submit(function, item))
-            # A short queue limits the memory for results.
+            # A short queue limits the memory that waiting results need.
             if len(futures) >= 2 * workers:
                 yield futures.popleft().result()
         while futures:

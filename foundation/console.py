@@ -1,12 +1,12 @@
 """Common parts of all commands: error messages, exit codes, signals, progress, log options, JSON output.
 
-A command parses its arguments, calls a function, and prints. `run` alone converts errors to text.
+A command parses its arguments, calls a function, and prints the result. Only `run` converts errors to text.
 
 `new_app` adds the options -h, --version, -v and -q to each command; they are not in the signature of the command. Log
-records go to stderr, by default warnings and errors. ``-v`` adds steps (``INFO``), ``-vv`` all communication with
-devices (``DEBUG``), ``-q`` removes warnings and progress bars.
+records go to stderr, by default warnings and errors. ``-v`` adds the steps (``INFO``), and ``-vv`` adds all
+communication with devices (``DEBUG``). ``-q`` removes warnings and progress bars.
 
-`with_json` adds ``--json``: the command then prints one JSON object to stdout, and text to stderr.
+`with_json` adds the option ``--json``. A command with this option prints one JSON object to stdout, and text to stderr.
 `docs/reference/json.md` lists the keys; later versions may only add keys. Unknown and infinite numbers are null.
 """
 
@@ -47,23 +47,23 @@ EXIT_CODES = (
     "5 the disk is full or read-only; 130 interrupted."
 )
 
-# Message if the current folder was deleted. It replaces other errors, because all relative paths need this folder.
-_NO_FOLDER = f"the current folder does not exist any more; change to an existing one (cd), {RUN_AGAIN}"
+# Message if the current folder was deleted. It replaces other errors, because relative paths need this folder.
+_NO_FOLDER_MESSAGE = f"the current folder does not exist any more; change to an existing one (cd), {RUN_AGAIN}"
 _WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 def print_error(message: str) -> None:
     """Print one error line to stderr, with secrets masked and control characters escaped."""
-    # If stderr is closed, the exit code reports the error.
+    # If stderr is closed, only the exit code reports the error.
     with suppress(OSError):
         print(f"error: {printable(masked(message))}", file=sys.stderr)
 
 
 def run(command: Callable[[], object], *, is_resumable: bool = True, pause_gc: bool = False) -> int:
-    """Call `command` and return its exit code; foreseeable errors are printed as one line to stderr.
+    """Call `command` and return its exit code; a foreseeable error is printed as one line to stderr.
 
-    `is_resumable`: whether the same command resumes after an interruption, for the message. `pause_gc`: pause garbage
-    collection until `resume_gc`, which makes imports faster.
+    `is_resumable`: whether the same command can resume after an interruption, for the message. `pause_gc`: whether
+    garbage collection pauses until `resume_gc` is called, which makes imports faster.
     """
     _make_printable()
     was_enabled = gc.isenabled()
@@ -76,7 +76,7 @@ def run(command: Callable[[], object], *, is_resumable: bool = True, pause_gc: b
         if was_enabled:
             gc.enable()
     try:
-        # Errors of the last output are handled here; otherwise they would occur at the end of the interpreter.
+        # Without this call, an error of the last output would occur when the interpreter ends.
         sys.stdout.flush()
     except OSError as error:
         print_error(f"cannot print: {error.strerror}; redirect the output to another file and run again")
@@ -86,19 +86,19 @@ def run(command: Callable[[], object], *, is_resumable: bool = True, pause_gc: b
 
 
 def _make_printable() -> None:
-    """Replace closed streams by /dev/null, and characters that an encoding lacks by a question mark."""
+    """Replace closed streams by /dev/null, and characters that the encoding does not have by a question mark."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
-            # The descriptor was closed at the start of the interpreter. The new one stays open until the end.
+            # The descriptor was closed when the interpreter started. The new one stays open until the process ends.
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
         elif isinstance(stream, TextIOWrapper):
             if stream.errors == "strict":
                 stream.reconfigure(errors="replace")
-            # With python -u, the buffer is the unbuffered file itself.
+            # With python -u there is no buffer, and `stream.buffer` is the file itself.
             buffer: Any = cast("Any", stream).buffer
             if type(getattr(buffer, "raw", buffer)) is FileIO:
-                setattr(sys, name, _tolerant(stream))
+                setattr(sys, name, _make_tolerant(stream))
 
 
 # Names of the descriptors in error messages.
@@ -106,9 +106,9 @@ _OUTPUTS = {1: "standard output", 2: "standard error"}
 
 
 class _Output(FileIO):
-    """Output stream that discards all text after its reader has ended (head, a closed pager).
+    """Output stream that discards all text after its reader has ended, such as `head` or a closed pager.
 
-    Other errors of writing get the name of the stream.
+    Other write errors are raised with the name of the stream.
     """
 
     def write(self, data: ReadableBuffer) -> int:
@@ -116,14 +116,14 @@ class _Output(FileIO):
         try:
             return super().write(data)
         except BrokenPipeError:
-            # Not an error: the job must be completed, although nobody reads its output.
+            # The job must be completed, although nobody reads its output.
             _discard_output(self.fileno())
             return super().write(data)
         except OSError as error:
             raise OSError(error.errno, error.strerror, _OUTPUTS.get(self.fileno())) from error
 
 
-def _tolerant(stream: Any) -> TextIOWrapper:
+def _make_tolerant(stream: Any) -> TextIOWrapper:
     stream.flush()
     output = _Output(stream.fileno(), "w", closefd=False)
     return TextIOWrapper(
@@ -136,7 +136,7 @@ def _tolerant(stream: Any) -> TextIOWrapper:
 
 
 def resume_gc() -> None:
-    """Enable garbage collection after the imports of a command, without searching the imported objects."""
+    """Enable garbage collection after the imports of a command; it then skips the imported objects."""
     if not gc.isenabled():
         _freeze_once()
     gc.enable()
@@ -144,7 +144,7 @@ def resume_gc() -> None:
 
 @functools.cache
 def _freeze_once() -> None:
-    # Once in a process: a second call would keep garbage for ever.
+    # gc.freeze exempts all present objects from collection. A second call would exempt garbage as well.
     gc.freeze()
 
 
@@ -152,14 +152,14 @@ def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
     try:
         command()
     except CropError as error:
-        print_error(_NO_FOLDER if error.exit_code == InputError.exit_code and _lacks_folder() else str(error))
+        print_error(_NO_FOLDER_MESSAGE if error.exit_code == InputError.exit_code and _is_cwd_missing() else str(error))
         return error.exit_code
     except KeyboardInterrupt:
         return _report_interruption(is_resumable)
     except OSError as error:
         has_name = isinstance(error.filename, str | bytes)
         remedy = disk_remedy(error)
-        # A missing file and an unconnected socket are not faults of a disk.
+        # A missing file and an unconnected socket have other causes than the disk.
         if remedy is not None and error.errno not in (errno.ENOENT, errno.ENOTCONN):
             about = os.fsdecode(error.filename) if has_name else "the disk"
             if about in _OUTPUTS.values():
@@ -167,8 +167,8 @@ def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
             action = "write" if error.errno in _WRITE_FAULTS else "use"
             print_error(f"cannot {action} {about}: {error.strerror}; {remedy}")
             return StorageError.exit_code
-        if _lacks_folder():
-            print_error(_NO_FOLDER)
+        if _is_cwd_missing():
+            print_error(_NO_FOLDER_MESSAGE)
             return InputError.exit_code
         remedy = path_remedy(error)
         if remedy is None or not has_name:
@@ -185,7 +185,7 @@ def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
     return 0
 
 
-def _lacks_folder() -> bool:
+def _is_cwd_missing() -> bool:
     try:
         os.getcwd()  # noqa: PTH109  as Path.cwd(), without an object
     except OSError:
@@ -203,16 +203,16 @@ def _report_interruption(is_resumable: bool) -> int:
 
 
 def _print_in_handler(message: str) -> None:
-    # A signal may come while a line is printed; the streams of Python must not be used then.
+    # A signal may arrive while Python prints a line, and its streams must not be used then.
     with suppress(OSError):
         os.write(2, f"\n{message}\n".encode())
 
 
 class EndRequest:
-    """Request to end the process, usually by a signal.
+    """Request to end the process, usually sent by a signal.
 
-    By default, a request raises KeyboardInterrupt. In a `postponed` block, the first request sets `is_requested` and
-    prints a message; the block ends when it can. A second request raises KeyboardInterrupt.
+    By default, a request raises KeyboardInterrupt. In a `postponed` block, the first request only sets `is_requested`
+    and prints a message, and the block ends when it can. A second request raises KeyboardInterrupt.
     """
 
     def __init__(self, report: Callable[[str], object] = _print_in_handler) -> None:
@@ -241,7 +241,7 @@ class EndRequest:
 
     @contextmanager
     def at_once(self) -> Generator[None]:
-        """End a part of a `postponed` block at the first request, because this part has nothing to complete."""
+        """Raise KeyboardInterrupt at the first request, in a part of a `postponed` block that can end at any time."""
         outer, self._message = self._message, ""
         try:
             if self.is_requested:
@@ -253,7 +253,7 @@ class EndRequest:
 
 @contextmanager
 def orderly_end() -> Generator[EndRequest]:
-    """Handle `kill` and a closed terminal like Ctrl-C, so that devices are closed; ignored signals stay ignored."""
+    """Treat `kill` and a closed terminal like Ctrl-C, so that devices are closed; ignored signals stay ignored."""
     ending = EndRequest()
     if threading.current_thread() is not threading.main_thread():
         yield ending
@@ -275,7 +275,7 @@ def orderly_end() -> Generator[EndRequest]:
     except OSError as error:
         if not is_external:
             raise
-        # A closed terminal does not accept the last state of a progress bar.
+        # A progress bar cannot write its last state to a closed terminal.
         raise KeyboardInterrupt from error
     finally:
         for number, handler in replaced.items():
@@ -283,7 +283,7 @@ def orderly_end() -> Generator[EndRequest]:
 
 
 class ReportProgress(Protocol):
-    """Function that is called with the number of completed items, their total, and optionally the current work."""
+    """Function that takes the number of completed items, the total number and, optionally, the current work."""
 
     def __call__(self, completed: int, total: int, work: str = ..., /) -> None:
         """Show the progress."""
@@ -324,7 +324,7 @@ def progress(unit: str) -> Generator[ReportProgress]:
     with ExitStack() as stack:
 
         def report(completed: int, total: int, work: str = unit) -> None:
-            # The bar starts here, so a command that is refused before the first report has none.
+            # The bar starts here, so a command that ends before the first report shows no bar.
             if not bar.live.is_started:
                 stack.enter_context(bar)
             bar.update(task, completed=completed, total=total, description=work)
@@ -332,7 +332,7 @@ def progress(unit: str) -> Generator[ReportProgress]:
         yield report
 
 
-# Format of log records. Milliseconds help to match answers of devices with requests.
+# Format of log records. Their time has milliseconds, to match answers of devices with requests.
 _FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 
@@ -358,7 +358,7 @@ def _set_log_level(level: int) -> None:
     root, handler = logging.getLogger(), logging.StreamHandler(sys.stderr)
     handler.set_name(_HANDLER)
     handler.setFormatter(logging.Formatter(_FORMAT))
-    # A group and its command may both have the option, but each record is printed once.
+    # A group of commands and its command may both have the option. Each record is printed once even then.
     root.handlers[:] = [present for present in root.handlers if present.name != _HANDLER] + [handler]
     root.setLevel(level)
 
@@ -395,7 +395,7 @@ _AS_JSON = Annotated[
     ),
 ]
 
-# Options of all commands and their defaults, by parameter name. Their callbacks do the work.
+# Options of all commands and their defaults, by parameter name. Callbacks handle these options.
 COMMON = {"verbose": (_VERBOSE, 0), "quiet": (_QUIET, False), "version": (_VERSION, False)}
 
 _COMMON_WORD = re.compile(r"-v+|-q|--verbose|--quiet")
@@ -406,12 +406,12 @@ def is_common_option(word: str) -> bool:
     return _COMMON_WORD.fullmatch(word) is not None
 
 
-# Placeholders for values of options in the help, by type; options with special values give their own placeholder.
+# Placeholders for option values in the help, by type. Some options define a placeholder of their own.
 _METAVARS = {"int": "N", "integer": "N", "float": "X", "str": "TEXT", "text": "TEXT", "path": "PATH"}
 
 
 def _apply_style(command: Any) -> None:
-    """Set the style of a command's help: placeholders in capitals, no Python types, paragraphs without line ends."""
+    """Change the help of a command: capital placeholders, no Python types, no line ends inside paragraphs."""
     for parameter in command.params:
         if getattr(parameter, "is_flag", False) or getattr(parameter, "count", False):
             parameter.metavar = ""
@@ -426,7 +426,7 @@ def _apply_style(command: Any) -> None:
 
 
 def _type_name(parameter: Any) -> str:
-    # The attributes depend on the version of typer. The result for a choice of words is an empty text.
+    # The attributes depend on the version of typer. An option with a choice of words has no type name.
     descriptor = getattr(parameter, "type_descriptor", None)
     if descriptor is None:
         name = str(parameter.type.name)
@@ -464,7 +464,7 @@ class StyledCommand(_Styled, TyperCommand):
 
 
 class _StyledGroup(_Styled, TyperGroup):
-    """Group of commands with our style of help."""
+    """Group of commands with our help."""
 
 
 class _StyledTyper(typer.Typer):
@@ -499,7 +499,7 @@ def _with_common(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _no_action() -> None:
-    """Do nothing: the common options of a group work by their callbacks."""
+    """Do nothing, because callbacks handle the common options of a group."""
 
 
 def new_app(help_text: str | None = None, **options: Any) -> typer.Typer:
@@ -521,7 +521,7 @@ def new_app(help_text: str | None = None, **options: Any) -> typer.Typer:
 
 
 class MainCommand(StyledCommand):
-    """Command whose first argument may be the name of a subcommand instead; its help lists the subcommands."""
+    """Command that can have the name of a subcommand as first argument; its help lists the subcommands."""
 
     subcommands: ClassVar[typer.Typer]
 
@@ -554,7 +554,7 @@ class MainCommand(StyledCommand):
 
 @contextmanager
 def preserved_logging() -> Generator[None]:
-    """Restore the log settings after the block: a program may call several commands with different options."""
+    """Restore the log settings after the block, because a program may call commands with different options."""
     root = logging.getLogger()
     level, handlers = root.level, list(root.handlers)
     try:
@@ -565,12 +565,12 @@ def preserved_logging() -> Generator[None]:
 
 
 def shows_progress() -> bool:
-    """Return whether progress is shown, which ``-q`` switches off."""
+    """Return whether progress is shown; ``-q`` switches it off."""
     return logging.getLogger().isEnabledFor(logging.WARNING)
 
 
 class JsonOutput:
-    """Values of the JSON object that a command prints at its end."""
+    """Values of the JSON object that a command prints when it ends."""
 
     def __init__(self, command: str, is_requested: bool) -> None:
         self.is_requested = is_requested
@@ -578,7 +578,7 @@ class JsonOutput:
         self._values: dict[str, Any] = {}
 
     def add(self, **values: Any) -> None:
-        """Add values, of the types of `json_value`."""
+        """Add values of types that `json_value` accepts."""
         self._values.update(values)
 
     def append(self, key: str, value: Any) -> None:
@@ -594,9 +594,9 @@ class JsonOutput:
 
 @contextmanager
 def json_output(command: str, is_requested: bool) -> Generator[JsonOutput]:
-    """Collect values in the block and, if requested, print them at its end; other output of the block goes to stderr.
+    """Collect values in the block and, if requested, print them when it ends, also after an error.
 
-    The values are also printed if an error ends the block. The exit code and stderr report the error.
+    If values are requested, all other output of the block goes to stderr.
     """
     output = JsonOutput(command, is_requested)
     if not is_requested:
@@ -613,15 +613,15 @@ def json_output(command: str, is_requested: bool) -> Generator[JsonOutput]:
 
 
 def option(metavar: str | None, text: str, *names: str, panel: str | None = None, **options: Any) -> Any:
-    """Return an option of typer; `names` replace the name of the parameter and its ``--no-`` form."""
+    """Return an option of typer; `names`, if given, replace the names that typer makes from the parameter."""
     return typer.Option(*names, metavar=metavar, help=text, rich_help_panel=panel, **options)
 
 
 def with_option_groups(function: Callable[..., None]) -> Callable[..., None]:
-    """Replace each parameter of a command that is a group of options by the options of the group.
+    """Replace each group of options among the parameters of a command by its options.
 
-    A group is a frozen dataclass. Its fields are ``Annotated`` with ``Option`` or ``Argument`` of typer and have
-    defaults; their names are unique within the command.
+    A group is a frozen dataclass. Its fields are ``Annotated`` with ``Option`` or ``Argument`` of typer, and have
+    defaults. A field name must occur only once in a command.
     """
     hints = get_type_hints(function, include_extras=True)
     parameters: list[inspect.Parameter] = []
@@ -658,7 +658,7 @@ def _with_signature(
 
 
 def with_json(command: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return a decorator that replaces the parameter of type `JsonOutput` of a command by the option ``--json``."""
+    """Return a decorator that replaces a command's parameter of type `JsonOutput` by the option ``--json``."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(function, include_extras=True)

@@ -2,24 +2,24 @@
 
 The classes form one tree::
 
-    CropError                 1   any foreseeable error; never raised itself
+    CropError                 1   any foreseeable error; only its subclasses are raised
     ├── InputError            2   input of the user cannot be used: arguments, files, folders
-    │   ├── ConfigurationError    settings file: a key, a value
-    │   └── FormatError           a file has another format or is damaged: raw, chart, session, LUT, picture
-    ├── DeviceError           3   a device or its cable
-    │   ├── LinkError             the cable
+    │   ├── ConfigurationError    a settings file has a wrong key or value
+    │   └── FormatError           a raw file, chart, session, LUT or picture is damaged or has the wrong format
+    ├── DeviceError           3   a device or its connection failed
+    │   ├── LinkError             the connection failed
     │   │   ├── LinkTimeout       no answer in time; the device may still be connected
-    │   │   └── LinkClosed        the device closed the connection; connect again
+    │   │   └── LinkClosed        the connection is closed; connect again
     │   ├── ProtocolError         the device sent bytes that its standard does not allow
     │   ├── DeviceRefused         the device refused a command
     │   └── DeviceFault           the device reports a defect: lamp, temperature, fan, cover
     ├── QualityError          4   the data are not good enough to continue
-    │   └── RegistrationError     the chart was not detected, or is another chart
-    └── StorageError          5   the disk: full, read-only, disconnected
+    │   └── RegistrationError     the chart was not detected, or it is another chart
+    └── StorageError          5   the disk is full, read-only or disconnected
 
 The number is the exit code of a command that ends with the error (0 success, 130 interrupted). A message has the form
-``about: problem; remedy``. Programs use the attributes of an error, never its text. Errors of libraries are converted
-to one of these classes where the library is called, with ``from error``.
+``about: problem; remedy``. Programs use the attributes of an error, never its text. Code that calls a library converts
+the library's errors to these classes, with ``raise … from error``.
 """
 
 from __future__ import annotations
@@ -35,24 +35,25 @@ from foundation.secret_texts import masked
 # Exit code of a command that was ended by Ctrl-C: 128 + SIGINT, as in shells.
 EXIT_INTERRUPTED = 130
 
-# Last part of a remedy. A command that waits resumes automatically and leaves it out (`CropError.while_waiting`).
+# Last part of a remedy. A waiting command resumes by itself, so `CropError.while_waiting` leaves this part out.
 RUN_AGAIN: Final = "then run the same command again"
 
-# Longest message, in characters: names and values in files from other people can have any length.
+# Longest message, in characters. Names and values in files from other people can have any length.
 _MAX_LENGTH = 8000
 
 
 class CropError(Exception):
-    """Root of the tree: a foreseeable error with a message of one sentence.
+    """Base class of all foreseeable errors. The message is one sentence.
 
     Parameters
     ----------
     problem
-        Fault, with the value found and the value expected.
+        Description of the fault, with the value found and the value expected.
     about
-        File, folder or device: the first part of the message. None if `problem` names it.
+        File, folder or device with the fault, the first part of the message. None if `problem` names it.
     remedy
-        Instruction: the last part of the message. If empty, the part of `problem` after its first semicolon.
+        What the user should do, the last part of the message. If empty, the part of `problem` after its first
+        semicolon.
     value, expected
         Value found and value expected, for programs.
 
@@ -80,7 +81,7 @@ class CropError(Exception):
         self.about, self.value, self.expected = about, value, expected
 
     def __str__(self) -> str:
-        """Return the message; users, passwords and tokens in addresses are masked, a very long text is shortened."""
+        """Return the message. User names, passwords and tokens in addresses are masked; a long message is shortened."""
         return self._message(self.remedy)
 
     def without_remedy(self) -> str:
@@ -104,11 +105,11 @@ class InputError(CropError):
 
 
 class ConfigurationError(InputError):
-    """A settings file holds an unknown key or an unusable value."""
+    """A settings file has a wrong key or value."""
 
 
 class FormatError(InputError):
-    """A file or folder has another format than expected, or is damaged."""
+    """A file or folder is damaged or has the wrong format."""
 
 
 class DeviceError(CropError):
@@ -142,13 +143,13 @@ class DeviceFault(DeviceError):
 
 
 class QualityError(CropError):
-    """The data were recorded and read, but are not good enough."""
+    """The data can be read, but are not good enough."""
 
     exit_code = 4
 
 
 class RegistrationError(QualityError):
-    """The chart was not detected in a frame, or is another chart."""
+    """The chart was not detected in a frame, or it is another chart."""
 
 
 class StorageError(CropError):
@@ -169,7 +170,7 @@ def counted(number: int, noun: str, plural: str | None = None) -> str:
 
 
 def nearest_names(name: str, candidates: Iterable[str], limit: int = 1) -> str:
-    """Return a question that names the most similar candidates, at most `limit`; empty if none is similar.
+    """Return a question with the most similar candidates, at most `limit`; an empty text if none is similar.
 
     Capitals, spaces, hyphens and underscores are ignored.
 
@@ -189,7 +190,7 @@ def first_few(items: Sequence[object], limit: int = 10) -> str:
 
 
 def value_text(value: object) -> str:
-    """Describe a wrong argument in a message: its type, and the text of a string or the shape of an array.
+    """Describe a wrong argument for a message: its type, and its text, its number or the shape of an array.
 
     Examples
     --------

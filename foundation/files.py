@@ -1,16 +1,16 @@
 """Atomic writing of files, and safe reading of files and folders from other people.
 
 A file is written under a hidden name in its final folder, flushed to the disk, then renamed. After a crash, an
-incomplete file may remain under the hidden name, never under the final name. Hashes are SHA-256 (FIPS 180-4).
+incomplete file may remain under the hidden name, but never under the final name. Hashes are SHA-256 (FIPS 180-4).
 
-Functions that read raise a `FormatError` with the name of a file that breaks one of these rules:
+Functions for folders from other people raise a `FormatError` if a file breaks one of these rules:
 
-- A file name from a file must lead to a file inside the folder: no ``..``, no absolute path, no link to the outside.
-- Only regular files are opened. The data of a device or pipe may never end, and reading changes some devices.
+- A file name that was read from a file must lead to a file inside the folder, without ``..`` and absolute paths.
+- Only regular files are opened. The data of a device or pipe may never end, and some devices change when they are read.
 - A file that is read as a whole has a size limit. A file that is read line by line has a limit for each line.
 
-A folder is checked once, when it is opened. Later checks would not help: a person who can change the folder can also
-change the content of its files.
+A folder is checked once, when it is opened. Later checks would not help, because a person who can change the folder can
+also change the content of its files.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _REMEDIES = {
 }
 _DISCONNECTED = f"the disk is disconnected: connect and mount it, {RUN_AGAIN}"
 _SERVER = f"the server of that folder does not answer: check the network and the server, {RUN_AGAIN}"
-# Remedies for errors of a disk, by the names of errno(3); not every system defines all of them.
+# Remedies for errors of a disk, by names of errno(3). Some systems do not define all these names.
 _DISK_REMEDIES = {
     "ENOSPC": f"free space or choose another disk, {RUN_AGAIN}",
     "EDQUOT": f"this user's quota on the disk is used up: remove files there, or ask for a larger quota, {RUN_AGAIN}",
@@ -69,13 +69,10 @@ _DISK_REMEDIES = {
     "ENFILE": f"close other programs, {RUN_AGAIN}",
 }
 _DISK_FAULTS = {getattr(errno, name): remedy for name, remedy in _DISK_REMEDIES.items() if hasattr(errno, name)}
-# Errors of a write to an open file; they have no file name. Errors that a socket can also cause are excluded, and
-# errors of a file that is read at the same time.
-_NAMELESS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT, errno.ENOTCONN}
+# Errors of a write to an open file contain no file name. Errors that sockets or reads may also cause are excluded.
+_NAMELESS_WRITE_ERRORS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT, errno.ENOTCONN}
 
-# Number of attempts to make a folder, because another program may remove it at the same time. Usually two or three are
-# sufficient; on special file systems such as /proc, all of them fail.
-FOLDER_ATTEMPTS = 1000
+FOLDER_ATTEMPTS = 1000  # Attempts to make a folder, because another program may remove it at the same time
 
 
 def partial_path(path: Path) -> Path:
@@ -103,7 +100,7 @@ def disk_remedy(error: OSError) -> str | None:
 
 
 def storage_error(path: Path, error: OSError, action: str = "write") -> InputError | StorageError:
-    """Return an error with remedy for a failed `action` on `path`: an InputError if the path is the cause."""
+    """Return an error with a remedy for a failed `action` on `path`, an InputError if the path itself is the cause."""
     remedy = path_remedy(error)
     is_path_fault = remedy is not None and not isinstance(error, PermissionError)
     return (InputError if is_path_fault else StorageError)(
@@ -113,7 +110,7 @@ def storage_error(path: Path, error: OSError, action: str = "write") -> InputErr
 
 
 def _write_error(path: Path, error: OSError) -> InputError | StorageError:
-    # If the folder exists, its disk is connected, but a file system such as /proc allows no new files.
+    # If a file is missing although its folder exists, the file system allows no new files there, as in /proc.
     missing_name = error.filename if error.errno == errno.ENOENT and error.filename2 is None else None
     if isinstance(missing_name, str | bytes) and Path(os.fsdecode(missing_name)).parent.is_dir():
         return InputError(
@@ -177,23 +174,23 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def is_write_error(error: BaseException, path: Path) -> TypeGuard[OSError]:
-    """Return whether `error` was raised by writing `path`, not by something else that the caller did."""
+    """Return whether `error` comes from writing `path`, not from another action of the caller."""
     if not isinstance(error, OSError):
         return False
     if not isinstance(error.filename, str | bytes):
-        return error.errno in _NAMELESS
+        return error.errno in _NAMELESS_WRITE_ERRORS
     file, partial = Path(os.fsdecode(error.filename)), partial_path(path)
     return file in (path, partial, *path.parents) or partial in file.parents
 
 
 def make_folder(folder: Path, target: Path | None = None) -> None:
-    """Make a folder and its missing parents; messages name `target`, by default the folder."""
+    """Make a folder and its missing parents; error messages name `target`, by default the folder."""
     path = folder if target is None else target
     for _ in range(FOLDER_ATTEMPTS):
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
-            # Another program may have removed the folder between two calls.
+            # If nothing is there now, another program has removed it in the meantime; try again.
             if os.path.lexists(folder) and not folder.is_dir():
                 raise InputError(
                     f"cannot write {path}: {_BROKEN_LINK if folder.is_symlink() else _PART_IS_A_FILE}"
@@ -208,7 +205,7 @@ def make_folder(folder: Path, target: Path | None = None) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush the names in `folder` to the disk, if the system can."""
+    """Flush the file names in `folder` to the disk, if the system can."""
     try:
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -225,7 +222,7 @@ def sync_folder(folder: Path) -> None:
 def atomic_file(
     path: Path, final: Callable[[], Path] | None = None, *, make_parents: bool = True
 ) -> Generator[BufferedRandom]:
-    """Open a file for writing (and reading back) that gets its final name, `path` or `final()`, when the block ends.
+    """Open a new file for writing and reading. When the block ends, rename it to `path`, or to `final()` if given.
 
     An existing file is replaced. If the block raises an error, the new file is removed.
     """
@@ -252,7 +249,7 @@ def read_buffer(path: Path) -> memoryview:
     import numpy as np
 
     with path.open("rb", buffering=0) as stream:
-        # Faster than `bytes`: numpy uses large memory pages, with 1/500 of the page faults.
+        # numpy uses large memory pages, so it is faster than `bytes`.
         buffer = np.empty(os.fstat(stream.fileno()).st_size, np.uint8).data
         filled = 0
         while filled < len(buffer) and (count := stream.readinto(buffer[filled:])):
@@ -267,7 +264,7 @@ def write_atomic(path: Path, data: bytes | str) -> None:
         stream.write(data.encode() if isinstance(data, str) else data)
 
 
-_BLOCK: Final = 1 << 20  # Bytes read at a time: one block fits into the second-level cache of the processor
+_BLOCK_BYTES: Final = 1 << 20  # Bytes that are read at a time; they fit into the second-level cache of the processor
 
 
 def sha256_of(data: Any) -> str:
@@ -278,7 +275,7 @@ def sha256_of(data: Any) -> str:
 def stream_sha256(stream: BinaryIO) -> str:
     """Return the SHA-256 of the rest of an open file."""
     digest = hashlib.sha256()
-    while block := stream.read(_BLOCK):
+    while block := stream.read(_BLOCK_BYTES):
         digest.update(block)
     return digest.hexdigest()
 
@@ -290,7 +287,7 @@ def file_sha256(path: Path) -> str:
 
 
 class HashingWriter(io.RawIOBase):
-    """Stream that hashes and counts the bytes written to `stream`, a buffered file that stays open."""
+    """Stream that writes to a buffered file and hashes and counts the bytes; it does not close the file."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -319,27 +316,25 @@ class HashingWriter(io.RawIOBase):
         return self._digest.hexdigest()
 
 
-# Largest JSON file, in bytes. The description of a data set with a million skipped source images has a third of it.
+# Largest accepted JSON file, in bytes. A data set with a million skipped images needs a third of this size.
 MAX_JSON_BYTES: Final = 256 << 20
 
-# Longest line of a file that is read line by line, in bytes. Our longest lines have a few hundred bytes, a file
-# name at most 4096.
+# Longest accepted line of a file that is read line by line, in bytes. Our own lines have a few hundred bytes.
 MAX_LINE_BYTES: Final = 1 << 20
 
 _MAX_NAME_LENGTH: Final = 4096  # PATH_MAX of Linux, in characters
 
-# Most bytes of a file that may be holes, which have no blocks on the disk. Copies of black pictures have smaller holes.
+# Largest accepted sum of the holes of a file, in bytes. A hole is a range of zeros without blocks on the disk.
 _MAX_HOLE_BYTES: Final = 1 << 30
 
-# Number of holes that are counted. A file with more holes has as many blocks with data.
-_MAX_HOLES: Final = 4096
+_MAX_HOLES: Final = 4096  # Number of holes that are measured; the rest of the file counts as data
 
-_COPY_REMEDY: Final = "ask the author of the folder for a copy without it, or copy it with links resolved (cp -rL)"
+_COPY_REMEDY: Final = "ask the author for a copy of the folder without it, or copy the folder with cp -rL (no links)"
 
 
 @lru_cache(8192)
 def is_inside_name(name: str) -> bool:
-    """Return whether a name from a file is a path below the file's folder; the disk is not read.
+    """Return whether a name that was read from a file is a path below the file's folder; the disk is not read.
 
     Examples
     --------
@@ -355,7 +350,7 @@ def is_inside_name(name: str) -> bool:
 
 @contextmanager
 def open_inside(root: Path, name: str) -> Generator[BinaryIO]:
-    """Open a file below a folder for reading; links are followed if they stay inside."""
+    """Open a file below a folder for reading; links are followed if they lead to a file in the folder."""
     if not is_inside_name(name):
         raise FormatError(f"{root}: {name!r}, expected the name of a file inside the folder; {_COPY_REMEDY}")
     handle = _open_without_links(root, name)
@@ -365,14 +360,14 @@ def open_inside(root: Path, name: str) -> Generator[BinaryIO]:
         if handle is None:
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(root / name))
     with open(handle, "rb") as stream:  # noqa: PTH123  a descriptor
-        _require_filled(handle, root / name)
+        _refuse_large_holes(handle, root / name)
         yield stream
 
 
 def require_plain_folder(folder: Path, max_bytes: Mapping[str, int] | None = None, below: tuple[str, ...] = ()) -> None:
-    """Raise a FormatError unless a folder contains only folders, regular files and links that stay inside.
+    """Raise a FormatError unless a folder contains only folders, regular files and links to files and folders inside.
 
-    `max_bytes`: size limits of files by name. `below`: subfolders that are checked too.
+    `max_bytes`: size limits of files by name. `below`: subfolders that are also checked.
     """
     try:
         for inner in ("", *below):
@@ -404,7 +399,7 @@ def require_plain_tree(folder: Path) -> None:
 
 
 def bounded_lines(stream: BinaryIO, name: str) -> Iterator[bytes]:
-    """Yield the lines of a stream; raise a FormatError, with `name`, for a line longer than `MAX_LINE_BYTES`."""
+    """Yield the lines of a stream; a line longer than `MAX_LINE_BYTES` raises a FormatError that contains `name`."""
     while line := stream.readline(MAX_LINE_BYTES + 1):
         if len(line) > MAX_LINE_BYTES:
             raise FormatError(
@@ -424,7 +419,7 @@ def _parse_json(data: bytes | str, name: str) -> Any:
 
 
 def parse_json_object(data: bytes | str, name: str) -> dict[str, Any]:
-    """Return the object of a JSON text (RFC 8259); a FormatError, with `name`, if it is not a JSON object."""
+    """Return the object in a JSON text (RFC 8259); another text raises a FormatError that contains `name`."""
     value = _parse_json(data, name)
     if not isinstance(value, dict):
         raise FormatError(
@@ -450,14 +445,14 @@ def _require_regular(mode: int, path: Path) -> None:
         raise FormatError(f"{path} is {_kind(mode)}, expected a regular file; {_COPY_REMEDY}")
 
 
-def _require_filled(handle: int, path: Path) -> None:
-    # A small archive can unpack to a file of any size that is mostly holes (lseek(2), SEEK_HOLE).
+def _refuse_large_holes(handle: int, path: Path) -> None:
+    # A small archive can contain a file of any size that consists mostly of holes (lseek(2), SEEK_HOLE).
     size = os.fstat(handle).st_size
     if size <= _MAX_HOLE_BYTES:
         return
     holes = data = 0
     with suppress(OSError):
-        # File systems that store no holes report the first hole at the end of the file.
+        # A file system without holes reports a single hole at the end of the file.
         for _ in range(_MAX_HOLES):
             hole = os.lseek(handle, data, os.SEEK_HOLE)
             if hole >= size:

@@ -1,8 +1,8 @@
-"""Folders: atomic creation, locks, unmounted disks, the user's cache.
+"""Create folders atomically, lock them, detect unmounted disks, and find the user's cache folder.
 
-A folder is filled under a hidden name next to its final path, then renamed, as files are (`foundation.files`). Locks
-are locks of the system, so a program that ends leaves none behind. If a file system cannot lock folders, a file in the
-folder is locked.
+A folder is filled under a hidden name next to its final path, then renamed. `foundation.files` does the same for files.
+The operating system holds the locks, so a lock ends with its program. If a file system cannot lock folders, a file in
+the folder is locked.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from foundation.files import (
 def cache_folder() -> Path | None:
     """Return the user's cache folder of CroP, or None if the user has no home folder.
 
-    `$XDG_CACHE_HOME/croplab` or `~/.cache/croplab`, on macOS `~/Library/Caches/croplab`.
+    The folder is `$XDG_CACHE_HOME/croplab`, or `~/.cache/croplab` (macOS: `~/Library/Caches/croplab`).
     """
     # XDG Base Directory Specification 0.8: relative paths are ignored.
     cache_home = Path(os.environ.get("XDG_CACHE_HOME", ""))
@@ -50,9 +50,9 @@ def cache_folder() -> Path | None:
 
 
 def require_free(path: Path, content: str) -> None:
-    """Raise an error if `path` exists and is not an empty folder, or cannot be written.
+    """Raise an error if `path` exists and is not an empty folder, or if it cannot be written.
 
-    `content`: noun for the message, such as "the LUT".
+    `content`: what is written there, for the message, such as "the LUT".
     """
     try:
         is_empty = path.is_dir() and not any(path.iterdir())
@@ -65,7 +65,7 @@ def require_free(path: Path, content: str) -> None:
 
 
 def require_free_file(path: Path, content: str) -> None:
-    """Raise an error if `path` exists, even as an empty folder, or cannot be written."""
+    """Raise an error if `path` exists, even as an empty folder, or if it cannot be written."""
     try:
         exists = path.exists() or path.is_symlink()
         folder = next(parent for parent in path.absolute().parents if parent.exists())
@@ -78,14 +78,14 @@ def require_free_file(path: Path, content: str) -> None:
         raise InputError(f"{path} already exists; choose another place for {content}, or remove it")
     if must_probe:
         try:
-            # Permissions and mount options can be misleading: only writing a file is a reliable test.
+            # Only a temporary file proves that a folder can be written; permissions and mount options do not.
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             raise storage_error(path, error) from error
 
 
 def publish_folder(folder: Path, path: Path, content: str) -> None:
-    """Rename a complete folder to `path`, which must be free or an empty folder, and flush it to the disk."""
+    """Rename a complete folder to `path`, which must be free or an empty folder, and flush the new name to the disk."""
     require_free(path, content)
     try:
         folder.replace(path)
@@ -98,7 +98,7 @@ def publish_folder(folder: Path, path: Path, content: str) -> None:
 def atomic_folder(path: Path, content: str) -> Generator[Path]:
     """Make a folder under a hidden name, and rename it to `path` when the block ends without an error.
 
-    `path` must be free or an empty folder. If the block raises an error, the folder is removed.
+    `path` must be free or an empty folder. If the block raises an error, the hidden folder is removed.
     """
     require_free(path, content)
     partial = partial_path(path)
@@ -116,15 +116,12 @@ def atomic_folder(path: Path, content: str) -> Generator[Path]:
         raise
 
 
-FSTAB: Final = Path("/etc/fstab")
-MOUNTS: Final = Path("/proc/self/mounts")  # Linux lists disks in FSTAB and mounted disks in MOUNTS
+FSTAB: Final = Path("/etc/fstab")  # List of the disks of a Linux machine
+MOUNTS: Final = Path("/proc/self/mounts")  # List of the disks that are mounted now
 
 
 def unmounted_folder(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
-    """Return the mount point at or above `path` without a mounted disk; None if there is none or the lists are missing.
-
-    `fstab`, `mounts`: lists of disks and mounted disks (fstab(5), proc(5)).
-    """
+    """Return the mount point at or above `path` whose disk is not mounted, or None if there is none."""
     try:
         disks, mounted = ({_mount_point(line) for line in table.read_text().splitlines()} for table in (fstab, mounts))
     except OSError:
@@ -138,7 +135,7 @@ def _mount_point(line: str) -> Path | None:
     fields = line.split()
     if len(fields) < 3 or fields[0].startswith("#") or not fields[1].startswith("/") or fields[1] == "/":
         return None
-    # Spaces and other special characters are octal escapes.
+    # Spaces and other special characters are written as octal escapes.
     return Path(re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), fields[1]))
 
 
@@ -153,22 +150,22 @@ def clear_folder(folder: Path) -> None:
             path.unlink()
 
 
-LOCK_FILE: Final = ".lock"  # File that is locked if the folder cannot be locked
+LOCK_FILE: Final = ".lock"  # File that is locked if the file system cannot lock the folder
 
-# Errors of file systems that cannot lock a file or folder (flock(2); NFS, Lustre, FUSE, SMB, macOS).
+# Errors of file systems without locks for a file or a folder (flock(2); NFS, Lustre, FUSE, SMB, macOS).
 _NO_LOCKS: Final = {errno.ENOLCK, errno.EBADF, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL}
 
 _log = logging.getLogger(__name__)
 
 
 class FolderLock:
-    """Lock on a folder, from `locked_folder`; `handle` is the locked file descriptor, None without locks."""
+    """Lock on a folder, made by `locked_folder`; `handle` is the locked descriptor, None if locks are impossible."""
 
     def __init__(self, handle: int | None) -> None:
         self._handle = handle
 
     def share(self) -> None:
-        """Allow other programs to share the lock (`share_if` of `locked_folder`)."""
+        """Allow other programs to use the folder at the same time (see `share_if` of `locked_folder`)."""
         if self._handle is not None:
             with contextlib.suppress(OSError):
                 fcntl.flock(self._handle, fcntl.LOCK_SH)
@@ -178,11 +175,11 @@ class FolderLock:
 def locked_folder(
     folder: Path, busy: str, share_if: Callable[[], bool] | None = None, target: Path | None = None
 ) -> Generator[FolderLock]:
-    """Lock a folder while the block runs; it is made if missing.
+    """Lock a folder while the block runs; a missing folder is made.
 
-    `busy` is the message of the InputError if another program has the lock. With `share_if`, wait until the other
-    program shares its lock (`FolderLock.share`), then share it if the function returns true, otherwise try again.
-    Messages name `target`, by default the folder.
+    If another program has the lock, an InputError with the message `busy` is raised. With `share_if`, wait instead
+    until the other program allows sharing (`FolderLock.share`). If `share_if()` is then true, share the lock, otherwise
+    try again. Messages name `target`, by default the folder.
     """
     for _ in range(FOLDER_ATTEMPTS):
         make_folder(folder, target)
@@ -192,7 +189,7 @@ def locked_folder(
                 handle, is_shared = _lock_folder(folder_handle, folder, share_if is not None, resources)
                 is_current = _is_at(folder_handle, folder)
             except FileNotFoundError:
-                continue  # Another program renamed the folder to its final name between two calls.
+                continue  # Another program renamed the folder to its final name between two of our calls.
             except BlockingIOError as error:
                 raise InputError(busy) from error
             except OSError as error:
@@ -212,13 +209,13 @@ def _open_folder(folder: Path, resources: ExitStack) -> int:
 
 
 def _close(handle: int) -> None:
-    # Nothing was written to it, so an error of the disk is not about this folder.
+    # Nothing was written through this descriptor, so an error here loses no data.
     with contextlib.suppress(OSError):
         os.close(handle)
 
 
 def _lock_folder(folder_handle: int, folder: Path, wait: bool, resources: ExitStack) -> tuple[int | None, bool]:
-    """Lock the open folder, else a file in it; return the locked descriptor, and whether the lock is shared."""
+    """Lock the open folder, or a file in it; return the locked descriptor, and whether the lock is shared."""
     with _ignore_missing_locks():
         return folder_handle, _lock(folder_handle, wait)
     while True:
@@ -231,7 +228,7 @@ def _lock_folder(folder_handle: int, folder: Path, wait: bool, resources: ExitSt
             _remove_lock_file(folder_handle)
             _log.warning("%s: this file system has no locks; make sure that no other program uses the folder", folder)
             return None, False
-        # The previous owner of the lock may have removed the file before we locked it.
+        # The program that had the lock before may have removed the file before we locked it.
         if _is_lock_file(file, folder_handle):
             resources.callback(_release_lock_file, file, folder_handle)
             return file, is_shared
@@ -254,8 +251,8 @@ def _is_lock_file(file: int, folder_handle: int) -> bool:
 
 
 def _release_lock_file(file: int, folder_handle: int) -> None:
-    # An exclusive lock fails if another program shares the lock. The folder is addressed by its handle, because it may
-    # have been renamed.
+    # If another program shares the lock, the exclusive lock fails and the file is kept. The folder may have been
+    # renamed, so its handle is used.
     with contextlib.suppress(OSError):
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         _remove_lock_file(folder_handle)
@@ -267,7 +264,7 @@ def _remove_lock_file(folder_handle: int) -> None:
 
 
 def _lock(handle: int, wait: bool) -> bool:
-    """Lock exclusively; if another program has the lock, wait and share it. Return whether the lock is shared."""
+    """Lock exclusively, or, if another program has the lock, wait and share it; return whether the lock is shared."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -1,7 +1,7 @@
-"""Locks for things such as a display: only one process may use them at a time, but the system does not lock them.
+"""Locks for resources that only one process may use at a time, such as a display.
 
-A lock is a socket in the abstract namespace of Linux (unix(7)). It leaves no file, ends with its process, and reports
-the process that holds it. Other systems have no such namespace, so nothing is locked or refused on them.
+A lock is a socket in the abstract namespace of Linux (unix(7)). It needs no file, ends with its process, and gives
+other processes the number of that process. Other systems have no such namespace, so nothing is locked there.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from contextlib import contextmanager, suppress
 
 from foundation.errors import DeviceRefused
 
-# Most processes that can wait for the process number of the holder; further processes do not get this number.
+# Number of refused processes that can get the process number of the owner; later ones do not get it.
 _QUEUE_LENGTH = 128
 
 
 @contextmanager
 def hold(noun: str, key: str) -> Generator[None]:
-    """Lock a thing against other processes while the block runs; a process may lock it several times.
+    """Lock a resource against other processes while the block runs; a process may lock it several times.
 
-    `noun` names the thing in messages, `key` identifies it on this machine. If another process holds the lock, the
-    DeviceRefused has its process number as `value`, None if unknown.
+    `noun` names the resource in messages, and `key` identifies it on this machine. If another process has the lock, a
+    DeviceRefused is raised. Its `value` is the number of that process, None if unknown.
     """
     if sys.platform != "linux":
         yield
@@ -36,18 +36,18 @@ def hold(noun: str, key: str) -> Generator[None]:
             lock.bind(name)
             lock.listen(_QUEUE_LENGTH)
         except OSError as error:
-            holder = _holder(name)
-            if holder != os.getpid():
-                process = "" if holder is None else f" (process {holder})"
+            owner = _find_owner(name)
+            if owner != os.getpid():
+                process = "" if owner is None else f" (process {owner})"
                 raise DeviceRefused(
                     f"another command of CroP{process} is using {noun}",
                     remedy="wait until it has ended, or end it",
-                    value=holder,
+                    value=owner,
                 ) from error
         yield
 
 
-def _holder(name: bytes) -> int | None:
+def _find_owner(name: bytes) -> int | None:
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC) as link:
         link.setblocking(False)
         link.connect(name)

@@ -1,12 +1,12 @@
 """HTTP server of one page on this machine; `Access` decides which requests are answered.
 
-A page on the loopback address needs no token, because users of this machine can read the files anyway. Requests under
-foreign host names (DNS rebinding) and data sent by pages of other sites are refused. For other machines, the first part
-of the address is a token, so that relative addresses of the page contain it. A QR code in the terminal passes the
-address to a phone.
+The server refuses requests under foreign host names (DNS rebinding) and data from pages of other sites. On the loopback
+address it needs no token, because users of this machine can read the files anyway. For other machines, the first part
+of the path is a token. Relative addresses in the page keep the token. The terminal shows the address as a QR code for
+phones.
 
-Everybody can connect, with or without a token, so connections are limited. The head of a request must be complete
-`HEAD_S` after its first byte. If the maximum number is reached, a new connection replaces an inactive one.
+Everybody can connect, even without the token, so the number and the duration of connections are limited. If too many
+are open, a new connection replaces an inactive one.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ from urllib.parse import parse_qs
 
 from foundation.errors import InputError
 
-# Random bytes of a token: 128 bits cannot be guessed, and their QR code fits on a terminal.
+# Number of random bytes in a token. 128 bits cannot be guessed, and their QR code fits on a terminal.
 TOKEN_BYTES = 16
 
 
 QUIET_MODULES = 4  # Width of the light border of a QR code, in modules (ISO/IEC 18004)
 
 
-MAX_CONNECTIONS = 64  # At the same time; a page uses one or two
+MAX_CONNECTIONS = 64  # Largest number of open connections; a page uses one or two
 
 # Time limit for the head of a request, s, from its first byte or from the start of the connection.
 HEAD_S = 5.0
 
 BODY_S = 30.0  # Time limit for the body of a request, s, after its head
 
-ANSWER_S = 2.0  # A viewer who has not received an answer in this time, s, may be disconnected for a new one
+ANSWER_S = 2.0  # Time after which a new connection may replace one whose answer is unfinished, s
 
 # A connection without requests is closed after this time, s. A hidden page sends one every 10 s.
 IDLE_S = 30.0
 
-GZIP_FROM_BYTES = 2048  # Smaller answers fit into two packets without compression
+GZIP_FROM_BYTES = 2048  # Smaller answers are not compressed, because they fit into two packets
 
 _TEXT = "text/plain; charset=utf-8"
 
-# Media types that gzip does not make smaller: pictures, and numbers with noise.
+# Media types that gzip does not make smaller: compressed pictures and noisy numbers.
 _INCOMPRESSIBLE = frozenset({"image/jpeg", "image/png", "application/octet-stream"})
 
 
@@ -62,7 +62,7 @@ _INCOMPRESSIBLE = frozenset({"image/jpeg", "image/png", "application/octet-strea
 class Request:
     """An accepted request."""
 
-    path: str  # Address below the server's address, without a leading slash; empty for the page
+    path: str  # Path without token and leading slash; empty for the page
     query: Mapping[str, str] = field(default_factory=dict[str, str])  # First value of each query parameter
     body: bytes | None = None  # Body of a PUT; None for a GET
 
@@ -85,7 +85,7 @@ class Response:
 
 
 class Connections:
-    """Open connections, limited to `limit` (1 or more); `now` returns the time in seconds."""
+    """Open connections, at most `limit` (1 or more); `now` returns the time in seconds."""
 
     def __init__(self, limit: int, now: Callable[[], float] = time.monotonic) -> None:
         self._limit = limit
@@ -94,7 +94,7 @@ class Connections:
         self._open: dict[int, _Connection] = {}
 
     def admit(self, link: socket.socket, address: str) -> bool:
-        """Add a connection, if necessary in place of another; return whether it was added."""
+        """Add a connection, if necessary by closing another one; return whether it was added."""
         with self._lock:
             if len(self._open) >= self._limit:
                 replaceable = self._replaceable()
@@ -117,17 +117,17 @@ class Connections:
             self._open.pop(id(link), None)
 
     def _replaceable(self) -> _Connection | None:
-        # From the address with most connections: first those without a request, then idle ones, then slow viewers.
-        late = self._now() - ANSWER_S
+        # Of the address with most connections, choose one without a request, then an idle one, then a slow one.
+        earliest_start = self._now() - ANSWER_S
         ranks = {"new": 0, "idle": 1, "answered": 2}
-        connections = [c for c in self._open.values() if c.state != "answered" or c.since < late]
+        connections = [c for c in self._open.values() if c.state != "answered" or c.since < earliest_start]
         counts = Counter(connection.address for connection in self._open.values())
         return min(connections, key=lambda c: (-counts[c.address], ranks[c.state], c.since), default=None)
 
 
 @dataclass(eq=False)
 class _Connection:
-    """`state` is "new" before the first request; `since` is the time when the state began."""
+    """`state` is "new" before the first request. `since` is the time at which the state began, in seconds."""
 
     link: socket.socket
     address: str
@@ -139,12 +139,12 @@ def _shut_down(link: socket.socket) -> None:
     try:
         link.shutdown(socket.SHUT_RDWR)
     except OSError:
-        # The other side has closed it already.
+        # The other side has already closed the connection.
         return
 
 
 class _TimedLink(io.RawIOBase):
-    """Connection for `http.server` with time limits: `idle_s` for the first byte of a request, then `head_s`."""
+    """Connection for `http.server` with time limits for the first byte of a request and for its head."""
 
     def __init__(self, link: socket.socket, head_s: float, idle_s: float) -> None:
         self.link = link
@@ -162,7 +162,7 @@ class _TimedLink(io.RawIOBase):
         return io.BufferedReader(self)
 
     def expect(self, within_s: float | None = None) -> None:
-        """Wait for the next request, or for data that must arrive within `within_s`."""
+        """Set the time limit of the next data, `within_s`; None means the limits of a new request."""
         self._deadline = None if within_s is None else time.monotonic() + within_s
 
     def readable(self) -> bool:
@@ -187,7 +187,7 @@ class LocalServer(ABC, ThreadingHTTPServer):
     """Server of one page, started by `serve`; the constructor raises an InputError if it cannot listen."""
 
     command: ClassVar[str]  # Name of the serving command in messages
-    max_bytes: ClassVar[int] = 0  # Size limit for the body of a PUT; 0 refuses all
+    max_bytes: ClassVar[int] = 0  # Size limit for the body of a PUT; with 0, every PUT is refused
 
     daemon_threads = True
     request_queue_size = MAX_CONNECTIONS
@@ -222,7 +222,7 @@ class LocalServer(ABC, ThreadingHTTPServer):
     def serve(self, content: str, warning: str) -> None:
         """Print the address of the page and serve it until interrupted.
 
-        `content`: what the page shows. `warning`: what other people can do if the server is reachable for them.
+        `content`: what the page shows. `warning`: what other people can do if they can reach the server.
         """
         with suppress(KeyboardInterrupt):
             addresses = [f"http://{name}:{self.port}/{self.path}" for name in reachable_addresses(self._host)]
@@ -244,35 +244,35 @@ class LocalServer(ABC, ThreadingHTTPServer):
 
     @property
     def path(self) -> str:
-        """Token with a slash, or an empty text: the part of the page's address after the first slash."""
+        """Path of the page: the token and a slash, or an empty text without a token."""
         return f"{self.access.token}/" if self.access.token else ""
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a connection in a new thread, or close it if all connections are being answered."""
+        """Serve a connection in a new thread, or close it if too many connections are busy."""
         if self.connections.admit(request, str(client_address[0])):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer a connection and remove it."""
+        """Serve a connection, then remove it."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self.connections.remove(request)
 
     def finish_request(self, request: Any, client_address: Any) -> None:
-        """Answer the requests of a connection, with time limits."""
+        """Answer the requests of a connection, with time limits for each request."""
         super().finish_request(_TimedLink(request, self._head_s, self._idle_s), client_address)  # pyrefly: ignore[bad-argument-type]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print nothing about viewers that disconnect."""
+        """Print nothing, because viewers may disconnect at any time."""
 
 
 class _Handler(BaseHTTPRequestHandler):
     server: LocalServer  # pyrefly: ignore[bad-override-mutable-attribute]  # http.server sets it to the LocalServer
     protocol_version = "HTTP/1.1"
-    # Head and body are written separately. Otherwise the body would wait 40 ms for the acknowledgement of the head.
+    # Head and body are written separately. Nagle's algorithm would delay the body by 40 ms.
     disable_nagle_algorithm = True
 
     def handle_one_request(self) -> None:
@@ -306,7 +306,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(self.server.answer(replace(request, body=body)))
 
     def _refuse(self) -> None:
-        # The connection is closed: a body that is not read would be taken for the next request.
+        # The body is not read, so the connection is closed. Otherwise the body would be read as the next request.
         headers = {"Allow": "GET, HEAD", "Connection": "close"}
         self._answer(405, _TEXT, b"method not allowed; use GET\n", headers)
 
@@ -345,12 +345,12 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server.command
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing: the terminal belongs to the user."""
+        """Log nothing, to keep the terminal free."""
 
 
 @dataclass(frozen=True)
 class Access:
-    """Rule that decides which requests are answered."""
+    """Rules that decide which requests are answered."""
 
     token: str  # First part of all addresses; empty on the loopback address
     names: frozenset[str]  # Host names of this server
@@ -358,7 +358,7 @@ class Access:
 
     @classmethod
     def for_host(cls, host: str, command: str) -> Access:
-        """Return the rule of a server that listens on `host`, with a new token unless it is a loopback address."""
+        """Return the rules of a server that listens on `host`, with a new token unless it is a loopback address."""
         own = socket.gethostname().lower()
         names = frozenset({"localhost", host.lower(), own, f"{own}.local"})
         return cls("" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES), names, command)
@@ -370,7 +370,7 @@ class Access:
         """
         if not self._is_own_name(host):
             return Refusal(421, f"unknown host name; open the address that {self.command} printed")
-        # Browsers send the origin of the page with a PUT.
+        # Browsers send the origin of the requesting page with a PUT.
         if origin is not None and origin.lower() != f"http://{host}".lower():
             return Refusal(403, "data from a page of another server; use the page of this server")
         path, _, query = target.removeprefix("/").partition("?")
@@ -381,7 +381,7 @@ class Access:
         return Request(path, {name: values[0] for name, values in parse_qs(query).items()})
 
     def _is_own_name(self, host: str | None) -> bool:
-        # Host header: RFC 9110, 7.2. Numeric addresses are accepted, since DNS rebinding needs a name.
+        # Host header: RFC 9110, 7.2. Numeric addresses are accepted, because DNS rebinding works only with a name.
         if not host:
             return False
         name = host.lower()
@@ -404,9 +404,9 @@ def is_loopback(host: str) -> bool:
 
 
 def reachable_addresses(host: str) -> tuple[str, ...]:
-    """Return the host names or addresses, for a URL, under which others reach a server that listens on `host`.
+    """Return the host names or addresses, for a URL, at which a server that listens on `host` can be reached.
 
-    For a server on all interfaces, these are the addresses of the default routes, or else the name of the machine.
+    For a server on all interfaces, these are the addresses of this machine on its default routes, or else its name.
     """
     try:
         number = ipaddress.ip_address(host)
@@ -415,8 +415,8 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
     if not number.is_unspecified:
         return (f"[{host}]" if number.version == 6 else host,)
     addresses: list[str] = []
-    # Connecting a datagram socket sends nothing, but selects an address of this machine. The destinations are reserved
-    # for documentation (RFC 5737, RFC 3849), so they are reached by the default route.
+    # A datagram socket that is connected sends nothing, but gets an address of this machine. The destinations are
+    # reserved for documentation (RFC 5737, RFC 3849), so the system uses the default route.
     for family, destination in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
         if family == socket.AF_INET6 and number.version == 4:
             continue
@@ -431,7 +431,7 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
 
 
 def qr_text(text: str) -> str:
-    """Return a QR code (ISO/IEC 18004) as lines of half-block characters, with two rows of modules in each line."""
+    """Return a QR code (ISO/IEC 18004) of a text. A line of half-block characters shows two rows of modules."""
     import cv2
     import numpy as np
 

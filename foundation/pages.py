@@ -1,11 +1,11 @@
-"""HTML pages in one file, with style, scripts and figures inside, made from Jinja2 templates.
+"""Make HTML pages from Jinja2 templates. A page is one file that contains its style, scripts and figures.
 
-Pages support light and dark screens and phones. Templates escape all values except `Markup`. A package has its
-templates in a folder `templates`; they extend `base.html` and use the macros of `parts.html`, both in this package. A
-page of headings, tables and figures needs no template (`page`).
+Pages support light and dark screens and phones. Templates escape all values except `Markup`. The templates of a
+package are in its folder `templates`. They extend `base.html` and use the macros of `parts.html`, both in this package.
+`page` makes a page of headings, tables and figures without a template.
 
-The content security policy of a page allows only its own script. A name from a file cannot become code, even if it is
-inserted without escaping.
+The content security policy of a page allows only the script of the page. So a text from a file is never executed, even
+if a template inserts it without escaping.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from typing import Any, Final, Literal
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-# A drawing narrower than this is scrolled sideways instead of scaled, because its text would be too small.
+# Smallest width of a drawing. On a narrower screen it is scrolled sideways, because its text would become too small.
 _MIN_SVG_WIDTH: Final = "36rem"
 
-# Options of commands and intervals in escaped text. Browsers break lines after hyphens and dashes.
-_UNBROKEN = re.compile(r"(?<![\w-])--[a-z][\w-]*|[-−]?\d[\d.]* – [-−]?\d[\d.]*")
+# Command options and intervals such as "1 – 2". Browsers would break lines after their hyphens and dashes.
+_UNBREAKABLE = re.compile(r"(?<![\w-])--[a-z][\w-]*|[-−]?\d[\d.]* – [-−]?\d[\d.]*")
 
 
 @dataclass(frozen=True)
 class RenderedPage:
-    """HTML text of a page, and its content security policy for the header of a server."""
+    """HTML text of a page, and its content security policy as the value of an HTTP header."""
 
     text: str
     policy: str
@@ -46,15 +46,15 @@ def render(
     uses_server: bool = False,
     **values: Any,
 ) -> RenderedPage:
-    """Render a template of a package with values, which include `title`.
+    """Render a template of a package with `values`, one of which is `title`.
 
-    `scripts` and `styles` are files next to the template that are inserted into the page, styles after the common style
-    sheet. `uses_server`: whether the page sends requests to its server.
+    `scripts` and `styles` are names of files next to the template, which are inserted into the page. The styles follow
+    the common style sheet. `uses_server`: whether the page sends requests to its server.
     """
     script = Markup("".join(_text(package, name) for name in scripts))
     sheets = (("foundation", "colours.css"), ("foundation", "style.css"), *((package, name) for name in styles))
     style = Markup("".join(_text(*sheet) for sheet in sheets))
-    # Inline styles, which figures have, are allowed in pages without scripts: there is no code to inject.
+    # Figures have inline styles, so a page without scripts allows all inline styles.
     policy = (
         f"default-src 'none'; {f'script-src {_hash(script)}; ' if script else ''}"
         f"style-src {_hash(style) if script else repr('unsafe-inline')}; base-uri 'none'; form-action 'none'; "
@@ -65,7 +65,7 @@ def render(
 
 
 def page(title: str, parts: Sequence[Markup]) -> str:
-    r"""Return the HTML of a page with a title and parts, which are made by the functions below.
+    r"""Return the HTML of a page with a title and parts. The functions below make the parts.
 
     Examples
     --------
@@ -102,9 +102,9 @@ def table(
     numeric: Sequence[bool],
     notes: Sequence[str] = (),
 ) -> Markup:
-    """Return a table with title and notes, which scrolls sideways on narrow screens.
+    """Return a table with title and notes. It scrolls sideways on narrow screens.
 
-    `numeric`: whether each column has numbers, which are aligned to the right.
+    `numeric`: for each column, whether it holds numbers, which are aligned to the right.
 
     Examples
     --------
@@ -117,13 +117,13 @@ def table(
 def figure(picture: bytes, caption: str, alt: str | None = None, wide: bool = False) -> Markup:
     """Return a figure from the bytes of an SVG, PNG or JPEG file; an SVG uses the colours of the page.
 
-    `wide`: scroll it sideways on a phone instead of scaling it; for several panels in a row.
+    `wide`: whether a phone scrolls the figure sideways instead of scaling it, for figures with several panels in a row.
     """
     return _piece("figure", picture, caption, alt, None, wide)
 
 
 def row(parts: Sequence[Markup]) -> Markup:
-    """Return parts next to each other, wrapped at the width of the screen."""
+    """Return parts placed next to each other; parts that do not fit the screen start a new row."""
     return _piece("row", parts)
 
 
@@ -163,8 +163,8 @@ def _hash(text: str) -> str:
 
 
 def _unbroken(text: str) -> Markup:
-    # By style, not by special characters, so that copied text is unchanged.
-    return Markup(_UNBROKEN.sub(r"<span class='unbroken'>\g<0></span>", str(escape(text))))
+    # A style prevents the line break. Special characters would also be in text that a reader copies.
+    return Markup(_UNBREAKABLE.sub(r"<span class='unbroken'>\g<0></span>", str(escape(text))))
 
 
 def _element(picture: bytes, alt: str) -> Markup:
@@ -176,7 +176,7 @@ def _element(picture: bytes, alt: str) -> Markup:
     svg = re.search(r"<svg\b.*</svg>", picture.decode("utf-8", errors="replace"), re.DOTALL)
     if not svg:
         raise ValueError(f"image data start with {picture[:8]!r}, expected PNG, JPEG or SVG")
-    # Drawings are never enlarged, so that all drawings of a page have the same text size.
+    # A drawing is never enlarged, so that the text of all drawings on a page has the same size.
     width = re.search(r'<svg\b[^>]* width="([\d.]+)pt"', svg[0])
     style = f" style='min-width: min({_MIN_SVG_WIDTH}, {width[1]}pt)'" if width else ""
     return Markup(svg[0].replace("<svg", f"<svg role='img' aria-label='{escape(alt)}'{style}", 1))

@@ -1,11 +1,11 @@
-"""Record file of the finished pieces of a long job, from which a killed program resumes.
+"""Record file of the finished pieces of a long job, so that the job can resume after its program was killed.
 
-A line has five fields, separated by tabs: SHA-256 of the rest of the line, name of a piece, hash of its inputs, JSON
-object of its file names with their SHA-256, and its values as JSON.
+A line describes one piece. It has five fields, separated by tabs: SHA-256 of the rest of the line, name of the piece,
+hash of its inputs, its file names and their SHA-256 as a JSON object, and its other results as JSON.
 
 - A line is written after the files of its piece.
 - Damaged lines, and pieces made from other inputs, are ignored, so these pieces are made again.
-- A file that was not flushed to the disk before its line was written is used only if its hash is correct.
+- If a file was not flushed to the disk before its line, it is used only if its hash is correct.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Piece:
 
     def to_line(self) -> bytes:
         """Return the line of this piece in a record file."""
-        # Starts with a line end, because the last line of the file may be incomplete.
+        # The first byte is a line end, because the last line of the file may be incomplete.
         rest = "\t".join((self.name, self.inputs, json.dumps(dict(self.files)), self.values)).encode()
         return b"\n%s\t%s\n" % (sha256_of(rest).encode(), rest)
 
@@ -48,7 +48,7 @@ class Piece:
 
 
 def read_pieces(data: bytes, inputs: str | None = None) -> dict[str, Piece]:
-    """Return the pieces of a record file by name, the last one of each name.
+    """Return the pieces of a record file by name. If a name occurs several times, the last line is valid.
 
     If `inputs` is given, only pieces made from these inputs are returned.
     """

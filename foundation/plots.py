@@ -1,6 +1,7 @@
-"""Matplotlib figures as SVG with the colours of the page, or as PNG on white; the same data give the same bytes.
+"""Draw Matplotlib figures as SVG in the colours of the page, or as PNG on white. Equal data give equal bytes.
 
-Matplotlib is imported when a figure is drawn, and used through its objects only, without windows and global state.
+Matplotlib is imported when a figure is drawn. Only its object interface is used, so there are no windows and no global
+state.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-# Colours of text, of axes and notes, of grid lines, and of the background. In an SVG, a dark page replaces them.
+# Colours of text, of axes and notes, of grid lines, and of the background. A dark page replaces them in an SVG.
 INK, FAINT, GRID, PAPER = "#22262b", "#5b636d", "#e3e6ea", "#fdfdfe"
 
 # Colour of marks in a picture.
@@ -24,18 +25,18 @@ MARK = "#e8502a"
 # Colours of the lines for R, G and B.
 CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
 
-# Colours of series: M. Okabe, K. Ito, "Color universal design", 2008, distinguishable for colour-blind people. Black is
-# replaced by grey, and yellow is omitted: they are invisible on a dark or a light page.
+# Colours of data series that colour-blind people can distinguish: M. Okabe, K. Ito, "Color universal design", 2008.
+# Black is replaced by grey, which is also visible on a dark page. Yellow is omitted, because a light page hides it.
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f8790")
 
-DASHES = ("-", "--", ":", "-.")  # Line styles: the first one for the first seven series, and so on
+DASHES = ("-", "--", ":", "-.")  # Line styles; the style changes after every seven series
 
 # Variables of `templates/colours.css` that replace the colours of an SVG.
 _CSS_VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
 
 _PNG_DPI = 110  # A picture of 10 inches fills the page width of 1100 pixels
 
-# With level 4, PNG files of photographs are as small as with Matplotlib's level 6, in a third of the time.
+# Compression level 4 makes PNG files as small as Matplotlib's level 6, in a third of the time.
 _PNG_SETTINGS: Final = (cv2.IMWRITE_PNG_COMPRESSION, 4)
 
 # Resolution of the images in an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
@@ -66,7 +67,7 @@ _SVG_STYLE = _STYLE | {
     "grid.color": GRID,
     "legend.frameon": False,
     "svg.fonttype": "none",
-    # Names of SVG elements come from a hash. Without a fixed salt they differ in each run.
+    # Matplotlib names SVG elements by a hash. With a fixed salt, the names are the same in each run.
     "svg.hashsalt": "crop",
 }
 
@@ -83,7 +84,7 @@ def series_style(number: int) -> dict[str, str]:
 
 
 def legend_label(name: str) -> str:
-    """Return a name with a space before a leading underscore: Matplotlib omits names with underscore from legends.
+    """Put a space before a name that starts with an underscore; Matplotlib leaves such names out of legends.
 
     Examples
     --------
@@ -99,14 +100,14 @@ def draw_png(draw: Callable[..., None], *arguments: Any) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    # `Any`, because the types of Matplotlib do not describe keyword arguments.
+    # `Any`, because Matplotlib's type hints do not describe keyword arguments.
     library: Any = matplotlib
     with library.rc_context(_STYLE):
         figure: Any = Figure(layout="constrained", dpi=_PNG_DPI)
         canvas: Any = FigureCanvasAgg(figure)
         draw(figure, *arguments)
         _write_plain_numbers(figure)
-        # Faster than Figure.savefig, which draws everything twice, once for the layout.
+        # Figure.savefig is slower, because it draws everything a second time for the layout.
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())
     return cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGR), _PNG_SETTINGS)[1].tobytes()
@@ -115,7 +116,8 @@ def draw_png(draw: Callable[..., None], *arguments: Any) -> bytes:
 def draw_svg(draw: Callable[..., None], *arguments: Any, inches: tuple[float, float] = (7.2, 4.0)) -> bytes:
     """Return the SVG of a figure that `draw(figure, *arguments)` draws, for use in a page (`foundation.pages.figure`).
 
-    The colours `INK`, `FAINT`, `GRID` and `PAPER` become CSS variables, which the page defines. Text remains text.
+    The colours `INK`, `FAINT`, `GRID` and `PAPER` become CSS variables, which the page defines. Text is not converted
+    to outlines.
     """
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -136,7 +138,7 @@ def draw_svg(draw: Callable[..., None], *arguments: Any, inches: tuple[float, fl
 
 
 def standalone_svg(svg: bytes) -> bytes:
-    """Add the colours of a page, light and dark, to an SVG of `draw_svg`, so that it can be a separate file.
+    """Add the light and dark colours of a page to an SVG of `draw_svg`, so that it can be a file on its own.
 
     Examples
     --------
@@ -157,19 +159,20 @@ def draw_squares(
     inches: float,
     **colours: Any,
 ) -> Any:
-    """Draw values (N,) as squares at positions (N, 2) on the chart page; return the squares, for a colour bar.
+    """Draw values (N,) as coloured squares at positions (N, 2) on the chart page.
 
-    `inches` is the approximate width of the axes, `colours` are the keywords `cmap`, `vmin`, `vmax` of Matplotlib.
+    `inches` is the approximate width of the axes. `colours` are Matplotlib's keywords `cmap`, `vmin` and `vmax`. Return
+    the squares, for a colour bar.
     """
     width, height = page_mm
-    # The size of a marker is an area in square points; 72 points are an inch.
+    # Matplotlib expects the area of a marker in square points; an inch has 72 points.
     points = max(72 * inches / width * side_mm, 1.2)
     axes.set(xlabel="mm", xlim=(0, width), ylim=(height, 0), aspect="equal")
     return axes.scatter(*positions_mm.T, c=values, s=points**2, marker="s", linewidths=0, **colours)
 
 
 def _write_plain_numbers(figure: Any) -> None:
-    # Matplotlib labels logarithmic axes with formulas, which do not work without `text.parse_math`.
+    # Matplotlib labels logarithmic axes with formulas, which `text.parse_math` switches off.
     from matplotlib.ticker import LogFormatter
 
     class PlainLogFormatter(LogFormatter):

@@ -1,7 +1,7 @@
-"""Typed, frozen records that are written as JSON or TOML and read again, with checks by pydantic.
+"""Typed, frozen records that are written to JSON or TOML files and read again, with checks by pydantic.
 
-The fields of a record are the keys of the file. Files of later versions may have more keys. Files of earlier versions
-may have fewer keys, so new fields need a default. Arrays are lists in the file; NaN and infinite numbers are null.
+The fields of a record are the keys of its file. Files of later versions may have more keys. Files of earlier versions
+may have fewer keys, so a new field needs a default. The file holds arrays as lists, and NaN and infinity as null.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ T = TypeVar("T")
 
 
 def _as_lists(values: npt.NDArray[Any]) -> Any:
-    return _finite(values.tolist())
+    return _replace_non_finite(values.tolist())
 
 
-def _finite(value: Any) -> Any:
+def _replace_non_finite(value: Any) -> Any:
     # JSON has no NaN and no infinite numbers.
     if isinstance(value, list):
-        return [_finite(item) for item in cast("list[Any]", value)]
+        return [_replace_non_finite(item) for item in cast("list[Any]", value)]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -49,12 +49,12 @@ def _as_floats(value: Any) -> npt.NDArray[np.float64]:
     return np.asarray(value, dtype=np.float64)
 
 
-# A float64 array of any shape as nested lists; NaN is null in the file.
+# Type of a field that is a float64 array of any shape. The file holds nested lists, with null for NaN.
 FloatArray = Annotated[npt.NDArray[np.float64], PlainValidator(_as_floats), PlainSerializer(_as_lists)]
 
 
 class Record(BaseModel):
-    """Frozen record; unknown keys are ignored, because later versions may add keys."""
+    """Frozen record. Unknown keys in a file are ignored, because later versions may add keys."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
@@ -67,15 +67,15 @@ def _adapter(record_type: Any) -> TypeAdapter[Any]:
 def to_plain(record: Any, record_type: Any = None) -> Any:
     """Convert a record, or a dataclass with typed fields, to dictionaries, lists and numbers for JSON.
 
-    `record_type` is needed if the type of the object is incomplete (`tuple[Frame, ...]`).
+    `record_type` is needed if the class of the object does not give all types, as for `tuple[Frame, ...]`.
     """
     return _adapter(record_type or cast("Any", type(record))).dump_python(record, mode="json")
 
 
 def from_plain(record_type: type[T], value: Any, about: object, remedy: str) -> T:
-    """Make a record, or a dataclass, from JSON or TOML objects; a FormatError names a wrong key.
+    """Make a record or a dataclass from the objects of a JSON or TOML file; a wrong key raises a FormatError.
 
-    `about` (the file) and `remedy` are parts of the message.
+    The message of the error starts with `about` (the file) and ends with `remedy`.
     """
     try:
         return _adapter(record_type).validate_python(value)
@@ -84,7 +84,7 @@ def from_plain(record_type: type[T], value: Any, about: object, remedy: str) -> 
 
 
 def from_json(record_type: type[T], text: bytes | str, about: object, remedy: str) -> T:
-    """Make a record, or a dataclass, from the text of a JSON file; see `from_plain`."""
+    """Make a record or a dataclass from the text of a JSON file; see `from_plain`."""
     try:
         return _adapter(record_type).validate_json(text)
     except ValidationError as error:
@@ -116,7 +116,7 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
 
 
 def list_mistakes(mistakes: Collection[str]) -> str:
-    """Return one mistake after a space, or the number of several mistakes and each on its own line."""
+    """Return the end of a message: a space and a single mistake, or the number of mistakes and a line for each."""
     lines = "".join(f"\n  {mistake}" for mistake in mistakes)
     return f" {next(iter(mistakes))}" if len(mistakes) == 1 else f" {len(mistakes)} mistakes:{lines}"
 
@@ -128,10 +128,10 @@ def find_mistakes(
     is_secret: Callable[[str], bool] = lambda key: False,
     hidden_choice: str = "",
 ) -> list[str]:
-    """Return each mistake in a settings file: key, value found, value expected.
+    """Return one text for each mistake in a settings file, with the key, the value found and the value expected.
 
-    `is_secret` returns whether the value of a key must be masked. `hidden_choice` is an allowed value that messages do
-    not list.
+    `is_secret(key)` returns whether the value of a key must be masked. `hidden_choice` is an allowed value that no
+    message lists.
     """
     errors = error.errors()
     unknown = [detail["loc"] for detail in errors if detail["type"] == "extra_forbidden"]
@@ -142,7 +142,7 @@ def find_mistakes(
         if detail["type"] == "extra_forbidden" and table is not None:
             mistakes[key] = unknown_key(key, table.model_fields)
         elif detail["type"] == "missing" and table is not None:
-            # A misspelt key is reported once, not also as missing.
+            # If a key is misspelt, the correct key is not reported as missing.
             questions = (
                 nearest_names(str(loc[-1]), table.model_fields) for loc in unknown if loc[:-1] == location[:-1]
             )
@@ -163,14 +163,14 @@ def find_mistakes(
 
 
 def _file_key(location: tuple[int | str, ...], document: Any) -> str:
-    # Leaves out the parts that pydantic adds: a number if a single value is read as a list, the type if several are
-    # allowed, and "[key]" if the key of a table is wrong.
+    # Leave out components that pydantic adds: an index for a single value that is read as a list, the type for a field
+    # with several types, and "[key]" for a wrong key.
     components: list[str] = []
     for component in location:
         if component == "[key]" or not isinstance(document, list if isinstance(component, int) else dict):
             break
         components.append(str(component))
-        # A missing key ends the location.
+        # After a missing key, the loop ends at the next component.
         document = cast("Any", document)[component] if isinstance(component, int) or component in document else None
     return ".".join(components)
 
@@ -185,7 +185,7 @@ def _missing(key: str, table: type[BaseModel] | None) -> str:
 
 
 def _expectation(key: str, error: ErrorDetails, is_secret: bool = False, hidden_choice: str = "") -> str:
-    """Return the expected value of a key in plain words, not in the words of pydantic."""
+    """Describe the expected value of a key without the terms of pydantic."""
     value, limits = error["input"], error.get("ctx", {})
     match error["type"]:
         case "literal_error" | "enum":
@@ -220,7 +220,7 @@ def _expectation(key: str, error: ErrorDetails, is_secret: bool = False, hidden_
             return error["msg"].removeprefix("Value error, ")
 
 
-# Words for the limit of a number, by the name of this limit in an error of pydantic.
+# Words for a lower or upper limit of a number. The keys are the names of these limits in pydantic.
 _BOUNDS: Final = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of at most"}
 
 
@@ -229,7 +229,7 @@ def _length(value: Any, limit: int) -> str:
 
 
 def _table_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel] | None:
-    """Return the model of the table at a location (keys and list indices); None if it is not a table."""
+    """Return the model of the table at a location (keys and list indices); None if no table is there."""
     for component in location:
         if isinstance(component, int):
             continue
@@ -243,7 +243,7 @@ def _table_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[B
 
 
 def unknown_key(key: str, known_keys: Iterable[str]) -> str:
-    """Return a message about an unknown key, with the most similar known key or all known keys."""
+    """Return a message about an unknown key that suggests the most similar known key or lists all known keys."""
     names = sorted(known_keys)
     hint = nearest_names(key.rsplit(".", 1)[-1], names)
     return f"unknown key {key!r}; {hint}" if hint else f"unknown key {key!r}, expected one of {', '.join(names)}"
@@ -252,9 +252,10 @@ def unknown_key(key: str, known_keys: Iterable[str]) -> str:
 def from_settings(
     record_type: type[T], values: Mapping[str, Any], where: str, key: str, known_names: Collection[str], **fixed: Any
 ) -> T:
-    """Make a dataclass from a user's `values` for fields in `known_names`, and from `fixed` values of other fields.
+    """Make a dataclass from the `values` that a user set and the `fixed` values of the other fields.
 
-    A ConfigurationError reports an unknown name or a wrong value, with the file `where` and its table `key`.
+    The user may set only the fields in `known_names`. The message of a ConfigurationError contains the file (`where`)
+    and the table (`key`).
     """
     for name in values:
         if name not in known_names:

@@ -7,27 +7,27 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-# Ratio of standard deviation and median absolute deviation of a normal distribution: 1 / Φ⁻¹(3/4).
+# Standard deviation of a normal distribution divided by its median absolute deviation: 1 / Φ⁻¹(3/4).
 MAD_TO_SIGMA: Final = 1.4826
 
-# Ratio of the standard errors of median and mean of many normal values: √(π/2).
+# Standard error of the median divided by that of the mean, for many normal values: √(π/2).
 MEDIAN_ERROR: Final = 1.2533
 
-# Residuals up to this many standard deviations have weight 1; 95 % of normal residuals do.
+# Residuals up to this number of standard deviations have weight 1. These are 95 % of normal residuals.
 _HUBER_SIGMAS: Final = 2.0
 
 
 def robust_sigma(residual: npt.NDArray[np.floating]) -> float:
-    """Return the standard deviation of normal residuals about 0, of any shape, from their median absolute value."""
+    """Estimate the standard deviation of residuals of any shape, with mean 0, from their median absolute value."""
     return MAD_TO_SIGMA * float(np.median(np.abs(residual)))
 
 
 def sigma_by_level(
     residual: npt.NDArray[np.float64], level: npt.NDArray[np.float64], groups: int
 ) -> npt.NDArray[np.float64]:
-    """Return the robust standard deviation (N,) float64 of residuals (N,) among residuals of similar level (N,).
+    """Return, for each residual, the robust standard deviation of the residuals with a similar level, (N,) float64.
 
-    `groups`: number of groups of equal size.
+    `residual`, `level`: (N,). Residuals are sorted by level and divided into `groups` equal groups.
     """
     sigma = np.empty(len(residual))
     for members in np.array_split(np.argsort(level, kind="stable"), groups):
@@ -36,10 +36,10 @@ def sigma_by_level(
 
 
 def huber_weights(size: npt.NDArray[np.float64], sigma: float) -> npt.NDArray[np.float64]:
-    """Return Huber's weights 0 to 1 of absolute residuals `size` (...) float64 (chapter 7)."""
+    """Return Huber's weights, 0 to 1, of absolute residuals `size` (...) float64 (chapter 7 of the book)."""
     return np.minimum(1, _HUBER_SIGMAS * sigma / np.maximum(size, 1e-12))
 
 
 def biweight(size: npt.NDArray[np.float64], sigma: float, cut: float = 6.0) -> npt.NDArray[np.float64]:
-    """Return Tukey's biweights 0 to 1 of absolute residuals `size` (...) float64; 0 from `cut` standard deviations."""
+    """Return Tukey's biweights, 0 to 1, of absolute residuals `size` (...) float64; 0 above `cut` * `sigma`."""
     return np.asarray(np.maximum(1 - (size / (cut * sigma)) ** 2, 0) ** 2, dtype=np.float64)

@@ -1,7 +1,7 @@
-"""Masking of passwords and tokens in texts, and escaping of control characters.
+"""Mask passwords and tokens in texts, and escape control characters.
 
 Sessions, data sets, reports and logs are copied and published, so they must not contain secrets. Code that writes or
-prints an address masks it first; `foundation.console` masks all error messages again.
+prints an address masks it first. `foundation.console` masks all error messages again.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from urllib.parse import urlsplit
 
 MASK: Final = "…"  # Replaces a secret
 
-# User name and password of a URL (RFC 3986, 3.2.1), up to the last @ before the path: passwords may contain an @.
+# User name and password of a URL (RFC 3986, 3.2.1). They end at the last @ before the path, as passwords may contain @.
 _USER = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*://)[^\s/?#'\"<>]+@")
 
-# Secret parameters of a URL: signatures of object stores (``X-Amz-Signature``, ``sig``, ``X-Goog-Credential``), and
-# tokens of services under various names.
+# Parameters of a URL that may be secret: signatures of object stores (``X-Amz-Signature``, ``sig``,
+# ``X-Goog-Credential``), and tokens, which have other names in each service.
 _PARAMETER = re.compile(
     r"(?P<name>[?&;](?:[^=&;\s'\"]*(?:auth|credential|key|passw|secret|sig|token)[^=&;\s'\"]*)=)[^&;\s'\"<>]+",
     re.IGNORECASE,
 )
 
-# Control characters (Unicode category Cc), line separators, marks that change the text direction, and lone surrogates,
-# which Python uses in file names that are not UTF-8.
+# Control characters (Unicode category Cc), line separators, and marks that change the text direction. Also lone
+# surrogates, which Python uses for bytes of file names that are not UTF-8.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-# A host name with a dot and a path or port. Names of commands do not look like this.
+# Host name with a dot, followed by a path or a port. Names of commands do not have this form.
 _ADDRESS = re.compile(r"[A-Za-z0-9-]+(?:\.[A-Za-z0-9-]+)+(?::\d+)?/\S*|[A-Za-z0-9.-]+\.[a-z]{2,}:\d+")
 
 
 def masked(text: str) -> str:
-    """Replace user, password and secret parameters of all URLs in a text by `MASK`.
+    """Replace user name, password and secret parameters of all URLs in a text by `MASK`.
 
     Examples
     --------
@@ -48,7 +48,7 @@ def masked(text: str) -> str:
 
 
 def masked_values(value: Any) -> Any:
-    """Apply `masked` to all texts in a JSON value, except keys."""
+    """Apply `masked` to all texts in a JSON value except its keys."""
     if isinstance(value, str):
         return masked(value)
     if isinstance(value, dict):
@@ -70,12 +70,12 @@ def printable(text: str) -> str:
 
 
 def is_webhook(target: str) -> bool:
-    """Return whether a notification target is a URL, not a command."""
+    """Return whether a target of notifications is a URL. Other targets are commands."""
     return target.lower().startswith(("http://", "https://"))
 
 
 def is_address(target: str) -> bool:
-    """Return whether a notification target looks like a URL without scheme.
+    """Return whether a target of notifications has the form of a URL without ``https://``.
 
     Examples
     --------
@@ -86,9 +86,9 @@ def is_address(target: str) -> bool:
 
 
 def target_label(target: str) -> str:
-    """Return the public part of a notification target: scheme and host of a URL, or the first word of a command.
+    """Return the public part of a target of notifications: scheme and host of a URL, or the first word of a command.
 
-    All other parts may be secret: path, user name and query of a URL, arguments of a command.
+    The other parts may be secret: path, user name and query of a URL, or the arguments of a command.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Name, version and packages of this software, and a check that no user file hides one of the packages."""
+"""Name, version and packages of this software, and a check that no file of the user hides one of the packages."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 
 
 def require_own_packages() -> None:
-    """Import each package; raise an InputError with the name of a file that hides one."""
-    # The package names are short: a user's generator.py next to a program is imported in place of our package.
+    """Import each package; raise an InputError if Python imports a file of the user instead."""
+    # Our package names are common words. Python imports a user's generator.py before our package `generator`.
     for name in PACKAGES:
         module = import_module(name)
         location = module.__file__ or next(iter(getattr(module, "__path__", [])), "a module without a file")

@@ -1,1 +1,1 @@
-"""The simulated laboratory: the displayed colour decides the photograph."""
+"""Simulated laboratory: projector, chart and camera in software, connected to the real drivers."""

@@ -34,7 +34,10 @@ app = new_app(
 
 
 def main(argv: Sequence[str] | None = None, read_chart: Callable[[Path], Print] | None = None) -> int:
-    """Run `sim` with `argv`, by default the arguments of the process, and return the exit code (`EXIT_CODES`)."""
+    """Run `sim` with `argv`, by default the arguments of the process, and return the exit code (`EXIT_CODES`).
+
+    `read_chart` returns the print that a file chart.json describes.
+    """
     return console.run(lambda: app(args=argv, prog_name="sim", obj=read_chart))
 
 
@@ -50,12 +53,14 @@ def projector(
     warm_up: Annotated[float, option("SECONDS", "Duration of warm-up.", min=0)] = 30.0,
     cool_down: Annotated[float, option("SECONDS", "Duration of cooling.", min=0)] = 60.0,
 ) -> None:
-    """Serve a simulated projector: standby, 30 s of warm-up, on, 60 s of cooling.
+    """Serve a simulated projector that needs time to warm up and to cool down.
 
-    Reads a language file if --serial names one; writes no file. With --pjlink, it listens on a TCP port. With --serial,
-    it uses a pseudo-terminal (Linux and macOS), which serial software can open. Prints its address or path, then serves
-    until Ctrl-C, with exit code 0. Exit code 2 if the language is unknown, or unless exactly one of --pjlink and
-    --serial is given; 3 if the port is in use.
+    With --pjlink, the projector listens on a TCP port. With --serial, it uses a pseudo-terminal (Linux and macOS),
+    which any program for serial ports can open. The command prints the address or path and serves until Ctrl-C. It
+    reads a file only if --serial names a language file, and writes no file.
+
+    Exit code 0 after Ctrl-C. Exit code 2 if the language is unknown, or if both or neither of --pjlink and --serial are
+    given. Exit code 3 if the port is in use.
     """
     from drivers.pjlink import MAX_PASSWORD
     from drivers.projector import Power
@@ -100,27 +105,29 @@ def camera(
     model: Annotated[str, typer.Option(help="EOS 550D, EOS 6D Mark II, or Test, which has small frames.")] = "EOS 550D",
     chart: Annotated[Path | None, typer.Option(help="chart.json of the print; by default grey squares.")] = None,
     room: Annotated[
-        list[str] | None, option("NAME=VALUE", "Changed parameter of the default room, as in LAB.toml.")
+        list[str] | None, option("NAME=VALUE", "Parameter of the simulated room, as in LAB.toml; can be repeated.")
     ] = None,
     watch_screen: Annotated[
         str | None,
-        option("SCREEN", "X screen that illuminates the chart: :1, 640x360+0+0, or :1,640x360+0+0."),
+        option("SCREEN", "X display or part of it that illuminates the chart: :1, 640x360+0+0, or :1,640x360+0+0."),
     ] = None,
     watch_projector: Annotated[
-        str | None, option("HOST:PORT", "PJLink projector of this screen; by default a constant lamp.")
+        str | None, option("HOST:PORT", "PJLink projector of the watched screen; by default a constant lamp.")
     ] = None,
 ) -> None:
     """Serve a simulated Canon EOS on a TCP port; by default it photographs grey squares under white light.
 
-    With --watch-screen, it photographs the chart under the light of that screen during the exposure, in real time: a
-    window on the screen affects the frame for its share of the exposure. With --watch-projector, power, mute, freeze
-    and input of the projector are also simulated. So `acquire` can be rehearsed (docs/how-to/rehearsal.md).
+    With --watch-screen, the picture on that screen illuminates the chart, in real time. A window that covers the screen
+    during half of the exposure contributes half of its light. With --watch-projector, power, mute, freeze and input of
+    that projector also change the light. These options allow rehearsals of `acquire` (docs/how-to/rehearsal.md).
 
-    Reads CHART if --chart names one; writes no file. Prints its address, and a line for each exposure of a watched
-    screen. Serves until Ctrl-C, with exit code 0. Exit code 2 if the model, chart, room or screen is wrong; 3 if the
-    port is in use or the screen cannot be read.
+    The command prints its address and serves until Ctrl-C. With --watch-screen, it also prints the progress of each
+    exposure. It reads the file of --chart, and writes no file.
 
-    Any software with PTP/IP can use it, for example (both connections use one port):
+    Exit code 0 after Ctrl-C. Exit code 2 if the model, chart, room or screen is wrong. Exit code 3 if the port is in
+    use or the screen cannot be read.
+
+    Any software that supports PTP/IP can use this camera. Both connections of PTP/IP use the same port. Example:
 
     gphoto2 --camera "PTP/IP Camera" --port ptpip:127.0.0.1:15740:15740 --capture-image-and-download
     """
@@ -137,7 +144,7 @@ def camera(
     if watch_screen is None and watch_projector is not None:
         raise ConfigurationError("--watch-projector is given without --watch-screen; give both")
     changes = dict(_setting("--room", text) for text in room or ())
-    # Lamp drift is off by default: its time starts at `SIM_START`, long ago, so the lamp would be dark.
+    # Lamp drift is off by default. It counts from `SIM_START`, which is long ago, so the lamp would now be dark.
     world = World(
         _grey_squares() if chart is None else _print(context, chart),
         BODIES[model],
@@ -145,7 +152,7 @@ def camera(
     )
     with ExitStack() as resources:
         film = resources.enter_context(_film(world, watch_screen, watch_projector))
-        # A frame may be exposed while earlier frames are still developed.
+        # A frame may be exposed while earlier frames are still calculated.
         executor = resources.enter_context(ThreadPoolExecutor(3, "developing"))
         eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, executor=executor)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
@@ -170,7 +177,7 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
         yield WorldFilm(world, lambda: WHITE, lambda: 1.0, serial, {})
         return
     clock, pictures = SystemClock(), Screenshots(ScreenPlace.parse(screen))
-    # A screen that is missing now is a mistake of the user; if it fails later, this is part of the rehearsal.
+    # A screen that is missing at the start is an error of the user. A screen that fails later is part of the rehearsal.
     pictures.take()
     pjlink_projector = None
     if projector is not None:
@@ -231,11 +238,11 @@ def _host_and_port(text: str) -> tuple[str, int]:
 
 
 def _until_interrupted(announcement: str) -> None:
-    """Print the address and serve until Ctrl-C or SIGTERM, even if a shell ignores these signals."""
+    """Print the address and serve until Ctrl-C or SIGTERM, even if the parent process ignores them."""
     signals = queue.SimpleQueue[int]()
     for request in (signal.SIGINT, signal.SIGTERM):
         signal.signal(request, lambda number, _: signals.put(number))
-    # Handlers are set first: a reader of the address may send a signal at once, and an exception would print it twice.
+    # Handlers are set before the address is printed, because a program may read it and send a signal at once.
     print(announcement, flush=True)
     signals.get()
     print("stopped")

@@ -1,30 +1,30 @@
-"""Optical effects of lens and projector besides Gaussian blur: shoulders, veiling glare, lateral colour, fall-off.
+"""Optical effects of lens and projector: wide tails of the point spread, veiling glare, lateral colour and fall-off.
 
-**Point spread.** A share 1 − s of the light is in the core, a Gaussian of standard deviation σ that includes the
-aperture of the photosite. A share s is in the shoulders: the core convolved with
+**Point spread.** The point spread has a core and wide tails, called shoulders. The core is a Gaussian of standard
+deviation σ, which includes the aperture of the photosite. The shoulders contain the share s of the light. They are the
+core convolved with
 
     w(r) = exp(−r / a) / (2π a²).
 
-The standard deviation of w along each axis is √3 a; `shoulder_px` is this value. At f cycles per half-size pixel, the
-lens has the modulation transfer function
+The standard deviation of w along each axis is √3 a, which is the parameter `shoulder_px`. The modulation transfer
+function at f cycles per half-size pixel is
 
     MTF(f) = exp(−2π² σ² f²) · (1 − s + s · (1 + (2π a f)²)^(−3/2)).
 
-The shoulders are exponential, because measured wings of photographic lenses, of spherical aberration and of scattered
-light are straight lines on a logarithmic plot over some decades. They are not a sum of Gaussians, so that software that
-fits Gaussians has no advantage. `MILD_SHOULDERS` and `STRONG_SHOULDERS` are two such lenses.
+The shoulders are exponential, because the measured tails of photographic lenses are straight lines on a logarithmic
+plot. Gaussian shoulders would give an advantage to software that fits Gaussians.
 
-**Veiling glare** (ISO 9358:1994, ISO 18844:2017): a share v of the light is distributed uniformly over the frame, which
-includes the background: (1 − v) · light + v · mean light, for each camera channel. A uniform frame does not change.
+**Veiling glare** (ISO 9358:1994, ISO 18844:2017). The lens distributes a share v of the light uniformly over the frame.
+Each camera channel becomes (1 − v) · light + v · mean light, where the mean includes the background.
 
-**Lateral chromatic aberration**: red and blue are magnified differently from green. At the fraction ρ of the distance
-from axis to corner, a channel is shifted outwards by d · ρ · (1 + ρ²) / 2 relative to green; d is the shift in the
-corner. Half of it is the chromatic difference of magnification (linear), half that of distortion (cubic; W. T. Welford,
-"Aberrations of Optical Systems", 1986, ch. 10). The equal parts are judgement.
+**Lateral chromatic aberration.** The lens magnifies red and blue differently from green. Let ρ be the distance from the
+axis relative to the corner, and d the shift in the corner. Then red or blue is shifted outwards by d · ρ · (1 + ρ²) / 2
+relative to green. The linear term is the chromatic difference of magnification, the cubic term that of distortion
+(W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 10). Their equal weights are chosen.
 
-**Fall-off** of the lens is 1 / (1 + c r²)² at the distance r from the axis, which is cos⁴ of the angle to the axis. The
-fall-off of a primary of the projector is g / (1 + c d²) at the distance d from its brightest point, with the gain g.
-`sim.world.rendering.light` uses these constants.
+**Fall-off.** The lens transmits 1 / (1 + c r²)² at the distance r from the axis, which is cos⁴ of the angle to the
+axis. A primary of the projector has the light g / (1 + c d²) at the distance d from its brightest point, with the gain
+g. `sim.world.rendering.light` applies both.
 
 Positions are half-size pixels, centres at integers, x right, y down.
 """
@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 
 def lens_falloff(axis: tuple[float, float], size: tuple[int, int], lost: float) -> NDArray[np.float64]:
-    """Return x, y of the axis (photosites) and c, (3,) float64; `lost`: fraction of light lost in the corners."""
+    """Return (3,) float64: x, y of the axis, in photosites, and c. `lost`: share of the light lost in the corners."""
     corner2 = (size[0] ** 2 + size[1] ** 2) / 4
     return np.array([*axis, ((1 - lost) ** -0.5 - 1) / corner2])
 
@@ -48,7 +48,7 @@ def lens_falloff(axis: tuple[float, float], size: tuple[int, int], lost: float) 
 def projector_falloff(
     page_mm: tuple[float, float], lost: float, difference: float, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return (3, 4) float64: x, y of the brightest point (mm), c and a gain of 1 for each primary."""
+    """Return (3, 4) float64: for each primary x, y of its brightest point, in mm, then c, and a gain of 1."""
     page = np.array(page_mm)
     half_diagonal = float(np.hypot(*page)) / 2
     losses = lost * (1 + difference * np.array([-1.0, 0.0, 1.0]))
@@ -57,28 +57,28 @@ def projector_falloff(
     return np.column_stack([spots, losses / (1 - losses) / half_diagonal**2, np.ones(3)])
 
 
-# Settings of a simulated room, chosen for an EOS 550D with 4.29 µm photosites. With the aperture of the photosite, its
-# MTF is 0.96 at 10 lp/mm and 0.73 at 30 lp/mm.
+# Settings of a simulated room with a good lens, for an EOS 550D with photosites of 4.29 µm. Together with the aperture
+# of the photosite, the MTF is 0.96 at 10 lp/mm and 0.73 at 30 lp/mm.
 MILD_SHOULDERS: Final = {"blur_px": 0.46, "shoulder_share": 0.0116, "shoulder_px": 3.0}
 
-# The same for an MTF of 0.93 and 0.64.
+# Settings for a worse lens, with an MTF of 0.93 and 0.64 at the same frequencies.
 STRONG_SHOULDERS: Final = {"blur_px": 0.535, "shoulder_share": 0.0452, "shoulder_px": 3.0}
 
-# Radius of the kernel, in lengths a. The 0.12 % of the light outside is restored by the normalisation.
-_REACH: Final = 9.0
+# Radius of the kernel, relative to the length a. The kernel is normalised, which adds the light outside, 0.12 %.
+_KERNEL_RADIUS: Final = 9.0
 
 # Points per pixel and axis over which the kernel is averaged, because its peak is narrower than a pixel.
 _POINTS_PER_PX: Final = 7
 
-# Iterations to invert a shift. Each multiplies the error by the slope of the shift, below 0.01 for shifts of some px.
-_STEPS: Final = 6
+# Iterations that invert a shift. Each divides the error by more than 100 for shifts of a few pixels.
+_INVERSION_STEPS: Final = 6
 
 APERTURE_VARIANCE: Final = 1 / 12  # Variance of the uniform aperture of a photosite, photosites².
 
 
 @dataclass(frozen=True)
 class PhotographicLens:
-    """Effects of a lens on a frame, except the core of its blur and vignetting, which are rendered with the print."""
+    """Shoulders, veiling glare and lateral colour of a lens. Core blur and vignetting are rendered with the print."""
 
     half_size: tuple[int, int]  # Rows and columns of the frame, half-size pixels; the optical axis is in its centre
     shoulder_share: float  # Share of the light in the shoulders
@@ -104,38 +104,38 @@ class PhotographicLens:
         return bool(self.lateral_red_px or self.lateral_blue_px)
 
     def shifted(self, green_px: NDArray[np.float64], channel: str) -> NDArray[np.float64]:
-        """Return the positions (..., 2) in a channel, ``R``, ``G`` or ``B``, of points at (..., 2) in green."""
-        at_corner = self._at_corner_px(channel)
-        if not at_corner:
+        """Convert positions (..., 2) in green to the positions (..., 2) in a channel ``R``, ``G`` or ``B``."""
+        corner_shift_px = self._corner_shift_px(channel)
+        if not corner_shift_px:
             return green_px
         offset = green_px - np.array(self.centre_px)
-        return np.array(self.centre_px) + offset * self._magnified(offset, at_corner)
+        return np.array(self.centre_px) + offset * self._magnification(offset, corner_shift_px)
 
     def unshifted(self, pixels: NDArray[np.float64], channel: str) -> NDArray[np.float64]:
-        """Return the positions (..., 2) in green of points in a channel: inverse of `shifted`, within 10⁻⁶ px."""
-        at_corner = self._at_corner_px(channel)
-        if not at_corner:
+        """Convert positions (..., 2) in a channel to the positions in green: inverse of `shifted`, within 10⁻⁶ px."""
+        corner_shift_px = self._corner_shift_px(channel)
+        if not corner_shift_px:
             return pixels
         shifted = pixels - np.array(self.centre_px)
         offset = shifted
-        for _ in range(_STEPS):
-            offset = shifted / self._magnified(offset, at_corner)
+        for _ in range(_INVERSION_STEPS):
+            offset = shifted / self._magnification(offset, corner_shift_px)
         return np.array(self.centre_px) + offset
 
-    def _at_corner_px(self, channel: str) -> float:
+    def _corner_shift_px(self, channel: str) -> float:
         return {"R": self.lateral_red_px, "G": 0.0, "B": self.lateral_blue_px}[channel]
 
-    def _magnified(self, offset: NDArray[np.float64], at_corner: float) -> NDArray[np.float64]:
+    def _magnification(self, offset: NDArray[np.float64], corner_shift_px: float) -> NDArray[np.float64]:
         """Return the magnification (..., 1) relative to green at offsets (..., 2) px from the axis."""
         rho2 = (offset**2).sum(axis=-1, keepdims=True) / self.corner_px**2
-        return 1 + at_corner / self.corner_px * (1 + rho2) / 2
+        return 1 + corner_shift_px / self.corner_px * (1 + rho2) / 2
 
     def spread(self, light: NDArray[np.float32]) -> None:
-        """Move a share of the light (primaries, rows, columns) on the photosites into the shoulders, in place.
+        """Move a share of the light into the shoulders, in place.
 
-        The four positions of the Bayer pattern are filtered separately, as images of half-size pixels. They are already
-        blurred by the core, so aliasing changes the shoulders by less than 0.1 %. Edge values continue outside of the
-        frame.
+        `light`: (primaries, rows, columns) float32, light on the photosites after the blur of the core. The four
+        positions of the Bayer pattern are filtered separately, as images of half-size pixels. Aliasing changes the
+        shoulders by less than 0.1 %, because the light is already blurred. Edge values continue outside of the frame.
         """
         if self.shoulder_share == 0:
             return
@@ -151,7 +151,7 @@ class PhotographicLens:
     def kernel(self) -> NDArray[np.float32]:
         """Return the shoulder kernel on half-size pixels, (n, n) float32 with odd n and sum 1."""
         length = self.shoulder_px / math.sqrt(3)
-        reach = max(math.ceil(_REACH * length), 1)
+        reach = max(math.ceil(_KERNEL_RADIUS * length), 1)
         distance = (np.arange((2 * reach + 1) * _POINTS_PER_PX) - (_POINTS_PER_PX - 1) / 2) / _POINTS_PER_PX - reach
         fine = np.exp(-np.hypot(distance[:, None], distance) / length)
         pixels = fine.reshape(2 * reach + 1, _POINTS_PER_PX, 2 * reach + 1, _POINTS_PER_PX).sum(axis=(1, 3))

@@ -1,44 +1,44 @@
-"""Spectra of cameras and published illuminants, and models of projectors, inks and papers.
+"""Spectra of cameras, light sources, projectors, inks and papers.
 
-**Sensitivities** (ISO 17321-1) have the format of AcademySoftwareFoundation/rawtoaces-data, schema 0.1.0:
-``spectral_data.units`` is ``relative``, ``spectral_data.index.main`` has the channels, ``spectral_data.data.main`` has
-their responses to equal power by wavelength in nm. Only proportions matter. Some cameras are included (`sim.data`) and
-selected by name, others by the path of their file.
+**Camera sensitivities** (ISO 17321-1) are measured. Their files have the format of
+AcademySoftwareFoundation/rawtoaces-data, schema 0.1.0: relative responses of R, G and B to equal power, by wavelength
+in nm. Cameras in `sim.data` are selected by name, others by the path of their file.
 
-**Published illuminants** are in `sim/data` (sources in its README): illuminants of CIE 15:2018 and ISO 7589, and
-measured light sources.
+**Published illuminants** are in `sim/data`: illuminants of CIE 15:2018 and ISO 7589, and measured light sources. The
+README of that folder names the sources.
 
-**Models** cover 380 to 780 nm in steps of 5 nm. They are parametric; only sensitivities are measured. Spectra are
-relative; `sim.world.world` sets the exposure. Functions have no state.
+**Projectors, inks and papers** are parametric models from 380 to 780 nm in steps of 5 nm. Their spectra are relative;
+`sim.world.world` sets the exposure.
 
-Projector ``uhp``: a mercury arc lamp (200 bar) behind the dichroic red, green and blue segments of a colour wheel. Its
-spectrum is a continuum with the lines 405, 436, 546 and 577/579 nm, broadened by pressure (Derra et al., "UHP lamp
-systems for projection applications", J. Phys. D 38 (2005) 2995, figure 4). Projector ``led``: three asymmetric
-Gaussians with peaks at 633, 515 and 451 nm and full widths of 19, 34 and 22 nm. A measured LED projector has peaks at
-632, 516 and 452 nm and widths of 19, 34 and 21 nm.
+Projector ``uhp`` is a mercury arc lamp (200 bar) behind a colour wheel with dichroic red, green and blue segments. Its
+spectrum is a continuum with pressure-broadened lines at 405, 436, 546 and 577/579 nm (Derra et al., "UHP lamp systems
+for projection applications", J. Phys. D 38 (2005) 2995, figure 4). Projector ``led`` follows a measured projector with
+LEDs. Its primaries are asymmetric Gaussians.
 
-Print: Yule-Nielsen spectral Neugebauer model (Yule and Nielsen 1951; Viggiano 1985). The reflectances of the sixteen
-overprints of cyan, magenta, yellow and black, to the power 1/n, are averaged with Demichel's weights. Solid inks are
-density bands within about 0.1 of ramps measured on photo paper. Yellow has 1.25 below 480 nm and half of it at 490 nm,
-magenta 1.17 at 540 nm and 0.2 at 450 nm. Cyan at a coverage of 0.75 has 1.0 at 600 nm and half of it at 700 nm. The
-reflection of the surface is added.
+The print follows the Yule-Nielsen spectral Neugebauer model (Yule and Nielsen 1951; Viggiano 1985). It takes the
+reflectances of the sixteen overprints of cyan, magenta, yellow and black to the power 1/n, and averages them with
+Demichel's weights. The reflection of the surface is added. Densities of the solid inks agree within about 0.1 with
+measured prints on photo paper.
 
 Papers ``matt`` and ``glossy`` follow prints of an Epson XP-960 without colour management, measured with a ColorMunki
-(olemagnp/print_profiles on GitHub; no data are copied). Solid inks and overprints on PermaJet Matt Plus 240 and Ilford
-Galerie Smooth Pearl, 400 to 730 nm, fit within 2.5 CIEDE2000 on average. Densities of black in that collection and on
-an Epson P800 (metebalci/profiling-an-epson-p800-printer) are 1.63 to 1.79 on four matt and 2.11 to 2.51 on ten satin to
-glossy photo papers. A review of more papers gives 1.6 to 1.7 and 2.0 to 2.2 (M. McNamee, "The whole range", swpp.co.uk,
-2010). Convex hulls of printed colours in CIELAB (D50) have 460 000 to 540 000 units on matt and 580 000 to 790 000 on
-glossy paper; ours have 466 000 and 596 000, with four inks instead of six or more. Black is constant over wavelength,
-like measured pigment blacks (P800, Canon Pro-300).
+(olemagnp/print_profiles on GitHub; no data are copied). Inks and overprints differ by 2.5 CIEDE2000 on average from the
+prints on PermaJet Matt Plus 240 and Ilford Galerie Smooth Pearl. Densities of black agree with that collection, with
+an Epson P800 (metebalci/profiling-an-epson-p800-printer) and with a review of more papers (M. McNamee, "The whole
+range", swpp.co.uk, 2010). The volumes of printed colours in CIELAB (D50) are near the smallest measured ones, because
+the model has four inks and those printers have six or more. Black is constant over wavelength, like measured pigment
+blacks (P800, Canon Pro-300).
 
-**Profiles.** ``unmanaged``: codes of the file are ink codes, as in the publication, so greys have the tint of equal
-inks. ``managed``: like an ICC profile of a print shop. sRGB (IEC 61966-2-1) → CIE XYZ under D50 (Bradford, ICC.1:2022
-annex E) → relative colorimetric with black point compensation (ISO 18619) → ink codes of the paper. White is bare
-paper, black is the darkest neutral print, and relative luminance between them is linear. Colours out of gamut go to the
-nearest printable colour in CIELAB relative to paper. Differences of hue count twice, because profiles preserve hue
-rather than chroma (chosen). The conversion table has 33 nodes per channel like an ICC profile, made by inversion of the
-print model (Levenberg-Marquardt from the nearest node of a coarse grid). It is interpolated in tetrahedra, so grey
+**Profiles.** With ``unmanaged``, the codes of the file are ink codes, as in Banić et al. 2019. Greys then have the tint
+of equal inks. ``managed`` converts like an ICC profile of a print shop, in three steps:
+
+1. sRGB (IEC 61966-2-1) to CIE XYZ under D50 (Bradford, ICC.1:2022 annex E);
+2. relative colorimetric rendering with black point compensation (ISO 18619): white is bare paper, black is the darkest
+   neutral print, and luminance between them is linear;
+3. XYZ to ink codes of the paper.
+
+Colours out of gamut become the nearest printable colour in CIELAB relative to paper. Differences of hue count twice
+(chosen), because profiles preserve hue rather than chroma. The conversion table has 33 nodes per channel, like an ICC
+profile, and is the numerical inverse of the print model. Interpolation in tetrahedra keeps greys neutral, because grey
 codes depend on grey nodes only (Kasson and others, J. Electronic Imaging 4 (1995) 226).
 """
 
@@ -64,10 +64,10 @@ from foundation.errors import FormatError, InputError, nearest_names
 from foundation.files import sha256_of
 from foundation.records import Record
 
-# Required range, nm. A camera with infrared filter gets less than 2 % of its signal outside.
+# Range that a spectrum must cover, nm. A camera with infrared filter gets less than 2 % of its signal outside.
 NEEDED_NM: Final = (400.0, 700.0)
 
-# Widest allowed gap, nm: edges of filters rise over about 40 nm, and measurements have steps of 5 or 10 nm.
+# Widest allowed step between wavelengths, nm. Edges of filters rise over about 40 nm.
 WIDEST_STEP_NM: Final = 20.0
 
 _Array = npt.NDArray[np.float64]
@@ -98,9 +98,10 @@ def resampled(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array
     """Resample curves to another grid.
 
     `wavelengths_nm`: (W,) float64, ascending. `curves`: (W, N) float64, per nm. `onto_nm`: (M,) float64, ascending in
-    equal steps. Returns (M, N) float64; 0 outside of the wavelengths. If the given grid is finer than the new one
-    anywhere, values are means with triangular weights that reach to the neighbouring wavelengths, which preserves the
-    integral: a lamp line between two wavelengths is not lost. Otherwise they are interpolated linearly.
+    equal steps. Returns (M, N) float64; 0 outside of the wavelengths.
+
+    Curves on a coarser grid are interpolated linearly. Curves on a finer grid are averaged with triangular weights,
+    which preserve the integral, because interpolation would lose lamp lines between two new wavelengths.
 
     Examples
     --------
@@ -116,7 +117,7 @@ def resampled(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array
             values[:, number] = np.interp(onto_nm, wavelengths_nm, curves[:, number], left=0, right=0)
         return values
     if float(np.diff(wavelengths_nm).max()) > 0.999 * step:
-        # Without this, the last wavelength before a wide step would also represent grid points inside the step.
+        # Otherwise, grid points inside a wide step would be 0, and those at its ends too large.
         wavelengths_nm, curves = _densified(wavelengths_nm, curves, step)
     # Each wavelength represents half the distance to its neighbours.
     edges = np.concatenate([wavelengths_nm[:1], (wavelengths_nm[1:] + wavelengths_nm[:-1]) / 2, wavelengths_nm[-1:]])
@@ -148,7 +149,7 @@ class PublishedSpectrum:
 
 @cache
 def published_spectra() -> Mapping[str, PublishedSpectrum]:
-    """Return all published spectra by name, such as ``D65``, ``FL2``, ``LED-B3``, ``Kinoton 75P``."""
+    """Return all published illuminants by name, such as ``D65``, ``FL2``, ``LED-B3``, ``Kinoton 75P``."""
     return MappingProxyType(_read("published_lights.csv"))
 
 
@@ -189,8 +190,8 @@ def _read(name: str) -> dict[str, PublishedSpectrum]:
 # End of the file names in `sim.data`: first and last wavelength and step, as in rawtoaces-data.
 SUFFIX: Final = "_380_780_5.json"
 
-# Highest relative response at the first and last wavelength of a file (judgement): less than 1 % of the light is then
-# missing.
+# Highest allowed response at the first and last wavelength of a file, relative to the peak (chosen). Less than 1 % of
+# the light is then missing.
 EDGE_SHARE: Final = 0.05
 
 _CHANNELS: Final = ("R", "G", "B")
@@ -246,7 +247,7 @@ def known_sensitivities() -> tuple[str, ...]:
 
 
 def read_sensitivities(name: str, other_names: Sequence[str] = ()) -> Sensitivities:
-    """Return the sensitivities of a name or file; error messages also list the names `other_names`."""
+    """Return the sensitivities of an included camera or of a file; error messages also list `other_names`."""
     if name in known_sensitivities():
         data = resources.files("sim").joinpath("data", name + SUFFIX).read_bytes()
         return parse_sensitivities(data, name, name)
@@ -363,15 +364,17 @@ LampSpectrum = Literal["uhp", "led"]
 
 PaperName = Literal["poster", "matt", "glossy"]  # Papers of the simulated print.
 
-SURFACE_REFLECTANCE = 0.03  # Relative light that the surface of plain matt paper reflects.
+SURFACE_REFLECTANCE = 0.03  # Share of the light that the surface of plain matt paper reflects.
 
-MATT_SURFACE = 0.0165  # The same for coated matt photo paper; its black has 0.016 to 0.026 from 400 to 660 nm.
+MATT_SURFACE = 0.0165  # The same for coated matt photo paper; its measured black reflects 0.016 to 0.026.
 
-GLOSSY_SURFACE = 0.0035  # The same for glossy paper outside of the mirror angle; its black has at least 0.0038.
+# The same for glossy paper outside of the mirror direction; its black reflects at least 0.0038.
+GLOSSY_SURFACE = 0.0035
 
-MATT_BLACK = 1.8  # Density of solid matt black below the surface; the total density then equals the measured one.
+# Density of solid matt black without the reflection of the surface. With this reflection, it equals the measured one.
+MATT_BLACK = 1.8
 
-GLOSSY_BLACK = 2.0  # Density of solid photo black below the surface, for the same reason.
+GLOSSY_BLACK = 2.0  # The same for solid photo black on glossy paper.
 
 YULE_NIELSEN_N = 2.0  # Yule-Nielsen factor; 2 is full optical dot gain.
 
@@ -421,7 +424,7 @@ class InkedPaper:
     white: NDArray[np.float64]  # (81,) float64, reflectance of bare paper
     # (4, 81) float64, optical density of solid cyan, magenta, yellow and black, without the surface
     inks: NDArray[np.float64]
-    surface: float  # Relative light that the surface reflects to the camera
+    surface: float  # Share of the light that the surface reflects to the camera
     black_generation: float  # Coverage of black at full coverage of the other inks
     undercolour_removal: float  # Share of black by which the other inks are reduced
 
@@ -459,8 +462,7 @@ def _poster_inks() -> NDArray[np.float64]:
 
 
 def _photo_inks(black: float) -> NDArray[np.float64]:
-    # Least squares over inks and overprints, 400 to 730 nm, on a glossy and a matt paper. Black is constant over
-    # wavelength, like pigments.
+    # Fitted by least squares to measured inks and overprints on a glossy and a matt paper.
     cyan = 1.85 * (_gauss(596, 37, 81) + 0.14 * _gauss(380, 75))
     magenta = 1.77 * (_gauss(548, 59, 29) + 0.10 * _gauss(397, 20))
     yellow = 1.84 * (1 - _rise(492, 11))
@@ -511,22 +513,22 @@ def sensitivities(name: str) -> NDArray[np.float64]:
     return curves
 
 
-ProfileName = Literal["unmanaged", "managed"]  # Conversion of codes to ink codes.
+ProfileName = Literal["unmanaged", "managed"]  # Conversion of codes of the file to ink codes.
 
 NODES = 33  # Nodes per channel of the table, as in ICC output profiles.
 
 _HUE_WEIGHT = 2.0  # Weight of hue differences for colours out of gamut (chosen).
 
-# Largest colour difference (CIELAB) of a neutral print in the search for the black point; 1 is visible. A smaller value
-# gives a paler black, because the mix of all inks is not neutral.
-_NEUTRAL = 0.7
+# Largest CIELAB distance of the black point from neutral; a distance of 1 is visible. A smaller limit gives a paler
+# black, because the darkest mix of inks is not neutral.
+_MAX_BLACK_TINT = 0.7
 
 # Linear sRGB to CIE XYZ under D50, Bradford adapted; sums of rows are D50.
 _SRGB_TO_D50 = np.array(
     [[0.4360747, 0.3850649, 0.1430804], [0.2225045, 0.7168786, 0.0606169], [0.0139322, 0.0971045, 0.7141733]]
 )
 
-_STEPS = 40  # Maximum number of iterations of the inversion; inside the gamut, five to ten are enough.
+_MAX_ITERATIONS = 40  # Iterations of the inversion; inside the gamut, five to ten are enough.
 
 
 def printed_reflectance(
@@ -540,12 +542,12 @@ def printed_reflectance(
 
 def ink_codes(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
     """Return the ink codes (N, 3) float64, 0 to 255, of the managed profile of a paper for sRGB codes (N, 3)."""
-    table = _table(on)
+    table = _profile_table(on)
     nodes = np.clip(np.asarray(rgb, dtype=np.float64), 0, 255) / 255 * (NODES - 1)
     corner = np.minimum(nodes.astype(np.int64), NODES - 2)
     fractions = nodes - corner
-    # The four nodes lie on the way from the corner to the opposite corner, along one channel after another, the channel
-    # with the largest fraction first.
+    # The four nodes of the tetrahedron: the lower corner of the cell, then one step along each channel. Channels follow
+    # in descending order of their fractions.
     order = np.argsort(-fractions, axis=1, kind="stable")
     sorted_share = np.take_along_axis(fractions, order, axis=1)
     weights = -np.diff(np.concatenate([np.ones((len(nodes), 1)), sorted_share, np.zeros((len(nodes), 1))], axis=1))
@@ -617,17 +619,17 @@ class _Inks:
         damping = np.full(len(lab), 1e-2)
         differences = self._difference(codes, lab, axes)
         active = np.arange(len(lab))
-        for _ in range(_STEPS):
+        for _ in range(_MAX_ITERATIONS):
             active_codes, difference, matrix = codes[active], differences[active], axes[active]
             slope = np.empty((len(active), 3, 3))
             for channel in range(3):
-                # Away from the nearer bound, so that codes stay in 0 to 1.
+                # Codes change away from the nearer bound, so that they stay between 0 and 1.
                 nudge = np.where(active_codes[:, channel] < 0.5, 1e-5, -1e-5)
                 shifted = active_codes.copy()
                 shifted[:, channel] += nudge
                 slope[:, :, channel] = (self._difference(shifted, lab[active], matrix) - difference) / nudge[:, None]
             downhill = (difference[:, None] @ slope)[:, 0]
-            # A code at its bound stays there if the descent leads outside.
+            # A code at a bound is fixed if the descent leads outside.
             fixed = ((active_codes <= 0) & (downhill > 0)) | ((active_codes >= 1) & (downhill < 0))
             slope = np.where(fixed[:, None], 0, slope)
             curvature = slope.swapaxes(1, 2) @ slope
@@ -653,21 +655,22 @@ class _Inks:
 
 
 @cache
-def _black(on: PaperName) -> float:
+def _black_point(on: PaperName) -> float:
+    # Luminance of the darkest neutral print, relative to paper.
     inks = _Inks(on)
     darkest = float(inks.xyz(np.zeros((1, 3)))[0, 1])
     candidates = darkest * np.geomspace(1, 2, 41)
     lab = _lab(np.repeat(candidates[:, None], 3, axis=1))
     difference = np.linalg.norm(_lab(inks.xyz(inks.codes_of_lab(lab))) - lab, axis=1)
-    return float(candidates[np.argmax(difference < _NEUTRAL)])
+    return float(candidates[np.argmax(difference < _MAX_BLACK_TINT)])
 
 
 @cache
-def _table(on: PaperName) -> _Array:
+def _profile_table(on: PaperName) -> _Array:
     # (33, 33, 33, 3) ink codes 0 to 255 by sRGB codes.
     axis = np.linspace(0, 1, NODES)
     codes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    ink = _Inks(on).codes_of_lab(_lab(_target_xyz(codes.reshape(-1, 3), _black(on))))
+    ink = _Inks(on).codes_of_lab(_lab(_target_xyz(codes.reshape(-1, 3), _black_point(on))))
     table = 255 * ink.reshape(codes.shape)
     table[-1, -1, -1] = 255
     table.setflags(write=False)

@@ -1,1 +1,1 @@
-"""Check a rig before a session: verdicts on exposure, light, optics, print, sensor and supplies."""
+"""Check a laboratory before a session: exposure, light, optics, print, sensor and supplies."""

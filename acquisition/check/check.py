@@ -1,7 +1,8 @@
-"""Check a rig before the session: ask the devices, propose a shutter time, and judge trial frames as a LUT is judged.
+"""Check a laboratory before a session (`acquire check`).
 
-A check takes about 25 frames into a hidden folder next to LAB.toml, deletes it at the end, and records nothing. The
-lamp is switched on if it was off, and stays on.
+The devices are queried, a shutter time is proposed, and trial frames are judged by the figures of `build-lut`. A check
+takes about 25 frames into a hidden folder next to LAB.toml and deletes the folder at the end. The lamp is switched on
+if it was off, and stays on.
 """
 
 from __future__ import annotations
@@ -63,8 +64,8 @@ from experiment.session.folder import Session
 from foundation.errors import RegistrationError, StorageError, counted
 from foundation.files import write_atomic
 
-# Range of the level of white, as a share of saturation, in which trial frames are taken with the shutter time of the
-# settings. Outside this range, they are taken with the best tried shutter time.
+# If white is in this range of saturation, trial frames have the shutter time of the settings. Otherwise they have the
+# best tried shutter time.
 USABLE = (0.3, 0.9)
 
 _Array = npt.NDArray[np.float64]
@@ -75,7 +76,7 @@ class TriedExposures:
     """White frames at the tried shutter times.
 
     - `first`: white frame at the shutter time of the settings.
-    - `trials`: tried shutter times; the first is the setting.
+    - `trials`: tried shutter times, beginning with the shutter time of the settings.
     - `times_s`: shutter times that can be set, s.
     - `saturation`: measured saturation level.
     """
@@ -101,7 +102,7 @@ def check_lab(
     corners: Corners | None = None,
     linearity: bool = False,
 ) -> CheckReport:
-    """Check the rig of the settings; record nothing.
+    """Check the devices and the chart of the settings; record nothing.
 
     `picture`: PNG file to draw. `corners`: corners of the field of a chart without tags, half-size px. `linearity`:
     also take an exposure series that measures the linearity of the sensor.
@@ -112,7 +113,7 @@ def check_lab(
     lines = [f"illuminants {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} in a session"]
     lab_folder = Path(settings.file).parent
     free_bytes_at(lab_folder)
-    # Not in /tmp, which may be in memory: the frames are 0.4 to 0.7 GB.
+    # The folder is not in /tmp, which may be in memory, because the frames are 0.4 to 0.7 GB.
     with tempfile.TemporaryDirectory(prefix=".check.", dir=lab_folder) as name:
         scratch = Path(name)
         with open_rig(settings, chart) as devices:
@@ -182,7 +183,7 @@ def _try_exposures(
         stated_counts, counts = float(first.mosaic.white_level), float(first.mosaic.saturation())
         saturation = Saturation(counts, counts < stated_counts, stated_counts)
         return TriedExposures(first, (measure_level(first, saturation, _paper(first, chart)),), (), saturation)
-    # The camera accepted the time of the settings even if it is not in its list.
+    # The camera may accept a time of the settings that it does not list.
     times = fitting_times(sorted({*offered_s, settings.camera.shutter_s}) if offered_s else (), period_s(settings))
     announce("measuring the saturation level with white frames of increasing shutter time")
     saturation = measure_saturation(first, lambda seconds: camera.take(WHITE, seconds), times)
@@ -195,7 +196,7 @@ def _try_exposures(
 
 
 def _paper(shot: Shot, chart: Chart) -> _Array | None:
-    """Return (3,) counts above black of white paper, as `acquire run` measures them; None if no chart is detected."""
+    """Return (3,) counts of white paper above black, as measured by `acquire run`; None if no chart is detected."""
     if not chart.tags:
         return None
     black = frame_black(shot.mosaic)

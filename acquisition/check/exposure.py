@@ -1,6 +1,6 @@
-"""Measure the saturation level of the sensor and find a shutter time at which white is bright but not clipped.
+"""Measure the saturation level of the sensor, and find a shutter time at which white is bright but not clipped.
 
-Every proposed shutter time has been tried.
+A shutter time is proposed only after a frame was taken with it.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ class Shot:
 
 
 class Photographer:
-    """Takes frames with the devices of a rig; never changes ISO speed or aperture."""
+    """Takes frames with the devices of the laboratory; never changes ISO speed or aperture."""
 
     def __init__(self, devices: Devices, settings: LabSettings, scratch: Path) -> None:
         self._devices = devices
         self._settings = settings
         self._file = scratch / "frame"
         self._shutter_s = settings.camera.shutter_s
-        # Shutter time of every frame, and time from release to the end of its download, s.
+        # Shutter time, and time from release to the end of the download, s, of every frame.
         self.timings: list[tuple[float, float]] = []
 
     def capture(self, colour: Colour, shutter_s: float, into: BinaryIO) -> CapturedFrame:
@@ -90,39 +90,40 @@ class Photographer:
             self._shutter_s = shutter_s
 
 
-TARGET = 0.7  # White level to search for, as a share of saturation
+TARGET = 0.7  # Best level of white, as a share of saturation.
 
-# White levels, as shares of saturation, at which no other time is proposed (our choice). Above, brighter places clip
-# after a drift of the lamp; below, each stop doubles the noise of dark patches.
+# Levels of white, as shares of saturation, at which no other time is proposed (chosen). Brighter white clips after a
+# drift of the lamp. Darker white makes dark patches noisier.
 SUITABLE = (0.6, 0.8)
 
-TRIALS = 8  # Most tries: five steps by a factor of 16 and a last one reach any other time
+TRIALS = 8  # Maximum number of tried times. Six are enough, because each step may be a factor of 16.
 
-# Factor by which the exposure is increased to saturate the sensor. The weakest channel of white has a third of the
-# strongest, which is at 0.7 of saturation in a good exposure.
+# Factor by which the exposure is increased to saturate the sensor. The weakest channel of white is at about a quarter
+# of saturation in a good exposure.
 LONGER = 8.0
 
-LONGEST_S = 30.0  # Longest shutter time to try: longer frames cost waiting time and have more hot photosites
+LONGEST_S = 30.0  # Longest shutter time to try, s. Longer exposures have more hot photosites.
 
-# Share of the expected counts below which a photosite is saturated. Cameras report nominal shutter times (0.3 s for
-# 0.315 s), so that the ratio of two is wrong by up to 8 %.
+# A photosite is saturated if it has less than this share of the expected counts. Expected counts may be wrong by 8 %,
+# because cameras report nominal shutter times (0.3 s for 0.315 s).
 PROPORTIONAL = 0.9
 
-# Share of the stated range below which counts cannot be saturation: noise in the dark is not proportional either.
+# Counts below this share of the stated range cannot be saturation. They may be noise, and noise does not
+# follow the exposure.
 LEAST_RANGE = 0.25
 
 _Array = npt.NDArray[np.float64]
 
 
 # Saturation is measured, because the level in the file can be wrong: LibRaw states 15 831 for an EOS 550D that
-# saturates at 13 584. A longer exposure raises the count of a photosite in proportion, unless it is saturated.
+# saturates at 13 584. Counts are proportional to exposure unless the photosite is saturated.
 @dataclass(frozen=True)
 class Saturation:
     """Saturation level of the sensor.
 
-    - `counts`: raw counts, the lowest level of the positions of the 2×2 block.
+    - `counts`: saturation level, raw counts; the lowest of the four positions of the 2×2 block.
     - `measured`: whether a frame was saturated; if not, `counts` is the level in the file.
-    - `stated`: the level in the file.
+    - `stated`: saturation level in the file.
     """
 
     counts: float
@@ -148,7 +149,7 @@ class TriedTime:
 
 
 def fitting_times(offered_s: Sequence[float], period_s: float | None) -> list[float]:
-    """Return the offered times up to 30 s, rising, that are whole periods of the light, if it has a period."""
+    """Return the offered times up to 30 s, in rising order; if the light has a period, only whole periods."""
     return [
         time
         for time in sorted(offered_s)
@@ -167,7 +168,7 @@ def measure_saturation(first: Shot, take: Callable[[float], Shot], times_s: Sequ
         longer_s = next((time for time in times_s if time >= LONGER * longer.shutter_s), max(times_s, default=0.0))
         if longer_s < 1.5 * first.shutter_s or longer_s <= longer.shutter_s:
             return Saturation(stated_counts, False, stated_counts)
-        # Compared with the previous frame, because the brightest counts of a dim first frame are noise.
+        # Each frame is compared with the previous one, because the brightest counts of a dim first frame are noise.
         shorter, longer = longer, take(longer_s)
         saturated_counts = _saturated_levels(shorter, longer)
         if saturated_counts:
@@ -204,7 +205,7 @@ def measure_level(shot: Shot, saturation: Saturation, white: _Array | None = Non
 
 
 def search(first: TriedTime, measure: Callable[[float], TriedTime], times_s: Sequence[float]) -> tuple[TriedTime, ...]:
-    """Try shutter times until the best offered one is among them; return all trials, `first` included.
+    """Try shutter times until the best offered time has been tried; return all trials, including `first`.
 
     `measure`: takes a frame at a shutter time, s, and returns its white level.
     """
@@ -235,7 +236,7 @@ def _next_time(trials: Sequence[TriedTime], times_s: Sequence[float]) -> float |
         next_s = much_shorter[-1] if much_shorter else next((time for time in times_s if time < shortest), None)
         return None if next_s in tried_s else next_s
     brightest = max(unclipped, key=lambda trial: trial.highest)
-    # The level of a very dark frame is inaccurate: at most a factor of 16 at a time.
+    # The time changes by at most a factor of 16, because the level of a very dark frame is inaccurate.
     gain = min(TARGET / max(brightest.highest, 1e-6), 16.0)
     ceiling = min((trial.shutter_s for trial in trials if trial.clipped), default=math.inf)
     low, high = SUITABLE

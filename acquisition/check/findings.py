@@ -1,4 +1,4 @@
-"""Findings of `acquire check`: one frozen value for each measured quantity, graded by its limit, as text and as JSON.
+"""Findings of `acquire check`, as text and as JSON. Each finding is the grade of one quantity.
 
 Grades follow the verdicts of `build-lut` (`calibration.figures.figure.Limit`): accepted values are good, values
 accepted with remarks are remarks, refused values are faults. A quantity that could not be measured is `not checked`.
@@ -20,16 +20,16 @@ _GRADES: Mapping[Outcome, Grade] = {"accept": "good", "accept with remarks": "re
 
 @dataclass(frozen=True)
 class Finding:
-    """Verdict on one quantity. The fields are the keys of `--json`.
+    """Grade of one quantity. The fields are the keys of `--json`.
 
-    - `name`: of the figure or limit, or of the checked object, such as "chart".
+    - `name`: name of the figure or limit, or of the checked object, such as "chart".
     - `grade`: good, remark, fault or not checked.
     - `said`: the measured value in words, or the reason why it could not be measured.
     - `value`: the judged value; None without a value.
     - `unit`: unit of the value and the limits, as in `Limit`.
     - `good`, `tolerable`: ranges that are accepted, and accepted with remarks.
-    - `reason`: the expected value, and the consequence of others; empty if the value is good.
-    - `remedy`: what to do; empty if nothing needs to be done.
+    - `reason`: the expected value, and the harm of other values; empty if the value is good.
+    - `remedy`: action of the user; empty if nothing needs to be done.
     - `details`: further values by name, for programs.
     """
 
@@ -60,11 +60,11 @@ class CheckReport:
 
     - `devices`: one line for each device.
     - `findings`: in the order of measurement.
-    - `forecast`: verdict of `build-lut` on the figures that a check measures; None if the chart was not detected, or
-      the trial frames were not exposed as the settings state.
+    - `forecast`: verdict of `build-lut` on the figures that a check measures; None if the chart was not detected, or if
+      the trial frames had another shutter time than the settings.
     - `figures`: measured figures by their names in `report.json`.
     - `not_known`: names of the figures that only a session can measure.
-    - `first_s`: shutter time of the trial frames, s, if the settings have another one; None otherwise.
+    - `shutter_s`: shutter time of the trial frames, s; None if it is the one of the settings.
     """
 
     devices: tuple[str, ...]
@@ -72,7 +72,7 @@ class CheckReport:
     forecast: Outcome | None = None
     figures: Mapping[str, float] = field(default_factory=dict[str, float])
     not_known: tuple[str, ...] = ()
-    first_s: float | None = None
+    shutter_s: float | None = None
 
     def sorted(self) -> list[Finding]:
         """Return the findings by grade, faults first."""
@@ -91,8 +91,8 @@ class CheckReport:
             return []
         names = ", ".join(name.replace("_", " ") for name in self.not_known)
         forecast = f"build-lut would return {self.forecast!r} on the {len(self.figures)} figures of this check"
-        if self.first_s is not None:
-            forecast = f"no forecast: the frames were exposed {self.first_s:.4g} s; set camera.shutter_s to this value"
+        if self.shutter_s is not None:
+            forecast = f"no forecast: frames were exposed {self.shutter_s:.4g} s; set camera.shutter_s to this value"
         return [
             f"LUT         {forecast}",
             f"            figures that only a session can measure: {names}",
@@ -102,7 +102,7 @@ class CheckReport:
         """Return the report for programs: `devices`, `faults` (their number), `findings`, `table`."""
         table = {
             "outcome": self.forecast,
-            "shutter_s": self.first_s,
+            "shutter_s": self.shutter_s,
             "figures": self.figures,
             "not_known": self.not_known,
         }
@@ -117,7 +117,7 @@ class CheckReport:
 def judge_value(
     limit: Limit, value: float, sentence: str = "", remedy: str = "", details: Mapping[str, Any] | None = None
 ) -> Finding:
-    """Judge a value by its limit; by default the sentence has the title and the remedy of the limit."""
+    """Judge a value by its limit; the sentence and the remedy of the limit are used if none are given."""
     grade, (good, tolerable) = _GRADES[limit.outcome(value)], limit.ranges
     is_good = grade == "good"
     expected = f", expected {limit.expected}" if is_good else ""

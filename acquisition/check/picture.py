@@ -1,6 +1,6 @@
-"""Picture of a check: the frame with tags and their blur, maps of light, sharpness and print, and every verdict.
+"""Picture of a check: the frame with tags, maps of light, sharpness and print, and every finding.
 
-Matplotlib is imported when the picture is drawn, and only its objects are used.
+Matplotlib is imported only when a picture is drawn, and pyplot is not used.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from experiment.framing.sharpness import MAX_BLUR_PX, edge_blurs
 # Colours of the grades, dark enough to be read on white.
 COLOURS = {"fault": "#b42318", "remark": "#b54708", "not checked": "#667085", "good": "#027a48"}
 
-_LINE = 150  # Characters in a line of the verdicts
+_LINE = 150  # Number of characters in a line of the findings.
 
 
 def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:

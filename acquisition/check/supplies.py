@@ -1,4 +1,4 @@
-"""Checks of supplies: battery, memory card, disk, and the camera's own dark frames."""
+"""Checks of battery, memory card, disk, and the noise reduction of the camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibration.figures.single_frames import BATTERY, CARD, DISK, NOISE_REDUCTI
 from drivers.camera import Camera, ReportsSupplies, Supplies
 from foundation.errors import DeviceError, StorageError
 
-CHARGE = 440  # Frames for one battery charge; source: see `BATTERY`
+CHARGE = 440  # Number of frames for one battery charge; source: see `BATTERY`.
 
 
 def judge_disk(folder: Path, frames: int, frame_bytes: int) -> Finding:
@@ -74,9 +74,9 @@ def _card(supplies: Supplies, needed: int) -> Finding:
 
 
 def judge_noise_reduction(timings: Sequence[tuple[float, float]]) -> Finding:
-    """Judge whether the camera takes its own dark frame after a long exposure.
+    """Judge whether the camera takes its own dark frame after a long exposure (noise reduction).
 
-    `timings`: of every frame, the shutter time and the time until its file was received, s.
+    `timings`: shutter time, and time from the release until the file was received, s, of every frame.
     """
     times = sorted(timings)
     if not times or times[-1][0] < 1.0 or times[-1][0] < 4 * times[0][0]:
@@ -87,6 +87,6 @@ def judge_noise_reduction(timings: Sequence[tuple[float, float]]) -> Finding:
     return judge_value(
         NOISE_REDUCTION,
         growth,
-        f"after an exposure of {times[-1][0]:.4g} s a frame takes {longest:.1f} s more, after {times[0][0]:.4g} s "
-        f"{shortest:.1f} s",
+        f"a frame is ready {longest:.1f} s after an exposure of {times[-1][0]:.4g} s, and "
+        f"{shortest:.1f} s after one of {times[0][0]:.4g} s",
     )

@@ -1,6 +1,6 @@
-"""Trial session: a temporary session of about 14 frames, measured like any session.
+"""Trial session of `acquire check`: a temporary session of about 14 frames, measured like any session.
 
-The frames are several of white, dark frames, the primaries, grey, and the darkest illuminant of the plan.
+It has white and dark frames, the three primaries, a grey, and the darkest illuminant of the plan.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from experiment.session.records import MIDDLE, FrameKind, Judgement, SessionStep
 from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError, QualityError, RegistrationError
 
-WHITES = 3  # White frames at the beginning, and again at the end: their scatter is the flicker of the lamp
+WHITES = 3  # Number of white frames at the start, and again at the end. Their scatter shows the flicker of the lamp.
 
-SERIES = 8  # Shutter times of a linearity series
+SERIES = 8  # Number of shutter times of a linearity series.
 
 PRIMARIES = {"red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255)}
 
@@ -68,7 +68,7 @@ class Trial:
 def trial_lights(plan: Sequence[Illuminant], primaries: npt.NDArray[np.float64]) -> tuple[Illuminant, ...]:
     """Return the illuminants of a trial: white, the primaries, grey, and the darkest of the plan.
 
-    `primaries`: (3, 3) counts of R, G and B under the projector's red, green and blue, which predict the counts of
+    `primaries`: (3, 3) counts of R, G and B under red, green and blue of the projector, which predict the counts of
     any illuminant. The darkest illuminant has the fewest counts in its strongest channel, as in `darkest_counts`.
     """
     colours = dict(_COLOURS)
@@ -94,7 +94,7 @@ def trial_steps(lights: Sequence[Illuminant]) -> tuple[SessionStep, ...]:
 def series_times(times_s: Sequence[float], white_s: float, white_level: float) -> list[float]:
     """Return rising shutter times at which white has 6 to 94 % of saturation.
 
-    `white_s`, `white_level`: a shutter time, s, and the white level at it, as a share of saturation.
+    `white_s`, `white_level`: a shutter time, s, and the level of white at this time, as a share of saturation.
     """
     usable_s = [time for time in times_s if 0.06 <= white_level * time / white_s <= 0.94]
     if len(usable_s) <= SERIES:
@@ -106,7 +106,7 @@ def series_times(times_s: Sequence[float], white_s: float, white_level: float) -
 def take_trial(
     camera: Photographer, session: Session, shutter_s: float, series_s: Sequence[float], series: Path
 ) -> None:
-    """Store the trial frames in their session, and white frames at rising shutter times in a folder."""
+    """Take the frames of the trial session, then white frames at rising shutter times into the folder `series`."""
     for step in session.steps:
         attempt = session.journal.begin(step, f"frames/{step.stem}", camera.now())
         received = session.receive(step.stem, lambda stream, step=step: camera.capture(step.colour, shutter_s, stream))
@@ -130,7 +130,7 @@ def measure_trial(session: Session, saturation: Saturation, corners: Corners | N
     rows = tuple(row for row in result.verdict.rows if row.figure.before_session)
     lit = _tiles(white)
     dark = [_tiles(read_raw(session.folder / frame.file)) for frame in frames if frame.kind == "dark"]
-    # `acquire run` subtracts the previous dark frame from white, so that the first dark frame is 0.
+    # White without dark light is the reference, as in `acquire run`.
     levels = [dark_level(tiles, white_scale(lit - dark[0])) for tiles in dark]
     return Trial(white, result.figures, Verdict(rows), max(levels, default=0.0))
 

@@ -1,1 +1,1 @@
-"""Judge each frame as it is taken: light, chart and exposure."""
+"""Live judge: each frame of a session is judged as it is taken, by its light, chart and exposure."""

@@ -1,12 +1,13 @@
-"""Judge each frame as it is taken: content, position, sharpness, and agreement with the plan.
+"""Judge each frame of a session as it is taken: content, position, sharpness, and agreement with the plan.
 
 Each check returns its value and limits, and a message if it fails. The value is None if it could not be measured. If a
 frame fails several checks, only the cause has a message (`CAUSES`), not its consequences.
 
-The amounts of the three primaries in a frame are compared with the prediction from the codes. The comparison of colour
-does not depend on lamp brightness, which has its own check. If the colour is wrong, the frame is compared with the
-previous illuminant, other illuminants of the plan, and the ordered illuminant plus other light. Tiles and rows that
-deviate from the whole frame are covered, part of another picture, or damaged.
+The amounts of the three primaries in a frame (`acquisition.judge.state`) are compared with a prediction from the
+ordered codes, which the projector should show. Colour is compared independently of lamp brightness, which has its own
+check. If the colour is wrong, the frame is compared with the previous illuminant, with other illuminants of the plan,
+and with the ordered illuminant plus other light. Tiles and rows that deviate from the rest of the frame are covered,
+show another picture, or are damaged.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from acquisition.judge.state import (
     BLACK_DN,
     Basis,
     Codes,
+    Deviations,
     ExaminedFrame,
     Fit,
     FrameLight,
     JudgeState,
     LampState,
-    Leaning,
     Prediction,
     ProjectorModel,
     RecentFrame,
@@ -65,7 +66,7 @@ from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError, RegistrationError, counted
 from foundation.robust import robust_sigma
 
-_BEFORE_RESTART = "this frame was exposed before earlier frames proved inconsistent; those frames are repeated first"
+_BEFORE_RESTART = "an error in the first frames was found after the exposure of this frame; they are repeated first"
 
 _UNPREDICTABLE = (
     "this illuminant cannot be predicted, expected accepted frames of black and of each primary; remove the causes of "
@@ -75,7 +76,7 @@ _UNPREDICTABLE = (
 
 @dataclass(frozen=True, eq=False)
 class _FrameChecks:
-    """Result of the checks of a frame; `deviating`: (T,) bool, tiles that deviate; None if not measured."""
+    """Result of the checks of a frame; `deviating`: (T,) bool, whether each tile deviates; None if not measured."""
 
     frame: Frame
     checks: tuple[Check, ...]
@@ -89,11 +90,11 @@ class LiveJudge:
 
     def __init__(self, settings: LabSettings, chart: Chart, illuminations: Sequence[Illuminant]) -> None:
         self._settings = settings
-        # A chart without tags needs corners given by hand, which a run does not have.
+        # A chart without tags cannot be used, because it needs corners that a person marks.
         self._chart = chart if settings.judge.chart and chart.tags else None
         self._plan = tuple(dict.fromkeys(light.colour for light in illuminations))
         self._state = self._base = JudgeState()
-        self._fresh = True
+        self._is_new_run = True
 
     @property
     def state(self) -> JudgeState:
@@ -101,11 +102,11 @@ class LiveJudge:
         return self._state
 
     def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
-        """Update the state with a frame of an earlier run; see `experiment.session.records.FrameJudge.recall`."""
+        """Update the state by a frame of an earlier run; see `experiment.session.records.FrameJudge.recall`."""
         frame = Frame.from_bytes(measurement) if measurement else None
         if frame is None:
             is_lost = accepted and step.kind in ("white", "dark")
-            self._state = replace(self._state, lost=self._state.lost or is_lost)
+            self._state = replace(self._state, has_lost_reference=self._state.has_lost_reference or is_lost)
             return
         light = None if self._state.basis is None else self._state.basis.light(frame.measured)
         self._state = self._state.updated(step, ExaminedFrame(frame, light, accepted))
@@ -113,11 +114,11 @@ class LiveJudge:
     def after_pause(self) -> None:
         """Allow for changes of lamp and chart; see `experiment.session.records.HandlesPauses`."""
         self._state = self._base = self._state.paused()
-        self._fresh = False
+        self._is_new_run = False
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
         """Judge a raw file; see `experiment.session.records.FrameJudge.judge`."""
-        if self._fresh:
+        if self._is_new_run:
             self.after_pause()
         restart_step, self._state = self._state.restart_step, replace(self._state, restart_step=None)
         if restart_step not in (None, step.number):
@@ -161,7 +162,7 @@ class LiveJudge:
     def _examine(self, mosaic: Mosaic, black: npt.NDArray[np.float64], step: SessionStep) -> _FrameChecks:
         state, settings = self._state, self._settings
         measured = measure(mosaic, black)
-        frame = Frame(measured, np.full(3, np.nan), UNKNOWN_PLACE)
+        frame = Frame(measured, np.full(3, np.nan), UNKNOWN_POSITION)
         checks = [
             *_judge_origin(state, mosaic, measured, settings),
             _judge_repeated(state, measured),
@@ -172,8 +173,8 @@ class LiveJudge:
         if state.awaits_primaries and (step.kind == "light" or (step.kind == "response" and not _is_reference(step))):
             return _FrameChecks(frame, (*checks, Check(OFF_CODES_DEG.name, reason=_UNPREDICTABLE)))
         anchor = state.anchor
-        if step.kind != "dark" and (anchor is None or (state.rested and _has_moved(state, mosaic, black, measured))):
-            # The anchor is the first lit frame, which is white. A resumed run replaces it if the chart was moved.
+        if step.kind != "dark" and (anchor is None or (state.resumed and _has_moved(state, mosaic, black, measured))):
+            # The first lit frame, which is white, becomes the anchor. A resumed run replaces it if the chart was moved.
             try:
                 anchor = Anchor.from_white(mosaic, black, self._chart)
             except RegistrationError as error:
@@ -206,13 +207,13 @@ class LiveJudge:
         measured = frame.measured
         primary = primary_of(step.colour) if step.kind == "response" else None
         checks: list[Check] = []
-        if primary is not None and not state.modelled:
+        if primary is not None and not state.has_primaries:
             checks.append(judge_first_primary(state, measured, primary))
         if state.basis is None:
             return _FrameChecks(frame, tuple(checks))
         light = state.basis.light(measured)
-        if not state.modelled and step.kind == "response":
-            # A basis from white cannot describe a frame of one primary.
+        if not state.has_primaries and step.kind == "response":
+            # A basis from the white frame alone cannot describe a frame of one primary.
             return _FrameChecks(frame, tuple(checks), light)
         moved = frame.moved_px if not np.isnan(frame.moved_px).any() else state.moved_px
         previous = state.recent[-1] if state.recent else None
@@ -221,8 +222,8 @@ class LiveJudge:
         judge = self._settings.judge
         of_light, lamp = _judge_light(state, step, light, self._plan, judge.light_deg, judge.drift_percent)
         checks += [*evenness, *of_light]
-        if step.kind == "white" and state.modelled:
-            # Reported only: never a reason to refuse.
+        if step.kind == "white" and state.has_primaries:
+            # This value is only reported; it is never a reason to refuse a frame.
             checks.append(Check(ADDITIVITY.name, round(100 * state.model.overlap, 2), None, None, "%"))
         return _FrameChecks(frame, tuple(checks), light, uneven, lamp)
 
@@ -255,11 +256,11 @@ def _paper_rgb(paper: npt.NDArray[np.float64]) -> tuple[float, float, float] | N
 
 
 def _judge_basis(state: JudgeState, following: JudgeState) -> Check | None:
-    # One frame of a primary cannot show that the chart is partly covered, but all later frames depend on it.
-    if state.modelled or not following.modelled or state.witness is None or following.basis is None:
+    # A frame of one primary cannot show that the chart is partly covered, but would falsify all later comparisons.
+    if state.has_primaries or not following.has_primaries or state.white_or_grey is None or following.basis is None:
         return None
     moved = np.zeros(2) if following.moved_px is None else following.moved_px
-    checks, _ = _judge_evenness(following.basis, following.basis.light(state.witness), state.witness, moved)
+    checks, _ = _judge_evenness(following.basis, following.basis.light(state.white_or_grey), state.white_or_grey, moved)
     if all(check.passed for check in checks):
         return None
     uneven = next((check for check in checks if check.name == "uniformity"), Check(UNIFORMITY.name))
@@ -318,7 +319,7 @@ def _independence(frame: Measured, reference: Measured) -> float | None:
     if frame.samples.shape != reference.samples.shape or len(frame.samples) == 0:
         return None
     noise, other_noise = frame.green_noise, reference.green_noise
-    if min(noise.spread, other_noise.spread) < limits.LEAST_NOISE:
+    if min(noise.spread, other_noise.spread) < limits.MIN_NOISE_DN:
         return None
     correlation = float((noise.pattern * other_noise.pattern).mean() / (noise.deviation * other_noise.deviation))
     return float(np.sqrt(max(1 - max(correlation, 0.0) ** 2, 0.0)))
@@ -328,7 +329,7 @@ def _judge_exposure(
     state: JudgeState, measured: Measured, step: SessionStep, settings: LabSettings
 ) -> tuple[Check, Check]:
     exposure = Exposure(measured.clipped, measured.brightest_dn, measured.range_dn)
-    # If there is a white frame, `judge_dark` compares dark frames with it instead.
+    # If there is a white frame, `judge_dark` judges the dark frame relative to white.
     is_compared = step.kind == "dark" and state.white is not None
     reason = "" if is_compared else refusal(exposure, step.kind, settings.limits) or ""
     clipped = 100 * measured.clipped > settings.limits.clipped_percent and step.kind != "dark"
@@ -339,7 +340,7 @@ def _judge_exposure(
     )
 
 
-UNKNOWN_PLACE: npt.NDArray[np.float64] = np.full(2, np.nan)  # Position of a chart that could not be measured
+UNKNOWN_POSITION: npt.NDArray[np.float64] = np.full(2, np.nan)  # Position of a chart that could not be measured
 
 _UNRECOGNISED = (
     "the chart was not detected at its last position: it is covered, out of focus, or has moved by more than its tags "
@@ -356,10 +357,10 @@ def _best_channel(measured: Measured) -> tuple[Channel, float]:
 def _has_moved(state: JudgeState, mosaic: Mosaic, black: npt.NDArray[np.float64], measured: Measured) -> bool:
     assert state.anchor is not None
     channel, level = _best_channel(measured)
-    if level < limits.DIM_DN / 2:
+    if level < limits.MIN_PAPER_DN / 2:
         return False
     shift = state.anchor.shift(mosaic, black, channel)
-    return shift.gauges == 0 or shift.length_px > limits.MOVED_FOLLOWED_PX
+    return shift.gauges == 0 or shift.length_px > limits.MOVEMENT_ACCEPTED_PX
 
 
 def _judge_movement(
@@ -370,23 +371,23 @@ def _judge_movement(
     frame: Frame,
     judge: JudgeSettings,
 ) -> tuple[list[Check], npt.NDArray[np.float64]]:
-    """Measure movement and blur against the anchor's frame; return also the position of the chart.
+    """Measure movement and blur relative to the anchor; return also the position of the chart.
 
     `black`: (2, 2) float64 counts of the frame. The position is (2,) float64 half-size px right and down; NaN if it
     could not be measured.
     """
     channel, _ = _best_channel(frame.measured)
     paper = float(np.nan_to_num(frame.paper[CHANNELS.index(channel)]))
-    if paper < limits.DIM_DN:
+    if paper < limits.MIN_PAPER_DN:
         return [
             Check("movement", None, None, judge.moved_px, "px"),
             Check("blur", None, None, judge.blur_px, "px"),
-        ], UNKNOWN_PLACE
+        ], UNKNOWN_POSITION
     shift = anchor.shift(mosaic, black, channel)
     if shift.gauges == 0:
         large_shift_px = anchor.displacement(mosaic, black, channel)
         if large_shift_px is None:
-            return [Check("movement", None, None, judge.moved_px, "px", _UNRECOGNISED)], UNKNOWN_PLACE
+            return [Check("movement", None, None, judge.moved_px, "px", _UNRECOGNISED)], UNKNOWN_POSITION
         reason, distance = _movement_reason(large_shift_px, judge.moved_px), round(float(np.hypot(*large_shift_px)), 3)
         return [Check("movement", distance, None, judge.moved_px, "px", reason)], np.array(large_shift_px)
     position = np.array([shift.dx, shift.dy])
@@ -394,15 +395,15 @@ def _judge_movement(
     moved = float(np.hypot(*change))
     reason = ""
     if moved > judge.moved_px:
-        steady = float(np.hypot(*(position - np.array(state.candidate[1:])))) <= limits.STEADY_PX
-        followed = steady and float(np.hypot(*position)) <= limits.MOVED_FOLLOWED_PX
-        reason = "" if followed or state.rested else _movement_reason(change.tolist(), judge.moved_px)
+        is_repeated = float(np.hypot(*(position - np.array(state.to_confirm[1:])))) <= limits.SAME_POSITION_PX
+        is_confirmed = is_repeated and float(np.hypot(*position)) <= limits.MOVEMENT_ACCEPTED_PX
+        reason = "" if is_confirmed or state.resumed else _movement_reason(change.tolist(), judge.moved_px)
     checks = [Check("movement", round(moved, 3), None, judge.moved_px, "px", reason)]
-    if paper < limits.BLUR_DIM_DN:
+    if paper < limits.MIN_PAPER_FOR_BLUR_DN:
         return [*checks, Check("blur", None, None, judge.blur_px, "px")], position
     softer = float(np.sign(shift.blur_growth_px2) * np.sqrt(abs(shift.blur_growth_px2)))
     blurred = ""
-    low = -limits.SHARPER * judge.blur_px
+    low = -limits.SHARPENING_RATIO * judge.blur_px
     if not low <= softer <= judge.blur_px:
         blurred = (
             f"the frame is {'softer' if softer > 0 else 'sharper'} than the first white frame by a blur of "
@@ -420,12 +421,12 @@ def _movement_reason(shift_px: Sequence[float], allowed_px: float) -> str:
     )
 
 
-_SIGMAS = 6.0  # Significant change of a mean, in standard deviations of its noise
+_DARK_CHANGE_SIGMAS = 6.0  # Significant change of a mean, in standard deviations of its noise
 
-_TILES = 16  # Tiles averaged to judge the change of a dark frame: a lamp in a corner lights about as many
+_REGION_TILES = 16  # Tiles in one region of a dark frame. A lamp in a corner lights about as many.
 
-# Most immediate repetitions of the first frames, if later frames contradict them. A passing disturbance ends within a
-# minute; a person must remove any other.
+# Largest number of immediate repetitions of the first frames, if later frames contradict them. Most disturbances end
+# within a minute; others must be removed by a person.
 MOST_RESTARTS: Final = 2
 
 # Checks that compare a frame with earlier frames.
@@ -434,15 +435,15 @@ _CONTRADICTIONS: Final = (
     OFF_CODES_DEG.name, STRAY_SHARE.name, DARK_DRIFT.name, OFF_BRIGHTNESS.name,
 )  # fmt: skip
 
-# Amount of light in a dark frame, share of a full primary, above which it may show the previous illuminant.
-_STALE_LEAST = 0.02
+# Amount of a primary in a dark frame above which the frame may still show the previous illuminant.
+_STALE_LIGHT = 0.02
 
 
 def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_percent: float) -> tuple[Check, ...]:
-    """Check that a dark frame is dark, and has changed little since the first one.
+    """Check that a dark frame is dark, and that its light has changed little since the first dark frame.
 
-    Both limits are percent of white in the same place and channel. The change is the largest of 24 regions, so that a
-    lamp in a corner is detected.
+    Both limits are percent of white in the same place and channel. The largest change of 24 regions is judged, so that
+    a lamp in a corner is detected.
     """
     if state.white is None:
         return (Check(LEAK_SHARE.name),)
@@ -452,7 +453,7 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
     previous = state.recent[-1] if state.recent else None
     if value > dark_percent and state.basis is not None and previous is not None and previous.amounts is not None:
         amounts = state.basis.light(frame).amounts
-        if amounts.max() > _STALE_LEAST and _light_distance(amounts, previous.amounts, 0.003) < 2 * limits.STALE_SIGMAS:
+        if amounts.max() > _STALE_LIGHT and _light_distance(amounts, previous.amounts, 0.003) < 2 * limits.STALE_SIGMAS:
             stale = (
                 f"the dark frame still shows the previous illuminant, {value:.1f} % of white, at most "
                 f"{dark_percent:g} % allowed; check whether the screen is frozen, or increase sequence.settle_s"
@@ -468,11 +469,11 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
     if first is not None and not reason:
         changed = _by_region(100 * (frame.tiles - first.tiles) / scale)
         noise = 100 * float(np.sqrt(frame.noise.variance(frame.level).max() / frame.places.tile_blocks.mean()))
-        noise /= float(scale.min()) * _TILES**0.5
+        noise /= float(scale.min()) * _REGION_TILES**0.5
         drift = float(np.abs(changed).max())
         black = 100 * BLACK_DN / float(scale.min())
-        limit = max(ambient_percent, _SIGMAS * 2**0.5 * float(np.hypot(noise, black)))
-        # Without optical black, the black level is a constant in the file, and its drift looks like light.
+        limit = max(ambient_percent, _DARK_CHANGE_SIGMAS * 2**0.5 * float(np.hypot(noise, black)))
+        # Without optical black, the black level is a constant in the file. Its real drift looks like light.
         if not frame.black_measured:
             limit = max(limit, 100 * 8.0 / float(scale.min()))
         reason = ""
@@ -487,7 +488,7 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
 
 
 def white_scale(white: _Array) -> _Array:
-    """Return the white (T, 3) by which tiles are divided; each value is at least a third of the mean."""
+    """Return the white (T, 3) by which tiles are divided; values are raised to at least a third of the mean."""
     return np.maximum(white, np.maximum(white.mean(axis=0) / 3, 1.0))
 
 
@@ -498,27 +499,27 @@ def dark_level(tiles: _Array, scale: _Array) -> float:
 
 
 def _by_region(tiles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    side = round(_TILES**0.5)
+    side = round(_REGION_TILES**0.5)
     grid = tiles.reshape(TILE_ROWS // side, side, TILE_COLUMNS // side, side, 3)
     return np.asarray(grid.mean(axis=(1, 3))).reshape(-1, 3)
 
 
 def judge_white(first: Frame | None, frame: Frame) -> Check:
-    """Compare white paper with its first frame under the same illuminant, white or the brightest grey."""
+    """Compare white paper with the first frame under the same illuminant (white, or the brightest grey)."""
     if first is None or np.isnan(frame.paper).any() or np.isnan(first.paper).any():
         return Check(WHITE_DRIFT.name)
     drift = float(100 * (frame.paper.sum() / max(first.paper.sum(), 1.0) - 1))
     reason = ""
-    if abs(drift) > limits.LAMP_TOTAL:
+    if abs(drift) > limits.MAX_WHITE_DRIFT:
         reason = (
             f"the brightness of white paper has changed by {drift:+.0f} % since the first frame of the session, at "
-            f"most ±{limits.LAMP_TOTAL:g} % allowed; let the lamp warm up, or start a new session"
+            f"most ±{limits.MAX_WHITE_DRIFT:g} % allowed; let the lamp warm up, or start a new session"
         )
-    return Check(WHITE_DRIFT.name, round(drift, 2), -limits.LAMP_TOTAL, limits.LAMP_TOTAL, "%", reason)
+    return Check(WHITE_DRIFT.name, round(drift, 2), -limits.MAX_WHITE_DRIFT, limits.MAX_WHITE_DRIFT, "%", reason)
 
 
 def judge_first_primary(state: JudgeState, frame: Measured, primary: int) -> Check:
-    """Check that the first frame of a primary shows it: relative to white, its own channel is the brightest."""
+    """Check that the first frame of a primary shows this primary: its channel is the brightest relative to white."""
     if state.white is None:
         return Check(OFF_CODES_DEG.name)
     dark = np.zeros(3) if state.dark is None else state.dark.level
@@ -537,14 +538,15 @@ def judge_first_primary(state: JudgeState, frame: Measured, primary: int) -> Che
 
 
 def judge_first_frames(state: JudgeState, step: SessionStep, cause: Check | None, judge: JudgeSettings) -> Check | None:
-    """Return the check by which the first frames of a session or run are inconsistent; None if they are consistent.
+    """Return the check that shows an error in the first frames of a session or run; None if there is no error.
 
-    The model is learnt from them, so that only later frames can show an error. A step that is refused twice
-    contradicts them. With the first illuminant, white is compared with its prediction from the other frames.
+    The model is learnt from the first frames, so only later frames can show an error in them. One sign is a step that
+    is refused twice. The other sign is a white frame that differs from its prediction by the other first frames; it is
+    tested with the first illuminant.
 
-    `cause`: the check that refuses the frame; None if it is accepted.
+    `cause`: the check that refuses the current frame; None if the frame is accepted.
     """
-    if not state.founding or all(not any(frame.codes) for frame in state.first_frames):
+    if not state.is_starting or all(not any(frame.codes) for frame in state.first_frames):
         return None
     check = cause
     if cause is None:
@@ -552,7 +554,7 @@ def judge_first_frames(state: JudgeState, step: SessionStep, cause: Check | None
     elif cause.name not in _CONTRADICTIONS or step.number not in state.contradicted:
         check = None
     elif state.awaits_primaries and cause.value is None:
-        # Without primaries the frame cannot be predicted.
+        # The frame was refused only because it cannot be predicted without primaries.
         check = None
     if check is None:
         return None
@@ -580,14 +582,14 @@ def _inconsistent_white(state: JudgeState, judge: JudgeSettings) -> Check | None
             f"primary frames, at most {limit:.1f}° allowed"
         )
         return Check(OFF_CODES_DEG.name, round(fit.angle_deg, 3), None, round(limit, 3), "°", reason)
-    room = max(judge.drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
-    if abs(fit.brightness) > room:
+    margin = max(judge.drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
+    if abs(fit.brightness) > margin:
         percent = 100 * float(np.expm1(fit.brightness))
         reason = (
             f"the brightness of the first white frame differs by {percent:+.1f} % from the prediction by grey and "
-            f"primary frames, at most ±{100 * room:.1f} % allowed"
+            f"primary frames, at most ±{100 * margin:.1f} % allowed"
         )
-        return lamp_check(fit.brightness, room, reason)
+        return lamp_check(fit.brightness, margin, reason)
     return None
 
 
@@ -597,8 +599,8 @@ class _FrameCause:
 
     - `explains`: checks that fail as a consequence.
     - `lasts`: whether every repeated frame fails, too.
-    - `is_hidden`: whether only a reference can show it, so that frames since the last good reference are voided.
-    - `in_each_light`: whether every illuminant shows it, if frames of the primaries predict it.
+    - `is_hidden`: whether only references can show the cause. Frames since the last good reference are then voided.
+    - `in_each_light`: whether every illuminant shows the cause, provided that the illuminant can be predicted.
     """
 
     explains: frozenset[str] = frozenset()
@@ -614,7 +616,7 @@ _AMBIENT = _FrameCause(frozenset({OFF_CODES_DEG.name, OFF_BRIGHTNESS.name, "unif
 
 _LIGHT_CHECKS = frozenset({"uniformity", "blur", OFF_CODES_DEG.name, OFF_BRIGHTNESS.name, WHITE_DRIFT.name})
 
-# Checks in the order in which they are reported as the cause: earlier ones explain later ones.
+# If several checks fail, the first one in this order is reported as the cause.
 CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
     {
         "file": _FrameCause(),
@@ -641,24 +643,24 @@ CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
     }
 )
 
-# Ratio of a tile's deviation to its limit above which uneven light explains small movement and blur. In 16
-# simulated frames with a blur of 0.5 px, only one tile exceeded its limit.
+# Uneven light explains a small movement or blur if a tile deviates by this multiple of its limit. A blur of 0.5 px
+# alone rarely makes a tile exceed its limit (simulated).
 _CLEARLY_UNEVEN = 2.0
 
-# Blur, px, below which rows match (simulated: none deviates at 0.75 px). If they deviate at less, they cause the blur.
+# Blur, px, below which rows still match (simulated). If rows deviate with less blur, wrong rows explain the blur.
 _ROWS_MATCH_PX = 0.7
 
 
 def _without_consequences(checks: Sequence[Check]) -> tuple[Check, ...]:
-    """Return the checks in the order of causes, without the messages of consequences of the first cause."""
-    # Two checks may have one name: blur of tags and of rows, colour and added light. A failed one is kept.
+    """Return the checks in the order of `CAUSES`, without the messages of the consequences of the first cause."""
+    # Two checks may have the same name, such as blur of tags and blur of rows. The failed check is kept.
     by_name = {check.name: check for check in sorted(checks, key=lambda check: bool(check.reason))}
     names = list(CAUSES)
     order = sorted(by_name.values(), key=lambda check: names.index(check.name))
     reasons = [check.name for check in order if check.reason]
     if "movement" in reasons and len(reasons) > 1:
         movement = next(check for check in order if check.name == "movement")
-        # If no tag was detected, another failed check is the cause; if tags have moved, the movement is.
+        # A movement has no value if no tag was detected; then another failed check is the cause.
         if movement.value is None:
             reasons.remove("movement")
     blur = by_name.get("blur")
@@ -669,7 +671,7 @@ def _without_consequences(checks: Sequence[Check]) -> tuple[Check, ...]:
     uneven = by_name.get("uniformity")
     if uneven is not None and uneven.reason and (uneven.value or 0.0) > _CLEARLY_UNEVEN * (uneven.high or np.inf):
         # Edges of a wrong picture shift and soften the measured edges of the chart.
-        for name, limit in (("movement", limits.MOVED_FOLLOWED_PX), ("blur", _ROWS_MATCH_PX)):
+        for name, limit in (("movement", limits.MOVEMENT_ACCEPTED_PX), ("blur", _ROWS_MATCH_PX)):
             check = by_name.get(name)
             if name in reasons and check is not None and check.value is not None and abs(check.value) < limit:
                 reasons.remove(name)
@@ -680,29 +682,31 @@ def _without_consequences(checks: Sequence[Check]) -> tuple[Check, ...]:
 
 
 def _voids_others(state: JudgeState, cause: str) -> bool:
-    hidden = CAUSES[cause].is_hidden or (CAUSES[cause].in_each_light and not state.modelled)
+    hidden = CAUSES[cause].is_hidden or (CAUSES[cause].in_each_light and not state.has_primaries)
     return hidden or cause in state.unmeasured
 
 
 def _is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
-    # If the lamp has changed at the start of a run, all illuminants up to the next white frame would be lost.
+    # A change of the lamp before the start of a run is lasting. Otherwise all illuminants before the next white
+    # frame would be lost.
     is_changed_lamp = cause == WHITE_DRIFT.name and is_brightest_grey(step)
     # If the first frame of a session is overexposed, so is its repetition.
     is_overexposed = cause == "clipping" and state.white is None
     return is_changed_lamp or is_overexposed or CAUSES[cause].lasts or state.refusals[1] >= limits.LASTING_FRAMES
 
 
-_SAME_SD = 0.0015  # Least relative scatter of amounts between two frames of one illuminant
+_MIN_SCATTER = 0.0015  # Least relative scatter of amounts between two frames of one illuminant.
 
-_SAME_FLOOR = 4e-4  # Least scatter of amounts in the dark, share of a full primary
+_DARK_SCATTER = 4e-4  # Least scatter of amounts in the dark, share of a full primary.
 
-_NEAREST = 12  # Illuminants of the plan with which a wrong one is compared in full
+_COMPARED_ILLUMINANTS = 12  # Number of similar illuminants of the plan with which a wrong illuminant is compared.
 
 _PRIMARIES = ("red", "green", "blue")
 
-_ORDERED_LEAST = 0.005  # Least ordered light of a primary, share of its full light, that can be missing
+_MIN_ORDERED_LIGHT = 0.005  # Least ordered light of a primary, share of its full light, that is reported as missing.
 
-_MISSING = 0.05  # Share of its ordered light below which a primary is missing: the leak at black is less
+# Share of its ordered light below which a primary is missing. The leak of a projector at black is less.
+_MISSING_SHARE = 0.05
 
 _Array = npt.NDArray[np.float64]
 
@@ -715,69 +719,68 @@ def _judge_light(
     angle_deg: float,
     drift_percent: float,
 ) -> tuple[tuple[Check, ...], LampState]:
-    """Compare the light of a frame with its step; return the checks, and the state of the lamp."""
+    """Compare the light of a frame with the codes of its step; return the checks and the state of the lamp."""
     codes = step.colour
     previous = state.recent[-1] if state.recent else None
-    if not state.modelled:
+    if not state.has_primaries:
         return (_without_model(light, codes, previous),), LampState()
     comparison = _LightComparison(state.model, light, codes, previous, plan)
     fit = comparison.fit
     limit = max(angle_deg, fit.angle_limit(limits.LIGHT_SIGMAS))
-    room = max(drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
+    margin = max(drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
     is_wrong = fit.angle_deg > limit
     reason, added = "", 0.0
-    if is_wrong or fit.distance > limits.STALE_SIGMAS or abs(fit.brightness) > room:
-        reason, added = comparison.cause(is_wrong, room, was_refused=state.refusals[0] == OFF_CODES_DEG.name)
+    if is_wrong or fit.distance > limits.STALE_SIGMAS or abs(fit.brightness) > margin:
+        reason, added = comparison.cause(is_wrong, margin, was_refused=state.refusals[0] == OFF_CODES_DEG.name)
     stepped = False
     lamp = ""
-    if not reason and abs(fit.brightness) > room:
-        level = state.candidate[0]
-        # A small step that two frames show: accepted, because each illuminant has its own ground truth.
-        stepped = abs(fit.brightness) <= limits.LAMP_FOLLOWED and abs(fit.brightness - level) <= room / 2
-        lamp = "" if stepped else _brightness_reason(fit.brightness, room)
-    leaning = Leaning(((fit.brightness, fit.brightness_sd),), (comparison.neutral_light(),))
-    if not reason and not lamp and not stepped and not state.rested:
-        lamp, added = slow_change(state.leaning.extended(leaning), drift_percent / 100)
+    if not reason and abs(fit.brightness) > margin:
+        level = state.to_confirm[0]
+        # A small step that two frames show is accepted, because each illuminant has its own ground truth.
+        stepped = abs(fit.brightness) <= limits.LAMP_STEP_ACCEPTED and abs(fit.brightness - level) <= margin / 2
+        lamp = "" if stepped else _brightness_reason(fit.brightness, margin)
+    deviations = Deviations(((fit.brightness, fit.brightness_sd),), (comparison.neutral_light(),))
+    if not reason and not lamp and not stepped and not state.resumed:
+        lamp, added = slow_change(state.deviations.extended(deviations), drift_percent / 100)
         reason = _ambient_reason(added) if added else ""
     ambient = (Check(STRAY_SHARE.name, round(100 * added, 2), None, None, "%", reason),) if added else ()
-    # If another cause changes the light, its brightness does not measure the lamp.
     checks = (
         *ambient,
         Check(OFF_CODES_DEG.name, round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
-        lamp_check(fit.brightness, room, lamp),
+        lamp_check(fit.brightness, margin, lamp),
     )
-    return checks, LampState(fit.brightness, stepped, leaning)
+    return checks, LampState(fit.brightness, stepped, deviations)
 
 
-def lamp_check(brightness: float, room: float, reason: str) -> Check:
-    """Return the check of the log brightness of a frame, relative to the prediction, with limit `room`.
+def lamp_check(brightness: float, margin: float, reason: str) -> Check:
+    """Return the check of `brightness`, the logarithm of measured over predicted brightness, with limit `margin`.
 
-    No limit is stated if the scatter of the lamp is still unknown: it would be above the limit of a session.
+    A limit above `MAX_WHITE_DRIFT` is not stated. It only means that the scatter of the lamp is still unknown.
     """
-    allowed = round(100 * room, 2) if 100 * room < limits.LAMP_TOTAL else None
+    allowed = round(100 * margin, 2) if 100 * margin < limits.MAX_WHITE_DRIFT else None
     low = None if allowed is None else -allowed
     return Check(OFF_BRIGHTNESS.name, round(100 * float(np.expm1(brightness)), 2), low, allowed, "%", reason)
 
 
-def slow_change(leaning: Leaning, drift: float) -> tuple[str, float]:
-    """Return the message about a changed lamp, and the added light (share of white), from the last frames together.
+def slow_change(deviations: Deviations, drift: float) -> tuple[str, float]:
+    """Judge the last frames together; return a message about a changed lamp, and the added light (share of white).
 
-    `drift`: change of brightness that is always allowed, 0 … 1.
+    Return ("", 0.0) if nothing is significant. `drift`: change of brightness that is always allowed, 0 … 1.
     """
-    for count in range(2, len(leaning.lamp) + 1):
-        added, sd = weighted_mean(leaning.added[:count])
-        if added > max(limits.ADDED_LEAST, limits.ADDED_SIGMAS * sd):
+    for count in range(2, len(deviations.lamp) + 1):
+        added, sd = weighted_mean(deviations.added[:count])
+        if added > max(limits.MIN_ADDED_LIGHT, limits.ADDED_SIGMAS * sd):
             return "", added
-        brightness, sd = weighted_mean(leaning.lamp[:count])
-        if abs(brightness) > (room := max(drift, limits.BRIGHTNESS_SIGMAS * sd)):
-            return _brightness_reason(brightness, room), 0.0
+        brightness, sd = weighted_mean(deviations.lamp[:count])
+        if abs(brightness) > (margin := max(drift, limits.BRIGHTNESS_SIGMAS * sd)):
+            return _brightness_reason(brightness, margin), 0.0
     return "", 0.0
 
 
 def _light_distance(amounts: _Array, reference: _Array, scatter: float) -> float:
     """Return the distance of the amounts (3,) of two frames in standard deviations; `scatter` is relative."""
-    sd = max(scatter, _SAME_SD)
-    variance = 2 * ((sd * np.maximum(amounts, reference)) ** 2 + _SAME_FLOOR**2)
+    sd = max(scatter, _MIN_SCATTER)
+    variance = 2 * ((sd * np.maximum(amounts, reference)) ** 2 + _DARK_SCATTER**2)
     return float(np.sqrt(((amounts - reference) ** 2 / variance).sum()))
 
 
@@ -805,10 +808,10 @@ class _LightComparison:
         """Agreement with the ordered codes."""
         return self.model.compare(self.light.amounts, self.codes, self.light.covariance)
 
-    def cause(self, is_wrong: bool, room: float, *, was_refused: bool) -> tuple[str, float]:
+    def cause(self, is_wrong: bool, margin: float, *, was_refused: bool) -> tuple[str, float]:
         """Return the message about a wrong colour, or "", and the light added to the ordered illuminant.
 
-        `is_wrong`: whether the colour is beyond its limit. `room`: allowed change of log lamp brightness.
+        `is_wrong`: whether the colour is beyond its limit. `margin`: allowed change of log lamp brightness.
         `was_refused`: whether the previous frame was also refused for its colour.
         """
         fit = self.fit
@@ -837,10 +840,10 @@ class _LightComparison:
             if coloured:
                 return _ambient_reason(coloured), coloured
             repeated = was_refused and not changed and distance < limits.LIGHT_SIGMAS
-            if repeated and not other_illuminant and fit.angle_deg <= limits.LIGHT_FOLLOWED_DEG:
+            if repeated and not other_illuminant and fit.angle_deg <= limits.ANGLE_ACCEPTED_DEG:
                 return "", 0.0
             return other_illuminant or self._wrong_reason(), 0.0
-        if fit.brightness > room and ambient is not None and ambient[1] + 9 < fit.distance**2:
+        if fit.brightness > margin and ambient is not None and ambient[1] + 9 < fit.distance**2:
             return _ambient_reason(ambient[0]), ambient[0]
         if fit.distance > limits.STALE_SIGMAS:
             return self._other_reason(squared), 0.0
@@ -865,8 +868,8 @@ class _LightComparison:
         sd = np.sqrt(
             np.diag(self.expected.with_lamp + self.light.covariance) + (self.model.brightness_sd * ordered) ** 2
         )
-        is_ordered = ordered > np.maximum(_ORDERED_LEAST, limits.LIGHT_SIGMAS * sd)
-        is_missing = is_ordered & (amounts < _MISSING * ordered)
+        is_ordered = ordered > np.maximum(_MIN_ORDERED_LIGHT, limits.LIGHT_SIGMAS * sd)
+        is_missing = is_ordered & (amounts < _MISSING_SHARE * ordered)
         if (
             not is_missing.any()
             or (np.abs(amounts - ordered) > limits.LIGHT_SIGMAS * sd)[~is_missing].any()
@@ -897,12 +900,12 @@ class _LightComparison:
     def _other_reason(self, squared: float) -> str:
         # Black or white may also be shown instead of the ordered illuminant.
         best: tuple[float, Codes] | None = None
-        # Only codes of similar amounts are compared in full.
+        # The full comparison is slow, so only codes of similar amounts are compared.
         for codes in self._nearest([*self.plan, (0, 0, 0), (255, 255, 255)]):
             if codes == self.codes:
                 continue
             if not any(codes):
-                distance = float(((self.light.amounts / (3 * _SAME_FLOOR)) ** 2).sum())
+                distance = float(((self.light.amounts / (3 * _DARK_SCATTER)) ** 2).sum())
             else:
                 fit = self.model.compare(self.light.amounts, codes, self.light.covariance)
                 distance = fit.distance**2 + (fit.brightness / (fit.brightness_sd + 0.01)) ** 2
@@ -910,7 +913,7 @@ class _LightComparison:
                 best = distance, codes
         if best is None or squared - best[0] < limits.OTHER_ADVANTAGE or best[0] > limits.LIGHT_SIGMAS**2:
             return ""
-        # Faint coloured light can make an illuminant look like its neighbour.
+        # Faint coloured light can make an illuminant look like a similar one of the plan.
         causes = "the projected image is late, or other light falls on the chart" if self._coloured_light() else ""
         return (
             f"the frame shows another illuminant, {_codes_text(best[1])}, but {_codes_text(self.codes)} was ordered; "
@@ -922,7 +925,7 @@ class _LightComparison:
         table = np.array(plan)
         predicted = np.stack([curves[primary, table[:, primary]] for primary in range(3)], axis=-1)
         distance = np.linalg.norm(predicted - self.light.amounts, axis=1)
-        return [plan[k] for k in np.argsort(distance, kind="stable")[:_NEAREST].tolist()]
+        return [plan[k] for k in np.argsort(distance, kind="stable")[:_COMPARED_ILLUMINANTS].tolist()]
 
     def _added_light(self, source: RecentFrame | None) -> tuple[float, float] | None:
         """Return the added neutral light, or the share of another frame's light, that explains the measured light.
@@ -936,9 +939,9 @@ class _LightComparison:
         elif source.amounts is None or source.codes == self.codes or not any(source.codes):
             return None
         else:
-            # The other light was shown instead during a share of the exposure.
+            # During a share of the exposure, the other illuminant was shown in place of the ordered one.
             direction = source.amounts - ordered
-        # Lamp brightness is fixed within its scatter: only the added light is fitted.
+        # Only the added light is fitted. Lamp brightness may vary within its scatter.
         scatter = (self.model.brightness_sd**2 + 1e-6) * np.outer(ordered, ordered)
         weight = np.linalg.inv(self.expected.covariance + self.light.covariance + scatter)
         power = float(direction @ weight @ direction)
@@ -955,7 +958,7 @@ class _LightComparison:
         excess = self.light.amounts - ordered
         variance = np.diag(self.expected.with_lamp + self.light.covariance) + (self.model.brightness_sd * ordered) ** 2
         mean = float(np.mean(excess))
-        is_added = (excess > -3 * np.sqrt(variance)).all() and limits.ADDED_LEAST < mean < limits.ADDED_MOST
+        is_added = (excess > -3 * np.sqrt(variance)).all() and limits.MIN_ADDED_LIGHT < mean < limits.MAX_ADDED_LIGHT
         return mean if is_added else 0.0
 
 
@@ -966,14 +969,14 @@ def _ambient_reason(added: float) -> str:
     )
 
 
-def _brightness_reason(brightness: float, room: float) -> str:
+def _brightness_reason(brightness: float, margin: float) -> str:
     percent = 100 * float(np.expm1(brightness))
     weaker, stronger = ("weaker", "keep people out of the light"), ("stronger", "darken the room")
     sign, remedy = weaker if percent < 0 else stronger
     return (
-        f"the light is {abs(percent):.1f} % {sign} than predicted and has the right colour, at most {100 * room:.1f} % "
-        "allowed; check the lamp and its power mode, the brightness of the projected image, shutter and aperture, and "
-        f"{remedy}"
+        f"the light is {abs(percent):.1f} % {sign} than predicted and has the right colour, at most {100 * margin:.1f} "
+        "% allowed; check the lamp and its power mode, the brightness of the projected image, shutter and aperture, "
+        f"and {remedy}"
     )
 
 
@@ -985,7 +988,7 @@ def _without_model(light: FrameLight, codes: Codes, last: RecentFrame | None) ->
     brighter = abs(float(np.log(linear[0].sum() / linear[1].sum())))
     same = _light_distance(light.amounts, last.amounts, 0.005)
     reason = ""
-    if same < 2 * limits.STALE_SIGMAS and (away > limits.NOMINAL_DEG or brighter > 0.2):
+    if same < 2 * limits.STALE_SIGMAS and (away > limits.DISTINCT_CODES_DEG or brighter > 0.2):
         reason = _stale_reason(last, codes)
     return Check(OFF_CODES_DEG.name, reason=reason)
 
@@ -1001,57 +1004,60 @@ def _codes_text(codes: Codes) -> str:
     return "black" if not any(codes) else "({}, {}, {})".format(*codes)
 
 
-# Median relative deviation below which places are reported as covered
-_DARKER = -0.1
+# Median relative deviation below which tiles are reported as covered.
+_COVERED_DEVIATION = -0.1
 
-# Share of squared deviation that may remain if a place still shows the previous illuminant: an angle of 6°.
+# Share of the squared deviation that may remain unexplained if tiles still show the previous illuminant. This is an
+# angle of 6°.
 _PREVIOUS_RESIDUAL = 0.01
 
-_WHOLE_FRAME = 0.5  # Share of deviating tiles above which the whole frame deviates
+_WHOLE_FRAME = 0.5  # Share of deviating tiles above which the whole frame deviates.
 
 # Blurs σ, half-size px, that are tried if rows deviate.
-_BLURS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
+_TRIED_BLURS_PX = (0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 
-_EXPLAINED = 0.4  # Share of the median deviation of rows that may remain if a blur is the cause
+_REMAINING = 0.4  # Share of the median deviation of rows that may remain if a blur is the cause.
 
-# Median relative deviation of rows above which a blur is tried: below it only some rows deviate.
-_BLURRED = 0.02
+# Median relative deviation of rows above which blurs are tried. With less, only some rows deviate.
+_MIN_BLURRED = 0.02
 
-_CONTRAST = 2.0  # Contrast of the chart at the edges of a tile, relative: tags, paper, patches
+_EDGE_CONTRAST = 2.0  # Relative contrast of the chart (tags, paper, patches) at the edges of a tile.
 
-_BOTH_SIGNS = 0.1  # Share of deviating rows with the rarer sign, above which rows belong to other places
+# If rows are from other places, at least this share of the deviating rows is brighter, and at least this share darker.
+_RARER_SIGN_SHARE = 0.1
 
-# Median step from row to row over the median deviation, above which rows belong to several places. Shadows, windows and
-# parts of a picture have at most 0.03, scrambled rows at least 0.2 (simulated).
-_RAGGED = 0.1
+# Ratio of the median step between neighbouring rows to the median deviation, above which rows are from several places.
+# Shadows, windows and parts of a picture have at most 0.03, scrambled rows at least 0.2 (simulated).
+_RAGGED_STEP = 0.1
 
-# Movement or blur, px, that rows at the edges of the chart tolerate: smaller ones cannot always be measured.
-_UNSEEN_PX = 1.0
+# Movement or blur, px, that rows at the edges of the chart tolerate, because less cannot always be measured.
+_UNMEASURED_PX = 1.0
 
-_EDGE = 0.15  # Relative deviation of a row per px of sideways movement: other patches at the ends of a strip
+# Relative change of a strip per px of sideways movement, which brings other patches to the ends of the strip.
+_ROW_EDGE_CHANGE = 0.15
 
 
 def _judge_evenness(
     basis: Basis, light: FrameLight, frame: Measured, moved_px: _Array, previous: RecentFrame | None = None
 ) -> tuple[list[Check], npt.NDArray[np.bool_]]:
-    """Check that a lit frame shows one illuminant everywhere; return also the deviating tiles (T,) to draw.
+    """Check that a lit frame shows one illuminant everywhere; return also which tiles (T,) bool deviate.
 
-    `moved_px`: (2,) displacement of the chart from the basis. `previous`: the previous frame, which may still be shown
-    in a part of this one, or None.
+    `moved_px`: (2,) displacement of the chart relative to the basis. `previous`: the previous frame or None; a part of
+    the current frame may still show its illuminant.
     """
     residuals = light.tiles
-    systematic = UNIFORMITY.accept if basis.of_primaries else limits.UNEVEN_WHITE
+    systematic = UNIFORMITY.accept if basis.shows_primaries else limits.UNEVEN_WITHOUT_PRIMARIES
     shift_tiles = float(np.hypot(*moved_px)) / float(np.diff(frame.places.x_edges).mean())
     # Movement brings other patches, or paper instead of the backdrop, into a tile.
-    systematic = systematic + shift_tiles * _CONTRAST * _neighbour_contrast(basis)
+    systematic = systematic + shift_tiles * _EDGE_CONTRAST * _neighbour_contrast(basis)
     allowed = np.maximum(systematic, limits.UNEVEN_SIGMAS * residuals.noise)
     excess = np.nan_to_num(residuals.relative / allowed, nan=0.0)
     deviating = excess > 1
     worst = int(excess.argmax())
-    # The coarse basis from white does not describe single tiles with few patches.
-    least_tiles = 1 if basis.of_primaries else max(1, round(limits.UNEVEN_TILES * len(deviating)))
-    late = _share_of_previous(basis, light, frame, deviating, previous)
-    reason = _uneven_reason(residuals, deviating, late) if deviating.sum() >= least_tiles else ""
+    # The coarse basis from white describes single tiles badly, so more of them must deviate.
+    least_tiles = 1 if basis.shows_primaries else max(1, round(limits.UNEVEN_TILES * len(deviating)))
+    previous_share = _share_of_previous(basis, light, frame, deviating, previous)
+    reason = _uneven_reason(residuals, deviating, previous_share) if deviating.sum() >= least_tiles else ""
     value, limit = (100 * float(np.nan_to_num(number)) for number in (residuals.relative[worst], allowed[worst]))
     checks = [Check(UNIFORMITY.name, round(value, 2), None, round(limit, 2), "%", reason)]
     if len(frame.strips):
@@ -1062,11 +1068,11 @@ def _judge_evenness(
 def _share_of_previous(
     basis: Basis, light: FrameLight, frame: Measured, deviating: npt.NDArray[np.bool_], previous: RecentFrame | None
 ) -> float:
-    """Return the share of the exposure during which tiles `deviating` (T,) bool showed the previous illuminant.
+    """Return the share of the exposure during which the tiles `deviating` (T,) bool showed the previous illuminant.
 
-    0 if another illuminant was shown, or a shadow explains the deviation as well.
+    The share is 0 if another illuminant was shown, or if a shadow explains the deviation as well.
     """
-    if previous is None or previous.amounts is None or not deviating.any() or not basis.of_primaries:
+    if previous is None or previous.amounts is None or not deviating.any() or not basis.shows_primaries:
         return 0.0
     maps = basis.maps[:, deviating]
     expected, change = (np.einsum("p,ptc->tc", a, maps) for a in (light.amounts, previous.amounts - light.amounts))
@@ -1077,14 +1083,14 @@ def _share_of_previous(
 
 
 def _fitted_share(deviation: _Array, change: _Array) -> tuple[_Array, float]:
-    """Return the shares (T,) 0 … 1 of `change` (T, 3) in `deviation` (T, 3), and the unexplained share of its power."""
+    """Return the shares (T,) 0 … 1 of `change` (T, 3) in `deviation` (T, 3), and the share that is not explained."""
     share = np.clip((deviation * change).sum(axis=1) / np.maximum((change**2).sum(axis=1), 1e-9), 0, 1)
     residual = ((deviation - share[:, None] * change) ** 2).sum() / max(float((deviation**2).sum()), 1e-9)
     return share, float(residual)
 
 
 def _neighbour_contrast(basis: Basis) -> _Array:
-    """Return (T,) float64, ≥ 1: white of the brightest tile among each tile and its neighbours, over its own."""
+    """Return (T,) float64, ≥ 1: white of the brightest neighbour of each tile, relative to white of the tile."""
     strength = np.linalg.norm(basis.maps.sum(axis=0), axis=1).reshape(TILE_ROWS, TILE_COLUMNS)
     return np.asarray(maximum_filter(strength, 3) / np.maximum(strength, 1e-6), dtype=np.float64).ravel()
 
@@ -1099,23 +1105,23 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
     checks = [Check(ROWS.name, float(count), None, float(ROWS.accept))]
     if count <= ROWS.accept:
         return checks
-    for sigma in _BLURS:
+    for sigma in _TRIED_BLURS_PX:
         soft = basis.strips(frame, light.amounts, down, sigma)
-        if soft is not None and _deviation(soft) < _EXPLAINED * _deviation(sharp) and _deviation(sharp) > _BLURRED:
+        if soft is not None and _deviation(soft) < _REMAINING * _deviation(sharp) and _deviation(sharp) > _MIN_BLURRED:
             reason = (
                 f"the frame is out of focus or shaken: its rows match with an additional blur of {sigma:g} px; check "
                 "the focus, switch off autofocus, and check for vibrations"
             )
             return [*checks, Check("blur", sigma, None, None, "px", reason)]
-    # Rows of other places are brighter and darker alternately; a shadow or other light has one sign.
+    # Rows from other places are partly brighter and partly darker. A shadow, or other light, has one sign.
     signed = sharp.signed[is_wrong]
     brighter = float((signed > 0).mean())
     ragged = _is_ragged(sharp, is_wrong)
-    if uneven and min(brighter, 1 - brighter) < _BOTH_SIGNS and not ragged:
+    if uneven and min(brighter, 1 - brighter) < _RARER_SIGN_SHARE and not ragged:
         return checks
     cause = "the file was damaged during transfer: check the cable and the memory card"
     if uneven and not ragged:
-        # A drawing on the screen has both signs, too, but is continuous from row to row.
+        # A drawing on the screen also has both signs, but changes little from row to row.
         cause = f"check the frame: a screen saver or a window covers the projected image, or {cause}"
     rows = np.flatnonzero(is_wrong.reshape(-1, SEGMENTS).any(axis=1))
     reason = (
@@ -1126,13 +1132,13 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
 
 
 def _is_ragged(residuals: Residuals, wrong_strips: npt.NDArray[np.bool_]) -> bool:
-    # The deviation of a shadow is continuous, the deviation of scrambled rows changes from row to row.
+    # The deviation of a shadow changes little from row to row, that of scrambled rows changes much.
     deviation, is_wrong = np.nan_to_num(residuals.signed).reshape(-1, SEGMENTS), wrong_strips.reshape(-1, SEGMENTS)
     are_neighbours = is_wrong[1:] & is_wrong[:-1]
     if np.count_nonzero(are_neighbours) < ROWS.accept:
         return False
     steps = np.abs(np.diff(deviation, axis=0))[are_neighbours]
-    return bool(np.median(steps) > _RAGGED * np.median(np.abs(residuals.signed[wrong_strips])))
+    return bool(np.median(steps) > _RAGGED_STEP * np.median(np.abs(residuals.signed[wrong_strips])))
 
 
 def _deviation(residuals: Residuals) -> float:
@@ -1144,26 +1150,26 @@ def _wrong_rows(basis: Basis, residuals: Residuals, moved_px: _Array) -> npt.NDA
     if not is_measured.any():
         return np.zeros(len(is_measured), dtype=np.bool_)
     usual = max(robust_sigma(residuals.signed[is_measured]), 1e-6)
-    # A row at the edge of the chart changes with the least movement.
+    # A row at an edge of the chart changes with the smallest movement.
     assert basis.strip_maps is not None
     strength = np.linalg.norm(basis.strip_maps.sum(axis=0), axis=1).reshape(-1, SEGMENTS)
     steep = np.abs(np.gradient(strength, axis=0)).ravel() / np.maximum(strength.ravel(), 1e-6)
     shift_px = float(np.hypot(*moved_px))
-    least_limit = limits.ROW_DEVIATION + _EDGE * shift_px + steep * max(shift_px, _UNSEEN_PX)
+    least_limit = limits.ROW_DEVIATION + _ROW_EDGE_CHANGE * shift_px + steep * max(shift_px, _UNMEASURED_PX)
     limit = np.maximum(least_limit, limits.ROW_SIGMAS * np.maximum(usual, residuals.noise))
     return np.asarray(np.abs(np.where(is_measured, residuals.signed, 0.0)) > limit)
 
 
-def _uneven_reason(residuals: Residuals, deviating: npt.NDArray[np.bool_], late: float) -> str:
+def _uneven_reason(residuals: Residuals, deviating: npt.NDArray[np.bool_], previous_share: float) -> str:
     lit = np.isfinite(residuals.relative)
     share = float(deviating.sum() / max(int(lit.sum()), 1))
     median = float(np.median(residuals.signed[deviating]))
     amount = f"{max(share, 0.01):.0%} of the frame, {_position_text(deviating)},"
-    if late:
+    if previous_share:
         return (
-            f"{amount} still showed the previous illuminant for {max(late, 0.01):.0%} of the exposure: only part of "
-            "the projected image had changed, or a window of that colour covers it; increase sequence.settle_s, and "
-            "close other programs that draw on the screen"
+            f"{amount} still showed the previous illuminant for {max(previous_share, 0.01):.0%} of the exposure: only "
+            "part of the projected image had changed, or a window of that colour covers it; increase "
+            "sequence.settle_s, and close other programs that draw on the screen"
         )
     if share > _WHOLE_FRAME:
         return (
@@ -1171,7 +1177,7 @@ def _uneven_reason(residuals: Residuals, deviating: npt.NDArray[np.bool_], late:
             "program draws on the screen, the projected image changed during the exposure, or other light falls on "
             "the chart"
         )
-    if median < _DARKER:
+    if median < _COVERED_DEVIATION:
         return (
             f"{amount} are {-median:.0%} darker than the rest; check whether a person or an object is in front of "
             "the chart or the projector, a window covers the projected image, or only part of the projected image has "

@@ -1,16 +1,15 @@
-"""Record of a frame: its measurements (`experiment.measures.frame`) and the position of the chart.
+"""Measurements of one frame for the live judge: light, position of the chart, and exposure.
 
-`Anchor` holds the position of the chart in the first white frame. Movement and blur of later frames are measured
-against it at gauges: the tags of the chart or, without a chart, the places with most texture
-(`experiment.framing.pictures`). `Frame` holds the measurements, and converts them to the bytes that the journal stores.
+`Anchor` is the position of the chart in the first white frame. Movement and blur of later frames are measured relative
+to the anchor, in image areas called gauges. Gauges are the tags of the chart or, without a chart, the areas with most
+texture (`experiment.framing.pictures`). `Frame` contains the measurements of a frame.
 
-Format of the bytes (version 1): a zip archive of arrays as `numpy.savez` writes it, without pickled objects. `facts` is
-UTF-8 JSON as uint8; `tiles` (T, 3) float32; `strips` (S, 3) float32 or empty; the names of an anchor's arrays begin
-with `anchor_`. Samples of noise are not stored; the digest suffices to recognise a frame. Bytes of another version are
-ignored: the judge then starts without earlier frames.
+The journal stores a `Frame` as bytes (version 1): a zip archive of arrays as of `numpy.savez`, without pickled objects.
+`facts` is UTF-8 JSON as uint8; `tiles` (T, 3) float32; `strips` (S, 3) float32 or empty; arrays of an anchor have the
+prefix `anchor_`. Samples of noise are not stored, because the digest suffices to recognise a repeated file. Bytes of
+another version are ignored, and the judge then starts without earlier frames.
 
-Positions are in 2×2 blocks of the mosaic ("half-size pixels"). T = 384 tiles, S strips of rows (four in a row of
-blocks).
+Positions are in 2×2 blocks of the mosaic ("half-size pixels"). T = 384 tiles; S strips, four in each row of blocks.
 """
 
 from __future__ import annotations
@@ -50,42 +49,42 @@ from foundation.errors import FormatError
 
 _Array = npt.NDArray[np.float64]
 
-_TEXTURE_PX = 32  # Side of a textured place that replaces a tag, half-size px
+_TEXTURE_PX = 32  # Side of a textured area that replaces a tag, half-size px.
 
-_TEXTURES = (4, 2)  # Textured places along width and height: as many as gauges are measured
+_TEXTURE_GRID = (4, 2)  # Number of textured areas along width and height.
 
-# Search radius around the predicted position of a white reference, half-size px: lens distortion and waves of the paper
-# move it as far.
-_PAPER_REACH_PX = 4
+# Search radius around the predicted position of a white reference, half-size px. Lens distortion and waves of the paper
+# may shift references that far.
+_PAPER_SEARCH_PX = 4
 
-# Smallest level of paper, as a share of the brightest references: about the fall-off of the flat field.
+# Smallest level of paper, relative to the brightest references. The flat field falls off to about this level.
 _PAPER_LEVEL = 0.7
 
-# Side of the square with the largest mean inside a reference of 10 px. The brightest of 3×3 px would be a place with
-# high noise in this frame, so that all later frames would seem darker by 0.2 %.
+# Side of the brightest square in a reference of 10 px, half-size px. A smaller square would be bright by chance, and
+# later frames would seem darker.
 _PAPER_PX = 7
 
-_MOST_PAPER = 300  # White references to measure: their mean is accurate to 0.1 % if each is to 2 %
+_MAX_REFERENCES = 300  # Number of measured white references. If each is accurate to 2 %, the mean is to 0.1 %.
 
 
 @dataclass(frozen=True, eq=False)
 class Anchor:
     """Position of the chart in a white frame.
 
-    - `framing`: its tags, or textured places instead.
+    - `framing`: tags of the chart, or textured areas in place of tags.
     - `gauges`: counts above black of each channel around the tags; 0 elsewhere.
     - `paper`: (N, 2) int64, columns and rows of blocks on white paper.
-    - `of_chart`: whether the chart was detected; if not, the places are only textured.
+    - `has_chart`: whether the chart was detected; if not, `framing` has textured areas.
     """
 
     framing: ChartPose
     gauges: dict[Channel, Plane]
     paper: npt.NDArray[np.int64]
-    of_chart: bool
+    has_chart: bool
 
     @classmethod
     def from_white(cls, mosaic: Mosaic, black: _Array, chart: Chart | None) -> Anchor:
-        """Return the anchor of a white frame; `black` (2, 2) float64 counts, `chart` None to use textured places."""
+        """Return the anchor of a white frame; `black` (2, 2) float64 counts, `chart` None to use textured areas."""
         if chart is None:
             plane = strongest_plane(mosaic, black)
             framing = _textures(plane)
@@ -93,9 +92,9 @@ class Anchor:
         else:
             framing = find_chart(mosaic, chart, "the white frame")
             whites = np.array([reference.centre_mm for reference in chart.white_references]).reshape(-1, 2)
-            paper = _paper(framing.plane.values, project(framing.homography, whites[:_MOST_PAPER]))
+            paper = _paper(framing.plane.values, project(framing.homography, whites[:_MAX_REFERENCES]))
         gauges: dict[Channel, Plane] = {c: gauges_of(mosaic, c, black, framing) for c in CHANNELS}
-        # To save memory the full plane is dropped: only the surroundings of the gauges are needed later.
+        # The full plane is dropped to save memory. Later frames are only compared around the gauges.
         small_framing = replace(framing, plane=gauges[framing.plane.channel])
         return cls(small_framing, gauges, paper, chart is not None)
 
@@ -108,7 +107,7 @@ class Anchor:
 
         `black` (2, 2) float64 counts of the frame.
         """
-        if not self.of_chart or not self.framing.tags:
+        if not self.has_chart or not self.framing.tags:
             return None
         centres_px = {tag.id: tag.centre_px for tag in detect_tags(plane_of(mosaic, channel, black))}
         shifts_px = [centres_px[tag.id] - tag.centre_px for tag in self.framing.tags if tag.id in centres_px]
@@ -118,7 +117,7 @@ class Anchor:
         return dx, dy
 
     def paper_level(self, mosaic: Mosaic, black: _Array, phases: dict[Channel, tuple[tuple[int, int], ...]]) -> _Array:
-        """Return (3,) float64: RGB counts of white paper above black, mean of the middle half of its places.
+        """Return the RGB counts (3,) float64 of white paper above black: the mean of the middle half of its places.
 
         `black`: (2, 2) float64 counts. The result is NaN without white references.
         """
@@ -133,15 +132,15 @@ class Anchor:
                 np.mean([blocks[position][y + dy, x + dx] for dy, dx in around], axis=0) - black[position]
                 for position in phases[channel]
             ]
-            # The middle half ignores a hand in front of some places. A median would depend on the noise of few places,
-            # because the light falls off by a quarter over the chart.
+            # A hand in front of some places does not change the middle half. A median would be noisier, because the
+            # light falls off over the chart.
             level[number] = np.sort(np.mean(planes, axis=0))[quarter : len(x) - quarter].mean()
         return level
 
     @property
     def outlines(self) -> tuple[_Array, ...]:
         """(K, 2) float64 each, half-size px: outlines of the tags; empty without a chart."""
-        if not self.of_chart:
+        if not self.has_chart:
             return ()
         return tuple(tag.corners_px for tag in self.framing.tags)
 
@@ -154,7 +153,7 @@ class Anchor:
 def _paper(values: npt.NDArray[np.float32], places: _Array) -> npt.NDArray[np.int64]:
     """Return (N, 2) centres of the brightest squares near `places` (N, 2) px that are as bright as paper."""
     height, width = values.shape
-    reach, half = _PAPER_REACH_PX, _PAPER_PX // 2
+    reach, half = _PAPER_SEARCH_PX, _PAPER_PX // 2
     margin = reach + half
     rounded = places.round().astype(np.int64)
     inside = ((rounded >= margin) & (rounded < (width - margin, height - margin))).all(axis=1)
@@ -175,7 +174,7 @@ def _paper(values: npt.NDArray[np.float32], places: _Array) -> npt.NDArray[np.in
 def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
     """Return (N, 2) centres of the brightest 3×3 neighbourhoods in a grid of regions.
 
-    Their noise is high in this frame: without a chart, a drift of white by some tenths of a percent is no fault.
+    They are partly bright by chance, so white seems to drift by some tenths of a percent in later frames.
     """
     smooth = cv2.blur(values, (3, 3))
     height, width = smooth.shape
@@ -198,7 +197,7 @@ def _textures(plane: Plane) -> ChartPose:
     tags: list[DetectedTag] = []
     margin = 2 * _TEXTURE_PX
     half = _TEXTURE_PX / 2
-    across, down = _TEXTURES
+    across, down = _TEXTURE_GRID
     for row in range(down):
         for column in range(across):
             y0, y1 = (max(margin, row * height // down), min(height - margin, (row + 1) * height // down))
@@ -220,7 +219,7 @@ VERSION = 1  # Version of the byte format
 class Frame:
     """Measurements of a frame.
 
-    - `measured`: measurements of its light; `strips` is empty if they were not stored.
+    - `measured`: measurements of the light; `strips` is empty if strips were not stored.
     - `paper`: (3,) float64, RGB counts of white paper above black; NaN without white references.
     - `moved_px`: (2,) displacement of the chart from the anchor, half-size px right and down; NaN if not measured.
     - `anchor`: position of the chart, if later frames are compared with this frame.
@@ -232,7 +231,7 @@ class Frame:
     anchor: Anchor | None = None
 
     def to_bytes(self, with_strips: bool) -> bytes:
-        """Return the bytes that `from_bytes` reads; `with_strips` for frames with which others are compared."""
+        """Return the bytes that `from_bytes` reads; `with_strips` for frames with which later frames are compared."""
         measured = self.measured
         facts: dict[str, Any] = {
             "version": VERSION,
@@ -251,7 +250,7 @@ class Frame:
         }
         if self.anchor is not None:
             arrays |= _anchor_arrays(self.anchor)
-            facts["anchor"] = [self.anchor.of_chart, self.anchor.framing.plane.channel]
+            facts["anchor"] = [self.anchor.has_chart, self.anchor.framing.plane.channel]
         arrays["facts"] = np.frombuffer(json.dumps(facts).encode(), dtype=np.uint8)
         stream = io.BytesIO()
         np.savez(stream, **arrays)  # pyrefly: ignore[bad-argument-type]  # no array has the name of an option
@@ -312,7 +311,7 @@ def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
         for number, corners in zip(arrays["anchor_ids"], arrays["anchor_corners"], strict=True)
     )
     residual, module, fill, turned = arrays["anchor_pose"].tolist()
-    of_chart, searched = facts
+    has_chart, searched = facts
     gauges: dict[Channel, Plane] = {
         channel: Plane(channel, np.zeros(shape, dtype=np.float32), (float(offset[0]), float(offset[1])))
         for channel, offset in zip(CHANNELS, arrays["anchor_offsets"], strict=True)
@@ -321,7 +320,7 @@ def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
         gauges[searched], tags, (), arrays["anchor_homography"], residual, module, fill,
         bool(arrays["anchor_inside"][0]), turned,
     )  # fmt: skip
-    anchor = Anchor(framing, gauges, arrays["anchor_paper"], of_chart)
+    anchor = Anchor(framing, gauges, arrays["anchor_paper"], has_chart)
     for channel in CHANNELS:
         values, crops, begin = gauges[channel].values, arrays[f"anchor_{channel}"], 0
         for x0, y0, x1, y1 in anchor.boxes():
@@ -331,16 +330,16 @@ def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
     return anchor
 
 
-# Largest difference between the exposure in a file and the one set, stops. Nominal values are rounded, and files
-# contain the nominal or the exact value: 0.3 s means 0.354 s on a dial of half stops, which is 0.24 stops. A third of a
-# stop on a dial differs by 0.2 to 0.5 stops in the file, so most of these turns are detected, and all larger ones.
+# Largest difference between the exposure in a file and the requested exposure, stops. Files contain nominal or exact
+# values: a nominal 0.3 s may be an exact 0.354 s, which is a difference of 0.24 stops. A dial that was turned by more
+# than a third of a stop is always detected.
 EXPOSURE_TOLERANCE_STOPS = 0.25
 
 
 def disagreement(mosaic: Mosaic, settings: ExposureSettings) -> str | None:
     """Return how the exposure in a raw file differs from the settings, or None if it does not.
 
-    A missing value is ignored, and so is 0, the aperture of a lens without contacts.
+    Missing values are ignored, and also an aperture of 0, which a lens without contacts has.
     """
     differing = [
         f"{name} {value:g} instead of {'none' if setting is None else f'{setting:g}'}"
@@ -370,7 +369,7 @@ def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str |
             f"{exposure.clipped:.1%} of the photosites are clipped, at most {limits.clipped_percent:g} % allowed; dim "
             "the projector, or set a shorter exposure (acquire check proposes one) and start a new session"
         )
-    # Response frames measure the tone curve of the projector: the darkest greys are dark on purpose.
+    # Response frames may be dark, because they measure the tone curve of the projector with dark greys, too.
     if kind != "response" and exposure.brightest_dn < limits.too_dark_dn:
         return (
             f"the brightest photosites are {exposure.brightest_dn:.0f} counts above black, at least "
@@ -411,4 +410,4 @@ class ExposureJudge:
         return Judgement.of_reason("exposure", judge_file(file, step.kind, self._settings))
 
     def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
-        """Do nothing: frames are judged independently."""
+        """Do nothing, because frames are judged independently."""

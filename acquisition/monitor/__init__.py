@@ -1,1 +1,1 @@
-"""Live page of `acquire monitor`, and the report of a session."""
+"""Live web page of a session (`acquire monitor`), and the report of a session."""

@@ -1,4 +1,4 @@
-"""Server of the live page: four addresses, answered from the journal (`foundation.local_server`). It never writes."""
+"""Web server of the live page of a session (`foundation.local_server`). It reads the journal and writes nothing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FRAME = re.compile(r"frame/([1-9][0-9]{0,8})\.jpg")
 
 
 def open_monitor(folder: Path, port: int, host: str = "127.0.0.1") -> MonitorServer:
-    """Return a server for a session; it does not serve yet."""
+    """Check the folder of a session, and return a server for it that is not started yet."""
     if (folder / JOURNAL_FILE).exists() or ledger_path(folder).exists():
         read_session(folder)
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -42,7 +42,7 @@ class MonitorServer(LocalServer):
         return self.watch.head().state != "absent"
 
     def answer(self, request: Request) -> Response | Refusal:
-        """Return the page, the changes of the state since a cursor, the summary, or the picture of an attempt."""
+        """Return the page, the changes since the cursor of the page, the summary, or the preview of an attempt."""
         match request.path:
             case "":
                 text, policy = self.page
@@ -54,7 +54,7 @@ class MonitorServer(LocalServer):
                 return Response("application/json", json.dumps(self.watch.head().to_plain()).encode())
             case path if match := _FRAME.fullmatch(path):
                 data = self.watch.picture(int(match[1]))
-                # Pictures can be cached: the page adds a version to their addresses.
+                # Browsers may cache previews, because the page adds a version to their addresses.
                 headers = {"Cache-Control": "private, max-age=86400"}
                 return Response("image/jpeg", data, headers) if data else Refusal(404, "this frame has no preview")
             case _:

@@ -1,14 +1,14 @@
-"""View of a session from its journal: attempts, current state, and the changes for a page.
+"""View of a session, read from its journal: attempts, state of the run, and data for the live page.
 
-Nothing is written, and no file stays open. `Head` reports the state of the run, its expected end, and the next
-action of the user. Rows that cannot change any more are read only once.
+Nothing is written. `Head` contains the state of the run, its expected end, and the next action of the user.
 
-One `SessionWatch` serves any number of pages. It opens the journal only after a change and for a short time, so that a
-session can be started, ended, deleted, replaced or restored at any time. Each change has a number; a page sends the
-newest number that it has, and receives the later changes as JSON, and previews of frames.
+A `SessionWatch` reads a session repeatedly for any number of pages. It opens the journal only after a change and for a
+short time, so the session can be started, ended, deleted, replaced or restored at any time. Rows that cannot change any
+more are read once. Each change has a number. A page sends the highest number that it has received, and gets the later
+changes as JSON.
 
-Times for a page are milliseconds since 1970 UTC, numbers have six digits; its script (`web/page.js`) reads this format.
-The page uses these data as text and numbers, never as markup.
+The script `web/page.js` reads the JSON. Times are milliseconds since 1970 UTC, and numbers have six digits. The page
+inserts all data as text, never as markup.
 """
 
 from __future__ import annotations
@@ -59,31 +59,31 @@ from foundation.colorimetry import decode_srgb
 from foundation.errors import CropError, FormatError, first_few
 from foundation.files import write_atomic
 
-RUN_STARTS = "start"  # Event at the start of the first frame of a run
+RUN_STARTS = "start"  # Name of the event at the start of the first frame of a run.
 
-# Number of frame durations after which a frame is late: a repeated download takes twice as long.
+# A frame is late after this number of usual frame durations. A repeated download needs two.
 LATE_FRAMES = 3
 
-AT_WORK = ("running", "waiting", "paused", "late")  # States of an active run
+AT_WORK = ("running", "waiting", "paused", "late")  # States of an active run.
 
-# Names of devices in sentences, for which a run may hang or wait.
+# Causes of a delay, a pause or missing frames, as named in the sentences of a run.
 CAUSES = ("the camera", "the screen", "the projector", "the disk", "the frames")
 
-# Free space below which a disk is full before the first frame: a row of the journal has 100 kB.
+# Free space below which a disk counts as full before the first frame. A row of the journal has 100 kB.
 LEAST_FREE_BYTES = 1 << 20
 
-LOOK = "check the camera, its cable and the computer"  # Remedy if a run reports nothing
+LOOK = "check the camera, its cable and the computer"  # Remedy if a run reports nothing.
 
-# Largest difference, s, between the clocks of lab and computer at which the end is shown as a time of day. The time of
-# a simulated lab passes differently, and an older attempt cannot predict the end.
+# The expected end is shown as a time of day only if the newest attempt and the last sign of life are nearer, s. In a
+# simulated lab, time passes at another rate.
 LAB_CLOCK_S = 600.0
 
 
 @dataclass(frozen=True)
 class AttemptView(Attempt):
-    """An attempt at a frame with its details (`AttemptDetails`).
+    """An attempt to take a frame, with its details (`AttemptDetails`).
 
-    `seconds`: from the start of the previous attempt to the start of this one; None for the first of a run.
+    `seconds`: time from the start of the previous attempt to the start of this attempt; None for the first of a run.
     """
 
     seen: tuple[float, float, float] | None = None
@@ -94,24 +94,29 @@ class AttemptView(Attempt):
 
 @dataclass(frozen=True)
 class Head:
-    """State of a session.
+    """State of a session. A run regularly writes a sign of life (`Heartbeat`) into the journal.
 
-    - `state`: ``running``, ``waiting`` or ``paused`` as reported by the run; ``late``: a frame takes much longer than
-      the previous ones; ``silent``: the process exists, but its sign of life is overdue; ``complete``;
-      ``incomplete``: ended with missing frames; ``stopped``: killed, or power lost; ``copy``: the signs of life belong
-      to another folder; ``unknown``: the journal has no sign of life; ``absent``, ``gone``, ``unreadable``: there is no
-      journal yet, or no longer, or it cannot be read.
+    - `state`: one of
+        - ``running``, ``waiting``, ``paused``: as reported by the run;
+        - ``late``: a frame takes much longer than the previous frames;
+        - ``silent``: the process of the run exists, but its sign of life is overdue;
+        - ``complete``: all frames are accepted;
+        - ``incomplete``: the run has ended, and frames are missing;
+        - ``stopped``: the run was killed, or the power failed;
+        - ``copy``: the signs of life belong to another folder;
+        - ``unknown``: the journal has no sign of life;
+        - ``absent``, ``gone``, ``unreadable``: there is no journal yet, or no longer, or it cannot be read.
     - `sentence`: the state in words, with the remedy after a semicolon; may be "".
     - `alive`: whether a run is active.
-    - `beat`, `until`: time of the last sign of life, and of the next that is due, by the computer's clock; None without
-      any.
-    - `total`, `done`, `lights_total`, `lights_done`: planned and accepted frames; the same of the illuminants alone.
+    - `beat`, `until`: times of the last sign of life, and of the next one, by the clock of the computer; may be None.
+    - `total`, `done`: planned and accepted frames.
+    - `lights_total`, `lights_done`: planned and accepted frames of illuminants.
     - `refused`, `failed`, `voided`: number of such attempts.
-    - `seconds_per_frame`: median interval of the newest `RECENT` attempts; None before the second.
-    - `remaining_s`: remaining time by the lab's clock, with retakes and references; None if unknown.
-    - `eta`: time at which all frames will be complete, by the computer's clock; None if unknown.
+    - `seconds_per_frame`: median interval of the newest `RECENT` attempts; None before the second attempt.
+    - `remaining_s`: remaining time by the clock of the lab, with retakes and references; None if unknown.
+    - `eta`: time at which all frames will be complete, by the clock of the computer; None if unknown.
     - `cause`: one of `CAUSES` if the run is late or paused, or ended with missing frames; "" if unknown.
-    - `last`: time of the newest frame by the lab's clock.
+    - `last`: time of the newest frame by the clock of the lab.
     """
 
     state: str
@@ -141,13 +146,13 @@ class Head:
 class SessionView:
     """A session as read from the disk; attempts and events, oldest first.
 
-    - `name`, `path_text`: name of its folder, and its path as given, for the sentence with the next command.
+    - `name`, `path_text`: name of the folder, and its path as the user gave it.
     - `lights`: illuminants of the plan; empty if their file cannot be read.
     - `records`: devices, software and plan, as recorded in the journal.
     - `heartbeat`, `place`: newest sign of life, and the location of the folder; None if unknown.
-    - `frame_bytes`: size of its largest frame; 0 without frames.
-    - `lost`: deleted or truncated files of accepted frames by step; determined only for a complete session.
-    - `unreadable`: reason why no LUT can be built, and the remedy; determined only for a complete session.
+    - `frame_bytes`: size of the largest frame; 0 without frames.
+    - `lost`: deleted or truncated files of accepted frames by step; determined only if all frames are accepted.
+    - `unreadable`: reason why no LUT can be built, and the remedy; determined only if all frames are accepted.
     """
 
     name: str
@@ -164,7 +169,7 @@ class SessionView:
     unreadable: str = ""
 
     def head(self, now: datetime) -> Head:
-        """Return the state at the computer's time `now`, using also the state of process and disk."""
+        """Return the state at the time `now` of the computer. The process of the run and the disk are also queried."""
         process = self.heartbeat.process if self.heartbeat else None
         return head_of(
             self,
@@ -175,9 +180,9 @@ class SessionView:
         )
 
     def whites(self) -> dict[int, tuple[float, float, float] | None]:
-        """Return for each attempt the RGB of its white frame.
+        """Return for each attempt the RGB of the newest accepted white frame up to this attempt.
 
-        This is the newest accepted white frame up to the attempt; before the first one, the first.
+        Attempts before the first white frame have the RGB of the first white frame.
         """
         white_steps = {step.number for step in self.steps if step.kind == "white"}
         whites = {
@@ -234,7 +239,7 @@ def _without_own_files(folder: Path) -> str:
 
 
 def _lights_of(folder: Path) -> tuple[Illuminant, ...]:
-    # Only kinds and temperatures are read from the file: the plan has the codes.
+    # The session can be shown without this file, because the plan contains the codes.
     try:
         return load_illuminants(folder / "illuminations.csv")
     except (CropError, OSError):
@@ -242,7 +247,7 @@ def _lights_of(folder: Path) -> tuple[Illuminant, ...]:
 
 
 def with_seconds(views: Sequence[AttemptView], starts: Iterable[datetime]) -> tuple[AttemptView, ...]:
-    """Return attempts, oldest first, with the seconds since the previous one; None after the start of a run."""
+    """Set `seconds` of attempts, oldest first; `starts`: times at which runs started."""
     start_times = sorted(starts)
     timed: list[AttemptView] = []
     for previous, view in zip([None, *views], views, strict=False):
@@ -271,8 +276,8 @@ def head_of(
 ) -> Head:
     """Return the state of a session.
 
-    `process_alive`: whether the process of the newest sign of life exists; None if unknown. `is_stopped`: whether it
-    was stopped by a signal. `free_bytes`: on the session's disk; None if unknown.
+    `process_alive`: whether the process of the newest sign of life exists; None if unknown. `is_stopped`: whether this
+    process was stopped by a signal. `free_bytes`: free space on the disk of the session; None if unknown.
     """
     steps, attempts, heartbeat = view.steps, view.attempts, view.heartbeat
     numbers = {step.number for step in steps} - {*view.lost}
@@ -364,39 +369,38 @@ def _state_of(
 Json = dict[str, Any]  # A JSON object
 
 
-# Age of a file, s, below which it is read again: it may change within the resolution of its time stamp (10 ms at the
-# slowest tick of Linux, more over a network).
+# A journal that changed less than this time ago, s, is read again. A second change within the resolution of its time
+# stamp would not be detected otherwise.
 FRESH_S = 0.25
 
-# Interval, s, after which an unchanged session is read again: files of its frames may have been deleted.
+# Interval, s, after which an unchanged session is read again, because files of frames may have been deleted.
 LOOK_AGAIN_S = 10.0
 
-# Newest attempts that are sent again with any change: a preview is written after its row, and two more frames may be in
-# the pipeline.
+# Number of newest attempts that are sent again with each change, because previews are written later than rows.
 _SENT_AGAIN = 3
 
 
-MOST_PICTURE_BYTES = 4 << 20  # Size limit of a preview: many times that of 640 px
+MOST_PICTURE_BYTES = 4 << 20  # Size limit of a preview. Previews of 640 px are much smaller.
 
 _JPEG = b"\xff\xd8\xff"
 
 _REVISION = re.compile("[0-9]{1,9}")
 
-# Inode, time of change (ns) and size of the journal and of its write-ahead file; empty without a journal.
+# Inode, time of change (ns) and size of the journal and of its write-ahead file. Empty without a journal.
 _Signature = tuple[tuple[int, int, int], ...]
 
 
 @dataclass(frozen=True)
 class _Numbered:
-    """A view of a session, with the number of the last change of each attempt and event."""
+    """A view of a session with numbered changes."""
 
-    epoch: str
-    inode: int
-    revision: int
+    epoch: str  # Random; another one after the session was replaced
+    inode: int  # Inode of the journal
+    revision: int  # Number of the last change
     view: SessionView
-    whites: Mapping[int, tuple[float, float, float] | None]
-    attempts: Mapping[int, int]
-    events: Mapping[int, int]
+    whites: Mapping[int, tuple[float, float, float] | None]  # RGB of the white frame of each attempt
+    attempts: Mapping[int, int]  # Number of the last change of each attempt
+    events: Mapping[int, int]  # Number of the change that added each event
 
 
 class SessionWatch:
@@ -503,14 +507,14 @@ class SessionWatch:
 
 
 def _numbered(inode: int, view: SessionView, earlier: _Numbered | None) -> _Numbered:
-    """Return a view with numbered changes; a replaced session starts again with all its content."""
+    """Return a view with numbered changes; after a session was replaced, all its content is new."""
     whites = view.whites()
     has_lost = earlier is not None and not earlier.attempts.keys() <= whites.keys()
     if earlier is None or has_lost or (view.steps, view.records) != (earlier.view.steps, earlier.view.records):
         attempts, events = dict.fromkeys(whites, 0), dict.fromkeys((event.number for event in view.events), 0)
         return _Numbered(secrets.token_hex(4), inode, 0, view, whites, attempts, events)
     old = {attempt.id: attempt for attempt in earlier.view.attempts}
-    # Identity is compared first, because comparing all checks is slow. Attempts that were not read again are identical.
+    # Attempts that were not read again are identical objects. Identity is compared first, because equality is slow.
     differing = {new.id for new in view.attempts if old.get(new.id) is not new and old.get(new.id) != new}
     changed = [number for number, white in whites.items() if number in differing or earlier.whites[number] != white]
     new_events = [event.number for event in view.events if event.number not in earlier.events]
@@ -521,7 +525,7 @@ def _numbered(inode: int, view: SessionView, earlier: _Numbered | None) -> _Numb
 
 
 def _signature(path: Path) -> _Signature:
-    # Data of the journal and of its write-ahead file, which change with every row.
+    # The journal or its write-ahead file changes with every row.
     signature: list[tuple[int, int, int]] = []
     for suffix in ("", "-wal"):
         try:
@@ -535,7 +539,7 @@ def _signature(path: Path) -> _Signature:
 
 
 def _session_json(view: SessionView) -> Json:
-    """Return the constant content of a session: name, plan, illuminants and devices.
+    """Return the content of a session that does not change: name, plan, illuminants and devices.
 
     A step is [number, kind, illuminant, red, green, blue], an illuminant [index, kind, K, [r, b], red, green, blue].
     The chromaticity [r, b] is defined in `experiment.lights`; None for black.
@@ -543,7 +547,7 @@ def _session_json(view: SessionView) -> Json:
     kinds = {light.index: (light.kind, light.cct_k) for light in view.lights}
     colours = {step.illumination: step.colour for step in view.steps if step.illumination is not None}
     codes = dict(sorted(colours.items()))
-    chromaticities = planned_places(list(codes.values()))
+    chromaticities = planned_chromaticities(list(codes.values()))
     return {
         "name": view.name,
         "steps": [[step.number, step.kind, step.illumination, *step.colour] for step in view.steps],
@@ -555,13 +559,13 @@ def _session_json(view: SessionView) -> Json:
     }
 
 
-def planned_places(codes: Sequence[tuple[int, int, int]]) -> list[list[float] | None]:
+def planned_chromaticities(codes: Sequence[tuple[int, int, int]]) -> list[list[float] | None]:
     """Return the chromaticities [r, b] (0 … 1) of the linear light of codes; None for black."""
     linear = decode_srgb(np.array(codes, dtype=np.float64).reshape(-1, 3) / 255)
-    return [place_of(red, green, blue) for red, green, blue in linear.tolist()]
+    return [rb_of(red, green, blue) for red, green, blue in linear.tolist()]
 
 
-def place_of(red: float, green: float, blue: float) -> list[float] | None:
+def rb_of(red: float, green: float, blue: float) -> list[float] | None:
     """Return the chromaticity [r, b] of linear values; None if their sum is not positive."""
     total = red + green + blue
     if not math.isfinite(total) or total <= 0:
@@ -571,7 +575,7 @@ def place_of(red: float, green: float, blue: float) -> list[float] | None:
 
 def _attempt_json(view: AttemptView, white: tuple[float, float, float] | None, preview: int | None) -> Json:
     seen = view.seen
-    chromaticity = place_of(*(rgb / w for rgb, w in zip(seen, white, strict=True))) if seen and white else None
+    chromaticity = rb_of(*(rgb / w for rgb, w in zip(seen, white, strict=True))) if seen and white else None
     values: Json = {
         "id": view.id,
         "step": view.step,
@@ -614,7 +618,7 @@ def _milliseconds(moment: datetime | None) -> int | None:
 
 
 def to_bytes(values: Json) -> bytes:
-    """Return JSON as bytes; none of its characters can end a script element."""
+    """Return JSON as bytes, with characters escaped that could end a script element."""
     text = json.dumps(values, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029").encode()
 
@@ -642,12 +646,12 @@ def _read_picture(folder: Path, file: str) -> bytes:
     return b""
 
 
-REPORT_FILE = "report.html"  # Name of the report in the session's folder
+REPORT_FILE = "report.html"  # Name of the report in the folder of a session.
 
-# Total size of the pictures in a report: with the third added by base64 it can still be mailed (10 MB on most servers).
+# Total size of the pictures in a report. Base64 adds a third, and most mail servers accept 10 MB.
 MOST_PICTURES_BYTES = 6 << 20
 
-# Files of the page's script in their order; the last one starts the page.
+# Files that form the script of the page, in this order; the last one starts the page.
 SCRIPTS = ("plots.js", "head.js", "series.js", "page.js")
 
 _FIELD = re.compile(r"\{(title|plain|policy|data|style|script)\}")
@@ -666,7 +670,7 @@ def live_page(name: str) -> tuple[str, str]:
 def write_session_report(folder: Path, path: Path | None = None) -> Path:
     """Write the report of the session in `folder`, by default into it, and return its path.
 
-    A run calls this function at its end; a run in this process therefore counts as ended.
+    A run calls this function at its end, so a run of this process counts as ended.
     """
     path = folder / REPORT_FILE if path is None else path
     read_session(folder)
@@ -701,7 +705,7 @@ def _ended(view: SessionView) -> SessionView:
 
 
 def _pictures(folder: Path, attempts: Sequence[AttemptView]) -> Iterator[tuple[int, bytes]]:
-    """Yield attempts with pictures up to the size limit: refused ones, the last one, then evenly spread ones."""
+    """Yield attempts and pictures up to the size limit: refused attempts, the last accepted one, then a selection."""
     free_bytes = MOST_PICTURES_BYTES
     refused = [view for view in attempts if view.has_frame and view.verdict not in (None, ACCEPTED)]
     accepted = [view for view in attempts if view.verdict == ACCEPTED]
@@ -713,7 +717,7 @@ def _pictures(folder: Path, attempts: Sequence[AttemptView]) -> Iterator[tuple[i
 
 
 def _spread(count: int) -> list[int]:
-    """Return 0 … count − 1 in an order of which any first part is spread evenly; last and first come first."""
+    """Return the indices 0 … count − 1, ordered so that the first ones are evenly spread, however many are used."""
     indices = dict.fromkeys([count - 1, 0] if count else [])
     step = count
     while step > 1:
@@ -743,7 +747,7 @@ def _filled(*, title: str, plain: str, policy: str, data: str) -> str:
         "style": _web_text("page.css"),
         "script": _script(),
     }
-    # In one pass, so that no field is replaced in inserted text.
+    # All fields are replaced in one pass, so that braces in inserted text are not replaced.
     return _FIELD.sub(lambda match: values[match[1]], _web_text("page.html"))
 
 

@@ -1,1 +1,1 @@
-"""Displays of uniform colours in full-screen windows."""
+"""Full-screen windows that show one uniform colour."""

@@ -1,17 +1,17 @@
-"""Uniform colours with exact codes on a whole display, read back from the screen before each frame.
+"""Fill a whole display with one colour of exact codes, and read the screen back.
 
-The window fills one display in the mode set by the desktop. `FullScreen.show` returns when every pixel, both in the
-drawn buffer and on the screen, has exactly the requested code. On X the screen is read over another connection, like a
-screenshot; on macOS from the front buffer. If a display was disconnected, the next `show` fills it again if its mode is
-unchanged. A display in use by another process is refused.
+The window fills one display in the mode that the desktop has set. `FullScreen.show` returns when every pixel has the
+requested code, both in the drawn buffer and on the screen. With X, the screen is read like a screenshot, over another
+connection. On macOS, the window's front buffer is read. If a display was disconnected, the next `show` fills it again
+if its mode is the same. A display that another process uses is refused.
 
-- The window belongs to the thread that opened it, as OpenGL contexts and GLFW require.
-- The window belongs to this process and disappears with it, even if the process is killed.
-- GLFW and OpenGL are used only here; GLFW runs while a window is open.
+- Only the thread that opened the window may use it, as OpenGL contexts and GLFW require.
+- The window disappears when the process ends, even if the process is killed.
+- GLFW and OpenGL are used only in this module. GLFW is initialised while a window is open.
 
-On Linux the window is an X window. Under Wayland it runs in XWayland, and the compositor may scale or tint the image
-without notice. Gamma ramps (night light, colour management) act after everything that can be read back.
-`FullScreen.warnings` reports both.
+On Linux the window is an X window. Under Wayland it is shown by XWayland, and the compositor may scale or tint the
+image without notice. Gamma ramps (night light, colour management) change the image after it is read back.
+`FullScreen.warnings` reports both problems.
 
 Sources: GLFW 3.4 reference; OpenGL 2.1, clauses 4.2.3 (Clear) and 4.3.2 (ReadPixels), numbers from its header, gl.h;
 ICC Profiles in X Specification 0.4.
@@ -46,7 +46,7 @@ _user_count = 0  # Number of open `running_glfw` blocks
 
 @dataclass(frozen=True)
 class Display:
-    """A display as arranged by the desktop; `x`, `y`, `width`, `height` in px of the whole desktop, y down."""
+    """A display and its area on the desktop; `x`, `y`, `width` and `height` are px of the whole desktop, y down."""
 
     number: int
     name: str
@@ -72,10 +72,10 @@ def list_displays() -> tuple[Display, ...]:
 
 
 def choose_display(displays: tuple[Display, ...], selection: str | int | None = None) -> Display:
-    """Return the display that `selection` selects.
+    """Return the selected display.
 
-    `selection` is a name (``"HDMI-1"``), a position (``"+1920+0"``), ``"left"``, ``"right"``, or a number; None selects
-    the only display.
+    `selection` is a name (``"HDMI-1"``), a position (``"+1920+0"``), ``"left"``, ``"right"``, or a number. None selects
+    the only display; with several displays it is an error.
     """
     present = "; ".join(str(display) for display in displays) or "none"
     if selection is None:
@@ -83,7 +83,7 @@ def choose_display(displays: tuple[Display, ...], selection: str | int | None = 
     elif isinstance(selection, int):
         matches = [display for display in displays if display.number == selection]
     elif selection in ("left", "right"):
-        # With one display, the missing one may be the projector; do not guess.
+        # A single display may be the wrong one, because the projector may be disconnected.
         x_positions = [display.x for display in displays]
         if len(set(x_positions)) < 2:
             raise ConfigurationError(
@@ -113,7 +113,7 @@ def choose_display(displays: tuple[Display, ...], selection: str | int | None = 
 
 @contextlib.contextmanager
 def running_glfw() -> Generator[ModuleType]:
-    """Yield GLFW's module, initialised; the end of the last block terminates GLFW."""
+    """Yield the initialised module of GLFW; GLFW is terminated when the last such block ends."""
     global _user_count
     glfw = _load_glfw()
     if not _user_count:
@@ -148,7 +148,7 @@ def _load_glfw() -> ModuleType:
     if sys.platform == "linux":
         # The wheel of glfw contains two libraries; only the one for X supports the platform X11.
         os.environ.setdefault("PYGLFW_LIBRARY_VARIANT", "x11")
-    # Imported late, because loading it starts another process to read its version.
+    # The import is slow, because it starts another process to read the version of GLFW.
     try:
         import glfw
     except (ImportError, OSError) as error:
@@ -173,7 +173,7 @@ def displays_with_monitors(glfw: ModuleType) -> list[tuple[Display, Any]]:
     return displays
 
 
-# Numbers from gl.h: the buffers of a window, the bit of Clear, and features that would change a uniform colour.
+# Numbers from gl.h: buffers of a window, the colour bit of glClear, and two settings that can change the drawn image.
 FRONT: Final = 0x0404
 BACK: Final = 0x0405
 COLOUR_BIT: Final = 0x4000
@@ -181,7 +181,7 @@ DITHER: Final = 0x0BD0
 SCISSOR: Final = 0x0C11
 
 BGRA: Final = 0x80E1  # Order of channels (gl.h)
-# Type of pixels as the number 0xAARRGGBB, the format of the drivers, without conversion.
+# Type of pixels as numbers 0xAARRGGBB. Graphics drivers store them in this format, so no conversion is needed.
 UNSIGNED_INT_8_8_8_8_REVERSED: Final = 0x8367
 
 
@@ -209,16 +209,17 @@ class OpenGl:
         self.viewport = function("glViewport", number, number, number, number)
 
 
-OPENING_S: Final = 5.0  # Time for a window to fill its display; window managers animate
+OPENING_S: Final = 5.0  # Time in which a window must fill its display, seconds; window managers animate new windows
 
-CONFIRMING_S: Final = 1.0  # Time from the buffer swap to the screen; a compositor adds one or two refresh periods
+# Time after the buffer swap in which the screen must show the colour, seconds. Compositors take one or two refreshes.
+CONFIRMING_S: Final = 1.0
 
-# Accepted deviation of a gamma ramp, 0 … 1, from a straight line; drivers end it at 255/256 or at 1.
+# Accepted deviation of a gamma ramp (0 to 1) from a straight line. Some drivers end the ramp at 255/256, others at 1.
 RAMP_TOLERANCE: Final = 1.5 / 255
 
-_POLL_S: Final = 0.002  # Pause between two readings of the screen; a refresh period is eight of them
+_POLL_S: Final = 0.002  # Pause between two readings of the screen, seconds; an eighth of a refresh period at 60 Hz
 
-# Digits 0 to 9 in 3×5 blocks, rows from the top.
+# Digits 0 to 9, drawn in 3 columns and 5 rows of blocks, row by row from the top.
 _DIGITS: Final = (
     "111101101101111", "010110010010111", "111001111100111", "111001111001111", "101101111001001",
     "111100111001111", "111100111101111", "111001001001001", "111101111101111", "111101111001111",
@@ -228,9 +229,10 @@ _COVER_REMEDY: Final = "check for a window or notification in front, desktop sca
 
 
 class FullScreen:
-    """A `drivers.presenter.Presenter` on a display, selected as in `choose_display`; black when it opens.
+    """A `drivers.presenter.Presenter` on a display, which is selected as in `choose_display`. It starts black.
 
-    All calls must be in the thread that opened it. It reads no keys: `close` or the end of the process closes it.
+    All calls must come from the thread that opened it. Keys have no effect; only `close` or the end of the process
+    closes the window.
     """
 
     def __init__(self, display: str | int | None = None, clock: Clock = SYSTEM_CLOCK) -> None:
@@ -258,7 +260,7 @@ class FullScreen:
         self._open = True
 
     def show(self, colour: Colour) -> None:
-        """Fill the display with exactly `colour`; returns when every pixel has been read back."""
+        """Fill the display with exactly `colour`, and return when every pixel has been read back."""
         self._require_usable()
         self._require_x_server()
         if not self._is_full():
@@ -269,8 +271,8 @@ class FullScreen:
     def verify(self, colour: Colour) -> None:
         """Check once that every pixel of the screen is exactly `colour`; see `drivers.presenter.ReadsBack`.
 
-        On X the server's screen is read, and a covering window is reported by name. On macOS only the window's own
-        front buffer is read, which does not show covering windows.
+        With X, the whole screen is read, and the name of a covering window is reported. On macOS, only the window's own
+        front buffer is read, so covering windows are not detected.
         """
         self._require_usable()
         self._require_x_server()
@@ -280,7 +282,7 @@ class FullScreen:
         self._require_colour(self._read_screen(), colour, "the screen shows")
 
     def identify(self) -> None:
-        """Show the display's number in large white blocks on black."""
+        """Show the number of the display, made of large white blocks on black."""
         self._require_usable()
         self._glfw.make_context_current(self._window)
         self._fill(BLACK)
@@ -304,7 +306,7 @@ class FullScreen:
         self._glfw.poll_events()
 
     def warnings(self) -> tuple[str, ...]:
-        """Return reasons why the light may be wrong although the codes on the screen are right; empty if none."""
+        """Return reasons why the light may be wrong although the codes on the screen are right; may be empty."""
         self._require_usable()
         return _find_warnings(self._glfw, self.display, self._monitor, self._screen)
 
@@ -314,14 +316,14 @@ class FullScreen:
             return
         self._require_usable()
         self._open = False
-        # If black cannot be shown, closing the window darkens the display.
+        # If black cannot be shown, the window is closed anyway.
         with self._closing, contextlib.suppress(DeviceError):
             self._present(BLACK)
 
     def _create_window(self) -> Any:
         glfw, display = self._glfw, self.display
         is_x11 = glfw.get_platform() == glfw.PLATFORM_X11
-        # The defaults have 8 bits per channel, without multisampling or sRGB conversion.
+        # The defaults are 8 bits per channel, no multisampling and no sRGB conversion.
         glfw.default_window_hints()
         if is_x11:
             glfw.window_hint(glfw.POSITION_X, display.x)
@@ -329,7 +331,7 @@ class FullScreen:
         for hint, value in (
             (glfw.VISIBLE, not is_x11),
             (glfw.DECORATED, False),
-            (glfw.AUTO_ICONIFY, False),  # else it disappears after a click on another display
+            (glfw.AUTO_ICONIFY, False),  # the window must not disappear after a click on another display
             (glfw.CENTER_CURSOR, False),
             (glfw.ALPHA_BITS, 0),
             (glfw.DEPTH_BITS, 0),
@@ -350,8 +352,8 @@ class FullScreen:
         return window
 
     def _make_full_screen(self, window: Any) -> None:
-        # Window managers without ``_NET_WM_FULLSCREEN_MONITORS`` (e.g. Openbox) fill the display on which the window
-        # is. A window that is full screen from the start would open on the first display.
+        # Window managers without ``_NET_WM_FULLSCREEN_MONITORS`` (e.g. Openbox) fill the display where the window is
+        # now. If it were created as full screen, it would open on the first display.
         display = self.display
         refresh_hz = display.refresh_hz or self._glfw.DONT_CARE
         self._glfw.set_window_monitor(window, self._monitor, 0, 0, display.width, display.height, refresh_hz)
@@ -379,9 +381,9 @@ class FullScreen:
             ):
                 self.display, self._monitor = display, monitor
                 area = display.x, display.y, display.width, display.height
-                # The display may be disconnected again during this.
+                # The display may be disconnected again during these calls.
                 with contextlib.suppress(DeviceError, glfw.GLFWError):
-                    # First a normal window, which can be moved; see `_make_full_screen`.
+                    # A full-screen window cannot be moved to another display.
                     glfw.set_window_monitor(self._window, None, *area, glfw.DONT_CARE)
                     self._make_full_screen(self._window)
                     self._wait_until_full()
@@ -407,7 +409,7 @@ class FullScreen:
         try:
             return displays_with_monitors(self._glfw)
         except self._glfw.GLFWError:
-            return []  # the displays are changing now
+            return []  # the arrangement of the displays is just changing
 
     def _require_awake(self) -> None:
         if self._screen is not None and is_dark(self._glfw.get_x11_display()):
@@ -445,7 +447,8 @@ class FullScreen:
         gl = self._gl
         gl.viewport(0, 0, self.display.width, self.display.height)
         gl.disable(DITHER)
-        # Fixed point stores round(255 · c / 255); single precision returns exactly the code (OpenGL 2.1, 2.14.9).
+        # The buffer stores round(255 * value). With single precision, the value c / 255 gives exactly the code c
+        # (OpenGL 2.1, 2.14.9).
         gl.clear_colour(colour.red / 255, colour.green / 255, colour.blue / 255, 1.0)
         gl.clear(COLOUR_BIT)
 
@@ -456,7 +459,7 @@ class FullScreen:
         return self._screen.read(display.x, display.y, display.width, display.height)
 
     def _read_buffer(self, buffer: int) -> npt.NDArray[np.uint32]:
-        """Return a buffer of the window, (height, width) uint32, 0xRRGGBB, bottom row first."""
+        """Return the content of a buffer of the window, (height, width) uint32, 0xRRGGBB, bottom row first."""
         display = self.display
         self._gl.read_buffer(buffer)
         pixels, pixel_type = self._pixels.ctypes.data, UNSIGNED_INT_8_8_8_8_REVERSED
@@ -500,14 +503,14 @@ class FullScreen:
 
 @contextlib.contextmanager
 def _hold_display(display: Display) -> Generator[None]:
-    """Reserve a display against other processes; the screens of a server (``:0.0``) share their displays."""
+    """Lock a display against other processes; screens of one X server (``:0.0``, ``:0.1``) share the lock."""
     server = re.sub(r"\.\d+$", "", os.environ.get("DISPLAY", ""))
     with hold(f"display {display}", f"display {server} {display.position}"):
         yield
 
 
 def display_warnings(selection: str | int | None = None) -> tuple[str, ...]:
-    """Return the warnings of `FullScreen.warnings` for a selected display, without a window on it."""
+    """Return the same warnings as `FullScreen.warnings` for a selected display, without opening a window."""
     with contextlib.ExitStack() as opened:
         glfw = opened.enter_context(running_glfw())
         displays = displays_with_monitors(glfw)
@@ -553,14 +556,14 @@ def _describe_ramp_fault(glfw: Any, monitor: Any) -> str:
     try:
         ramp = glfw.get_gamma_ramp(monitor)
     except glfw.GLFWError:
-        # This display has no ramp.
+        # This display has no gamma ramp.
         return ""
     channels = [np.asarray(channel) for channel in ramp]
     if any(_is_noise(values) for values in channels):
         return ""
     for name, values in zip(("red", "green", "blue"), channels, strict=True):
         if not values.any():
-            # A server without its own ramp returns zeros; a real ramp of zeros would make the display black.
+            # A server without gamma ramps returns zeros, which are no real ramp.
             continue
         deviation = values - np.linspace(0, 1, values.size)
         worst_index = int(np.argmax(np.abs(deviation)))
@@ -570,20 +573,20 @@ def _describe_ramp_fault(glfw: Any, monitor: Any) -> str:
 
 
 def _profile_property(glfw: Any, monitor: Any) -> str:
-    """Return the root window property of a display's profile (ICC Profiles in X Specification 0.4, section 2)."""
+    """Return the root window property that holds a display's colour profile (ICC Profiles in X 0.4, section 2)."""
     addresses = [ctypes.addressof(candidate.contents) for candidate in glfw.get_monitors()]
     number = addresses.index(ctypes.addressof(monitor.contents))
     return "_ICC_PROFILE" if number == 0 else f"_ICC_PROFILE_{number}"
 
 
 def _is_noise(ramp: npt.NDArray[np.float64]) -> bool:
-    """Return whether a gamma ramp oscillates; some X servers never initialise theirs."""
-    travel = float(np.abs(np.diff(ramp)).sum())
-    return travel > 2 * float(np.ptp(ramp)) and travel > 0.1
+    """Return whether a gamma ramp goes up and down; it is then memory that the X server never set."""
+    total_variation = float(np.abs(np.diff(ramp)).sum())
+    return total_variation > 2 * float(np.ptp(ramp)) and total_variation > 0.1
 
 
 def identify_displays(seconds: float, clock: Clock = SYSTEM_CLOCK) -> tuple[Display, ...]:
-    """Show its number on every display for some seconds, and return all displays."""
+    """Show on each display its own number for `seconds`, and return all displays."""
     with contextlib.ExitStack() as opened:
         displays = list_displays()
         for display in displays:

@@ -1,9 +1,9 @@
 """Read the screen of an X server, detect covering windows and the end of the server, and suspend the screen saver.
 
-The screen is read over a connection of its own, not over the connection of our window, so that it is read as the server
-shows it. This connection uses libxcb, which returns errors. Our window requires Xlib, which ends the process if the
-server ends; `survive_server_end` prevents this. Windows may disappear at any time, so a missing reply is treated as a
-missing window. Window managers put frames around windows; therefore names are searched in descendants.
+The screen is read over a separate connection, not over that of our window, so that the result is what the server
+shows. This connection uses libxcb, which returns errors. Our window needs Xlib, which ends the process if the server
+ends; `survive_server_end` prevents this. Windows may disappear at any time, so a missing reply is treated as a missing
+window. Window managers put frames around windows, so the name of a window may be that of an inner window.
 
 Sources: X Window System Protocol, GetImage, QueryExtension, QueryTree, GetWindowAttributes, GetGeometry and
 GetProperty; MIT-SCREEN-SAVER extension 1.1, Suspend; DPMS extension 1.2; Xlib, XSetIOErrorHandler(3) and
@@ -25,14 +25,14 @@ import numpy.typing as npt
 from foundation.errors import RUN_AGAIN, DeviceError
 
 INPUT_ONLY = 2  # Window class without visible content (X protocol, CreateWindow)
-VIEWABLE = 2  # Map state of a mapped window with mapped ancestors (X protocol, GetWindowAttributes)
-MAX_TEXT = 256  # Longest name, bytes; enough to distinguish windows
-MAX_DEPTH = 4  # Levels below a top window that are searched for its name; window managers add one or two
-# Most windows searched for one name, as a limit for programs with thousands of windows.
+VIEWABLE = 2  # Map state of a window that is shown on the screen (X protocol, GetWindowAttributes)
+MAX_TEXT = 256  # Longest name that is read, bytes
+MAX_DEPTH = 4  # Levels of inner windows that are searched for a name; window managers add one or two levels
+# Most windows that are searched for one name, because some programs have thousands of windows.
 MAX_WINDOWS = 200
 
-_ANY_TYPE = 0  # AnyPropertyType of GetProperty: names in any encoding
-_WORD_BYTES = 4  # GetProperty counts in words of four bytes (X protocol, GetProperty)
+_ANY_TYPE = 0  # AnyPropertyType of GetProperty, because names have several encodings
+_WORD_BYTES = 4  # Bytes of a word, in which GetProperty counts lengths (X protocol, GetProperty)
 
 
 _Z_PIXMAP = 2  # Format of GetImage: complete pixels in sequence (X protocol, GetImage; XYPixmap is 1)
@@ -55,7 +55,7 @@ def _record_loss(display: int | None, data: int | None) -> None:
 
 
 def survive_server_end(display: int) -> None:
-    """Keep the process alive if the server of an Xlib connection ends; not possible with old libraries."""
+    """Keep the process alive if the server of an Xlib connection ends; without effect before libX11 1.7."""
     with contextlib.suppress(OSError, AttributeError):
         xlib = ctypes.CDLL("libX11.so.6")
         set_exit_handler = xlib.XSetIOErrorExitHandler
@@ -63,17 +63,17 @@ def survive_server_end(display: int) -> None:
         set_exit_handler.restype = None
         set_exit_handler(display, ctypes.cast(_record_loss, ctypes.c_void_p), None)
         xlib.XSetIOErrorHandler(_ignore_loss)
-        # A new connection may have the address of a lost one.
+        # A new connection may have the same address in memory as a lost one.
         _lost_displays.discard(display)
 
 
 def is_lost(display: int) -> bool:
-    """Return whether the server of an Xlib connection has ended, if `survive_server_end` was called."""
+    """Return whether the server of an Xlib connection has ended; `survive_server_end` must have been called."""
     return display in _lost_displays
 
 
 def is_dark(display: int) -> bool:
-    """Return whether power saving keeps the displays of an Xlib connection dark; False if this cannot be determined."""
+    """Return whether power saving keeps the displays of an X server dark; False if this cannot be determined."""
     with contextlib.suppress(OSError, AttributeError):
         extension = ctypes.CDLL("libXext.so.6")
         event_base, error_base = ctypes.c_int(), ctypes.c_int()
@@ -88,13 +88,13 @@ def is_dark(display: int) -> bool:
 
 
 class _Cookie(ctypes.Structure):
-    """Handle of a pending libxcb request."""
+    """Number by which libxcb identifies a request whose reply is pending."""
 
     _fields_ = (("sequence", ctypes.c_uint),)
 
 
 class _Screens(ctypes.Structure):
-    """xcb_screen_iterator_t; `data` points to the number of the root window."""
+    """xcb_screen_iterator_t of libxcb; `data` points to the number of the root window."""
 
     _fields_ = (("data", ctypes.POINTER(ctypes.c_uint32)), ("rem", ctypes.c_int), ("index", ctypes.c_int))
 
@@ -106,7 +106,7 @@ _POINTER, _WORD, _HALF, _BYTE, _COORDINATE = (
     ctypes.c_uint8,
     ctypes.c_int16,
 )
-# Requests by their names in libxcb, with argument types.
+# Argument types of requests, by their names in libxcb.
 _REQUESTS: dict[str, list[type]] = {
     "get_geometry": [_WORD],
     "get_image": [_BYTE, _WORD, _COORDINATE, _COORDINATE, _HALF, _HALF, _WORD],
@@ -150,7 +150,7 @@ def _load_xcb() -> ctypes.CDLL:
 
 
 class _Reply:
-    """A reply of libxcb, false if none arrived; freed at the end of its ``with`` block."""
+    """A reply of libxcb, freed at the end of its ``with`` block; it is false if no reply arrived."""
 
     def __init__(self, address: int | None, libc: ctypes.CDLL) -> None:
         self.address = address or 0
@@ -173,7 +173,7 @@ class _Reply:
 
 @dataclass(frozen=True)
 class Cover:
-    """A covering window: name and area, px of the whole screen, y down."""
+    """Name and area of a window that covers ours, in px of the whole screen, y down."""
 
     name: str
     x: int
@@ -186,9 +186,9 @@ class Cover:
 
 
 class XScreen:
-    """The screen of an X server (None: of DISPLAY), and the windows on it.
+    """The screen of an X server and the windows on it; `display` None means the server in DISPLAY.
 
-    With `keep_awake` screen saver and power saving are suspended while the connection is open.
+    With `keep_awake`, screen saver and power saving are suspended while the connection is open.
     """
 
     def __init__(self, display: str | None = None, *, keep_awake: bool = True) -> None:
@@ -208,11 +208,11 @@ class XScreen:
             self._xcb.xcb_screen_next(ctypes.byref(screens))
         self._root: int = screens.data[0]
         self._pixels: npt.NDArray[np.uint32] = np.empty((0, 0), np.uint32)
-        # True if screen saver and power saving are suspended.
+        # Whether screen saver and power saving are suspended.
         self.stays_awake = keep_awake and self._suspend_saver()
 
     def size(self) -> tuple[int, int]:
-        """Return width and height of the whole screen, px; they change with the display mode."""
+        """Return the present width and height of the whole screen, px."""
         self._require_open()
         with self._request("get_geometry", self._root) as reply:
             if not reply:
@@ -221,7 +221,7 @@ class XScreen:
         return width, height
 
     def read(self, x: int, y: int, width: int, height: int) -> npt.NDArray[np.uint32]:
-        """Return the screen content, (height, width) uint32, 0xRRGGBB; the next call overwrites it."""
+        """Return the screen content, (height, width) uint32, 0xRRGGBB; the next call overwrites the array."""
         self._require_open()
         with self._request("get_image", _Z_PIXMAP, self._root, x, y, width, height, _ALL_PLANES) as reply:
             if not reply:
@@ -240,7 +240,7 @@ class XScreen:
             return np.bitwise_and(pixels, np.uint32(0xFFFFFF), out=self._pixels)
 
     def has_extension(self, name: str) -> bool:
-        """Return whether the server has an extension."""
+        """Return whether the server has an extension of the X protocol."""
         with self._request("query_extension", len(name), name.encode("ascii")) as reply:
             return bool(reply) and reply.read(8, 1) != b"\0"
 
@@ -301,7 +301,7 @@ class XScreen:
             self._xcb.xcb_disconnect(connection)
 
     def _suspend_saver(self) -> bool:
-        # A request of a missing extension would end the connection.
+        # A request of an extension that the server does not have would end the connection.
         if not self.has_extension("MIT-SCREEN-SAVER"):
             return False
         with contextlib.suppress(OSError, AttributeError):
@@ -358,7 +358,7 @@ class XScreen:
             return ctypes.string_at(self._xcb.xcb_get_property_value(reply.address), size)
 
     def _request(self, request: str, *arguments: object) -> _Reply:
-        """Return the reply to a request; a false reply if there is none, or the screen was closed."""
+        """Return the reply to a request; it is false if no reply arrives, or if the screen was closed."""
         if self._connection is None:
             return _Reply(None, self._libc)
         cookie = getattr(self._xcb, f"xcb_{request}")(self._connection, *arguments)

@@ -1,1 +1,1 @@
-"""Cables to devices; only these modules import socket, pyserial and pyusb."""
+"""Connections to devices: USB, serial and network; only these modules import socket, pyserial and pyusb."""

@@ -1,7 +1,7 @@
-"""Interface of a connection with three methods (write, read, close), and one request at a time over it.
+"""Connection to a device (`Link`) that can write, read and close, and exchange of requests and replies (`Exchange`).
 
-Contract of every implementation of `Link`: it raises `LinkTimeout` or `LinkClosed` instead of errors of the operating
-system. Bytes that the far side sent before it disconnected can still be read.
+Every implementation of `Link` raises `LinkTimeout` or `LinkClosed` instead of errors of the operating system. Bytes
+that the device sent before it disconnected can still be read.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Link(Protocol):
 
 
 class ClosedAtEnd:
-    """Base class: `close` is called at the end of the `with` block."""
+    """Base class of objects that are closed at the end of their `with` block."""
 
     def __enter__(self) -> Self:
         return self
@@ -45,17 +45,17 @@ class ClosedAtEnd:
 
 
 class Peer(Protocol):
-    """The far side of a connection as a pure state machine: bytes in, bytes out."""
+    """A simulated device at the other end of a connection; it takes bytes and returns bytes."""
 
     def connect(self) -> bytes:
-        """Start a new connection, drop any earlier one, and return the first bytes of the far side."""
+        """Start a new connection, end any earlier one, and return the first bytes that the device sends."""
 
     def receive(self, data: bytes) -> bytes:
-        """Process the next bytes of the near side and return the reply so far; may disconnect."""
+        """Process the next bytes from the driver and return the bytes of the reply; may disconnect."""
 
     @property
     def closed(self) -> bool:
-        """True if the far side has disconnected."""
+        """True if the device has disconnected."""
 
 
 class PeerLink:
@@ -95,22 +95,22 @@ class PeerLink:
 
 _log = logging.getLogger(__name__)
 
-# Default wait for a message that the device may have sent without a request, seconds.
+# Time to wait for a message that the device may send without a request, seconds.
 POLL_S = 0.1
 
-# Longest message, bytes; all supported protocols stay far below it.
+# Longest accepted message, bytes. Messages of all supported protocols are much shorter.
 MAX_MESSAGE = 512
 
 _T = TypeVar("_T")
-# Returns the first message and its length in bytes, or None while the message is incomplete.
+# Takes received bytes, and returns the first message and its length in bytes, or None if the message is incomplete.
 MessageParser = Callable[[bytes], tuple[_T, int] | None]
 
 
 class Exchange:
-    """Requests and replies over connections that `connect` opens.
+    """Requests and replies over a connection that `connect` opens when it is needed.
 
-    - `greet` exchanges the opening messages of a new connection. It returns a prefix of the first request, which is not
-      logged.
+    - `greet` exchanges the first messages of a new connection. It returns bytes to send before the first request, which
+      are not logged.
     - `silence_remedy`, `endless_remedy`: remedies in the messages for a missing reply and for a reply without an end.
     """
 
@@ -131,30 +131,30 @@ class Exchange:
         self._greet = greet
         self._silence_remedy, self._endless_remedy = silence_remedy, endless_remedy
         self._prefix = b""
-        # Requests on the present connection since its greeting.
+        # Number of requests on the present connection, without its greeting.
         self.request_count = 0
         self._link: Link | None = None
         self._received = b""
 
     def query(self, request: bytes, parse: MessageParser[_T], skip: Callable[[_T], bool] | None = None) -> _T:
-        """Send `request` and return the first message that `skip` does not reject."""
+        """Send `request` and return the first message after it for which `skip` is false."""
         return self._repeat_if_lost(lambda: self._request_once(request, parse, skip))
 
     def open_with(self, opening: bytes, parse: MessageParser[_T], skip: Callable[[_T], bool] | None = None) -> _T:
-        """Send `opening` over the new connection and return its reply; for `greet` only."""
+        """Send `opening` over the new connection and return its reply; used only by `greet`."""
         return self._request_once(opening, parse, skip)
 
     def listen(self, parse: MessageParser[_T], skip: Callable[[_T], bool] | None = None) -> _T:
-        """Return the first message of the device on the new connection; for `greet` only."""
+        """Return the first message of the device on the new connection; used only by `greet`."""
         assert self._link is not None
         return self._answer(self._link, parse, skip)
 
     def send(self, command: bytes) -> None:
-        """Send a command with a slow reply; read the reply with `poll`."""
+        """Send a command without waiting for its reply, which `poll` returns later."""
         self._repeat_if_lost(lambda: self._send_once(command))
 
     def poll(self, parse: MessageParser[_T], wait: float = POLL_S) -> _T | None:
-        """Return the next message within `wait` seconds; None if none arrives or nothing is connected."""
+        """Return the next message within `wait` seconds; None if no message arrives or no connection is open."""
         if self._link is None:
             return None
         try:
@@ -178,7 +178,7 @@ class Exchange:
             link.close()
 
     def _repeat_if_lost(self, action: Callable[[], _T]) -> _T:
-        """Run `action`; repeat it once over a new connection if an old connection turns out to be lost."""
+        """Run `action`; if the connection was open before and is lost now, repeat it once over a new connection."""
         was_connected = self._link is not None
         try:
             return action()
@@ -242,7 +242,7 @@ class Exchange:
 
     def _discard_input(self, link: Link) -> None:
         self._received = b""
-        # The limit ends the loop for a device that never stops sending; the next message then exceeds MAX_MESSAGE.
+        # The loop is limited, because a faulty device may never stop sending. The next message then fails.
         for _ in range(MAX_MESSAGE):
             if not link.read(MAX_MESSAGE, 0.0):
                 return
@@ -253,5 +253,5 @@ class Exchange:
 
 
 def quoted(data: bytes) -> str:
-    """Return the first 40 bytes as text for a message."""
+    """Return the first 40 bytes as text in quotation marks, for a message."""
     return repr(data[:40])[1:] + ("…" if len(data) > 40 else "")

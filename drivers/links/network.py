@@ -1,7 +1,7 @@
-"""TCP connections, the loopback servers of simulated devices, and UDP datagrams.
+"""TCP connections, TCP servers for simulated devices, and UDP datagrams.
 
-Every message names host and port. A datagram arrives complete or not at all, and from any sender; the reader checks
-sender and content.
+Every error message names host and port. A datagram arrives complete or not at all. It may come from any sender, so the
+caller must check its sender and content.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class TcpLink:
         self._socket = connection
         self._address = address
         self._timeout: float | None = None
-        # Commands are short and each waits for its reply; gathering them into larger packets only delays them.
+        # Commands are short, and each one waits for its reply. Nagle's algorithm would only delay them.
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     @classmethod
@@ -70,19 +70,19 @@ class TcpLink:
         return data
 
     def hang_up(self) -> None:
-        """Shut the connection down, without closing its socket; a reader in another thread stops."""
-        # Only the reader may close the socket: after a close here, its number could belong to a new connection before
-        # the reader waits. The shutdown fails if the far side has disconnected, which needs no action.
+        """End the connection without closing its socket; a thread that is reading from it stops."""
+        # Only the reading thread may close the socket. Otherwise the system could give its number to a new connection,
+        # from which the thread would then read. The shutdown fails if the other side has already disconnected.
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Disconnect and close the socket; a reader in another thread stops."""
+        """Disconnect and close the socket; a thread that is reading from it stops."""
         self.hang_up()
         self._socket.close()
 
     def _set_timeout(self, timeout: float) -> None:
-        # Each setting is a system call, and most calls use the same timeout.
+        # Setting the timeout is a system call, which is not needed if the timeout is unchanged.
         if timeout != self._timeout:
             self._socket.settimeout(timeout)
             self._timeout = timeout
@@ -95,9 +95,9 @@ class TcpLink:
 
 
 class TcpServer(ClosedAtEnd):
-    """A server that passes each connection to `handle` in a new thread, until it is closed.
+    """A server on the loopback address that calls `handle` in a new thread for each connection.
 
-    The end of its `with` block closes every connection and joins every thread.
+    The end of its `with` block stops the server, closes all connections and waits for all threads.
     """
 
     def __init__(self, handle: Callable[[TcpLink], None], port: int = 0) -> None:
@@ -112,7 +112,7 @@ class TcpServer(ClosedAtEnd):
         self._links: set[TcpLink] = set()
         self._threads: list[threading.Thread] = []
         self._closing = False
-        # Host and port on which the server listens.
+        # Host and port where the server listens.
         self.address: tuple[str, int] = self._listener.getsockname()[:2]
         self._accepting = threading.Thread(target=self._accept, name=f"listening at {self.address[1]}", daemon=True)
         self._accepting.start()
@@ -130,7 +130,7 @@ class TcpServer(ClosedAtEnd):
             if self._closing:
                 return
             self._closing = True
-        # The only portable way to end accept() in another thread is to connect to it.
+        # On all systems, a new connection ends accept() in the other thread.
         with contextlib.suppress(OSError):
             socket.create_connection(self.address, 1).close()
         self._accepting.join()
@@ -166,14 +166,12 @@ class TcpServer(ClosedAtEnd):
                 self._links.discard(link)
 
 
-# Interval at which a peer is polled for delayed replies; drivers wait seconds for a reply.
-POLLING_S = 0.02
-# Longest wait until a client accepts a reply, seconds.
-_TIMEOUT_S = 30.0
+POLLING_S = 0.02  # Interval at which a simulated device is polled for delayed replies, seconds
+_TIMEOUT_S = 30.0  # Longest wait until the driver accepts a reply, seconds
 
 
 def serve_peer(new_peer: Callable[[], Peer], port: int = 0) -> TcpServer:
-    """Return a running server with one new peer per connection; the caller closes it."""
+    """Start a server that makes a new simulated device for each connection; the caller closes the server."""
 
     def handle(link: TcpLink) -> None:
         peer = new_peer()
@@ -191,8 +189,7 @@ def serve_peer(new_peer: Callable[[], Peer], port: int = 0) -> TcpServer:
 
 ANY_HOST = "0.0.0.0"
 BROADCAST = "255.255.255.255"
-# Bytes; the length field of UDP has 16 bits (RFC 768), so no datagram is truncated.
-MAX_DATAGRAM = 65535
+MAX_DATAGRAM = 65535  # Longest datagram, bytes; the length field of UDP has 16 bits (RFC 768)
 
 Address = tuple[str, int]
 
@@ -210,11 +207,11 @@ class UdpSocket(ClosedAtEnd):
             raise LinkClosed(
                 f"cannot receive datagrams at {host}:{port}: {error}; close the other program that uses this port"
             ) from error
-        # Host and port at which datagrams arrive.
+        # Host and port where datagrams arrive.
         self.address: Address = self._socket.getsockname()[:2]
 
     def send(self, data: bytes, address: Address) -> None:
-        """Send one datagram to host and port; the arrival is not confirmed."""
+        """Send one datagram to host and port; its arrival is not confirmed."""
         host, port = address
         try:
             self._socket.sendto(data, address)

@@ -1,7 +1,8 @@
 """Serial port; the only module that imports pyserial.
 
-All projectors in `drivers.serial_projectors` use eight data bits, no parity, one stop bit and no flow control. The port
-is opened exclusively, and earlier input is discarded. If the cable is disconnected, the last bytes may be lost.
+The port has eight data bits, no parity, one stop bit and no flow control, as all projectors in
+`drivers.serial_projectors` require. It is opened exclusively, and earlier input is discarded. If the cable is
+disconnected, the last bytes may be lost.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Pipes of USB still image devices; the only module that imports pyusb.
+"""Data pipes of USB still image devices (cameras); the only module that imports pyusb.
 
-A device is identified by vendor, product and serial number, or by its port. The address is not used, because it changes
-when a device restarts. The kernel's driver is detached while the device is open and attached again at the end. Errors
-of the system are translated here and nowhere else.
+A device is selected by its vendor, serial number and port. Its address is not used, because it changes when the device
+restarts. The driver of the system's kernel is detached while the device is open, and attached again at the end. Errors
+of pyusb are converted to ours in this module only.
 
 Sources: USB 2.0, clauses 5.8 (bulk), 5.7 (interrupt), 9.4 (SetConfiguration) and 9.6 (descriptors); error codes of
 libusb 1.0.
@@ -32,11 +32,11 @@ STILL_IMAGE_CLASS: Final = (6, 1, 1)
 
 
 class PipeStalled(LinkError):
-    """A pipe is halted: it refuses this transfer and all others until the halt is cleared."""
+    """A pipe is halted: it refuses all transfers until the halt is cleared."""
 
 
 class Pipe(Enum):
-    """Pipes of a still image device, in addition to the control pipe."""
+    """Pipes of a still image device, without the control pipe."""
 
     BULK_OUT = "bulk out"
     BULK_IN = "bulk in"
@@ -44,10 +44,10 @@ class Pipe(Enum):
 
 
 class UsbPipes(Protocol):
-    """The claimed interface of one device.
+    """Interface of an open device with its pipes.
 
-    All methods raise `LinkClosed` if the device is disconnected, and transfers raise `PipeStalled`. All except
-    `interrupt_read` raise `LinkTimeout` if nothing happens in time.
+    All methods raise `LinkClosed` if the device is disconnected. Transfers raise `PipeStalled` if the pipe is halted.
+    All methods except `interrupt_read` raise `LinkTimeout` after their time limit.
     """
 
     @property
@@ -60,7 +60,7 @@ class UsbPipes(Protocol):
 
     @property
     def polling_s(self) -> float:
-        """Polling interval of the interrupt pipe, seconds; shorter waits may miss every event."""
+        """Polling interval of the interrupt pipe, seconds; a shorter wait may miss all events."""
 
     def bulk_write(self, data: bytes, timeout: float) -> None:
         """Send all of `data`; b"" is sent as a zero-length packet."""
@@ -107,7 +107,7 @@ _CLASS_IN: Final = 0xA1  # bmRequestType: class request from the interface
 _BULK: Final = 2  # Transfer type in an endpoint's bmAttributes (USB 2.0, 9.6.6)
 _INTERRUPT: Final = 3  # Transfer type, as above
 
-# Upper limit of the polling interval, seconds: a wrong descriptor must not delay events by seconds.
+# Upper limit of the polling interval, seconds, because a wrong descriptor must not delay events.
 _MAX_POLLING_S: Final = 0.05
 
 
@@ -115,9 +115,9 @@ _MAX_POLLING_S: Final = 0.05
 class UsbDevice:
     """A still image device on the bus.
 
-    - `serial`: None if the device has no serial number, or does not permit reading it.
-    - `port`: bus and ports on the way, such as ``1-2.4``; unlike `address`, it does not change when the device
-      restarts.
+    - `serial`: serial number; None if there is none, or if it cannot be read.
+    - `port`: bus and ports from the computer to the device, such as ``1-2.4``. Unlike `address`, it does not change
+      when the device restarts.
     """
 
     vendor: int
@@ -144,7 +144,7 @@ def open_usb(
     port: str | None = None,
     backend: IBackend | None = None,
 ) -> OpenUsbDevice:
-    """Open the one still image device with the given properties, and claim its interface."""
+    """Open the still image device that has all given properties, and claim its interface."""
     matching: list[tuple[usb.core.Device, UsbDevice]] = []
     other_devices: list[UsbDevice] = []
     read_error: DeviceRefused | None = None
@@ -193,7 +193,7 @@ class OpenUsbDevice:
         if self._closed:
             return
         self._closed = True
-        # Release fails if the device was unplugged; no action is needed then.
+        # If the device was unplugged, these calls fail, but then nothing must be released.
         with contextlib.suppress(usb.core.USBError, NotImplementedError):
             if self._detached is not None:
                 usb.util.release_interface(self._device, self._detached)
@@ -271,7 +271,7 @@ class OpenUsbDevice:
         except usb.core.USBError as error:
             if error.errno is not None:
                 raise
-            # No configuration is active: some systems leave the choice to the program.
+            # No configuration is active, because some systems let the program choose one.
             self._device.set_configuration()
             return self._device.get_active_configuration()
 
@@ -284,7 +284,7 @@ class OpenUsbDevice:
 
     @contextlib.contextmanager
     def _transfer(self, timeout_meaning: str) -> Generator[None]:
-        """Translate the errors of pyusb; `timeout_meaning` is the text for a timeout."""
+        """Convert errors of pyusb to ours; `timeout_meaning` describes a timeout in the message."""
         label = self._label
         if self._closed:
             raise LinkClosed(f"{label} was closed; open it again")
@@ -312,11 +312,11 @@ class OpenUsbDevice:
 
 @dataclass(frozen=True)
 class _StillImageInterface:
-    """Descriptors of a still image interface.
+    """Properties of a still image interface, from its descriptors.
 
     - `number`: number of the interface.
     - `addresses`: endpoint address of each pipe.
-    - `packet_size`, `interrupt_size`: full packet on the bulk pipes and on the interrupt pipe, bytes.
+    - `packet_size`, `interrupt_size`: size of a full packet on the bulk pipes and on the interrupt pipe, bytes.
     - `polling_s`: polling interval of the interrupt pipe, seconds.
     """
 
@@ -340,7 +340,8 @@ def _read_descriptors(interface: usb.core.Interface, label: str) -> _StillImageI
     if missing:
         raise ProtocolError(f"{label} has no pipe {', '.join(missing)}; it is not a PTP camera, connect another device")
     interval = endpoints[Pipe.INTERRUPT_IN].bInterval
-    # High speed counts 2^(n-1) microframes of 125 µs, full speed n frames of 1 ms; a too long interval is safe.
+    # bInterval n means 2^(n-1) microframes of 125 µs at high speed, and n frames of 1 ms at full speed. The longer time
+    # is safe for both.
     frames = 2 ** (min(interval, 16) - 1) / 8 if interval else 1
     return _StillImageInterface(
         interface.bInterfaceNumber,
@@ -352,7 +353,7 @@ def _read_descriptors(interface: usb.core.Interface, label: str) -> _StillImageI
 
 
 def _packet_size(endpoint: usb.core.Endpoint) -> int:
-    # Bits 11 and 12 count extra transactions in a microframe (USB 2.0, 9.6.6).
+    # Bits 11 and 12 are not part of the size (USB 2.0, 9.6.6).
     return endpoint.wMaxPacketSize & 0x7FF
 
 
@@ -374,7 +375,7 @@ def _still_image_devices(backend: IBackend | None) -> Iterator[tuple[usb.core.De
             serial = usb.util.get_string(device, device.iSerialNumber)
             name = usb.util.get_string(device, device.iProduct) or ""
         except (usb.core.USBError, ValueError, NotImplementedError):
-            # pyusb also raises ValueError if it cannot read the list of languages.
+            # pyusb also raises ValueError if it cannot read the device's list of languages.
             label = f"the camera {device.idVendor:04x}:{device.idProduct:04x} at {port}"
             refusal = DeviceRefused(f"{label} {_PERMISSION_REMEDY}")
         finally:
@@ -407,5 +408,5 @@ def _no_camera_message(vendor: int | None, serial: str | None, port: str | None,
 
 
 def _milliseconds(timeout: float) -> int:
-    # libusb treats 0 as no limit.
+    # For libusb, 0 means no time limit.
     return max(1, math.ceil(timeout * 1000))

@@ -1,1 +1,1 @@
-"""PTP, the picture transfer protocol of cameras: datasets, sessions and transports."""
+"""PTP, the Picture Transfer Protocol of cameras (ISO 15740): data formats, sessions, USB and network."""

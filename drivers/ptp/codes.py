@@ -1,11 +1,10 @@
-"""Numbers of PTP with their names: of the standard, and of Canon for EOS bodies.
+"""Codes of PTP and their names: those of the standard, and those of Canon for EOS bodies.
 
-Messages carry plain integers, because a device may use unnamed codes; `drivers.ptp.protocol.describe` returns their
-names. All known responses and event records have a name here, because users read them; other codes only if used.
-Canon's meanings are valid only for EOS bodies: other makers use the same numbers differently.
+All known responses and event records have a name, because they appear in messages to users. Other codes have one only
+if we use them. Canon's codes are valid only for EOS bodies, because other makers use the same numbers for other things.
 
-Sources: ISO 15740:2013, tables of clauses 10 to 13. Canon's extensions have no public standard; their numbers were
-recorded from devices and have the names of libgphoto2.
+Sources: ISO 15740:2013, tables of clauses 10 to 13. Canon's extensions have no public standard. Their numbers were
+recorded from devices, and their names are from libgphoto2.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from enum import IntEnum
 
 
 class Operation(IntEnum):
-    """Operations of an initiator; from 0x9000 of Canon."""
+    """Operations that a host requests; codes from 0x9000 are Canon's."""
 
     GET_DEVICE_INFO = 0x1001
     OPEN_SESSION = 0x1002
@@ -63,7 +62,7 @@ class Operation(IntEnum):
 
 
 class ResponseCode(IntEnum):
-    """Results of operations; from 0xa000 of Canon."""
+    """Results of operations; codes from 0xa000 are Canon's."""
 
     UNDEFINED = 0x2000
     OK = 0x2001
@@ -109,7 +108,7 @@ class ResponseCode(IntEnum):
 
 
 class EventCode(IntEnum):
-    """Events on the event channel; from 0xc000 of Canon."""
+    """Events that a device sends; codes from 0xc000 are Canon's."""
 
     UNDEFINED = 0x4000
     OBJECT_ADDED = 0x4002
@@ -123,7 +122,7 @@ class EventCode(IntEnum):
 
 
 class EosEvent(IntEnum):
-    """Types of the records in a reply to GetEvent."""
+    """Types of the records in a reply to Canon's GetEvent."""
 
     END = 0
     OBJECT_ADDED = 0xC181
@@ -158,7 +157,7 @@ class EosEvent(IntEnum):
 
 
 class ObjectFormat(IntEnum):
-    """Formats of objects; from 0xb100 of Canon."""
+    """Formats of objects; codes from 0xb100 are Canon's."""
 
     UNDEFINED = 0x3000
     ASSOCIATION = 0x3001
@@ -176,7 +175,7 @@ class ObjectFormat(IntEnum):
 
 
 class Property(IntEnum):
-    """Settings and states of a device; from 0xd100 of Canon."""
+    """Settings and states of a device; names with EOS are Canon's."""
 
     BATTERY_LEVEL = 0x5001
 
@@ -235,7 +234,7 @@ class Property(IntEnum):
 
 
 class DataType(IntEnum):
-    """Types of property values; 0x4000 is added for arrays."""
+    """Types of property values; an array has the code of its items plus 0x4000."""
 
     INT8 = 0x0001
     UINT8 = 0x0002
@@ -251,14 +250,14 @@ class DataType(IntEnum):
 
 
 class StorageType(IntEnum):
-    """Media of a store."""
+    """Kinds of storage in a device."""
 
     UNDEFINED = 0
     REMOVABLE_RAM = 4
 
 
 class FilesystemType(IntEnum):
-    """File systems of a store."""
+    """File systems of a storage."""
 
     UNDEFINED = 0
     DCF = 3
@@ -286,7 +285,7 @@ class FocusMode(IntEnum):
 
 
 class DriveMode(IntEnum):
-    """Action of the release button (property 0xd106)."""
+    """Drive mode of an EOS body (property 0xd106)."""
 
     SINGLE = 0x00
     CONTINUOUS = 0x01
@@ -300,7 +299,7 @@ class DriveMode(IntEnum):
 
 
 class WhiteBalance(IntEnum):
-    """White balance of an EOS body (property 0xd109); in raw files only metadata."""
+    """White balance of an EOS body (property 0xd109); it does not change the counts of raw files."""
 
     AUTO = 0x00
     DAYLIGHT = 0x01
@@ -315,7 +314,7 @@ class WhiteBalance(IntEnum):
 
 
 class CaptureDestination(IntEnum):
-    """Destination of frames (property 0xd11c); the body lists the values that it offers."""
+    """Destination of frames (property 0xd11c); a body lists those that it offers."""
 
     CARD = 2
     HOST = 4

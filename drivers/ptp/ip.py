@@ -1,10 +1,10 @@
-"""PTP over a network: transactions on one TCP connection, events on a second one.
+"""PTP over a network (PTP/IP): transactions on one TCP connection, events on a second one.
 
-A packet has a header with its length, including the header, and its type (32 bits each), and the fields of the type.
-The initiator opens the command channel with `InitCommandRequest`; `InitCommandAck` returns a connection number. The
-initiator sends this number on the event channel in `InitEventRequest`; the reply is `InitEventAck`. `InitFail` may
-replace either reply. Transactions use the command channel; events, `Ping` and `Pong` use the event channel. There is no
-thread: a waiting call answers the pings of the device at least once a second.
+A packet has its length with header (32 bits), its type (32 bits), and the fields of the type. The initiator opens the
+command channel with `InitCommandRequest`. The reply `InitCommandAck` has a connection number, with which the initiator
+opens the event channel (`InitEventRequest`, reply `InitEventAck`). To refuse, the camera replies `InitFail`.
+Transactions use the command channel. Events, `Ping` and `Pong` use the event channel. There is no thread: a call that
+waits for a reply also answers the pings of the camera.
 
 Source: CIPA DC-005-2005, PTP-IP, clauses 2.2 (connections) and 2.3 (packets).
 """
@@ -43,10 +43,9 @@ VERSION = 0x00010000  # PTP/IP 1.0
 _HEADER: Final = struct.Struct("<II")  # Length and type of a packet (clause 2.3)
 HEADER_LENGTH: Final = _HEADER.size  # Bytes
 _DATA_HEADER: Final = struct.Struct("<III")  # Length, type and transaction of a data packet
-# Longest accepted packet except data, bytes; the longest real packet carries a name of 40 characters.
-MAX_PACKET = 4096
+MAX_PACKET = 4096  # Longest accepted packet without data, bytes; real packets hold at most a name of 40 characters
 MAX_NAME_UNITS = 255  # Longest accepted name, UTF-16 units; the standard permits 39
-UNKNOWN_TOTAL = 0xFFFFFFFFFFFFFFFF  # Total length of a data phase of unknown length
+UNKNOWN_TOTAL = 0xFFFFFFFFFFFFFFFF  # Total length in `StartData` if the length of the data is unknown
 GUID_LENGTH = 16  # Bytes of a GUID
 
 
@@ -70,7 +69,7 @@ class PacketType(IntEnum):
 
 
 class FailReason(IntEnum):
-    """Reasons of a responder for refusing a connection."""
+    """Reasons why a responder refuses a connection."""
 
     REJECTED = 1
     BUSY = 2
@@ -116,9 +115,10 @@ def _read_sends_data(cursor: Cursor, _: str) -> bool:
     return phase == _DATA_OUT
 
 
-_NO_DATA_OR_IN = 1  # Data phase information: no data, or data to the initiator
-_DATA_OUT = 2  # Data phase information: data to the responder
+_NO_DATA_OR_IN = 1  # Data phase of a request: no data, or data to the initiator
+_DATA_OUT = 2  # Data phase of a request: data to the responder
 
+# Types of fields in packets.
 Guid = Annotated[bytes, FieldKind(lambda cursor, field: cursor.take(GUID_LENGTH, field), _encode_guid)]
 Name = Annotated[str, FieldKind(_read_name, _encode_name)]
 Version = Annotated[int, FieldKind(_read_version, lambda version: encode_integer(version, 4))]
@@ -129,13 +129,12 @@ Total = Annotated[
 SendsData = Annotated[
     bool, FieldKind(_read_sends_data, lambda sends: encode_integer(_DATA_OUT if sends else _NO_DATA_OR_IN, 4))
 ]
-# Field types of packets, in addition to the types of all datasets.
 Request = Annotated[PtpRequest, FieldKind(lambda cursor, _: PtpRequest.read(cursor), PtpRequest.encode)]
 
 
 @dataclass(frozen=True)
 class InitCommandRequest(PtpDataset):
-    """Names the initiator: a GUID of 16 bytes, which a paired camera checks, and a name."""
+    """Identifies the initiator by a name and a GUID of 16 bytes, which a paired camera checks."""
 
     guid: Guid
     name: Name
@@ -144,7 +143,7 @@ class InitCommandRequest(PtpDataset):
 
 @dataclass(frozen=True)
 class InitCommandAck(PtpDataset):
-    """The responder accepts, numbers the connection, and gives its name."""
+    """The responder accepts, and sends the number of the connection and its own name."""
 
     connection: U32
     guid: Guid
@@ -154,7 +153,7 @@ class InitCommandAck(PtpDataset):
 
 @dataclass(frozen=True)
 class InitEventRequest(PtpDataset):
-    """Number of the connection to which the event channel belongs."""
+    """Opens the event channel of the connection with this number."""
 
     connection: U32
 
@@ -166,14 +165,14 @@ class InitEventAck(PtpDataset):
 
 @dataclass(frozen=True)
 class InitFail(PtpDataset):
-    """The responder refuses; see `FailReason`."""
+    """The responder refuses the connection; see `FailReason`."""
 
     reason: U32
 
 
 @dataclass(frozen=True)
 class OperationRequest(PtpDataset):
-    """A request, and whether the initiator sends its data phase."""
+    """A request, and whether the initiator sends data with it."""
 
     sends_data: SendsData
     request: Request
@@ -181,7 +180,7 @@ class OperationRequest(PtpDataset):
 
 @dataclass(frozen=True)
 class StartData(PtpDataset):
-    """Start of a data phase of `total` bytes; None if the length is unknown."""
+    """Start of a data phase of `total` bytes, or of unknown length (None)."""
 
     transaction: U32
     total: Total
@@ -197,7 +196,7 @@ class Data(PtpDataset):
 
 @dataclass(frozen=True)
 class EndData(PtpDataset):
-    """The last bytes of a data phase; may be empty, or the whole data phase."""
+    """The last bytes of a data phase, which may be none or all of its bytes."""
 
     transaction: U32
     data: Rest = b""
@@ -212,7 +211,7 @@ class Cancel(PtpDataset):
 
 @dataclass(frozen=True)
 class Ping(PtpDataset):
-    """Requests a sign of life from the other side."""
+    """Asks the other side to reply with `Pong`, to check the connection."""
 
 
 @dataclass(frozen=True)
@@ -251,17 +250,17 @@ def encode(packet: Packet) -> bytes:
 
 
 def encode_data(transaction: int, data: bytes | memoryview, *, last: bool) -> bytes:
-    """Return a `Data` packet, or `EndData` for the last one; the data are copied only once."""
+    """Return the bytes of a `Data` packet, or of an `EndData` packet if `last`; the data are copied once."""
     length = _DATA_HEADER.size + len(data)
     packet_type = PacketType.END_DATA if last else PacketType.DATA
     return b"".join((encode_integer(length, 4), encode_integer(packet_type, 4), encode_integer(transaction, 4), data))
 
 
 class PacketCutter:
-    """Splits the stream of one channel into packets, for pieces of any size.
+    """Cuts the bytes of one channel into packets; the bytes may arrive in pieces of any size.
 
-    Data bytes are returned at once as `Data`, and only the last bytes of an END_DATA packet as `EndData`. After a
-    `ProtocolError` the position in the stream is lost, and every further `feed` raises too.
+    Data are returned as soon as they arrive, as `Data`. Only the last bytes of an END_DATA packet are `EndData`. After
+    a `ProtocolError` the position in the stream is unknown, and every further call of `feed` raises it again.
     """
 
     def __init__(self) -> None:
@@ -274,7 +273,7 @@ class PacketCutter:
     def feed(self, piece: bytes) -> list[Packet]:
         """Process the next bytes and return the packets that they complete."""
         packets: list[Packet] = []
-        # Data are passed on at once, so the buffer never holds more than the start of a short packet.
+        # Data are returned at once, so the buffer holds at most the start of a short packet.
         self._buffer = self._buffer + piece if self._buffer else piece
         self._position = 0
         try:
@@ -292,7 +291,7 @@ class PacketCutter:
         return len(self._buffer) - self._position
 
     def _take_packet(self, packets: list[Packet]) -> bool:
-        """Move one packet, or a part of one, from the buffer to `packets`; return whether to continue."""
+        """Move one packet, or a part of its data, from the buffer to `packets`; return whether to continue."""
         if self._data_type:
             return self._take_data(packets)
         if self._remaining < HEADER_LENGTH:
@@ -330,7 +329,7 @@ class PacketCutter:
         return self._remaining > 0
 
 
-# First bytes from HTTP servers; read as packets, they would have a length of gigabytes.
+# First bytes that HTTP servers send. Read as a packet, they would mean a length of gigabytes.
 _HTTP_STARTS: Final = (b"HTTP/", b"<!DOC", b"<HTML")
 
 
@@ -356,12 +355,11 @@ def _stream_error(fault: str) -> ProtocolError:
     return ProtocolError(f"the PTP/IP stream has {fault}; check that a camera answers at this port, and reconnect")
 
 
-# Bytes of one read: few calls for a long transfer, and no new memory mapping for each buffer.
-READ: Final = 128 * 1024
+READ: Final = 128 * 1024  # Most bytes of one read; larger buffers would need a memory mapping of their own
 
 
 class Channel:
-    """Packets on one of the two connections, in both directions."""
+    """Sends and receives packets on one of the two connections."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -373,7 +371,7 @@ class Channel:
         self._link.write(encode(packet), timeout)
 
     def send_data(self, transaction: int, data: bytes, piece: int, timeout: float) -> Iterator[None]:
-        """Announce a data phase, and send `piece` bytes at each step; short data go into one `EndData`."""
+        """Announce a data phase, and send `piece` bytes at each step of the iteration; the last packet is `EndData`."""
         self.send(StartData(transaction, len(data)), timeout)
         view = memoryview(data)
         last_start = max(0, len(data) - 1) // piece * piece
@@ -395,19 +393,19 @@ class Channel:
         self._link.close()
 
 
-MAX_EVENTS: Final = 4096  # Events kept if the caller never reads them
+MAX_EVENTS: Final = 4096  # Most events that are stored if the caller does not read them
 
 # Timeout of each connection and greeting, seconds; a camera wakes its network in a few seconds.
 CONNECT_S: Final = 10.0
 
-# Time for repeated connection attempts, seconds; devices refuse the second connection for about 0.1 s.
+# Time for which attempts to connect are repeated, seconds. Some devices refuse the event channel for about 0.1 s.
 EVENT_CHANNEL_S: Final = 2.0
 
-RETRY_S: Final = 0.1  # Pause between two attempts
+RETRY_S: Final = 0.1  # Pause between two attempts, seconds
 
-_PING_EVERY_S: Final = 1.0  # Interval at which the event connection is read during a wait
+_PING_EVERY_S: Final = 1.0  # Interval at which the event channel is read during a wait, seconds
 
-# Most packets in one read of the event connection, for a device that never stops sending.
+# Most packets that one call reads from the event channel, because a faulty device may never stop sending.
 _MAX_PACKETS_PER_READ: Final = 1 << 17
 
 # Bytes of data in a packet to the device, as in libgphoto2.
@@ -417,11 +415,11 @@ _CANCEL_S: Final = 2.0  # Timeout for the end of a cancelled transaction, second
 
 
 class IpTransport(CableTransport):
-    """A `drivers.ptp.protocol.Transport` over two links.
+    """A `drivers.ptp.protocol.Transport` over a network.
 
-    - `open_command`, `open_event` open the links, also after `reset`. If `open_event` raises `LinkClosed`, it is
-      repeated for 2 s.
-    - `guid`: 16 bytes that identify this computer to a paired camera.
+    - `open_command`, `open_event`: open the two connections, also after `reset`. If `open_event` raises `LinkClosed`,
+      it is repeated for `EVENT_CHANNEL_S`.
+    - `guid`: 16 bytes by which a paired camera recognises this computer.
     - `name`: name of this computer on the camera's display.
     """
 
@@ -448,7 +446,7 @@ class IpTransport(CableTransport):
     def connect(
         cls, host: str, port: int = PORT, *, event_port: int | None = None, guid: bytes, name: str, clock: Clock
     ) -> IpTransport:
-        """Connect to the camera at an address; `event_port` is None if both ports are equal."""
+        """Connect to the camera at an address; `event_port` None means the same port for the event channel."""
         second_port = port if event_port is None else event_port
         return cls(
             lambda: TcpLink.connect(host, port, CONNECT_S),
@@ -489,14 +487,14 @@ class IpTransport(CableTransport):
                     raise ProtocolError(f"{self.label} sent {type(packet).__name__} instead of a response; reset it")
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return the events received since the last call, and answer pings; never waits."""
+        """Return the events that were received since the last call, and answer pings, without waiting."""
         self._read_event_channel()
         events = tuple(self._events)
         self._events.clear()
         return events
 
     def reset(self) -> None:
-        """Disconnect and connect again; ends an open session."""
+        """Disconnect and connect again; an open session ends."""
         self.close()
         self._events.clear()
         self._command, self._event, self._name = self._connect(DeviceRefused, LinkClosed)
@@ -509,7 +507,7 @@ class IpTransport(CableTransport):
         self._command.close()
 
     def cancel(self, transaction: int) -> bool:
-        """Cancel a transaction whose data the caller cannot accept; return whether its end arrived."""
+        """Cancel a transaction if the caller cannot take its data; return whether its end arrived."""
         deadline = self._clock.monotonic() + _CANCEL_S
         with contextlib.suppress(LinkError, ProtocolError):
             self._event.send(Cancel(transaction), _CANCEL_S)
@@ -534,7 +532,7 @@ class IpTransport(CableTransport):
                 self._read_event_channel()
 
     def _read_event_channel(self) -> None:
-        """Read the waiting packets of the event channel and answer pings; never waits."""
+        """Read the packets that have arrived on the event channel, and answer pings, without waiting."""
         with contextlib.suppress(LinkTimeout):
             for _ in range(_MAX_PACKETS_PER_READ):
                 match self._event.next(0.0):
@@ -544,11 +542,11 @@ class IpTransport(CableTransport):
                         self._event.send(Pong(), _PING_EVERY_S)
 
     def _connect(self, *transient: type[Exception]) -> tuple[Channel, Channel, str]:
-        # A device reports busy until it has noticed that an earlier connection was closed.
+        # A camera refuses new connections until it has detected the end of the previous one.
         return self._retry(self._greet, *transient)
 
     def _greet(self) -> tuple[Channel, Channel, str]:
-        """Open both connections and introduce the initiator (clause 2.2); return them with the device name."""
+        """Open both channels with their first messages (clause 2.2); return them and the name of the device."""
         with contextlib.ExitStack() as opened:
             command = opened.enter_context(contextlib.closing(Channel(self._open_command())))
             command.send(self._initiator, CONNECT_S)
@@ -560,7 +558,7 @@ class IpTransport(CableTransport):
         return command, event, accepted.name.strip()
 
     def _retry(self, attempt: Callable[[], _T], *transient: type[Exception]) -> _T:
-        """Call `attempt` again for `EVENT_CHANNEL_S` while it raises one of `transient`."""
+        """Call `attempt`; repeat it for `EVENT_CHANNEL_S` as long as it raises one of `transient`."""
         deadline = self._clock.monotonic() + EVENT_CHANNEL_S
         while True:
             try:
@@ -588,8 +586,8 @@ class IpTransport(CableTransport):
         raise DeviceRefused(f"{self._address} refuses the connection: it {reason}")
 
 
-# Text of each refusal, with its remedy.
+# Message about each reason of a refusal, with a remedy.
 _REFUSALS: dict[int, str] = {
     FailReason.REJECTED: "is not paired with this computer; pair it again in the camera's wireless menu",
-    FailReason.BUSY: "is in use by another program or computer; disconnect the other, or switch the camera off and on",
+    FailReason.BUSY: "is in use by another program or computer; disconnect that one, or switch the camera off and on",
 }

@@ -1,17 +1,15 @@
-"""PTP on any cable: datasets, and a session of numbered transactions.
+"""PTP for USB and network: the binary format of its data, and a session of numbered transactions.
 
-A transaction is a request, at most one data phase, and a response; events arrive separately. All numbers are
-little-endian. A string is the count of its UTF-16 units with the closing NUL, then the units; an empty string is only
-the count 0. An array is a count of 32 bits, then the items.
+The computer is the initiator, and the camera is the responder. A transaction is a request of the initiator, at most one
+data phase, and a response. Events are sent separately. A dataset is a sequence of fields. Numbers are little-endian. A
+string has the count of its UTF-16 units with the closing NUL, then the units; an empty string is only the count 0. An
+array has a count of 32 bits, then the items.
 
-Contract:
-
-- ``decode`` and ``encode`` are inverse on well-formed bytes, so both ends of a cable share one type.
-- Invalid bytes of a device raise only `ProtocolError`. Counts are checked before memory is allocated. Extra bytes after
-  the last field are accepted, because later editions append fields. ``encode`` raises ValueError for values that the
-  protocol cannot carry.
-- Faults of cable or protocol go to the caller, who decides about a repetition. After a fault the session is over; a new
-  one starts with `Transport.reset` or a new transport.
+- ``decode`` reads bytes, and ``encode`` writes the same bytes again.
+- Invalid bytes from a device raise only `ProtocolError`. Extra bytes after the last field are accepted, because later
+  editions of the standard append fields. ``encode`` raises ValueError for a value that the format cannot hold.
+- After a fault of the connection or the protocol, the session has ended. `Transport.reset` or a new transport starts a
+  new session.
 
 Source: ISO 15740:2013, clauses 5 (types and datasets), 9.3 (sessions and transactions) and 13 (properties).
 """
@@ -42,7 +40,7 @@ from foundation.errors import (
 
 
 def describe(kind: type[IntEnum], code: int) -> str:
-    """Return name and number of a code, such as ``DEVICE_BUSY (0x2019)``; only the number without a name."""
+    """Return name and number of a code, such as ``DEVICE_BUSY (0x2019)``, or the number if it has no name."""
     try:
         return f"{kind(code).name} (0x{code:04x})"
     except ValueError:
@@ -50,7 +48,7 @@ def describe(kind: type[IntEnum], code: int) -> str:
 
 
 class Cursor:
-    """Reads little-endian `data` from its start; `name` is used in messages."""
+    """Reader of little-endian `data` that starts at the first byte; messages contain `name`."""
 
     def __init__(self, data: bytes, name: str, limit: int | None = None) -> None:
         if limit is not None and len(data) > limit:
@@ -66,7 +64,7 @@ class Cursor:
         return len(self._data) - self.position
 
     def fault(self, field: str, expected: str, value: object, position: int | None = None) -> ProtocolError:
-        """Return the error for a wrong field: the last one read, or the one at `position`."""
+        """Return the error for a wrong field: the field that was read last, or the field at `position`."""
         start = self._field_position if position is None else position
         return ProtocolError(f"{self.name}: {field} at byte {start} is {value}, expected {expected}")
 
@@ -121,14 +119,14 @@ class Cursor:
         return self.integers(self.u32(f"the count of {field}"), size, field, signed)
 
 
-# Largest accepted dataset, bytes; real ones stay below 10 kB, including long lists of handles.
+# Largest accepted dataset, bytes. Real datasets have less than 10 kB.
 MAX_DATASET = 1 << 20
 _MAX_STRING_UNITS = 254  # Longest string without its closing NUL, UTF-16 units
 
 Value = int | str | tuple[int, ...]  # A property's value: an integer, a string, or an array of integers
 
-_ARRAY = 0x4000  # Bit of array types (ISO 15740, table of data type codes)
-# Size in bytes, and whether signed, of each integer type.
+_ARRAY = 0x4000  # Bit of the types of arrays (ISO 15740, table of data type codes)
+# Size in bytes of each integer type, and whether the type is signed.
 _INTEGERS: dict[int, tuple[int, bool]] = {
     DataType.INT8: (1, True),
     DataType.UINT8: (1, False),
@@ -144,7 +142,7 @@ _INTEGERS: dict[int, tuple[int, bool]] = {
 
 
 def _read_string(cursor: Cursor, field: str) -> str:
-    # Cut at the first NUL; invalid UTF-16 becomes U+FFFD.
+    # The string ends at its first NUL. Invalid UTF-16 becomes U+FFFD.
     count = cursor.u8(f"the length of {field}")
     octets = cursor.take(2 * count, field)
     return octets[: 2 * _MAX_STRING_UNITS].decode("utf-16-le", "replace").partition("\0")[0]
@@ -186,7 +184,7 @@ def encode_u32_array(values: Iterable[int]) -> bytes:
 
 
 def read_value(cursor: Cursor, data_type: int, field: str) -> Value:
-    """Return the next property value of type `data_type`: one of `DataType`, or an array of it."""
+    """Return the next property value; `data_type` is a code of `DataType`, or of an array of such a type."""
     if data_type == DataType.STRING:
         return _read_string(cursor, field)
     if data_type & _ARRAY and data_type - _ARRAY in _INTEGERS:
@@ -204,7 +202,7 @@ def decode_value(data_type: int, data: bytes) -> Value:
 
 
 def encode_value(data_type: int, value: Value) -> bytes:
-    """Return the bytes of a property value; ValueError if it is not of the type."""
+    """Return the bytes of a property value; ValueError if the value does not have this type."""
     if data_type == DataType.STRING and isinstance(value, str):
         return encode_string(value)
     if data_type & _ARRAY and data_type - _ARRAY in _INTEGERS and isinstance(value, tuple):
@@ -218,7 +216,7 @@ def encode_value(data_type: int, value: Value) -> bytes:
 
 @dataclass(frozen=True)
 class FieldKind:
-    """Format of a dataset field: `read` takes a cursor, and the field's name for messages."""
+    """Format of a field of a dataset; `read` takes a cursor and the name of the field for messages."""
 
     read: Callable[[Cursor, str], Any]
     encode: Callable[[Any], bytes]
@@ -244,7 +242,7 @@ Rest = Annotated[bytes, FieldKind(lambda cursor, _: cursor.rest(), bytes)]  # Al
 
 
 class PtpDataset:
-    """Base of frozen dataclasses whose fields, each of a type above, follow each other in a dataset."""
+    """Base class of datasets: frozen dataclasses whose fields have the types above and the order of the bytes."""
 
     @classmethod
     @cache
@@ -270,7 +268,7 @@ class PtpDataset:
 
 @dataclass(frozen=True)
 class DeviceInfo(PtpDataset):
-    """Identity and capabilities of a device (GetDeviceInfo, 5.5.1); version 100 is 1.00."""
+    """Identity and capabilities of a device (GetDeviceInfo, 5.5.1); the number of version 1.00 is 100."""
 
     standard_version: U16 = 100
     vendor_extension_id: U32 = 0
@@ -290,7 +288,7 @@ class DeviceInfo(PtpDataset):
 
 @dataclass(frozen=True)
 class ObjectInfo(PtpDataset):
-    """An object in a store (GetObjectInfo, 5.5.3): sizes in bytes and pixels, dates as ``YYYYMMDDThhmmss``."""
+    """A file or folder in a storage (GetObjectInfo, 5.5.3): sizes in bytes or pixels, dates as ``YYYYMMDDThhmmss``."""
 
     storage: U32 = 0
     format: U16 = 0
@@ -315,9 +313,9 @@ class ObjectInfo(PtpDataset):
 
 @dataclass(frozen=True)
 class StorageInfo(PtpDataset):
-    """A store (GetStorageInfo, 5.5.2): capacities in bytes; 0xffffffff free images if the device does not report them.
+    """A storage, such as a card (GetStorageInfo, 5.5.2); capacities in bytes.
 
-    `padding` holds the bytes after the dataset: two NULs on the EOS 60D.
+    `free_images` is 0xffffffff if the device does not report it. `padding` holds the bytes after the dataset.
     """
 
     storage_type: U16 = 0
@@ -331,7 +329,7 @@ class StorageInfo(PtpDataset):
     padding: Rest = field(default=b"", repr=False)
 
 
-_NO_FORM, _ENUMERATION = 0, 2  # Form flag (13.3.3): no list of values, or all values
+_NO_FORM, _ENUMERATION = 0, 2  # Form flag (13.3.3): no list of values, or a list of all values
 
 
 @dataclass(frozen=True)
@@ -339,8 +337,8 @@ class DevicePropDesc:
     """A property of a device (GetDevicePropDesc, 13.3.3).
 
     - `choices`: permitted values; empty if they are not listed.
-    - `widened`: the device sends each choice of one byte as two bytes. The EOS 60D does so for the battery level
-      (0x5001: 100, 75, 50, 25, 0), against the standard.
+    - `widened`: the device sends each choice of one byte as two bytes, against the standard. The EOS 60D does this for
+      the battery level (0x5001).
     """
 
     code: int
@@ -372,23 +370,23 @@ class DevicePropDesc:
 
 _log = logging.getLogger(__name__)
 
-# Timeout for OpenSession, seconds. After a killed host, a body does not reply before it is reset.
+# Timeout for OpenSession, seconds. If the previous program was killed, a camera does not reply until it is reset.
 START_TIMEOUT_S = 1.5
-TIMEOUT_S = 20.0  # Default timeout of all other replies, as in libgphoto2
-TRANSIENT_LIMIT_S = 10.0  # Time for which a temporarily declined operation is repeated
+TIMEOUT_S = 20.0  # Default timeout of all other replies, seconds, as in libgphoto2
+TRANSIENT_LIMIT_S = 10.0  # Time for which a temporarily declined operation is repeated, seconds
 OPEN_TRIES = 3  # Attempts at OpenSession, with a reset between them, as in libgphoto2
 
-# Responses of a temporary nature.
+# Responses to an operation that is declined only temporarily.
 TRANSIENT = (ResponseCode.DEVICE_BUSY, ResponseCode.EOS_OBJECT_NOT_READY, ResponseCode.EOS_MEMORY_STATUS_NOT_READY)
 
-_FIRST_PAUSE_S = 0.05  # Pause before the first repetition; an operation takes milliseconds
-_LONGEST_PAUSE_S = 1.0  # Upper limit of the doubling pauses, so that a ready device waits at most 1 s
-# Last session number to try if a device declines the transaction number, as in libgphoto2.
+_FIRST_PAUSE_S = 0.05  # Pause before the first repetition, seconds; later pauses double
+_LONGEST_PAUSE_S = 1.0  # Longest pause, seconds, so that a device that is ready waits at most 1 s
+# Highest session number that is tried if a device declines the transaction number, as in libgphoto2.
 _LAST_SESSION = 8
 
 
 class OperationDeclined(DeviceRefused):
-    """The response to an operation was not OK; `code` is the response code."""
+    """The device declined an operation; `code` is its response code."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -403,7 +401,7 @@ _REMEDIES: dict[int, str] = {
 
 
 class PtpSession:
-    """The initiator's side of a session."""
+    """A session with a camera, in which operations are executed."""
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
         self._transport = transport
@@ -416,7 +414,7 @@ class PtpSession:
         return self._transport.label
 
     def open(self) -> None:
-        """Open the session, or take over one that an earlier host left open."""
+        """Open the session, or continue a session that an earlier program left open."""
         fault_count = 0
         session = 1
         pauses = self._pauses(TRANSIENT_LIMIT_S)
@@ -453,16 +451,16 @@ class PtpSession:
         timeout: float = TIMEOUT_S,
         retry_s: float = TRANSIENT_LIMIT_S,
     ) -> tuple[tuple[int, ...], bytes]:
-        """Execute an operation and return the response's parameters and the collected data.
+        """Execute an operation; return the parameters of the response, and the data that the device sent.
 
         Parameters
         ----------
         operation, parameters
             Code and up to five parameters.
         send
-            Data phase to the device; None if the operation has none.
+            Data to the device; None if the operation has no data in this direction.
         receive
-            Called with each piece of the data phase from the device; None collects the data.
+            Function that is called with each piece of data from the device. If None, the data are returned.
         timeout
             Longest wait for each reply, seconds.
         retry_s
@@ -477,16 +475,16 @@ class PtpSession:
             _log.debug("%s%s: %s", describe(Operation, operation), parameters, response_name)
             if transaction.response.ok:
                 return transaction.response.parameters, transaction.data
-            # A device that declines sends no data, so a repetition never repeats a call of `receive`.
+            # A device that declines an operation sends no data, so `receive` gets no data twice.
             if transaction.response.code not in TRANSIENT or not next(pauses, False):
                 raise self._declined_error(request, transaction.response.code)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return the events received since the last call; never waits."""
+        """Return the events that were received since the last call; wait at most some milliseconds."""
         return self._transport.events()
 
     def _pauses(self, limit: float) -> Iterator[bool]:
-        """Sleep for doubling pauses, one at each step; stop after `limit` seconds."""
+        """Sleep before each step of the iteration, with doubling pauses; end after `limit` seconds."""
         end = self._clock.monotonic() + limit
         pause = _FIRST_PAUSE_S
         while (remaining := end - self._clock.monotonic()) > 0:
@@ -500,7 +498,7 @@ class PtpSession:
 
 
 MAX_PARAMETERS = 5  # Parameters of 32 bits in a request, response or event
-LAST_TRANSACTION = 0xFFFFFFFE  # Highest transaction number; 1 follows, because 0 and 0xffffffff are reserved
+LAST_TRANSACTION = 0xFFFFFFFE  # Highest transaction number; the next is 1, because 0 and 0xffffffff are reserved
 
 
 def _read_parameters(cursor: Cursor, field: str) -> tuple[int, ...]:
@@ -518,8 +516,8 @@ def _encode_parameters(parameters: tuple[int, ...]) -> bytes:
 
 
 @dataclass(frozen=True)
-class _Coded(PtpDataset):
-    """Base of request, response and event: a code of `codes`, and parameters; as text ``NAME(0x1, 0x2)``."""
+class _Message(PtpDataset):
+    """Base class of requests, responses and events. As text, a message is ``NAME (0x1001)(0x1, 0x2)``."""
 
     codes: ClassVar[type[IntEnum]]
     code: U16
@@ -532,14 +530,14 @@ class _Coded(PtpDataset):
 
 
 @dataclass(frozen=True)
-class PtpRequest(_Coded):
+class PtpRequest(_Message):
     """An operation requested by the initiator."""
 
     codes = Operation
 
 
 @dataclass(frozen=True)
-class PtpResponse(_Coded):
+class PtpResponse(_Message):
     """Result of an operation; `transaction` is the number of the request."""
 
     codes = ResponseCode
@@ -551,37 +549,37 @@ class PtpResponse(_Coded):
 
 
 @dataclass(frozen=True)
-class PtpEvent(_Coded):
-    """An event in the device; `transaction` is 0xffffffff if it belongs to no transaction."""
+class PtpEvent(_Message):
+    """An event of the device; `transaction` is 0xffffffff if the event belongs to no transaction."""
 
     codes = EventCode
     transaction: U32 = 0xFFFFFFFF
 
 
 def next_transaction(transaction: int) -> int:
-    """Return the number after `transaction`; OpenSession has 0, and 0xffffffff means none."""
+    """Return the number of the transaction after `transaction`; 0 is the number of OpenSession."""
     return 1 if transaction >= LAST_TRANSACTION else transaction + 1
 
 
-# Largest data phase that a transport collects if the caller does not pass `receive`, bytes.
+# Most data that a transport collects if the caller does not pass `receive`, bytes.
 MAX_COLLECTED = 4 * 1024 * 1024
 
 
 @dataclass(frozen=True)
 class Transaction:
-    """Result of a transaction: the response, and the collected data phase."""
+    """Result of a transaction: the response, and the data that were collected."""
 
     response: PtpResponse
     data: bytes = b""
 
 
 class Transport(Protocol):
-    """An open cable to a PTP device, seen from the initiator."""
+    """An open connection from the initiator to a PTP device."""
 
     @property
     @abstractmethod
     def label(self) -> str:
-        """Name of the device in messages: address, and name if known."""
+        """Name of the device in messages: its address, and its own name if known."""
 
     @abstractmethod
     def transact(
@@ -592,15 +590,15 @@ class Transport(Protocol):
         receive: Callable[[bytes], object] | None = None,
         timeout: float,
     ) -> Transaction:
-        """Execute one transaction; arguments as in `PtpSession.call`, collecting at most `MAX_COLLECTED` bytes."""
+        """Execute one transaction; arguments as in `PtpSession.call`. At most `MAX_COLLECTED` bytes are collected."""
 
     @abstractmethod
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return the events received since the last call; never waits."""
+        """Return the events that were received since the last call; wait at most some milliseconds."""
 
     @abstractmethod
     def reset(self) -> None:
-        """Restore cable and device so that a session can be opened; ends an open session."""
+        """Reset connection and device so that a session can be opened; an open session ends."""
 
     @abstractmethod
     def close(self) -> None:
@@ -609,24 +607,24 @@ class Transport(Protocol):
 
 @dataclass(frozen=True)
 class Answer:
-    """A response and its data phase; `data` is None without a data phase, and b"" for an empty one."""
+    """A response and the data before it; `data` is None without a data phase, and b"" if the phase is empty."""
 
     response: PtpResponse
     data: bytes | None = None
 
 
 class NoAnswer(Exception):
-    """Raised by a responder that does not reply; the initiator times out."""
+    """Raised by a simulated responder that does not reply; the initiator's time limit then ends."""
 
 
 class Responder(Protocol):
-    """The device end of a cable: answers one request at a time, without containers or packets."""
+    """A simulated device, which answers one request at a time. Containers and packets are made elsewhere."""
 
     def takes_data(self, request: PtpRequest) -> bool:
-        """Return whether the initiator sends a data phase with this operation."""
+        """Return whether the initiator sends data with this operation."""
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-        """Execute a request; `data` is the initiator's data phase."""
+        """Execute a request; `data` are the data from the initiator."""
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that occurred since the last call."""
@@ -635,11 +633,11 @@ class Responder(Protocol):
         """Record that the initiator cancelled a transaction."""
 
     def unplugged(self) -> None:
-        """Record that the cable was unplugged or reset: the session is over."""
+        """Record that the cable was unplugged or reset, which ends the session."""
 
 
 class Reception:
-    """Receives the data and response of one request; `label` names the device."""
+    """Receiver of the data and the response of one request; `label` is the device in messages."""
 
     def __init__(self, request: PtpRequest, receive: Callable[[bytes], object] | None, label: str) -> None:
         self.request = request
@@ -652,7 +650,7 @@ class Reception:
 
     @property
     def remaining(self) -> int | None:
-        """Bytes of the data phase still to come; None if no length was announced."""
+        """Number of bytes that the data phase still lacks; None if no length was announced."""
         return None if self._announced_length is None else self._announced_length - self._received_count
 
     def start(self, transaction: int, length: int | None) -> None:
@@ -686,7 +684,7 @@ class Reception:
     def end(self, response: PtpResponse) -> Transaction:
         """Return the transaction that `response` completes."""
         self._check_transaction("a response", response.transaction)
-        # If the device aborts the data phase, its response reports the error and is returned.
+        # A device may end the data phase early and report an error. This response is returned.
         if response.ok and self._announced_length is not None and self._received_count != self._announced_length:
             raise ProtocolError(
                 f"{self.label} announced {self._announced_length} bytes with {self.request}, "
@@ -708,7 +706,7 @@ class Reception:
 
 
 class CableTransport(Transport, ABC):
-    """Base of transports over real cables; it refuses a transaction after an unfinished one."""
+    """Base class of transports over real cables; after an unfinished transaction, all others are refused."""
 
     def __init__(self) -> None:
         self.closed = False
@@ -720,7 +718,7 @@ class CableTransport(Transport, ABC):
 
     @abstractmethod
     def cancel(self, transaction: int) -> bool:
-        """Cancel a transaction whose data the caller cannot accept; return whether the next can follow."""
+        """Cancel a transaction if the caller cannot take its data; return whether another transaction is possible."""
 
     def transact(
         self,

@@ -1,8 +1,8 @@
 """PTP over USB: commands, data and responses in containers on the bulk pipes, events on the interrupt pipe.
 
-A container is its length with header (32 bits), its type (16), a code (16), the transaction (32), then up to five
-parameters of 32 bits, or a payload. Devices split containers in any way: header alone, data and response in one
-transfer, with or without a zero-length packet.
+A container has its length with header (32 bits), its type (16), a code (16), the transaction (32), and up to five
+parameters of 32 bits, or data (the payload). Devices divide containers into transfers in different ways. The header may
+be a transfer on its own, data and response may share one, and a zero-length packet may follow.
 
 Sources: USB Still Image Capture Device Definition 1.0, clauses 5 (control requests) and 7 (containers); ISO 15740:2013,
 annex D.
@@ -34,9 +34,8 @@ from foundation.errors import LinkError, LinkTimeout, ProtocolError
 
 _HEADER: Final = struct.Struct("<IHHI")  # Length, type, code and transaction (clause 7)
 HEADER_LENGTH: Final = _HEADER.size  # Bytes
-_LENGTH_AND_TYPE = 6  # Bytes before the code, where the message of ISO 15740 starts
-# Length field of a container that ends with a short packet: more than 4 GiB, or unknown.
-UNKNOWN_LENGTH = 0xFFFFFFFF
+_LENGTH_AND_TYPE = 6  # Bytes of length and type, before the message as in ISO 15740
+UNKNOWN_LENGTH = 0xFFFFFFFF  # Length field if a short packet ends the container: length unknown or above 4 GiB
 HIGH_SPEED_PACKET = 512  # wMaxPacketSize of a bulk pipe at high speed; 64 at full speed, 1024 at super speed
 
 
@@ -51,7 +50,7 @@ class ContainerType(IntEnum):
 
 @dataclass(frozen=True)
 class DataStart:
-    """Start of a data phase; `length` of the payload in bytes, None if a short packet ends it."""
+    """Start of a data phase; `length` of the payload in bytes, None if a short packet ends the payload."""
 
     code: int
     transaction: int
@@ -60,7 +59,7 @@ class DataStart:
 
 @dataclass(frozen=True)
 class DataPiece:
-    """The next bytes of the payload, may be empty; the piece with `last` ends the data phase."""
+    """The next bytes of the payload, which may be empty; the piece with `last` ends the data phase."""
 
     data: bytes
     last: bool = False
@@ -76,11 +75,10 @@ Message = PtpRequest | PtpResponse | PtpEvent | DataStart | DataPiece
 
 
 class ContainerReader:
-    """Splits the bytes of one pipe into messages, for pieces of any size.
+    """Divides the bytes of one pipe into messages; the bytes may arrive in pieces of any size.
 
-    `packet_size` is the pipe's wMaxPacketSize. It is used only in data phases of unknown length, which a short packet
-    ends: in these phases, each piece must be the result of one read. After a `ProtocolError` the position in the stream
-    is lost, and every further `feed` raises too.
+    If the length of the data is unknown, a packet that is not full (`packet_size`) ends them; each piece must then be
+    the result of one read. After a `ProtocolError`, every further call of `feed` raises it again.
     """
 
     def __init__(self, packet_size: int = HIGH_SPEED_PACKET) -> None:
@@ -90,7 +88,7 @@ class ContainerReader:
         self._in_data = False
 
     def feed(self, piece: bytes) -> list[Message]:
-        """Process the next bytes (b"" for a zero-length packet) and return the messages that they complete."""
+        """Process the next bytes, b"" for a zero-length packet; return the messages that they complete."""
         if self._in_data and self._payload_remaining is None:
             return self._feed_until_short(piece)
         messages: list[Message] = []
@@ -109,7 +107,7 @@ class ContainerReader:
         return [DataPiece(bytes(piece), last)] if piece or last else []
 
     def _take_message(self, messages: list[Message], piece: bytes) -> bool:
-        """Move one message, or a part of one, from the buffer to `messages`; return whether to continue."""
+        """Move one message, or a part of its data, from the buffer to `messages`; return whether to continue."""
         if self._in_data:
             return self._take_payload(messages)
         if len(self._buffer) < HEADER_LENGTH:
@@ -138,7 +136,7 @@ class ContainerReader:
         messages.append(DataStart(code, transaction, None))
         payload = bytes(self._buffer)
         self._buffer.clear()
-        # A header alone is also a short packet, but it starts the phase and does not end it.
+        # A header without data is also a short packet, but it does not end the data phase.
         last = bool(payload) and len(piece) % self._packet_size != 0
         if payload:
             messages.append(DataPiece(payload, last))
@@ -164,15 +162,15 @@ def encode(message: PtpRequest | PtpResponse | PtpEvent) -> bytes:
 
 
 def encode_data_header(code: int, transaction: int, length: int | None) -> bytes:
-    """Return the header of a payload of `length` bytes; if None or 4 GiB and more, a short packet ends the payload."""
+    """Return the header of a data container with `length` bytes of payload, None if the length is unknown."""
     total = UNKNOWN_LENGTH if length is None else min(HEADER_LENGTH + length, UNKNOWN_LENGTH)
     start = encode_integer(total, 4) + encode_integer(ContainerType.DATA, 2)
     return start + encode_integer(code, 2) + encode_integer(transaction, 4)
 
 
 def ends_with_empty_packet(total: int, packet_size: int) -> bool:
-    """Return whether a transfer of `total` bytes with header must end with a zero-length packet."""
-    # The receiver detects the end by a packet that is not full; if all are full, an empty packet must follow.
+    """Return whether a transfer of `total` bytes, including the header, must end with a zero-length packet."""
+    # The receiver detects the end by a packet that is not full. If all packets are full, an empty one must follow.
     return total % packet_size == 0
 
 
@@ -201,7 +199,7 @@ class ControlRequest(IntEnum):
 
 
 _CANCELLATION = 0x4001  # Cancellation code in the data of a CANCEL request (clause 5)
-# Bytes requested by GET_DEVICE_STATUS: a header of 4, and the addresses of stalled pipes.
+# Bytes that GET_DEVICE_STATUS requests: a header of 4 bytes and the addresses of stalled pipes.
 MAX_DEVICE_STATUS = 0x14
 
 
@@ -211,7 +209,7 @@ def encode_cancel(transaction: int) -> bytes:
 
 
 def decode_cancel(data: bytes) -> int:
-    """Return the number of the transaction that a CANCEL request ends."""
+    """Return the number of the transaction that a CANCEL request cancels."""
     cursor = Cursor(data, "a cancel request", 6)
     code = cursor.u16("code")
     if code != _CANCELLATION:
@@ -242,16 +240,15 @@ class DeviceStatus:
         return encode_integer(4 + len(parameters), 2) + encode_integer(self.code, 2) + parameters
 
 
-PIECE = 512 * 1024  # Largest transfer, bytes; some hosts and cameras fail with larger ones
-MAX_EVENTS = 4096  # Maximum number of events of one call, because a faulty device may never stop sending
+PIECE = 512 * 1024  # Largest transfer, bytes; some computers and cameras fail with larger transfers
+MAX_EVENTS = 4096  # Most events that one call returns, because a faulty device may never stop sending
 
-_CONTROL_S = 1.0  # Timeout of a control request; a reply takes milliseconds
-_READY_TRIES = 40  # Status requests after a cancellation or reset, 2 s in total
-_READY_EVERY_S = 0.05  # Pause between two status requests; short compared with a reset
-_DRAIN_S = 0.05  # Silence after which all old data have arrived
-# Maximum number of pieces to discard, 128 MiB: more than a raw frame, but a faulty device may never stop.
-_DRAIN_READS = 256
-_EMPTY_READS = 16  # Empty packets in a row that are skipped; one may follow a full packet, more are a fault
+_CONTROL_S = 1.0  # Timeout of a control request, seconds; a reply takes milliseconds
+_READY_TRIES = 40  # Most status requests after a cancellation or reset
+_READY_EVERY_S = 0.05  # Pause between two status requests, seconds
+_DRAIN_S = 0.05  # Time without data after which all old data have been discarded, seconds
+_DRAIN_READS = 256  # Most pieces that are discarded, because a faulty device may never stop sending
+_EMPTY_READS = 16  # Most empty packets in a row; one may follow a full packet, more are a fault of the device
 
 
 class UsbTransport(CableTransport):
@@ -278,9 +275,9 @@ class UsbTransport(CableTransport):
         return self._receive_reply(reception, timeout)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return the events received since the last call.
+        """Return the events that were received since the last call.
 
-        A call takes at least one polling interval of the interrupt pipe, some milliseconds.
+        It waits for one polling interval of the interrupt pipe, which is some milliseconds.
         """
         self.check_open()
         events: list[PtpEvent] = []
@@ -301,7 +298,7 @@ class UsbTransport(CableTransport):
         return tuple(events)
 
     def reset(self) -> None:
-        """Reset the device; ends an open session."""
+        """Reset the device; an open session ends."""
         self.check_open()
         try:
             self._pipes.control_out(ControlRequest.RESET_DEVICE, b"", _CONTROL_S)
@@ -358,7 +355,7 @@ class UsbTransport(CableTransport):
                 raise ProtocolError(f"{self.label} sent {empty_count} empty packets in a row; reset it")
             messages = self._reader.feed(piece)
             if is_open_ended and piece and len(piece) < limit and len(piece) % self._pipes.packet_size == 0:
-                # The zero-length packet at the end of the data phase has also ended this read.
+                # All packets were full, so a zero-length packet has ended this read. It also ends the data phase.
                 messages += self._reader.feed(b"")
             for message in messages:
                 match message:
@@ -379,11 +376,11 @@ class UsbTransport(CableTransport):
             return PIECE
         if not remaining:
             return packet_size
-        # Only whole packets of the data, so that the response never arrives in the same read.
+        # Read only whole packets of the data, so that a read never returns data and the response together.
         return max(packet_size, min(PIECE, remaining // packet_size * packet_size))
 
     def cancel(self, transaction: int) -> bool:
-        """Cancel a transaction if the caller cannot accept its data; return whether another transaction is possible."""
+        """Cancel a transaction if the caller cannot take its data; return whether another transaction is possible."""
         with contextlib.suppress(LinkError, ProtocolError):
             self._pipes.control_out(ControlRequest.CANCEL, encode_cancel(transaction), _CONTROL_S)
             self._await_ready()
@@ -400,7 +397,7 @@ class UsbTransport(CableTransport):
         raise LinkTimeout(f"{self.label} stays busy after a reset; switch it off and on")
 
     def _clear_pipes(self) -> None:
-        """Clear stalls of the bulk pipes, and discard data that the device still sends."""
+        """Clear the halts of the bulk pipes, and discard data that the device still sends."""
         for pipe in (Pipe.BULK_OUT, Pipe.BULK_IN):
             # Some devices refuse to clear a pipe that is not stalled.
             with contextlib.suppress(PipeStalled):

@@ -1,1 +1,1 @@
-"""Raw files of cameras: unprocessed counts, black level, active area."""
+"""Readers of raw files: unprocessed counts, black level, visible area."""

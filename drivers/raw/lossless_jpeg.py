@@ -1,8 +1,8 @@
-"""Integrity check of lossless JPEG streams, which hold the pixels of CR2 and most DNG files.
+"""Check whether lossless JPEG streams, which hold the counts in CR2 and most DNG files, are intact.
 
-LibRaw does not report damage: Huffman codes synchronise again after it, and all later samples are shifted or offset.
-Therefore the stream is also decoded here. It must hold as many samples as its header states, end there, and stay within
-its precision.
+LibRaw does not report a damaged stream. Huffman codes synchronise again after the damage, but all later samples have a
+wrong position or value. Therefore the stream is also decoded here. It must hold as many samples as its header states,
+end after the last one, and have no sample above its precision.
 
 Source: ITU-T T.81 (ISO/IEC 10918-1), annexes B (markers), C and F (Huffman codes) and H (lossless mode).
 """
@@ -22,17 +22,20 @@ from foundation.compiled import compiled
 # Markers (T.81, table B.1).
 _SOI, _EOI, _SOF0, _SOF1, _SOF3, _DHT, _DQT, _DRI, _SOS = 0xD8, 0xD9, 0xC0, 0xC1, 0xC3, 0xC4, 0xDB, 0xDD, 0xDA
 
-# Bytes after the last sample that are ignored, as some encoders write whole words. More are ignored if all are equal.
+# Number of bytes after the last sample that are ignored, because some encoders write whole words. More bytes are
+# ignored only if all are equal.
 _PADDING: Final = 4
 
-# Zeros that cannot be samples: if zero bits do not mean "as before", they would be a dozen equal steps.
+# Run of zero bytes. If zero bits are the code of a difference, the run is damage, because a dozen samples never change
+# by equal steps.
 _GAP: Final = bytes(16)
 
 _END: Final = bytes((0xFF, _EOI))
 
-_WHOLE, _NO_CODE, _TOO_SHORT, _TOO_LONG, _OUT_OF_RANGE = range(5)
+# Results of `_decode`.
+_INTACT, _NO_CODE, _TOO_SHORT, _TOO_LONG, _OUT_OF_RANGE = range(5)
 _REASONS: Final = {
-    _NO_CODE: "has bits that are not a code",
+    _NO_CODE: "has bits that are no Huffman code",
     _TOO_SHORT: "ends before its last sample",
     _TOO_LONG: "continues after its last sample",
     _OUT_OF_RANGE: "has samples above its precision",
@@ -41,7 +44,11 @@ _REASONS: Final = {
 
 @dataclass
 class _Header:
-    """Header of a stream; `tables` by number, (65536,) uint16 each: code length in bits · 256 + SSSS."""
+    """Header of a stream.
+
+    `tables`: Huffman tables, (65536,) uint16. The next 16 bits of the stream give an element. Its high byte is the
+    length of the code, and its low byte the number of bits of the difference (SSSS).
+    """
 
     precision: int = 0
     rows: int = 0
@@ -57,7 +64,7 @@ class _Header:
 
 
 class JpegSize(NamedTuple):
-    """Frame header of a JPEG: rows, samples per row of all `components`, and their bits."""
+    """Frame header of a JPEG: rows, samples per row (`columns`, of all components together), and bits per sample."""
 
     rows: int
     columns: int
@@ -69,8 +76,8 @@ class JpegSize(NamedTuple):
 def jpeg_size(stream: bytes | memoryview) -> JpegSize | None:
     """Return the frame header of a lossless or sequential DCT JPEG; None for other streams.
 
-    A DCT must have 8 or 12 bits and quantisation tables (T.81, tables B.2 and B.4); otherwise LibRaw decodes nothing
-    and leaves its memory unset.
+    A DCT stream must have 8 or 12 bits and quantisation tables (T.81, tables B.2 and B.4). For other DCT streams,
+    LibRaw returns memory that was never set.
     """
     size, is_quantised, position = None, False, 2
     while bytes(stream[:2]) == bytes((0xFF, _SOI)) and position + 10 <= len(stream) and stream[position] == 0xFF:
@@ -88,10 +95,10 @@ def jpeg_size(stream: bytes | memoryview) -> JpegSize | None:
 
 
 def lossless_fault(stream: bytes | memoryview) -> str | None:
-    """Return the damage of a strip or tile that starts as a lossless JPEG; None if it is intact or another format.
+    """Describe the damage of a strip or tile; None if it is intact, or if it is not checked.
 
-    Other processes than Huffman-coded lossless are not checked, nor components of different sizes (Canon's small raw
-    files, which are not Bayer data).
+    Only Huffman-coded lossless JPEG is checked, if its components have equal size. Canon's small raw files have other
+    components, but are no Bayer data.
     """
     try:
         header = _read_header(stream)
@@ -111,7 +118,7 @@ def lossless_fault(stream: bytes | memoryview) -> str | None:
         return f"its lossless JPEG is damaged: it has only zeros from byte {gap} on"
     size, limit = (header.rows, header.columns), 1 << header.precision
     result, row = _decode(np.frombuffer(data, np.uint8), header.start, tables, size, header.predictor, limit)
-    return None if result == _WHOLE else f"its lossless JPEG is damaged: it {_REASONS[result]}, detected in row {row}"
+    return None if result == _INTACT else f"its lossless JPEG is damaged: it {_REASONS[result]}, detected in row {row}"
 
 
 def _read_header(stream: bytes | memoryview) -> _Header | None:
@@ -140,7 +147,7 @@ def _read_header(stream: bytes | memoryview) -> _Header | None:
             table_of_component = {content[1 + 2 * number]: content[2 + 2 * number] >> 4 for number in range(count)}
             header.predictor, header.transform = content[1 + 2 * count], content[3 + 2 * count] & 15
             header.start = position
-            # A component that is missing in the scan has no table.
+            # A component that the scan does not list gets a table number that does not exist.
             header.table_numbers = tuple(table_of_component.get(component, -1) for component in header.components)
             return header
 
@@ -164,9 +171,9 @@ def _read_tables(content: bytes, tables: dict[int, npt.NDArray[np.uint16]]) -> N
 
 @compiled
 def _decode(stream: Any, start: int, tables: Any, size: Any, predictor: int, limit: int) -> tuple[int, int]:
-    """Decode a scan; return the fault (0 if none) and the row where it was detected.
+    """Decode a scan; return a result (`_INTACT` to `_OUT_OF_RANGE`), and the row where a fault was detected.
 
-    `stream` (N,) uint8; `tables` (C, 65536) uint16, one per component; `size`: rows and columns.
+    `stream` (N,) uint8; `tables` (C, 65536) uint16, one for each component; `size`: rows and columns.
     """
     components, (rows, columns) = len(tables), size
     above, row = np.zeros((columns, components), int64), np.zeros((columns, components), int64)
@@ -210,7 +217,7 @@ def _decode(stream: Any, start: int, tables: Any, size: Any, predictor: int, lim
                     return 4, y
                 row[x, component] = sample
         above, row = row, above
-    # Bytes that were read ahead count as unread. The rest of the last byte is padding, as may be a few equal bytes.
+    # Count the bytes after the last sample, including those that are already in the buffer.
     unread = (bits - missing_bits) // 8
     first = int64(stream[position]) if position < end else -1
     while position + 1 < end and not (stream[position] == 0xFF and stream[position + 1] != 0):

@@ -1,18 +1,16 @@
-"""Reads raw files into mosaics: unprocessed counts of the sensor with metadata, and planes of one colour.
+"""Read raw files: the unprocessed counts of the sensor with metadata (`Mosaic`), and planes of one colour (`Plane`).
 
-- Nothing is subtracted, scaled, rotated or interpolated: `Mosaic.counts` equals the output of ``dcraw -D -4 -T``
-  without its rotation.
-- Any bytes give a `Mosaic` or raise one `FormatError`. LibRaw fills missing pixels and reads beyond the stored data
-  without an error. Therefore each sensor image in a file must be complete, and LibRaw's result must have the size of
-  one of them (`StoredFrame.has_size`). In files other than TIFF and CR3 (see `layout_is_known`), only the size
-  and empty parts of the frame are checked.
-- LibRaw is called only here. DNG files with counts stored as in memory are read directly, with the same result. Colour
-  matrices of LibRaw are read by opening a small raw file with the camera's name.
+- Nothing is subtracted, scaled, rotated or interpolated. `Mosaic.counts` equals the output of ``dcraw -D -4 -T``, but
+  without rotation.
+- Any bytes give a `Mosaic` or raise one `FormatError`. LibRaw reports no error if pixels are missing. Therefore we
+  check that each sensor image in the file is complete, and that LibRaw's result has the size of one of them. In files
+  other than TIFF and CR3 (see `layout_is_known`), only the size and empty parts of the frame are checked.
+- LibRaw is called only here. DNG files whose counts are stored as in memory are read without it, with the same result.
 
-Sources: TIFF 6.0 (strips), TIFF technical note 1 and DNG 1.7.1 (tiles, CameraSerialNumber; ActiveArea, the origin of
-colour filters and black levels); LibRaw 0.22 for the selected directory, size and packing (src/metadata/tiff.cpp); Exif
+Sources: TIFF 6.0 (strips), TIFF technical note 1 and DNG 1.7.1 (tiles; CameraSerialNumber; ActiveArea, the origin of
+colour filters and black levels). LibRaw 0.22, src/metadata/tiff.cpp, for the selected directory, size and packing. Exif
 2.32, section 4.6.5 (BodySerialNumber, LensModel). Canon bodies before Exif 2.3 write a maker note that no standard
-defines: a TIFF directory with offsets from the start of the file. Source: P. Harvey, ExifTool,
+defines. It is a TIFF directory with offsets from the start of the file. Its source is P. Harvey, ExifTool,
 lib/Image/ExifTool/Canon.pm (0x000c SerialNumber, 0x0095 LensModel).
 """
 
@@ -57,19 +55,19 @@ if TYPE_CHECKING:
     from rawpy import RawPy
 
 
-# Tags of the Exif directory, and of the maker note in it (Exif 2.32).
-_EXIF_POINTER, _NOTE = int(TiffTag.EXIF_IFD_POINTER), 37500
+# Tags of the Exif directory, and of the maker note in this directory (Exif 2.32).
+_EXIF_POINTER, _MAKER_NOTE = int(TiffTag.EXIF_IFD_POINTER), 37500
 
 _CANON_SERIAL, _CANON_LENS = 0x000C, 0x0095  # Tags of Canon's maker note
 
-_MAX_ENTRIES = 512  # Most entries read from a directory; Canon's notes have about 60
+_MAX_ENTRIES = 512  # Most entries that are read from a directory; Canon's maker notes have about 60
 
-_MAX_TEXT = 128  # Longest lens name that is read, bytes; names of Canon have 70
+_MAX_TEXT = 128  # Longest lens name that is read, bytes; Canon's names have at most 70
 
 
 @dataclass(frozen=True)
 class FrameOrigin:
-    """Camera, lens and exposure as stated in a raw file.
+    """Camera, lens and exposure that a raw file states.
 
     - `camera`: maker and model, ``Canon EOS 550D``; empty if not stated.
     - `serial`: serial number of the body; empty if not stated.
@@ -86,10 +84,10 @@ class FrameOrigin:
 
     @property
     def exposure(self) -> float:
-        """Shutter time × ISO speed / f-number², seconds, proportional to the counts; 0 if not stated."""
+        """Shutter time × ISO speed / f-number², seconds, to which the counts are proportional; 0 if not stated."""
         if self.shutter_s is None or self.iso is None:
             return 0.0
-        # A lens without contacts states no f-number; its aperture is constant.
+        # For a lens without contacts no f-number is stated, but its aperture does not change.
         return self.shutter_s * self.iso / (self.aperture or 1.0) ** 2
 
     @property
@@ -124,13 +122,13 @@ def _first_text(directories: Sequence[Directory], tags: Sequence[TiffTag]) -> st
 
 
 def _read_canon_note(data: bytes | memoryview) -> tuple[str, str]:
-    """Return the serial number and lens model in Canon's maker note in a CR2; empty if there is none."""
+    """Return the serial number and lens model from Canon's maker note in a CR2; empty if not stated."""
     if bytes(data[:2]) not in (b"II", b"MM") or bytes(data[8:10]) != b"CR":
         return "", ""
     order = "<" if bytes(data[:2]) == b"II" else ">"
     try:
         (offset,) = struct.unpack_from(order + "I", data, 4)
-        for tag in (_EXIF_POINTER, _NOTE):
+        for tag in (_EXIF_POINTER, _MAKER_NOTE):
             entry = _read_entries(data, order, offset).get(tag)
             if entry is None:
                 return "", ""
@@ -159,12 +157,13 @@ def _read_entries(data: bytes | memoryview, order: str, start: int) -> dict[int,
 # Matrix from CIE XYZ (D65, Y = 1) to linear camera RGB, three rows of three numbers.
 Matrix = tuple[tuple[float, float, float], ...]
 
-_SIDE = 32  # Side of the small raw file, photosites; LibRaw requires at least 22
+_SIDE = 32  # Height and width of the raw file in `camera_matrix`, photosites; LibRaw requires at least 22
 
 
 @lru_cache(maxsize=64)
 def camera_matrix(camera: str) -> Matrix | None:
-    """Return the colour matrix of a camera, such as ``Canon EOS 550D``; None if LibRaw has none."""
+    """Return the colour matrix that LibRaw has for a camera, such as ``Canon EOS 550D``; None if it has none."""
+    # LibRaw gives the matrix only for a file, so a small raw file with the camera's name is made.
     maker, _, model = camera.strip().partition(" ")
     if not model or not camera.isascii():
         return None
@@ -195,31 +194,30 @@ def camera_matrix(camera: str) -> Matrix | None:
     return matrix if any(any(row) for row in matrix) else None
 
 
-_SKIPPED_COLUMNS = 4  # The readout of a row disturbs the first columns of a masked area (observed on the 550D)
+_SKIPPED_COLUMNS = 4  # First columns of a masked area, which the readout of a row disturbs (observed on the 550D)
 
-# Photosites per position of the 2×2 block; with fewer, the masked mean is less certain than the metadata.
-_MIN_MASKED = 256
+_MIN_MASKED = 256  # Fewest masked photosites for each position of the 2×2 block, for a reliable mean
 
-# If at least so many photosites have the highest count, it is the saturation level; noise does not give so many equal
+# If at least this number of photosites has the highest count, it is the saturation level. Noise gives fewer equal
 # counts.
-_PLATEAU = 64
+_PLATEAU_PHOTOSITES = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Mosaic:
-    """One raw frame as recorded by the sensor; all arrays are read-only.
+    """One raw frame as the sensor recorded it; all arrays are read-only.
 
     - `counts`: (H, W) uint16, unprocessed counts of the visible area, a view into `sensor`. H and W may be odd.
     - `pattern`: colours of the 2×2 block at the top left of the visible area, row by row; one of `BAYER_PATTERNS`.
-    - `black`: (2, 2) float64, black level of each position of that block, counts. From the metadata; for Canon's own
-      formats from LibRaw, which measures it in the borders and truncates it to an integer.
-    - `white_level`: counts, from the metadata or LibRaw. It is not the saturation level: 15 831 is stated for a 550D
-      that saturates at 13 584 (ISO 100); see `saturation`.
+    - `black`: (2, 2) float64, black level of each position of that block, counts, from the metadata. For Canon's own
+      formats, LibRaw measures it in the masked borders and truncates it to an integer.
+    - `white_level`: counts, from the metadata or LibRaw. The real saturation level may be lower, see `saturation`. An
+      EOS 550D states 15 831 and saturates at 13 584 (ISO 100).
     - `camera`: maker and model, ``Canon EOS 550D``; empty if not stated.
-    - `sensor`: (RH, RW) uint16, the whole sensor with its masked borders.
+    - `sensor`: (RH, RW) uint16, counts of the whole sensor with its masked borders.
     - `visible`: area of `counts` on the sensor.
     - `masked`: optically black areas in sensor coordinates; empty if none is known.
-    - `iso`, `aperture`, `shutter_s`: ISO speed, f-number, seconds, as stated; None if not stated.
+    - `iso`, `aperture`, `shutter_s`: stated ISO speed, f-number and shutter time in seconds; None if not stated.
     - `serial`, `lens`: serial number of the body and lens model; empty if not stated.
     """
 
@@ -248,15 +246,15 @@ class Mosaic:
         Returns
         -------
         (2, 2) float64, counts, or None
-            Mean for each position of the top left visible block. The first four columns of each area are left out,
-            as are photosites more than six robust standard deviations from the median. None if the masked areas are
-            too small. Not truncated: an integer would lose up to one count (LibRaw's 2047 for 2047.98).
+            Mean for each position of the top left visible block, not truncated to an integer. The mean excludes the
+            first four columns of each area, and photosites more than six robust standard deviations from the median.
+            None if the masked areas are too small.
         """
         means = np.empty((2, 2))
         for row in range(2):
             for column in range(2):
                 phase_counts = [self._masked_phase(area, row, column) for area in self.masked]
-                # There are few different counts, so a histogram is sufficient and fast.
+                # A histogram is faster, because there are few different counts.
                 frequencies = np.bincount(np.concatenate(phase_counts)) if phase_counts else np.zeros(0, dtype=np.int64)
                 if frequencies.sum() < _MIN_MASKED:
                     return None
@@ -271,18 +269,18 @@ class Mosaic:
     def saturation(self) -> int:
         """Return the saturation level of this frame, counts.
 
-        The stated white level, or the highest count if it is lower and at least 64 photosites have it. A frame
-        without clipped photosites keeps the stated level, which is too high. This does no harm, because no count is
-        near it.
+        It is the stated white level, or the highest count if this is lower and at least 64 photosites have it. In a
+        frame without clipped photosites, the stated level may be too high. This does no harm, because no count is near
+        it.
         """
         top = int(self.counts.max())
-        has_plateau = top < self.white_level and int(np.count_nonzero(self.counts == top)) >= _PLATEAU
+        has_plateau = top < self.white_level and int(np.count_nonzero(self.counts == top)) >= _PLATEAU_PHOTOSITES
         return top if has_plateau else self.white_level
 
     def block_planes(self) -> NDArray[np.uint16]:
-        """Return the four positions of the 2×2 blocks as planes, (2, 2, H/2, W/2).
+        """Return the four positions of the 2×2 blocks as planes, (2, 2, H/2, W/2), a view of `counts`.
 
-        ``[r, c, i, j]`` is ``counts[2 i + r, 2 j + c]``, without copying. An odd last row or column is left out.
+        ``[r, c, i, j]`` is ``counts[2 i + r, 2 j + c]``. If H or W is odd, the last row or column is left out.
         """
         height, width = (size // 2 for size in self.counts.shape)
         down, right = self.counts.strides
@@ -291,7 +289,7 @@ class Mosaic:
         )
 
     def _masked_phase(self, area: Area, row: int, column: int) -> NDArray[np.uint16]:
-        """Return the masked photosites of `area` in phase with (`row`, `column`) of the visible block."""
+        """Return the photosites of a masked area with the colour filter of position (`row`, `column`) of the block."""
         top, left = area.top, area.left + _SKIPPED_COLUMNS
         top += (self.visible.top + row - top) % 2
         left += (self.visible.left + column - left) % 2
@@ -306,10 +304,10 @@ def _median(values: NDArray[np.float64], frequencies: NDArray[np.int64]) -> floa
     return float(values[order][middle].mean())
 
 
-# Sensor size and LibRaw's visible area of cameras for which dcraw has one more row at the top: LibRaw makes the odd top
-# margin of a Canon even. Measured with dcraw 9.28 and LibRaw 0.22 on CR2 files of (in this order) the 50D; 1D Mark IV;
-# 550D, 600D and 60D; 7D; 5D Mark II.
-_ONE_ROW_MORE = {
+# Sensor size and LibRaw's visible area of Canon cameras for which dcraw has one more row at the top, because LibRaw
+# makes an odd top margin even. Measured with dcraw 9.28 and LibRaw 0.22 on CR2 files. Cameras in this order: 50D;
+# 1D Mark IV; 550D, 600D and 60D; 7D; 5D Mark II.
+_AREAS_WITH_EXTRA_ROW = {
     ((3228, 4832), Area(52, 62, 3176, 4770)),
     ((3318, 5120), Area(46, 142, 3272, 4916)),
     ((3516, 5344), Area(52, 142, 3464, 5202)),
@@ -317,10 +315,9 @@ _ONE_ROW_MORE = {
     ((3804, 5792), Area(52, 158, 3752, 5634)),
 }
 
-# Masked columns at the left that are not black: number at the sensor's edge, and number next to the visible area. From
-# LibRaw 0.22 (src/metadata/identify.cpp, table of Canon's sensors). For all other Canon bodies with masked columns
-# LibRaw uses all except the outermost.
-_BLACK_COLUMNS = {
+# Number of masked columns at the left that are not black: at the edge of the sensor, and next to the visible area.
+# Source: LibRaw 0.22, src/metadata/identify.cpp, table of Canon's sensors.
+_UNUSABLE_BLACK_COLUMNS = {
     "Canon EOS R10": (16, 48),
     "Canon EOS R6m2": (16, 48),
     "Canon EOS R6 Mark II": (16, 48),
@@ -328,8 +325,8 @@ _BLACK_COLUMNS = {
     "Canon EOS R5 Mark II": (128, 4),
 }
 
-# Optically black areas by camera and sensor, from rawspeed's cameras.xml; a shared corner belongs to only one area.
-_MASKED = {
+# Optically black areas by camera and sensor size, from rawspeed's cameras.xml. The areas do not overlap.
+_MASKED_AREAS = {
     ("Canon EOS 550D", (3516, 5344)): (Area(0, 0, 3516, 140), Area(4, 140, 44, 5204)),
     ("Canon EOS REBEL T2i", (3516, 5344)): (Area(0, 0, 3516, 140), Area(4, 140, 44, 5204)),
     ("Canon EOS Kiss X4", (3516, 5344)): (Area(0, 0, 3516, 140), Area(4, 140, 44, 5204)),
@@ -343,9 +340,9 @@ def read_raw(path: Path) -> Mosaic:
 
 
 def decode_raw(data: bytes | memoryview, path: Path, *, is_verified: bool = False) -> Mosaic:
-    """Return the mosaic of a raw file's bytes; `path` is used in messages.
+    """Return the mosaic of the bytes of a raw file; `path` is the file in messages.
 
-    `is_verified` skips the check of the lossless JPEG, for bytes that were decoded before.
+    `is_verified`: whether the same bytes were decoded before; the lossless JPEG is then not checked again.
     """
     if not data:
         raise _unreadable_error(path, "it is empty")
@@ -354,7 +351,7 @@ def decode_raw(data: bytes | memoryview, path: Path, *, is_verified: bool = Fals
     if plain_mosaic is not None:
         return plain_mosaic
     with ThreadPoolExecutor(1, "LibRaw") as executor:
-        # LibRaw releases the interpreter lock, so decoding and check run in parallel.
+        # LibRaw releases Python's interpreter lock, so it decodes while this thread checks.
         mosaic = executor.submit(_decode_with_libraw, path, data, contents)
         fault = None if is_verified else _lossless_fault(data, contents)
     if fault is not None:
@@ -373,7 +370,7 @@ def _decode_with_libraw(path: Path, data: bytes | memoryview, contents: _Content
 
     with _libraw_silenced():
         try:
-            # Not closed: the counts are in LibRaw's memory, which is freed with the last view.
+            # The file is not closed, because the counts are in LibRaw's memory. The last view of them frees it.
             return _mosaic_from_libraw(path, rawpy.imread(io.BytesIO(data)), data, contents)
         except (rawpy.LibRawError, rawpy.NotSupportedError) as error:
             raise _unreadable_error(path, f"LibRaw reports {_reason(error)}") from error
@@ -381,29 +378,29 @@ def _decode_with_libraw(path: Path, data: bytes | memoryview, contents: _Content
             raise _unreadable_error(path, str(error) or type(error).__name__) from error
 
 
-_LOSSLESS_BITS = 1.0  # Fewest bits per photosite of a lossless JPEG (ITU-T T.81, annex H)
+_LOSSLESS_BITS = 1.0  # Fewest bits per photosite in a lossless JPEG (ITU-T T.81, annex H)
 
-# Compression (TIFF 6.0; DNG 1.7.1, chapter 3; Sony's own).
+# Codes of the tag Compression (TIFF 6.0; DNG 1.7.1, chapter 3; _SONY is Sony's own).
 _UNCOMPRESSED, _OLD_JPEG, _JPEG, _SONY, _LOSSY_JPEG = 1, 6, 7, 32767, 34892
 
-# Compression of DNG that our LibRaw does not support (DNG 1.7.1, chapter 3; 32946 is Adobe's older number).
+# Compressions of DNG that our LibRaw does not support (DNG 1.7.1, chapter 3; 32946 is Adobe's older code).
 _UNSUPPORTED = {8: "Deflate", 32946: "Deflate", 9: "VC-5", 52546: "JPEG XL"}
 
-# First words of makers whose TIFF files state size and position of the raw pixels in standard tags.
+# Starts of the names of makers whose TIFF files state size and position of the raw pixels in standard tags.
 _MAKERS = ("nikon", "sony", "pentax", "ricoh", "olympus", "om digital", "samsung", "hasselblad")
 
-# Tags of tables that LibRaw applies to the stored values.
-_TONES = (TiffTag.LINEARIZATION_TABLE, TiffTag.GRAY_RESPONSE_CURVE)
+# Tags of tables through which LibRaw maps the stored values.
+_TONE_TABLES = (TiffTag.LINEARIZATION_TABLE, TiffTag.GRAY_RESPONSE_CURVE)
 
 _LINEAR_RAW = 34892  # PhotometricInterpretation of pixels with all colours (DNG 1.7.1)
 
 
-LAYOUT_START = 12  # Number of first bytes that identify the layout of a file
+LAYOUT_START = 12  # Number of bytes at the start of a file that identify its layout
 
 
 def layout_is_known(start: bytes | memoryview) -> bool:
-    """Return whether a file with these first `LAYOUT_START` bytes is a TIFF or CR3; only their storage is checked."""
-    # Panasonic's files start almost like TIFF, but their pixel tags have other meanings.
+    """Return whether a file is a TIFF or CR3, whose storage can be checked; `start`: first `LAYOUT_START` bytes."""
+    # Panasonic's files are almost TIFF, but their pixel tags have other meanings.
     return bytes(start[4:12]) == _CR3_START or (is_tiff(start) and start[:4] != b"IIU\0")
 
 
@@ -411,13 +408,13 @@ _CR3_START = b"ftypcrx "  # Type and brand of the first box of a CR3, after its 
 
 
 def stored_frames(data: bytes | memoryview, directories: Sequence[Directory]) -> list[StoredFrame]:
-    """Return the complete frames of a TIFF file with these directories, the largest first."""
+    """Return the frames of a TIFF file with these directories, the largest first; see `check_frames`."""
     frames = list(_tiff_frames(data, directories))
     return sorted(check_frames(data, frames), key=lambda frame: -frame.rows * frame.columns)
 
 
 def check_frames(data: bytes | memoryview, frames: Sequence[StoredFrame]) -> Sequence[StoredFrame]:
-    """Return `frames`; refuse an empty sequence, and frames with missing, overlapping or too few bytes."""
+    """Return `frames`; raise RawDamaged if there are none, or if one has missing, overlapping or too few bytes."""
     if not frames:
         raise RawDamaged("it describes no sensor pixels")
     for frame in frames:
@@ -440,11 +437,11 @@ def check_frames(data: bytes | memoryview, frames: Sequence[StoredFrame]) -> Seq
 
 
 def _tiff_frames(data: bytes | memoryview, directories: Sequence[Directory]) -> Iterator[StoredFrame]:
-    # LibRaw treats a DNG version of zeros as missing.
+    # LibRaw treats a DNG version of only zeros as missing.
     is_dng = any(any(directory.integers(TiffTag.DNG_VERSION)) for directory in directories)
     is_canon = bytes(data[8:10]) == b"CR" and not is_dng
     maker = next((name for directory in directories if (name := directory.text(TiffTag.MAKE))), "")
-    # Files of Olympus state that their pixels are grey.
+    # Olympus files state photometric interpretation 1, grey, for their raw pixels.
     interpretations = {CFA, 1} if data[2:4] in (b"RO", b"RS", b"OR") else {CFA}
     for directory in directories:
         if is_canon:
@@ -459,14 +456,14 @@ def _tiff_frames(data: bytes | memoryview, directories: Sequence[Directory]) -> 
             continue
         if not is_dng and not maker.casefold().startswith(_MAKERS):
             raise RawUnsupported(f"the layout of files by {maker or 'an unnamed maker'} cannot be checked")
-        for tones in (directory.integers(tag) for tag in _TONES):
-            if tones and (list(tones) != sorted(tones) or tones[0] == tones[-1]):
+        for table in (directory.integers(tag) for tag in _TONE_TABLES):
+            if table and (list(table) != sorted(table) or table[0] == table[-1]):
                 raise RawDamaged("its linearisation table does not rise")
         yield (_dng_frame if is_dng else _maker_frame)(data, directory, _read_extents(directory))
 
 
 def _read_extents(directory: Directory) -> tuple[Extent, ...]:
-    """Return the strips or tiles of a directory; the tiles if both are stated, as in Sony's files."""
+    """Return the strips or tiles of a directory; if both are stated, as in Sony's files, the tiles."""
     offsets_tag, sizes_tag = (
         (TiffTag.TILE_OFFSETS, TiffTag.TILE_BYTE_COUNTS)
         if directory.integers(TiffTag.TILE_OFFSETS)
@@ -493,8 +490,8 @@ def _dng_frame(data: bytes | memoryview, directory: Directory, extents: tuple[Ex
     if compression not in (_UNCOMPRESSED, _JPEG, _LOSSY_JPEG):
         name = _UNSUPPORTED.get(compression, f"number {compression}")
         raise RawUnsupported(f"its compression is {name}, which is not supported")
-    # A linearisation table may give any count of 16 bits.
-    count_bits = 16 if any(directory.integers(tag) for tag in _TONES) else min(bits, 16)
+    # With a linearisation table, all counts of 16 bits are possible.
+    count_bits = 16 if any(directory.integers(tag) for tag in _TONE_TABLES) else min(bits, 16)
     if not 8 <= bits <= 16 or directory.first(TiffTag.SAMPLE_FORMAT) > 1:
         raise RawUnsupported(f"its photosites have {bits} bits or are not integers, expected integers of 8 to 16 bits")
     is_tiled = bool(directory.integers(TiffTag.TILE_OFFSETS))
@@ -516,7 +513,7 @@ def _dng_frame(data: bytes | memoryview, directory: Directory, extents: tuple[Ex
         return StoredFrame(rows, columns, extents, bits, count_bits, directory=directory)
     if compression == _LOSSY_JPEG:
         return StoredFrame(rows, columns, extents, bits=count_bits, directory=directory)
-    # LibRaw wraps rows at the sensor's edge, and treats the first strip as all data.
+    # LibRaw decodes only the first strip, and continues a tile that is too wide in the next row.
     if part_width > columns or not (is_tiled or len(extents) == 1):
         raise RawUnsupported("its JPEG has several strips, or tiles wider than the sensor")
     is_lossless = True
@@ -531,7 +528,7 @@ def _dng_frame(data: bytes | memoryview, directory: Directory, extents: tuple[Ex
 
 
 def _cr2_frame(data: bytes | memoryview, directory: Directory) -> StoredFrame | None:
-    """Return the frame of a directory with a lossless JPEG, with the size of the JPEG; None for other directories."""
+    """Return the frame of a CR2 directory with a lossless JPEG, from its size; None for other directories."""
     if not directory.integers(TiffTag.STRIP_OFFSETS):
         return None
     offset, size = directory.first(TiffTag.STRIP_OFFSETS), directory.first(TiffTag.STRIP_BYTE_COUNTS)
@@ -552,7 +549,8 @@ def _cr2_frame(data: bytes | memoryview, directory: Directory) -> StoredFrame | 
 
 def _maker_frame(data: bytes | memoryview, directory: Directory, extents: tuple[Extent, ...]) -> StoredFrame:
     rows, columns = directory.first(TiffTag.IMAGE_LENGTH), directory.first(TiffTag.IMAGE_WIDTH)
-    # TIFF 6.0: uncompressed if not stated. Olympus states compressed pixels of 16 bits as uncompressed.
+    # Pixels are uncompressed if no compression is stated (TIFF 6.0). Olympus states uncompressed for compressed pixels
+    # of 16 bits.
     compression = directory.first(TiffTag.COMPRESSION) or _UNCOMPRESSED
     bits = directory.first(TiffTag.BITS_PER_SAMPLE)
     size, least_bits, spare_rows = sum(size for _, size in extents), LEAST_BITS, 0
@@ -562,8 +560,8 @@ def _maker_frame(data: bytes | memoryview, directory: Directory, extents: tuple[
         if not _are_contiguous(extents):
             raise RawUnsupported("its strips are not contiguous")
         is_grey = directory.first(TiffTag.PHOTOMETRIC_INTERPRETATION) != CFA
-        # LibRaw treats grey pixels as compressed from 8/7 bits per photosite on. It reads 14 bits as 16, unless the
-        # rows have exactly the size of 14 bits in whole blocks of 16 bytes.
+        # LibRaw accepts compressed grey pixels from 8/7 bits per photosite on. It reads 16 bits for each photosite of
+        # 14 bits, unless the pixels have exactly the size of packed rows that are padded to blocks of 16 bytes.
         size_of_14_bits = rows * -(-columns * 7 // 64) * 16 if columns % 4 == 0 else 0
         least_bits = 8 / 7 if is_grey and bits == 16 else 16 if bits > 12 and size != size_of_14_bits else bits
     elif compression in (_OLD_JPEG, _JPEG):
@@ -595,11 +593,11 @@ def _mosaic_from_libraw(path: Path, raw: RawPy, data: bytes | memoryview, conten
             f"{contents.frames[0].columns}×{contents.frames[0].rows} are stored",
         )
     sensor = raw.raw_image
-    # A view that does not keep LibRaw's object alive would show freed memory.
+    # The counts are in the memory of LibRaw's object. If the view does not keep this object alive, copy them.
     if sensor.base is not raw or sensor.dtype != np.uint16:
         sensor = np.array(sensor, dtype=np.uint16)
     sensor.setflags(write=False)
-    # LibRaw leaves its memory unset where it decodes nothing.
+    # If LibRaw decodes nothing, its memory holds random values.
     if stored.bits < 16 and int(sensor.max()) >> stored.bits:
         raise _unreadable_error(path, f"its counts reach {sensor.max()}, expected at most {stored.bits} bits")
     libraw_area = Area(sizes.top_margin, sizes.left_margin, sizes.height, sizes.width)
@@ -612,7 +610,7 @@ def _mosaic_from_libraw(path: Path, raw: RawPy, data: bytes | memoryview, conten
         raise _unreadable_error(path, f"its visible area {libraw_area} is not inside its {columns}×{rows} sensor")
     directory = stored.directory
     visible = _active_area(directory, (rows, columns)) or _dcraw_frame((rows, columns), libraw_area)
-    # rawpy's pattern starts at the sensor's corner, ours at the corner of the visible area.
+    # rawpy's pattern starts at the corner of the sensor, ours at the corner of the visible area.
     colours = np.roll(pattern, (-visible.top, -visible.left), axis=(0, 1))
     names = raw.color_desc.decode("ascii", "replace")
     letters = "".join(names[index] for index in colours.ravel())
@@ -628,7 +626,7 @@ def _mosaic_from_libraw(path: Path, raw: RawPy, data: bytes | memoryview, conten
     black.setflags(write=False)
     exposure = raw.other.iso_speed, raw.other.aperture, raw.other.shutter_speed
     mosaic = _assemble_mosaic(data, contents, stored, sensor, visible, letters, black, int(raw.white_level), exposure)
-    # LibRaw accepts any file of 123 known sizes as a frame, even zeros.
+    # LibRaw knows some formats only by the size of the file, so it also accepts a file of zeros.
     fault = None if contents.frames else filled_fault(mosaic.counts, mosaic.black, mosaic.white_level)
     if fault is not None:
         raise _unreadable_error(path, fault)
@@ -646,12 +644,12 @@ def _assemble_mosaic(
     white_level: int,
     exposure: tuple[float, float, float],
 ) -> Mosaic:
-    """Return the mosaic of a sensor; `exposure`: ISO speed, f-number and seconds, 0 if not stated."""
+    """Return the mosaic of a sensor; `exposure`: ISO speed, f-number and shutter time in seconds, 0 if not stated."""
     directories, cr3 = contents.directories, contents.cr3
     camera = _camera_name(data, directories) if cr3 is None else _join_names(cr3.maker, cr3.model)
     serial, lens = read_serial_and_lens(data, directories if cr3 is None else cr3.exif)
     iso, aperture, shutter_s = exposure
-    # For a file without exposure LibRaw returns 1 s at f/1, but no ISO speed.
+    # If a file states no exposure, LibRaw returns 1 s at f/1, but no ISO speed.
     is_stated = iso > 0
     return Mosaic(
         counts=sensor[visible.top : visible.top + visible.height, visible.left : visible.left + visible.width],
@@ -686,7 +684,7 @@ def _read_bytes(path: Path) -> memoryview:
 
 @dataclass(frozen=True)
 class _Contents:
-    """Structure of a file: TIFF directories, boxes of a CR3, stored frames (none if the layout is not checked)."""
+    """Structure of a file: TIFF directories, content of a CR3, stored frames (none if the layout is not known)."""
 
     directories: list[Directory]
     cr3: Cr3 | None
@@ -694,7 +692,7 @@ class _Contents:
 
 
 def _read_contents(path: Path, data: bytes | memoryview) -> _Contents:
-    """Return the structure of a file; refuse a file that cannot hold its stated frames."""
+    """Return the structure of a file; raise a FormatError if the file cannot hold its stated frames."""
     try:
         cr3 = read_cr3(data) if bytes(data[4:12]) == _CR3_START else None
         directories = read_directories(data) if is_tiff(data) else []
@@ -729,7 +727,7 @@ def _join_names(maker: str, model: str) -> str:
 
 
 def _dcraw_frame(sensor: tuple[int, int], libraw_area: Area) -> Area:
-    if (sensor, libraw_area) in _ONE_ROW_MORE:
+    if (sensor, libraw_area) in _AREAS_WITH_EXTRA_ROW:
         return Area(libraw_area.top - 1, libraw_area.left, libraw_area.height + 1, libraw_area.width)
     return libraw_area
 
@@ -737,18 +735,18 @@ def _dcraw_frame(sensor: tuple[int, int], libraw_area: Area) -> Area:
 def _masked_areas(
     directory: Directory | None, camera: str, visible: Area, sensor: tuple[int, int], cr3: Cr3 | None = None
 ) -> tuple[Area, ...]:
-    """Return the optically black areas: from the file, from `_MASKED`, or the usual area of a Canon sensor."""
+    """Return the optically black areas: from the file, from `_MASKED_AREAS`, or the usual area of a Canon sensor."""
     stated_areas = _stated_areas(directory, TiffTag.MASKED_AREAS, sensor)
     if stated_areas:
         return stated_areas
-    if (camera, sensor) in _MASKED:
-        return _MASKED[camera, sensor]
-    # Every Canon sensor has black columns at its left; the four next to the visible area may receive light.
-    outer, inner = _BLACK_COLUMNS.get(camera, (0, 4))
+    if (camera, sensor) in _MASKED_AREAS:
+        return _MASKED_AREAS[camera, sensor]
+    # Every Canon sensor has black columns at its left. The four columns next to the visible area may receive light.
+    outer, inner = _UNUSABLE_BLACK_COLUMNS.get(camera, (0, 4))
     if not camera.startswith("Canon") or visible.left - outer - inner < _SKIPPED_COLUMNS + 2:
         return ()
     area = Area(visible.top, outer, visible.height, visible.left - outer - inner)
-    # No standard confirms the areas in a CR3, so they only reduce the usual area of Canon sensors.
+    # No standard describes the areas in a CR3, so they may only reduce the usual area of Canon sensors.
     stated_left = next((black for black in cr3.black if black.left < visible.left), None) if cr3 is not None else None
     if stated_left is not None and stated_left.left + stated_left.width <= visible.left:
         area = _intersection(area, stated_left)
@@ -795,9 +793,9 @@ _saved_stream: int | None = None
 
 @contextmanager
 def _libraw_silenced() -> Generator[None]:
-    """Suppress LibRaw's messages about damaged data on stderr; the errors are raised anyway."""
-    # LibRaw prints through C's `stderr`, and rawpy cannot redirect it. Only this stream is set to /dev/null while any
-    # thread decodes; Python's stderr is not changed. If C has no variable of this name, nothing is done.
+    """Suppress LibRaw's messages about damaged data on stderr; errors are still raised."""
+    # LibRaw prints to the stream `stderr` of C, which rawpy cannot redirect. This stream is set to /dev/null while any
+    # thread decodes; Python's own stderr is not changed. Without a variable `stderr` in C, nothing is done.
     _count_silencers(1)
     try:
         yield
@@ -821,8 +819,7 @@ def _count_silencers(step: int) -> None:
 
 @cache
 def _null_stream() -> int | None:
-    """Return a C stream to /dev/null; None if it cannot be opened."""
-    # Never closed: a C++ library that is loaded while stderr is redirected may use it until the program ends.
+    # The stream is never closed, because a C++ library that is loaded meanwhile may use it until the program ends.
     libc = ctypes.CDLL(None)
     libc.fopen.restype = ctypes.c_void_p
     return libc.fopen(b"/dev/null", b"w")
@@ -831,8 +828,8 @@ def _null_stream() -> int | None:
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 
-# Permitted tag values of a DNG with counts stored as in memory.
-_PLAIN: dict[TiffTag, tuple[tuple[int, ...], ...]] = {
+# Permitted values of tags in a DNG whose counts are stored as in memory.
+_PLAIN_TAG_VALUES: dict[TiffTag, tuple[tuple[int, ...], ...]] = {
     TiffTag.COMPRESSION: ((1,),),
     TiffTag.PHOTOMETRIC_INTERPRETATION: ((CFA,),),
     TiffTag.BITS_PER_SAMPLE: ((16,),),
@@ -847,13 +844,13 @@ _PLAIN: dict[TiffTag, tuple[tuple[int, ...], ...]] = {
 
 
 def _plain_mosaic(path: Path, data: bytes | memoryview, contents: _Contents) -> Mosaic | None:
-    """Return the mosaic of a DNG with counts stored as in memory; None for other files."""
-    # LibRaw copies such counts one by one, which takes longer than all later processing of a frame.
+    """Return the mosaic of a DNG whose counts are stored as in memory; None for other files."""
+    # LibRaw would copy these counts one by one, which takes longer than all later processing of a frame.
     stored, directories = next(iter(contents.frames), None), contents.directories
     directory = None if stored is None else stored.directory
     if stored is None or directory is None or data[:2] != b"II" or sys.byteorder != "little":
         return None
-    if any(directory.integers(tag) not in allowed for tag, allowed in _PLAIN.items()):
+    if any(directory.integers(tag) not in allowed for tag, allowed in _PLAIN_TAG_VALUES.items()):
         return None
     size = stored.rows, stored.columns
     pattern = directory.integers(TiffTag.CFA_PATTERN)
@@ -881,11 +878,11 @@ def _first_number(directories: Sequence[Directory], tag: TiffTag) -> float:
 
 
 def _stated_black(directory: Directory | None) -> NDArray[np.float64] | None:
-    """Return BlackLevel of a DNG for the visible block, (2, 2) float64; None if LibRaw must decide."""
+    """Return BlackLevel of a DNG for the visible block, (2, 2) float64; None if LibRaw's level must be used."""
     if directory is None or not directory.numbers(TiffTag.BLACK_LEVEL):
         return None
     # LibRaw would truncate the level to an integer. The pattern starts at the corner of the active area (DNG 1.7,
-    # BlackLevel); deltas per row and column are added as their mean, as in LibRaw.
+    # BlackLevel). The mean of the deltas per row and per column is added, as in LibRaw.
     levels = np.array(directory.numbers(TiffTag.BLACK_LEVEL), dtype=np.float64)
     shape = directory.integers(TiffTag.BLACK_LEVEL_REPEAT_DIM) or (1, 1)
     if shape not in ((1, 1), (1, 2), (2, 1), (2, 2)) or levels.size != shape[0] * shape[1]:
@@ -898,13 +895,13 @@ def _stated_black(directory: Directory | None) -> NDArray[np.float64] | None:
 
 
 def _active_area(directory: Directory | None, sensor: tuple[int, int]) -> Area | None:
-    """Return the visible area stated in a DNG; unlike dcraw, LibRaw makes its top even for a Canon."""
+    """Return the visible area that a DNG states; for Canon, LibRaw would change its top to an even row."""
     areas = _stated_areas(directory, TiffTag.ACTIVE_AREA, sensor)
     return areas[0] if areas and min(areas[0].height, areas[0].width) >= 2 else None
 
 
 def _stated_areas(directory: Directory | None, tag: TiffTag, sensor: tuple[int, int]) -> tuple[Area, ...]:
-    """Return the rectangles of `tag` (top, left, bottom, right) inside the sensor."""
+    """Return the rectangles in `tag` (top, left, bottom, right) that are inside the sensor."""
     edges = () if directory is None else directory.integers(tag)
     return tuple(
         Area(top, left, bottom - top, right - left)
@@ -913,19 +910,19 @@ def _stated_areas(directory: Directory | None, tag: TiffTag, sensor: tuple[int, 
     )
 
 
-# Smallest black level (counts) for which much lower counts are impossible; cameras with a lower one clip at zero.
+# Black level, counts, from which no photosite has less than half of it. At lower levels, noise is clipped at zero.
 _MIN_BLACK = 16
 
-_TILE = (32, 256)  # Rows and columns of the smallest checked part, the smallest unit of storage
+_TILE = (32, 256)  # Rows and columns of the smallest part that is checked; files store no smaller parts
 
-_LARGEST = 65535  # Largest count of 16 bits, with all bits set
+_LARGEST = 65535  # Largest count of 16 bits
 
 
 def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, bits: int) -> None:
-    """Refuse levels that are impossible for `bits`; `black`: (2, 2) counts."""
+    """Raise a FormatError if levels are impossible for counts of `bits`; `black`: (2, 2) counts."""
     if not 0 < white_level <= 1 << bits:
         raise _unreadable_error(path, f"its white level is {white_level:g}, expected 1 to {1 << bits} for {bits} bits")
-    # Mean deltas may reduce a black level of 0 by a fraction of a count.
+    # The mean of the deltas may reduce a black level of 0 by less than one count.
     if not -1 < black.min() <= black.max() < white_level:
         raise _unreadable_error(
             path,
@@ -934,11 +931,11 @@ def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, 
 
 
 def filled_fault(counts: NDArray[np.uint16], black: NDArray[np.float64], white_level: int) -> str | None:
-    """Describe the part of a frame without real counts, as in a truncated file that was padded; None if there is none.
+    """Describe the part of a frame that was filled with equal bytes, as after a truncation; None if there is none.
 
-    `counts`: (H, W) of the visible area; `black`: (2, 2) counts. In a row or a 32×256 tile of a real frame, at least
-    one photosite reaches half of the black level, or one count if the black level is near zero. If the white level is
-    at most half of the largest count of 16 bits, no row or tile has only this count.
+    `counts`: (H, W) of the visible area; `black`: (2, 2) counts. Rows, and tiles of 32×256 photosites, are checked.
+    Each measured row or tile has a count of at least half of the black level, or 1 if the black level is near zero. If
+    the white level is at most half of 65535, it also has a count below 65535.
     """
     level = float(black.min())
     floor = level / 2 if level >= _MIN_BLACK else 1
@@ -963,9 +960,9 @@ def _tile_size(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def _row_tile_extremes(extreme: np.ufunc, counts: NDArray[np.uint16]) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    """Return the largest or smallest count of each row and tile; the last tiles include the remainder."""
+    """Return the largest or smallest count of each row and of each tile; the last tiles include the remainder."""
     height, width = _tile_size(counts.shape)
-    # First along the rows: `reduceat` across the rows of a whole frame takes 45 times as long.
+    # Reduce along the rows first, because `reduceat` across the rows of a whole frame is 45 times slower.
     segments = extreme.reduceat(counts, range(0, counts.shape[1] - width + 1, width), axis=1)
     tiles = extreme.reduceat(segments, range(0, counts.shape[0] - height + 1, height), axis=0)
     return extreme.reduce(segments, axis=1), tiles
@@ -984,11 +981,10 @@ def _extent_text(indices: NDArray[np.intp], shape: tuple[int, ...]) -> str | Non
 Channel = Literal["R", "G", "B"]
 CHANNELS: tuple[Channel, Channel, Channel] = ("R", "G", "B")
 
-# Counts above this fraction of saturation are treated as clipped (our choice: the response bends only above it).
+# Counts above this fraction of the saturation level are treated as clipped. Chosen; the response is linear below it.
 CLIPPING_SHARE = 0.98
 
-# Percentile of the counts that represents paper: bare paper covers more than 2 % of a frame, hot photosites and
-# highlights cover less.
+# Percentile of the counts that represents white paper, which covers more of a frame than hot photosites and highlights.
 PAPER_PERCENTILE = 98
 
 
@@ -997,8 +993,8 @@ class Plane:
     """One colour of a mosaic.
 
     - `values`: (H // 2, W // 2) float32, counts above black.
-    - `offset_px`: (x, y). Element [i, j] was measured at x = j + offset_px[0], y = i + offset_px[1] in half-size pixels
-      (2×2 blocks of photosites; x to the right, y down, centres at integers).
+    - `offset_px`: mean offset (x, y) of the photosites from the centre of their 2×2 block, in half-size pixels. Element
+      [i, j] was measured at x = j + offset_px[0] (to the right), y = i + offset_px[1] (down).
     """
 
     channel: Channel
@@ -1007,7 +1003,7 @@ class Plane:
 
 
 def phases(mosaic: Mosaic) -> dict[Channel, tuple[tuple[int, int], ...]]:
-    """Return the (row, column) positions of each colour in the 2×2 block."""
+    """Return the positions (row, column) of each colour in the 2×2 block."""
     positions: dict[Channel, tuple[tuple[int, int], ...]] = {}
     for channel in CHANNELS:
         positions[channel] = tuple(divmod(index, 2) for index, letter in enumerate(mosaic.pattern) if letter == channel)
@@ -1015,19 +1011,19 @@ def phases(mosaic: Mosaic) -> dict[Channel, tuple[tuple[int, int], ...]]:
 
 
 def channel_offset_px(positions: Sequence[tuple[int, int]]) -> tuple[float, float]:
-    """Return the offset of block positions from the block centre, half-size px (x, y): 0 or ±0.25."""
+    """Return the mean offset (x, y) of block positions from the block centre, in half-size px: 0 or ±0.25."""
     rows, columns = np.mean(np.asarray(positions, dtype=np.float64), axis=0)
     return (float(columns) - 0.5) / 2, (float(rows) - 0.5) / 2
 
 
 def frame_black(mosaic: Mosaic) -> NDArray[np.float64]:
-    """Return the black level (2, 2) float64 of each block position: measured in the masked border, else as stated."""
+    """Return the black level (2, 2) float64 of each block position, measured in the masked border or else as stated."""
     measured = mosaic.masked_black()
     return mosaic.black if measured is None else measured
 
 
 def plane_of(mosaic: Mosaic, channel: Channel, black: NDArray[np.float64] | None = None) -> Plane:
-    """Return one colour of a mosaic above `black`, (2, 2) float64 counts; None for the result of `frame_black`."""
+    """Return one colour of a mosaic above `black`, (2, 2) float64 counts; by default `frame_black`."""
     black = frame_black(mosaic) if black is None else black
     positions = phases(mosaic)[channel]
     blocks = mosaic.block_planes()
@@ -1041,13 +1037,13 @@ def plane_of(mosaic: Mosaic, channel: Channel, black: NDArray[np.float64] | None
 
 
 def strongest_plane(mosaic: Mosaic, black: NDArray[np.float64] | None = None) -> Plane:
-    """Return the colour with the brightest paper; `black` as in `plane_of`."""
+    """Return the plane of the colour with the brightest paper; `black` as in `plane_of`."""
     black = frame_black(mosaic) if black is None else black
     return plane_of(mosaic, strongest_channel(mosaic, black, every=8), black)
 
 
 def strongest_channel(mosaic: Mosaic, black: NDArray[np.float64], every: int = 16) -> Channel:
-    """Return the colour with the brightest paper, from every `every`-th block; `black` (2, 2) float64 counts."""
+    """Return the colour with the brightest paper, using each `every`-th block; `black` (2, 2) float64 counts."""
     blocks = mosaic.block_planes()[:, :, ::every, ::every]
     levels = [
         max(float(np.percentile(blocks[position], PAPER_PERCENTILE) - black[position]) for position in positions)

@@ -1,9 +1,9 @@
-"""Location of the photosites in raw files: the record `StoredFrame`, and the reader of CR3 files.
+"""Find where raw files store the counts of a frame (`StoredFrame`), and read the structure of CR3 files.
 
-`drivers.raw.rawfile` reads TIFF files, including DNG. Any bytes give frames or raise `RawDamaged`. A CR3 (EOS R, EOS
-M50, EOS 250D and later) is an ISO base media file of nested boxes, big-endian: a size of 32 bits (1: 64 bits after the
-type; 0: to the end), a type of four letters, and content. A box beyond the end of the file means a truncated file;
-invalid content inside a box is ignored.
+Any bytes give a result or raise `RawDamaged`. CR3 is the format of the EOS R, EOS M50, EOS 250D and later bodies. It is
+an ISO base media file of nested boxes, big-endian. A box has its size (32 bits), a type of four letters, and content.
+Size 1 means a size of 64 bits after the type, and size 0 means a box up to the end of the file. If a box extends beyond
+the end, the file is truncated. Invalid content inside a box is ignored.
 
 Sources: ISO/IEC 14496-12, 4.2 (boxes), 8.7.3 (sample sizes) and 8.7.5 (chunk offsets). The rest has no public standard:
 P. Harvey, ExifTool (CanonRaw.pm); L. Clévy, "Describing the Canon Raw v3 (CR3) file format" (structure); LibRaw 0.22
@@ -18,27 +18,26 @@ from dataclasses import dataclass
 
 from drivers.tiff import Directory, TiffDamaged, TiffTag, read_directories
 
-Extent = tuple[int, int]  # First byte, and number of bytes
+Extent = tuple[int, int]  # Part of a file: first byte, and number of bytes
 
-# Lower limit of the compressed size, bits per photosite: noise alone takes several bits. Chosen.
-LEAST_BITS = 0.25
+LEAST_BITS = 0.25  # Smallest accepted size of compressed counts, bits per photosite; noise alone needs several bits
 
 
 class RawDamaged(ValueError):
-    """The bytes are incomplete or inconsistent."""
+    """The bytes of a raw file are incomplete or inconsistent."""
 
 
 class RawUnsupported(ValueError):
-    """The file may be complete, but this kind of pixels cannot be read or checked."""
+    """The raw file may be complete, but we cannot read or check its kind of pixels."""
 
 
 class NotBayer(ValueError):
-    """The pixels are not from a sensor with one colour filter per photosite."""
+    """The raw file is not from a sensor with one colour filter per photosite."""
 
 
 @dataclass(frozen=True)
 class Area:
-    """A rectangle of photosites: first row and column from 0, number of rows and columns."""
+    """A rectangle of photosites: first row and column, counted from 0, and number of rows and columns."""
 
     top: int
     left: int
@@ -48,15 +47,15 @@ class Area:
 
 @dataclass(frozen=True)
 class StoredFrame:
-    """Storage of the photosites of one frame, as described by the file.
+    """Storage of the counts of one frame, as the file describes it.
 
     - `rows`, `columns`: size of the whole sensor.
-    - `extents`: positions of the bytes, in order.
-    - `least_bits`: smallest number of bits per photosite.
-    - `bits`: number of bits of the largest count.
-    - `lossless`: each extent is a lossless JPEG, which can be decoded to its end.
-    - `spare_rows`: rows that LibRaw may add.
-    - `directory`: its directory in a TIFF file.
+    - `extents`: parts of the file that hold the counts, in order.
+    - `least_bits`: smallest possible number of stored bits per photosite.
+    - `bits`: number of bits of the largest possible count.
+    - `lossless`: whether each extent is a lossless JPEG.
+    - `spare_rows`: number of rows that LibRaw may add.
+    - `directory`: TIFF directory that describes the frame, None if the file is not TIFF.
     """
 
     rows: int
@@ -69,14 +68,15 @@ class StoredFrame:
     directory: Directory | None = None
 
     def has_size(self, rows: int, columns: int) -> bool:
-        """Return whether LibRaw may return a sensor of this size for the frame."""
+        """Return whether LibRaw may return a sensor of this size for this frame."""
         return columns == self.columns and rows in (self.rows, self.rows + self.spare_rows)
 
 
 def ciff_entries(data: bytes | memoryview) -> dict[int, Extent]:
-    """Return the extents of the values in a Canon CRW by tag, with inner heaps; empty for other files.
+    """Return the extents of the values in a Canon CRW by tag, also those in inner heaps; empty for other files.
 
-    Source: Canon, CIFF 1.0 revision 4: a heap ends with the offset of its table; types 0x28 and 0x30 are heaps.
+    Source: Canon, CIFF 1.0 revision 4. A heap ends with the offset of its table. Entries of types 0x28 and 0x30 are
+    inner heaps.
     """
     if bytes(data[6:14]) != b"HEAPCCDR":
         return {}
@@ -100,26 +100,26 @@ def ciff_entries(data: bytes | memoryview) -> dict[int, Extent]:
     return extents
 
 
-MAX_BOXES = 4096  # Most boxes to read; a real file has about a hundred
+MAX_BOXES = 4096  # Most boxes that are read; a real file has about a hundred
 
-_CANON = bytes.fromhex("85c0b687820f11e08111f4ce462b6a48")  # uuid of the box with Canon's metadata
-_SAMPLE_ENTRY_HEAD = 82  # Bytes of a CRAW sample entry before the boxes in it (cr3_parser.cpp)
-_MOST_SAMPLES = 4096  # Most samples of a track; a roll of bursts has a few hundred
-_UUID_LENGTH = 16  # Bytes of the uuid before the content of a uuid box (ISO/IEC 14496-12, 4.2)
+_CANON_UUID = bytes.fromhex("85c0b687820f11e08111f4ce462b6a48")  # uuid of the box with Canon's metadata
+_SAMPLE_ENTRY_HEAD = 82  # Bytes of a CRAW sample entry before its inner boxes (cr3_parser.cpp)
+_MAX_SAMPLES = 4096  # Most samples (images) of a track; a file of burst images has a few hundred
+_UUID_LENGTH = 16  # Bytes of the uuid at the start of a uuid box (ISO/IEC 14496-12, 4.2)
 _TABLE_HEAD = 8  # Bytes of `stsd` before its entries: version, flags and count (ISO/IEC 14496-12, 8.5.2)
 _FULL_BOX_HEAD = 4  # Bytes of version and flags in a full box (ISO/IEC 14496-12, 4.2)
-_WHOLE_AREAS = 48  # Bytes of `IAD1` in the track of the full image: six areas of four numbers; previews have fewer
-_LEFT_BLACK, _UPPER_BLACK = 3, 4  # Indices of the optically black areas (cr3_parser.cpp)
+_AREA_TABLE_LENGTH = 48  # Bytes of `IAD1` of the full image: six areas of four numbers; for previews it is shorter
+_LEFT_BLACK, _UPPER_BLACK = 3, 4  # Indices of the optically black areas in `IAD1` (cr3_parser.cpp)
 
 
 @dataclass(frozen=True)
 class Cr3:
-    """Content of a CR3.
+    """Content of a CR3 file.
 
     - `maker`, `model`: such as ``Canon`` and ``Canon EOS R``; empty if missing.
-    - `black`: optically black areas of the largest image in sensor coordinates, left and upper; without empty areas.
-    - `frames`: images of the raw tracks.
-    - `exif`: directories of the Exif box with serial number and lens; empty without this box.
+    - `black`: optically black areas at the left and the top of the full image, in sensor coordinates.
+    - `frames`: the raw frames.
+    - `exif`: directories of the Exif box, with serial number and lens; empty without this box.
     """
 
     maker: str = ""
@@ -137,7 +137,7 @@ class _Box:
 
 
 def read_cr3(data: bytes | memoryview) -> Cr3:
-    """Return the content of a CR3."""
+    """Return the content of a CR3 file."""
     maker = model = ""
     black: tuple[Area, ...] = ()
     exif: tuple[Directory, ...] = ()
@@ -149,7 +149,7 @@ def read_cr3(data: bytes | memoryview) -> Cr3:
         if box.box_type != b"moov":
             continue
         for inner in _boxes(data, box.start, box.end, budget):
-            if inner.box_type == b"uuid" and bytes(data[inner.start : inner.start + _UUID_LENGTH]) == _CANON:
+            if inner.box_type == b"uuid" and bytes(data[inner.start : inner.start + _UUID_LENGTH]) == _CANON_UUID:
                 for entry in _boxes(data, inner.start + _UUID_LENGTH, inner.end, budget):
                     if entry.box_type == b"CMT1":
                         directories = _directories(data[entry.start : entry.end])
@@ -173,7 +173,7 @@ def read_cr3(data: bytes | memoryview) -> Cr3:
 def _boxes(
     data: bytes | memoryview, start: int, end: int, budget: list[int], *, is_file: bool = False
 ) -> Iterator[_Box]:
-    """Yield the boxes between two positions; a damaged box ends them, or raises an error if `is_file`."""
+    """Yield the boxes between two positions; a damaged box ends the iteration, or raises an error if `is_file`."""
     # `budget` holds the number of boxes that may still be read.
     while end - start >= 8:
         budget[0] -= 1
@@ -209,7 +209,7 @@ _HEADER_SIZES = {b"stsd": _TABLE_HEAD, b"CRAW": _SAMPLE_ENTRY_HEAD, b"CDI1": _FU
 
 
 def _find_box(data: bytes | memoryview, box: _Box, budget: list[int], *box_types: bytes) -> _Box | None:
-    """Follow the first box of each type, one inside the other; return the last, None if one is missing."""
+    """Return the box that is reached through nested boxes of the given types, or None if one is missing."""
     for box_type in box_types:
         child = next((inner for inner in _boxes(data, box.start, box.end, budget) if inner.box_type == box_type), None)
         if child is None:
@@ -219,7 +219,7 @@ def _find_box(data: bytes | memoryview, box: _Box, budget: list[int], *box_types
 
 
 def _track_frames(data: bytes | memoryview, table: _Box, entry: _Box, budget: list[int]) -> list[StoredFrame]:
-    """Return the images of a raw track, each a sample in its own chunk; empty for other tracks."""
+    """Return the frames of a raw track, in which each chunk holds one frame; empty for other tracks."""
     compression = _find_box(data, entry, budget, b"CMP1")
     sizes_box, offsets_box = _find_box(data, table, budget, b"stsz"), _find_box(data, table, budget, b"co64")
     if compression is None or compression.end - compression.start < 16:
@@ -231,7 +231,7 @@ def _track_frames(data: bytes | memoryview, table: _Box, entry: _Box, budget: li
     try:
         common_length, count = struct.unpack_from(">II", stsz, 4)
         (chunks,) = struct.unpack_from(">I", co64, 4)
-        if not 0 < count == chunks <= _MOST_SAMPLES:
+        if not 0 < count == chunks <= _MAX_SAMPLES:
             raise RawDamaged(f"a track of its pixels has {count} samples in {chunks} chunks, expected equal numbers")
         lengths = (common_length,) * count if common_length else struct.unpack_from(f">{count}I", stsz, 12)
         offsets = struct.unpack_from(f">{count}Q", co64, 8)
@@ -245,13 +245,13 @@ def _black_areas(data: bytes | memoryview, entry: _Box, budget: list[int]) -> tu
     box = _find_box(data, entry, budget, b"CDI1", b"IAD1")
     if box is None:
         return ()
-    if box.end - box.start < _WHOLE_AREAS:
+    if box.end - box.start < _AREA_TABLE_LENGTH:
         return ()
-    numbers = struct.unpack_from(f">{_WHOLE_AREAS // 2}H", data, box.start)
+    numbers = struct.unpack_from(f">{_AREA_TABLE_LENGTH // 2}H", data, box.start)
     areas: list[Area] = []
     for index in (_LEFT_BLACK, _UPPER_BLACK):
         first_column, first_row, last_column, last_row = numbers[4 * index : 4 * index + 4]
-        # Last row and column are inclusive, as in all areas in Canon's files.
+        # The last row and column belong to the area, as in all areas in Canon's files.
         if last_column > first_column and last_row > first_row:
             areas.append(Area(first_row, first_column, last_row - first_row + 1, last_column - first_column + 1))
     return tuple(areas)

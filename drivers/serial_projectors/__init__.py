@@ -1,1 +1,1 @@
-"""Projectors with a line protocol of their maker, on a serial cable or over TCP."""
+"""Projectors that take text commands defined by their maker, over a serial cable or TCP."""

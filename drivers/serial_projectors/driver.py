@@ -1,4 +1,4 @@
-"""Driver of all projectors with a line protocol; a `Language` holds the commands and replies of each maker."""
+"""Driver of all projectors with text commands; the commands and replies of a maker are in a `Language`."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ class _Busy(DeviceRefused):
 
 
 class _Unclear(DeviceRefused):
-    """The projector does not support the command, or cannot execute it now."""
+    """The projector does not support the command or cannot execute it now; the reply has both meanings."""
 
 
 _REFUSALS = {"unknown": (_Unknown, _MANUAL_REMEDY), "busy": (_Busy, _WAIT_REMEDY), "unclear": (_Unclear, _WAIT_REMEDY)}
 
 
 class LineProjector(Projector):
-    """A `drivers.projector.Projector` with a line protocol; the connection is opened at the first use.
+    """A `drivers.projector.Projector` with text commands; the connection is opened at its first use.
 
     All queries and commands may raise `DeviceRefused`, `DeviceFault`, `LinkError` and `ProtocolError`. A command may be
-    repeated without harm. No power command is sent if the projector is already in the requested state or changes to it.
-    With `network` the connection starts with the handshake of the language.
+    repeated without harm. No power command is sent if the projector is already in the requested state or is changing to
+    it. With `network`, a connection starts with the handshake of the language.
     """
 
     def __init__(
@@ -65,22 +65,22 @@ class LineProjector(Projector):
         self._clock = clock
         timeout = language.line.timeout_s
         self._exchange = Exchange(connect, timeout, label, clock, self._greet, _CABLE_REMEDY, CHECK_SPEED)
-        # State that a switch command started; its reply is pending until `_switch_deadline`.
+        # Power state that a command has started, if its reply is pending. The time limit is `_switch_deadline`.
         self._switching_to: Power | None = None
         self._switch_deadline = 0.0
-        # Last stable power state, last announced power state, announced faults, last mute command.
+        # Last state ON or STANDBY, last announced power state, announced faults, last mute command.
         self._stable_power: Power | None = None
         self._announced_power: Power | None = None
         self._announced_faults: tuple[str, ...] = ()
         self._mute_set: bool | None = None
 
     def identity(self) -> ProjectorIdentity:
-        """Return maker, model and name; empty texts if the projector does not report them."""
+        """Return maker, model and name; an empty text if the projector does not report the value."""
         language = self._language
         return ProjectorIdentity(language.maker, self._query_text(language.model), self._query_text(language.name))
 
     def power(self) -> Power:
-        """Return the power state; if the language cannot report it, the last announced or commanded state."""
+        """Return the power state. Warm-up and cooling may be known only from a message or from our own command."""
         self._read_switch_reply()
         if self._switching_to is not None:
             return self._switching_to
@@ -120,12 +120,12 @@ class LineProjector(Projector):
             self._switch(self._language.power.off, Power.COOLING)
 
     def muted(self) -> bool | None:
-        """Return whether mute hides the image; if not reported, the last command, or None without one."""
+        """Return whether the image is muted; if not reported, the last command counts. None without a command."""
         reported = self._query_mute()
         return self._mute_set if reported is None else reported
 
     def _query_mute(self) -> bool | None:
-        """Return the reported mute state; the last command if the language has no such query."""
+        """Return the reported mute state, or the last command if the language has no query for it."""
         words = self._language.mute
         if not words.ask:
             return self._mute_set
@@ -137,7 +137,7 @@ class LineProjector(Projector):
         return words.states[value.upper()]
 
     def set_muted(self, muted: bool) -> None:
-        """Hide the image or show it; refused unless the projector is on."""
+        """Mute the image or show it; refused unless the projector is on."""
         words = self._language.mute
         if words.only_changes and self._query_mute() is muted:
             return
@@ -145,14 +145,14 @@ class LineProjector(Projector):
         self._mute_set = muted
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return all faults reported now, or announced since the start of the last warm-up.
+        """Return all faults that are reported now, or that were announced since the start of the last warm-up.
 
-        Empty if there are none, if the projector does not support the query, or if it refuses the query outside
-        standby.
+        Empty if there are no faults, if the projector does not support the query, or if it refuses the query and is not
+        in standby.
         """
         words = self._language.faults
         if words is None:
-            # Raises if the cable is unplugged, which must not look like a healthy projector.
+            # This raises an error if the cable is unplugged; otherwise this would look like "no faults".
             with contextlib.suppress(_Busy):
                 self.power()
             if self._language.reports_unasked:
@@ -172,7 +172,7 @@ class LineProjector(Projector):
         return tuple(Fault(component, Severity.ERROR) for component in components)
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return all lamps; empty for a lampless projector, or if lamp hours are not reported."""
+        """Return all lamps; empty if the projector has no lamp or does not report lamp hours."""
         query = self._language.lamp_hours
         value = None if query is None else self._query_if_supported(query)
         if query is None or value is None:
@@ -240,7 +240,7 @@ class LineProjector(Projector):
         except _Unknown:
             return None
         except _Unclear:
-            # A projector that is on and refuses a query does not support it.
+            # A projector that is on is not busy, so it does not support the query.
             if self.power() is Power.ON:
                 return None
             raise
@@ -253,7 +253,7 @@ class LineProjector(Projector):
         if self._switching_to is not None:
             raise DeviceRefused(f"{self.label} is busy ({self._switching_to.value}); wait until it has finished")
         if self._language.reports_unasked:
-            # `Exchange.query` discards waiting input; read it first, because it may announce power or faults.
+            # `Exchange.query` discards the input that has arrived. It may announce power or faults, so read it first.
             self._discard_messages(0.0)
         line = self._language.line
         reply = self._exchange.query(

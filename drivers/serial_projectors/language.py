@@ -1,7 +1,7 @@
-"""A projector's line protocol as data: commands, replies, and the meaning of the replies.
+"""The text commands of a projector as data: commands, replies, and the meaning of the replies.
 
-A language is one TOML file, in ``drivers/data/languages`` or at a path of the user. In its texts `{}` is a value, and
-replies are compared without regard to case.
+A language is one TOML file, in ``drivers/data/languages`` or at a path that the user gives. In its texts, `{}` means a
+value. Replies are compared without regard to upper and lower case.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from foundation.records import find_mistakes, list_mistakes, parse_toml
 # Folder of the built-in languages, one file each.
 FOLDER: Final = Path(__file__).parents[1] / "data" / "languages"
 
-FILE_ENDING: Final = ".toml"  # A text with this ending is the path of a language file, not the name of a language
+FILE_ENDING: Final = ".toml"  # A text with this ending is the path of a language file; another text is a name
 
-# Remedy for bytes that cannot be decoded.
+# Remedy for replies that cannot be decoded.
 CHECK_SPEED: Final = "compare speed and parity with the projector's menu, and check the name of the language"
 
 _BLANK: Final = b"\r\n\0 "  # Bytes between messages, without meaning in any language
 
-_VALUE: Final = "{}"
+_VALUE: Final = "{}"  # Position of the value in a text
 
 
 def _require_ascii(text: str) -> str:
@@ -78,9 +78,9 @@ def _require_fault_part(part: str) -> str:
 
 Words = Annotated[str, AfterValidator(_require_ascii)]  # A text that is sent or received
 PlainWords = Annotated[Words, AfterValidator(_require_no_value)]  # A text without a value, not empty
-Texts = Annotated[tuple[PlainWords, ...], BeforeValidator(_as_tuple)]  # One such text, or a list of them
+Texts = Annotated[tuple[PlainWords, ...], BeforeValidator(_as_tuple)]  # One text without a value, or a list of them
 Template = Annotated[Words, AfterValidator(_require_value)]  # A text with one value
-# One such text, or several alternatives.
+# One text with a value, or a list of alternatives.
 Templates = Annotated[tuple[Template, ...], BeforeValidator(_as_tuple), Field(min_length=1)]
 State = Annotated[Power, Field(strict=False)]  # A power state, by its name
 Hexadecimal = Annotated[str, AfterValidator(_require_hexadecimal)]  # A byte
@@ -88,7 +88,7 @@ Part = Annotated[str, AfterValidator(_require_fault_part)]  # One of `drivers.pr
 
 
 class _Table(BaseModel):
-    """A table of a language file: frozen; unknown keys and wrong types are errors."""
+    """A table of a language file. It is frozen, and unknown keys and wrong types are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
 
@@ -97,23 +97,23 @@ class LineFormat(_Table):
     """Format of commands and replies."""
 
     baud: Annotated[int, Field(ge=300)]
-    """Factory setting of the speed, bit/s; 8 data bits, no parity, 1 stop bit."""
+    """Speed, bit/s, as set by the maker; always with 8 data bits, no parity and 1 stop bit."""
     command: Template
-    """Format of a command; `{}` is its text, the characters after `{}` end the command."""
+    """Format of a command. `{}` is its text, and the characters after `{}` end the command."""
     answer: Template
-    """Format of a reply; `{}` is its text, the characters before `{}` may be missing."""
+    """Format of a reply. `{}` is its text, and the characters before `{}` may be missing."""
     ends: Annotated[Words, Field(min_length=1)]
     """Characters that end a reply."""
     unended: Texts = ()
-    """Replies that may arrive without an end character."""
+    """Replies that may arrive without any character of `ends`."""
     echo: bool = False
     """True if the projector may repeat a command before its reply."""
     prompt: Words = ""
-    """Text that the projector sends when it is ready for a command; empty for none."""
+    """Text that the projector sends when it is ready for a command; empty if it sends none."""
     wake: Words = ""
-    """Text sent over a new connection before the first command, and answered; empty for none."""
+    """Text that is sent first over a new connection, and has a reply; empty if none is needed."""
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 5.0
-    """Longest time to a reply, seconds."""
+    """Longest time until a reply, seconds."""
 
     @model_validator(mode="after")
     def _check_ends(self) -> LineFormat:
@@ -132,7 +132,7 @@ class LineFormat(_Table):
         return self
 
     def require_received(self, key: str, text: str) -> None:
-        """Refuse a text with a character that ends a reply; no reply can contain it."""
+        """Refuse a text with a character that ends a reply, because no received reply can contain it."""
         if any(character in text for character in self.ends):
             raise ValueError(f"{key} has {text!r}: expected a text without the characters of line.ends")
 
@@ -141,7 +141,7 @@ class Handshake(_Table):
     """First messages of a connection over TCP."""
 
     send: Words
-    """Text sent over a new connection."""
+    """Text that is sent over a new connection."""
     answer_begins: Words
     """First characters of the reply."""
     answer_length: Annotated[int, Field(ge=1, le=256)]
@@ -149,9 +149,9 @@ class Handshake(_Table):
     state_at: Annotated[int, Field(ge=0, le=255)]
     """Position of the state byte in the reply, from 0."""
     accepted: Hexadecimal
-    """State of an accepted connection, two hexadecimal digits."""
+    """State byte of an accepted connection, two hexadecimal digits."""
     refusals: Annotated[dict[Hexadecimal, str], AfterValidator(_uppercase_keys)] = {}
-    """Other states, each with fault and remedy."""
+    """Message with a remedy for each other state byte."""
 
     @model_validator(mode="after")
     def _check_state_position(self) -> Handshake:
@@ -161,23 +161,23 @@ class Handshake(_Table):
 
 
 class Network(_Table):
-    """The same language over TCP."""
+    """Use of the language over TCP."""
 
     port: Annotated[int, Field(ge=1, le=65535)]
     """TCP port."""
     handshake: Handshake | None = None
-    """Handshake of a new connection; None if it starts with the first command."""
+    """Handshake of a new connection; None if the connection starts with the first command."""
 
 
 class Refusals(_Table):
     """Replies that refuse a command or query."""
 
     unknown: Texts = ()
-    """The projector does not support the command."""
+    """Replies if the projector does not support the command."""
     busy: Texts = ()
-    """Not now; used for the power state only during warm-up and cooling."""
+    """Replies if it cannot execute the command now; to the power query, they mean warm-up or cooling."""
     unclear: Texts = ()
-    """Unknown or busy; unknown if the projector is on."""
+    """Replies with both meanings; if the projector is on, the command is not supported."""
 
     @model_validator(mode="after")
     def _check_not_empty(self) -> Refusals:
@@ -211,11 +211,11 @@ class _Commands(_Table):
     """Commands for the two values of a setting."""
 
     on: PlainWords
-    """Switches on, or hides the image."""
+    """Command that switches on, or mutes the image."""
     off: PlainWords
-    """Switches off, or shows the image."""
+    """Command that switches off, or shows the image."""
     done: Words
-    """Reply to both. It may contain `{}` for the new state; the driver accepts any value."""
+    """Reply to both commands. It may contain `{}` for the new state; the driver accepts any value."""
 
     @model_validator(mode="after")
     def _check_difference(self) -> _Commands:
@@ -228,11 +228,11 @@ class PowerWords(_Commands, Question):
     """Commands and replies for the power state."""
 
     states: Annotated[dict[str, State], AfterValidator(_uppercase_keys)]
-    """Meaning of the values: on, standby, warm-up or cooling. The last two are optional."""
+    """Meaning of the values: on, standby, warm-up or cooling. Warm-up and cooling are optional."""
     stopped: Annotated[dict[str, str], AfterValidator(_uppercase_keys)] = {}
-    """Values of states that need a person, each with its remedy."""
+    """Values of fault states that end only if a person acts, each with a remedy."""
     done_within_s: Annotated[float, Field(ge=0, le=600)] = 0.0
-    """Longest time to the reply `done`, seconds, if it is sent after the switching; 0 if it is sent at once."""
+    """Longest time until the reply `done`, seconds, if it is sent after switching; 0 if it is sent at once."""
 
     @model_validator(mode="after")
     def _check_states(self) -> PowerWords:
@@ -244,7 +244,7 @@ class PowerWords(_Commands, Question):
         return self
 
     def value_of(self, power: Power) -> str | None:
-        """Return the first value for a state; None if there is none."""
+        """Return the first value that means a power state; None if no value does."""
         return next((value for value, meaning in self.states.items() if meaning is power), None)
 
 
@@ -252,11 +252,11 @@ class MuteWords(_Commands):
     """Commands and replies for the image mute."""
 
     ask: Words = ""
-    """Text of the query, which requires `states`; empty for no query: the last command then gives the state."""
+    """Text of the query, which requires `states`. If empty, there is no query, and the last command counts."""
     answer: Templates = (_VALUE,)
     """Text of the reply."""
     states: Annotated[dict[str, bool], AfterValidator(_uppercase_keys)] = {}
-    """Meaning of the values: true if the image is hidden."""
+    """Meaning of the values: true if the image is muted."""
     only_changes: bool = False
     """True if the projector may refuse a command that changes nothing; it is then not sent."""
 
@@ -269,7 +269,7 @@ class MuteWords(_Commands):
         return self
 
     def value_of(self, muted: bool) -> str:
-        """Return the value of a state; empty if there is none."""
+        """Return the value of a mute state; empty if the language has no values."""
         return next((value for value, meaning in self.states.items() if meaning is muted), "")
 
 
@@ -277,9 +277,9 @@ class FaultWords(Question):
     """Query and replies for faults; several faults are separated by spaces."""
 
     healthy: PlainWords
-    """Value without a fault."""
+    """Value that means "no fault"."""
     parts: Annotated[dict[str, Part], AfterValidator(_uppercase_keys), Field(min_length=1)]
-    """Meaning of the values; all others mean "other"."""
+    """Faulty component by value; a value that is not listed means "other"."""
     digits: Annotated[int, Field(ge=0, le=8)] = 0
     """Number of hexadecimal digits of each value; 0 if any word is permitted."""
 
@@ -295,7 +295,7 @@ class FaultWords(Question):
         return self
 
     def is_valid(self, value: str) -> bool:
-        """Return whether a word can be a value."""
+        """Return whether a word has the form of a value."""
         return not self.digits or re.fullmatch(f"[0-9A-Fa-f]{{{self.digits}}}", value) is not None
 
 
@@ -305,18 +305,18 @@ class Unasked(_Table):
     text: Words
     """The message; `{}` matches any text."""
     power: State | None = None
-    """Power state that begins with this message."""
+    """Power state that the message announces."""
     fault: Part | None = None
-    """Faulty component; reported until the lamp is struck again."""
+    """Faulty component that the message announces; it is reported until the next warm-up."""
 
 
 class Language(_Table):
-    """The line protocol of a projector, as in its file."""
+    """The text commands of a projector, as in a language file."""
 
     maker: str
     """Maker, used in messages and records."""
     source: str
-    """Manual from which the language was taken."""
+    """Manual with these commands."""
     line: LineFormat
     network: Network | None = None
     refusals: Refusals
@@ -353,7 +353,7 @@ class Language(_Table):
 
     @property
     def announces_power(self) -> bool:
-        """True if the projector announces warm-up and cooling, so that no query is needed."""
+        """True if the projector announces its power states."""
         return any(message.power is not None for message in self.unasked)
 
     @property
@@ -398,16 +398,16 @@ def encode_command(line: LineFormat, text: str) -> bytes:
 
 
 def encode_answer(line: LineFormat, text: str) -> bytes:
-    """Return the bytes of a reply; an empty reply has no line of its own."""
+    """Return the bytes of a reply; line ends before an empty reply are left out."""
     framed = line.answer.replace(_VALUE, text)
     return (framed if text else framed.lstrip("\r\n")).encode("ascii")
 
 
 def answer_parser(language: Language, sent: str = "") -> MessageParser[str]:
-    """Return a parser of one reply, which removes the framing.
+    """Return a parser of one reply, which returns its text without prefix and end characters.
 
-    The parser skips an echo of the command `sent`. Echo and reply may be the same text: if only one of them arrives, a
-    prompt after it shows that it was the reply. An unasked message also ends an unended reply.
+    The parser skips an echo of the command `sent`. Echo and reply may be the same text. If only one of them arrives and
+    a prompt follows, it was the reply. A reply without an end character may also end where an unasked message starts.
     """
     line = language.line
     ends = [character.encode("ascii") for character in line.ends]
@@ -440,7 +440,7 @@ def answer_parser(language: Language, sent: str = "") -> MessageParser[str]:
 
 
 def handshake_parser(handshake: Handshake) -> MessageParser[str]:
-    """Return a parser of the handshake's reply, which returns the state."""
+    """Return a parser of the reply to a handshake, which returns the state byte as hexadecimal digits."""
     prefix = handshake.answer_begins.encode("ascii")
 
     def parse(data: bytes) -> tuple[str, int] | None:
@@ -454,14 +454,14 @@ def handshake_parser(handshake: Handshake) -> MessageParser[str]:
 
 
 def decode_text(data: bytes) -> str:
-    """Return printable ASCII as text."""
+    """Return printable ASCII as text; other bytes raise a ProtocolError."""
     if any(not 0x20 <= byte < 0x7F for byte in data):
         raise ProtocolError(f"the projector sends {quoted(data)}, expected ASCII text; {CHECK_SPEED}")
     return data.decode("ascii")
 
 
 def match_value(templates: Iterable[str], text: str) -> str | None:
-    """Return the value in the first template that matches, "" if it has no value; None if none matches."""
+    """Return the value in the first template that matches, "" if it has no value, None if no template matches."""
     for template in templates:
         match = _pattern(template).fullmatch(text)
         if match is not None:
@@ -474,9 +474,9 @@ def _pattern(template: str) -> re.Pattern[str]:
     return re.compile(re.escape(template).replace(re.escape(_VALUE), "(.*)"), re.IGNORECASE)
 
 
-Refusal = Literal["unknown", "busy", "unclear"]  # The kinds of `Refusals`
+Refusal = Literal["unknown", "busy", "unclear"]  # Fields of `Refusals`
 
 
 def refusal_kind(refusals: Refusals, text: str) -> Refusal | None:
-    """Return the kind of refusal in a reply; None if it is no refusal."""
+    """Return the kind of a refusal; None if the reply is not a refusal."""
     return next((kind for kind in get_args(Refusal) if match_value(getattr(refusals, kind), text) is not None), None)

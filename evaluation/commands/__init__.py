@@ -1,1 +1,1 @@
-"""The commands under `evaluate`, one file each: parse, build, call, print."""
+"""The commands of `evaluate`, one module for each."""

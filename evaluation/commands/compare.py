@@ -27,8 +27,8 @@ _MAX_DETAILED = 3
 
 HELP = f"""Compare two methods on the same images, or one method in two runs, image by image.
 
-Reads one or two RESULTS: results folders, or their errors.csv. With one, all pairs of its methods are compared; with
-two, each common method. Images of one group, such as one picture under several illuminants, count as one case.
+Reads one or two RESULTS: results folders, or their errors.csv. With one, compares all pairs of its methods; with two,
+each method that both contain. Images of one group, such as one picture under several illuminants, count as one case.
 
 Prints Wilcoxon's signed-rank test. For up to three comparisons also prints differences and ratios of all statistics
 with bootstrap intervals, and the images with the largest differences. Writes files only with --out.
@@ -44,12 +44,12 @@ def compare(
         list[str] | None,
         option(
             "NAME",
-            "Method to compare, by its name in the tables or for evaluate run; repeat the option for several methods. "
+            "Method to compare, by its name in the tables or in evaluate run; repeat the option for several methods. "
             "With two RESULTS, FIRST=SECOND compares methods of different names. \\[default: all]",
         ),
     ] = None,
     error: Annotated[AngularError, typer.Option(help="Angular error to compare.")] = "reproduction",
-    out: Annotated[Path | None, option("FOLDER", "Write tables and a page with scatters to this new folder.")] = None,
+    out: Annotated[Path | None, option("FOLDER", "Write tables and scatter plots to this new folder.")] = None,
     *,
     output: JsonOutput,
 ) -> None:
@@ -63,7 +63,7 @@ def compare(
     if out is not None:
         require_free(out, "the comparison")
     runs = [read_errors(location) for location in results]
-    pairs = _pairs(runs, results, method, error)
+    pairs = _match_pairs(runs, results, method, error)
     comparisons = comparing.compare(pairs)
     notes = [*dict.fromkeys(note for pair in pairs for note in pair.notes), *_treatment_notes(results)]
     if out is not None:
@@ -81,7 +81,7 @@ def compare(
         print(f"written to {out}: report.html, tests.csv, statistics.csv, tables.tex")
 
 
-def _pairs(
+def _match_pairs(
     runs: Sequence[Mapping[str, MethodErrors]], locations: Sequence[str], names: Sequence[str] | None, error: ErrorKind
 ) -> list[MatchedErrors]:
     """Return the pairs to compare: all pairs of one run, or each method of both runs."""
@@ -106,7 +106,7 @@ def _pairs(
 
 
 def _run_method(run: Mapping[str, MethodErrors], name: str, location: str) -> str:
-    """Return the name of the method in the run; upper and lower case are equal."""
+    """Return the name of the method as it is written in the run; `name` may differ in upper and lower case."""
     same_names = [method for method in run if method.lower() in (name.lower(), _table_name(name).lower())]
     if len(same_names) != 1 and name not in run:
         raise InputError(f"{location} has no method {name!r}, expected one of {', '.join(run)}; correct --method")
@@ -114,7 +114,7 @@ def _run_method(run: Mapping[str, MethodErrors], name: str, location: str) -> st
 
 
 def _table_name(name: str) -> str:
-    """Return the name in tables of a method of this suite ("pca"); other names unchanged."""
+    """Return the name in tables for an option value such as "pca"; return other names unchanged."""
     for choose in (choose_methods, choose_learners):
         with suppress(InputError):
             return choose([name])[0].name
@@ -123,12 +123,12 @@ def _table_name(name: str) -> str:
 
 def _treatment_notes(locations: Sequence[str]) -> list[str]:
     # Runs with different treatments of the images differ in more than their methods.
-    first, second = (_treatment(location) for location in (locations[0], locations[-1]))
+    first, second = (_read_treatment(location) for location in (locations[0], locations[-1]))
     differences = [aspect for aspect in first if aspect in second and first[aspect] != second[aspect]]
     return [f"the runs differ in {aspect}: first {first[aspect]}, second {second[aspect]}" for aspect in differences]
 
 
-def _treatment(location: str) -> dict[str, Any]:
+def _read_treatment(location: str) -> dict[str, Any]:
     """Return images and treatment of a run from its run.json; empty if it cannot be read."""
     path = Path(location) if Path(location).is_dir() else Path(location).parent
     try:

@@ -47,7 +47,7 @@ PrintedError = Annotated[
 
 @contextmanager
 def image_steps(count: int) -> Generator[Callable[[], None]]:
-    """Show the progress of `count` images with `orderly_end`; yield a function that counts one image."""
+    """Show the progress of `count` images; yield a function that counts one image."""
     with orderly_end(), progress("images") as advance:
         steps = itertools.count(1)
         yield lambda: advance(next(steps), count)
@@ -132,7 +132,7 @@ def choose_methods(texts: Iterable[str]) -> list[Method]:
     names: list[str] = []
     for text in _distinct_names(texts):
         names += groups.get(text.lower(), (text,))
-    return [_method(text) for text in dict.fromkeys(names)]
+    return [_load_method(text) for text in dict.fromkeys(names)]
 
 
 def choose_learners(texts: Iterable[str]) -> list[Learner]:
@@ -148,7 +148,7 @@ def choose_learners(texts: Iterable[str]) -> list[Learner]:
     names: list[str] = []
     for text in _distinct_names(texts):
         names += standard_learners() if text.lower() == "all" else [text]
-    return [_learner(text) for text in dict.fromkeys(names)]
+    return [_load_learner(text) for text in dict.fromkeys(names)]
 
 
 def _distinct_names(texts: Iterable[str]) -> list[str]:
@@ -187,7 +187,7 @@ def choose_estimates(texts: Sequence[str], images: Sequence[str]) -> list[GivenE
     return estimates
 
 
-def _method(text: str) -> Method:
+def _load_method(text: str) -> Method:
     from evaluation.learning.standard import standard_learners
 
     if text in standard_learners():
@@ -203,7 +203,7 @@ def _method(text: str) -> Method:
     return cast("Method", method)
 
 
-def _learner(text: str) -> Learner:
+def _load_learner(text: str) -> Learner:
     from evaluation.learning.standard import standard_learners
     from evaluation.methods.standard import standard_methods
 

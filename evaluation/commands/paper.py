@@ -46,10 +46,10 @@ ErrorOption = Annotated[AngularError, typer.Option(help="Angular error to print.
 Out = Annotated[Path | None, option("FOLDER", "Write page, tables and figures here.")]
 Workers = Annotated[int | None, thread_option()]
 
-# Added to the conditions if pictures or ground truths are not those of the paper.
+# This note is added to the conditions if pictures or ground truths differ from those of the paper.
 _NOT_C1_NOTE = (
-    "The paper uses C1, the 259 images of the Canon 1Ds Mark III of NUS, for pictures and ground truths. Its numbers "
-    "are shown only if both scenes and illuminants are those of C1 or random."
+    "The paper uses C1, the 259 images of the Canon 1Ds Mark III of NUS, for pictures and ground truths. "
+    "Published numbers are shown only if both scenes and illuminants are from C1 or random."
 )
 
 _TABLE1_HELP = f"""Statistics-based methods on eight generated data sets (table 1).
@@ -107,10 +107,10 @@ def table1(
     from evaluation.experiments.paper.table1 import settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
 
-    sides = _sides(sizes)
+    sides = _parse_sides(sizes)
     _require_free(out)
-    opened = _open(luts)
-    scenes, pictures_text, pictures_name = _pictures(pictures, matrix)
+    opened = _open_luts(luts)
+    scenes, pictures_text, pictures_name = _open_pictures(pictures, matrix)
     truths = read_truths(lights_like)
     names = cell_name(pictures_name, [scene.name for scene in scenes]), cell_name(truths.name, truths.images)
     empty_blocks = settings(opened, scenes, truths.lights, side, seed, names)
@@ -123,7 +123,7 @@ def table1(
         f"LUTs: {'; '.join(map(_lut_text, opened))}.",
         *(() if names == ("C1", "C1") else (_NOT_C1_NOTE,)),
     )
-    _finish(table1_report(blocks, opened, conditions, error, size_rows), conditions, out, output)
+    _show(table1_report(blocks, opened, conditions, error, size_rows), conditions, out, output)
 
 
 def _lut_text(lut: Lut) -> str:
@@ -172,7 +172,7 @@ def table2(
     real, generated_set = open_data(data, read), open_scenes(generated)
     count = len(real.scenes)
     training, shared_images = trainable_images(generated_set, real, unseen, real.name)
-    treatment_text = "excluded" if unseen else "kept, as in the paper, where generated images show test pictures"
+    treatment_text = "excluded" if unseen else "kept, because generated images of the paper also show test pictures"
     shared_notes = (f"{shared_images}. They were {treatment_text}.",) if shared_images else ()
     # Three folds, as in the published tables for Cube+.
     folds, _ = choose_folds(real, "3", 0)
@@ -182,11 +182,11 @@ def table2(
     conditions = (
         f"Real: {real.name}, {count} images, {int(folds.max()) + 1} folds. Generated: {generated_set.name}, "
         f"{len(training)} images. {error.capitalize()} error, degrees.",
-        _treatment(real),
+        _treatment_text(real),
         *shared_notes,
         *(() if is_cube else ("The paper's table is for Cube+, so only its ratios are shown.",)),
     )
-    _finish(table2_report(table2_tables(comparisons, error, real.name, is_cube), conditions), conditions, out, output)
+    _show(table2_report(table2_tables(comparisons, error, real.name, is_cube), conditions), conditions, out, output)
 
 
 _BITS_HELP = f"""Influence of colour reduction on methods (section 4.2).
@@ -220,8 +220,8 @@ def bits(
     with image_steps(len(opened.scenes)) as step:
         result = remove_bits(opened.scenes, paper_methods(sigma), workers=workers or processor_count(), on_scene=step)
     description = f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px."
-    conditions = (description, _treatment(opened))
-    _finish(bits_report(result, error, opened.name, conditions), conditions, out, output)
+    conditions = (description, _treatment_text(opened))
+    _show(bits_report(result, error, opened.name, conditions), conditions, out, output)
 
 
 _REDUCTION_HELP = f"""One picture with 0 to 7 bits of each code set to zero (a figure of section 4.2).
@@ -243,7 +243,7 @@ def reduction(
     from generator import read_picture
 
     _require_free(out)
-    _finish(reduction_report(read_picture(picture), picture.name), (), out, output)
+    _show(reduction_report(read_picture(picture), picture.name), (), out, output)
 
 
 _CHROMATICITIES_HELP = f"""Chromaticities of the illuminants of look-up tables (LUT) in camera RGB (section 3.3).
@@ -272,17 +272,17 @@ def chromaticities(
     from evaluation.experiments.paper.reporting import chromaticities_report
 
     _require_free(out)
-    report = chromaticities_report(_open(luts), [read_truths(location) for location in truths or ()])
-    _finish(report, (), out, output)
+    report = chromaticities_report(_open_luts(luts), [read_truths(location) for location in truths or ()])
+    _show(report, (), out, output)
     if out is None:
         print("The figure was not written; use --out FOLDER to write it.")
 
 
-def _treatment(data: SceneSet) -> str:
+def _treatment_text(data: SceneSet) -> str:
     return f"{'; '.join(f'{aspect}: {text}' for aspect, text in data.treatment.items())}."
 
 
-def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None, output: JsonOutput) -> None:
+def _show(report: PaperReport, conditions: Sequence[str], out: Path | None, output: JsonOutput) -> None:
     from evaluation.experiments.paper.reporting import write_report
     from evaluation.reports.table_output import show_notes, show_tables
 
@@ -297,13 +297,13 @@ def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None, ou
         print(f"\n{out / 'report.html'}")
 
 
-def _open(folders: Sequence[Path]) -> list[Lut]:
+def _open_luts(folders: Sequence[Path]) -> list[Lut]:
     from generator import open_lut
 
     return [open_lut(folder) for folder in folders]
 
 
-def _pictures(location: str, matrix: str) -> tuple[Sequence[Source], str, str]:
+def _open_pictures(location: str, matrix: str) -> tuple[Sequence[Source], str, str]:
     """Return the source pictures at a location, a text on their origin, and their name."""
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
@@ -329,7 +329,7 @@ def _pictures(location: str, matrix: str) -> tuple[Sequence[Source], str, str]:
     return develop_sources(data, colour_matrix), text, data.name
 
 
-def _sides(text: str) -> list[int]:
+def _parse_sides(text: str) -> list[int]:
     sides = [side.strip() for side in text.split(",") if side.strip()]
     for side in sides:
         if not side.isdigit() or not 1 <= int(side) <= 65535:

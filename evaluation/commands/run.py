@@ -22,8 +22,8 @@ from foundation.folders import require_free
 
 HELP = f"""Estimate the illuminant of every image of a data set and summarise the errors.
 
-Reads DATA: a data set made by generate (folder or URL), or a real data set in its published layout. Methods are
-implemented in this suite, your own classes, trained models, or estimates of other programs; by default the seven
+Reads DATA: a data set made by generate (folder or URL), or a real data set in its published layout. A method belongs
+to this suite, or is your own class, a trained model, or a file with estimates of another program; by default the seven
 standard methods are used. Prints mean, median, trimean, best 25 %, worst 25 % and Avg. (their geometric mean) in
 degrees, as in the paper. With several illuminants in an image also prints errors by pixel and region. Prints how the
 images were treated. Writes files only with --out.

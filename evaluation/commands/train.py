@@ -68,7 +68,7 @@ def train(
             raise InputError(
                 f"{adapt} is a model of {base_model.learner.key}, expected {method}; give a model of {method}"
             )
-        # Its settings apply, which may differ from the present defaults.
+        # The settings of the base model apply, which may differ from the present defaults.
         learner = base_model.learner
     data_set = open_data(data, read)
     truths = truths_of(data_set.scenes)

@@ -37,9 +37,10 @@ if TYPE_CHECKING:
     from evaluation.experiments.transfer.plan import TransferPlan
     from evaluation.scene import Scene
 
-# Ratio of sizes above which all images are reduced. Learned methods use sizes that differ by up to 2 (whole factors).
+# If the longest sides of images differ by more than this ratio, all images are reduced to one size. Learned methods
+# reduce images by whole factors, so the sizes that they use already differ by up to 2.
 _MAX_SIZE_RATIO = 2.0
-_MAX_MEASURED = 25  # Maximum number of images of a set from which the size is determined
+_MAX_MEASURED = 25  # Largest number of images of a set that are read to measure its size
 
 HELP = f"""Train learned methods on generated images and test them on real ones.
 
@@ -47,7 +48,7 @@ Reads data sets in any layout of evaluate run. Trains each method on each TRAIN 
 cross-validation of the same method on TEST, the constant illuminant (median of the training illuminants), and methods
 without training. --naive adds training without a look-up table: linear sRGB of the same pictures times the same
 illuminants, with and without the camera's colour matrix. --real adds two trainings with N real images of the other
-folds: on these images alone, and on each set with adaptation to these images. Prints mean, median, trimean, best and
+folds: on these images alone, and on each TRAIN with adaptation to these images. Prints mean, median, trimean, best and
 worst 25 %, bootstrap intervals, and ratios to the cross-validation, paired by image. Training images that share a
 picture with the test set, by name or content, are excluded. Writes files only with --out.
 
@@ -98,7 +99,7 @@ def transfer(
     threads = workers or processor_count()
     names = split_names(method or ["all", "gray-world", "shades-of-gray", "gray-edge-1"])
     learned = [name for name in names if name.lower() == "all" or is_learner(name)]
-    learners, left_out = _learners(learned)
+    learners, left_out = _choose_learners(learned)
     references = choose_methods(name for name in names if name not in learned)
     requested_counts = _parse_counts(real)
     test_set = open_data(test, read)
@@ -136,7 +137,7 @@ def transfer(
     show_notes(output, plan.notes)
 
 
-def _learners(names: Sequence[str]) -> tuple[list[AnyLearner], list[str]]:
+def _choose_learners(names: Sequence[str]) -> tuple[list[AnyLearner], list[str]]:
     from evaluation.learning.constant_light import ConstantLight
 
     learners, left_out = choose_without_constant(names)

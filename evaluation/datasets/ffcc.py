@@ -3,8 +3,8 @@
     FOLDER/…/000001.png      linear thumbnail, black level subtracted; 8 or 16 bits
     FOLDER/…/000001.txt      red, green and blue of the illuminant, one per line
 
-Source: README.md of github.com/google/ffcc, "Preparation and folder structure". Subfolders are searched too. FFCC's
-preparation (internal/ReadImage.m) sets charts and clipped pixels to zero before it averages.
+Source: README.md of github.com/google/ffcc, "Preparation and folder structure". Subfolders are searched too. Charts
+and clipped pixels are zero, because FFCC (internal/ReadImage.m) sets them to zero before it reduces an image.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from evaluation.datasets.options import DataOptions, level_note
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, first_few
 
-_SEARCH_DEPTH = 4  # levels of subfolders that are searched: more than the toolbox's own data sets have
+_SEARCH_DEPTH = 4  # levels of subfolders that are searched; data sets of FFCC have fewer
 _SAMPLED_NAMES = 100  # thumbnails of a folder that are checked to recognise the layout
 
 

@@ -1,8 +1,8 @@
-"""Read the parts of data sets on a disk: folders, ground truths in text files and tables, and linear images.
+"""Read file names, ground truths and linear images of data sets from a disk.
 
-File names are checked before any file is opened; images are read on use. Images are PNG, TIFF or NumPy files with 16
-bits or more per channel. Truncated files are refused, and so are JPEG and 8-bit sRGB, because their values are not
-linear.
+File names are checked before any file is opened, and images are read on use. Images are PNG, TIFF or NumPy files with
+16 bits or more per channel. Truncated files are refused. JPEG and 8-bit sRGB are also refused, because their values are
+not linear.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ IMAGE_ENDINGS = (".png", ".tif", ".tiff", ".npy")  # file types of linear images
 
 @dataclass(frozen=True)
 class Folder:
-    """Names in a folder, read once; hidden files, which operating systems leave behind, are ignored."""
+    """Names in a folder, read once. Hidden files are ignored, because operating systems create them."""
 
     path: Path
 
@@ -101,7 +101,9 @@ def gather_images(folders: Iterable[Folder], endings: Collection[str] = (".png",
 def match_images(
     names: Sequence[str], images: Mapping[str, str], source: str, folder: Path | str, partial: bool
 ) -> tuple[list[int], str]:
-    """Return the indices of listed images that exist, and a note on their number.
+    """Return the indices of the listed `names` that exist in `images`, and a note on their number.
+
+    `source` is the list and `folder` the place of the images, for messages. If `partial`, missing images are allowed.
 
     Examples
     --------
@@ -140,7 +142,7 @@ Light = tuple[float, float, float]  # linear camera RGB of an illuminant, any le
 
 
 def check_light(values: Sequence[float], origin: str, remedy: str = "restore the file") -> Light:
-    """Return three values as an illuminant; raise FormatError if they are none."""
+    """Return three values as an illuminant; raise FormatError if they are not an illuminant."""
     if len(values) != 3 or not all(map(math.isfinite, values)) or min(values) < 0 or not any(values):
         raise FormatError(
             f"{origin}: the illuminant is {' '.join(f'{value:g}' for value in values) or 'empty'}, expected red, green "
@@ -170,7 +172,7 @@ def to_numbers(text: str, origin: str) -> list[float]:
 
 
 def read_lights(path: Path) -> list[Light]:
-    """Return the illuminants of a file with one per line (red, green, blue); empty lines at the end are ignored."""
+    """Return the illuminants of a text file: red, green, blue in each line; empty lines at the end are ignored."""
     lines = read_text(path).rstrip().splitlines()
     return [
         check_light(to_numbers(line, f"{path}, line {number}"), f"{path}, line {number}")
@@ -179,7 +181,7 @@ def read_lights(path: Path) -> list[Light]:
 
 
 def read_light(path: Path | str) -> Light:
-    """Return the illuminant of a file with one, on one line or three."""
+    """Return the illuminant of a text file with three numbers, on one line or on three."""
     return check_light(to_numbers(read_text(path), str(path)), str(path))
 
 
@@ -190,7 +192,7 @@ def split_header(line: str) -> tuple[list[str], str]:
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield the file and line of each table row, for messages, and its fields by column."""
+    """Yield the fields of each row of a table by column, after its file and line number for messages."""
     lines = files.read_text(path, "restore it").splitlines()
     header, separator = split_header(lines[0] if lines else "")
     missing = [name for name in columns if name not in header]
@@ -233,7 +235,7 @@ Mask = npt.NDArray[np.bool_]  # (H, W), True for pixels that must not be used
 
 @dataclass(frozen=True, slots=True)
 class RawScene:
-    """Image in a file with its levels; layouts with masks have subclasses.
+    """Image in a file, with its levels. Layouts with masks define subclasses.
 
     - `name`: name of the image, unique in its data set.
     - `path`: path of the image file.
@@ -274,7 +276,7 @@ class RawScene:
 
 
 def require_black_below_peak(scenes: Iterable[RawScene]) -> None:
-    """Refuse black levels above all pixels of all images."""
+    """Raise InputError if the black level is not below the largest value of all images."""
     peaks: list[tuple[float, RawScene]] = []
     for scene in scenes:
         try:
@@ -282,7 +284,7 @@ def require_black_below_peak(scenes: Iterable[RawScene]) -> None:
         except FormatError:
             return  # An unreadable image is reported when it is used.
         if peaks[-1][0] > scene.black:
-            return  # Correct levels usually require only one image to be read.
+            return  # If the level is correct, usually only one image is read.
     if peaks:
         peak_value, scene = max(peaks, key=lambda peak: peak[0])
         raise InputError(
@@ -291,15 +293,15 @@ def require_black_below_peak(scenes: Iterable[RawScene]) -> None:
         )
 
 
-_INSPECTED_IMAGES = 16  # images that are searched for a black level that was not subtracted
+_INSPECTED_IMAGES = 16  # largest number of images that `black_level_warning` reads
 
-# An image without black level has pixels below this fraction of its largest value. Black levels of cameras are 3 % of
-# saturation or more.
+# If black was subtracted, an image has pixels below this fraction of its largest value. Black levels of cameras are 3 %
+# of saturation or more.
 _NEAR_BLACK_SHARE = 0.01
 
 
 def black_level_warning(scenes: Sequence[RawScene]) -> str:
-    """Return a warning if no pixel is near 0, as if black were not subtracted; else an empty string."""
+    """Return a warning if no pixel is near 0, because black was probably not subtracted; else an empty string."""
     minima: list[float] = []
     for scene in scenes[:: -(-len(scenes) // _INSPECTED_IMAGES)]:
         try:
@@ -311,7 +313,7 @@ def black_level_warning(scenes: Sequence[RawScene]) -> str:
             return ""
         minima.append(float(usable.min()))
     inspected = "the image" if len(minima) == 1 else f"the {len(minima)} inspected images"
-    return f"; but the smallest value of {inspected} is {min(minima):g}, expected 0; give it with --read black=LEVEL"
+    return f"; but the smallest value of {inspected} is {min(minima):g}, expected 0; give --read black=LEVEL"
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,7 +326,7 @@ class PaintedScene(RawScene):
 
 
 def box_mask(shape: tuple[int, int], rows: slice, columns: slice) -> Mask:
-    """Return a mask (H, W) bool that is True in a box.
+    """Return a mask (H, W) bool that is True in a rectangle.
 
     Examples
     --------
@@ -351,7 +353,7 @@ def chart_mask(shape: tuple[int, int], corners: npt.NDArray[np.float64], path: s
     """
     import cv2
 
-    # Drawing time is proportional to the length of a line, and values beyond 32 bits overflow.
+    # Drawing to distant corners takes long, and corners beyond 32 bits overflow.
     if not (np.abs(corners) < 2 * max(shape)).all():
         raise FormatError(
             f"the chart of {path} has the corners {corners.tolist()}, expected corners in the image of "
@@ -378,7 +380,7 @@ def subtract_black(image: Image, black: float) -> Image:
         image = image.astype(np.float32)
     if black:
         if not image.flags.c_contiguous:
-            # A TIFF may have one plane per channel, which OpenCV cannot write to.
+            # The array of a TIFF with one plane per channel is not contiguous; OpenCV cannot write to it.
             image = image.copy(order="C")
         cv2.subtract(image, np.array([black, black, black, 0.0]), dst=image)  # clips integers at 0
     return image if image.dtype == np.uint16 else np.maximum(image, 0, out=image)

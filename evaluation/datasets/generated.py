@@ -30,7 +30,7 @@ class GeneratedScene:
 
     @property
     def group(self) -> str:
-        """Name of its source picture; all images of a source picture belong to one fold."""
+        """Name of the source picture. All images of a source picture belong to the same fold."""
         return self.entry.source
 
     @property
@@ -40,7 +40,7 @@ class GeneratedScene:
 
     @property
     def saturation(self) -> float:
-        """Saturation level of the LUT that the image was made with, in the units of the image."""
+        """Saturation level of the LUT from which the image was made, in the units of the image."""
         return float(self.dataset.description.table.white_level)
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
@@ -78,7 +78,7 @@ def open_generated(location: Path | str, subset: str | None = None) -> SceneSet:
     split = choose_name(subset, subsets, "subset", masked(str(location)))
     table = dataset.description.table
     white = table.white_level
-    # Readers of results must see that these colours were never photographed.
+    # Results must show that the colours were calculated, not photographed.
     computed = {} if table.computed is None else {"table": "computed from spectra and a model of the sensor"}
     uncertainties_deg = [light.uncertainty_deg for light in dataset.description.lights]
     known_deg = [value for value in uncertainties_deg if value is not None]

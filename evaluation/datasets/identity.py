@@ -1,7 +1,7 @@
 """Recognise copies of images without decoding them.
 
-A model file stores hashes of its training images, so that a test on the same images is noticed. The hash of an image
-covers its name and ground truth, or its source picture if it was generated. Renamed images, and images with another
+A model file stores hashes of its training images, so that a test on the same images is noticed. The hash is calculated
+from name and ground truth, or for a generated image from its source picture. Renamed images, and images with another
 ground truth, are not recognised.
 """
 
@@ -27,9 +27,8 @@ from generator.dataset.reader import Dataset
 def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:
     """Return two hashes of each scene, (N, 2) uint64, each the first 64 bits of a SHA-256.
 
-    The first hash identifies the image: by its name and ground truth, or by its source picture if it was generated. The
-    second is of the name; `find_training_images` uses it to link a generated image with the photograph it was made
-    from.
+    The first hash identifies the image, see the module docstring. The second is calculated from the name only. With it,
+    `find_training_images` links a generated image with the photograph from which it was made.
     """
     cache: dict[int, Mapping[str, str]] = {}
     rows: list[tuple[int, int]] = []
@@ -46,7 +45,7 @@ def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:
 
 
 def find_training_images(scenes: Sequence[Scene], training_identities: npt.NDArray[np.uint64]) -> tuple[str, ...]:
-    """Return the names of the scenes that occur in `training_identities`, the `identities` of other scenes."""
+    """Return the names of the scenes that are among the training images with these identities, (N, 2) uint64."""
     images = {int(number) for number in training_identities[:, 0]}
     names = {int(number) for number in training_identities[:, 1]}
     recognised_names: list[str] = []
@@ -79,17 +78,18 @@ def _hash(role: str, text: str) -> int:
     return int(sha256_of(f"{role}\t{text}".encode())[:16], 16)
 
 
-# Bytes of a file that are compared: 100 000 pixels or more, whose noise differs between any two photographs.
+# Length of the section of a file that is compared. Its 100 000 or more pixels have different noise in any two
+# photographs.
 _COMPARED_BYTES: Final = 1 << 20
 
 
 def first_copies(scenes: Sequence[Scene]) -> list[int]:
-    """Return for each scene the index of the first scene with the same pixels, which is its own index if unique.
+    """Return for each scene the index of the first scene with the same pixels; a unique scene gets its own index.
 
     Files of equal length are compared by a section from their middle. Scenes that are neither files nor thumbnails in
     memory count as unique.
     """
-    # Copies matter because a method must not be tested on a copy of a training image in another fold.
+    # Copies must be in the same fold, so that a method is not tested on a copy of a training image.
     counts = Counter(_byte_count(scene) for scene in scenes)
     first_indices: dict[tuple[int, str], int] = {}
     originals: list[int] = []

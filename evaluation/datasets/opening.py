@@ -1,4 +1,4 @@
-"""Open data sets of every supported layout; the layout is given or recognised from the files."""
+"""Open data sets of every supported layout. The layout is given by name or recognised from the files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Layout:
     - `options`: fields of `DataOptions` that apply to the layout.
     - `is_generic`: many data sets may have the layout; it is tried only if no other layout matches.
     - `is_unverified`: the reader was never tested on a published copy; results report this.
-    - `path_type`: "folder" or "file"; None if both are possible, or a URL.
+    - `path_type`: "folder" or "file"; None if the location may be either of them, or a URL.
     """
 
     title: str
@@ -54,7 +54,7 @@ class Layout:
     path_type: str | None = "folder"
 
 
-# Printed with results if the reader was only tested on synthetic copies.
+# Printed with results if the reader was only tested on synthetic copies of the data set.
 _UNVERIFIED_NOTE = "not verified against a published copy; compare one image with the authors' program"
 
 
@@ -94,7 +94,7 @@ LAYOUTS: Mapping[str, Layout] = {
     ),
     "simple-cube++": Layout(
         "SimpleCube++",
-        "gt.csv beside PNG, or those in train and test",
+        "gt.csv and a folder PNG, or both in train and test",
         is_simple_cube,
         open_simple_cube,
         ("subset", *_LEVELS, "partial"),
@@ -126,7 +126,7 @@ LAYOUTS: Mapping[str, Layout] = {
     ),
     "lsmi": Layout(
         "LSMI, several illuminants",
-        "meta.json beside split.json",
+        "meta.json and split.json",
         is_lsmi,
         open_lsmi,
         ("camera", "subset", *_LEVELS, "partial"),
@@ -134,7 +134,7 @@ LAYOUTS: Mapping[str, Layout] = {
     ),
     "ffcc": Layout(
         "FFCC's thumbnails",
-        "NAME.png beside NAME.txt",
+        "NAME.png with NAME.txt",
         is_ffcc,
         open_ffcc,
         (*_LEVELS, "partial"),
@@ -197,12 +197,12 @@ def open_scenes(location: Path | str, layout: str | None = None, options: DataOp
 
 
 def check_black_level(data: SceneSet, black: float | None) -> SceneSet:
-    """Return the data set, with a warning in its treatment if the black level was probably not subtracted.
+    """Return the data set, with a warning in `treatment` if the black level was probably not subtracted.
 
     `black` is the level given by the user. Raises InputError if a given level is not below the largest
     pixel of all images.
     """
-    # Images are read until one has plausible values; usually this is the first image.
+    # Both checks read images until one has plausible values; usually this is the first image.
     scenes = [scene for scene in data.scenes if isinstance(scene, RawScene)]
     if black is not None or data.layout == "folder":
         require_black_below_peak(scenes)

@@ -1,4 +1,4 @@
-"""Options of a user for reading a data set."""
+"""Options for reading a data set, as given by the user."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from foundation.errors import InputError
 
 @dataclass(frozen=True)
 class DataOptions:
-    """Selected part of a data set, and levels that replace those of its layout.
+    """Selected part of a data set, and levels that replace the levels of its layout.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class DataOptions:
     black
         Black level ≥ 0, in the units of the files; None for the level of the layout.
     saturation
-        Value > 0 from which a pixel is clipped, in the units of the files, before black is subtracted; None for the
+        Value > 0 from which a pixel is clipped, in the units of the files, black level not subtracted; None for the
         level of the layout.
     partial
         True to exclude and count missing images; False to raise an error for them.
@@ -62,9 +62,9 @@ class DataOptions:
 
 
 def choose_name(requested: str | None, available: Collection[str], option: str, location: str) -> str | None:
-    """Return the available name that equals `requested` except for case, "_" and "-"; None if none was requested.
+    """Return the available name that equals `requested`; None if none was requested. Case and "_" or "-" do not matter.
 
-    `option` and `location` are for the message of the InputError that is raised if there is no such name.
+    Raises InputError if there is no such name; `option` and `location` are for its message.
 
     Examples
     --------
@@ -80,7 +80,7 @@ def choose_name(requested: str | None, available: Collection[str], option: str, 
 
 
 def level_note(level: float | None, otherwise: str) -> str:
-    """Return the level given by the user with this source, or else `otherwise`, the level and source of the layout.
+    """Return a text with the level given by the user, or if it is None, `otherwise`: level and source of the layout.
 
     Examples
     --------

@@ -2,16 +2,16 @@
 
 Layout::
 
-    gt.csv              image,r,g,b: one row per image; path relative to the table, with or without the ending
+    gt.csv              image,r,g,b: one row per image; image is a path relative to the table, ending optional
                         columns black, saturation: levels of the image, in the units of its file, optional
                         column mask: a picture that is not 0 at pixels that must not be used, optional
                         column fold: whole numbers from 0 for cross-validation, optional
     photo1.png …        linear camera RGB, red first: PNG or TIFF of 16 bits, TIFF of floats, or NumPy files
     photo1_mask.png     mask of photo1 if column mask is empty, optional
 
-The table is the only .csv of the folder with these columns, or the path of the table is given. Images without a row
-are refused, so that no image is excluded by mistake. JPEG and 8-bit sRGB are refused, because their values are not
-proportional to light.
+The table may have any name if no other .csv of the folder has these columns; else its path must be given. Images
+without a row are refused, so that no image is excluded by mistake. JPEG and 8-bit sRGB are refused, because their
+values are not proportional to light.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ from foundation.names import comparable
 COLUMNS = ("image", "r", "g", "b")  # required columns of the table
 
 # Source of the black level if neither the table nor the user gives one.
-ASSUMED_BLACK = "0: assumed, as neither a column black nor --read black gives it"
+ASSUMED_BLACK = "0: assumed, because neither a column black nor --read black gives it"
 
 _PICTURES = (".jpg", ".jpeg", ".webp", ".heic", ".gif", ".bmp")
 _RAWS = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef", ".srw", ".crw")
 _MASK = "_mask"
 _MASK_ENDINGS = (".png", ".tif", ".tiff")
 _MAX_HEADER_BYTES = 4096  # of the first line of a table
-_INSPECTED_TABLES = 50  # tables of a folder whose headers are read to find the one with ground truths
+_INSPECTED_TABLES = 50  # number of tables whose headers are read to find the one with ground truths
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folde
             first_refusal = first_refusal or _unusable_file(folder, name, origin, indices)
             continue
         if (earlier_name := paths.setdefault(os.path.normpath(image), name)) != name:
-            raise FormatError(f"{origin}: {name} and {earlier_name} are one file, expected one row for it; remove one")
+            raise FormatError(f"{origin}: {name} and {earlier_name} are the same file, expected one row; remove one")
         given_columns.update(name for name in ("black", "saturation", "mask", "fold") if row.get(name, "").strip())
         mask_path = _find_mask(name, image, indices)
         scenes.append(_scene(folder, name, image, mask_path, light, row, origin, options))
@@ -123,9 +123,9 @@ def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folde
             f"({first_few(missing) or 'it is empty'}); {remedy}"
         )
     if "fold" in given_columns and min(folds) < 0:
-        raise FormatError(f"{path}: some rows have a fold, expected one in all or none; complete the column")
+        raise FormatError(f"{path}: some rows have a fold, expected a fold in all rows or in none; complete the column")
     if mask_images := sorted(masks & paths.keys()):
-        raise FormatError(f"{path}: {first_few(mask_images)} is an image and a mask, expected one of these; rename it")
+        raise FormatError(f"{path}: {first_few(mask_images)} is an image and a mask, expected only one; rename it")
     exclusion_note = _unlisted_note(Path(location), path, indices, paths.keys(), masks, options.partial)
     return SceneSet(
         name=folder.resolve().name,
@@ -184,7 +184,7 @@ def _find_table(location: Path, scanned_folder: Folder | None) -> Path:
 
 
 def refuse_unusable_table(folder: Folder) -> None:
-    """Raise FormatError if a folder with images has one table, which lacks required columns."""
+    """Raise FormatError if a folder with images has only one table, and required columns are missing there."""
     headers = _headers(folder)
     if len(headers) == 1 and folder.images(IMAGE_ENDINGS):
         ((name, header),) = headers.items()
@@ -256,7 +256,7 @@ def _ending(file: str) -> str:
 
 
 def _find_image(folder: Path, name: str, origin: str, indices: dict[str, _FolderIndex]) -> str | None:
-    """Return the path of a listed image, with or without ending in the table; None if it does not exist."""
+    """Return the path of an image with this name in the table, with or without ending; None if it does not exist."""
     parent, _, file = comparable(name).rpartition("/")
     if _ending(file) in (*_PICTURES, *_RAWS):
         raise FormatError(f"{origin}: {name} is {_refusal_reason(file)}")
@@ -271,7 +271,7 @@ def _find_image(folder: Path, name: str, origin: str, indices: dict[str, _Folder
 
 
 def _refusal_reason(file: str) -> str:
-    """Return why a file with this ending is not read as an image."""
+    """Return the reason if a file with this ending is not read as an image."""
     if _ending(file) in _PICTURES:
         file_type = "JPEG, " if _ending(file) in (".jpg", ".jpeg") else ""
         return (
@@ -290,7 +290,7 @@ def _refusal_reason(file: str) -> str:
 
 
 def _unusable_file(folder: Path, name: str, origin: str, indices: Mapping[str, _FolderIndex]) -> str | None:
-    """Return why the unusable file that has the name of a missing image is refused; None if there is none."""
+    """Return a message if a missing image exists only as a file that cannot be used, else None."""
     parent, _, file = comparable(name).rpartition("/")
     stem = Path(file).stem if _ending(file) in IMAGE_ENDINGS else file
     file_name = indices[parent].unusable.get(stem)
@@ -311,7 +311,7 @@ def _unlisted_note(
     masks: Collection[str],
     partial: bool,
 ) -> str:
-    """Return a note on excluded images without a row; an empty string if there are none."""
+    """Return a note on excluded images without a row; an empty string if there are no such images."""
     folders = {file.rpartition(os.sep)[0] or "." for file in images}
     root = Folder(path.parent)
     row_folders = [index.folder for index in indices.values() if index.files]
@@ -323,7 +323,7 @@ def _unlisted_note(
         (near_images if folder_path in folders else elsewhere).extend(
             file for file in files if file not in images and file not in masks
         )
-    # Masks need no row of their own; they are reported only if there are no other images.
+    # Unused masks are reported only if there are no other images without a row.
     near_images = [file for file in near_images if not Path(file).stem.endswith(_MASK)] or near_images
     # If the user gave one of several tables, it is a selection of images. Otherwise an image without a row is an error.
     is_selection = location.is_file() and len(_tables(root)) > 1
@@ -333,8 +333,8 @@ def _unlisted_note(
             f"({first_few([os.path.relpath(file, root.path) for file in near_images])}), expected one row each; add "
             "rows, remove the files, or exclude them with --read partial"
         )
-    groups = ((near_images, "next to them"), (elsewhere, "in other folders"))
-    return ", ".join(f"{len(files)} {note} without a row in {path.name} excluded" for files, note in groups if files)
+    groups = ((near_images, "in the same folders"), (elsewhere, "in other folders"))
+    return ", ".join(f"{len(files)} more {note} excluded (no row in {path.name})" for files, note in groups if files)
 
 
 def _scene(

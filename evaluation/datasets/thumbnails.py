@@ -29,7 +29,7 @@ class Thumbnail:
     - `name`: name of the image.
     - `truth`: ground truth (3,) float64, linear camera RGB of any length.
     - `image`: (H, W, 3) float32 or uint16, linear camera RGB minus black level.
-    - `saturation`: value from which a pixel is clipped; None if unknown, as averaged pixels do not show it.
+    - `saturation`: value from which a pixel is clipped; None if unknown, because averaging hides clipped pixels.
     """
 
     name: str
@@ -47,7 +47,7 @@ def open_thumbnails(path: Path | str, saturation: float | None = None) -> SceneS
     try:
         with np.load(path) as content:
             images, truths, names = native(content["images"]), content["gt"].astype(np.float64), content["names"]
-    except Exception as error:  # NumPy evaluates file headers; damaged ones may raise any error.
+    except Exception as error:  # NumPy evaluates file headers, so a damaged file may raise any error.
         raise FormatError(f"{path} cannot be read as thumbnails: {error}; {_EXPECTED}") from error
     count = len(images)
     if images.ndim != 4 or images.shape[3] != 3 or truths.shape != (count, 3) or names.shape != (count,) or not count:

@@ -1,7 +1,7 @@
 """Confidence intervals of error statistics by the bootstrap: the range expected for other images of the same kind.
 
-Intervals are bias-corrected and accelerated (BCa), computed by `scipy.stats.bootstrap`. Errors of colour constancy are
-skewed; plain percentile intervals of a mean or of the worst 25 % would be too low.
+Intervals are bias-corrected and accelerated (BCa), computed by `scipy.stats.bootstrap`. Errors of colour constancy have
+a skewed distribution, so percentile intervals of a mean or of the worst 25 % would be too low.
 
 Related images, such as one picture under several illuminants, are drawn together (cluster bootstrap: A. C. Davison,
 D. V. Hinkley, *Bootstrap Methods and their Application* (1997), section 3.8). Drawing them separately would give
@@ -21,13 +21,14 @@ from scipy import stats
 
 from foundation.errors import InputError
 
-# Errors are equal up to twice the last of the six decimals in files.
+# Errors that differ by less than this are equal, degrees: two units of the last decimal in files.
 TIE_DEG: Final = 2e-6
 
-# Counts drawn at once (resamples × images): arrays of 1.6 MB stay in the processor's cache.
+# Largest number of counts (resamples × images) at a time. Arrays of 1.6 MB stay in the processor's cache.
 _COUNTS_AT_ONCE: Final = 200_000
 
-# The ends of a 95 % interval then vary by about 2 % of its length (one standard deviation) between seeds.
+# Number of resamples. The ends of an interval then vary by about 2 % of its length (one standard deviation) between
+# seeds.
 RESAMPLES: Final = 2000
 
 # Confidence level of all intervals, as usual in the field.
@@ -72,9 +73,9 @@ def bounded_figures(
 ) -> tuple[BoundedFigure, ...]:
     """Return K statistics of a sample of images with their confidence intervals.
 
-    `statistics`: maps counts (B, N) int64 of N images in B resamples to (B, K) float64. `groups`: group of each image;
-    images of a group are drawn together; None if every image is its own group. With a single group the ends are NaN,
-    because nothing is known about other groups.
+    `statistics`: function from counts (B, N) int64 of N images in B resamples to statistics (B, K) float64. `groups`:
+    group of each image; images of a group are drawn together. None if every image is its own group. With a single
+    group, the ends are NaN, because the variation between groups is unknown.
     """
     group_indices = np.arange(images) if groups is None else group_ids(groups)
     group_count = int(group_indices.max()) + 1
@@ -83,7 +84,7 @@ def bounded_figures(
         rows = drawn.reshape(-1, drawn.shape[axis])
         shifted = rows + np.arange(len(rows))[:, None] * group_count
         counts = np.bincount(shifted.ravel(), minlength=len(rows) * group_count).reshape(-1, group_count)
-        # Rounded, because resamples that differ only in the last digit must count as equal.
+        # Values are rounded, so that resamples that differ only by rounding errors are equal.
         rounded = np.round(statistics(counts if groups is None else counts[:, group_indices]), 12)
         return rounded.T.reshape(-1, *drawn.shape[:-1])
 
@@ -106,7 +107,7 @@ def bounded_figures(
             method="BCa",
             rng=np.random.default_rng(seed),
         )
-        # BCa has no ends if all resamples are equal, or if a ratio is infinite in some; percentiles replace them.
+        # BCa has no ends if all resamples are equal, or if a ratio is infinite in some. Percentiles are then used.
         probabilities = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
         percentile_ends = np.quantile(bootstrap.bootstrap_distribution, probabilities, axis=-1, method="inverted_cdf")
     ends = np.where(np.isnan(bootstrap.confidence_interval), percentile_ends, bootstrap.confidence_interval)
@@ -115,22 +116,23 @@ def bounded_figures(
 
 
 def _hazen_position(count: Indices, percent: float) -> tuple[Indices, Indices, Floats]:
+    # A percentile by Hazen's definition lies between two sorted errors. Returns the indices of both, and the weight of
+    # the upper one.
     position: Floats = np.clip(np.multiply(count, percent / 100) - 0.5, 0, np.subtract(count, 1))
-    # By Hazen's definition. A percentile lies between two sorted errors; the fraction is the weight of the upper one.
     low: Indices = position.astype(np.int64)
     return low, np.minimum(low + 1, np.subtract(count, 1)), position - low
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorSample:
-    """Errors, sorted once; `order` (N,) int64 is the image index of each of the sorted `errors` (N,) float64."""
+    """Sorted errors (N,) float64; `order` (N,) int64 has the image index of each error."""
 
     order: Indices
     errors: Floats
 
     @classmethod
     def of(cls, errors: npt.ArrayLike) -> ErrorSample:
-        """Return the sorted errors (N,) float; InputError if there is none, or if one is NaN or infinite."""
+        """Return the errors (N,) float, sorted. Raises InputError if the list is empty or a value is not finite."""
         values = np.asarray(errors, dtype=np.float64).ravel()
         if not values.size or not np.isfinite(values).all():
             raise InputError(
@@ -145,14 +147,14 @@ class ErrorSample:
         return self.statistics(np.ones((1, len(self.order)), np.int64))[0]
 
     def statistics(self, counts: Indices) -> Floats:
-        """Return the statistics (B, 6) float64 of resamples, given as counts (B, N) of the images in original order."""
+        """Return statistics (B, 6) float64 of B resamples; `counts` (B, N): how often each image was drawn."""
         # Statistics follow `evaluation.metrics.summarise`, with its percentiles and its treatment of equal errors.
         rows, images = counts.shape
         counts = counts[:, self.order]
         cumulative_counts = np.cumsum(counts, axis=1)
         sums = np.cumsum(counts * self.errors, axis=1)
-        # With the totals of earlier rows added, the cumulative counts of all rows form one ascending list, which is
-        # searched once.
+        # If the totals of earlier rows are added, the cumulative counts of all rows form one ascending list. It can be
+        # searched for all rows at once.
         row: Indices = np.arange(rows, dtype=np.int64)
         totals: Indices = cumulative_counts[:, -1]
         offsets: Indices = np.cumsum(totals) - totals
@@ -174,7 +176,7 @@ class ErrorSample:
         count_below = np.where(worst_start >= 0, cumulative_counts[row, worst_start], 0)
         worst_mean = (sums[:, -1] - sum_below) / (totals - count_below)
         first_five = np.stack([sums[:, -1] / totals, q2, (q1 + 2 * q2 + q3) / 4, best_mean, worst_mean], axis=-1)
-        # If all errors are 0, rounding of sums may leave a small negative value.
+        # If all errors are 0, rounding of sums may give a small negative value.
         non_negative = np.where(first_five < 0, np.nan, first_five)
         return np.concatenate([first_five, np.prod(non_negative**0.2, axis=-1, keepdims=True)], axis=-1)
 
@@ -200,8 +202,9 @@ def compare_paired(
 ) -> tuple[PairedFigure, ...]:
     """Return difference and ratio of every statistic for two methods on the same images.
 
-    The same images are drawn for both, so that images that are difficult for both do not widen the intervals.
-    `errors_a`, `errors_b`: (N,) float, N ≥ 1, finite, in the same order of images. `groups`: see `bounded_figures`.
+    The same images are drawn for both methods, so images that are difficult for both methods do not widen the
+    intervals. `errors_a`, `errors_b`: (N,) float, N ≥ 1, finite, in the same order of images. `groups`: see
+    `bounded_figures`.
     """
     sample_a, sample_b = ErrorSample.of(errors_a), ErrorSample.of(errors_b)
     images = len(sample_a.order)
@@ -224,6 +227,6 @@ def compare_paired(
 
 
 def safe_ratio(numerator: Floats, denominator: Floats) -> Floats:
-    """Return the ratio; infinite, or NaN for 0 / 0, if the denominator is 0 within the rounding of angles."""
+    """Return the ratio. Denominators up to `TIE_DEG` count as 0: the ratio is then infinite, or NaN for 0 / 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return numerator / np.where(np.abs(denominator) > TIE_DEG, denominator, 0)

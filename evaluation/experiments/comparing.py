@@ -1,11 +1,11 @@
 """Compare the errors of two methods, or of one method in two runs, image by image.
 
-All results are paired by image: Wilcoxon's signed-rank test, recommended for colour constancy by S. D. Hordley,
-G. D. Finlayson, JOSA A 23 (2006) 1008-1020; intervals of differences and ratios of all statistics
-(`bootstrap.compare_paired`); and the images with the largest differences.
+Errors on the same image are paired. Wilcoxon's signed-rank test is recommended for colour constancy by S. D. Hordley,
+G. D. Finlayson, JOSA A 23 (2006) 1008-1020. Differences and ratios of all statistics have confidence intervals
+(`bootstrap.compare_paired`).
 
-Images of one picture or scene are not independent. If results have groups, the test uses the mean error of each group
-and the bootstrap draws whole groups: 1000 images of 15 pictures are 15 cases.
+Images of the same picture or scene are not independent. If results have groups, the test uses the mean error of each
+group, and the bootstrap draws whole groups. 1000 images of 15 pictures then count as 15 cases.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from foundation.plots import FAINT, SERIES, draw_svg
 # Smaller errors are drawn at this value, degrees: a logarithmic axis has no zero, and no ground truth is more accurate.
 _FLOOR_DEG: Final = 0.01
 
-# Largest angle between two ground truths of the same image, degrees: files round them differently.
+# Largest accepted angle between two ground truths of the same image, degrees. Files round ground truths differently.
 _SAME_TRUTH_DEG: Final = 0.01
 
 _STATISTIC_HEADS: Final = dict(zip(STATISTICS, PAPER_COLUMNS[1:], strict=True))
@@ -75,7 +75,7 @@ class MatchedErrors:
         return images if self.groups is None else f"{counted(self.sizes[1], 'group')} of {images}"
 
     def case_errors(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return the errors (M,) float64 of both: the mean of each group, or of each image."""
+        """Return for both methods the mean error of each group, or the error of each image, (M,) float64."""
         numbers = group_ids(self.groups or self.images)
         sizes = np.bincount(numbers)
         return np.bincount(numbers, self.errors_a) / sizes, np.bincount(numbers, self.errors_b) / sizes
@@ -85,7 +85,7 @@ class MatchedErrors:
 class SignedRank:
     """Wilcoxon's signed-rank test of paired errors."""
 
-    # Number of images, or groups, on which the first error is smaller, larger, equal
+    # Number of images, or of groups, with a smaller, larger and equal error of the first method
     wins: int
     losses: int
     ties: int
@@ -95,12 +95,12 @@ class SignedRank:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All results of a pair."""
+    """All results for a pair of methods."""
 
     matched: MatchedErrors
     test: SignedRank
     p_holm: float  # p of the test, corrected for all comparisons made together (`holm`)
-    statistics: tuple[PairedFigure, ...]  # Every statistic of both, with intervals of difference and ratio
+    statistics: tuple[PairedFigure, ...]  # Every statistic of both methods, with intervals of difference and ratio
 
 
 def match(first: MethodErrors, second: MethodErrors, names: tuple[str, str], metric: ErrorKind) -> MatchedErrors:
@@ -118,7 +118,7 @@ def match(first: MethodErrors, second: MethodErrors, names: tuple[str, str], met
             f"the ground truths of {images[worst]} in {names[0]} and {names[1]} differ by {angles[worst]:.2f} degrees, "
             f"expected at most {_SAME_TRUTH_DEG:g}; run both methods on the same data and ground truths"
         )
-    # The groups of the first method are used if it has groups, otherwise the groups of the second.
+    # Groups of the first method are used if it has groups, else groups of the second method.
     groups: tuple[str, ...] = ()
     for source, indices in ((second, indices_b), (first, indices_a)):
         groups = groups if source.groups is None else tuple(source.groups[index] for index in indices.tolist())
@@ -138,7 +138,7 @@ def match(first: MethodErrors, second: MethodErrors, names: tuple[str, str], met
 def signed_rank(errors_a: npt.ArrayLike, errors_b: npt.ArrayLike) -> SignedRank:
     """Return the signed-rank test of paired errors.
 
-    `errors_a`, `errors_b`: (N,) float, degrees, in the same order of images, which must be independent of each other.
+    `errors_a`, `errors_b`: (N,) float, degrees, in the same order of images. The images must be independent.
 
     Examples
     --------
@@ -159,7 +159,7 @@ def signed_rank(errors_a: npt.ArrayLike, errors_b: npt.ArrayLike) -> SignedRank:
 
 
 def holm(probabilities: Sequence[float]) -> list[float]:
-    """Return p-values for which the probability of any false positive is at most the significance level.
+    """Return p-values that are corrected for several tests, so that the level is valid for all tests together.
 
     S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statistics 6 (1979) 65-70.
 
@@ -187,7 +187,7 @@ def compare(pairs: Sequence[MatchedErrors]) -> tuple[Comparison, ...]:
 
 
 def verdict(comparison: Comparison) -> str:
-    """Return one sentence: which of the two has the smaller errors, and whether the difference is significant."""
+    """Return a sentence that reports which method is better, and if the difference is significant."""
     matched, test = comparison.matched, comparison.test
     name_a, name_b = matched.names
     counts = (
@@ -228,8 +228,8 @@ def statistics_table(comparisons: Sequence[Comparison]) -> Table:
         ),
         digits=3,
         notes=(
-            f"Intervals of {LEVEL:.0%}: BCa bootstrap over images, or groups of them, {bootstrap.RESAMPLES} resamples, "
-            "the same for both methods. A single group has no interval.",
+            f"Intervals of {LEVEL:.0%}: BCa bootstrap over images or groups of images, {bootstrap.RESAMPLES} "
+            "resamples, the same for both methods. A single group has no interval.",
         ),
     )
 
@@ -280,7 +280,7 @@ def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str]) -> 
 
 
 def _interval_cells(pair: PairedFigure) -> list[Cell]:
-    # NaN: unknown. An infinite upper end of a ratio is kept.
+    # NaN means unknown. Infinite ratios are kept.
     return [None if np.isnan(number) else number for number in (*pair.difference, *pair.ratio)]
 
 

@@ -1,7 +1,7 @@
 """Cross-validation of learned methods, and tuning of statistics-based methods without ground truth.
 
-In cross-validation each image is estimated by a model that was not trained on it. Images may be reduced first, so that
-training and test images have the same size, noise and detail.
+In cross-validation, the model that estimates an image was not trained on this image. Images may be reduced first, so
+that training and test images have the same size, noise and detail.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from evaluation.scene import Image, Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
-# Smallest usable fraction of the area of a reduced pixel; with less, rounding errors of areas dominate its colour.
+# Smallest usable fraction of the area of a reduced pixel. Below, rounding errors of areas dominate its colour.
 _MIN_USABLE_AREA: Final = 1e-3
 
 
@@ -47,7 +47,7 @@ class SmallScene:
     truth: npt.NDArray[np.float64]  # (3,) float64, ground truth, linear camera RGB of any length
     image: Image  # (H, W, 3), linear camera RGB, in the unit of the original image; float32 if reduced
     mask: npt.NDArray[np.bool_] | None  # (H, W) bool, True for pixels that must not be used; None if all may be used
-    saturation: float | None  # level of the original image; None if the image was reduced without clipped pixels
+    saturation: float | None  # level of the original image; None if reduced, because averages exclude clipped pixels
 
     def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
         """Return the image (H, W, 3) and its mask (H, W) bool."""
@@ -75,8 +75,8 @@ def shrink_image(
 
     `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB. `side`: longest side of the result, px.
     `saturation`: value from which a channel is clipped; None for no clipping. `mask`: (H, W) bool, True for pixels that
-    must not be used. Returns the image (h, w, 3) float32 and its mask (h, w) bool. The mask is True and the image is
-    0 where too few pixels of an area are usable.
+    must not be used. Returns the image (h, w, 3) float32 and its mask (h, w) bool. If too few pixels of an
+    area are usable, the mask is True and the image is 0.
 
     Examples
     --------
@@ -103,12 +103,12 @@ AnyLearner = Learner | FeatureLearner  # Is fitted to scenes, or to features of 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Scenes, with their features for some learners."""
+    """Scenes, with their features for the learners that use features."""
 
     scenes: tuple[Scene, ...]
     truths: npt.NDArray[np.float64]  # (N, 3) float64, linear camera RGB of any length
-    # For each learner, the features of each scene or None if it has no usable pixel; None for a learner that reads the
-    # scenes itself.
+    # One entry for each learner: the features of each scene, or None if the learner reads images itself. A scene
+    # without usable pixel has the features None.
     features: tuple[Sequence[Features | None] | None, ...]
 
     @property
@@ -124,7 +124,7 @@ def collect_material(
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> Material:
-    """Return the material of scenes for learners; learners that extract features share one reading of each image.
+    """Return the material for learners; each image is read once for all learners that extract features.
 
     `side`: longest side to which images are reduced first, px; None keeps their size.
     """
@@ -175,10 +175,10 @@ def cross_validate(
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[Result, ...]:
-    """Return the estimates and errors of learned methods; each image is estimated by a model of the other folds.
+    """Return estimates and errors of learned methods; each image is estimated by a model trained on the other folds.
 
-    Images are read once for all learners that extract features, and again in each fold by learners that only have
-    `fit(scenes, seed)`. `folds`: (N,) int64, fold of each image, at least two different folds.
+    Images are read once for all learners that extract features. Learners that only have `fit(scenes, seed)` read them
+    again in each fold. `folds`: (N,) int64, fold of each image, at least two different folds.
     """
     truths_of(scenes)
     fold_count = len(np.unique(folds))
@@ -194,7 +194,7 @@ def cross_validate(
 
 
 def cross_fit(learner: AnyLearner, number: int, material: Material, folds: npt.NDArray[np.int64], seed: int) -> Result:
-    """Return the result of one learner; each scene is estimated by a model of the other `folds` (N,) int64."""
+    """Return the result of one learner, with a new model for each fold; `folds`: (N,) int64, fold of each scene."""
     answers: dict[int, SceneAnswer] = {}
     for fold in np.unique(folds):
         test_indices = np.flatnonzero(folds == fold)
@@ -205,7 +205,7 @@ def cross_fit(learner: AnyLearner, number: int, material: Material, folds: npt.N
 
 @dataclass(frozen=True)
 class FamilySetting:
-    """One set of parameters of a family, with its results."""
+    """One set of parameters of a family of methods, with its results."""
 
     text: str  # Value of `--method` for this set: "gray-edge-1:p=4:sigma=2"
     name: str  # Name of the method in tables
@@ -280,8 +280,8 @@ def tuning_table(tuning: Tuning) -> Table:
     notes: list[str] = []
     if tuning.counted < tuning.images:
         notes.append(
-            f"{tuning.images - tuning.counted} of {tuning.images} images are excluded for all settings, because some "
-            "setting gives no estimate for them."
+            f"{tuning.images - tuning.counted} of {tuning.images} images are excluded for all settings, because at "
+            "least one setting gives no estimate for them."
         )
     return Table(
         f"{tuning.data}: {tuning.family} by the spread of green chromaticity on {tuning.counted} images, "

@@ -1,7 +1,7 @@
 """Folds of a data set: defined by its authors, drawn by a seed, or read from a file.
 
-A method is trained on all folds but one and tested on that one. Related images (a group), such as one picture under
-several illuminants, are always in the same fold; otherwise a method would be tested on its training data.
+A method is trained on all folds except one, and tested on that fold. Related images, such as one picture under several
+illuminants, form a group and are always in the same fold. Otherwise a method would be tested on its training data.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _MIN_FOLDS = 2  # With one fold there are no training images
 
 
 def group_of(scene: Scene) -> str:
-    """Return the group of related images that the scene belongs to: its `group`, else its name."""
+    """Return the group of related images to which the scene belongs: its `group` if it has one, else its name."""
     return str(getattr(scene, "group", scene.name))
 
 
 def groups_of(scenes: Sequence[Scene]) -> tuple[str, ...] | None:
-    """Return the group of each scene; None if every scene has its own."""
+    """Return the group of each scene; None if every scene is its own group."""
     groups = tuple(map(group_of, scenes))
     return groups if len(set(groups)) < len(groups) else None
 
@@ -39,8 +39,8 @@ def groups_of(scenes: Sequence[Scene]) -> tuple[str, ...] | None:
 def choose_folds(data: SceneSet, text: str | None = None, seed: int = 0) -> tuple[npt.NDArray[np.int64], str]:
     """Return the fold of each image, (N,) int64 from 0, and a text on the origin of the folds.
 
-    `text`: value of --folds, a number of folds to draw or the path of a CSV file with the columns image,fold. None
-    uses the data set's own folds, else draws `FOLDS`.
+    `text`: value of --folds, a number of folds to draw or the path of a CSV file with the columns image,fold. If it is
+    None, the folds of the data set are used; a data set without folds gets `FOLDS` drawn folds.
     """
     if text is None and data.folds is not None:
         return np.asarray(data.folds, dtype=np.int64), "the data set's own"
@@ -56,7 +56,7 @@ def choose_folds(data: SceneSet, text: str | None = None, seed: int = 0) -> tupl
 
 
 def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | None = None) -> npt.NDArray[np.int64]:
-    """Return the fold of each image, (N,) int64 from 0, with sizes as equal as the groups allow.
+    """Draw the fold of each image, (N,) int64 from 0. Folds are as equal in size as the groups allow.
 
     `groups`: group of each of the N images; None if every image is its own group.
 
@@ -82,7 +82,7 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
             expectation = f"expected {possible} folds, at least {unit} in each; choose another number (--folds)"
         raise InputError(f"{counted(folds, 'fold')} of {available}: {expectation}")
     order = np.random.default_rng(seed).permutation(len(group_names))
-    # Largest groups first, each into the emptiest fold: fold sizes then differ by less than the largest group.
+    # The largest groups are assigned first, each to the smallest fold, so that fold sizes differ little.
     order = order[np.argsort(-sizes[order], kind="stable")]
     fold_sizes, group_folds = np.zeros(folds, np.int64), np.zeros(len(group_names), np.int64)
     for group in order:
@@ -92,12 +92,12 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
 
 
 def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.NDArray[np.int64]:
-    """Return the fold of each scene, (N,) int64 from 0, with groups and copies kept together."""
+    """Draw the fold of each scene, (N,) int64 from 0. Groups of images and copies stay together."""
     groups = groups_of(scenes)
     if groups is None:
         names = [scene.name for scene in scenes]
         copy_names = tuple(names[first] for first in first_copies(scenes))
-        # Without copies, `draw_folds` draws from the indices of the images; from their names it would draw other folds.
+        # Without copies, `groups` stays None. Names as groups would change the drawn folds.
         groups = copy_names if len(set(copy_names)) < len(copy_names) else None
     return draw_folds(len(scenes), folds, seed, groups)
 
@@ -105,7 +105,7 @@ def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.
 def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     """Return the fold of each image, (N,) int64 from 0, from a CSV file `image,fold` with a line for each image.
 
-    Folds may be any words or numbers; they are numbered in sorted order. Missing and unknown images are refused.
+    Folds may have any names; they are numbered in sorted order. Missing and unknown images are refused.
     """
     columns, rows = read_csv(path, "use a CSV file with the columns image,fold", "folds from")
     if not {"image", "fold"} <= set(columns):
@@ -138,7 +138,7 @@ def folds_to_csv(names: Sequence[str], folds: npt.NDArray[np.int64]) -> str:
 
 
 def require_groups_together(scenes: Sequence[Scene], folds: npt.NDArray[np.int64]) -> None:
-    """Refuse folds (N,) int64 that separate images of one group."""
+    """Raise InputError if folds (N,) int64 separate images of the same group."""
     group_folds: dict[str, int] = {}
     for scene, fold in zip(scenes, folds, strict=True):
         group = group_of(scene)

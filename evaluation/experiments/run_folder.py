@@ -1,4 +1,4 @@
-"""Runs of methods on a data set, and their results folders, which are written completely or not at all."""
+"""Run methods on a data set, and write their results folder, completely or not at all."""
 
 from __future__ import annotations
 

@@ -26,13 +26,13 @@ from evaluation.scene import MixedScene, Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import RUN_AGAIN, CropError, FormatError, InputError
 
-# Folder of this package: code outside it that is not an installed library is the user's.
+# Folder of this package. Code outside this folder belongs to the user or to an installed library.
 _PACKAGE_FOLDER = Path(__file__).parents[1]
 
 
 @runtime_checkable
 class SceneMethod(Protocol):
-    """Source of estimates that needs no pixels, such as estimates of another program."""
+    """Source of estimates that needs no pixels, such as a file from another program."""
 
     @property
     def name(self) -> str:
@@ -40,7 +40,7 @@ class SceneMethod(Protocol):
         ...
 
     def estimate_scene(self, scene: Scene) -> npt.NDArray[np.float64] | None:
-        """Return the estimate (3,) float64 for a scene, camera RGB of any length; None if there is none."""
+        """Return the estimate (3,) float64 for a scene, camera RGB of any length; None without an estimate."""
         ...
 
 
@@ -73,7 +73,7 @@ def evaluate(
 
 
 def require_truths(scenes: Sequence[Scene], methods: Sequence[object]) -> npt.NDArray[np.float64]:
-    """Return the ground truths (N, 3) float64 of scenes, camera RGB of any length; refuse invalid ones."""
+    """Return the ground truths (N, 3) float64 of scenes, camera RGB of any length. Invalid ones raise InputError."""
     if not scenes or not methods:
         raise InputError(f"{len(methods)} methods on {len(scenes)} images, expected at least one of each; give some")
     return np.stack([_checked_truth(scene) for scene in scenes])
@@ -109,7 +109,7 @@ class _MethodCall:
 
 
 def _answer(scene: Scene, calls: Sequence[_MethodCall], needs_no_image: bool) -> tuple[SceneAnswer, ...]:
-    # An image is not read if no method needs its pixels and one illuminant reaches it.
+    # An image is not read if no method needs its pixels and it has only one illuminant.
     is_mixed = isinstance(scene, MixedScene)
     image, mask = (None, None) if needs_no_image and not is_mixed else scene.read()
     truth = (scene.read_truth_map(), scene.read_weights()) if isinstance(scene, MixedScene) else None
@@ -142,9 +142,9 @@ def _answer(scene: Scene, calls: Sequence[_MethodCall], needs_no_image: bool) ->
 
 
 def fit_copy(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
-    """Return the method that a copy of the learner is fitted to.
+    """Fit a copy of the learner to scenes, and return the fitted method.
 
-    A learner may store its training data in itself; without the copy, later folds would contain their test images.
+    A learner may store its training data. Without the copy, test images of later folds would be among these data.
     """
     try:
         fresh = copy.deepcopy(learner)
@@ -170,7 +170,7 @@ def fit_copy(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
 
 
 def _checked_map(returned_value: object, image: Any) -> tuple[npt.NDArray[np.floating[Any]], str]:
-    """Return the estimates by pixel (H, W, 3) float with grey for missing ones, and a text that counts these."""
+    """Return the estimate of each pixel, (H, W, 3) float, grey if missing; and a note on the number of missing ones."""
     lights = np.asarray(returned_value)
     if lights.shape != image.shape or not np.issubdtype(lights.dtype, np.floating):
         raise ValueError(
@@ -206,14 +206,14 @@ def _reason(error: BaseException) -> str:
     outside = [frame for frame in frames if _PACKAGE_FOLDER not in Path(frame.filename).parents]
     user_frames = [frame for frame in outside if "site-packages" not in Path(frame.filename).parts] or outside
     line_text = f" ({Path(user_frames[-1].filename).name}, line {user_frames[-1].lineno})" if user_frames else ""
-    # A ValueError of this package's own checks is a complete message; its type would add nothing.
+    # A ValueError from a check of this package has a complete message, so its type is not shown.
     is_complete = isinstance(error, ValueError) and not user_frames
     return f"{error}{line_text}" if is_complete else f"{type(error).__name__}: {error}{line_text}"
 
 
 def _remedy(method: object) -> str:
     if callable(getattr(method, "fit", None)):
-        # A class with `fit` fails here most often because it was not trained.
+        # The usual cause for a class with `fit` is that it was not trained.
         return f"if it must be trained first, use evaluate cv, otherwise correct it, {RUN_AGAIN}"
     return f"correct it, {RUN_AGAIN}"
 

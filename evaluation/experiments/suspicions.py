@@ -1,8 +1,8 @@
 """Detect estimates or ground truths that were probably written in another convention.
 
-Illuminants written with red and blue exchanged, as gains (reciprocals), or in another order of images give errors like
-those of a poor method. If another reading of the estimates fits the ground truths far better, a note is printed; no
-number changes.
+Red and blue may be exchanged, values may be gains (reciprocals), or the images may be in another order. The errors are
+then as large as with a poor method. If one of these other readings fits the ground truths far better, a note is
+printed; results are not changed.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ _Lights = npt.NDArray[np.float64]
 
 _MIN_IMAGES: Final = 8  # A median of fewer images is not reliable
 
-# Median error, degrees, below which estimates are read correctly; near grey, all readings fit about equally.
+# Below this median error, degrees, no other reading is tried. Near grey, all readings fit about equally.
 _MIN_MEDIAN_DEG: Final = 5.0
 
-# Largest ratio of the median errors of another and of the present reading; correct data stay far above it.
+# Largest median error of another reading, as a fraction of the present median error. Correct data have a far larger
+# ratio.
 _MAX_RATIO: Final = 0.5
 
-# Largest median error of another reading, degrees; a poor fit is no evidence for it.
+# Largest median error of another reading, degrees. A poor fit is no evidence for that reading.
 _MAX_OTHER_DEG: Final = 8.0
 
-_MIN_CHANNEL: Final = 1e-9  # Replaces a channel at 0 before inversion, relative to the largest
+_MIN_CHANNEL: Final = 1e-9  # Replaces smaller channels before inversion; fraction of the largest channel
 
 
 def suspicions(images: Sequence[str], truths: npt.NDArray[np.float64], results: Sequence[Result]) -> tuple[str, ...]:

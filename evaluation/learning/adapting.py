@@ -1,8 +1,8 @@
 """Adapt a pretrained model to N images of another camera.
 
-Two models are blended. The pretrained model was usually fitted to generated images; its method may tune it to the N
-images (`FeatureLearner.tune`). The local model is fitted to the N images alone. The estimate is the mean of the
-logarithms of both estimates. In this mean, the pretrained model has the weight w.
+The estimates of two models are combined. The pretrained model was usually fitted to generated images, and may be tuned
+to the N images (`FeatureLearner.tune`). The local model is fitted to the N images alone. The result is the weighted
+mean of the logarithms of both estimates. The pretrained model has the weight w, the local model 1 - w.
 
 Test images are not used. docs/decisions/0044-adapted-is-two-models-and-a-weight.md explains the constants.
 """
@@ -20,9 +20,9 @@ from evaluation.learning.feature_learner import FeatureLearner, Features, Learne
 from evaluation.metrics import recovery_error
 
 PRETRAINED_WORTH: Final = 200.0  # W: number of local images to which a pretrained model is equivalent
-PRIOR_IMAGES: Final = 25.0  # weight of the expected w, expressed as a number of images
+PRIOR_IMAGES: Final = 25.0  # weight of the prior for w, as a number of images
 _SHARES: Final = np.linspace(0, 1, 101)  # candidates for w
-_FOLDS: Final = 3  # folds of the N images for cross-validation; few, because each requires a fit
+_FOLDS: Final = 3  # folds of the N images for cross-validation; few, because each fold requires a fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class LocalFit:
 def fit_local(
     learner: FeatureLearner, features: Sequence[Features | None], truths: npt.NDArray[np.float64], seed: int = 0
 ) -> LocalFit:
-    """Fit a learner to the features (or None) and ground truths (N, 3) float64 of N local images."""
+    """Fit a learner to features and ground truths (N, 3) float64 of N local images; features may be None."""
     method = fit_extracted(learner, features, truths, seed)
     usable = [index for index, image_features in enumerate(features) if image_features is not None]
     stacked: Any = np.stack([image_features for image_features in features if image_features is not None])
@@ -69,15 +69,15 @@ def adapt(pretrained: LearnedMethod, local_fit: LocalFit, worth: float = PRETRAI
     if not worth > 0:
         return local_fit.method
     model, count = pretrained.model, len(local_fit.features)
-    # A model that was already adapted blends models of two cameras, so it is not tuned.
+    # An adapted model consists of models of two cameras and cannot be tuned.
     tuned = model
     if not isinstance(model, BlendedModel):
         tuned = pretrained.learner.tune(model, local_fit.features, local_fit.truths, worth, local_fit.seed)
-    # The expected w is W / (W + N), or 1 after tuning, because the tuning also uses the N images.
+    # The expected w is W / (W + N). After tuning it is 1, because tuning has already used the N images.
     share = worth / (worth + count) if tuned is model else 1.0
     if local_fit.held_out is not None:
         share = stacked_share(model.lights(local_fit.features), local_fit.held_out, local_fit.truths, share)
-    # A pretrained model does not improve with N: from N = 2 W, its weight is small even if stacking returns 1.
+    # A pretrained model does not improve with N. From N = 2 W, its weight is small even if stacking returns 1.
     share *= worth**4 / (worth**4 + count**4)
     return replace(pretrained, model=BlendedModel(tuned, local_fit.method.model, np.array(share)))
 
@@ -89,14 +89,14 @@ def stacked_share(
 
     Examples
     --------
-    The expected weight is 0, but only the first estimate is correct: its weight increases with the number of images:
+    The expected weight is 0, but only the first estimate is correct. Its weight increases with the number of images:
 
     >>> truths, wrong = np.tile([0.3, 0.4, 0.3], (450, 1)), np.tile([0.2, 0.4, 0.4], (450, 1))
     >>> [round(stacked_share(truths[:n], wrong[:n], truths[:n], 0.0), 1) for n in (0, 25, 450)]
     [0.0, 0.5, 1.0]
     """
     # Stacking: L. Breiman, "Stacked regressions", Machine Learning 24, 1996. A prior is added, because twenty images
-    # alone select the weight poorly. Both compared models are also worse than the final models.
+    # are too few to select the weight. The final models are also better than the models compared here.
     if not len(truths):
         return expected
     errors = np.array([recovery_error(_log_mean(first, second, share), truths).sum() for share in _SHARES])
@@ -111,9 +111,9 @@ def _log_mean(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64], s
 
 @dataclass(frozen=True, eq=False)
 class BlendedModel:
-    """Two models whose estimates are averaged.
+    """Model that averages the estimates of two models.
 
-    - `pretrained`: the pretrained model, tuned if its method supports this.
+    - `pretrained`: the pretrained model; it is tuned if its method supports tuning.
     - `local`: the model fitted to the N local images.
     - `share`: () float64, 0 … 1, weight of the pretrained model in the mean of the logarithms.
     """

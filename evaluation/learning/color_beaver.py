@@ -1,15 +1,15 @@
-"""Color Beaver: estimates of another method, restricted to a learned region of illuminants.
+"""Color Beaver: restrict the estimates of another method to a learned region of illuminants.
 
 K. Koščević, N. Banić, S. Lončarić, "Color Beaver: bounding illumination estimations for higher accuracy", VISAPP 2019.
 The estimate of an underlying method (Gray-world in the table of the paper) is moved into a region of the chromaticity
 plane. A genetic algorithm fits the region: it minimises the median angular error of the training images.
 
-*Reconstruction*, because the paper was not accessible. The plane is r and b of r + g + b = 1. The region is a band
-along the locus of illuminants: a polyline of `corners` points with a half-width at each end. Estimates outside move to
-the nearest point of the band. A genome has the corners, the half-widths and the index of the underlying method. Genomes
-start near the main axis of the training illuminants, and the best of them survive unchanged. Parents are selected by
-tournaments; their genes are blended (BLX-α, L. J. Eshelman, J. D. Schaffer 1993) and mutated by normal steps that
-decrease over the generations. The error is the recovery error.
+The paper was not accessible, so the following is our reconstruction. The plane is r and b of r + g + b = 1. The region
+is a band along the locus of illuminants: a polyline of `corners` points with a half-width at each end. Estimates
+outside the band move to its nearest point. A genome has the corners, the half-widths and the index of the underlying
+method. The first genomes are near the main axis of the training illuminants. The best genomes survive unchanged.
+Parents are selected by tournaments. Genes of children are blended (BLX-α, L. J. Eshelman, J. D. Schaffer 1993) and
+mutated by normally distributed steps, which decrease over the generations. The error is the recovery error.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from evaluation.methods.prepared import GREY
 from evaluation.scene import Image
 
 _ELITE_SIZE = 4  # genomes that survive unchanged: few, so that most genomes of a generation are new
-_TOURNAMENT_SIZE = 3  # genomes of which the best becomes a parent
-# largest distance of a child's gene outside the interval of its parents' genes, fraction of this interval (BLX-α)
+_TOURNAMENT_SIZE = 3  # genomes in a tournament; the best one becomes a parent
+# A child's gene may be outside the interval of its parents' genes by this fraction of the interval (BLX-α).
 _CROSSOVER_MARGIN = 0.3
 _MUTATION = 0.15  # probability of a mutation per gene: one or two per genome
-# Standard deviation of a mutation in the first and last generation, in standard deviations of the training illuminants.
+# Standard deviation of a mutation in the first and in the last generation, relative to the spread of the illuminants.
 _STEPS = (0.5, 0.02)
 
 
@@ -42,7 +42,7 @@ class ColorBeaver(FeatureLearner):
 
     - `norms`: Minkowski norms of the underlying methods, separated by spaces; training selects one. "1" is Gray-world.
     - `corners`: number of corners of the polyline, 2 or more.
-    - `population`: genomes per generation.
+    - `population`: number of genomes in a generation.
     - `generations`: number of generations.
     """
 

@@ -1,4 +1,4 @@
-"""Constant estimate: a baseline that does not use the image."""
+"""Constant estimate, as a baseline that does not use the image."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from evaluation.scene import Image
 class ConstantLight(FeatureLearner):
     """Returns the median of the training illuminants for every image.
 
-    The median is taken for each of the chromaticities r, g and b. A learned method that is not better has learned only
-    the distribution of illuminants.
+    The median is calculated for each of the chromaticities r, g and b. A learned method that is not better has learned
+    only the distribution of illuminants.
     """
 
     key: ClassVar[str] = "constant-light"

@@ -1,13 +1,13 @@
-"""Small convolutional network with local estimates weighted by confidence; requires PyTorch.
+"""Small convolutional network that weights local estimates by confidence; requires PyTorch.
 
 After Y. Hu, B. Wang, S. Lin, "FC4: fully convolutional color constancy with confidence-weighted pooling", CVPR 2017. A
-fully convolutional network returns four channels: a local illuminant and its confidence. Their product, summed over the
-image and scaled to length 1, is the estimate (equations 4 to 6); the angular error is the loss (equation 7).
+fully convolutional network returns four channels: a local illuminant and its confidence. The sum of their products
+over the image, scaled to length 1, is the estimate (equations 4 to 6). The angular error is the loss (equation 7).
 
 *Differences to the paper.* Three convolutions on thumbnails replace AlexNet or SqueezeNet pretrained on ImageNet, so
-that training takes a minute on a processor. The input is the square root of the image divided by its mean, and a mask
+that training takes a minute on a processor. The image is divided by its mean. The input is its square root and a mask
 of usable pixels. Local illuminants are exponentials of three channels. Images are flipped and get random gains as in
-section 5.1, but gains of at most 10 %.
+section 5.1, but gains change a channel by at most 10 %.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features, LightModel, require_installed
-from evaluation.learning.working_size import reduce
+from evaluation.learning.working_size import reduce_image
 from evaluation.scene import Image
 from foundation.errors import InputError
 
-_FIRST_KERNEL = 5  # side of the first convolution, px; the others have 3
+_FIRST_KERNEL = 5  # side of the kernel of the first convolution, px
 _BATCH_SIZE = 16  # images per step of the optimiser, as in the paper
 # Range of the random gain of each channel. The range 0.6 to 1.4 of the paper hides the distribution of illuminants,
 # which is important with a few hundred images.
 _GAIN_RANGE = (0.9, 1.1)
-_TUNING_FACTOR = 4  # reduction of epochs and learning rate for tuning; not selected by results
+_TUNING_FACTOR = 4  # tuning has fewer epochs and a smaller learning rate by this factor; our choice
 _DECAY = 1e-4  # weight decay, because the network has more weights than there are images
 
 
@@ -39,7 +39,7 @@ class ConvNet(FeatureLearner):
     """Settings of the method.
 
     - `working_size`: side of the square input, px.
-    - `width`: channels of the first convolution; the others have twice as many.
+    - `width`: channels of the first convolution; the next two convolutions have twice as many.
     - `epochs`: number of epochs.
     - `rate`: learning rate of Adam, which decreases to zero along a cosine.
     """
@@ -60,7 +60,7 @@ class ConvNet(FeatureLearner):
 
         Smaller images are padded with unusable black pixels. See `FeatureLearner.features`.
         """
-        small, used = reduce(image, saturation, mask, self.working_size)
+        small, used = reduce_image(image, saturation, mask, self.working_size)
         if not small[used].any():
             return None
         height, width = used.shape
@@ -101,7 +101,7 @@ class ConvNet(FeatureLearner):
     ) -> ConvNetModel:
         torch = _torch()
         threads = torch.get_num_threads()
-        # Sums depend on the number of threads, and the network is too small to benefit from several.
+        # Rounding depends on the number of threads, and the network is too small to benefit from several threads.
         torch.set_num_threads(1)
         try:
             images = torch.from_numpy(np.moveaxis(features, 3, 1).astype(np.float32))
@@ -173,7 +173,7 @@ def _weight_shapes(width: int) -> dict[str, tuple[int, ...]]:
 
 
 def _initial_weights(torch: Any, width: int, generator: Any) -> dict[str, Any]:
-    # Initialisation of K. He et al. (ICCV 2015); the last layer starts with a tenth of it.
+    # Initialisation of K. He et al. (ICCV 2015), with ten times smaller weights in the last layer.
     weights: dict[str, Any] = {}
     for name, shape in _weight_shapes(width).items():
         inputs = int(np.prod(shape[1:]))
@@ -208,7 +208,7 @@ def _forward(torch: Any, weights: Mapping[str, Any], images: Any) -> Any:
 
 
 def _angle(torch: Any, estimates: Any, truths: Any) -> Any:
-    # Angles (N,) in radians, with the sine: the cosine has no gradient near zero.
+    # Angles (N,) in radians. The sine is used, because the cosine has no gradient at an angle of zero.
     directions = torch.nn.functional.normalize(truths, dim=1)
     sine = torch.linalg.cross(estimates, directions).norm(dim=1).clamp(min=1e-6)
     return torch.atan2(sine, (estimates * directions).sum(1))

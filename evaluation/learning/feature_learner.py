@@ -1,8 +1,8 @@
 """Contract of learned methods that extract features from an image and fit a model to the features.
 
-`FeatureLearner.features` does not depend on ground truths, so cross-validation reads each image only once. The fitted
-`LightModel` consists of arrays, which can be stored in a model file. Classes of users need only the contract
-`methods.method.Learner` with `fit(scenes, seed)`.
+`FeatureLearner.features` does not use ground truths, so cross-validation reads each image only once. The fitted
+`LightModel` consists of arrays, which can be stored in a model file. Classes of users need only `fit(scenes, seed)`,
+see `methods.method.Learner`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Features = npt.NDArray[Any]
 
 
 class LightModel(Protocol):
-    """Fitted model: the illuminant as a function of features."""
+    """Fitted model, which estimates illuminants from features."""
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
         """Return the estimates for N images.
@@ -49,14 +49,14 @@ class LightModel(Protocol):
 
 
 class FeatureLearner(ABC):
-    """Method that must be fitted: a frozen dataclass; its fields are its settings, numbers or strings."""
+    """Method that must be fitted. A subclass is a frozen dataclass with settings (numbers or strings) as fields."""
 
     key: ClassVar[str]  # name on the command line and in model files
 
     title: ClassVar[str]  # name in tables, if it does not depend on the settings
 
+    # Additional module for training, and the command that installs it; None if no module is required
     needs: ClassVar[tuple[str, str] | None] = None
-    # Additional module for training, and the command that installs it; None if none is required.
 
     @property
     def name(self) -> str:
@@ -161,7 +161,7 @@ def extract(
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[list[Features | None], ...]:
-    """Return for each learner the features of each scene, or None; each image is read once."""
+    """Return for each learner the features of each scene, None without usable pixels; each image is read once."""
 
     def extract_scene(scene: Scene) -> list[Features | None]:
         image, mask = scene.read()
@@ -174,7 +174,7 @@ def extract(
 def fit_extracted(
     learner: FeatureLearner, features: Sequence[Features | None], truths: npt.NDArray[np.float64], seed: int = 0
 ) -> LearnedMethod:
-    """Return the method fitted to the features and ground truths (N, 3) of N images; features of None are excluded."""
+    """Return the method fitted to features and ground truths (N, 3) of N images, except images with features None."""
     usable = [index for index, image_features in enumerate(features) if image_features is not None]
     if not usable:
         raise InputError(
@@ -207,7 +207,7 @@ def missing_requirement(learner: object) -> str | None:
 
 
 def truths_of(scenes: Sequence[Scene]) -> npt.NDArray[np.float64]:
-    """Return the ground truths (N, 3) float64, linear camera RGB; raise InputError if one has a value of 0 or less."""
+    """Return the ground truths (N, 3) float64, linear camera RGB; raise InputError if a value is 0 or less."""
     if not scenes:
         raise InputError("0 training images, expected at least one; add some")
     truths = np.stack([np.asarray(scene.truth, dtype=np.float64) for scene in scenes])

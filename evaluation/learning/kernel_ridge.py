@@ -1,14 +1,14 @@
 """Kernel ridge regression of the illuminant on a histogram of chromaticities.
 
 C. Saunders, A. Gammerman, V. Vovk, "Ridge regression learning algorithm in dual variables", ICML 1998. The estimate is
-a weighted sum of kernels between an image and each training image; the weights a are the solution of (K + λ I) a = y.
+a weighted sum of kernels between an image and each training image. The weights a are the solution of (K + λ I) a = y.
 V. Agarwal, A. V. Gribok, A. Koschan, M. A. Abidi, "Estimating illumination chromaticity via kernel regression", ICIP
 2006, use kernel regression on chromaticity histograms.
 
-The kernel is K = exp(-d² / 2), with d² = Σ (√p - √q)² ≤ 2 for the bin fractions p and q of two images; d is
+The kernel is K = exp(-d² / 2). Here d² = Σ (√p - √q)² ≤ 2, p and q are the bin fractions of two images, and d is
 proportional to the Hellinger distance. Pixels are weighted by brightness, because the chromaticity of dark pixels is
 mostly noise. *Not from these papers:* the 64 × 64 bins of (r, g), the square root, the width of the kernel, and
-λ. They were not selected by results on generated images; see docs/decisions/0056-settings-of-learned-methods.md.
+λ. They were not tuned on generated images, see docs/decisions/0056-settings-of-learned-methods.md.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features, LightModel
-from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
+from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce_image
 from evaluation.scene import Image
 
 BINS = 64  # bins of r and of g, each 0 … 1; near usual illuminants a bin is 2° to 4° wide
 _LARGEST_SIZE = 255  # largest working size for which unweighted counts fit into 16 bits, px
 _PENALTY_IMAGES = 900  # number of training images for which λ is `penalty`
-_LARGEST_COUNT = 65535  # stored value of a bin that contains all weights of an image: the largest 16-bit number
+_LARGEST_COUNT = 65535  # sum of the weighted counts of an image, the largest 16-bit number
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class KernelRidge(FeatureLearner):
 
         Black pixels are excluded. If pixels are weighted by brightness, the sum of the counts is 65535 before rounding.
         """
-        small, used = reduce(image, saturation, mask, self.working_size)
+        small, used = reduce_image(image, saturation, mask, self.working_size)
         pixels = small[used & small.any(axis=2)]
         if not len(pixels):
             return None
@@ -84,7 +84,7 @@ class KernelRidge(FeatureLearner):
     def tune(
         self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
     ) -> KernelRidgeModel:
-        """Return the model fitted to its own M images and to N new images, each of weight M / `worth`, at least 1."""
+        """Return the model fitted to its own M images and N new images, which have the weight max(1, M / `worth`)."""
         if not isinstance(model, KernelRidgeModel):
             raise TypeError(f"the model is {type(model).__name__}, expected KernelRidgeModel")
         old, new = _square_roots(model.counts), _square_roots(features)

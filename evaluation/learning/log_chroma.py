@@ -3,13 +3,13 @@
 J. T. Barron, Y.-T. Tsai, "Fast Fourier color constancy", CVPR 2017. A change of the illuminant shifts the histogram of
 log chromas u = log(g / r), v = log(g / b) (equation 2). The histogram is convolved with a learned filter, and the
 illuminant is at the largest response (equations 5 and 6). The histogram is on a torus, so the convolution is a product
-of Fourier transforms. Two histograms are used, of pixels and of their local absolute deviations (section 4). A softmax
-of the response plus a learned bias gives probabilities. The estimate is the mean of a bivariate von Mises distribution
-with the same moments (section 3.1).
+of Fourier transforms. There are two histograms: of pixels, and of their local absolute deviations (section 4). A
+softmax of the response plus a learned bias gives probabilities. The estimate is the mean of a bivariate von Mises
+distribution with the same moments (section 3.1).
 
-*Differences from the paper.* A bias is learned, but no gain map (equation 5), as in the authors' program. Each bin of
-the torus contains several chromas. The estimate is the chroma nearest to the middle of the training illuminants; in the
-paper it is the chroma nearest to grey light or to the grey-world estimate (section 3.3).
+*Differences from the paper.* As in the authors' program, a bias is learned, but no gain map (equation 5). Each bin of
+the torus stands for several chromas. Here, the chroma nearest to the middle of the training illuminants is the
+estimate. In the paper, it is the chroma nearest to grey light or to the grey-world estimate (section 3.3).
 
 *Training* follows sections 3 and 4 of the paper and its supplement. The first iterations minimise a convex loss, the
 cross-entropy between the softmax and the bin of the ground truth. Later iterations minimise the negative log-likelihood
@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features, LightModel
-from evaluation.learning.working_size import reduce
+from evaluation.learning.working_size import reduce_image
 from evaluation.scene import Image
 from foundation.errors import InputError
 
@@ -35,7 +35,8 @@ BINS = 64  # bins of the torus along each axis (section 5 of the paper)
 _BATCH_SIZE = 16  # images per batch; the arrays of a batch fit into the second-level cache
 _SHAPE = (BINS, BINS)
 _BIN_ANGLE = 2 * np.pi / BINS  # radians per bin
-# Smallest squared length of a mean direction. The length of a uniform distribution is 0, and its angle is undefined.
+# Smallest squared length of a mean direction. A uniform distribution has the length 0, for which the angle is
+# undefined.
 _SMALLEST_LENGTH = 1e-12
 
 
@@ -43,8 +44,8 @@ _SMALLEST_LENGTH = 1e-12
 class Penalties:
     """Weights of the regularisation.
 
-    - `smoothness`: weights of squared differences between neighbouring bins: pixel filter, edge filter, bias.
-    - `size`: weights of squares, in the same order.
+    - `smoothness`: weights of squared differences between neighbouring bins of pixel filter, edge filter and bias.
+    - `size`: weights of the squares of their bins, in the same order.
     - `spread`: variance added to the distribution along each axis, bins².
     """
 
@@ -94,8 +95,9 @@ def likelihood(
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     """Return the losses (N,) and their derivatives with respect to the responses (N, 64, 64).
 
-    The loss of an image is its negative log-likelihood minus the smallest possible value. This is the value of an exact
-    estimate with the variance `spread`. `probabilities` are (N, 64, 64), `truth_bins` (N, 2) ground truths in bins.
+    The loss of an image is its negative log-likelihood minus the smallest possible value. An exact estimate with the
+    variance `spread` has this smallest value. `probabilities` are (N, 64, 64), `truth_bins` (N, 2) ground truths in
+    bins.
     """
     offset = fit.mean - truth_bins
     offset = offset - BINS * np.rint(offset / BINS)
@@ -149,8 +151,8 @@ def train(
     of iterations, weight of the cross-entropy and weight of the likelihood.
     """
     # Penalties are diagonal in Fourier space. L-BFGS uses parameters scaled so that the penalty is half their squared
-    # length (preconditioning, section 4.2). Scaled parameters are stored by bin, because the packing of the paper is
-    # then unnecessary. Each batch is calculated in single precision, so that it fits into the cache.
+    # length (preconditioning, section 4.2). Each batch is calculated in single precision, so that it fits into the
+    # cache.
     import scipy.fft
     import scipy.optimize
 
@@ -200,7 +202,7 @@ def train(
 
 
 def _fourier_scale(smoothness: float, size: float) -> npt.NDArray[np.float64]:
-    # Factors (64, 33) of the Fourier coefficients, after which the penalty is a squared length. The authors' penalty is
+    # Factors (64, 33) from scaled parameters to Fourier coefficients, see `train`. The authors' penalty is
     # Σ |F|² (smoothness (|1 − e^iα|² + |1 − e^iβ|²) / 8 + size) over all coefficients F. The constant coefficient is
     # omitted, because it does not change the softmax.
     differences = (2 - 2 * np.cos(_BIN_ANGLE * np.arange(BINS))) / 8
@@ -209,13 +211,13 @@ def _fourier_scale(smoothness: float, size: float) -> npt.NDArray[np.float64]:
     return 1 / (BINS * np.sqrt(weights))
 
 
-# Bins of extracted histograms along each axis. For training and estimates they are folded to 64 bins. Their width is
-# 1/32, as in the paper, or 1/16 for widely spread training illuminants.
+# Bins of extracted histograms along each axis. For training and estimates, histograms are folded to 64 bins. A folded
+# bin has a width of 1/32, as in the paper, or of 1/16 if training illuminants are widely spread.
 _FINE_BINS = 128
 _FINE_WIDTH = 1 / 32  # width of a bin, natural logarithm (section 5 of the paper)
 _CHANNELS = 2  # histograms per image: pixels and edges
 _IMAGE_BINS = _CHANNELS * _FINE_BINS**2
-_LARGEST_SPAN = 0.75  # largest fraction of the torus for training illuminants; the rest makes chromas unambiguous
+_LARGEST_SPAN = 0.75  # training illuminants may span this fraction of the torus; the gap makes chromas unambiguous
 _LARGEST_SIZE = 255  # largest working size for which counts fit into 16 bits, px
 
 
@@ -223,8 +225,8 @@ _LARGEST_SIZE = 255  # largest working size for which counts fit into 16 bits, p
 class LogChroma(FeatureLearner):
     """Settings of the method.
 
-    Default weights are from the authors' program for thumbnails of Gehler-Shi. Exceptions are `bias_smoothness` and the
-    three sizes. They were selected by cross-validation with the Canon 5DSR of INTEL-TAU
+    Most default weights are from the authors' program for thumbnails of Gehler-Shi. `bias_smoothness` and the three
+    sizes were selected by cross-validation with the Canon 5DSR of INTEL-TAU
     (docs/decisions/0056-settings-of-learned-methods.md).
 
     - `working_size`: longer side of the reduced image, px, up to 255.
@@ -265,7 +267,7 @@ class LogChroma(FeatureLearner):
 
         See `FeatureLearner.features`.
         """
-        small, used = reduce(image, saturation, mask, self.working_size)
+        small, used = reduce_image(image, saturation, mask, self.working_size)
         counts = _histogram(small[used], self.least)
         if not counts.any():
             return None
@@ -279,7 +281,7 @@ class LogChroma(FeatureLearner):
     def tune(
         self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
     ) -> LogChromaModel:
-        """Return the model fitted to its own M images and to N new images, each of weight M / `worth`, at least 1.
+        """Return the model fitted to its own M images and N new images, which have the weight max(1, M / `worth`).
 
         A model without its training images is returned unchanged.
         """
@@ -316,8 +318,8 @@ class LogChroma(FeatureLearner):
             penalties,
             ((self.pretraining, self.crossentropy, 0.0), (self.training, 0.0, self.likelihood)),
         )
-        # The middle of the range, not the median: if tungsten illuminants are rare, the median is near one end of the
-        # range, and the torus would be cut inside the range near its other end.
+        # The torus is cut opposite to the centre. The centre is the middle of the range, because the median can be near
+        # one end. The cut could then be inside the range.
         centre = (chromas.min(axis=0) + chromas.max(axis=0)) / 2
         return LogChromaModel(filters, bias, centre, np.array(grid))
 
@@ -382,7 +384,7 @@ class LogChromaModel:
     - `bias`: (64, 64) float64, added to the response.
     - `centre`: (2,) float64, u and v of the middle of the training illuminants, opposite to the cut of the torus.
     - `grid`: (2,) float64, width of a bin and chroma of the centre of the first bin.
-    - `examples`: its training images; None if the model was tuned or its file does not contain them.
+    - `examples`: training images of the model; None if the model was tuned or its file has no training images.
     """
 
     filters: npt.NDArray[np.complex128]
@@ -392,7 +394,7 @@ class LogChromaModel:
     examples: TrainingImages | None = None
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
-        """Return the arrays by name, and the arrays of the training images if the model contains them."""
+        """Return the arrays by name, with the arrays of the training images if the model has them."""
         model_arrays = {"filters": self.filters, "bias": self.bias, "centre": self.centre, "grid": self.grid}
         examples = {} if self.examples is None else vars(self.examples)
         return {**model_arrays, **{f"learned_{name}": array for name, array in examples.items()}}
@@ -421,7 +423,7 @@ def fold(features: Features, is_wide: bool) -> npt.NDArray[np.float64]:
 
 
 def _histogram(pixels: npt.NDArray[np.float32], least: float) -> npt.NDArray[np.uint16]:
-    # Only pixels (M, 3) whose channels all reach `least` are counted.
+    # Only pixels (M, 3) with at least the value `least` in every channel are counted.
     logs = np.log(pixels[(pixels >= least).all(axis=1)].astype(np.float64))
     bin_indices = np.rint((logs[:, 1:2] - logs[:, [0, 2]]) / _FINE_WIDTH).astype(np.int64) % _FINE_BINS
     counts = np.bincount(bin_indices @ np.array([_FINE_BINS, 1]), minlength=_FINE_BINS**2)
@@ -429,7 +431,7 @@ def _histogram(pixels: npt.NDArray[np.float32], least: float) -> npt.NDArray[np.
 
 
 def _deviations(image: npt.NDArray[np.float32], used: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-    # Mean absolute difference between each pixel and those of its eight neighbours that are usable.
+    # Mean absolute difference between each pixel and its usable neighbours, at most eight.
     height, width = used.shape
     values = np.pad(image, ((1, 1), (1, 1), (0, 0)))
     usable = np.pad(used, 1).astype(np.float32)

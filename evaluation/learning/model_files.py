@@ -1,7 +1,8 @@
-"""Model files: arrays of a fitted method with a record of their training.
+"""Read and write model files: arrays of a fitted method with a record of its training.
 
 A model file is a NumPy `.npz` without pickled objects, so opening it runs no code. It has the arrays of the model by
-name, and under `about` a JSON text with the method, its settings and the provenance. All parts are checked when read.
+name. The array `about` is a JSON text with the method, its settings and the provenance. All parts are checked when
+read.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _TRAINED = "trained_on"
 _REMEDY = "give a file made by evaluate train"
 
 
-# Stored as an array, not in the JSON text.
+# The images are stored as an array, not in the JSON text.
 _Images = Annotated[npt.NDArray[np.uint64], PlainValidator(np.asarray), Field(exclude=True)]
 
 
@@ -51,7 +52,7 @@ class TrainingRecord:
     - `treatment`: treatment of its images, see `scene.SceneSet`.
     - `scenes`: number of images.
     - `sha256`: hash of names and ground truths, see `scenes_sha256`.
-    - `part`: part of the data set: "all", or its folds.
+    - `part`: part of the data set: "all", or the folds that were used.
     - `seed`: seed of the fit.
     - `software`: name and version of the program.
     - `date`: ISO 8601, UTC.
@@ -91,7 +92,7 @@ class StoredMethod(LearnedMethod):
 def provenance_of(
     data: SceneSet, seed: int, clock: Clock, adapted_from: TrainingRecord | None = None
 ) -> TrainingRecord:
-    """Return the record of a training on a data set; images of the pretrained `adapted_from` are included."""
+    """Return the record of a training on a data set; the images of `adapted_from` are added, if given."""
     images = identities(data.scenes)
     return TrainingRecord(
         data_name=data.name,
@@ -192,7 +193,7 @@ def _damaged_file_error(path: Path, reason: str) -> FormatError:
 
 def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
-        # numpy.load tries to unpickle other files, and checks sums only when it reads an array.
+        # This check comes first, because numpy.load does not check the whole archive.
         if (damaged := archive.testzip()) is not None:
             raise ValueError(f"{damaged} is damaged")
     with np.load(path, allow_pickle=False) as content:

@@ -3,13 +3,13 @@
 D. Cheng, B. Price, S. Cohen, M. S. Brown, "Effective learning-based illuminant estimation using simple features", CVPR
 2015. Features are the chromaticities (r, g) of the mean colour, the brightest colour, the dominant colour (mode of an
 RGB histogram) and the mode of the colour palette. Each feature has an ensemble of trees. Training images are sorted
-by the r of their illuminant; in the training of each tree, one window of them has a higher weight. Estimates on which
-features agree are used (section 3).
+by the r of their illuminant. For each tree, a window of consecutive images has a higher weight in training. Estimates
+on which features agree are used (section 3).
 
 Constants are from OpenCV (`xphoto::LearningBasedWB` and its training script): 64³ bins, a palette of 300 colours, the
 kernel max(0, 1 − d² / 0.1²), trees of depth 4, 20 windows of 2⌈N / 21⌉ images with weight 20, and agreement within
-0.025. *Reconstruction*: the paper does not define agreement. Here three of four features agree if their estimates are
-pairwise within that distance. The result is the median of all estimates that agree, or of all estimates if none agree.
+0.025. The paper does not define agreement. Here, three of four features agree if each two of their estimates are within
+this distance. The result is the median of the estimates that agree. If none agree, it is the median of all estimates.
 The histogram is scaled to the largest usable value of the image; OpenCV scales it to the white level.
 """
 
@@ -24,13 +24,13 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features, require_installed
-from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
+from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce_image
 from evaluation.scene import Image
 
 _FEATURES = 4  # mean, brightest, dominant and palette mode (section 3.1)
 _TARGETS = 2  # one tree for r and one for g (section 3.2)
-_WINDOW_WEIGHT = 20  # repetitions of the images of a window in the training script of OpenCV
-_MIN_AGREEING = 3  # features of four that must agree
+_WINDOW_WEIGHT = 20  # weight of the images in a window: their repetitions in the training script of OpenCV
+_MIN_AGREEING = 3  # number of the four features that must agree
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class RegressionTrees(FeatureLearner):
 
     - `working_size`: longer side of the reduced image, px.
     - `bins`: bins of the histogram along each channel.
-    - `palette`: number of the most frequent colours in the palette.
+    - `palette`: number of colours in the palette, which has the most frequent colours.
     - `bandwidth`: radius of the kernel for the mode of the palette, in chromaticity.
-    - `windows`: windows of the sorted training illuminants, each with its own trees.
+    - `windows`: number of windows of sorted training images, each with its own trees.
     - `depth`: depth of each tree.
     - `agreement`: largest distance between the estimates of features that agree, in chromaticity.
     """
@@ -65,7 +65,7 @@ class RegressionTrees(FeatureLearner):
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float32] | None:
         """Return four chromaticities (r, g), (8,) float32; see `FeatureLearner.features`."""
-        small, used = reduce(image, saturation, mask, self.working_size)
+        small, used = reduce_image(image, saturation, mask, self.working_size)
         pixels = small[used]
         if not pixels.any():
             return None
@@ -174,7 +174,7 @@ class Forest:
 
 
 def _frequent_colours(pixels: npt.NDArray[np.float32], bins: int, colour_count: int) -> npt.NDArray[np.float64]:
-    # Mean colours of the fullest bins of the histogram, fullest first.
+    # Mean colours of the bins with most pixels, in descending order of their counts.
     codes = np.minimum((pixels * bins).astype(np.int64), bins - 1) @ np.array([bins * bins, bins, 1])
     filled_codes, membership, counts = np.unique(codes, return_inverse=True, return_counts=True)
     fullest = np.argsort(-counts, kind="stable")[:colour_count]
@@ -183,7 +183,7 @@ def _frequent_colours(pixels: npt.NDArray[np.float32], bins: int, colour_count: 
 
 
 def consensus(estimates: npt.NDArray[np.float64], agreement: float) -> npt.NDArray[np.float64]:
-    """Return the median (2,) float64 of the estimates on which three features agree, or of all if none agree.
+    """Return the median (2,) float64 of the estimates on which three features agree, or of all if no three agree.
 
     `estimates`: (windows, 4, 2) float64, r and g for each window and feature.
 

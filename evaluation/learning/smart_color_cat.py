@@ -1,13 +1,13 @@
-"""Smart Color Cat: position on a line of illuminants from the histogram of red chromaticities.
+"""Smart Color Cat: estimate a position on a line of illuminants from the histogram of red chromaticities.
 
 N. Banić, S. Lončarić, "Using the red chromaticity for illumination estimation", ISPA 2015. Illuminants of real scenes
 are near a line in the rb-chromaticity plane. The histogram of red chromaticities, with a few bins, is mapped linearly
 to the position on the line.
 
-*Reconstruction*, because the paper was not accessible. The line is the first principal axis of the training illuminants
-in the plane of r = R / (R + G + B) and b. The map is a least-squares fit with the fractions of the bins as inputs. The
-number of bins is selected from `BIN_CHOICES` by five-fold cross-validation of the median recovery error on the training
-images. Positions beyond the training illuminants are clipped.
+The paper was not accessible, so the following is our reconstruction. The line is the first principal axis of the
+training illuminants in the plane of r = R / (R + G + B) and b. The map is a least-squares fit with the fractions of the
+bins as inputs. The number of bins is selected from `BIN_CHOICES` by five-fold cross-validation of the median recovery
+error on the training images. Positions outside the range of the training illuminants are clipped.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features
-from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
+from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce_image
 from evaluation.metrics import recovery_error
 from evaluation.scene import Image
 
-FINE_BINS = 720  # extracted bins of the range 0 … 1; a multiple of each of `BIN_CHOICES`
-# Candidate numbers of bins: from too few to separate illuminants to too many for the data of the paper.
+FINE_BINS = 720  # bins of the extracted histograms, 0 … 1; a multiple of every number in `BIN_CHOICES`
+# Candidate numbers of bins. The smallest cannot separate illuminants; the largest overfit the data of the paper.
 BIN_CHOICES = (3, 4, 5, 6, 8, 9, 10, 12, 15, 16, 18, 20, 24, 30, 36, 40, 48, 60)
-_FOLDS = 5  # folds of the training images for the number of bins
+_FOLDS = 5  # folds of the training images, for the selection of the number of bins
 _MIN_IMAGES = 2 * _FOLDS  # smallest number of training images for a selection
 
 
@@ -36,7 +36,7 @@ class SmartColorCat(FeatureLearner):
     """Settings of the method.
 
     - `working_size`: longer side of the reduced image, px.
-    - `bins`: bins of the histogram, one of `BIN_CHOICES`; 0 to select them with the training images.
+    - `bins`: number of bins, one of `BIN_CHOICES`; 0 selects it with the training images.
     """
 
     key: ClassVar[str] = "smart-color-cat"
@@ -56,7 +56,7 @@ class SmartColorCat(FeatureLearner):
 
         Black pixels are excluded.
         """
-        small, used = reduce(image, saturation, mask, self.working_size)
+        small, used = reduce_image(image, saturation, mask, self.working_size)
         pixels = small[used & small.any(axis=2)]
         if not len(pixels):
             return None

@@ -1,4 +1,4 @@
-"""Learned methods of the commands."""
+"""List the learned methods that the commands offer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evaluation.learning.smart_color_cat import SmartColorCat
 
 
 def standard_learners() -> Mapping[str, FeatureLearner]:
-    """Return the learned methods by name on the command line.
+    """Return the learned methods by their names on the command line.
 
     Examples
     --------

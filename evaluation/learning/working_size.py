@@ -8,12 +8,12 @@ import numpy.typing as npt
 from evaluation.methods.prepared import PreparedImage
 from evaluation.scene import Image
 
-# Smallest fraction of usable pixels in a block. With less, single pixels at the edge of a masked chart or a clipped sky
-# would be used.
+# Smallest fraction of usable pixels in a block. A smaller limit would include single pixels at the edge of a masked
+# chart or a clipped sky.
 _MIN_USABLE_SHARE = 0.5
 
 
-def reduce(
+def reduce_image(
     image: Image, saturation: float | None, mask: npt.NDArray[np.bool_] | None, longest: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Return an image reduced by an integer factor, (h, w, 3) float32, 0 … 1, and its usable pixels, (h, w) bool.
@@ -26,7 +26,7 @@ def reduce(
     --------
     >>> image = np.full((4, 4, 3), 200.0)
     >>> image[:2, :2] = [[[100] * 3, [300] * 3], [[100] * 3, [900] * 3]]
-    >>> small, used = reduce(image, None, image[..., 0] == 900, longest=2)
+    >>> small, used = reduce_image(image, None, image[..., 0] == 900, longest=2)
     >>> small[..., 0].round(3)
     array([[0.833, 1.   ],
            [1.   , 1.   ]], dtype=float32)
@@ -90,5 +90,5 @@ def lights_from_chromaticities(red_green: npt.NDArray[np.float64]) -> npt.NDArra
     return clipped / clipped.sum(axis=1, keepdims=True)
 
 
-# Smallest chromaticity of an estimate: extrapolating models may return impossible colours.
+# Smallest chromaticity of an estimate, because models that extrapolate may return negative values.
 _MIN_CHROMATICITY = 1e-6

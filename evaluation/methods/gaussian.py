@@ -1,14 +1,13 @@
-"""Compute Gaussian derivatives of images of any size, in tiles, with separable filters.
+"""Compute Gaussian derivatives of images in tiles, with separable filters.
 
-Filters follow the program of the authors of the Gray-Edge framework (J. van de Weijer et al., 2007). Gaussian kernels
-are cut at 3σ and normalised on the pixel grid; edges are continued by their last pixel; order 2 is
-√(f_xx² + 4 f_xy² + f_yy²).
+The filters follow the program of the authors of the Gray-Edge framework (J. van de Weijer et al., 2007). Gaussian
+kernels are cut at 3σ and normalised on the pixel grid. Positions outside the image have the value of the nearest pixel.
+The derivative of order 2 is √(f_xx² + 4 f_xy² + f_yy²).
 
-Rows filtered along x are stored in columns of 16 numbers: (columns, rows, 16), one cache line per row. The filter along
-y reads them from top to bottom. Tiles are filtered from top to bottom; rows shared with the tile above are reused.
-
-Pixels that are neighbours along the filtered axis are in consecutive vectors, so all loads are aligned. Rows are
-therefore transposed in groups of 16 before they are filtered along x.
+A vector has 16 float32, one cache line. Neighbouring pixels along the filtered axis belong to different vectors, so
+that all loads are aligned. Therefore 16 rows are transposed before the filter along x, except with the shortest kernels
+of order 2. For the filter along y, the rows filtered along x are stored as (columns, rows, 16): a column has 16 numbers
+of every row. A tile reuses the rows that it shares with the tile above.
 """
 
 from __future__ import annotations
@@ -40,14 +39,14 @@ from generator.kernels.vector import (
     store,
 )
 
-# Vectors computed together: as many as a multiplication takes cycles, so that no sum waits for another.
+# Number of vectors that are computed together. Their independent sums hide the latency of a multiplication.
 OUTPUTS: Final = 4
 _FLOAT: Final = 4  # bytes of a float32
-INTERLEAVED_PIXELS: Final = 16  # interleaved pixels of a row that fill three vectors
-_PIXEL_BYTES: Final = 3 * LINE  # distance of two pixels in 16 transposed rows
+INTERLEAVED_PIXELS: Final = 16  # pixels of a row that fill three vectors with interleaved R, G, B
+_PIXEL_BYTES: Final = 3 * LINE  # bytes from a pixel to the next one in 16 transposed rows
 
-# Symmetries of the kernels of a Gaussian and its first two derivatives:
-# Σ w(k) (x(k) + x(-k)) + w(0) x(0); Σ w(k) (x(k) - x(-k)); Σ w(k) (x(k) + x(-k) - 2 x(0)).
+# Symmetries of the kernels of a Gaussian and its first and second derivative. With weights w(k) and values x(k), the
+# filtered values are: Σ w(k) (x(k) + x(-k)) + w(0) x(0), Σ w(k) (x(k) - x(-k)), Σ w(k) (x(k) + x(-k) - 2 x(0)); k > 0.
 EVEN, ODD, CENTRED = 0, 1, 2
 
 
@@ -76,10 +75,10 @@ def _emit_filter(
     *,
     side_by_side: bool = False,
 ) -> list[list[Any]]:
-    """Return the filtered vectors from `source` on, for each kernel.
+    """Emit code that filters the vectors from address `source` on, and return the results of each kernel.
 
-    `stride` is the distance of neighbouring vectors in bytes; `weights` are pointers of radius + 1 float32 per kernel.
-    The result has `OUTPUTS` vectors, or with `side_by_side` the three vectors of interleaved pixels.
+    `stride`: bytes between neighbours along the filtered axis. `weights`: for each kernel, a pointer to radius + 1
+    float32. A result has `OUTPUTS` vectors; with `side_by_side`, it has the three vectors of `INTERLEAVED_PIXELS`.
     """
     from numba.core import cgutils
 
@@ -91,9 +90,9 @@ def _emit_filter(
     def times(number: Any, count: int) -> Any:
         return builder.mul(number, ir.Constant(I64, count))
 
-    # From tap to tap the required neighbours move on by one vector. So each tap loads two new vectors, and the loop is
-    # limited by arithmetic, not by loads. Symmetric taps are combined before the multiplication, so that derivatives of
-    # constant whole numbers are exactly zero.
+    # Without `side_by_side`, neighbours of successive kernel positions differ by one vector on each side, so that only
+    # two vectors are loaded. Values at k and -k are combined before multiplication, so that derivatives of constant
+    # whole numbers are exactly zero.
     outputs = range(3 if side_by_side else OUTPUTS)
     spacing = ir.Constant(I64, LINE) if side_by_side else stride
     centre = [load(builder, builder.add(source, times(spacing, i)), 0, FLOATS) for i in outputs]
@@ -143,7 +142,7 @@ def _write(builder: Builder, values: Sequence[Any], target: Any, stride: Any) ->
 def _filter_x(
     builder: Builder, symmetries: Sequence[int], source: Value, radius: Value, pointers: Sequence[Value]
 ) -> None:
-    # `pointers` are those of the kernels, then those of the targets.
+    # `pointers`: addresses of the kernels, then of the targets.
     spacing = ir.Constant(I64, _PIXEL_BYTES)
     filtered = _emit_filter(builder, source, spacing, pointers[: len(symmetries)], radius, symmetries)
     for values, target in zip(filtered, pointers[len(symmetries) :], strict=True):
@@ -191,7 +190,7 @@ def filter_interleaved_x(
     curve: Value,
     column: Value,
 ) -> None:
-    """Write 16 interleaved pixels of a row, filtered with all kernels, as vectors with a distance of `column` bytes."""
+    """Write 16 interleaved pixels of a row, filtered with all kernels, as vectors `column` bytes apart."""
     spacing = ir.Constant(I64, 3 * _FLOAT)
     filtered = _emit_filter(builder, source, spacing, (w0, w1, w2), radius, (EVEN, ODD, CENTRED), side_by_side=True)
     for values, target in zip(filtered, (smooth, slope, curve), strict=True):
@@ -200,7 +199,7 @@ def filter_interleaved_x(
 
 @step(*[ADDRESS] * 5)
 def smooth_y(builder: Builder, smooth: Value, radius: Value, w0: Value, target: Value, pitch: Value) -> None:
-    """Write four rows of 16 numbers, smoothed along y, with a distance of `pitch` bytes."""
+    """Write four rows of 16 numbers, smoothed along y, `pitch` bytes apart."""
     (filtered,) = _emit_filter(builder, smooth, ir.Constant(I64, LINE), (w0,), radius, (EVEN,))
     _write(builder, filtered, target, pitch)
 
@@ -257,7 +256,7 @@ def transpose(builder: Builder, source: Value, pitch: Value, target: Value) -> N
     ]
     size = LANES // 2
     while size:
-        # Squares of `size` numbers are exchanged across the diagonal.
+        # Blocks of size x size numbers are exchanged across the diagonal.
         upper = [lane if not lane & size else LANES + lane - size for lane in range(LANES)]
         lower = [lane + size if not lane & size else LANES + lane for lane in range(LANES)]
         for row in range(LANES):
@@ -271,10 +270,10 @@ def transpose(builder: Builder, source: Value, pitch: Value, target: Value) -> N
 
 
 ROW_GROUP: Final = LANES  # rows that are filtered together along x, one per lane
-# Largest kernel radius for which order 2 filters rows without transposing them. Its four transpositions per vector take
-# longer than unaligned loads (2 cycles per tap). Orders 0 and 1 need two and three, and are not faster that way.
+# Up to this kernel radius, order 2 filters along x without transposing rows, because unaligned loads then take less
+# time than its four transpositions per vector. Orders 0 and 1 need fewer transpositions and always transpose.
 LARGEST_DIRECT_RADIUS: Final = 9
-# Numbers of a row that are converted before they are transposed: 16 rows take 12 KB of the first-level cache.
+# Numbers of a row that are converted to float32 together. 16 rows take 12 KB and fit into the first-level cache.
 ROW_BUFFER: Final = 4 * 3 * INTERLEAVED_PIXELS
 
 
@@ -303,7 +302,7 @@ def _transpose_rows(
 ) -> None:
     """Write 16 rows from `top` and P pixels from `left`, times `scale`, to `transposed` (3 P + 16, 16) float32.
 
-    Positions outside the image (H, 3 W) get copies of its edge. `lines` is a buffer (16, ROW_BUFFER) float32.
+    Positions outside the image (H, 3 W) get the nearest pixel. `lines` is a buffer (16, ROW_BUFFER) float32.
     """
     height, length = image.shape
     begin = max(0, 3 * left)
@@ -331,7 +330,7 @@ def _convert_row(
     left: int,
     line: npt.NDArray[np.float32],
 ) -> None:
-    # Positions outside the image get copies of its edge.
+    # Positions outside the image get the nearest pixel.
     height, length = image.shape
     begin = max(0, 3 * left)
     end = min(length, 3 * left + line.size)
@@ -377,14 +376,14 @@ def filter_rows(
     filtered: npt.NDArray[np.float32],
     columns: npt.NDArray[np.float32],
 ) -> int:
-    """Filter rows of an image along x for one tile; rows in `columns` of the tile above are reused.
+    """Filter the rows of one tile along x, and return the new `next_y`. Rows of the tile above in `columns` are reused.
 
-    `image`: (H, 3 W) uint16, float32 or float64, rows of interleaved pixels. `scale`: factor for values outside the
-    range of float32. `next_y`: first row that is not filtered yet; returned for the tile below. `weights`:
-    (3, radius + 1) float32, half kernels of order 0, 1 and 2 from their centre on. `columns`: (order + 1, Q / 16,
-    rows + 2 radius + 16, 16) float32, filtered rows from row top - radius on; Q, numbers per tile row, is a multiple of
-    48. Buffers: `lines` (16, ROW_BUFFER), `transposed` (Q + 6 radius + 16, 16) and `filtered` (order + 1, 48, 16)
-    float32. `columns`, `transposed` and `filtered` start at a cache line.
+    `image`: (H, 3 W) uint16, float32 or float64, rows of interleaved pixels. `scale`: factor that brings all values
+    into the range of float32. `next_y`: first image row that is not filtered yet. `weights`: (3, radius + 1) float32,
+    kernels of order 0, 1 and 2 from their centre on. `columns`: (order + 1, Q / 16, rows + 2 radius + 16, 16) float32,
+    filtered rows, the first is image row top - radius. Q is the count of numbers per tile row, a multiple of 48.
+    Buffers: `lines` (16, ROW_BUFFER), `transposed` (Q + 6 radius + 16, 16) and `filtered` (order + 1, 48, 16) float32.
+    `columns`, `transposed` and `filtered` start at a cache line.
     """
     radius = weights.shape[1] - 1
     height = image.shape[0]
@@ -392,7 +391,7 @@ def filter_rows(
     w0 = weights.ctypes.data
     w1 = w0 + weights.shape[1] * _FLOAT
     w2 = w1 + weights.shape[1] * _FLOAT
-    # Bytes of one order in `filtered`; of one column and of one order in `columns`.
+    # `block`: bytes of one order in `filtered`. `column`, `plane`: bytes of one column and of one order in `columns`.
     block = filtered.shape[1] * LINE
     blocks = filtered.ctypes.data
     column = columns.shape[2] * LINE
@@ -446,7 +445,7 @@ def filter_columns(
     rows: int,
     out: npt.NDArray[np.float32],
 ) -> None:
-    """Write the size of the Gaussian derivative of rows that are filtered along x to `out`.
+    """Filter the rows of `filter_rows` along y, and write the magnitude of the derivative to `out`.
 
     `columns`: (order + 1, Q / 16, R, 16) float32 from `filter_rows`, R ≥ rows + 2 radius, rows a multiple of 4.
     `weights`: as in `filter_rows`. `out`: (rows, Q) or longer float32, starts at a cache line.
@@ -470,9 +469,10 @@ def filter_columns(
                 curvature_y(smooth, smooth + plane, smooth + 2 * plane, radius, w0, w1, w2, target, pitch)
 
 
-# Largest width of a tile, px, a multiple of 16. Neighbours of narrower tiles are a larger part of each row.
+# Largest width of a tile, px, a multiple of 16. A tile also reads pixels on its left and right, so narrow tiles cost
+# more.
 TILE_WIDTH = 256
-# Rows of a tile, a multiple of 16. With the widest standard kernels, intermediate results take up to 0.8 MB, which fit
+# Rows of a tile, a multiple of 16. Intermediate results of the widest standard kernels take up to 0.8 MB, which fit
 # into the cache of a core.
 TILE_ROWS = 64
 
@@ -482,8 +482,8 @@ _ALIGNMENT = 64  # bytes of a cache line; unaligned buffers are slower
 def gaussian_kernel(sigma: float, order: int) -> npt.NDArray[np.float64]:
     """Return the correlation kernel (N,) float64 of a Gaussian derivative; N = 2⌊3σ + ½⌋ + 1, σ > 0 in px.
 
-    Normalised on the pixel grid: order 0 has the sum 1; order 1 returns 1 for the ramp x; order 2 returns 1 for x²/2
-    and 0 for a constant.
+    Kernels are normalised on the pixel grid. Order 0 has the sum 1. Order 1 gives 1 for the ramp x. Order 2 gives 1 for
+    x²/2 and 0 for a constant.
 
     Examples
     --------
@@ -514,9 +514,9 @@ def differentiated_tiles(
 ) -> Iterator[tuple[int, int, npt.NDArray[np.float32]]]:
     """Yield the Gaussian derivative of an image (H, W, 3) ≥ 0 in tiles, from top to bottom and then from left to right.
 
-    `order` is 0 to 2, `sigma` in px, above 0; `scale` is a factor for values outside the range of float32. Yields the
-    first row and pixel of a tile and (rows, Q) float32, interleaved pixels, which may extend beyond the image. The next
-    tile overwrites the array.
+    `order` is 0 to 2, `sigma` in px, above 0; `scale` is a factor that brings all values into the range of float32.
+    Yields the first row and column of a tile, and its values (rows, Q) float32, interleaved pixels. A tile may extend
+    beyond the right edge of the image. The next tile overwrites the array.
     """
     height, width = image.shape[:2]
     flat: Any = image.reshape(height, -1)

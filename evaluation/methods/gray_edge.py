@@ -1,9 +1,9 @@
 """The Gray-Edge framework: the estimate is the Minkowski mean of an image or of its derivatives.
 
 J. van de Weijer, T. Gevers, A. Gijsenij, "Edge-based color constancy", IEEE Transactions on Image Processing 16(9),
-2007, equation 13: ``e ∝ (∫ |∂ⁿ f_σ / ∂xⁿ|ᵖ dx)^(1/p)`` for each channel. With n = 0 and σ = 0 it is Gray-world (p = 1),
-White-Patch (p = ∞) and Shades-of-Gray; with n = 0 general Gray-world. Filters and excluded pixels follow the authors'
-program, see `gaussian.py`.
+2007, equation 13: ``e ∝ (∫ |∂ⁿ f_σ / ∂xⁿ|ᵖ dx)^(1/p)`` for each channel. For n = 0 and σ = 0 it is Gray-world (p = 1),
+White-Patch (p = ∞) or Shades-of-Gray (any other p). For n = 0 and σ > 0 it is General Gray-world. Filters and excluded
+pixels follow the authors' program, see `gaussian.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from evaluation.methods.prepared import PreparedImage, PreparedMethod, unit
 
 @dataclass(frozen=True)
 class GrayEdge(PreparedMethod):
-    """One method of the framework.
+    """One method of the Gray-Edge framework.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class GrayEdge(PreparedMethod):
     sigma
         Scale of the Gaussian, px; 0 for no filter, which is only possible with order 0.
     border
-        Pixels excluded along every edge; None for 0 if σ is 0, else ⌊σ⌋ + 1.
+        Pixels excluded along every edge of the image. None selects ⌊σ⌋ + 1, or 0 if σ is 0.
 
     Raises
     ------
@@ -63,10 +63,10 @@ class GrayEdge(PreparedMethod):
 
     @property
     def border_width(self) -> int:
-        """Pixels excluded along every edge."""
+        """Pixels excluded along every edge of the image."""
         if self.border is not None:
             return self.border
-        # The authors' program excludes 1 px for σ = 0 too. Without a filter no pixel depends on values beyond the edge.
+        # The authors' program excludes 1 px even if σ is 0. Without a filter, no pixel depends on values outside.
         return math.floor(self.sigma) + 1 if self.sigma else 0
 
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:

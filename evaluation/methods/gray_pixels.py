@@ -1,21 +1,22 @@
 """Detect pixels of grey surfaces by their derivatives, and estimate the illuminant as their mean colour.
 
-Values are fractions of white, which is the saturation if known, else the largest value of the image. Edges are
-continued by their last pixel; the authors' programs continue periodically. Constants are the authors' values.
+Values are fractions of white: of the saturation if known, else of the largest value of the image. Outside the image,
+filters use the nearest pixel; the authors' programs repeat the image. Constants are the authors' values.
 
 Grayness index
     Y. Qian, J.-K. Kämäräinen, J. Nikkanen, J. Matas, "On finding gray pixels", CVPR 2019, equations 9 and 10. On grey
-    surfaces, chromaticity does not change with shading and highlights. The index is the norm of the derivatives of
+    surfaces, shading and highlights do not change the chromaticity. The index is the norm of the derivatives of
     ln R - ln(R + G + B) and ln B - ln(R + G + B).
 Grayness index for several illuminants
     K.-F. Yang, S.-B. Gao, Y.-J. Li, "Efficient illuminant estimation for color constancy using grey pixels", CVPR 2015,
-    section 3.3, equations 15 to 17. Positions of gray pixels are clustered, each cluster gives an illuminant, and near
-    clusters have more weight. *Reconstruction*: k-means starts from evenly spread gray pixels, so that maps are
-    reproducible.
+    section 3.3, equations 15 to 17. Gray pixels are clustered by position, and each cluster gives an illuminant. The
+    estimate at a pixel is a mean of these illuminants, with larger weights for nearer clusters. We start k-means from
+    evenly spread gray pixels, so that maps are reproducible.
 Mean-shifted gray pixels
     Y. Qian, S. Pertuz, J. Nikkanen, J.-K. Kämäräinen, J. Matas, "Revisiting gray pixel for statistical illumination
     estimation", VISAPP 2019 (and 2020, extended). Candidates are the pixels whose derivatives of ln R, ln G, ln B have
-    the smallest angle to grey. They are clustered by mean shift, and the largest cluster gives the illuminant.
+    the smallest angle to (1, 1, 1). Their colours are clustered by mean shift. The largest cluster gives the
+    illuminant.
 """
 
 from __future__ import annotations
@@ -32,19 +33,19 @@ from evaluation.scene import Image
 DERIVATIVE_SIGMA = 0.5  # scale of the derivatives, px, from both programs
 MEAN_SIDE = 7  # side of the mean filters, px, from both programs
 DARK_SUM = 8 / 255  # largest red + green + blue of excluded pixels, fraction of white, from the authors' examples
-_KERNEL_RADIUS = 2  # px, includes exp(-x² / 2σ²) above 1e-6, as in the authors' program
-_HALO = 8  # rows on either side on which an index depends: mean filter and derivative, with a margin
-_STRIP = 1 << 20  # pixels of a strip: 12 MB for a float32 colour image
+_KERNEL_RADIUS = 2  # px; as in the authors' program, exp(-x² / 2σ²) is below 1e-6 outside
+_HALO = 8  # extra rows above and below a strip, for the mean filter and the derivative
+_STRIP = 1 << 20  # pixels of a strip, which is processed at once: 12 MB as float32
 _SMALLEST = float(np.finfo(np.float64).eps)  # replaces zero in logarithms, as in the authors' programs
 
-# Function of a strip (H, W, 3) float32, fractions of white; returns the index (H, W) float32 and the pixels without
-# index, (H, W) bool.
+# Function that calculates the index of each pixel, (H, W) float32, from image rows (H, W, 3) float32, fractions of
+# white. It also returns (H, W) bool, True for pixels without index.
 Index = Callable[[npt.NDArray[np.float32]], tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]]
 
 
 def gradient_length(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Return the length of the gradient of each channel of values (H, W) or (H, W, C) float32, in the same shape."""
-    # The authors' kernel is -x exp(-(x² + y²) / 2σ²) / (π σ²); it returns 0.54 for a ramp of 1 per pixel.
+    # The authors' kernel is -x exp(-(x² + y²) / 2σ²) / (π σ²). The result for a ramp of 1 per pixel is 0.44, not 1.
     import cv2
 
     x = np.arange(-_KERNEL_RADIUS, _KERNEL_RADIUS + 1, dtype=np.float64)
@@ -69,7 +70,7 @@ def logarithm(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def index_map(prepared: PreparedImage, index: Index) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """Return the smoothed index of each pixel, (H, W) float32, and (H, W) bool, True if it may be selected."""
+    """Return the smoothed index of each pixel, (H, W) float32, and (H, W) bool, True if selectable."""
     index_values = np.empty((prepared.height, prepared.width), dtype=np.float32)
     usable = prepared.usable(0).copy()
     for rows, inner, strip in _strips(prepared):
@@ -87,7 +88,7 @@ def index_map(prepared: PreparedImage, index: Index) -> tuple[npt.NDArray[np.flo
 def least_indices(index: npt.NDArray[np.float32], usable: npt.NDArray[np.bool_], share: float) -> npt.NDArray[np.bool_]:
     """Return (H, W) bool, True for the usable pixels with the smallest index.
 
-    `share` is the fraction of all pixels of the image that are selected, 0 … 1; at least one.
+    `share`: number of selected pixels as a fraction of all pixels of the image, 0 … 1. At least one is selected.
     """
     count = min(max(1, int(index.size * share)), int(usable.sum()))
     if not count:
@@ -97,7 +98,7 @@ def least_indices(index: npt.NDArray[np.float32], usable: npt.NDArray[np.bool_],
 
 
 def _strips(prepared: PreparedImage) -> Iterator[tuple[slice, slice, npt.NDArray[np.float32]]]:
-    # Yields the rows of a strip in the image, the same rows in the strip, and the strip with its halo.
+    # Yields the rows of a strip in the image, the same rows in the array, and the array, which has `_HALO` extra rows.
     height, step = prepared.height, max(1, _STRIP // prepared.width)
     white = prepared.white or 1.0
     for top in range(0, height, step):
@@ -107,13 +108,13 @@ def _strips(prepared: PreparedImage) -> Iterator[tuple[slice, slice, npt.NDArray
         yield slice(top, bottom), slice(top - first, bottom - first), strip
 
 
-FLAT_SLOPE = 1e-4  # largest derivative of a flat channel, fraction of white per pixel (the authors' δ)
+FLAT_SLOPE = 1e-4  # a channel with at most this derivative is flat, fraction of white per pixel (the authors' δ)
 
 
 def grayness(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """Return the grayness index (H, W) float32 of a strip (H, W, 3) float32, and the pixels without index, (H, W) bool.
+    """Return the grayness index of image rows and the pixels without index, see `Index`.
 
-    Flat pixels, and pixels with a channel of zero, have no index.
+    Pixels without gradient, and pixels with a channel of zero, have no index.
     """
     mean = mean_filter(strip)
     missing = (mean <= 0).any(axis=2) | (gradient_length(mean) <= FLAT_SLOPE).all(axis=2)
@@ -127,11 +128,11 @@ class GraynessIndex(PreparedMethod):
     """Mean colour of the pixels with the lowest grayness index.
 
     - `name`: name in tables.
-    - `share`: fraction of the pixels that are selected, 0 … 1; the authors use 0.001.
+    - `share`: fraction of the pixels that is selected, 0 … 1; the authors use 0.001.
 
     Examples
     --------
-    Unevenly lit grey on the left, random colours on the right, one illuminant:
+    The left half is unevenly lit grey, the right half has random colours; the illuminant is the same:
 
     >>> shading = np.random.default_rng(0).uniform(0.2, 0.9, (40, 80, 1))
     >>> paint = np.ones((40, 80, 3))
@@ -154,15 +155,15 @@ class GraynessIndex(PreparedMethod):
 
 
 _WEIGHT_SIGMA = 0.2  # σ of a cluster's weight exp(-d / 2σ²), d as a fraction of the image diagonal, from the paper
-_MAX_ROUNDS = 50  # iterations of k-means, more than required
+_MAX_ROUNDS = 50  # limit for iterations of k-means, which needs fewer
 
 
 @dataclass(frozen=True)
 class LocalGraynessIndex(GraynessIndex):
-    """Grayness index with an illuminant map; `estimate` is the global method with the same share.
+    """Grayness index with an illuminant map. `estimate` returns the mean colour of all selected pixels.
 
     - `name`: name in tables.
-    - `share`: fraction of the pixels that are selected, 0 … 1; the authors use 0.1 for several illuminants.
+    - `share`: fraction of the pixels that is selected, 0 … 1; the authors use 0.1 for several illuminants.
     - `lights`: number of clusters.
     """
 
@@ -214,29 +215,26 @@ def _k_means(positions: npt.NDArray[np.float64], count: int) -> tuple[npt.NDArra
     return centres, member
 
 
-# Candidates that are clustered, evenly spread over their order in the image: as many as an image of 0.2 megapixels has.
-# The time grows with the square of their number.
+# Largest number of candidates that are clustered, because the time grows with its square. If an image has more, they
+# are sampled evenly in reading order. An image of 0.2 megapixels has this number.
 MAX_CANDIDATES = 2000
 BANDWIDTH = 0.1  # h of the mean shift (the authors' `bandwidth`)
-_LARGEST_DISTANCE = 0.01 * BANDWIDTH  # of a colour to its mean: angle in radians times squared distance
-_SMALLEST_STEP = 1e-3 * BANDWIDTH  # of a moving mean: distance times angle
-_MERGING_DISTANCE = BANDWIDTH / 2  # of two means of one cluster: distance times angle
-_MAX_STEPS = 100  # steps of a mean, many more than required
-# Largest derivative of the logarithm of a flat channel. Rounding to float32 causes as much on flat surfaces; a step of
-# one 16-bit count near white is 8e-6.
-_FLAT_SLOPE = 2e-6
+_LARGEST_DISTANCE = 0.01 * BANDWIDTH  # limit for colours near a mean: angle (radians) times squared distance
+_SMALLEST_STEP = 1e-3 * BANDWIDTH  # a mean that moves less is final: distance times angle (radians)
+_MERGING_DISTANCE = BANDWIDTH / 2  # means within it are one cluster: distance times angle (radians)
+_MAX_STEPS = 100  # limit for steps of a mean, which needs far fewer
+# A channel with at most this derivative of its logarithm is flat. Rounding to float32 can cause this value. A step of
+# one 16-bit count near white causes 3e-6.
+_FLAT_LOG_SLOPE = 2e-6
 
 
 def angle_to_grey(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """Return the angle of the log derivatives of a strip (H, W, 3) float32 to grey, and the flat pixels (H, W) bool.
-
-    The angle is (H, W) float32, radians.
-    """
+    """Return the angle between log derivatives and (1, 1, 1), radians, and the pixels without gradient, see `Index`."""
     slopes = gradient_length(logarithm(strip))
     red, green, blue = (slopes[..., channel] for channel in range(3))
-    # An arc cosine near 1 resolves angles only to 3e-4; smaller angles would depend on the rounding of each processor.
+    # arctan2 is used, because an arc cosine near 1 cannot resolve angles below 3e-4.
     distance = np.sqrt((green - blue) ** 2 + (blue - red) ** 2 + (red - green) ** 2)
-    return np.arctan2(distance, slopes.sum(axis=2)), np.asarray((slopes <= _FLAT_SLOPE).all(axis=2), dtype=bool)
+    return np.arctan2(distance, slopes.sum(axis=2)), np.asarray((slopes <= _FLAT_LOG_SLOPE).all(axis=2), dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -268,8 +266,8 @@ class MeanShiftedGrayPixel(PreparedMethod):
 def largest_cluster(colours: npt.NDArray[np.float64], order: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     """Return (N,) bool, True for the colours of the largest mean-shift cluster.
 
-    `colours`: (N, 3) float64, largest value 1. `order`: (N,) float32; means start in this order from colours that no
-    earlier mean has reached.
+    `colours`: (N, 3) float64, largest value 1. `order`: (N,) float32. In ascending order of these values, a mean starts
+    at each colour, except at colours near an earlier mean.
 
     Examples
     --------
@@ -279,25 +277,25 @@ def largest_cluster(colours: npt.NDArray[np.float64], order: npt.NDArray[np.floa
     20
     """
     directions = colours / np.maximum(np.linalg.norm(colours, axis=1, keepdims=True), np.finfo(float).tiny)
-    is_reached = np.zeros(len(colours), dtype=bool)
+    was_near = np.zeros(len(colours), dtype=bool)
     centres: list[npt.NDArray[np.float64]] = []
     votes: list[npt.NDArray[np.int64]] = []
     for start in np.argsort(order, kind="stable"):
-        if is_reached[start]:
+        if was_near[start]:
             continue
-        mean, counted = _shift(colours, directions, int(start))
-        is_reached |= counted > 0
-        is_reached[start] = True
+        mean, near_counts = _shift(colours, directions, int(start))
+        was_near |= near_counts > 0
+        was_near[start] = True
         is_near = [_distance(mean, centre) < _MERGING_DISTANCE for centre in centres]
         if any(is_near):
-            # The authors weight the two means by their numbers of members; members stay in their cluster.
+            # As in the authors' program, the weights of the two means are their numbers of near colours.
             nearest = is_near.index(True)
-            shares = np.array([counted.sum(), votes[nearest].sum()], dtype=np.float64)
+            shares = np.array([near_counts.sum(), votes[nearest].sum()], dtype=np.float64)
             centres[nearest] = (mean * shares[0] + centres[nearest] * shares[1]) / shares.sum()
-            votes[nearest] = votes[nearest] + counted
+            votes[nearest] = votes[nearest] + near_counts
         else:
             centres.append(mean)
-            votes.append(counted)
+            votes.append(near_counts)
     member = np.stack(votes).argmax(axis=0)
     return member == np.bincount(member).argmax()
 
@@ -306,21 +304,21 @@ def _shift(
     colours: npt.NDArray[np.float64], directions: npt.NDArray[np.float64], start: int
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
     """Return the final position of a mean, (3,), and how often each colour was near it, (N,)."""
-    mean, counted = colours[start], np.zeros(len(colours), dtype=np.int64)
+    mean, near_counts = colours[start], np.zeros(len(colours), dtype=np.int64)
     for _ in range(_MAX_STEPS):
         direction = mean / max(float(np.linalg.norm(mean)), np.finfo(float).tiny)
         angles = np.arccos(np.clip(directions @ direction, -1, 1))
         is_near = angles * ((colours - mean) ** 2).sum(axis=1) < _LARGEST_DISTANCE
         if not is_near.any():
             break
-        counted += is_near
+        near_counts += is_near
         next_mean = directions[is_near].mean(axis=0)
         next_mean /= np.linalg.norm(next_mean)
         is_at_rest = _distance(next_mean, direction) < _SMALLEST_STEP
         mean = next_mean
         if is_at_rest:
             break
-    return mean, counted
+    return mean, near_counts
 
 
 def _distance(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> float:

@@ -1,9 +1,9 @@
-"""Tune parameters of a method on images without ground truth, by the green stability assumption.
+"""Tune parameters of a method on images without ground truth, based on the green stability assumption.
 
 N. Banić, S. Lončarić, "Green stability assumption: unsupervised learning for statistics-based illumination estimation",
-Journal of Imaging 4(11), 2018 (arXiv 1802.00776). Illuminants differ much in red and blue chromaticity and little in
-green. The best parameters are those whose estimates vary least in green chromaticity. *Reconstruction*: the variation
-is the standard deviation of g / (r + g + b) over the images.
+Journal of Imaging 4(11), 2018 (arXiv 1802.00776). Illuminants differ much in red and blue chromaticity, but little in
+green. The best parameters are therefore those whose estimates vary least in green chromaticity. We chose the measure of
+this variation: the standard deviation of g / (r + g + b) over the images.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _MIN_IMAGES = 2  # smallest number of images for a standard deviation
 class TuningResult:
     """Result of tuning.
 
-    - `best`: candidate with the smallest spread, the first of equals.
-    - `candidates`: C methods.
+    - `best`: candidate with the smallest spread; the first one if several are equal.
+    - `candidates`: the C methods that were compared.
     - `spreads`: standard deviation of the green chromaticity of the estimates, for each candidate.
-    - `lights`: (M, C, 3) float64, camera RGB of length 1: estimates for each of M images with estimates.
-    - `has_estimates`: (N,) bool, True for images with estimates of all candidates; others are excluded.
+    - `lights`: (M, C, 3) float64, camera RGB of length 1: estimates for the M images that are True in `has_estimates`.
+    - `has_estimates`: (N,) bool, True for images with estimates of all candidates; other images are excluded.
     """
 
     best: Method
@@ -91,7 +91,7 @@ def tune(
 def family_names(name: str) -> tuple[str, ...]:
     """Return the names of the candidates of a family, see `naming.find_method`.
 
-    Shades-of-Gray has the norms 1 to 15; other families have six norms up to 13, each with scales of 1 to 9 px.
+    Candidates of Shades-of-Gray have p from 1 to 15. Other families combine six values of p with five values of sigma.
 
     Examples
     --------

@@ -35,7 +35,8 @@ class Method(Protocol):
         image
             (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, black level subtracted, any unit.
         saturation
-            Value from which a pixel is clipped and not used, in the unit of the image; None if no pixel is clipped.
+            Pixels with a channel of at least this value are clipped and not used; in the unit of the image. None if no
+            pixel is clipped.
         mask
             (H, W) bool, True for pixels that must not be used; None if all may be used.
 

@@ -1,4 +1,4 @@
-"""Return a method by its name: a method of this suite, a class of an installed module, or a class in a file.
+"""Find a method by its name: a method of this suite, a class of an installed module, or a class in a file.
 
     gray-edge-1            a method of `standard.standard_methods`
     gray-edge-1:p=4:sigma=2, shades-of-gray:p=6      a method of the Gray-Edge framework with other parameters
@@ -7,11 +7,11 @@
 
 All of these can have a suffix:
 
-    gray-edge-2@360        for images shrunk to 360 px along their longer side (`wrapped.ResizedMethod`)
-    gray-world@patches     for 8 patches along the shorter side, with several illuminants (`wrapped.PatchwiseMethod`)
-    gray-world@patches=12  for 12 patches
+    gray-edge-2@360        applied to images reduced to a longer side of 360 px (`wrapped.ResizedMethod`)
+    gray-world@patches     applied to a grid with 8 patches along the shorter side (`wrapped.PatchwiseMethod`)
+    gray-world@patches=12  with 12 patches along the shorter side
 
-A class is called without arguments; a value is used unchanged. A file of ten lines is sufficient::
+A class is called without arguments; any other value is used unchanged. Example of a file::
 
     import numpy as np
 
@@ -24,7 +24,7 @@ A class is called without arguments; a value is used unchanged. A file of ten li
             light = pixels[pixels.sum(axis=1).argmax()]
             return light / np.linalg.norm(light)
 
-The code of the file or module is run, so use only trusted ones.
+Loading a file or module runs its code, so use only files and modules that you trust.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ FAMILIES = ("shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2"
 
 _MODIFIERS = re.compile(r"(?P<size>[0-9]{1,6})|patches(=(?P<patches>[0-9]{1,6}))?")
 
-# Largest scale of a Gaussian, px: no image has larger structures, and the width of the filter must be limited.
+# Largest accepted scale of a Gaussian, px. It limits the width of the filter.
 LARGEST_SIGMA = 1000
 
 _FORMS = "a name of this suite, module:Class or path/file.py:Class"
@@ -188,7 +188,7 @@ def _looks_like_method(module: ModuleType, name: str) -> bool:
 
 
 def _load_file(path: Path) -> ModuleType:
-    # The file is run once per process, so that all methods of the file share one module.
+    # A file is run once per process, so that all its methods belong to the same module.
     if not path.is_file():
         raise InputError(f"{path} does not exist, expected a Python file with the class of a method; correct the path")
     resolved = path.resolve()
@@ -230,8 +230,8 @@ def _load_module(name: str) -> ModuleType:
 
 
 def _describe_failure(error: BaseException, file: Path | None = None) -> str:
-    """Return the error with the last line in `file`, or without `file` the last file and line of its traceback."""
-    # Lines of this module are omitted, because they do not help the author of the method.
+    """Return the error with its last line in `file`. Without `file`, return it with its last file and line."""
+    # Lines of naming.py itself do not help the author of the method.
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)

@@ -15,10 +15,12 @@ import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 
-# Number of usable pixels from which a sample of them determines the limits. Counting fewer pixels takes less than 1 ms.
+# Pixels are used if their projection is below a lower or above an upper limit. With at least this number of usable
+# pixels, the limits are first estimated from a sample.
 _SPARSE_COUNT = 1 << 16
-_SPARSE_INTERVAL = 16  # px between sampled pixels
-# Margin of the limits, standard deviations of independently drawn pixels; beyond it, all pixels are counted.
+_SPARSE_INTERVAL = 16  # one of this number of pixels is sampled
+# A limit is searched within this number of standard deviations around its estimated rank. If it is not there, all
+# pixels are counted.
 _MARGIN_SIGMAS = 4.0
 
 
@@ -26,11 +28,11 @@ _MARGIN_SIGMAS = 4.0
 class BrightDark(PreparedMethod):
     """Principal direction of the brightest and darkest pixels.
 
-    Pixels are projected on the direction of their mean. The estimate is the first eigenvector of the uncentred
-    second-moment matrix of the pixels with the smallest and largest projections.
+    Pixels are projected on the direction of their mean. The pixels with the smallest and largest projections are
+    selected. The estimate is the first eigenvector of their second-moment matrix, without subtraction of the mean.
 
     - `name`: name in tables.
-    - `share`: fraction of the pixels at either end, 0 … 0.5; the authors use 0.035.
+    - `share`: fraction of all pixels that is used at each end, 0 … 0.5; the authors use 0.035.
 
     Examples
     --------
@@ -55,9 +57,9 @@ class BrightDark(PreparedMethod):
 def _sum_of_products(
     prepared: PreparedImage, direction: npt.NDArray[np.float64], peaks: npt.NDArray[np.float64], tail: int, count: int
 ) -> npt.NDArray[np.float64]:
-    """Return the sum of x xᵀ (3, 3) over `tail` of the `count` usable pixels at either end."""
-    # A histogram of projections gives the bins of the two limits, and only the pixels of these bins are sorted. So no
-    # array of the size of the image is needed. Pixels with equal projections are sorted in reading order.
+    """Return the sum of x xᵀ (3, 3) over the `tail` darkest and the `tail` brightest of the `count` usable pixels."""
+    # A histogram of projections shows which bins contain the two limits, and only the pixels of these bins are sorted.
+    # So no array of the size of the image is needed. Pixels with equal projections keep their order in the image.
     from evaluation.methods.pixel_loops import BINS, count_projections, sum_outer_bins
 
     image: Any = prepared.image
@@ -65,7 +67,7 @@ def _sum_of_products(
     pixels = (image, prepared.usable_or_empty(), direction, step)
     if 2 * tail >= count:  # The ends overlap: every pixel is used once.
         return sum_outer_bins(*pixels, np.full(4, BINS), np.empty((0, 4)))[0]
-    # In large images a sample determines the limits; if they prove wrong, all pixels are counted.
+    # In large images, the limits are estimated from a sample. If this fails, all pixels are counted.
     for interval in (_SPARSE_INTERVAL, 1) if count >= _SPARSE_COUNT else (1,):
         histogram = count_projections(*pixels, interval)
         rank = tail * int(histogram.sum()) / count
@@ -94,11 +96,11 @@ def _sum_of_products(
             ends.append(upper[np.argsort(upper[:, 3], kind="stable")][len(upper) - remaining :])
             selected = np.concatenate(ends)[:, :3]
             return total + selected.T @ selected
-    raise AssertionError("all pixels were counted, but the limits are in no bin")
+    raise AssertionError("all pixels were counted, but no bin contains the limits")
 
 
 def _bracket(histogram: npt.NDArray[np.int64], rank: float, margin: float) -> tuple[int, int]:
-    # First and last bin that may contain a rank, counted from below, within a margin.
+    # First and last bin that may contain the pixel with this rank ± margin, counted from the first bin.
     cumulated = histogram.cumsum()
     first, last = np.searchsorted(cumulated, [max(0.0, rank - margin), rank + margin])
     return int(first), min(int(last), len(histogram) - 1)

@@ -1,8 +1,7 @@
-"""Compiled loops over the pixels of an image in its own dtype, without arrays of the size of the image.
+"""Compiled loops over the pixels of an image. They need no further arrays of the size of the image.
 
-Sums are float64, or whole numbers for uint16, and do not depend on the dtype. An image is (H, W, 3) uint16, float32 or
-float64. `usable` is (H, W) bool, True for pixels that may be used, or (0, 0) if all may be used. `border` is the number
-of excluded pixels along every edge.
+An image is (H, W, 3) uint16, float32 or float64. `usable` is (H, W) bool, True for pixels that may be used, or (0, 0)
+if all may be used. `border` is the number of excluded pixels along every edge of the image.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ if TYPE_CHECKING:
     from evaluation.scene import Image
 
 
-SPAN = 64  # pixels of a row that are added together if all are usable: a few vectors per channel
-# Number of spans after which the 32-bit sums are emptied. 65 537 spans of uint16 fit; the check is at the end of a row,
-# so a row of 350 000 px may be added.
+SPAN = 64  # pixels of a row that are added with vector instructions, if all of them are usable
+# Number of spans after which the 32-bit sums are added to the result and reset. They can hold 65 537 spans. The
+# difference is a margin of one row, because the number is checked at the end of a row.
 LARGEST_SPAN_COUNT = 60_000
-CHUNK = 256  # pixels whose powers are computed together, in the first-level cache
-BLOCK = 16  # pixels of float32 whose whole powers are computed together: three vectors, six of float64
-LARGEST_PRODUCT_POWER = 64  # largest power that is computed by multiplications
+CHUNK = 256  # pixels that are processed together; they fit into the first-level cache
+BLOCK = 16  # pixels per step of `_add_powers`: three vectors of float32, converted to six of float64
+LARGEST_PRODUCT_POWER = 64  # whole-number powers up to this one are computed by multiplications
 
 
 _FLOAT_BYTES = 4  # size of a float32
@@ -53,7 +52,7 @@ def mark_clipped(image: Image, saturation: Any, clipped: npt.NDArray[np.uint8]) 
 
     `saturation` has the dtype of the image.
     """
-    # Whole rows are compared first, because LLVM uses vectors for that loop.
+    # Whole rows are checked first, because LLVM uses vector instructions for that loop.
     count = 0
     flat = image.reshape(-1)
     length = 3 * image.shape[1]
@@ -78,7 +77,7 @@ def _add_span(
     squares: npt.NDArray[np.uint64],
     maxima: npt.NDArray[np.uint16],
 ) -> None:
-    # LLVM uses vectors for loops of this form.
+    # LLVM uses vector instructions for loops of this form.
     for j in range(3 * SPAN):
         value = span[j]
         sums[j] += uint32(value)
@@ -145,8 +144,8 @@ def integer_moments(
 def float_moments(
     image: npt.NDArray[np.float32] | npt.NDArray[np.float64], usable: npt.NDArray[np.bool_], border: int, scale: float
 ) -> tuple[npt.NDArray[np.float64], int]:
-    """Return sum, sum of squares and maximum of each channel times `scale`, (3, 3) float64, and the usable count."""
-    # Rows are summed separately, which preserves twelve digits in images of any size.
+    """Return sum, sum of squares and maximum of each channel times `scale`, (3, 3) float64, and the pixel count."""
+    # Each row has its own sums, so that rounding errors stay small in large images.
     moments = np.zeros((3, 3), np.float64)
     height, width = image.shape[:2]
     count = 0
@@ -170,7 +169,7 @@ def float_moments(
 
 @compiled
 def _raise_to_power(factors: npt.NDArray[np.float64], powers: npt.NDArray[np.float64], length: int, p: float) -> None:
-    # Whole powers are products of vectors; `factors` is overwritten.
+    # Whole-number powers are calculated by repeated squaring. `factors` is overwritten.
     exponent = int(p) if p <= LARGEST_PRODUCT_POWER else 0
     if exponent != p:
         for j in range(length):
@@ -192,7 +191,7 @@ def _raise_to_power(factors: npt.NDArray[np.float64], powers: npt.NDArray[np.flo
 def _add_powers(
     builder: Builder, source: Value, blocks: Value, scale: Value, p: Value, bits: Value, sums: Value
 ) -> None:
-    # Adds powers of scaled float32 values to 48 float64 at `sums`. `p` is a whole number with `bits` bits. Factors,
+    # Adds powers of scaled float32 values to the 48 float64 at `sums`. `p` is a whole number with `bits` bits. Factors,
     # powers and sums stay in registers.
     from numba.core import cgutils
 
@@ -241,10 +240,11 @@ def sum_powers(
     scale: float,
     sums: npt.NDArray[np.float64],
 ) -> None:
-    """Add the powers p of scaled values of some rows of an image to `sums` (3,) float64.
+    """Scale values of a part of an image, raise them to the power `p`, and add them to `sums` (3,) float64.
 
-    `values`: (rows, Q) uint16, float32 or float64 ≥ 0, rows of interleaved pixels or parts of them, from row `top` and
-    pixel `first` on. Values beyond the image are ignored. `height`, `width` and `usable` belong to the whole image.
+    If `p` is infinite, `sums` becomes the maximum instead. `values`: (rows, Q) uint16, float32 or float64 ≥ 0, rows of
+    interleaved pixels; the first pixel is in row `top` and column `first` of the image. Values outside the image are
+    ignored. `height`, `width` and `usable` belong to the whole image.
     """
     factors = np.empty(3 * CHUNK, np.float64)
     powers = np.empty(3 * CHUNK, np.float64)
@@ -292,10 +292,10 @@ def sum_powers(
             sums[j % 3] += sums_by_position[j]
 
 
-# Number of equal bins of projections, from 0 to the largest possible projection. With 18 million pixels, the bin that
-# contains a limit has some thousand pixels.
+# Number of equal bins of projections, from 0 to the largest possible projection. In an image of 18 megapixels, the bins
+# that are sorted have a few thousand pixels.
 BINS = 4096
-# Offset of the counted pixels from row to row, px. Without it, only every 16th column would be counted.
+# The first counted pixel moves by this number of columns from row to row, so that all columns are counted.
 _ROW_SHIFT = 5
 
 
@@ -326,15 +326,15 @@ def sum_outer_bins(
     brackets: npt.NDArray[np.int64],
     collected: npt.NDArray[np.float64],
 ) -> tuple[npt.NDArray[np.float64], int, int, int]:
-    """Sum and count the pixels of bins outside two brackets, and collect the pixels inside.
+    """Sum the pixels below a lower and above an upper bracket, and collect the pixels inside the brackets.
 
-    `brackets`: (4,) int64, first and last bin of the lower bracket, then of the upper one; they may overlap.
-    `collected`: (N, 4) float64, receives red, green, blue and the projection of up to N pixels inside, in reading
-    order. Returns the sum of x xᵀ (3, 3) float64 over the pixels below the lower and above the upper bracket, and the
-    numbers of pixels below, above and inside.
+    A bracket is a range of bins of `count_projections`. `brackets`: (4,) int64, first and last bin of the lower
+    bracket, first and last bin of the upper bracket; brackets may overlap. `collected`: (N, 4) float64, receives red,
+    green, blue and the projection of up to N pixels inside, in reading order. Returns the sum of x xᵀ (3, 3) float64
+    over the pixels below the lower and above the upper bracket, and the numbers of pixels below, above and inside.
     """
-    # Projections of a chunk are computed before they are compared, so that both loops have no branches and the first
-    # uses vectors. Only the few pixels in the outer bins are processed one by one.
+    # All projections of a chunk are computed before they are compared. Without branches, both loops are fast. Only the
+    # few pixels in the outer bins are processed one by one.
     total = np.zeros((3, 3), np.float64)
     bins, kept_positions = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
     first, low, high, last = brackets

@@ -3,8 +3,8 @@
     prepared = PreparedImage(image, saturation, mask)
     lights = [estimate(method, prepared) for method in methods]
 
-Methods that can use it have `estimate_prepared(prepared)`, which `estimate` then calls. Images are processed in their
-own dtype, row by row or in tiles. The additional memory is:
+If a method has `estimate_prepared(prepared)`, the function `estimate` calls it instead of `method.estimate`. Images are
+processed in their own dtype, row by row or in tiles. The additional memory is:
 
 - one byte per pixel if pixels are masked or saturated;
 - 2 MB for a derivative, for images of any size;
@@ -23,8 +23,8 @@ import numpy.typing as npt
 from evaluation.methods.method import Method
 from evaluation.scene import Image
 
-# Estimate (3,) float64 if no pixel is usable or all are black. Methods return this object itself, so that callers can
-# distinguish it from a grey estimate by identity.
+# Estimate (3,) float64 if no pixel is usable or all pixels are black. Methods return this object itself. Callers use
+# `is` to distinguish it from the estimate of a grey image.
 GREY = np.full(3, 3**-0.5)
 GREY.setflags(write=False)
 
@@ -32,7 +32,7 @@ GREY.setflags(write=False)
 def dilate_clipped(
     image: npt.NDArray[np.integer[Any]] | npt.NDArray[np.floating[Any]], saturation: float
 ) -> npt.NDArray[np.bool_]:
-    """Return (H, W) bool, True if a channel of a pixel, or of one of its neighbours, is saturated."""
+    """Return (H, W) bool, True for pixels with a saturated channel and for their eight neighbours."""
     import cv2
 
     from evaluation.methods.pixel_loops import mark_clipped
@@ -71,8 +71,8 @@ def shrink(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Return an image whose longer side is `longest` px, (h, w, 3) float32, and its mask (h, w) bool.
 
-    Each new pixel is the mean of the usable pixels in its area. It is masked if they cover no more than `min_share` of
-    the area (0 … 1).
+    Each new pixel is the mean of the usable pixels in its area. It is masked (True) if usable pixels cover `min_share`
+    of the area or less (0 … 1).
     """
     import cv2
 
@@ -90,18 +90,18 @@ def shrink(
     return means.astype(np.float32), masked
 
 
-CACHED_PIXELS = 1 << 20  # largest images whose derivatives are kept for the next method, 12 MB each
+CACHED_PIXELS = 1 << 20  # largest image whose derivatives are kept, px; each takes up to 12 MB
 
-# Largest norm whose powers of values between 1 and 1e-19 of the largest value of the image are in the range of float64.
-# For larger norms, the largest usable value is required first.
+# Up to this p, values are divided by the largest value of the image, because powers of ratios above 1e-19 do not
+# underflow. For larger p, values are divided by the largest usable value, which needs a second pass.
 SAFE_POWER = 16
 
-_ALL_USABLE = np.zeros((0, 0), dtype=bool)  # marker: all pixels are usable
+_ALL_USABLE = np.zeros((0, 0), dtype=bool)  # stands for a mask with all pixels usable
 
 
 @runtime_checkable
 class PreparedMethod(Protocol):
-    """A method that accepts a prepared image; classes that inherit it get `Method.estimate`."""
+    """A method that accepts a prepared image. Classes that inherit from it get `Method.estimate`."""
 
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
         """Return the estimate of a prepared image, (3,) float64, camera RGB of length 1, or `GREY`."""
@@ -115,7 +115,7 @@ class PreparedMethod(Protocol):
 
 
 class PreparedImage:
-    """Image with results that several methods need, computed on first use; for one thread at a time.
+    """Image with intermediate results for several methods, computed on first use; not thread-safe.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class PreparedImage:
         (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0; must not be changed during use. uint8 is converted
         to uint16, all other types to float64.
     saturation
-        Value from which a channel is clipped, in the unit of the image; None if no pixel is clipped.
+        A channel of at least this value is clipped, in the unit of the image; None if no pixel is clipped.
     mask
         (H, W) bool, True for pixels that must not be used; None if all may be used.
 
@@ -168,7 +168,7 @@ class PreparedImage:
     @property
     def scale(self) -> float:
         """Power of two that scales the largest value of a float image to 0.5 … 1; 1 for black images and for uint16."""
-        # Scaled values and their squares are in the range of float32.
+        # After scaling, values and their squares are in the range of float32.
         if self.image.dtype == np.uint16 or not 0 < self.peak < math.inf:
             return 1.0
         return math.ldexp(1.0, -math.frexp(self.peak)[1])
@@ -269,10 +269,10 @@ class PreparedImage:
         return sums
 
     def derivative(self, order: int, sigma: float) -> npt.NDArray[np.float32]:
-        """Return the size of the Gaussian derivative, (H, W, 3) float32, in units of 1 / `scale`.
+        """Return the magnitude of the Gaussian derivative, (H, W, 3) float32, multiplied by `scale`.
 
-        Order 0 is the smoothed image, 1 the length of the gradient, 2 √(f_xx² + 4 f_xy² + f_yy²). Edges are continued
-        by their last pixel.
+        Order 0 is the smoothed image, order 1 the length of the gradient, order 2 √(f_xx² + 4 f_xy² + f_yy²). Positions
+        outside the image have the value of the nearest pixel.
         """
         key = (order, float(sigma))
         if key in self._derivatives:
@@ -287,7 +287,7 @@ class PreparedImage:
         return values
 
     def shrunk(self, longest: int) -> PreparedImage:
-        """Return the prepared image shrunk to a longer side of `longest` px, see `shrink`; itself if it is smaller."""
+        """Return the image reduced to a longer side of `longest` px by `shrink`, or itself if it is not larger."""
         if max(self.height, self.width) <= longest:
             return self
         if longest not in self._shrunk:
@@ -297,7 +297,7 @@ class PreparedImage:
 
     def tiles(self, order: int, sigma: float) -> Iterator[tuple[int, int, npt.NDArray[np.float32]]]:
         """Yield the derivative in tiles, see `gaussian.differentiated_tiles`."""
-        # Most derivatives are requested once; only those requested again are kept.
+        # A derivative is kept from its second request on, because most derivatives are requested only once.
         from evaluation.methods.gaussian import differentiated_tiles
 
         key = (order, float(sigma))
@@ -311,7 +311,7 @@ class PreparedImage:
 def usable(
     image: Image, saturation: float | None, mask: npt.NDArray[np.bool_] | None, border: int = 0
 ) -> npt.NDArray[np.bool_]:
-    """Return `PreparedImage.usable` for a method that uses the image only once."""
+    """Return the usable pixels as `PreparedImage.usable` does, for callers that need nothing else of the image."""
     return PreparedImage(image, saturation, mask).usable(border)
 
 

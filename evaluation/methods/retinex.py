@@ -1,20 +1,22 @@
-"""Methods of the Retinex family: local maxima represent white.
+"""Methods of the Retinex family, which take local maxima as white.
 
 Color Sparrow
     N. Banić, S. Lončarić, "Using the Random Sprays Retinex algorithm for global illumination estimation", CCVW 2013. At
-    each point of a grid, Random Sprays Retinex divides the pixel by the maximum of a spray: random pixels around it,
-    dense in the middle (E. Provenzi et al., 2009). The illuminant of a point is the smoothed pixel divided by the
-    smoothed ratio; the estimate is their mean. Constants are from the authors' program, version 0.1. The program rounds
-    sprays before it scales them to the image; as in the paper, they are not rounded here.
+    each point of a grid, Random Sprays Retinex divides the pixel by the maximum of a spray. A spray is a set of random
+    pixels around the point, denser near the point (E. Provenzi et al., 2009). The illuminant at a point is the smoothed
+    pixel divided by the smoothed ratio. The estimate is the mean over all points. Constants are from the authors'
+    program, version 0.1. It rounds sprays before it scales them to the image. Here they are not rounded, as in the
+    paper.
 Improved White-Patch
-    N. Banić, S. Lončarić, "Improving the White Patch method by subsampling", ICIP 2014. Maxima of few pixels rarely
-    include a highlight or a noisy pixel, and the mean of many such maxima is stable. *Reconstruction*: the paper gives
-    several numbers of pixels and samples, selected by cross-validation.
+    N. Banić, S. Lončarić, "Improving the White Patch method by subsampling", ICIP 2014. A sample of few pixels rarely
+    includes a highlight or a noisy pixel, and the mean of the maxima of several samples is stable. The paper selects
+    the numbers of pixels and samples by cross-validation; here they are fixed.
 Local Surface Reflectance statistics
     S.-B. Gao, W. Han, K. Yang, C. Li, Y. Li, "Efficient color constancy with local surface reflectance statistics",
-    ECCV 2014. The sum of the reflectances divided by the sum of the locally normalised ones is nearly achromatic. The
-    estimate of a channel is the sum of its values divided by the sum of its locally normalised values.
-    *Reconstruction* from the text: the number of patches is not the authors' tuned one, and images are not smoothed.
+    ECCV 2014. The estimate of a channel is the sum of its values divided by the sum of its locally normalised values:
+    the values of each image patch divided by their maximum. The same ratio of surface reflectances is nearly
+    achromatic. The paper tunes the number of patches and smooths images; here the number is fixed, and images are not
+    smoothed.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ def spray_maxima(
     """Return the maxima of each channel over the spray around each point of a grid, (R, C, 3) float64.
 
     `usable`: (H, W) bool, or (0, 0) if all pixels are usable. `offsets`: (sprays, N, 2) int64, rows and columns from
-    the point; those outside the image are ignored. `spray_indices`: (R, C) int64, spray of each point.
+    the point; pixels outside the image are ignored. `spray_indices`: (R, C) int64, spray of each point.
     """
     height, width = image.shape[:2]
     maxima = np.zeros((spray_indices.shape[0], spray_indices.shape[1], 3), np.float64)
@@ -66,7 +68,7 @@ def patch_sums(
     """Return sums and maxima of each channel over the usable pixels of patches, (R, C, 3) float64 each.
 
     `usable`: (H, W) bool, or (0, 0) if all pixels are usable. `rows`, `columns`: (R + 1,) and (C + 1,) int64, first
-    row and column of each patch, and the end of the last.
+    row and column of each patch, and the end of the last patch.
     """
     shape = (rows.size - 1, columns.size - 1, 3)
     sums, maxima = np.zeros(shape, np.float64), np.zeros(shape, np.float64)
@@ -83,18 +85,18 @@ def patch_sums(
     return sums, maxima
 
 
-SPRAY_COUNT = 1000  # number of sprays from which each point gets one, as in the authors' program
+SPRAY_COUNT = 1000  # number of different sprays; each point uses one of them, as in the authors' program
 
 
 @dataclass(frozen=True)
 class ColorSparrow(PreparedMethod):
-    """Mean of local estimates by random sprays.
+    """Mean of local estimates from random sprays.
 
     - `name`: name in tables.
     - `spray`: n, pixels per spray.
-    - `step`: r and c, distance of grid points, px.
+    - `step`: r and c, distance between grid points, px.
     - `kernel`: k, side of the mean filter over the grid, points.
-    - `seed`: seed of the sprays; estimates are reproducible.
+    - `seed`: seed of the random sprays.
 
     Examples
     --------
@@ -125,7 +127,7 @@ class ColorSparrow(PreparedMethod):
             return GREY
         ratios = np.where(is_used[..., None], np.minimum(points / np.where(maxima > 0, maxima, 1), 1), 0)
         size = (self.kernel, self.kernel)
-        # Both are sums over the same points, so their number cancels.
+        # Both filters include the same points, so the number of used points cancels in the ratio.
         sums = cv2.blur(np.where(is_used[..., None], points, 0), size, borderType=cv2.BORDER_CONSTANT)
         divisors = cv2.blur(ratios, size, borderType=cv2.BORDER_CONSTANT)
         lights = np.asarray(sums).reshape(points.shape)[is_used] / np.asarray(divisors).reshape(points.shape)[is_used]
@@ -134,7 +136,7 @@ class ColorSparrow(PreparedMethod):
 
 @cache
 def _draw_sprays(seed: int, count: int) -> npt.NDArray[np.float64]:
-    # Rows and columns from the middle, (SPRAY_COUNT, count, 2), as fractions of the radius.
+    # Rows and columns from the middle of the spray, (SPRAY_COUNT, count, 2), as fractions of its radius.
     random = np.random.default_rng((seed, 0))
     angle, distance = random.uniform(0, 2 * np.pi, (SPRAY_COUNT, count)), random.uniform(0, 1, (SPRAY_COUNT, count))
     sprays = distance[..., None] * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
@@ -149,7 +151,7 @@ class ImprovedWhitePatch(PreparedMethod):
     - `name`: name in tables.
     - `pixels`: N, pixels of a sample, drawn with repetition from the usable pixels.
     - `samples`: M, number of samples.
-    - `seed`: seed of the samples; estimates are reproducible.
+    - `seed`: seed of the random samples.
 
     Examples
     --------
@@ -181,11 +183,11 @@ class SurfaceReflectance(PreparedMethod):
     """Ratio of the sum of values to the sum of locally normalised values.
 
     - `name`: name in tables.
-    - `patches`: number of patches along either side of the image; at least one pixel each.
+    - `patches`: number of patches along each side of the image; limited by the number of pixels.
 
     Examples
     --------
-    A dark coloured half has less weight than the grey half:
+    The dark coloured half of this image has less weight than the grey half:
 
     >>> image = np.ones((20, 40, 3)) * np.linspace(0.2, 1, 20)[:, None, None]
     >>> image[:, 20:] *= [0.3, 0.1, 0.1]

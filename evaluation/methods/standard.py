@@ -9,16 +9,16 @@ Sources::
     Shades-of-Gray      G. Finlayson, E. Trezzi, "Shades of gray and colour     0, 2, 0
                         constancy", 2004
     General Gray-world  J. van de Weijer et al., 2007; see `gray_edge.py`       0, 9, 9
-    Gray-Edge, order 1  the same                                                1, 1, 6
-    Gray-Edge, order 2  the same                                                2, 1, 1
+    Gray-Edge, order 1  as General Gray-world                                   1, 1, 6
+    Gray-Edge, order 2  as General Gray-world                                   2, 1, 1
     PCA                 D. Cheng et al., 2014; see `pca.py`                     -
 
 Further methods: improved White-Patch, Color Sparrow, Local Surface Reflectance (`retinex`), grayness index and
 mean-shifted gray pixel (`gray_pixels`), and Gray-world of OpenCV (`OpenCvGrayWorld`).
 
-The paper's tables have the first three, with p = 2 for Shades-of-Gray. Other constants are from the tables of the NUS
-data set. Methods of the framework follow its equation only, without additional preprocessing of a source (for
-White-Patch: no median filter).
+The CroP paper (`experiments.paper.published`) uses the first three methods, with p = 2 for Shades-of-Gray. Other
+constants are from the tables of the NUS data set. Methods of the Gray-Edge framework apply only its equation.
+Preprocessing steps of the papers are omitted, for example the median filter before White-Patch.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, uni
 from evaluation.methods.retinex import ColorSparrow, ImprovedWhitePatch, SurfaceReflectance
 from evaluation.methods.wrapped import PatchwiseMethod
 
-_WHITE = 16383  # value of white: a quarter of uint16, so that a channel multiplied by up to 4 is not clipped
+_WHITE = 16383  # white in the input of OpenCV: a quarter of uint16, so that factors up to 4 do not clip
 
-_STRIP_ROWS = 256  # rows that are scaled together, so that no float64 copy of a large image is made
+_STRIP_ROWS = 256  # rows that are scaled together, to avoid a float64 copy of a large image
 
 
 @dataclass(frozen=True)
 class OpenCvGrayWorld(PreparedMethod):
     """Gray-world of OpenCV's xphoto, which ignores strongly coloured pixels.
 
-    `GrayworldWB` corrects an image. The estimate of a channel is its sum before divided by its sum after correction.
+    `GrayworldWB` corrects an image. The estimate of a channel is the ratio of its sums before and after correction.
     Masked and saturated pixels are passed as black.
 
     - `name`: name in tables.
@@ -63,8 +63,8 @@ class OpenCvGrayWorld(PreparedMethod):
 
     def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
         """Return the estimate for a prepared image, (3,) float64, camera RGB of length 1."""
-        # Other methods of xphoto are not offered. `SimpleWB` stretches channels between percentiles, with an offset, so
-        # it is not an estimate. `LearningBasedWB` (D. Cheng et al., CVPR 2015) of OpenCV 5.0 is not reproducible:
+        # Two other methods of xphoto are not offered. `SimpleWB` also adds an offset to each channel, so it does not
+        # estimate an illuminant. `LearningBasedWB` (D. Cheng et al., CVPR 2015) of OpenCV 5.0 is not reproducible: its
         # estimates for the same image differ by degrees.
         import cv2
 
@@ -84,12 +84,12 @@ class OpenCvGrayWorld(PreparedMethod):
         return unit(np.divide(sums_before, sums_after, out=np.zeros(3), where=sums_after > 0)[::-1])
 
 
-# Methods in most tables of the field; the others may take seconds on a large image.
+# Methods in most published tables. The other methods may take seconds for a large image.
 STANDARD = ("white-patch", "gray-world", "shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2", "pca")
 
 
 def standard_methods() -> Mapping[str, Method]:
-    """Return the methods by name on the command line; the three methods of the paper are first.
+    """Return all methods by their names on the command line, in the order of the module docstring.
 
     Examples
     --------
@@ -120,7 +120,7 @@ def standard_methods() -> Mapping[str, Method]:
 
 
 def local_methods() -> Mapping[str, LocalMethod]:
-    """Return methods that estimate an illuminant map, by name on the command line.
+    """Return the methods that estimate an illuminant map, by their names on the command line.
 
     Examples
     --------

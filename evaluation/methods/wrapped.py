@@ -1,12 +1,12 @@
-"""Methods that apply another method to patches of an image (not of a chart), or to a smaller image.
+"""Methods that apply another method to patches of an image, or to a reduced image. A patch is a rectangle of the image.
 
 With patches, a global method estimates an illuminant map: A. Gijsenij, R. Lu, T. Gevers, "Color constancy for multiple
-light sources", IEEE Transactions on Image Processing 21(2), 2012. The paper groups the estimates into two illuminants;
-here they are interpolated between patch centres, because the number of illuminants is unknown.
+light sources", IEEE Transactions on Image Processing 21(2), 2012. The paper groups the estimates into two illuminants.
+Here, the number of illuminants is unknown, so estimates are interpolated between patch centres.
 
-Edge-based methods depend on the size and the noise of the images for which they were tuned. Published results of the
-Gray-Edge family are for images of some hundred pixels (360 x 240 in van de Weijer et al.). At the size of a sensor, the
-strongest edges are noise, which shrinking removes.
+Edge-based methods depend on image size and noise. Published results of the Gray-Edge family are for images with a few
+hundred pixels per side (360 x 240 in van de Weijer et al.). At full sensor resolution, the strongest edges are noise.
+Reducing the image averages this noise.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from evaluation.methods.method import Method
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, estimate
 from evaluation.scene import Image
 
-# Patches along the shorter side: small compared with a region of one illuminant, but with many pixels. Our choice; the
-# patches of the paper have 5 to 20 px in images of 300 px.
+# Number of patches along the shorter side (our choice). A patch must be smaller than a region of one illuminant, but
+# have many pixels. The paper uses patches of 5 to 20 px in images of 300 px.
 PATCHES = 8
 
 
@@ -32,7 +32,7 @@ class PatchwiseMethod:
     """A global method that is applied to each patch of a grid; `estimate` uses the whole image.
 
     - `method`: the global method.
-    - `patches`: patches along the shorter side; patches are nearly square.
+    - `patches`: number of patches along the shorter side; they are nearly square.
 
     Examples
     --------
@@ -74,7 +74,7 @@ class PatchwiseMethod:
         height, width = image.shape[:2]
         side = max(1.0, min(height, width) / self.patches)
         rows, columns = (_patch_bounds(size, side) for size in (height, width))
-        # Neighbours of saturated pixels, also in other patches, are not usable.
+        # Calculated for the whole image, because a saturated pixel also excludes its neighbours in the next patch.
         usable = PreparedImage(image, saturation, mask).usable(0)
         lights = np.full((len(rows) - 1, len(columns) - 1, 3), np.nan)
         for i, (top, bottom) in enumerate(pairwise(rows)):
@@ -87,9 +87,9 @@ class PatchwiseMethod:
 
 
 def fill_unknown(lights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return illuminants (R, C, 3) float64 in which NaN are replaced by the mean of the nearest known patches.
+    """Return illuminants (R, C, 3) float64 with every NaN replaced by the mean of the nearest patches with values.
 
-    All patches are grey if none is known.
+    If all are NaN, all patches become grey.
 
     Examples
     --------
@@ -108,7 +108,7 @@ def fill_unknown(lights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def _patch_bounds(size: int, side: float) -> npt.NDArray[np.int64]:
-    # First pixels of patches of about `side` px, and the end of the last.
+    # First pixels of patches of about `side` px, and the end of the last patch.
     count = max(1, min(size, round(size / side)))
     return np.arange(count + 1, dtype=np.int64) * size // count
 
@@ -116,7 +116,7 @@ def _patch_bounds(size: int, side: float) -> npt.NDArray[np.int64]:
 def _interpolate(
     lights: npt.NDArray[np.float64], rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.float32]:
-    # Linear between patch centres, constant beyond.
+    # Linear between patch centres, constant outside the outermost centres.
     values: Any = lights.astype(np.float32)
     for axis, bounds in enumerate((rows, columns)):
         centres = (bounds[:-1] + bounds[1:] - 1) / 2
@@ -134,7 +134,7 @@ class ResizedMethod(PreparedMethod):
     """A method that is applied to images reduced to a given size.
 
     - `method`: the method.
-    - `longest`: largest length of the longer side, px; smaller images are not changed.
+    - `longest`: length of the longer side after reduction, px; smaller images are not changed.
 
     Examples
     --------

@@ -26,16 +26,17 @@ from foundation.colorimetry import srgb_codes
 from foundation.errors import counted
 from foundation.plots import FAINT, draw_svg, legend_label, series_style
 
-# The axis of errors ends at this percentile of all methods' errors; a few outliers would compress the other curves.
+# The axis of errors ends at this percentile of all methods' errors, because a few outliers would compress the curves.
 _AXIS_PERCENTILE = 98
 
 _STEPS = 300  # Points of a curve: about one for each pixel of its width on the page
 
-_PANELS = 12  # Most methods with their own panel; more panels would be too small to read
+_PANELS = 12  # Largest number of methods with a panel; more panels would be too small to read
 
 _COLUMNS = 3  # Panels in a row, for a page width of 1100 px
 
-# Most points drawn as vectors; more are drawn as a bitmap, because a page with millions of circles opens slowly.
+# Largest number of points drawn as vectors. More are drawn as a bitmap, because a page with millions of circles opens
+# slowly.
 _MAX_VECTOR_POINTS = 3000
 
 _SCALE_PERCENTILE = 95  # The colour scale ends at this percentile of all methods' errors
@@ -54,11 +55,11 @@ def _draw_curves(figure: Any, results: Sequence[Result], metric: ErrorKind) -> N
     for number, result in enumerate(results):
         errors = np.sort(result.errors[metric])
         shares = np.linspace(0, 100, min(len(errors), _STEPS) + 1)
-        # k of n images have at most the k-th of n sorted errors.
+        # The error of k of n images is at most the k-th of the n sorted errors.
         indices = np.ceil(shares / 100 * len(errors)).astype(int) - 1
         reached_errors = np.where(indices < 0, 0.0, errors[np.maximum(indices, 0)])
         axes.plot(reached_errors, shares, label=legend_label(result.method), linewidth=1.6, **series_style(number))
-    axes.set(xlim=(0, axis_end), ylim=(0, 100), xlabel=f"{metric} angular error, degrees", ylabel="images up to it, %")
+    axes.set(xlim=(0, axis_end), ylim=(0, 100), xlabel=f"{metric} angular error, degrees", ylabel="share of images, %")
     figure.legend(loc="outside lower left", ncols=2, handlelength=3)
 
 
@@ -68,12 +69,12 @@ def error_planes(results: Sequence[Result], truths: npt.NDArray[np.float64], met
     `truths`: (N, 3) float64, ground truths, camera RGB of any length.
     """
     drawn = results[:_PANELS]
-    columns = _columns(len(drawn))
+    columns = _column_count(len(drawn))
     width, height = (4.6, 3.6) if len(drawn) == 1 else (8.6, 0.7 + (7.8 / columns) * math.ceil(len(drawn) / columns))
     return draw_svg(_draw_planes, drawn, truths, metric, inches=(width, height))
 
 
-def _columns(panels: int) -> int:
+def _column_count(panels: int) -> int:
     # Four panels in two rows of two look better than three and one.
     return 2 if panels == 4 else min(_COLUMNS, panels)
 
@@ -87,7 +88,7 @@ def _draw_planes(figure: Any, results: Sequence[Result], truths: npt.NDArray[np.
     scale_end = max(float(percentiles(all_errors, (_SCALE_PERCENTILE,))[0]), 1e-3)
     # Both ends of the colour scale must be visible on a light and on a dark page.
     colours = ListedColormap(colormaps["viridis"](np.linspace(0.15, 0.92, 256)))
-    columns = _columns(len(results))
+    columns = _column_count(len(results))
     grid = figure.subplots(math.ceil(len(results) / columns), columns, squeeze=False, sharex=True, sharey=True)
     points = None
     for axes, result in zip(grid.flat, results, strict=False):
@@ -119,9 +120,9 @@ def _draw_planes(figure: Any, results: Sequence[Result], truths: npt.NDArray[np.
 
 _PICTURE_HEIGHT = 170  # Height of a picture, px: three next to each other fill half a page
 
-_MAX_PICTURE_WIDTH = 300  # Width of a picture, px, at most: a panorama would make the others tiny
+_MAX_PICTURE_WIDTH = 300  # Largest width of a picture, px; a panorama would make the pictures next to it tiny
 
-# Percentile of the brightest channel, under the true illuminant, that becomes white; brighter pixels are highlights.
+# After correction by the ground truth, this percentile of the pixels' largest channels becomes white.
 _WHITE_PERCENTILE = 98.0
 
 _GAP = 6  # White gap between pictures, px
@@ -164,10 +165,10 @@ def developed_pictures(scene: Scene, estimates: Sequence[npt.NDArray[np.float64]
 
     as_recorded, correct = display_codes(np.ones(3)), display_codes(truth)
     gap = np.full((len(reduced), _GAP, 3), 255, np.uint8)
-    return [_jpeg(np.hstack([as_recorded, gap, display_codes(light), gap, correct])) for light in estimates]
+    return [_encode_jpeg(np.hstack([as_recorded, gap, display_codes(light), gap, correct])) for light in estimates]
 
 
-def _jpeg(picture: npt.NDArray[np.uint8]) -> bytes:
+def _encode_jpeg(picture: npt.NDArray[np.uint8]) -> bytes:
     import cv2
 
     codes = np.ascontiguousarray(picture[..., ::-1])
@@ -194,7 +195,7 @@ def _resized(array: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 WORST_IMAGES, MEDIAN_IMAGES = 3, 2  # Images shown of each method: largest errors, and nearest to the median error
 
-MAX_METHODS = 12  # Methods with images; with more the page would be too large for an e-mail
+MAX_METHODS = 12  # Largest number of methods with images; more would make the page too large for an e-mail
 
 _DEFINITIONS = (
     "Recovery error: angle between estimated and true illuminant. Reproduction error: angle between white and a white "
@@ -215,7 +216,7 @@ def chosen_images(result: Result, metric: ErrorKind) -> tuple[tuple[int, ...], t
     """
     errors = result.errors[metric]
     worst = tuple(int(number) for number in np.argsort(-errors, kind="stable")[:WORST_IMAGES])
-    # With an even number of images, two are equally far from the median; rounding must not choose between them.
+    # With an even number of images, two are equally far from the median. Rounding errors must not choose between them.
     nearest = np.argsort(np.round(np.abs(errors - np.median(errors)), 9), kind="stable")
     return worst, tuple([int(number) for number in nearest if int(number) not in worst][:MEDIAN_IMAGES])
 
@@ -245,24 +246,24 @@ def run_page(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], byt
         pages.heading("Errors over the chromaticity plane"),
         pages.figure(
             error_planes(run.results, run.truths, metric),
-            "Each point is the ground truth of an image; its colour is the error." + _left_out(run.results),
+            "Each point is the ground truth of an image; its colour is the error." + _omitted_methods_text(run.results),
             "Errors over chromaticities",
         ),
-        *_images(run, metric, pictures),
+        *_image_elements(run, metric, pictures),
         pages.heading("Methods"),
-        table_part(Table("Methods of this run", ("Method", "Class", "Settings"), tuple(map(_method, run.methods)))),
+        table_part(Table("Methods of this run", ("Method", "Class", "Settings"), tuple(map(_method_row, run.methods)))),
         pages.note(f"Data set {run.data_sha256[:16]}…, {run.software}"),
     ]
     return pages.page(f"{run.subject.name}: {len(run.results)} method{'s' * (len(run.results) > 1)}", elements)
 
 
-def _left_out(results: Sequence[Result]) -> str:
+def _omitted_methods_text(results: Sequence[Result]) -> str:
     # Methods after the first `MAX_METHODS` have no images.
     names = [result.method for result in results[MAX_METHODS:]]
     return f" Only {MAX_METHODS} of {len(results)} methods are shown, without {', '.join(names)}." if names else ""
 
 
-def _images(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> list[Markup]:
+def _image_elements(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> list[Markup]:
     if not pictures:
         return []
     elements = [
@@ -270,7 +271,7 @@ def _images(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], byte
         pages.paragraph(
             "From left to right: as recorded, corrected by the estimate, corrected by the ground truth. "
             "Linear camera RGB without a colour matrix, equal exposure in each row, sRGB curve; masked pixels are grey."
-            + _left_out(run.results)
+            + _omitted_methods_text(run.results)
         ),
     ]
     for number, result in enumerate(run.results[:MAX_METHODS]):
@@ -281,14 +282,14 @@ def _images(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], byte
             if indices
             for element in (
                 pages.heading(title, 3),
-                pages.row([_image(run, number, index, metric, pictures) for index in indices]),
+                pages.row([_figure(run, number, index, metric, pictures) for index in indices]),
             )
         ]
         elements.append(pages.fold(result.method, rows, is_open=number == 0))
     return elements
 
 
-def _image(run: Run, number: int, index: int, metric: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> Markup:
+def _figure(run: Run, number: int, index: int, metric: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> Markup:
     result, image = run.results[number], run.subject.images[index]
     cause = (result.causes or {}).get(index, "")
     captions = [f"{image}: {result.errors[metric][index]:.2f}°"]
@@ -300,12 +301,12 @@ def _image(run: Run, number: int, index: int, metric: ErrorKind, pictures: Mappi
     return pages.figure(pictures[number, index], "; ".join(captions), description)
 
 
-def _method(method: Mapping[str, Any]) -> tuple[str, str, str]:
+def _method_row(method: Mapping[str, Any]) -> tuple[str, str, str]:
     settings: Mapping[str, Any] = method.get("settings", method.get("estimates", {}))
-    settings_text = ", ".join(f"{name} {_short(value)}" for name, value in settings.items())
+    settings_text = ", ".join(f"{name} {_shortened(value)}" for name, value in settings.items())
     return str(method.get("name", "")), str(method.get("class", "estimates of another program")), settings_text
 
 
-def _short(value: Any) -> str:
+def _shortened(value: Any) -> str:
     text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}…"

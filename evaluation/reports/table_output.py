@@ -37,13 +37,14 @@ def print_table(table: Table) -> None:
             min_width = max((len(word_part) for word in words for word_part in word.split()), default=1)
             grid.add_column(Text(head), min_width=min_width)
     for row in texts:
-        # Text, not str: square brackets in a name are not markup.
+        # Text objects are used, because rich would interpret square brackets in a str as markup.
         grid.add_row(*map(Text, row))
     console = Console()
     natural_width = Console(width=_UNLIMITED_WIDTH).measure(grid)
-    # A file or pipe has no width; rich would use that of the terminal on stdin or stderr.
+    # A file or pipe has no width. For these, rich would use the width of the terminal on stdin or stderr.
     console.width = max(console.width, natural_width.minimum) if console.is_terminal else natural_width.maximum
-    # Rich would end the process if the reader of its output is gone; `foundation.console.run` handles our own output.
+    # Rich would end the process if its output is closed. Its text is therefore captured and printed here, because
+    # `foundation.console.run` handles closed output.
     with console.capture() as captured:
         console.print(grid)
     print(f"{table.title}\n{captured.get()}", end="")

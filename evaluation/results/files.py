@@ -29,7 +29,7 @@ from foundation.errors import FormatError, InputError, counted, first_few
 from foundation.files import csv_text, file_sha256, read_text
 from foundation.names import comparable
 
-ERRORS_FILE = "errors.csv"  # Its name in a results folder
+ERRORS_FILE = "errors.csv"  # Name of the file with all errors in a results folder
 
 _ERROR_KINDS: tuple[ErrorKind, ...] = ("recovery", "reproduction")
 _TRUTH_KEYS = ("truth_r", "truth_g", "truth_b")
@@ -72,7 +72,7 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
             "evaluate run again"
         )
     if len(set(columns)) < len(columns):
-        raise FormatError(f"{path} has the columns {', '.join(columns)}, expected each once; remove the others")
+        raise FormatError(f"{path} has the columns {', '.join(columns)}, expected each once; remove the repeated ones")
     lines_by_method: dict[str, dict[str, _Line]] = {}
     for row in rows:
         line_name = f"{path}, line {rows.line_num}"
@@ -168,8 +168,8 @@ def several_lights_csv(images: Sequence[str], results: Sequence[Result]) -> tupl
     """Return the text of `pixels.csv` and `regions.csv`: errors by pixel and by region under several illuminants.
 
     Columns of the first: image, method, pixel_recovery (LSMI's MAE_illum), pixel_reproduction, pixel_rgb (MAE_rgb).
-    Columns of the second: image, method, light (index from 0), share (fraction of the judged pixels), recovery,
-    reproduction. Errors are degrees; empty if no pixel of an image is judged.
+    Columns of the second: image, method, light (index from 0), share (fraction of the evaluated pixels), recovery,
+    reproduction. Errors are degrees; empty if no pixel of an image is evaluated.
     """
     pixels: list[tuple[object, ...]] = [("image", "method", "pixel_recovery", "pixel_reproduction", "pixel_rgb")]
     regions: list[tuple[object, ...]] = [("image", "method", "light", "share", "recovery", "reproduction")]
@@ -229,7 +229,7 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
         else:
             lights[image] = light
     missing = [image for image in images if image not in lights]
-    # A file of another part of the data set is refused: errors of the common images alone would mislead.
+    # A file for another part of the data set is refused, because errors of the common images alone would mislead.
     faults = [
         f"{counted(len(faulty_images), singular, plural)} ({first_few(faulty_images)})"
         for faulty_images, singular, plural in (

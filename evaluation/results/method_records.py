@@ -19,7 +19,7 @@ import numpy.typing as npt
 from evaluation.results.files import GivenEstimates
 from foundation.files import file_sha256, sha256_of
 
-# Levels of nested values that are recorded: settings are flat, and a graph of objects may contain a cycle.
+# Deepest level of nested values that is recorded. Settings are flat, and objects may refer to each other in a cycle.
 _MAX_DEPTH = 6
 
 

@@ -1,4 +1,4 @@
-"""Values of a run: the answers of methods for each image, their results, and the run itself."""
+"""Values of a run: the answer of each method for each image, the results of each method, and the whole run."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ class Result:
 
     - `method`: name of the method.
     - `estimates`: (N, 3) float64, camera RGB of length 1, in the order of the scenes.
-    - `errors`: kind of error to (N,) float64, degrees; under several illuminants, the error against their mean.
+    - `errors`: (N,) float64 for each kind of error, degrees. Under several illuminants, it is the error against their
+      mean.
     - `guessed`: (N,) bool, True if the method returned no illuminant and grey replaces it.
-    - `causes`: index of the image to the reason why the image, or some of its pixels, has no estimate; None if not
+    - `causes`: by index of the image, the reason why the image or some of its pixels have no estimate; None if not
       recorded.
-    - `maps`: index of the image to its errors by pixel and region, in ascending order of the index; None if no image
-      has several illuminants, or if none was measured.
+    - `maps`: by index of the image in ascending order, its errors by pixel and region; None if no image has several
+      illuminants, or if none was measured.
     """
 
     method: str

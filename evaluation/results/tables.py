@@ -125,7 +125,7 @@ def summary_table(subject: Subject, results: Sequence[Result], metric: ErrorKind
         f"{subject.name}: {metric} angular error of {len(subject.images)} images{mixed_text}, degrees",
         (*PAPER_COLUMNS, *(FURTHER_COLUMNS if with_further else ())),
         tuple((result.marked_name, *_statistics(result.errors[metric], with_further)) for result in results),
-        notes=tuple(note for result in results for note in _notes(subject, result)),
+        notes=tuple(note for result in results for note in _missing_estimate_notes(subject, result)),
     )
 
 
@@ -240,7 +240,7 @@ def _statistics(errors: npt.NDArray[np.float64], with_further: bool) -> Iterable
     return (*summary.as_tuple(), *((summary.p95, summary.maximum, 100 * summary.below3) if with_further else ()))
 
 
-def _notes(subject: Subject, result: Result) -> Iterable[str]:
+def _missing_estimate_notes(subject: Subject, result: Result) -> Iterable[str]:
     count, causes = len(subject.images), result.causes or {}
     missing = [int(index) for index in np.flatnonzero(result.guessed)]
     without_pixel = [index for index in missing if causes.get(index, NO_PIXEL) == NO_PIXEL]

@@ -1,1 +1,1 @@
-"""Compiled kernels that convert source codes to samples, and their arithmetic."""
+"""Compiled functions that draw a sample of the look-up table for each pixel of a source image."""

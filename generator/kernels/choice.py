@@ -1,16 +1,20 @@
-"""Choose the sample of each pixel, and check the arguments of all kernels.
+"""Choose a random sample for each pixel, and check the arguments of all kernels.
 
-The choice is a pure function of (seed, image number, stream, x, y). Tiles, threads and workers cannot change it. The
+The look-up table (LUT) holds S samples of each patch colour. A pixel receives one sample of its colour. The choice
+depends only on the seed, image number, stream (see below), x and y, so tiles, threads and workers cannot change it. The
 rule is part of the data set format (reasons: `docs/decisions/0010-compiled-kernel.md`). All arithmetic is modulo 2³²
 except for p and q::
 
     keys     k0, k1, k2: first words of Philox4x32-10 with counter (y, stream, image, 0) and the seed as key
     word     i = 8 ⌊x/16⌋ + x mod 8,  h = (i ⊕ k0) · 0x21F0AAAD ⊕ k1,  h = (h ⊕ ⌊h/2¹⁶⌋) · 0x735A2D97 ⊕ k2,
              h = (h ⊕ ⌊h/2¹⁵⌋) · 0x31848BAB
-    sample   p = h S and q = (p mod 2³²) S, S samples of a colour; ⌊p/2³²⌋ if x mod 16 < 8, else ⌊q/2³²⌋
+    sample   p = h S,  q = (p mod 2³²) S,  index of the sample: ⌊p/2³²⌋ if x mod 16 < 8, else ⌊q/2³²⌋
 
-The stream is 0, or the index of the illuminant if several illuminants are mixed per pixel. Functions decorated with
-`step` emit LLVM vector code (`kernels/vector.py`) and can be called from compiled functions only.
+`stream` is 0 for one illuminant. If several illuminants are mixed per pixel, it is the index of the illuminant.
+
+A group is 32 consecutive pixels of a row. The offset of a sample is its distance from the start of the samples, in
+bytes. Functions decorated with `step` emit LLVM vector code (`kernels/vector.py`); only compiled functions can call
+them.
 """
 
 from __future__ import annotations
@@ -50,14 +54,14 @@ from generator.kernels.vector import (
 )
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES, key_of
 
-# Number of groups between the choice of offsets and the reading of their samples; hides the latency of memory.
+# Offsets are chosen this many groups before their samples are read, which hides the latency of memory.
 LEAD: Final = 2
-OFFSETS_BYTES: Final = 4 * GROUP  # Bytes of the offsets of a group, uint32 each
-# Distance in bytes between prefetching and reading of the picture, about 21 groups; hides the latency of memory.
+OFFSETS_BYTES: Final = 4 * GROUP  # Size of the offsets of a group, uint32 each
+# The picture is prefetched this many bytes before it is read.
 _PREFETCH_BYTES: Final = 2048
-# Bytes of scratch memory for the last pixels of a row: 96 bytes of a group, rounded up to whole cache lines.
+# Scratch memory for the last, incomplete group of a row, in bytes: 96, rounded up to whole cache lines.
 EDGE_BYTES: Final = 128
-# Bytes of scratch memory per thread: the last pixels of a row, and offsets of four groups, LEAD + 1 of them in use.
+# Scratch memory per thread, in bytes: the incomplete group, and the offsets of four groups, of which LEAD + 1 are used.
 SCRATCH_BYTES: Final = EDGE_BYTES + 4 * OFFSETS_BYTES
 
 _P0: Final = np.uint64(MULTIPLIERS[0])
@@ -65,10 +69,10 @@ _P1: Final = np.uint64(MULTIPLIERS[1])
 _W0: Final = np.uint32(KEY_STEPS[0])
 _W1: Final = np.uint32(KEY_STEPS[1])
 _WORD_BITS: Final = np.uint64(32)
-_PURPOSE: Final = np.uint32(SAMPLES)
+_SAMPLES_PURPOSE: Final = np.uint32(SAMPLES)
 _PAIRS: Final = ir.VectorType(I64, LANES // 2)
-# Odd multipliers of the three rounds, which spread changes of bits well: C. Wellons, "Prospecting for hash functions",
-# 2018, and its collection of improved constants.
+# Odd multipliers of the three rounds: C. Wellons, "Prospecting for hash functions", 2018, and its list of improved
+# constants.
 _MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
 
 
@@ -85,8 +89,8 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
 
 
 def _hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
-    # Three keyed rounds are needed. With one round, images of two seeds are equal after swapping neighbours. With two
-    # rounds, pixels at distances near a power of two depend on each other.
+    # Three rounds are needed. After one, images of two seeds would differ only by swapped neighbours. After two, pixels
+    # at distances near a power of two would be correlated.
     numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
     h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
     h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
@@ -98,12 +102,12 @@ def _hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
 
 
 def _choices_of_words(builder: Builder, h: Value, count: Value) -> tuple[Value, ...]:
-    # The two choices from one word are its first two digits in base S. Their probabilities differ from those of
-    # independent choices by less than S²/2³².
+    # Each word, read as a fraction of 2³², gives two choices: its first two digits in base S. The joint probability of
+    # two digits is 1/S², with a relative error below S²/2³².
     counts = broadcast(builder, count, WORDS)
 
     def upper_halves(numbers: Value) -> Value:
-        # One 64-bit product for the even and one for the odd lanes.
+        # A lane of 64 bits holds two words, so the words of even and odd lanes are multiplied separately.
         low, half = constant(_PAIRS, 0xFFFFFFFF), constant(_PAIRS, 32)
         pairs, factor = builder.bitcast(numbers, _PAIRS), builder.and_(builder.bitcast(counts, _PAIRS), low)
         even_lanes = builder.lshr(builder.mul(builder.and_(pairs, low), factor), half)
@@ -112,7 +116,7 @@ def _choices_of_words(builder: Builder, h: Value, count: Value) -> tuple[Value, 
         return builder.bitcast(builder.or_(even_lanes, odd_lanes), WORDS)
 
     first, second = upper_halves(h), upper_halves(builder.mul(h, counts))
-    # The first digits of eight words serve eight pixels, the second digits the next eight.
+    # Of 16 pixels, the first eight use the first digits of eight words, the next eight use the second digits.
     return tuple(
         builder.shuffle_vector(
             first, second, constant(WORDS, [*range(half, half + EIGHT), *range(LANES + half, LANES + half + EIGHT)])
@@ -133,9 +137,9 @@ def choose(
     bits: Value,
     target: Value,
 ) -> None:
-    """Write the byte offsets (uint32) of the samples of the 32 pixels at `picture` to `target`.
+    """Choose the samples of the 32 pixels at `picture` and write their offsets (uint32) to `target`.
 
-    `word` is the number of the first word of the group. 96 bytes are read, 128 written.
+    `word` is the first i of the group (module docstring), `count` is S. 96 bytes are read, 128 written.
     """
     stride = broadcast(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
     for half, choices in enumerate(_choices_of_words(builder, _hashed(builder, word, (k0, k1, k2)), count)):
@@ -155,7 +159,7 @@ def write_colours(
     second_stride: Value,
     second_target: Value,
 ) -> None:
-    """Write the colour indices (uint32) of the 32 pixels at `picture`, times each stride, to its target."""
+    """Write the colour indices (uint32) of 32 pixels to both targets, multiplied by the stride of the target."""
     for half in range(2):
         colours = _colours(builder, builder.add(picture, ir.Constant(I64, 3 * LANES * half)), bits)
         for factor, address in ((stride, target), (second_stride, second_target)):
@@ -166,7 +170,10 @@ def write_colours(
 def choose_for_colours(
     builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
 ) -> None:
-    """Choose like `choose` for 32 pixels with colour offsets (index times bytes of a colour) at `colours`."""
+    """Do the same as `choose`, with one offset (uint32) for each pixel at `colours`.
+
+    The samples of the pixel's colour begin at this offset.
+    """
     for half, choices in enumerate(_choices_of_words(builder, _hashed(builder, word, (k0, k1, k2)), count)):
         colour_offsets = load(builder, colours, 4 * LANES * half, WORDS)
         offsets = builder.add(colour_offsets, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
@@ -213,7 +220,7 @@ def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
 @inlined
 def row_keys(y: Any, stream: Any, image: Any, seed: Any) -> Any:
     """Return the three keys (uint32) of row `y`; `seed` is uint64."""
-    k0, k1, k2, _ = philox4x32(uint32(y), uint32(stream), uint32(image), _PURPOSE, seed)
+    k0, k1, k2, _ = philox4x32(uint32(y), uint32(stream), uint32(image), _SAMPLES_PURPOSE, seed)
     return k0, k1, k2
 
 
@@ -225,9 +232,9 @@ def offsets_slot(scratch: int, group: int) -> int:
 
 @inlined
 def group_address(row: int, width: int, group: int, scratch: int) -> int:
-    """Return an address from which the pixels at x = 32 `group` can be read; `row` is the address of the row.
+    """Return an address at which a whole group can be read; `row` is the address of the first pixel of the row.
 
-    If the row ends before the end of the group, its pixels are copied to scratch memory.
+    If the row ends inside the group, its pixels are first copied to scratch memory.
     """
     source = row + 3 * GROUP * group
     if GROUP * (group + 1) > width:
@@ -239,7 +246,7 @@ def group_address(row: int, width: int, group: int, scratch: int) -> int:
 
 @inlined
 def prefetch_group(row: int, group: int) -> None:
-    """Prefetch the pixels that are read some groups later; call it for every group in turn."""
+    """Prefetch the pixels `_PREFETCH_BYTES` after a group; call it for each group of a row in turn."""
     line = row + 3 * GROUP * group + _PREFETCH_BYTES
     prefetch_once(line)
     prefetch_once(line + LINE)
@@ -247,7 +254,7 @@ def prefetch_group(row: int, group: int) -> None:
 
 @inlined
 def choose_group(row: int, width: int, group: int, keys: Any, count: Any, bits: Any, scratch: int, target: int) -> None:
-    """Write the byte offsets (uint32) of the samples of the pixels at x = 32 `group` of a row to `target`."""
+    """Choose the samples of a group (number `group` of its row) and write their offsets (uint32) to `target`."""
     source = group_address(row, width, group, scratch)
     choose(source, uint32(LANES * group), keys[0], keys[1], keys[2], count, bits, target)
 
@@ -257,7 +264,7 @@ def channel_bits(colours: int) -> int:
     for bits in range(1, 6):
         if colours == 8**bits:
             return bits
-    raise InputError(f"the samples have {colours} colours, expected 8, 64, 512, 4096 or 32768; pass those of a LUT")
+    raise InputError(f"the samples have {colours} colours, expected 8, 64, 512, 4096 or 32768; pass LUT samples")
 
 
 def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
@@ -270,9 +277,9 @@ def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
 Samples = npt.NDArray[np.uint16]
 Picture = npt.NDArray[np.uint8]
 
-# Bytes of a memory page on x86-64 and arm64, the smallest unit of protection; larger pages are multiples of it.
+# Smallest memory page of x86-64 and arm64, in bytes. If one byte of a page is readable, all are.
 _PAGE_BYTES: Final = 4096
-_MOST_BYTES: Final = 0xFFFFFFFF  # Largest size of an illuminant's samples: offsets have 32 bits
+_MOST_BYTES: Final = 0xFFFFFFFF  # Largest size of the samples of one illuminant: offsets have 32 bits
 
 
 def check_samples(samples: Samples) -> int:
@@ -285,7 +292,7 @@ def check_samples(samples: Samples) -> int:
 
 
 def check_tables(tables: Samples | Sequence[Samples]) -> list[Samples]:
-    """Check the samples of several illuminants, uint16 (8**bits, S, 3) of one shape; return them as a list."""
+    """Check the samples of several illuminants, all uint16 (8**bits, S, 3) of one shape; return them as a list."""
     checked = list(tables)
     if not checked:
         raise InputError("0 illuminants were given to mix, expected 1 or more")
@@ -350,7 +357,7 @@ def readable(samples: Samples) -> Samples:
 
     A copy is returned if the samples are not contiguous, or if the two bytes are on another memory page.
     """
-    # Samples have six bytes and are fetched eight bytes at a time. Bytes on the page of the last byte can be read,
+    # Eight bytes are read for a sample of six. The two bytes after the last sample can be read if they are on its page,
     # even if another object owns them.
     last_byte = samples.ctypes.data + samples.nbytes - 1
     if samples.flags.c_contiguous and last_byte // _PAGE_BYTES == (last_byte + 2) // _PAGE_BYTES:
@@ -363,7 +370,7 @@ def readable(samples: Samples) -> Samples:
 def writable(target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
     """Return `target` (H, W, 3) or (H, W) uint16 if compiled code can write its rows, else a new array of its shape.
 
-    Rows must be contiguous and at even addresses. Pass a new array to `copied_back` when it is filled.
+    Rows must be contiguous and at even addresses. After filling, pass the returned array to `copied_back`.
     """
     packed = (6, 2) if target.ndim == 3 else (2,)
     return target if target.strides[1:] == packed and target.flags.aligned else np.empty(target.shape, target.dtype)
@@ -377,7 +384,7 @@ def copied_back(work: npt.NDArray[np.uint16], target: npt.NDArray[np.uint16]) ->
 
 
 def run_in_threads(fill: Callable[[int, int], object], count: int, threads: int) -> None:
-    """Call `fill(first, end)` on `threads` equal ranges of 0 … count − 1, each in its own thread."""
+    """Call `fill(first, end)` for `threads` equal parts of 0 … count − 1, each in its own thread."""
     threads = min(threads, count)
     if threads <= 1:
         fill(0, count)

@@ -1,18 +1,22 @@
 """Mix several illuminants with the noise that one exposure under all of them would have.
 
-Light is additive: under illuminants i with weights w_i the mean of a colour is Σ w_i m_i, where m_i is its mean under
-illuminant i alone. A sample is x_i = m_i + n_i. The variance of the noise n_i is g m_i + r² (photon noise at gain g,
-and read noise r). One exposure under all illuminants has the variance g Σ w_i m_i + r². A weighted mean of samples
-would have only g Σ w_i² m_i, half of it for two equal illuminants. Deviations are therefore scaled by √w_i::
+Light is additive. If m_i is the mean of a colour under illuminant i alone, the mean under all illuminants with weights
+w_i is Σ w_i m_i. A sample is x_i = m_i + n_i. Its noise n_i has the variance g m_i + r², with photon noise at gain g,
+and read noise r. One exposure under all illuminants has the variance g Σ w_i m_i + r². A weighted mean of samples has
+too little photon noise: its variance is only g Σ w_i² m_i, half the true value for two equal illuminants. Therefore the
+noise of each sample is multiplied by √w_i::
 
     y = Σ w_i m_i + Σ √w_i (x_i − m_i),   x_i drawn independently for each illuminant
 
-The variance is Σ w_i (g m_i + r²). Photon noise is exact for any weights. Read noise is exact if the weights sum to 1,
-otherwise it is √(Σ w_i) times its true value. A single illuminant of weight 1 gives its own samples exactly.
+The variance of y is Σ w_i (g m_i + r²). Photon noise is exact for any weights. Read noise is exact if the weights sum
+to 1, otherwise it is √(Σ w_i) times its true value. A single illuminant of weight 1 gives its own samples exactly.
 
-Approximations: m_i is the mean of the S samples, not of all paper of that colour. Deviations of print and photosites,
-which are proportional to the light, are treated as noise. For illuminants of equal brightness and weights of sum 1 they
-are exact, otherwise √(Σ w_i) times too small. Samples clipped by the sensor stay clipped.
+There are three approximations:
+
+- m_i is the mean of S samples, not of the whole patch.
+- Differences within the print and between photosites are proportional to the light, but here they are multiplied by
+  √w_i. For illuminants of equal brightness they are 1/√(Σ w_i) of their true value.
+- Samples clipped by the sensor stay clipped.
 """
 
 from __future__ import annotations
@@ -79,7 +83,7 @@ _MIXTURES: Final = np.uint32(philox.MIXTURES)
 
 @compiled
 def _mix_table(samples: Any, weight: float, seed: Any, stream: int, shuffled: bool, colours: Any, total: Any) -> None:
-    # Adds one illuminant to `total` (N, S, 3) float64; each colour has its own shuffle.
+    # Adds the samples of one illuminant to `total` (N, S, 3) float64; each colour has its own shuffle.
     count = samples.shape[1]
     root = np.sqrt(weight)
     order = np.empty(count, np.uint32)
@@ -126,11 +130,10 @@ def mixed_table(
     seed: int = 0,
     colours: npt.NDArray[np.bool_] | None = None,
 ) -> Samples:
-    """Mix the samples of several illuminants to samples of one combined illuminant, by the formula of the module.
+    """Mix the samples of several illuminants into those of one illuminant; the module docstring has the formula.
 
-    The result is used like the samples of an illuminant: `draw_samples(mixed_table(...), picture)`. For each colour,
-    the samples of the first illuminant with a weight keep their order. The samples of each further illuminant are
-    shuffled independently, so that their noise is uncorrelated.
+    Within a colour, the samples of the first illuminant with a weight keep their order. The samples of each further
+    illuminant are shuffled independently, so that their noise is uncorrelated.
 
     Parameters
     ----------
@@ -143,8 +146,8 @@ def mixed_table(
     seed
         Seed of the shuffles, 0 … 2⁶⁴ − 1.
     colours
-        (8**bits,) bool, colours to compute, as from `kernels.unfit.colours_in`; None for all. It saves time for small
-        pictures. Samples of other colours are 0; those of the chosen colours do not depend on it.
+        (8**bits,) bool, colours to compute, for example from `kernels.unfit.colours_in`; None for all. Samples of other
+        colours are 0. A selection saves time for small pictures and changes no sample.
 
     Returns
     -------
@@ -182,22 +185,24 @@ def mixed_table(
     return out
 
 
-# Pixels of a row that are mixed together, whole groups: their weights and offsets fit into the second-level cache.
+# A row is mixed in segments of this many pixels, a multiple of a group. Their weights and offsets fit into the
+# second-level cache.
 SEGMENT_PIXELS: Final = 512
-# Distance between prefetching and reading weights, pixels: eight segments, which hides the latency of memory.
+# Weights are prefetched this many pixels before they are read.
 _PREFETCH_PIXELS: Final = 4096
-# Bytes of offsets, or of weights of one illuminant, in a segment; the last segment of a row has up to seven more
-# pixels.
+# Size of the offsets of a segment, or of its weights of one illuminant, in bytes. The last segment of a row has up to
+# seven more pixels.
 SEGMENT_BYTES: Final = OFFSETS_BYTES * (SEGMENT_PIXELS // GROUP + 1)
-# Bytes of a segment for two illuminants: weights in pixel order, weights in the order of `mix`, and offsets.
+# Scratch memory of a segment for a pair of illuminants, in bytes: weights in pixel order, weights in the order of
+# `mix`, and offsets.
 PAIR_BYTES: Final = 6 * SEGMENT_BYTES
-# Bytes of a segment that is buffered before it is streamed.
+# Size of the buffer of a segment before it is streamed (written past the caches), in bytes.
 _LINES_BYTES: Final = line_buffer_bytes(SAMPLE_BYTES * (SEGMENT_PIXELS + BLOCK))
 
 
 @compiled
 def _fill_means(samples: int, colours: Any, count: int, means: int, stride: int) -> int:
-    # Writes the mean of each colour, `stride` bytes apart; returns the largest sample.
+    # Writes the means of all colours, `stride` bytes apart; returns the largest channel value of all samples.
     largest = 0
     for colour in colours:
         largest = max(largest, mean4(samples + SAMPLE_BYTES * count * colour, count, means + stride * colour))
@@ -206,7 +211,8 @@ def _fill_means(samples: int, colours: Any, count: int, means: int, stride: int)
 
 @inlined
 def _single_light(pair_weights: Any, count: int) -> int:
-    # Index of the only illuminant with nonzero weights in the first pixels if all its weights are 1, else -1.
+    # Returns the index of the only illuminant with nonzero weights in the first `count` pixels, if all its weights are
+    # equal to 1, and −1 in all other cases.
     lit, single = 0, -1
     for pair in range(len(pair_weights)):
         flags = weight_flags(pair_weights[pair], count)
@@ -233,7 +239,7 @@ def _draw_segment(
     lines_per_group: int,
     base: int,
 ) -> None:
-    # This function and `_mix_segment` are separate, because in one loop over rows they would need too many registers.
+    # This code is not part of `_mix_pixels`, because its loop would then need too many registers.
     choose_first_groups(row, width, keys, count, bits, scratch, low, high)
     draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, prefetch_from, lines_per_group, base)
 
@@ -259,11 +265,12 @@ def _mix_segment(
     plan_at: int,
     target: int,
 ) -> None:
-    """Fill the groups `low` … `high` − 1 of a row, `pixels` in all, under illuminants with weights.
+    """Mix the groups `low` … `high` − 1 of a row, `pixels` in all, under several illuminants.
 
-    `pair_weights` are the addresses of the weights of each pair. Scratch memory holds, in this order: the last pixels
-    of a row, the marks of faulty weights, the colour offsets in the means and in the samples, then the weights and
-    offsets of each pair. With each group, `lines_per_group` lines of weights are prefetched from `prefetch_from`.
+    `pair_weights` are the addresses of the weights of each pair. Scratch memory holds, in this order: the incomplete
+    group, the fault marks (NaN if a weight is invalid), each pixel's offset in the means and in the samples, then the
+    weights and offsets of each pair. With each group, `lines_per_group` cache lines of later weights are prefetched,
+    starting at `prefetch_from`.
     """
     pairs = len(pair_weights)
     faults = scratch + SCRATCH_BYTES
@@ -286,7 +293,7 @@ def _mix_segment(
             continue
         plan[lit_pairs, 0], plan[lit_pairs, 5] = line, means + 2 * MEAN_BYTES * pair
         for member in range(2):
-            # An illuminant whose weights are all 0 needs no offsets and is replaced by its partner.
+            # If all weights of an illuminant are 0, the samples of the partner are read in its place.
             drawn_member = member if lit >> member & 1 else 1 - member
             offsets = line + SEGMENT_BYTES * (2 + drawn_member)
             plan[lit_pairs, 1 + member], plan[lit_pairs, 3 + member] = offsets, tables[light + drawn_member]
@@ -313,7 +320,7 @@ def _mix_pixels(
     weights: int,
     weight_steps: Any,
     white: Any,
-    within: Any,
+    is_unclipped: Any,
     seed: Any,
     image: int,
     first_row: int,
@@ -327,13 +334,13 @@ def _mix_pixels(
     zero_weight: int,
     streamed: bool,
 ) -> None:
-    # Rows have at least eight pixels. `weight_steps` are the bytes from row to row, pixel to pixel, and illuminant to
-    # illuminant; `within` marks illuminants whose samples are all within the saturation level.
+    # Rows have at least eight pixels. `weight_steps` are the distances of weights in bytes: to the next row, pixel and
+    # illuminant. `is_unclipped` marks illuminants without samples above the saturation level.
     lights, pairs = len(tables), len(pair_weights)
     lines = scratch + SCRATCH_BYTES + FAULT_BYTES + 2 * SEGMENT_BYTES
     line_buffer = first_line(lines + PAIR_BYTES * pairs)
     uniform = weight_steps[0] == 0 and weight_steps[1] == 0
-    # Cache lines with the weights of a group, if all weights of a pixel are adjacent.
+    # Number of cache lines with the weights of a group; 0 if the weights of a pixel are not adjacent.
     lines_per_group = GROUP * weight_steps[1] // LINE if weight_steps[1] == 4 * lights else 0
     for y in range(rows):
         row, start = picture + y * pitch, 0
@@ -364,12 +371,12 @@ def _mix_pixels(
             stop = segment_target + SAMPLE_BYTES * pixels
             if streamed:
                 segment_target = line_buffer + buffered
-            # A segment under one illuminant of weight 1 is drawn without mixing. The first pixels are checked first,
-            # because they usually show that several illuminants have weights.
+            # A segment under one illuminant of weight 1 needs no mixing. The first pixels are checked first, because
+            # they usually show that several illuminants have weights.
             single = _single_light(pair_weights, BLOCK)
             if single >= 0:
                 single = _single_light(pair_weights, pixels)
-            if single >= 0 and within[single]:
+            if single >= 0 and is_unclipped[single]:
                 light_keys = keys[single, 0], keys[single, 1], keys[single, 2]
                 base = segment_target - SAMPLE_BYTES * start
                 _draw_segment(
@@ -427,10 +434,10 @@ def mix_samples(
     threads: int = 1,
     out: npt.NDArray[np.uint16] | None = None,
 ) -> npt.NDArray[np.uint16]:
-    """Draw the raw linear image of `picture` under several illuminants with weights for each pixel.
+    """Draw the raw linear image of `picture` under several illuminants with one weight per pixel and illuminant.
 
-    The module docstring has the formula. `choice.py` draws the sample of each illuminant, with its index in `tables` as
-    the stream. A pixel with weight 1 of illuminant 0 and no other is the same as from `draw_samples`.
+    The module docstring has the formula. `choice.py` chooses the sample of each illuminant; the stream is the index of
+    the illuminant in `tables`. With weights 1, 0, 0 …, a pixel is the same as from `draw_samples`.
 
     Parameters
     ----------
@@ -439,7 +446,8 @@ def mix_samples(
     picture
         (H, W, 3) uint8, sRGB codes.
     weights
-        (H, W, K) float32 ≥ 0, or (K,) for all pixels: relative intensity of each illuminant, 1 as photographed.
+        (H, W, K) float32 ≥ 0, or (K,) for all pixels: relative intensity of each illuminant; 1 is the intensity at
+        which it was photographed.
     white_level
         Saturation level, 1 … 65535 counts; larger values are clipped.
     seed, image, first_row, threads
@@ -493,14 +501,14 @@ def mix_samples(
     # The means of a pair, 32 bytes, must be in one cache line.
     memory = np.zeros(8 * pairs * colours + 15, np.float32)
     means = memory[-memory.ctypes.data % 64 // 4 :][: 8 * pairs * colours].reshape(colours, 2 * pairs, MEAN_BYTES // 4)
-    # The means of all colours would take longer than a small picture.
+    # For a small picture, the means of all colours would take longer than the mixing.
     is_small = picture.shape[0] * picture.shape[1] < 10 * colours
     chosen_colours = np.flatnonzero(colours_in(picture, bits) if is_small else np.ones(colours, np.bool_))
     largest = [
         _fill_means(samples.ctypes.data, chosen_colours, count, means[:, light].ctypes.data, means.strides[0])
         for light, samples in enumerate(tables_in_memory)
     ]
-    within = np.array(largest) <= white_level
+    is_unclipped = np.array(largest) <= white_level
     faults: list[bool] = []
     no_weight = np.zeros(1, np.float32)
 
@@ -521,7 +529,7 @@ def mix_samples(
             pixel_weights[top:].ctypes.data,
             np.array(pixel_weights.strides),
             np.uint16(white_level),
-            within,
+            is_unclipped,
             key,
             image,
             first_row + top,

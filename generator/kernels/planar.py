@@ -1,16 +1,17 @@
-"""Draw training crops: float32 planes of any window of a picture.
+"""Draw training crops: windows of generated images, as float32 planes of R, G and B.
 
-A crop is a window of the image that `rendering.draw_samples` makes of the whole picture. It is mirrored on request,
-multiplied by a gain, divided by the saturation level and clipped at 1::
+A crop is a window of the image that `rendering.draw_samples` draws for the whole picture. It may be mirrored. Its
+samples are multiplied by a gain, divided by the saturation level and clipped at 1::
 
     out[c, y, x] = min(float32(sample) · float32(gain / white_level), 1)
 
-The gain is digital: it scales signal and noise alike, and saturated pixels become darker with it. If a part of the
-print's black is subtracted (`generator.rendering.black_points`), with s[c] = gain · stretch[c] / white_level::
+The gain is digital: it scales signal and noise equally. A gain below 1 also makes saturated pixels darker. Part of the
+black of the print may be subtracted (`generator.rendering.black_points`). Then, with s[c] = gain · stretch[c] /
+white_level::
 
     out[c, y, x] = min(float32(sample) · float32(s[c]) + float32(-black_counts[c] · s[c]), float32(min(gain, 1)))
 
-Negative values are kept: if noise were clipped at 0, black would be too bright.
+Negative values are kept, because clipping noise at 0 would make black too bright.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, p
 
 Window = tuple[int, int, int, int]  # x, y, width and height of a window in the picture, px
 
-SCALES: Final = 7  # Values per crop for `vector.planes8`: three factors, three summands, one limit
+SCALES: Final = 7  # Values of a crop for `vector.planes8`: three factors, three summands, one limit
 
 
 @compiled
@@ -49,7 +50,7 @@ def _crop(
     plan: Any,
     seeds: Any,
     scales: Any,
-    lines: int,
+    scales_address: int,
     tables: int,
     light_bytes: int,
     last: int,
@@ -63,15 +64,14 @@ def _crop(
     end: int,
     scratch: int,
 ) -> None:
-    # `plan` (N, 9) int64 has the columns that are unpacked below. `scales` (N, 7) float32 lies at address `lines`, and
-    # `last` is the address of the last illuminant's samples from `choice.readable`.
-    # Offsets of a row are chosen, and their samples prefetched, before the row above is fetched: samples may be in
-    # memory that no cache holds.
+    # `scales_address` is the address of `scales` (N, 7) float32. `last` is the address of the samples of the last
+    # illuminant, from `choice.readable`. Samples of a row are prefetched while the previous row is written, because
+    # they may be in no cache.
     row_bytes = OFFSETS_BYTES * (width // GROUP + 2)
     for item in range(first, end):
         light, picture, pitch, picture_width, x0, y0, flip, image, lights = plan[item]
         samples = last if light == lights - 1 else tables + light * light_bytes
-        line = lines + 4 * SCALES * item
+        scales_at = scales_address + 4 * SCALES * item
         low, high = x0 // GROUP, (x0 + width - 1) // GROUP
         for y in range(height + 1):
             if y < height:
@@ -98,12 +98,12 @@ def _crop(
                         plane1(sample + 2 * channel, factor, summand, limit, red + channel * pitches[1] + 4 * x)
             else:
                 for start in range(0, width, EIGHT):
-                    # The last eight pixels may overlap the previous ones.
+                    # If the width is no multiple of eight, the last eight pixels overlap the previous ones.
                     x = min(start, width - EIGHT)
                     if flip:
-                        planes8_mirrored(samples, offsets - 4 * x, line, red + 4 * x, green + 4 * x, blue + 4 * x)
+                        planes8_mirrored(samples, offsets - 4 * x, scales_at, red + 4 * x, green + 4 * x, blue + 4 * x)
                     else:
-                        planes8(samples, offsets + 4 * x, line, red + 4 * x, green + 4 * x, blue + 4 * x)
+                        planes8(samples, offsets + 4 * x, scales_at, red + 4 * x, green + 4 * x, blue + 4 * x)
 
 
 def _checked_window(window: Sequence[int], picture: npt.NDArray[np.uint8]) -> Window:
@@ -134,7 +134,8 @@ def draw_batch(
 ) -> npt.NDArray[np.float32]:
     """Draw N training crops; the module docstring has the formula.
 
-    Samples are not copied, so `tables` may be gigabytes mapped from disk. The work is done without the GIL.
+    Samples are not copied, so `tables` may be a file of several gigabytes, mapped to memory. Other Python threads can
+    run at the same time.
 
     Parameters
     ----------
@@ -145,13 +146,13 @@ def draw_batch(
     pictures
         N source pictures (H, W, 3) uint8 of any sizes. The same array may be given several times.
     windows
-        (N, 4) int, x, y, width, height of each crop in px; all of one width and height.
+        (N, 4) int, x, y, width, height of each crop in px. All crops have the same width and height.
     white_level
-        Saturation level, 1 … 65535 counts. It becomes 1.
+        Saturation level, 1 … 65535 counts. It is scaled to 1.
     flips
-        (N,) bool, or one value for all: mirror the crop left to right. Each pixel keeps its sample.
+        (N,) bool, or one value for all: mirror the crop left to right. Mirrored pixels keep their samples.
     gains
-        (N,) float ≥ 0, or one value for all: factor on the values before they are clipped at 1.
+        (N,) float ≥ 0, or one value for all: factor on the values before clipping.
     seeds, images
         (N,) int, or one value for all, as for `draw_samples`.
     black_counts
@@ -166,7 +167,7 @@ def draw_batch(
     Returns
     -------
     ndarray
-        (N, 3, height, width) float32, linear camera RGB, 0 … 1 = saturation.
+        (N, 3, height, width) float32, linear camera RGB; 1 is saturation.
 
     Raises
     ------
@@ -204,7 +205,7 @@ def draw_batch(
     if not tables[0].flags.c_contiguous:
         tables = np.ascontiguousarray(tables)
     last_samples = readable(tables[-1])
-    # Most batches contain a picture more than once; each is checked once.
+    # A batch often contains a picture several times; it is checked once.
     distinct = {id(picture): picture for picture in pictures}
     for picture in distinct.values():
         check_picture(picture)
@@ -251,10 +252,10 @@ def draw_batch(
 def scales_of(
     gains: npt.NDArray[np.float64], white_level: int, black_counts: npt.ArrayLike | None, stretches: npt.ArrayLike
 ) -> npt.NDArray[np.float32]:
-    """Return (N, 7) float32: factors, summands and limit of each crop, as `vector.planes8` expects them."""
+    """Return (N, 7) float32: factors, summands and limit of each crop, in the order of `vector.planes8`."""
     scales = np.empty((len(gains), SCALES), np.float32)
     if black_counts is None:
-        # Adding -0 changes no number, and keeps the sign of 0.
+        # -0.0 is added because it changes no number, not even the sign of 0.
         scales[:, :3], scales[:, 3:6], scales[:, 6] = (gains / white_level)[:, None], -0.0, 1.0
         return scales
     blacks = np.broadcast_to(np.asarray(black_counts, np.float64), (len(gains), 3))

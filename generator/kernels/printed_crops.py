@@ -1,4 +1,4 @@
-"""Draw training crops by colour, each with its own window, scale and mirroring; `printing.py` has the formula."""
+"""Draw training crops rendered by colour: windows as float32 planes; `printing.py` has the formula."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from generator.kernels.printing import (
     PrintedMembers,
     PrintMemory,
     SharedTables,
-    at_least_a_block,
+    padded_to_block,
     print_segments,
 )
 
@@ -38,7 +38,8 @@ def _print_crops(
     pitches: Any,
     scales: int,
 ) -> None:
-    # Columns of `plan` (N, 9) int64: source, pitch, x, y, flip, means, bases, first member and end.
+    # Columns of `plan` (N, 9) int64: address and row pitch of the window, x, y, flip, addresses of means and bases, and
+    # the range (first, end) of the crop in `PrintedMembers`.
     member_samples, roots, owners = members
     for item in range(first, end):
         source, pitch, x, y, flip, means, bases, begin, stop = plan[item]
@@ -77,13 +78,14 @@ def draw_printed_crops(
 ) -> npt.NDArray[np.float32]:
     """Fill `out` (N, 3, height, width) float32 with N crops rendered by colour, 1 = saturation; return it.
 
-    `lights`, `pictures` and `windows` (N, 4: x, y, width, height, inside the picture) have one entry per crop. `scales`
-    (N, 7) float32 is from `planar.scales_of`. An InputError is raised if `out` has another shape or type.
+    `lights`, `pictures` and `windows` (N, 4) have one entry per crop. A window is x, y, width and height inside the
+    picture; all have the same size. `scales` (N, 7) float32 is from `planar.scales_of`. An InputError is raised if
+    `out` has another shape or type.
     """
     width, height = windows[0, 2:].tolist()
     check_out(out, (len(pictures), 3, height, width), np.float32)
     count = len(pictures)
-    # Each illuminant is prepared once, because most batches contain some of them more than once.
+    # A batch often contains an illuminant several times; it is prepared once.
     distinct_lights = {id(light): light for light in lights}
     members, shared = PrintedMembers(samples, list(distinct_lights.values())), SharedTables(samples, cells)
     light_columns = {
@@ -91,7 +93,7 @@ def draw_printed_crops(
         for (identity, light), ends in zip(distinct_lights.items(), pairwise(members.starts.tolist()), strict=True)
     }
     sources = [
-        at_least_a_block(picture[y : y + height, x : x + width])
+        padded_to_block(picture[y : y + height, x : x + width])
         for picture, (x, y) in zip(pictures, windows[:, :2].tolist(), strict=True)
     ]
     plan = np.empty((count, 9), np.int64)

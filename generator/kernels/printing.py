@@ -1,23 +1,23 @@
-"""Convert source codes to linear camera RGB by colour: interpolated mean of the print plus recorded noise.
+"""Draw images by colour: each pixel is the interpolated mean of the print plus recorded noise.
 
-The print under an illuminant is described at nodes: 17 codes per channel, 0, 16 … 240, 255. Each node has m, the
-counts that the camera records where the chart shows the colour of the node, and the nearest patch to that position
-(`generator.rendering.colorimetric`). The rule is part of the data set format. A pixel with codes v at (x, y) becomes ::
+The print under an illuminant is described at nodes. A node is a colour with one of 17 codes in each channel: 0, 16 …
+240, 255. Each node has the counts m that the camera records of this colour on the chart, and a nearest patch
+(`generator.rendering.colorimetric`). The rule is part of the data set format. A pixel with codes v becomes ::
 
     m(v) + k σ(v) (x - b)
 
-- m(v) is interpolated between the four nodes of a tetrahedron around v (J. M. Kasson et al., "Performing color space
-  conversions with three-dimensional linear interpolation", Journal of Electronic Imaging 4, 1995). The position of v
-  between nodes is linear in light: (lin v - lin v₀) / (lin v₁ - lin v₀), where lin decodes sRGB. Greys are
-  interpolated between greys only.
-- x is a sample of the patch of the nearest node (the higher code if two are equally near), chosen as in
-  `kernels/choice.py`. b is the mean of these samples, so x - b is a recorded deviation.
-- k σ scales deviations to the noise of the LUT at m(v). σ is the total noise of the three channels by the
-  photon-transfer curve, interpolated like m. k is, for each channel, the noise at the node divided by the noise of the
-  25 samples of the patch and by σ.
+- m(v) is interpolated between four nodes, the corners of a tetrahedron around v (J. M. Kasson et al., "Performing color
+  space conversions with three-dimensional linear interpolation", Journal of Electronic Imaging 4, 1995). Codes are
+  decoded first: v lies at (lin v - lin v₀) / (lin v₁ - lin v₀) between nodes v₀ and v₁, where lin decodes sRGB. Greys
+  are interpolated between greys only.
+- x is a sample of the patch of the nearest node, chosen as in `kernels/choice.py`. If two nodes are equally near, the
+  one with the higher code is used. b is the mean of all samples of the patch, so x - b is a recorded deviation.
+- k σ(v) scales the deviation to the noise of the LUT at m(v). σ is the total noise of the three channels by the
+  photon-transfer curve, interpolated like m. k is a factor of the node for each channel: the noise at the node, divided
+  by the noise of the 25 samples of the patch and by σ of the node.
 
-If several illuminants are mixed, each has its own samples, drawn independently (stream i of `choice.row_keys` for the
-i-th). Deviations are weighted with the root of the weight, as in `kernels/mixing.py`.
+If several illuminants are mixed, each has its own samples, chosen independently (stream i of `choice.row_keys` for the
+i-th). Each deviation is multiplied by the square root of the weight, as in `kernels/mixing.py`.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ NODES: Final = SIDE**3  # Nodes of all colours
 
 NODE_CODES: Final = (*range(0, 256, 16), 255)  # sRGB codes of the nodes of a channel
 
-# Distances between the indices of neighbouring nodes in each channel, and in all three.
+# Differences between the indices of nodes that are neighbours in one channel, and in all three.
 _RED, _GREEN, _BLUE = np.int32(SIDE * SIDE), np.int32(SIDE), np.int32(1)
 _ALL = np.int32(SIDE * SIDE + SIDE + 1)
 _HALF = np.int32(8)  # Half the distance between nodes, codes
@@ -87,11 +87,11 @@ _HALF = np.int32(8)  # Half the distance between nodes, codes
 
 @dataclass(frozen=True, eq=False)
 class PrintedLight:
-    """The print under one illuminant, for compiled code.
+    """The print under one illuminant, which may be a mixture of C illuminants of the LUT; for compiled code.
 
-    - `means`: (4913, 4) float32: m in red, green and blue, counts; and the noise σ.
-    - `bases`: (C, 4913, 2, 4) float32 for each of the C illuminants of the LUT that it consists of: b in red, green and
-      blue, counts, and k; the fourth value of each is 0.
+    - `means`: (4913, 4) float32: m in red, green and blue, and σ; counts.
+    - `bases`: (C, 4913, 2, 4) float32: for each illuminant of the LUT, b in red, green and blue, counts, and k. The
+      fourth value of b and k is 0.
     - `lights`: (C,) int64, indices of these illuminants.
     - `roots`: (C,) float32, square roots of their weights.
 
@@ -106,7 +106,7 @@ class PrintedLight:
 
 @lru_cache(maxsize=1)
 def _node_fractions() -> npt.NDArray[np.float32]:
-    # Position of each code between the node below it and the next, 0 … 1, linear in light.
+    # Position of each code between its lower and its upper node, 0 … 1, linear in light.
     codes = np.arange(256)
     low = np.minimum(codes // 16, SIDE - 2)
     linear, nodes = decode_srgb(codes / 255), decode_srgb(np.array(NODE_CODES) / 255)
@@ -133,11 +133,11 @@ def count_by_node(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
 def means_at(
     samples: Any, corners: Any, weights: Any, nearest: Any, cells: Any, means: Any, bases: Any, spreads: Any
 ) -> None:
-    """Write the mean counts of nodes under an illuminant.
+    """Calculate the mean counts of nodes under an illuminant.
 
-    `samples` (N, S, 3) uint16; `cells` (U,) the patches that nodes need; `corners` (K, 8) and `nearest` (K,) positions
-    in `cells`; `weights` (K, 8). `means`, `bases` and `spreads` (K, 3) float64 are filled; the last two with the mean
-    and variance of the samples of the nearest patch.
+    `samples` (N, S, 3) uint16; `cells` (U,) are the patches that the K nodes use. `corners` (K, 8) and `nearest` (K,)
+    are positions in `cells`, and `weights` (K, 8) are the weights of the corners. Three arrays (K, 3) float64 are
+    filled: `means` of the nodes, and mean (`bases`) and variance (`spreads`) of the samples of the nearest patch.
     """
     count = samples.shape[1]
     cell_means = np.empty((len(cells), 3))
@@ -161,23 +161,23 @@ def means_at(
 
 
 _FOUR: Final = ir.VectorType(F32, 4)
-PRINTED_BLOCK: Final = LANES  # Pixels planned and interpolated at a time
-# Rows of 16 numbers in the plan of a block: byte offsets of three nodes, weights of four nodes, offset of the nearest
-# node. The fourth node is one step farther than the first in each channel.
+PRINTED_BLOCK: Final = LANES  # Pixels of a block, which are planned and interpolated together
+# The plan of a block has eight rows of 16 numbers, one per pixel: byte offsets of three nodes, weights of four nodes,
+# and the offset of the nearest node. The fourth node needs no row: it is the next one after the first in all channels.
 _PLAN_ROWS: Final = 8
-_ROW: Final = 4 * PRINTED_BLOCK  # Bytes of a row: one 32-bit number per pixel
+_ROW: Final = 4 * PRINTED_BLOCK  # Bytes of a row of the plan: one 32-bit number per pixel
 _PLAN_BYTES: Final = _ROW * _PLAN_ROWS
 _LINE_BYTES: Final = 16 * PRINTED_BLOCK  # Bytes of the pixels of a block: red, green, blue and noise, float32
-# Blocks of a row that are planned, and their samples prefetched, while the previous blocks are interpolated.
+# Blocks per segment. A segment is planned, and its samples are prefetched, before the previous segment is interpolated.
 _SEGMENT: Final = 8
-_ROWS_AHEAD: Final = 2  # Rows by which the picture is prefetched before it is planned
-# Largest number of groups of 32 pixels, whose samples are chosen together, in a segment.
+_ROWS_AHEAD: Final = 2  # The picture is prefetched this many rows before it is planned
+# Largest number of groups (32 pixels whose samples are chosen together) that overlap a segment.
 _SEGMENT_GROUPS: Final = _SEGMENT * PRINTED_BLOCK // GROUP + 2
 
 
 @step(ADDRESS, ADDRESS, ADDRESS)
 def plan_block(builder: Builder, picture: Value, fractions: Value, target: Value) -> None:
-    """Write the plan of the 16 pixels at `picture`; 48 bytes of it are read, and 256 float32 at `fractions`."""
+    """Write the plan of a block to `target`; 48 bytes at `picture` and 256 float32 at `fractions` are read."""
 
     def filled(value: int) -> Value:
         return constant(WORDS, value)
@@ -234,10 +234,10 @@ def plan_block(builder: Builder, picture: Value, fractions: Value, target: Value
 
 @step(*[ADDRESS] * 5)
 def place_samples(builder: Builder, plan: Value, cells: Value, choices: Value, samples: Value, target: Value) -> None:
-    """Write the byte offsets (uint32) in `samples` of the samples of a block, and prefetch them.
+    """Write the byte offsets (uint32) of the chosen samples of a block to `target`, and prefetch the samples.
 
-    `cells` is the address of one uint32 per node, the offset of its samples. The uint32 at `choices` are added per
-    pixel.
+    `cells` is the address of one uint32 per node, the offset of its first sample in `samples`. `choices` is the address
+    of one uint32 per pixel, which is added to that offset.
     """
     for pixel in range(PRINTED_BLOCK):
         nearest_offset = load(builder, plan, _ROW * 7 + 4 * pixel, I32)
@@ -265,7 +265,7 @@ def _repeated_four_times(builder: Builder, address: Value, position: int) -> Val
 
 
 def _interpolated(builder: Builder, plan: Value, means: Value, first_pixel: int) -> Value:
-    # Means of four pixels, four numbers each, interpolated between the four nodes of each.
+    # Returns red, green, blue and noise of four pixels, each interpolated between the four nodes of the pixel.
     total: Value = None
     corners = [_load_offsets(builder, plan, _ROW * row + 4 * first_pixel) for row in range(3)]
     for corner, offsets in enumerate((*corners, corners[0])):
@@ -299,10 +299,10 @@ def draw_block(
     means: Value,
     line: Value,
 ) -> None:
-    """Write the pixels of a block, four float32 each: `means` interpolated between the nodes, plus deviations.
+    """Write the pixels of a block to `line`, four float32 each: interpolated means plus deviations.
 
-    A deviation is the sample minus the mean of its patch, from `bases`. It is multiplied by the float32 of the pixel at
-    `factors`, by its noise, and by the scale that follows the mean in `bases`. The scale of the fourth value is 0.
+    A deviation is (sample − b) · k · σ · factor; `factors` is the address of one float32 per pixel. For the fourth
+    number, k is 0.
     """
     for first_pixel in range(0, PRINTED_BLOCK, 4):
         values = _interpolated(builder, plan, means, first_pixel)
@@ -314,7 +314,7 @@ def draw_block(
 def add_deviations(
     builder: Builder, plan: Value, bases: Value, samples: Value, sample_offsets: Value, factors: Value, line: Value
 ) -> None:
-    """Add the deviations of the samples of another illuminant to the pixels at `line`, as `draw_block` does."""
+    """Add the deviations of another illuminant of the LUT to the pixels at `line`, as `draw_block` does."""
     for first_pixel in range(0, PRINTED_BLOCK, 4):
         values = load(builder, line, 16 * first_pixel, FLOATS)
         values = _with_deviations(builder, values, first_pixel, (plan, bases, samples, sample_offsets, factors))
@@ -339,19 +339,19 @@ def _write_planes(builder: Builder, line: Value, scales: Value, targets: Sequenc
 
 @step(*[ADDRESS] * 5)
 def write_planes(builder: Builder, line: Value, scales: Value, red: Value, green: Value, blue: Value) -> None:
-    """Write a block as float32 to three planes; `scales` are as for `vector.planes8`."""
+    """Write a block as float32 to three planes; `scales` is the same as for `vector.planes8`."""
     _write_planes(builder, line, scales, (red, green, blue), mirrored=False)
 
 
 @step(*[ADDRESS] * 5)
 def write_mirrored(builder: Builder, line: Value, scales: Value, red: Value, green: Value, blue: Value) -> None:
-    """Write a block like `write_planes`, from right to left."""
+    """Write a block as `write_planes` does, but mirrored."""
     _write_planes(builder, line, scales, (red, green, blue), mirrored=True)
 
 
 @step(ADDRESS, "float32", ADDRESS)
 def write_pixels(builder: Builder, line: Value, upper_limit: Value, target: Value) -> None:
-    """Write a block as uint16 RGB pixels, rounded and clipped to 0 … `upper_limit`; 96 bytes."""
+    """Write a block as uint16 RGB pixels (96 bytes), rounded and clipped to 0 … `upper_limit`."""
     zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
     limit, shorts = broadcast(builder, upper_limit, FLOATS), ir.VectorType(I16, LANES)
     rounded: list[Value] = []
@@ -453,7 +453,8 @@ def print_segments(
 ) -> None:
     """Fill an image (height, width, 3) uint16, or a crop (3, height, width) float32 if `scales` is not 0.
 
-    The pixel at address `source` is at x0, y0; the width is at least 16. `shares`: (height, width, M) if `masked`.
+    `frame` is (x0, y0, width, height): the pixel at address `source` is (x0, y0), and the width is at least 16. If
+    `masked`, `shares` (height, width, M) are the weights of M illuminants.
     """
     x0, y0, width, height = frame
     plans, sample_offsets, choices, line, factors, lines = memory
@@ -510,7 +511,7 @@ def print_segments(
 
 
 class PrintMemory:
-    """Scratch memory of compiled code: plans of two segments, offsets and choices of samples, lines of pixels."""
+    """Scratch memory of `print_segments`: plans, choices and offsets of samples, and pixels."""
 
     def __init__(self, components: int) -> None:
         sizes = {
@@ -534,10 +535,12 @@ class PrintMemory:
 
 
 class PrintedMembers:
-    """Illuminants of the LUT whose mixtures are the illuminants of an image or batch, for compiled code.
+    """Members of all illuminants of an image or batch, for compiled code.
 
-    The addresses are valid as long as this object exists. `starts`: (M + 1,) int64, first member of each illuminant,
-    and the end.
+    Each of the M illuminants is a mixture. Its members are the illuminants of the LUT in this mixture. `arrays` holds
+    the address of the samples of each member, the square root of its weight, and the index of its illuminant. `starts`
+    (M + 1,) int64 is the first member of each illuminant, and the end. The addresses are valid as long as this object
+    exists.
     """
 
     def __init__(self, samples: npt.NDArray[np.uint16], lights: Sequence[PrintedLight]) -> None:
@@ -553,18 +556,18 @@ class PrintedMembers:
         self.largest_size = max(sizes)
 
 
-_ZEROS: Final = np.zeros(GROUP, np.uint32)  # Colour offsets for `choose_for_colours`: choices alone
+_ZEROS: Final = np.zeros(GROUP, np.uint32)  # With these colour offsets, `choose_for_colours` writes only the choices
 
 
 class SharedTables:
-    """Addresses of arrays for all illuminants: sample offsets of nodes, node fractions of codes, and zeros."""
+    """Addresses of arrays for all illuminants: offset of each node's samples, `_node_fractions`, and zeros."""
 
     def __init__(self, samples: npt.NDArray[np.uint16], cells: npt.NDArray[np.uint32]) -> None:
         self._kept = (cells * (SAMPLE_BYTES * samples.shape[2])).astype(np.uint32), _node_fractions(), _ZEROS
         self.addresses = tuple(array.ctypes.data for array in self._kept)
 
 
-def at_least_a_block(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+def padded_to_block(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """Return a picture (H, W, 3) with contiguous rows, padded with black to the width of a block."""
     missing = PRINTED_BLOCK - picture.shape[1]
     return packed_rows(picture) if missing <= 0 else np.pad(picture, ((0, 0), (0, missing), (0, 0)))
@@ -584,12 +587,12 @@ def draw_printed(
     threads: int = 1,
     out: npt.NDArray[np.uint16] | None = None,
 ) -> npt.NDArray[np.uint16]:
-    """Return the raw linear image (H, W, 3) uint16 of `picture` by colour; the module docstring has the rule.
+    """Draw the raw linear image (H, W, 3) uint16 of `picture` by colour; the module docstring has the rule.
 
     `samples`: (L, 8**bits, S, 3) uint16, of all illuminants of the LUT. `picture`: (H, W, 3) uint8, sRGB codes.
     `lights`: M illuminants. `shares`: (H, W, M) float32, weight of each illuminant in each pixel; None for one
-    illuminant. `cells`: (4913,) uint32, patch whose samples each node has. `white_level`: saturation level, counts.
-    `seed`, `image`, `first_row`, `threads` and `out`: as for `rendering.draw_samples`.
+    illuminant. `cells`: (4913,) uint32, nearest patch of each node. `white_level`: saturation level, counts. `seed`,
+    `image`, `first_row`, `threads` and `out`: as for `rendering.draw_samples`.
     """
     check_picture(picture)
     target = check_out(out, picture.shape, np.uint16)
@@ -601,7 +604,7 @@ def draw_printed(
         for name in ("means", "bases")
     )
     share_array = np.zeros((1, 1, 1), np.float32) if shares is None else shares
-    source = at_least_a_block(picture)
+    source = padded_to_block(picture)
     if is_mixed and width < PRINTED_BLOCK:
         share_array = np.pad(share_array, ((0, 0), (0, PRINTED_BLOCK - width), (0, 0)))
     work = writable(target) if width >= PRINTED_BLOCK else np.empty(source.shape, np.uint16)

@@ -1,11 +1,11 @@
-"""Convert source codes to linear camera RGB: each pixel becomes one sample of its colour (paper, section 3.4).
+"""Draw generated images by codes: each pixel becomes one sample of its colour (paper, section 3.4).
 
-With n bits per channel of the look-up table (LUT; 5 in the paper), a pixel R, G, B at (x, y) becomes ::
+The look-up table (LUT) has n bits per channel (5 in the paper). A pixel R, G, B at (x, y) becomes ::
 
     samples[((R >> (8 - n)) << 2n) | ((G >> (8 - n)) << n) | (B >> (8 - n)), choice(seed, image, x, y)]
 
-`kernels/choice.py` defines the choice. This module makes whole images, `kernels/planar.py` makes training crops, and
-`kernels/mixing.py` mixes several illuminants.
+`kernels/choice.py` defines the choice. This module draws whole images, `kernels/planar.py` training crops, and
+`kernels/mixing.py` images under several illuminants.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 def choose_first_groups(
     row: int, width: int, keys: Any, count: Any, bits: Any, scratch: int, begin: int, limit: int
 ) -> None:
-    """Choose the offsets of the first `LEAD` groups from `begin`, which `draw_groups` expects in scratch memory."""
+    """Choose the offsets of the first `LEAD` groups from `begin`; `draw_groups` reads them from scratch memory."""
     for group in range(begin, min(begin + LEAD, limit)):
         choose_group(row, width, group, keys, count, bits, scratch, offsets_slot(scratch, group))
 
@@ -82,11 +82,11 @@ def draw_groups(
     lines_per_group: int,
     base: int,
 ) -> None:
-    """Write the samples of groups `begin` … `end` − 1 of a row; `base` is the target address of its first pixel.
+    """Write the samples of groups `begin` … `end` − 1 of a row; `base` is the target address of the row's first pixel.
 
-    Offsets are chosen `LEAD` groups before their samples are fetched, up to group `limit` − 1. With each group,
-    `lines_per_group` more cache lines are prefetched, starting at address `prefetch_from`. Two bytes after the last
-    pixel are overwritten unless it is the last of the row.
+    Offsets are chosen `LEAD` groups before their samples are read, for groups up to `limit` − 1. With each group,
+    `lines_per_group` cache lines that are needed later are prefetched, starting at `prefetch_from`. The two bytes after
+    the last pixel are overwritten, except at the end of the row.
     """
     group, whole_groups = begin, min(limit, width // GROUP)
     while group < end:
@@ -97,7 +97,7 @@ def draw_groups(
             choose(source, word, keys[0], keys[1], keys[2], count, bits, offsets_slot(scratch, group + LEAD))
             _copy_group(samples, offsets_slot(scratch, group), base + SAMPLE_BYTES * GROUP * group)
             group += 1
-        # The last groups have fewer pixels, or all offsets are chosen already.
+        # Near the end of the row, a group is incomplete, or all offsets are already chosen.
         if group < end:
             _prefetch_lines(prefetch_from, lines_per_group, group - begin)
             if group + LEAD < limit:
@@ -125,10 +125,11 @@ def _copy_group(samples: int, offsets: int, target: int) -> None:
         copy8(samples + offset_at(offsets + 4 * i), target + SAMPLE_BYTES * i)
 
 
-# Number of pixels from which copying all samples of an illuminant (5 MB) is faster than reading pages in random order.
+# From this number of pixels, copying all samples of an illuminant (5 MB) to memory is faster than reading pages from
+# disk in random order.
 WHOLE_LIGHT_PIXELS: Final = 1 << 20
 
-# Groups of pixels that are buffered before they are streamed: 3 KiB, which fit into the first-level cache.
+# Groups of a segment, which is buffered before it is streamed: 3 KiB, which fit into the first-level cache.
 _SEGMENT_GROUPS: Final = 16
 
 
@@ -149,8 +150,8 @@ def _gather(
     streamed: bool,
     scratch: int,
 ) -> None:
-    # Picture, samples, target and scratch are addresses; pitches are bytes from row to row. The caches are left to the
-    # samples: the picture is prefetched for one use, and a `streamed` image is written past the caches line by line.
+    # Picture, samples, target and scratch are addresses; pitches are bytes from row to row. The caches are reserved for
+    # the samples. The picture is prefetched for one use only, and a `streamed` image is written past the caches.
     groups = (width + GROUP - 1) // GROUP
     lines = first_line(scratch + SCRATCH_BYTES)
     for y in range(rows):
@@ -196,7 +197,8 @@ def draw_samples(
     image
         Number of the image in its data set, 0 … 2³² − 1.
     first_row
-        Row of the whole picture at which `picture` begins. Bands of a picture give the same pixels as the whole.
+        Row of the whole picture at which `picture` begins, if it is a band of a larger picture. Bands give the same
+        pixels as the whole picture.
     threads
         Number of threads that share the rows. The result does not depend on it.
     out
@@ -249,7 +251,7 @@ def draw_samples(
             scratch.ctypes.data,
         )
 
-    # Not numba's own threads: two Python threads cannot enter their pool at once, and it does not survive a fork.
+    # numba's own threads are not used: two Python threads cannot use them at once, and they do not survive a fork.
     run_in_threads(fill, len(picture), threads)
     return copied_back(work, target)
 
@@ -270,7 +272,7 @@ def valid_light(lut: Lut, light: int) -> int:
 def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.NDArray[np.uint16]:
     """Return the samples (8**bits, S, 3) uint16 of illuminant `light`.
 
-    They are copied to memory for a picture of `WHOLE_LIGHT_PIXELS` or more, else they stay on disk until they are used.
+    For pictures of `WHOLE_LIGHT_PIXELS` or more they are copied to memory; otherwise they are read from disk when used.
     """
     mapped = lut.light_samples(valid_light(lut, light))
     return np.array(mapped) if pixels >= WHOLE_LIGHT_PIXELS else mapped

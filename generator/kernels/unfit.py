@@ -1,7 +1,7 @@
-"""Replace colours that are unfit for use by the nearest fit colour, and count the replaced pixels.
+"""Replace unfit colours of a picture by the nearest fit colours, and count the replaced pixels.
 
-A look-up table (LUT) lists the patches whose samples must not be used. The number of pixels with such colours is
-printed and recorded with the data set.
+A colour is unfit if the look-up table (LUT) excludes its patch from use. The number of replaced pixels is printed and
+recorded with the data set.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool
 
 @compiled
 def _mark_colours(pixels: int, count: int, bits: Any, is_present: int, scratch: int) -> None:
-    # Copies the last byte of scratch memory, a 1, to the byte of each colour that occurs.
+    # For each colour that occurs, copies the last byte of scratch memory, a 1, to `is_present`.
     indices, unused = scratch + EDGE_BYTES, scratch + EDGE_BYTES + OFFSETS_BYTES
     one_byte = unused + OFFSETS_BYTES
     for group in range((count + GROUP - 1) // GROUP):

@@ -1,12 +1,11 @@
 """Kernel steps written as LLVM code: vectors of 16 numbers of 32 bits, and loads and stores by address.
 
-numba does not vectorise pixel loops that shuffle bytes, and cannot load eight bytes from any address. These functions
-can be called from compiled functions only. LLVM maps the vectors to the processor: one of AVX-512, two of AVX2 or four
-of NEON. Shuffles stay within 16 bytes, which all of these can do.
+numba does not vectorise pixel loops that shuffle bytes, and cannot load eight bytes from an arbitrary address. The
+steps of this module do both; only compiled functions can call them. LLVM maps a vector to the registers of the
+processor: one of AVX-512, two of AVX2 or four of NEON. Bytes are shuffled within 16 bytes, which all of these can do.
 
-Addresses are plain integers; the caller must keep them inside arrays. Each docstring lists bytes that are read or
-written beyond. First come general steps, then steps that write large images past the caches, so that the samples stay
-in them, then the steps of `mixing.py`. The choice of samples and prefetching are in `choice.py`.
+Addresses are plain integers, and the caller must ensure that they are valid. Docstrings report bytes that are read or
+written in addition to the result. Large images are streamed: written past the caches, which then keep the samples.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from llvmlite import ir
 from foundation.compiled import inlined, intrinsic
 
 LANES: Final = 16  # 32-bit numbers per vector: one register of AVX-512
-GROUP: Final = 2 * LANES  # Pixels whose samples are chosen by one vector of words, two by each word
-EIGHT: Final = 8  # Pixels written to float32 planes at a time: one register of AVX2 per channel
+GROUP: Final = 2 * LANES  # Pixels of a group: one vector of random words chooses their samples, two by each word
+EIGHT: Final = 8  # Pixels that are written to float32 planes together: one register of AVX2 per channel
 SAMPLE_BYTES: Final = 6  # Bytes of a sample: red, green and blue, uint16 each
 LINE: Final = 64  # Bytes of a cache line on x86-64 and on most arm64 processors
 
@@ -39,7 +38,7 @@ Value = Any
 
 
 def constant(ir_type: Any, numbers: int | Sequence[int]) -> Value:
-    """Return a constant vector: one number in every lane, or one number per lane."""
+    """Return a constant vector with one number in all lanes, or one number per lane."""
     return ir.Constant(ir_type, [numbers] * ir_type.count if isinstance(numbers, int) else list(numbers))
 
 
@@ -90,18 +89,18 @@ def pixel_codes(builder: Builder, picture: Value) -> Value:
     return builder.bitcast(builder.shuffle_vector(loaded, zeros, mask), WORDS)
 
 
-def signature(returned: str, *kinds: str) -> Any:
-    """Return numba's type of a function from the names of its return type and argument types."""
+def signature(returned: str, *type_names: str) -> Any:
+    """Return numba's function type, from the names of the return type and the argument types."""
     from numba import types
 
     numba_types: Any = types
-    return getattr(numba_types, returned)(*(getattr(numba_types, ir_type) for ir_type in kinds))
+    return getattr(numba_types, returned)(*(getattr(numba_types, ir_type) for ir_type in type_names))
 
 
-def step(*kinds: str, returned: str = "void") -> Callable[[Callable[..., Any]], Any]:
+def step(*type_names: str, returned: str = "void") -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that turns an emitter of LLVM code into a function callable from compiled functions.
 
-    The emitter takes a builder and one value for each of `kinds` (numba type names), and returns the result of the
+    The emitter takes a builder and one value for each of `type_names` (numba type names), and returns the result of the
     step.
     """
 
@@ -114,7 +113,7 @@ def step(*kinds: str, returned: str = "void") -> Callable[[Callable[..., Any]], 
         @wraps(emit)
         def typed(typing: Any, *arguments: Any) -> Any:
             del typing, arguments
-            return signature(returned, *kinds), generate
+            return signature(returned, *type_names), generate
 
         return intrinsic(typed)
 
@@ -173,7 +172,7 @@ def copy1(builder: Builder, source: Value, target: Value) -> None:
 
 
 def _channels(builder: Builder, samples: Value, offsets: Value, step: int) -> list[Value]:
-    # Red, green and blue, eight float32 each, of the samples whose offsets are `step` bytes apart.
+    # Returns red, green and blue of eight samples, eight float32 each; the offsets are `step` bytes apart.
     pairs = [
         [
             load(
@@ -187,7 +186,8 @@ def _channels(builder: Builder, samples: Value, offsets: Value, step: int) -> li
         for couple in ((0, 1), (4, 5), (2, 3), (6, 7))
     ]
     fours = [builder.shuffle_vector(*pair, constant(ir.VectorType(I32, 4), range(4))) for pair in pairs]
-    # Pixels 0, 1, 4, 5 and 2, 3, 6, 7, 32 bits of red and green, 32 of blue and what follows.
+    # The two halves are pixels 0, 1, 4, 5 and 2, 3, 6, 7. A pixel has 32 bits of red and green, then 16 of blue and 16
+    # that are unused.
     halves = [builder.shuffle_vector(*fours[i : i + 2], constant(_EIGHT_WORDS, range(EIGHT))) for i in (0, 2)]
     front = builder.shuffle_vector(*halves, constant(_EIGHT_WORDS, (0, 2, 8, 10, 4, 6, 12, 14)))
     back = builder.shuffle_vector(*halves, constant(_EIGHT_WORDS, (1, 3, 9, 11, 5, 7, 13, 15)))
@@ -202,11 +202,11 @@ def minimum(builder: Builder, first: Value, second: Value) -> Value:
 
 
 def _write_planes8(
-    builder: Builder, samples: Value, offsets: Value, stride: int, line: Value, targets: Sequence[Value]
+    builder: Builder, samples: Value, offsets: Value, stride: int, scales: Value, targets: Sequence[Value]
 ) -> None:
 
     def broadcast_value(index: int) -> Value:
-        return broadcast(builder, load(builder, line, 4 * index, F32), _EIGHT_FLOATS)
+        return broadcast(builder, load(builder, scales, 4 * index, F32), _EIGHT_FLOATS)
 
     for index, (channel, target) in enumerate(zip(_channels(builder, samples, offsets, stride), targets, strict=True)):
         value = builder.fadd(builder.fmul(channel, broadcast_value(index)), broadcast_value(3 + index))
@@ -215,26 +215,26 @@ def _write_planes8(
 
 @step(*[ADDRESS] * 6)
 def planes8(
-    builder: Builder, samples: Value, offsets: Value, line: Value, red: Value, green: Value, blue: Value
+    builder: Builder, samples: Value, offsets: Value, scales: Value, red: Value, green: Value, blue: Value
 ) -> None:
     """Write eight pixels as float32 to three planes: min(sample · factor + summand, limit).
 
-    `line` is the address of seven float32: factors and summands of red, green and blue, and the limit.
+    `scales` is the address of seven float32: factors and summands of red, green and blue, and the limit.
     """
-    _write_planes8(builder, samples, offsets, 4, line, (red, green, blue))
+    _write_planes8(builder, samples, offsets, 4, scales, (red, green, blue))
 
 
 @step(*[ADDRESS] * 6)
 def planes8_mirrored(
-    builder: Builder, samples: Value, offsets: Value, line: Value, red: Value, green: Value, blue: Value
+    builder: Builder, samples: Value, offsets: Value, scales: Value, red: Value, green: Value, blue: Value
 ) -> None:
-    """Do `planes8` from right to left: `offsets` is the address of the last offset, the first is read last."""
-    _write_planes8(builder, samples, offsets, -4, line, (red, green, blue))
+    """Write eight pixels mirrored, as `planes8` does; `offsets` is the address of the last of eight offsets."""
+    _write_planes8(builder, samples, offsets, -4, scales, (red, green, blue))
 
 
 @step(ADDRESS, "float32", "float32", "float32", ADDRESS)
 def plane1(builder: Builder, source: Value, factor: Value, summand: Value, limit: Value, target: Value) -> None:
-    """Write one channel of one pixel as float32; `planes8` for crops narrower than eight pixels."""
+    """Write one channel of one pixel as `planes8` does, for crops narrower than eight pixels."""
     value = builder.fmul(builder.uitofp(load(builder, source, 0, I16), F32), factor)
     store(builder, minimum(builder, builder.fadd(value, summand), limit), target, 0)
 
@@ -242,11 +242,11 @@ def plane1(builder: Builder, source: Value, factor: Value, summand: Value, limit
 BLOCK: Final = 8  # Pixels mixed at a time: their weights under two illuminants fill a vector of 16
 MEAN_BYTES: Final = 16  # Bytes of the mean of a colour under one illuminant: red, green, blue, padding; float32
 PLAN_ENTRIES: Final = 6  # Addresses per pair of illuminants in the plan of `mix`
-FAULT_BYTES: Final = 4 * LANES  # Bytes of the 16 float32 that become NaN if a weight is faulty
+FAULT_BYTES: Final = 4 * LANES  # Bytes of the 16 fault marks, float32 that become NaN if a weight is invalid
 
 _QUAD: Final = 4  # Numbers per pixel in a vector: red, green, blue and padding
 _SHORTS: Final = ir.VectorType(I16, 2 * LANES)
-# Pairs of the eight pixels that share a vector, so that packing does not cross its quarters.
+# The eight pixels of a block are mixed in these pairs. This order lets `_store_pixels` shuffle within 16 bytes.
 _PIXEL_PAIRS: Final = ((0, 2), (4, 6), (1, 3), (5, 7))
 # Pixel and illuminant of each weight of a block in the order of `arrange_weights`, which follows `_PIXEL_PAIRS`.
 _ORDER: Final = tuple((_PIXEL_PAIRS[lane % _QUAD][lane // (2 * _QUAD)], lane // _QUAD % 2) for lane in range(LANES))
@@ -254,9 +254,9 @@ _ORDER: Final = tuple((_PIXEL_PAIRS[lane % _QUAD][lane // (2 * _QUAD)], lane // 
 
 @step(ADDRESS, "int64", ADDRESS, returned="int64")
 def mean4(builder: Builder, source: Value, count: Value, target: Value) -> Value:
-    """Write the mean of `count` ≥ 1 consecutive samples as four float32, the fourth is padding.
+    """Write the mean of `count` ≥ 1 consecutive samples as four float32; the fourth is padding.
 
-    Returns the largest value of the samples.
+    Returns the largest channel value of the samples.
     """
     from numba.core import cgutils
 
@@ -278,14 +278,14 @@ def mean4(builder: Builder, source: Value, count: Value, target: Value) -> Value
     return largest_channel
 
 
-def _for_each_line(builder: Builder, weights: Value, count: Value, process: Callable[[Value, Value], None]) -> None:
-    # Calls `process` with the weights of each eight pixels under a pair of illuminants, and the index of the block.
+def _for_each_block(builder: Builder, weights: Value, count: Value, process: Callable[[Value, Value], None]) -> None:
+    # Calls `process` for each block of eight pixels, with its weights under two illuminants and its index.
     with _blocks(builder, count) as (block, begin):
         process(load(builder, builder.add(weights, builder.shl(begin, ir.Constant(I64, 3))), 0, WORDS), block)
 
 
 def _any_nonzero(builder: Builder, words: Value) -> Value:
-    # Bit 0: an even lane is not 0; bit 1: an odd lane is not 0.
+    # Sets bit 0 if an even lane is not 0, and bit 1 if an odd lane is not 0.
     flags = ir.Constant(I64, 0)
     for light in range(2):
         lanes = constant(_EIGHT_WORDS, range(light, LANES, 2))
@@ -312,7 +312,7 @@ def weight_flags(builder: Builder, weights: Value, count: Value) -> Value:
         for accumulator, words in zip(accumulators, (line, builder.xor(line, ones)), strict=True):
             builder.store(builder.or_(builder.load(accumulator), words), accumulator)
 
-    _for_each_line(builder, weights, count, accumulate)
+    _for_each_block(builder, weights, count, accumulate)
     nonzero, not_one = (_any_nonzero(builder, builder.load(accumulator)) for accumulator in accumulators)
     return builder.or_(nonzero, builder.shl(not_one, ir.Constant(I64, 2)))
 
@@ -321,7 +321,7 @@ def weight_flags(builder: Builder, weights: Value, count: Value) -> Value:
 def interleave_weights(
     builder: Builder, first: Value, first_step: Value, second: Value, second_step: Value, target: Value
 ) -> None:
-    """Write the weights of eight pixels under two illuminants alternately; steps are in bytes."""
+    """Write the weights of eight pixels under two illuminants alternately. Both steps are in bytes."""
     line = ir.Constant(FLOATS, ir.Undefined)
     for lane in range(LANES):
         weights, stride = ((first, first_step), (second, second_step))[lane % 2]
@@ -332,7 +332,7 @@ def interleave_weights(
 
 @step(ADDRESS, "int64", ADDRESS, returned="int64")
 def arrange_weights(builder: Builder, weights: Value, count: Value, target: Value) -> Value:
-    """Write weights, given as for `weight_flags`, in the order that `mix` expects, 64 bytes for eight pixels.
+    """Write weights, stored as for `weight_flags`, in the order of `mix`: 64 bytes for eight pixels.
 
     Returns bits 0 and 1 of `weight_flags`.
     """
@@ -346,13 +346,13 @@ def arrange_weights(builder: Builder, weights: Value, count: Value, target: Valu
         address = builder.add(target, builder.shl(block, ir.Constant(I64, 6)))
         store(builder, builder.shuffle_vector(line, line, lanes), address, 0)
 
-    _for_each_line(builder, weights, count, write_line)
+    _for_each_block(builder, weights, count, write_line)
     return _any_nonzero(builder, builder.load(accumulator))
 
 
 @contextmanager
 def _blocks(builder: Builder, count: Value) -> Generator[tuple[Value, Value]]:
-    """Loop over `count` ≥ 8 pixels eight by eight; yield the index of each block and its first pixel.
+    """Loop over `count` ≥ 8 pixels in blocks of eight; yield the index and the first pixel of each block.
 
     If `count` is no multiple of eight, the last block overlaps the previous one.
     """
@@ -374,10 +374,10 @@ def _store_pixels(builder: Builder, even_pixels: Value, odd_pixels: Value, targe
         store(builder, builder.shuffle_vector(packed, packed, constant(ir_type, lanes[span])), target, 2 * span.start)
 
 
-def _pair(
+def _mix_pair(
     builder: Builder, addresses: Sequence[Value], block: Value, position: Value, means: Value
 ) -> tuple[list[Value], Value]:
-    # The sum of a pair of illuminants in even and in odd pixels, and a mark of faulty weights.
+    # Returns the sums of two illuminants in the even and in the odd pixels, and the fault marks of the weights.
     weights, *other_addresses = addresses
     offsets, samples, mean_base = other_addresses[:2], other_addresses[2:4], other_addresses[4]
     name = f"llvm.sqrt.v{LANES}f32"
@@ -386,7 +386,7 @@ def _pair(
     weight = load(builder, builder.add(weights, builder.shl(block, ir.Constant(I64, 6))), 0, FLOATS)
     root = builder.call(square_root, [weight])
     remainder = builder.fsub(weight, root)
-    # The mark is 0, or NaN for a faulty weight: the root of a negative number, and 0 times infinity, are NaN.
+    # A fault mark is 0, or NaN for an invalid weight: the root of a negative number and 0 times infinity are NaN.
     fault = builder.fmul(root, ir.Constant(FLOATS, [0.0] * LANES))
     sums: list[Value] = []
     for lane, pixels in enumerate(_PIXEL_PAIRS):
@@ -423,11 +423,12 @@ def _pair(
 def mix(
     builder: Builder, plan: Value, pairs: Value, count: Value, means: Value, faults: Value, white: Value, target: Value
 ) -> None:
-    """Write `count` ≥ 8 pixels under pairs of illuminants as uint16, rounded, 0 … `white`; formula in `mixing.py`.
+    """Write `count` ≥ 8 pixels under pairs of illuminants as uint16, rounded and clipped to 0 … `white`.
 
-    `plan` is the address of `PLAN_ENTRIES` addresses per pair: weights from `arrange_weights`, sample offsets of the
-    first and second illuminant, samples of the first and second illuminant, and means. `means` is the address of the
-    offsets in the means. Some of the 16 float32 at `faults` become NaN if a weight is negative, infinite or NaN.
+    `mixing.py` has the formula. `plan` is the address of `PLAN_ENTRIES` addresses per pair: weights from
+    `arrange_weights`, sample offsets of the first and second illuminant, samples of the first and second illuminant,
+    and means of all colours. `means` is the address of the offset of each pixel's mean. Some of the 16 float32 at
+    `faults` become NaN if a weight is negative, infinite or NaN.
     """
     from numba.core import cgutils
 
@@ -454,34 +455,34 @@ def mix(
                 builder, rounded[0], rounded[1], builder.add(target, builder.mul(begin, number(SAMPLE_BYTES)))
             )
 
-    def of_pair(entries: Sequence[Value], block: Value, position: Value) -> Sequence[Value]:
-        totals, pair_fault = _pair(builder, entries, block, position, means)
+    def mix_pair(entries: Sequence[Value], block: Value, position: Value) -> Sequence[Value]:
+        totals, pair_fault = _mix_pair(builder, entries, block, position, means)
         builder.store(builder.fadd(builder.load(fault), pair_fault), fault)
         return totals
 
-    def of_all(block: Value, position: Value) -> Sequence[Value]:
+    def mix_all_pairs(block: Value, position: Value) -> Sequence[Value]:
         for total in sums:
             builder.store(zero, total)
         with cgutils.for_range(builder, pairs) as loop:
-            for total, value in zip(sums, of_pair(addresses(loop.index), block, position), strict=True):
+            for total, value in zip(sums, mix_pair(addresses(loop.index), block, position), strict=True):
                 builder.store(builder.fadd(builder.load(total), value), total)
         return [builder.load(total) for total in sums]
 
     with builder.if_else(builder.icmp_signed("==", pairs, number(1))) as (single, several):
         with single:
             entries = addresses(number(0))
-            fill(lambda block, position: of_pair(entries, block, position))
+            fill(lambda block, position: mix_pair(entries, block, position))
         with several:
-            fill(of_all)
+            fill(mix_all_pairs)
     store(builder, builder.load(fault), faults, 0)
 
 
-# Bytes from which an image is streamed: size of the last-level cache of a desktop processor.
+# Images of this size or larger are streamed, bytes: the size of the last-level cache of a desktop processor.
 STREAMED_BYTES: Final = 24 << 20
 
 
 def line_buffer_bytes(segment_bytes: int) -> int:
-    """Return the buffer size for a segment that begins anywhere in a cache line, plus one line."""
+    """Return the size of the buffer of a segment, with reserve because it may begin anywhere in a cache line."""
     return segment_bytes + 3 * LINE
 
 
@@ -493,10 +494,11 @@ def first_line(buffer: int) -> int:
 
 @inlined
 def stream_lines(lines: int, begin: int, stop: int, last: bool) -> int:
-    """Stream the buffered `lines` to their target, from the cache line of address `begin` up to `stop`; both are even.
+    """Stream the buffer at `lines` to the target addresses `begin` … `stop` − 1; `begin` and `stop` are even.
 
-    Nothing is written before `begin`. Unless this is the `last` segment of the row, an incomplete last line is kept for
-    the next call. Returns the number of its bytes.
+    The buffer starts with the cache line of `begin`, but bytes before `begin` are not written. Unless this is the
+    `last` segment of the row, an incomplete last line stays in the buffer for the next call. Returns the number of its
+    bytes.
     """
     source, line_target = lines, begin & -LINE
     if begin > line_target:

@@ -1,1 +1,1 @@
-"""Illuminants of images: those of the LUT, mixtures of them, and how they are chosen."""
+"""Illuminants of images: illuminants of the look-up table (LUT) or mixtures of them, and their choice."""

@@ -1,8 +1,8 @@
-"""Choices of illuminants for source pictures, and parsing of illuminants from text.
+"""Choose the illuminants of each source picture, and read illuminants from text.
 
-A choice is a `LightChoice`: its result depends only on the position of the picture in the list of sources and on a
-seed. Illuminants are listed, drawn from the look-up table (LUT) or from a distribution, or they match the ground truths
-of another data set (paper, section 4.3).
+A `LightChoice` returns the illuminants of a picture. They depend only on the position of the picture in the list of
+sources and on a seed. Illuminants are listed by the user, drawn from the look-up table (LUT) or from a distribution, or
+they match the ground truths of another data set (paper, section 4.3).
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from generator.named_numbers import parse_numbers
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-# Chromaticities drawn at once: enough that one of them is in the gamut, unless the gamut is narrow.
+# Chromaticities are drawn in batches of this size. Usually at least one of a batch is in the gamut.
 _BATCH: Final = 32
-# Largest number of batches for one illuminant: 65 536 draws. If the share `_LEAST_WITHIN` of the distribution is in the
-# gamut, all draws are outside with the probability e⁻⁶⁵.
+# Largest number of batches for one illuminant: 65 536 draws. Even for the smallest allowed share in the gamut,
+# `_LEAST_WITHIN`, all draws are outside only with the probability e⁻⁶⁵.
 _BATCHES: Final = 2048
-# Smallest share of a distribution in the gamut; with less, an illuminant would need thousands of draws.
+# Smallest allowed share of a distribution in the gamut. With less, an illuminant would need thousands of draws.
 _LEAST_WITHIN: Final = 1e-3
-# A ground truth is far if its angle to the nearest mixture is larger, in degrees. The limit is above the error of good
-# methods (2 degrees), so the mixture would be a different illuminant.
+# A ground truth is far if its angle to the nearest mixture exceeds this value, in degrees. Errors of good methods are
+# smaller, about 2 degrees.
 _FAR_DEG: Final = 3.0
-# Share of far ground truths above which a file is refused. A few ground truths at the edge of a data set may be far;
-# many mean that the channels are in another order or that the ground truths belong to another camera.
+# A file is refused if a larger share of its ground truths is far. A few unusual illuminants may be far. Many
+# indicate another order of the channels or another camera.
 _MOST_FAR: Final = 0.25
 _MOST_DEG: Final = 10.0  # Largest angle in degrees for a ground truth of the same camera
 
 
 @dataclass(frozen=True)
 class SequentialLights:
-    """The illuminants for a list of ground truths, one after another; the list is repeated if it is too short."""
+    """Illuminants that match a list of ground truths, used in order and repeated if the list is too short."""
 
     method: Literal["nearest", "match"]  # nearest illuminant of the LUT, or a mixture that matches
     matches: tuple[Match, ...]  # for each ground truth
@@ -88,8 +88,8 @@ class SequentialLights:
 class DrawnLights:
     """Illuminants for each picture, drawn from a distribution within the gamut of the LUT.
 
-    Illuminant j of the picture at position p is the first of the draws 0, 1, 2 … in the gamut. Draw i uses the words
-    of `philox` with counter (i, j), number p and purpose 4.
+    Illuminant j of the picture at position p is made from the first of the draws 0, 1, 2 … that is in the gamut. Draw i
+    uses the words of `philox` with counter (i, j, p, 4).
     """
 
     gamut: Gamut
@@ -100,11 +100,11 @@ class DrawnLights:
     def __post_init__(self) -> None:
         if self.lights_each < 1:
             raise InputError(f"illuminants of each picture: {self.lights_each}, expected 1 or more; correct it")
-        within = np.mean([self._batch(trial, 0, 0)[1].mean() for trial in range(128)])
-        if within < _LEAST_WITHIN:
+        inside = np.mean([self._batch(trial, 0, 0)[1].mean() for trial in range(128)])
+        if inside < _LEAST_WITHIN:
             raise InputError(
-                f"{within:.1%} of the distribution is in the gamut of {self.gamut.table}, expected {_LEAST_WITHIN:.1%} "
-                f"or more; choose a distribution nearer to the illuminants, with the mean "
+                f"{inside:.1%} of the distribution is in the gamut of {self.gamut.table}, expected {_LEAST_WITHIN:.1%} "
+                f"or more; choose a distribution nearer to the illuminants, which have the mean "
                 "r={:.3f}, b={:.3f}".format(*self.gamut.rb.mean(axis=0))
             )
 
@@ -118,9 +118,9 @@ class DrawnLights:
 
     def _light(self, position: int, light: int) -> Mixture:
         for batch in range(_BATCHES):
-            drawn, within = self._batch(batch, light, position)
-            if within.any():
-                return self.gamut.match(rgb_of(drawn[int(within.argmax())])).mixture
+            drawn, is_inside = self._batch(batch, light, position)
+            if is_inside.any():
+                return self.gamut.match(rgb_of(drawn[int(is_inside.argmax())])).mixture
         raise InputError(f"{_BATCH * _BATCHES} draws are all outside {self.gamut.table}; choose another distribution")
 
     def _batch(self, batch: int, light: int, position: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
@@ -134,8 +134,8 @@ class DrawnLights:
 class SimultaneousLights:
     """Several illuminants of another choice in each image, combined by masks.
 
-    Image i of a picture gets `together` illuminants of `choice`, from number i · together on. Its masks have the number
-    position · lights_each + i.
+    Image i of a picture gets `together` illuminants of `choice`, from number i · together on. It gets the masks of
+    image number position · lights_each + i.
     """
 
     choice: LightChoice
@@ -215,7 +215,7 @@ def light_numbers(text: str, total: int) -> tuple[int, ...]:
     return tuple(lights)
 
 
-_LEAST_K: Final = 1000  # From this value on, a number is probably a colour temperature in kelvin
+_LEAST_K: Final = 1000  # A number from this value on is probably a colour temperature in kelvin
 
 # White balance settings of cameras in kelvin, from the manuals of EOS cameras.
 _WHITE_BALANCES: Final = {"sunny": 5200, "daylight": 5200, "shade": 7000, "cloudy": 6000, "tungsten": 3200}
@@ -267,7 +267,7 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
 
 
 def light_of(light: int | str | Mixture, lut: Lut) -> Mixture:
-    """Return the mixture of an illuminant given by number, by a text for `parse_light`, or as a mixture."""
+    """Return the mixture for an illuminant: for its number, for a text as in `parse_light`, or the mixture itself."""
     if isinstance(light, str):
         return parse_light(light, lut)
     if isinstance(light, Mixture):
@@ -314,9 +314,9 @@ def matched_lights(
     if len(far) > _MOST_FAR * len(truths) or choice.largest_deg > _MOST_DEG:
         raise InputError(
             f"{len(far)} of the {len(truths)} ground truths of {file} are more than {_FAR_DEG:g} degrees outside the "
-            f"gamut of {gamut.table}, at most {choice.largest_deg:.2f} degrees, the first in line {far[0]}, expected "
-            f"{_MOST_FAR:.0%} or less, and 0 beyond {_MOST_DEG:g} degrees; check that the channels are in the order "
-            "R, G, B and that the file belongs to the camera of the LUT, or use a LUT with a wider gamut"
+            f"gamut of {gamut.table}, by up to {choice.largest_deg:.2f} degrees (first in line {far[0]}), expected "
+            f"at most {_MOST_FAR:.0%} of them, and no angle above {_MOST_DEG:g} degrees; check that the channels are "
+            "in the order R, G, B and that the file belongs to the camera of the LUT, or use a LUT with a wider gamut"
         )
     return choice
 

@@ -1,7 +1,7 @@
 """Distributions of illuminants in the rb-chromaticity plane, and files of ground truths.
 
-A distribution turns random words into chromaticities. The caller repeats draws outside the gamut of the LUT, so that
-every distribution is cut to the gamut and keeps its shape inside.
+A distribution converts random words to chromaticities. The caller repeats a draw that is outside the gamut of the LUT.
+This cuts the distribution to the gamut and keeps its shape inside.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from generator.philox import Words, standard_normal
 _Array = npt.NDArray[np.float64]
 
 
-# Names of the columns of a ground truth in data sets and tables.
+# Column names of ground truths in data sets and tables, in lower case.
 TRIPLES: Final = (
     ("gt_r", "gt_g", "gt_b"),
     ("r", "g", "b"),
@@ -94,7 +94,7 @@ class Uniform:
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
         """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
         r, b = ((word + 0.5) / _WORD for word in words[:2])
-        # Points in the upper half of the square are rotated about its centre into the lower half.
+        # Points with r + b > 1 are rotated into the triangle, about the centre of the square.
         over = r + b > 1
         return np.stack([np.where(over, 1 - r, r), np.where(over, 1 - b, b)], axis=1)
 
@@ -179,7 +179,8 @@ class Fitted:
 # Maps random words to r and b; some results may be outside the triangle of chromaticities.
 Distribution = Uniform | Gaussian | Fitted
 
-# Ranges of the numbers of a Gaussian. With a standard deviation of 0 or a correlation of 1 it would have no density.
+# Allowed ranges of the parameters of a Gaussian. With a standard deviation of 0 or a correlation of 1, it has no
+# density.
 _GAUSSIAN: Final = {
     "r": (0.0, 1.0),
     "b": (0.0, 1.0),

@@ -1,15 +1,16 @@
 """Gamut of a LUT: the mixtures of its illuminants, and the mixture for a given chromaticity.
 
-An illuminant is a direction in linear camera RGB. Mixtures of several illuminants form a cone. In the chromaticity
-plane of r = R / (R + G + B) and b = B / (R + G + B), the cone is their convex hull. Three illuminants suffice for any
-point (Carathéodory). `Gamut.match` selects, in this order:
+An illuminant is a direction in linear camera RGB. The mixtures of several illuminants form a cone. In the chromaticity
+plane of r = R / (R + G + B) and b = B / (R + G + B), this cone is the convex hull of the illuminants. Three illuminants
+suffice for any point in it (Carathéodory). `Gamut.match` selects, in this order:
 
 1. one illuminant, if it is within `TOLERANCE_DEG` of the target;
-2. two neighbours, if a mixture of them is that near; of several pairs the closest;
+2. two neighbours, if a mixture of them is within this angle; of several pairs the two that are nearest to each other;
 3. the three neighbours around the target, which match exactly.
 
 Neighbours are defined by the Delaunay triangulation of the rb-chromaticities. Near illuminants have similar spectra, so
-that colours other than white also look as under a real illuminant. A mixture of far illuminants would be a metamer.
+their mixture renders all colours like a real illuminant. A mixture of distant illuminants would match only white, as a
+metamer.
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ from generator.lights.lighting import Mixture, mixture_of
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-# Angle to the target in degrees within which one or two illuminants are used instead of three: about the error of a
-# LUT.
+# One or two illuminants are used instead of three if they come within this angle of the target, in degrees. It is about
+# the error of a LUT.
 TOLERANCE_DEG: Final = 0.01
 
 # Treatment of a target outside the gamut: refuse it, or use the nearest mixture.
 OutsideGamut = Literal["refuse", "nearest"]
 
 _Array = npt.NDArray[np.float64]
-# Ratio of the singular values of the chromaticities below which illuminants are on a line: far above rounding errors
-# and far below the value for three illuminants of a projector.
+# Illuminants are on a line if the singular values of their chromaticities have a ratio below this limit. It is far
+# above rounding errors and far below the ratio for three illuminants of a projector.
 _THIN: Final = 1e-6
 
 
@@ -69,7 +70,7 @@ class Gamut:
 
     @cached_property
     def directions(self) -> _Array:
-        """(L, 3) float64, the ground truths, of length 1."""
+        """(L, 3) float64, the ground truths scaled to length 1."""
         return _unit(self.white)
 
     @cached_property
@@ -77,15 +78,15 @@ class Gamut:
         """(T, 3) int64, illuminants at the corners of the Delaunay triangles; T is 0 if all are on a line."""
         from scipy.spatial import Delaunay
 
-        if self._along is not None:
+        if self._order_on_line is not None:
             return np.zeros((0, 3), np.int64)
         return np.sort(np.asarray(Delaunay(self.rb).simplices, dtype=np.int64), axis=1)
 
     @cached_property
     def edges(self) -> npt.NDArray[np.int64]:
         """(E, 2) int64, the pairs of neighbours."""
-        if self._along is not None:
-            return np.array(list(pairwise(self._along)), np.int64).reshape(-1, 2)
+        if self._order_on_line is not None:
+            return np.array(list(pairwise(self._order_on_line)), np.int64).reshape(-1, 2)
         corners = self.triangles
         return np.unique(np.concatenate([corners[:, [0, 1]], corners[:, [0, 2]], corners[:, [1, 2]]]), axis=0)
 
@@ -116,10 +117,10 @@ class Gamut:
             best = int(near[(u * v).sum(axis=1).argmax()])
             return self._match_of(pairs[best], shares[best], target)
         if len(self.triangles):
-            within = self._inverses @ target
-            best = int(within.min(axis=1).argmax())
-            if within[best].min() >= 0:
-                return self._match_of(self.triangles[best], within[best], target)
+            triangle_shares = self._inverses @ target
+            best = int(triangle_shares.min(axis=1).argmax())
+            if triangle_shares[best].min() >= 0:
+                return self._match_of(self.triangles[best], triangle_shares[best], target)
         if len(pairs) and angles.min() < nearest.angle:
             best = int(angles.argmin())
             nearest = self._match_of(pairs[best], shares[best], target)
@@ -133,7 +134,7 @@ class Gamut:
         )
 
     @cached_property
-    def _along(self) -> list[int] | None:
+    def _order_on_line(self) -> list[int] | None:
         """The illuminants in their order along a line, or None if they are not on a line; duplicates are omitted."""
         centred = self.rb - self.rb.mean(axis=0)
         _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
@@ -146,9 +147,10 @@ class Gamut:
 
     @cached_property
     def _inverses(self) -> _Array:
-        # (T, 3, 3) float64, from RGB to the shares of the directions at the corners of each triangle.
+        # (T, 3, 3) float64: for each triangle, the matrix from RGB to the shares of its three corners.
         corners = self.directions[self.triangles].transpose(0, 2, 1)
-        # A triangle without area is left to its edges: entries of -1 make all shares negative.
+        # A triangle without area has no inverse. Entries of -1 make all shares negative, so that an edge is used in its
+        # place.
         flat = np.abs(np.linalg.det(corners)) < 1e-15 if len(corners) else np.zeros(0, bool)
         inverses = np.full(corners.shape, -1.0)
         inverses[~flat] = np.linalg.inv(corners[~flat])
@@ -156,7 +158,7 @@ class Gamut:
 
     @cached_property
     def _cosines(self) -> _Array:
-        # (E,) float64, of the angles between neighbours.
+        # (E,) float64, cosines of the angles between neighbours.
         return (self.directions[self.edges[:, 0]] * self.directions[self.edges[:, 1]]).sum(axis=1)
 
     def _nearest_light(self, target: _Array) -> Match:
@@ -164,16 +166,17 @@ class Gamut:
         return Match(mixture_of({light: 1.0}), float(angles_deg(self.white[light], target)))
 
     def _pairs(self, target: _Array) -> tuple[npt.NDArray[np.int64], _Array, _Array]:
-        # The pairs of neighbours (P, 2) int64 with the target between them, the shares (P, 2) float64 of the nearest
-        # mixture, and its angle to the target (P,) float64 in degrees.
+        # Returns the pairs of neighbours (P, 2) int64 with the target between them. For each pair, also returns the
+        # shares (P, 2) float64 of the mixture that is nearest to the target, and its angle to the target (P,) float64
+        # in degrees.
         at_u, at_v = (self.directions @ target)[self.edges.T]
         cosine = self._cosines
         area = np.maximum(1 - cosine**2, 1e-30)
         shares = np.stack([at_u - cosine * at_v, at_v - cosine * at_u], axis=1) / area[:, None]
         between = (shares > 0).all(axis=1)
-        # `common` is the scalar product of the target with its projection, the square of the cosine of the angle.
-        common = (shares[:, 0] * at_u + shares[:, 1] * at_v)[between]
-        return self.edges[between], shares[between], np.degrees(np.arccos(np.sqrt(np.minimum(common, 1))))
+        # The scalar product of the target with its projection is the square of the cosine of the angle.
+        cos_squared = (shares[:, 0] * at_u + shares[:, 1] * at_v)[between]
+        return self.edges[between], shares[between], np.degrees(np.arccos(np.sqrt(np.minimum(cos_squared, 1))))
 
     def _match_of(self, lights: npt.NDArray[np.int64], shares: _Array, target: _Array) -> Match:
         weights = np.maximum(shares, 0) / np.linalg.norm(self.white[lights], axis=1)
@@ -204,8 +207,8 @@ def black_body(lut: Lut, cct_k: float) -> Mixture:
     observer sees the colour of the black body (`experiment.lights.blackbody_light`). The camera is not this observer,
     so the ground truth differs from its response to the real black body.
     """
-    # Chromaticities of black bodies are nearly linear in mired (10⁶ / K). For steps of 200 K the error is 0.05° in the
-    # median and 0.2° at most, as for a cubic spline, and below the quantisation of 8-bit projector codes.
+    # Chromaticities of black bodies are nearly linear in mired (10⁶ / K). For steps of 200 K the error is at most 0.2°.
+    # This is less than the quantisation of 8-bit projector codes; a cubic spline is not better.
     bodies = sorted((light.cct_k, light.index) for light in lut.illuminations if light.cct_k is not None)
     if not bodies:
         raise InputError(f"the LUT {lut.folder} has no black bodies; give a chromaticity r=…,b=… instead")

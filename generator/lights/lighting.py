@@ -1,7 +1,7 @@
 """Illuminant of an image: a mixture of illuminants of the LUT, or several mixtures with masks.
 
-It also defines `LightChoice`, the choice of illuminants for pictures, and two simple choices. Others are in
-`generator.lights.choices`. Contract:
+`LightChoice` is the choice of illuminants for pictures; two simple choices are here, others are in
+`generator.lights.choices`. Rules:
 
 - The ground truth of a mixture is the same mixture of ground truths, because light adds.
 - Weights of a mixture sum to 1, so that stray light and the noise of one exposure are counted once
@@ -36,19 +36,19 @@ _BILLION: Final = 10**9  # Units of a weight; a label has nine decimals
 
 @dataclass(frozen=True)
 class Mixture:
-    """A mixture of illuminants of a LUT; with one illuminant of weight 1, that illuminant.
+    """A mixture of illuminants of a LUT, or a single illuminant with weight 1.
 
     Attributes
     ----------
     lights
-        Numbers in the LUT, ascending.
+        Indices in the LUT, ascending.
     weights
-        Above 0, sum 1; rounded to billionths.
+        Weights above 0 with the sum 1; they are rounded to billionths.
 
     Raises
     ------
     InputError
-        Numbers or weights are invalid.
+        If indices or weights are invalid.
 
     Examples
     --------
@@ -117,7 +117,7 @@ def single_mixture(light: int) -> Mixture:
 
 
 def mixture_of(shares: Mapping[int, float]) -> Mixture:
-    """Return the mixture of illuminants with shares ≥ 0 by number; shares of 0 are omitted."""
+    """Return the mixture for shares ≥ 0 by illuminant number; shares that round to 0 are omitted."""
     total = sum(shares.values())
     used = {light: shares[light] / total for light in sorted(shares) if shares[light] / total * _BILLION >= 0.5}
     total = sum(used.values())
@@ -163,7 +163,7 @@ class Lighting:
 
 @runtime_checkable
 class LightChoice(Protocol):
-    """Choice of illuminants: a function of the position in the list of sources and of a seed."""
+    """Choice of illuminants; it depends only on the position of the picture in the list of sources and on a seed."""
 
     @property
     def lights_each(self) -> int:
@@ -175,7 +175,10 @@ class LightChoice(Protocol):
         ...
 
     def describe(self) -> dict[str, Any]:
-        """Return the choice as plain values for `dataset.json`; with the sources they determine every byte."""
+        """Return the choice as plain values for `dataset.json`.
+
+        With the sources, they determine every byte of the data set.
+        """
         ...
 
 
@@ -204,7 +207,7 @@ class ListedLights:
 
 @dataclass(frozen=True)
 class RandomLights:
-    """`lights_each` different illuminants of `total` for each picture, equally likely; drawn with `philox.LIGHTS`."""
+    """Random illuminants for each picture: `lights_each` different ones of `total`, all equally likely."""
 
     lights_each: int
     total: int

@@ -1,17 +1,18 @@
 """Masks: the weight of each of several illuminants in each pixel, computed or read from files.
 
-A mask plan returns a mask maker for each image, and a maker returns the masks at any size. The weights of a
-pixel are multiples of 1/65535 with sum 1, so that a 16-bit file stores them without loss. Contract of computed masks:
+A mask plan returns a mask maker for each image, and a maker returns the masks at any size. The weights of a pixel are
+multiples of 1/65535 with sum 1, so that a 16-bit file stores them without loss. Computed masks follow these rules:
 
 - They depend only on the seed and the number of the image (purpose 5 of `philox`).
 - Lengths are relative to the longer side of the image. Masks with one seed and number look the same at every size, and
   an edge is never sharper than one pixel.
 - Pixels are computed only with +, −, ×, ÷ and √, which IEEE 754 rounds equally everywhere. Masks therefore have the
   same bytes on every processor, except for the last bit of a few sines that place the shapes.
-- The first illuminant is outside all shapes.
+- Outside all discs or windows, the first illuminant has the weight 1.
 
-docs/formats.md describes mask files. Full scale is weight 1, transparency is ignored, and masks are resized to the
-image. Weights are divided by their sum. A pixel that is 0 in all K masks gets the first illuminant.
+docs/formats.md describes mask files. The largest number of the file format is weight 1, transparency is ignored, and
+masks are resized to the image. Weights are divided by their sum. A pixel that is 0 in all K masks gets the first
+illuminant.
 """
 
 from __future__ import annotations
@@ -37,17 +38,18 @@ from generator.named_numbers import Range, parse_numbers
 
 _log = logging.getLogger(__name__)
 
-# float32 in practice: numpy keeps float32 if arrays are combined with Python numbers.
+# The arrays are float32: numpy keeps this type if arrays are combined with Python numbers.
 Array = npt.NDArray[np.floating[Any]]
 _ZERO: Final = np.float32(0)
 _HALF: Final = np.float32(0.5)
 _ONE: Final = np.float32(1)
 _THREE: Final = np.float32(3)
-_STREAM_LENGTH: Final = 64  # Numbers per stream; spots need up to 1 + 3 · 20, smooth fields pass their count
+_STREAM_LENGTH: Final = 64  # Default number of random numbers of a stream; spots need up to 1 + 3 · 20
 # Width of the bars between the panes of a window, relative to the window: 6 cm of 1 m, as in real windows.
 _BAR: Final = 0.06
 
-# Maps v (h, 1) to the shares (K, h, W): v is the distance of rows from the image centre, relative to the longer side.
+# Function from rows v (h, 1) to the shares (K, h, W) of K illuminants, which are weights before normalisation. v is the
+# distance of a row from the image centre, relative to the longer side.
 Shares = Callable[[Array], Array]
 
 
@@ -74,10 +76,10 @@ def stepped(x: Any) -> Any:
 
 @dataclass(frozen=True)
 class HalfPlanes:
-    """Parallel strips, one for each illuminant; half planes for two."""
+    """Parallel strips, one for each illuminant; for two illuminants, these are half planes."""
 
     angle: float | None = None  # from the first illuminant to the last, degrees, clockwise from the right; None: random
-    width: float | None = 0.0  # of the soft edge, 0 for one pixel; None: random from 0.1 to 0.6
+    width: float | None = 0.0  # of the soft edges; 0 for one pixel; None: random from 0.1 to 0.6
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to the shares (K, h, W) float32 of the illuminants.
@@ -147,7 +149,7 @@ class SmoothFields:
     """Smooth transitions: a random field for each illuminant from cubic B-splines (I. Schoenberg, 1946)."""
 
     scale: float = 0.5  # distance over which a field changes, relative to the longer side
-    contrast: float = 2.0  # dominance of one illuminant at the maximum of its field
+    contrast: float = 2.0  # standard deviation of the fields; with large values, one illuminant dominates at each pixel
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `HalfPlanes.shares`."""
@@ -156,7 +158,7 @@ class SmoothFields:
         fields: list[Array] = []
         for light in range(lights):
             drawn = streams.uniform(light, knots * knots).reshape(knots, knots)
-            # The spline reduces the variance of the knots to 0.479 on average in each direction.
+            # The spline multiplies the variance by 0.479 on average in each of two directions.
             field = (self.contrast / 0.479 * math.sqrt(12) * (drawn - 0.5)).astype(np.float32)
             fields.append(np.ascontiguousarray(self._splined(np.ascontiguousarray(field.T), u[0]).T))
 
@@ -342,7 +344,8 @@ _FULL_COUNT: Final = np.int32(FULL)
 
 @compiled
 def _quantise_shares_of_two(first: Any, second: Any, out: Any) -> None:
-    # `_quantise_shares` for two illuminants and `out` (H, 2 W), in a loop that the compiler vectorises.
+    # Does the same as `_quantise_shares` for two illuminants and `out` (H, 2 W), in a loop that the compiler
+    # vectorises.
     for y in range(first.shape[0]):
         for x in range(first.shape[1]):
             total = first[y, x] + second[y, x]
@@ -518,8 +521,8 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _read(path: Path) -> list[_Array]:
-    # A file with one channel or equal channels has one mask (H, W) float32, 0 … 1; other files have three. Masks are
-    # turned upright like pictures.
+    # Returns the masks (H, W) float32, 0 … 1, of a file: one if it has one channel or equal channels, otherwise three.
+    # They are turned upright like pictures.
     require_plausible(_bytes_of(path), str(path))
     try:
         stored = read_native(path)

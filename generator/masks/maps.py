@@ -1,8 +1,8 @@
 """Maps of images with several illuminants: the weights and the ground truth of every pixel, as 16-bit PNG files.
 
-`masks/NNNNNN_k.png` has the weight of illuminant k = 0 … K − 1 in grey; 65535 is weight 1, the sum of all K.
-`ground_truth/NNNNNN.png` has r, g, b with r + g + b = 65535. The ground truth of a pixel is the chromaticity of the
-weighted sum of the ground truths of its illuminants.
+`masks/NNNNNN_k.png` is the weight of illuminant k = 0 … K − 1 of image NNNNNN, in grey; 65535 is weight 1. The weights
+of a pixel sum to 1. `ground_truth/NNNNNN.png` has r, g, b with r + g + b = 65535. The ground truth of a pixel is the
+chromaticity of the weighted sum of the ground truths of its illuminants.
 """
 
 from __future__ import annotations
@@ -50,11 +50,12 @@ def _quantise_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> 
 
 @compiled
 def _quantise_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: Any) -> None:
-    # `_quantise_chromaticities` for weights (H, 2 W) and `out` (H, 3 W), in a loop that the compiler vectorises.
+    # Does the same as `_quantise_chromaticities` for weights (H, 2 W) and `out` (H, 3 W), in a loop that the compiler
+    # vectorises.
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1] // 2):
             first, second = weights[y, 2 * x], weights[y, 2 * x + 1]
-            # The sum starts from 0 as for any number of illuminants, so that the result has the same bits.
+            # The sum starts from 0, as for any number of illuminants, so that the result is equal to the last bit.
             red = _ZERO + first * whites[0, 0] + second * whites[1, 0]
             green = _ZERO + first * whites[0, 1] + second * whites[1, 1]
             blue = _ZERO + first * whites[0, 2] + second * whites[1, 2]

@@ -31,20 +31,21 @@ if TYPE_CHECKING:
     from PIL.ImageCms import ImageCmsProfile, ImageCmsTransform
 
 
-# Codes per channel (every 32nd) in the grid of 729 colours that decides if a profile is sRGB.
+# Codes per channel of the test grid, 729 colours, that shows if a profile is sRGB.
 _PROBE_STEPS: Final = 9
 
 _ADOBE_GAMMA: Final = 563 / 256  # Adobe RGB (1998) Color Image Encoding, clause 4.3.1.2
 
-# For linear light: matrices of Adobe RGB (1998), clause 4.3.5.3, and IEC 61966-2-1; both have the white D65.
+# Linear Adobe RGB (1998) to linear sRGB, from the matrices of its clause 4.3.5.3 and of IEC 61966-2-1. Both have the
+# white D65.
 _ADOBE_TO_SRGB: Final = np.array(
     [[1.39835574, -0.39835574, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04292899, 1.04292899]], np.float32
 )
 
-# Steps of the table of encoded linear light: at most 1/20 of a code, at the steepest part of the curve.
+# Steps of the table that encodes linear light as sRGB; a step changes the code by at most 1/20.
 _ENCODING_STEPS: Final = 65535
 
-_BAND_ROWS: Final = 256  # Rows converted together: their float32 need little memory
+_BAND_ROWS: Final = 256  # Rows that are converted together, which limits the memory for float32
 
 _Array = npt.NDArray[np.float64]
 
@@ -192,8 +193,8 @@ def space_of_gamma(file_gamma: float, chromaticities: Sequence[float] | None) ->
 def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes) -> tuple[npt.NDArray[np.uint8], str]:
     """Return the sRGB codes of a picture (H, W, 3) uint8, and how its profile was treated.
 
-    `codes`: (H, W, 3) uint8 in the space of the profile `icc`. A grey profile is applied if the channels are equal. The
-    same array is returned if no code changes. The remark is such as ``"Display P3, converted to sRGB"``.
+    `codes`: (H, W, 3) uint8 in the space of the profile `icc`. A grey profile is applied only if the three channels are
+    equal. The same array is returned if no code changes. The text is, for example, ``"Display P3, converted to sRGB"``.
     """
     transform, mode, remark = _transform(icc)[:3]
     if mode == "L" and (codes != codes[..., :1]).any():

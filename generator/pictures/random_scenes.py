@@ -14,7 +14,7 @@ from generator.pictures.sources import LARGEST_SIDE, SourcePicture
 
 @dataclass(frozen=True, slots=True)
 class RandomScene:
-    """A picture whose codes are drawn uniformly from 0 … 255: the second set of scenes of the paper (section 4.3).
+    """A picture of random codes, uniform in 0 … 255, like the second set of scenes of the paper (section 4.3).
 
     Codes R, G, B of pixel (x, y) are the three high bytes, highest first, of word x mod 4 of Philox4x32-10 with counter
     (⌊x/4⌋, y, number, 2) and the seed as key.

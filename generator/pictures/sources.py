@@ -1,18 +1,18 @@
-"""Source pictures: find files and convert them to 8-bit sRGB codes, as for a printer.
+"""Find source pictures and convert them to 8-bit sRGB codes, as for a printer.
 
-Sources are files, folders of any size, remote stores, or random colours. The conversion has these steps, in this order,
-so that a picture always gives the same codes::
+A source is a file, a folder of any size, a remote store, or random colours. The conversion has these steps, in this
+order, so that a picture always gives the same codes::
 
-    channels      the first three are R, G, B; a single one is grey; the first image of a file with several, but not
-                  a reduced one of a TIFF
+    image         the first one, if the file has several; the first full one of a TIFF with reduced images
+    channels      the first three are R, G and B; if there are fewer, the first is grey
     depth         8-bit codes are kept; 16-bit codes v become ⌊(v + 128) / 257⌋; floating-point values are linear
                   light, 1 = white, clipped and encoded with the sRGB curve (IEC 61966-2-1), unless the file is
                   marked as sRGB or has a profile that is not linear
-    transparency  composited on white, like paper in a print, with the values as stored
+    transparency  composited on white, like paper in a print; codes are not decoded for this
     profile       another colour space, by profile or by primaries and transfer function, is converted to sRGB
                   (`generator.pictures.conversion`); HDR pictures and unknown spaces are refused
     orientation   rotated or mirrored according to EXIF or TIFF orientation
-    size          on request only: reduced, by averaging areas of codes
+    size          on request only: reduced; codes are averaged over areas
     crop          on request only: from the centre, or at positions derived from the name of the picture and a seed
 """
 
@@ -58,14 +58,14 @@ if TYPE_CHECKING:
 
 ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"  # Treatment of a photograph in that space
 
+# Notes on a picture, for `sources.csv` of the data set.
 LINEAR: Final = "floating-point values, taken as linear light"
 TRANSPARENT: Final = "transparent, composited on white"
-# Notes on a picture, like the two above, for sources.csv of the data set.
 PROFILE_UNUSED: Final = "colour profile not applied"
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"  # First bytes of a PNG file
 
-# Candidates for each further crop (judgement); with one, crops could be nearly equal.
+# Candidates for each crop after the first (judgement). With only one, two crops could be nearly equal.
 _CROP_CANDIDATES: Final = 8
 
 
@@ -84,7 +84,7 @@ def random_positions(
     `first`. For each further crop, the next 8 candidates are compared: the one with the least overlap with existing
     crops is used, or the first of several equal ones. This is best-candidate sampling (D. Mitchell, "Spectrally optimal
     sampling for distribution ray tracing", SIGGRAPH 1991). If all 8 positions are taken, the first free position after
-    the last of them is used, row by row.
+    the eighth is used, row by row.
 
     `starts`: numbers of columns and rows at which a crop can begin, with a product of at least `count`. `size`: width
     and height of a crop, px. `first`: column and row of the first crop, px; None for a random position.
@@ -125,11 +125,11 @@ def clear_bits(codes: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint8]
 Picture = npt.NDArray[np.uint8]
 
 LARGEST_SIDE: Final = 65535  # Longest side of a crop or a random scene, px: largest 16-bit number
-# Largest number of pixels, 1.6 GB of codes: a small file can claim more than the memory.
+# Largest number of pixels, 1.6 GB of codes. The header of a small file may state more pixels than fit into memory.
 LARGEST_PICTURE: Final = 1 << 29
 
 _UNCALIBRATED: Final = 0xFFFF  # Value of the tag ColorSpace (EXIF 2.3, tag 40961) for a space that is not sRGB
-# Formats with colours multiplied by alpha unless the file states otherwise (names of OpenImageIO).
+# Formats that store colours multiplied by alpha, unless the file states otherwise; names of OpenImageIO.
 _PREMULTIPLIED: Final = frozenset({"dpx", "iff", "openexr", "rla", "tiff"})
 
 
@@ -139,11 +139,11 @@ class Preparation:
 
     - `max_side`: longest side allowed, px; a larger picture is reduced.
     - `crop`: width and height of the crops of every picture, px.
-    - `cover`: first reduce a picture as far as it still covers the crop.
-    - `crop_at`: position of the first crop: ``"centre"``, or ``"random"``, derived from the seed and the name of the
-      picture; None for the centre if there is one crop, else random.
+    - `cover`: before cropping, reduce a picture to the smallest size that covers the crop.
+    - `crop_at`: position of the first crop: ``"centre"`` or ``"random"``. None is the centre for one crop, and random
+      for several. A random position depends on the seed and the name of the picture.
     - `crops`: number of different crops. Further crops are at random positions, far from each other.
-    - `seed`: of random positions, 0 … 2⁶⁴ − 1.
+    - `seed`: seed of random positions, 0 … 2⁶⁴ − 1.
     """
 
     max_side: int | None = None
@@ -199,7 +199,7 @@ class SourcePicture:
     """A source picture that was read.
 
     - `picture`: (H, W, 3) uint8, sRGB codes; the first crop if there are several.
-    - `sha256`: SHA-256 of the file; None if there is no file, or from `open_picture`.
+    - `sha256`: SHA-256 of the file; None if there is no file. `open_picture` leaves it None.
     - `profile`: treatment of its colour profile, such as ``"Display P3, converted to sRGB"``; empty without a file.
     - `cuts`: the crops, if several were requested.
     - `notes`: other conversions that may change the look of the picture.
@@ -214,7 +214,7 @@ class SourcePicture:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _FileValues:
-    """Values of a file.
+    """Content of a picture file before conversion.
 
     - `light`: (H, W, 3), codes 0 … 255, or linear values 0 … 1 in float64.
     - `alpha`: (H, W), 0 … 1; None without transparency.
@@ -271,7 +271,7 @@ def open_picture(
     data: bytes | None = None,
     most_pixels: int | None = None,
 ) -> SourcePicture:
-    """Read a picture file as sRGB codes with details; the module docstring lists the steps.
+    """Read a picture file as sRGB codes with notes on the conversion; the module docstring lists the steps.
 
     `name`: name of the picture, from which random positions of crops are derived; the file name if None. `data`: bytes
     of the file, if they were read already. `most_pixels`: largest number of pixels; `LARGEST_PICTURE` if None.
@@ -317,7 +317,7 @@ def _read(path: Path, data: bytes | None, most_pixels: int) -> _FileValues:
     if not path.is_file():
         raise FormatError(f"cannot read {path}: no such file; name a picture")
     chunks = _checked_png(path, data)
-    with _named_in_text(path) as name:
+    with _utf8_file_name(path) as name:
         values = _read_named(path, name, data, most_pixels, chunks)
     has_profile = b"iCCP" in chunks and values.space is None
     # OpenImageIO silently drops a profile that it cannot use. An empty profile is treated as damaged.
@@ -331,7 +331,7 @@ _COLOUR_CHUNKS: Final = (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM")
 
 def _checked_png(path: Path, data: bytes | None) -> Mapping[bytes, bytes]:
     # Returns the chunks of a PNG that state its colour space. Truncated or damaged pixels are refused here, because
-    # libpng would print its own lines.
+    # libpng would print its own messages.
     try:
         with path.open("rb") as stream:
             if stream.read(len(_PNG)) != _PNG:
@@ -435,7 +435,7 @@ def _read_named(
         is_linear = is_floating and not is_encoded
         pixels = None
         if stream.format_name() == "jpeg" and spec.nchannels == 3:
-            pixels = _jpeg(path.read_bytes() if data is None else data)
+            pixels = _decode_jpeg(path.read_bytes() if data is None else data)
         if pixels is None:
             pixels = stream.read_image("float" if is_floating else "uint8" if base_type == oiio.UINT8 else "uint16")
         if pixels is None or stream.has_error:
@@ -449,7 +449,7 @@ def _read_named(
     finally:
         stream.close()
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
-    # For a GIF file OpenImageIO reports the channel after the last.
+    # For GIF files, OpenImageIO reports an alpha channel that is too high by one.
     alpha_channel = min(alpha_channel, spec.nchannels - 1)
     alpha = None
     if alpha_channel > 0:
@@ -471,14 +471,14 @@ def _read_named(
         values = values.astype(np.float64) * (1.0 if is_linear else 255.0)
     is_associated = not is_separate
     if alpha is not None and not is_floating:
-        # A colour brighter than its alpha was not multiplied by it, whatever the format usually does.
+        # A value above alpha cannot have been multiplied by alpha, even if the format usually stores such products.
         is_associated = is_associated and not bool(np.any(values > 255.0 * alpha[..., None] + 1.0))
     is_adobe_rgb = is_uncalibrated and icc is None and own_space is None and _interoperability(path) == "R03"
     return _FileValues(values, alpha, is_associated, is_linear, orientation, icc, is_adobe_rgb, own_space)
 
 
 @contextmanager
-def _named_in_text(path: Path) -> Generator[str]:
+def _utf8_file_name(path: Path) -> Generator[str]:
     """Yield a file name for OpenImageIO: a link to the file if its own name is not UTF-8."""
     try:
         str(path).encode()
@@ -505,7 +505,7 @@ def _interoperability(path: Path) -> str:
     return str(index).strip("\0 ")
 
 
-def _jpeg(data: bytes) -> npt.NDArray[np.uint8] | None:
+def _decode_jpeg(data: bytes) -> npt.NDArray[np.uint8] | None:
     # simplejpeg decodes a usual colour JPEG in half the time of OpenImageIO.
     import simplejpeg
 
@@ -569,9 +569,9 @@ SUFFIXES: Final = frozenset(
 # Suffixes of pictures that no installed library reads; such pictures in a folder are reported.
 UNREADABLE: Final = frozenset({".avif", ".heic", ".heif"})
 
-# Backslashes before a byte that is not text, or before text that looks like an escaped byte.
+# Backslashes before a byte that is not UTF-8, or before text that looks like an escaped byte, such as x8a.
 _BYTE_LIKE: Final = re.compile(r"\\+(?=x[89a-f][0-9a-f]|[\udc80-\udcff])")
-# Largest file that is read only once, to be hashed and decoded: 32 MiB are little compared with the decoded picture.
+# Files up to this size are read once, for both hash and decoding: 32 MiB are little next to the decoded picture.
 _BYTES_READ_AT_ONCE: Final = 1 << 25
 
 _log = logging.getLogger(__name__)
@@ -583,7 +583,7 @@ _MACHINE_ERRORS: Final = frozenset(
 
 
 class Source(Protocol):
-    """A picture that can be read from anywhere."""
+    """A source picture, from a file or random."""
 
     @property
     def name(self) -> str:
@@ -616,8 +616,7 @@ class PictureFile:
     def name(self) -> str:
         r"""Name in the data set: path below the folder, with \xNN for bytes that are not text.
 
-        Different paths have different names: backslashes before such a byte, or before text that looks like one, are
-        doubled.
+        To keep names distinct, backslashes are doubled before such a byte and before text such as ``x8a``.
         """
         name = self.relative_path or PurePosixPath(masked(self.root).replace(os.sep, "/")).name
         name = _BYTE_LIKE.sub(lambda match: 2 * match[0], name)
@@ -682,14 +681,14 @@ def _local_file(location: str) -> Generator[Path]:
         try:
             store.get_file(path, copy.name)
         except Exception as error:
-            # Every store raises errors of its own.
+            # Each store has its own exceptions.
             is_gone = isinstance(error, FileNotFoundError)
             raise _unreadable_error(location, error, is_file_fault=is_gone and _folder_exists(store, path)) from error
         yield Path(copy.name)
 
 
 def _hashed(path: Path) -> tuple[str, bytes | None]:
-    # Small files are also returned, to be decoded. Unbuffered, since Python's buffer needs four system calls per file.
+    # The bytes of a small file are also returned, so that it is read once. Unbuffered reading saves four system calls.
     with path.open("rb", buffering=0) as stream:
         if os.fstat(stream.fileno()).st_size > _BYTES_READ_AT_ONCE:
             return stream_sha256(stream), None
@@ -700,7 +699,8 @@ def _hashed(path: Path) -> tuple[str, bytes | None]:
 def _is_file_fault(path: Path, error: OSError) -> bool:
     if error.errno in _MACHINE_ERRORS:
         return False
-    # If a disk is not mounted or fails, the folder is missing, empty or cannot be listed.
+    # The file is not at fault if its disk is not mounted or fails: then the folder is missing, empty or cannot be
+    # listed.
     try:
         with os.scandir(path.parent) as entries:
             return next(entries, None) is not None
@@ -819,7 +819,7 @@ class _Search:
         self._first_unreadable = ""
 
     def follows(self, link: str) -> bool:
-        """Return whether to follow a link to a folder: not if it is, contains or is in a searched folder."""
+        """Return False for a link to a folder that was searched, is in a searched folder, or contains one."""
         target = os.path.realpath(link)
         for folder in self._searched:
             if os.path.commonpath([folder, target]) in (folder, target):
@@ -845,7 +845,7 @@ class _Search:
 
 
 def _below_folder(folder: str, search: _Search, prefix: str = "") -> Iterator[str]:
-    """Yield the pictures below a folder in the order of their paths; one folder list is in memory at a time."""
+    """Yield the pictures below a folder in the order of their paths."""
     linked_folders: set[str] = set()
     try:
         with os.scandir(folder) as entries:
@@ -855,7 +855,7 @@ def _below_folder(folder: str, search: _Search, prefix: str = "") -> Iterator[st
                 if name.startswith("."):
                     continue
                 if _entry_is(entry.is_dir):
-                    # A folder is sorted with the slash that follows it in a path.
+                    # The name of a folder is sorted with a slash at the end, as in a path.
                     names.append(f"{name}/")
                     if entry.is_symlink():
                         linked_folders.add(f"{name}/")
@@ -865,7 +865,7 @@ def _below_folder(folder: str, search: _Search, prefix: str = "") -> Iterator[st
     except OSError as error:
         raise InputError(f"cannot list {folder}: {error.strerror}; name a readable folder") from error
     if DESCRIPTION in names:
-        # A data set among the pictures, perhaps made from them: its images are not sources.
+        # A data set below the searched folder, perhaps made from these pictures, is skipped.
         if prefix:
             return
         names.remove(DESCRIPTION)
@@ -898,7 +898,7 @@ def _below_url(url: str, search: _Search) -> list[str]:
         root_path = PurePosixPath(root)
         paths = [PurePosixPath(path).relative_to(root_path) for path in store.find(root)]
     except Exception as error:
-        # Every store raises errors of its own.
+        # Each store has its own exceptions.
         raise InputError(f"cannot list {url}: {error}; check the address and the access rights") from error
     datasets = {path.parent for path in paths if path.name == DESCRIPTION and len(path.parts) > 1}
     names = sorted(

@@ -1,4 +1,4 @@
-"""Rendering by colour: the camera records the colours of the source picture."""
+"""Rendering of source pictures by colour: the camera records the colours of the picture."""
 
 from typing import Final, Literal
 

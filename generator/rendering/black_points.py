@@ -1,4 +1,4 @@
-"""Subtract the print's own black from samples.
+"""Subtract the black of the print from samples.
 
 A print is never black: its surface scatters a few percent of the light, which is added to every colour. Let b be the
 counts of the black patch under an illuminant and W the white of the illuminant. A share v of b is subtracted from a
@@ -15,7 +15,7 @@ black was mapped to the darkest grey of the print, and b is this grey under the 
 then reverses the mapping, and greys stay grey.
 
 If several illuminants are mixed, the black of each is subtracted before mixing. Subtraction after mixing gives the same
-result if b / W is equal for all of them; for b / W of 0.03 and 0.045 it differs by less than 0.0005 of white.
+result if b / W is equal for all of them. For b / W of 0.03 and 0.045, it differs by less than 0.0005 of white.
 
 Source: black point compensation (ISO 18619:2015, clause 5.2), here in linear counts of a camera.
 """
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from generator.lights.lighting import Mixture
 
-# Default of the largest random share. Of all shares tried in earlier work, it gave the lowest errors of learned methods
-# on real photographs (docs/transfer.md). It is below 1 because real scenes have some stray light, too.
+# Default of the largest random share. In earlier work, it gave the lowest errors of learned methods on real photographs
+# (docs/transfer.md). It is below 1 because real scenes have some stray light, too.
 LARGEST_SHARE: Final = 0.97
 
-_BISECTIONS: Final = 40  # Bisection steps for the offset in `_lowering`: resolution 2⁻²⁴ counts
+_BISECTIONS: Final = 40  # Bisection steps for the offset in `_clipping_offset`: resolution 2⁻²⁴ counts
 
 _Array = npt.NDArray[np.float64]
 
@@ -52,7 +52,8 @@ _Array = npt.NDArray[np.float64]
 class BlackPoint:
     """Treatment of the print's black.
 
-    - `kind`: ``"keep"``: none is subtracted; ``"compensate"``: all of it; ``"random"``: a random share for each image.
+    - `kind`: share of the black that is subtracted. ``"keep"``: 0; ``"compensate"``: 1; ``"random"``: random for each
+      image.
     - `largest_share`: largest random share, above 0 and at most 1.
 
     Raises `InputError` if the largest share is out of range.
@@ -168,10 +169,9 @@ def subtract_black(
 
 
 @compiled
-def _lowering(values: Any, count: int) -> float:
-    # Offset by which values are lowered before clipping at 0, so that clipping keeps the mean of all. Clipping alone
-    # would make black too bright by 0.4 σ, since counts have no sign. A patch whose mean is not above the subtracted
-    # counts becomes 0.
+def _clipping_offset(values: Any, count: int) -> float:
+    # Returns the offset to subtract from values before they are clipped at 0, so that clipping keeps their mean.
+    # Without it, black would be too bright by 0.4 σ. If the mean is not above 0, all values become 0.
     total, upper = 0.0, 0.0
     for i in range(count):
         total += values[i]
@@ -200,7 +200,7 @@ def _subtract(samples: Any, subtracted: Any, stretch: Any, white: float, chosen_
             for i in range(count):
                 values[i] = (samples[colour, i, channel] - subtracted[channel]) * stretch[channel]
                 smallest = min(smallest, values[i])
-            offset = _lowering(values, count) if smallest < 0.0 else 0.0
+            offset = _clipping_offset(values, count) if smallest < 0.0 else 0.0
             # Each sample takes over the rounding remainder of the previous one, which keeps the mean of the patch.
             remainder = 0.0
             for i in range(count):

@@ -1,19 +1,18 @@
 """Render by colour: print a picture through a profile of the chart, as a print shop does.
 
-The camera should record a = C · linear sRGB for a source colour, where C is the colour matrix of the camera body. The
-print's black is not black and its paper is not white. Black is mapped to the black point b of the print and white to
-its white point w, as in black point compensation (ISO 18619:2015; there in XYZ, here in camera RGB):
-t = b + (w - b) a.
+For a source colour, the camera should record a = C · linear sRGB, where C is the colour matrix of the camera body. The
+black and the paper of a print are not ideal. Black is therefore mapped to the black point b of the print and white to
+its white point w, as in black point compensation (ISO 18619:2015; there in XYZ, here in camera RGB): t = b + (w - b) a.
 
 Nodes are 17 × 17 × 17 source colours (`kernels.printing.NODE_CODES`). Once per look-up table (LUT), `print_inverse`
-calculates the position of each node in the chart, where the camera records t under a reference illuminant. Like the
-profile of a printer, positions do not depend on the illuminant of an image. Under an illuminant of the LUT, the value
-of a node is interpolated between the means of the patches around its position. Values under several illuminants are
-added, because light is additive. A new illuminant takes a few milliseconds and no space on the disk.
+calculates the position of each node: the place in the chart at which the camera records t under a reference illuminant.
+Like the profile of a printer, positions do not depend on the illuminant of an image. Under an illuminant of the LUT,
+the value of a node is interpolated between the means of the patches around its position. Values under several
+illuminants are added, because light is additive. A new illuminant takes a few milliseconds and no space on the disk.
 
-The greys of a print change their tint with the illuminant, by some degrees if inks are not neutral. Estimators and the
-eye judge an illuminant by greys, so greys are made neutral. Each grey is multiplied by a factor per channel that keeps
-its brightness. Colours get the factor of the grey of equal brightness. `kernels/printing.py` adds the noise.
+Greys of a print are tinted by some degrees if inks are not neutral, and the tint changes with the illuminant. Methods
+and the eye judge an illuminant by greys, so greys are made neutral. Each grey is multiplied by a factor per channel
+that keeps its brightness. Colours get the factor of the grey of equal brightness. `kernels/printing.py` adds the noise.
 """
 
 from __future__ import annotations
@@ -54,16 +53,16 @@ if TYPE_CHECKING:
 
 _Array = npt.NDArray[np.float64]
 
-# Temperature of the reference illuminant, K: about the middle of daylight. Estimators trained with a map of 5600 K
-# were as accurate as with one map per illuminant (docs/transfer.md).
+# Temperature of the reference illuminant, K: about the middle of daylight. Methods trained with positions for 5600 K
+# were as accurate as with positions for each illuminant (docs/transfer.md).
 REFERENCE_K: Final = 5600.0
 
-# Smallest ratio of the darkest to the brightest channel of white under a reference illuminant, which must contain
-# light of all channels.
+# Smallest ratio of the darkest to the brightest channel of white under a reference illuminant. The illuminant must
+# contain light of all channels.
 _LEAST_RATIO: Final = 0.2
 
-# Largest relative difference in a channel between target and print inside the gamut: 1/5 of the difference between
-# neighbouring patches of a 5-bit chart.
+# A colour is in the gamut if target and print differ by at most this relative amount in each channel. It is 1/5 of the
+# difference between neighbouring patches of a 5-bit chart.
 GAMUT_TOLERANCE: Final = 0.02
 
 # Largest angle of the black point to grey, degrees: slightly below the 0.5° allowed for greys.
@@ -73,20 +72,20 @@ BLACK_WITHIN_DEG: Final = 0.4
 # contrast of a print by 0.01 of white.
 MOST_LIFT: Final = 1.25
 
-# Largest factor that makes greys neutral. Prints need up to 1.1; channels with very few counts may need more, but
-# because of noise alone.
+# Limit of the factors that make greys neutral. Prints need up to 1.1. In channels with very few counts, noise alone may
+# cause larger factors.
 MOST_TINT: Final = 1.5
 
-# Largest factor that scales recorded deviations to the noise at their level. The standard deviation of 25 samples has
-# an uncertainty of 1/7, and the nearest patch has a different level.
+# Limit of the factors that scale recorded deviations to the expected noise. Factors differ from 1, because 25 samples
+# give their standard deviation only to 1/7, and because the nearest patch has another level.
 MOST_SPREAD: Final = 2.0
 
-# Smallest distance of a mean from 0 after subtraction of black, in standard deviations of noise. Clipping then raises
-# the mean by 2 %.
-NOISE_ABOVE: Final = 1.5
+# After subtraction of black, noise is reduced until the mean is this many standard deviations above 0. Clipping at 0
+# then raises the mean by 2 %.
+NOISE_MARGIN: Final = 1.5
 
-# Rounding steps per code and per level: 0.001 of the distance between neighbouring patches, far above the rounding
-# differences of processors.
+# Positions and levels are rounded to 1/1024 of the distance between neighbours, far above the rounding differences of
+# processors.
 _ROUNDING_STEPS: Final = 1024
 
 _GREYS: Final = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)  # Nodes of three equal codes
@@ -114,7 +113,7 @@ class PrintMap:
     - `nearest`: (4913,) int64, position in `cells` of the patch whose samples a node uses.
     - `levels`: (4913,) float64, 0 … 16: grey node of equal brightness, interpolated.
     - `distance`: (4913,) float64, angle between the colour at the position and the target, degrees.
-    - `outside`: (4913,) bool, colour outside the gamut of the print: a channel is off by more than `GAMUT_TOLERANCE`.
+    - `outside`: (4913,) bool, whether the colour is outside the gamut of the print; see `GAMUT_TOLERANCE`.
     - `noise`: (3, 3) float64, coefficients of 1, y and y² in the variance at y counts, one column per channel; 0 if the
       noise of the LUT cannot be measured.
     """
@@ -232,7 +231,7 @@ def compute_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
     black = black_point(profile, colours, bits)
     source = source_colours(matrix)
     targets = black + (profile.white - black) * source
-    # Rounded, because last digits differ between processors and libraries, but pixels must be equal.
+    # The last digits differ between processors and libraries. Rounding makes pixels equal on all of them.
     positions = _rounded(invert(colours, targets.mean(axis=1), targets, bits))
     around, weights = corners(positions, bits)
     weights = weights * usable[around]
@@ -271,7 +270,8 @@ def _require_contrast(lut: Lut, light: int | str, black: float, white: float) ->
 
 
 def _usable_elsewhere(lut: Lut, reference: int) -> npt.NDArray[np.bool_]:
-    # Hot photosites are most visible under the illuminants that are darkest in a channel.
+    # Hot photosites are most visible under the illuminants that are darkest in a channel. Patches that are unreliable
+    # there are excluded.
     darkest_lights = {int(light) for light in lut.white.argmin(axis=0)} - {reference}
     usable = np.ones(8**lut.provenance.bits, bool)
     for light in darkest_lights:
@@ -298,9 +298,9 @@ def _nearest(positions: npt.NDArray[Any], cells: npt.NDArray[np.int64], bits: in
 def black_point(profile: PrintProfile, colours: _Array, bits: int) -> float:
     """Return the grey to which black is mapped, 1 = ideal white.
 
-    It is the darkest grey that the print shows within `BLACK_WITHIN_DEG`, at 1 to 1.25 times the print's own black. If
-    there is no such grey, it is the print's own black. `colours`: (8**bits, 3) float64, colours of the profile, with
-    replacements for unusable patches.
+    Candidates are 1 to 1.25 times the print's own black. The darkest candidate that the print shows within
+    `BLACK_WITHIN_DEG` of grey is used; if there is none, the print's own black. `colours`: (8**bits, 3) float64,
+    colours of the profile, with replacements for unusable patches.
     """
     levels = profile.black * np.linspace(1.0, MOST_LIFT, 26)
     levels = levels[levels <= profile.white]
@@ -402,8 +402,8 @@ class ColorimetricRendering:
         if share:
             removal = black_subtraction(self.lut, light, share, self._black(nodes, light))
             nodes = np.maximum((nodes - removal.counts) * removal.stretch, 0.0)
-            # Counts have no sign: noise below 0 would be clipped, and black would be too bright.
-            cells[:, :, 1, :3] *= removal.stretch * np.minimum(nodes / (NOISE_ABOVE * sigmas * removal.stretch), 1.0)
+            # Counts have no sign. Clipping the noise below 0 would make black too bright.
+            cells[:, :, 1, :3] *= removal.stretch * np.minimum(nodes / (NOISE_MARGIN * sigmas * removal.stretch), 1.0)
         means[:, :3] = nodes
         return PrintedLight(means, cells, np.array(light.lights, np.int64), np.sqrt(light.weights).astype(np.float32))
 

@@ -1,8 +1,7 @@
 """Colour matrices of cameras, from linear sRGB to camera RGB.
 
-The matrix of a manufacturer converts XYZ to camera RGB under D65. It is multiplied by the matrix from sRGB to XYZ
-(IEC 61966-2-1), which is for D65, too. Rows are scaled to sum 1, so white becomes (1, 1, 1) and can be multiplied by
-the illuminant.
+A listed matrix converts XYZ to camera RGB under D65. It is multiplied by the matrix from sRGB to XYZ (IEC 61966-2-1),
+which is for D65, too. Rows are scaled to sum 1: white becomes (1, 1, 1), which is then multiplied by the illuminant.
 
 For other cameras the matrix is fitted to the look-up table (LUT). The patches were printed from sRGB codes. If the
 print shop reproduces sRGB, the camera RGB of the patches is C · linear sRGB, and least squares give C. If the print was
@@ -48,9 +47,9 @@ SOURCE: Final = "ColorMatrix2 as listed by dcraw 9.28 and LibRaw (adobe_coeff)"
 # Linear sRGB to XYZ, white D65: IEC 61966-2-1:1999, clause 5.2.
 _SRGB_TO_XYZ: Final = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 
-_SMALLEST_ROW_SUM: Final = 1e-6  # Smallest sum of a row: a smaller one cannot be scaled to 1
+_SMALLEST_ROW_SUM: Final = 1e-6  # Smallest allowed sum of a row; smaller sums cannot be scaled to 1
 
-# Largest number of a matrix in a file: rows in 1/10000 have about 10⁴, whose sums are exact enough.
+# Largest allowed number of a matrix in a file. In units of 1/10000, its numbers are about 10⁴.
 _LARGEST: Final = 1e6
 
 
@@ -168,9 +167,9 @@ def fitted_matrix(lut: Lut) -> ColourMatrix:
 def fit_matrix(profile: PrintProfile) -> tuple[npt.NDArray[np.float64], float]:
     """Return the matrix (3, 3) float64 with rows of sum 1 from linear sRGB codes to colours, and its residual, degrees.
 
-    Colours are scaled between the print's black and paper, channel by channel. Least squares with row sums of 1 equal
-    unconstrained least squares of differences to green: a - G = c_r (R - G) + c_b (B - G). The residual is the median
-    angle between predicted and recorded colours.
+    Colours are scaled between the print's black and paper, channel by channel. For a scaled channel a, least squares
+    fit a - G = c_r (R - G) + c_b (B - G), which makes the sums of rows 1. R, G and B are linear sRGB.
+    The residual is the median angle between predicted and recorded colours.
     """
     bits = profile.bits
     codes = channels_of(np.flatnonzero(profile.usable), bits) / (2.0**bits - 1)

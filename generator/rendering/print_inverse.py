@@ -1,19 +1,18 @@
-"""Find the position in the chart that shows a given colour: the inverse of the camera's response to the print.
+"""Find the position in the chart at which the camera records a given colour.
 
-The patches are samples of a continuous print; between them, colours are interpolated. A position p is a code per
-channel, 0 … 2ⁿ - 1, not necessarily whole. R(p) is what the camera records there under a reference illuminant,
-relative to its white: trilinear interpolation of the means of the eight patches around p. The position of a colour t
-minimises ::
+The print is treated as continuous: colours are interpolated between patches. A position p is a code per channel from 0
+to 2ⁿ - 1, not necessarily whole. R(p) is what the camera records there under a reference illuminant, relative to its
+white: trilinear interpolation of the means of the eight patches around p. The position of a colour t minimises ::
 
     |S (log R(p) - log t)|²,   0 ≤ p ≤ 2ⁿ - 1
 
-S converts channel differences to brightness and chromaticity, with less weight on brightness. Errors of estimates are
+S converts channel differences to brightness and chromaticity, with less weight on brightness. The errors of methods are
 angles, so a colour outside the gamut of the print should keep its hue rather than its brightness.
 
-Positions are calculated along a path from the grey of equal brightness to the colour, in `STEPS` steps. Each step
-starts at the previous position and makes Levenberg-Marquardt iterations within the chart (K. Levenberg 1944,
-D. Marquardt 1963; bounds by projection, C. T. Kelley, *Iterative Methods for Optimization*, 1999, section 5.4).
-Outside the gamut, positions follow its surface, so similar colours have neighbouring positions.
+The target moves from the grey of equal brightness to the colour, in `STEPS` steps. Each step starts at the previous
+position and makes Levenberg-Marquardt iterations within the chart (K. Levenberg 1944, D. Marquardt 1963; bounds by
+projection, C. T. Kelley, *Iterative Methods for Optimization*, 1999, section 5.4). Outside the gamut, positions follow
+its surface, so similar colours have neighbouring positions.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _ROUNDS: Final = 12  # Levenberg-Marquardt iterations per step of a path; inside
 
 _STRIDE: Final = 4.0  # Largest change of a position per iteration along each axis, patches
 
-# Weight of relative differences of brightness; chromaticity has the weight 1 (docs/reference/rendering.md).
+# Weight of brightness differences; chromaticity differences have the weight 1 (docs/reference/rendering.md).
 BRIGHTNESS_COST: Final = 0.5
 
 # Unit vectors of brightness and two chromaticity directions, for logarithmic channel differences.

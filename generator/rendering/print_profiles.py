@@ -1,9 +1,9 @@
 """Measure what a camera records of each patch of the chart under one illuminant, from the look-up table (LUT).
 
 The mean of the samples of a patch, divided by the white of the illuminant, is the reflectance as this camera records
-it; (1, 1, 1) is an ideal white. Unreliable patches are excluded, not repaired. Black and white are the darkest and
-brightest grey that mixtures of patches make exactly: the print's own black and paper are tinted, and greys mapped
-between them would be tinted, too.
+it; (1, 1, 1) is an ideal white. Unreliable patches are excluded, not repaired. Black and white are the darkest and the
+brightest grey that mixtures of patches make exactly. The black patch and the paper are tinted, and greys between them
+would be tinted, too.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from generator.lights.lighting import single_mixture
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-# Distance of mean and median of a patch, in standard errors, above which the mean is unreliable. Normal samples of
-# 100 000 patches stay far below, with the standard error known to 1/7 from 25 samples. One clipped photosite of 25 in a
-# patch at 0.1 of saturation moves the mean by more.
+# The mean of a patch is unreliable if it is more than this many standard errors from the median. With normally
+# distributed samples, the means of 100 000 patches are much nearer. One clipped photosite of 25 in a patch at 0.1 of
+# saturation moves the mean by more.
 ODD_SIGMAS: Final = 8.0
 
 ODD_SHIFT: Final = 0.02  # Smallest relevant shift of a mean, relative to the median: 0.02 changes the hue by 1° at most
 
 # White point relative to the brightest grey that patches can make. At the very edge of the gamut, patches of different
-# colours would have to be mixed. Greys near white are then within 0.1° on simulated unmanaged prints.
+# colours would have to be mixed. With this margin, greys near white of simulated unmanaged prints are within 0.1°.
 WHITE_MARGIN: Final = 0.99
 
-# Largest white point relative to the mean of the paper, so that white, too, is drawn from several patches.
+# Largest white point relative to the mean of the paper. Below 1, white is interpolated between several patches, too.
 PAPER_MARGIN: Final = 0.97
 
 _Array = npt.NDArray[np.float64]
@@ -85,7 +85,7 @@ def profile_of(lut: Lut, light: int) -> PrintProfile:
     """Return the colours of all patches under illuminant `light` of the LUT."""
     white = single_mixture(light).white(lut)
     samples = lut.light_samples(light)
-    # The mean, not the median: each sample is drawn equally often.
+    # The mean is used, not the median, because rendering draws each sample equally often.
     means = samples.mean(axis=1, dtype=np.float64)
     # A patch with a clipped sample has a mean that is too low.
     usable = (samples.max(axis=(1, 2)) < lut.provenance.white_level) & ~odd_cells(samples, means)
@@ -107,7 +107,7 @@ def odd_cells(samples: npt.NDArray[np.uint16], means: _Array) -> npt.NDArray[np.
     """
     medians = np.median(samples, axis=1)
     deviations = np.median(np.abs(samples - medians[:, None]), axis=1)
-    # At least half a count, for rounding: otherwise samples that are mostly equal have no scale.
+    # Half a count, for rounding, is the smallest deviation. Otherwise mostly equal samples would have a deviation of 0.
     sigmas = MEDIAN_ERROR * MAD_TO_SIGMA * np.maximum(deviations, 0.5) / np.sqrt(samples.shape[1])
     shifts = np.abs(means - medians)
     return ((shifts > ODD_SIGMAS * sigmas) & (shifts > ODD_SHIFT * medians)).any(axis=1)

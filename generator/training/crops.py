@@ -1,11 +1,11 @@
 """Training batches: crops of pictures under newly drawn illuminants, with their ground truths.
 
-`Crops` is an unlimited set of crops from a look-up table (LUT) and a gallery. Item i of an epoch is a pure function of
-(seed, epoch, i). Its random numbers are the words of Philox4x32-10 with counter (i, epoch, k, 7). k = 0: picture,
-column, row, illuminant; k = 1: mirroring, gain, share of the subtracted black; k = 2: seed of the kernel. Items do not
-depend on the number of workers.
+`Crops` draws any number of crops from a look-up table (LUT) and a gallery. Item i of an epoch depends only on seed,
+epoch and i. Its random numbers are the words of Philox4x32-10 with counter (i, epoch, k, 7). k = 0: picture, column,
+row, illuminant; k = 1: mirroring, gain, share of the subtracted black; k = 2: seed of the samples. Items do not depend
+on the number of workers.
 
-This module does not need PyTorch; `torch_crops` has data sets for PyTorch::
+Only `torch_crops` needs PyTorch; it has data sets for PyTorch::
 
     from torch.utils.data import DataLoader
     from generator.training import Crops, open_gallery
@@ -72,7 +72,8 @@ class RecycledMemory:
         """Return an array (...) float32 in C order, with arbitrary content."""
         size = 4 * int(np.prod(shape))
         memory = self._memory(size)
-        # All views refer to `values`, because its own base is not an array. It therefore exists as long as a view does.
+        # All views refer to `values`, because the base of `values` is not an array. Thus `values` exists as long as any
+        # view.
         values = np.frombuffer(memory, dtype=np.float32)
         weakref.finalize(values, self._free.append, memory).atexit = False
         return values.reshape(shape)
@@ -150,10 +151,10 @@ class Crops:
         Smallest and largest gain, > 0. Gains are drawn uniformly in stops. Values above saturation are clipped.
     noise
         Noise of the samples, `generator.variation.sensor_noise.measured_noise(lut)`. Crops with a gain below 1 then get
-        the noise of a camera in less light. None scales the samples with their noise.
+        the noise of a camera in less light. With None, the gain scales signal and noise equally.
     iso
-        ISO speed that determines the noise of the crops; needs `noise`. None for the speed of the LUT. A gain above the
-        relative speed gives more noise.
+        ISO speed that determines the noise of the crops; needs `noise`. None for the speed of the LUT. A gain above
+        `iso.ratio` gives more noise.
     flip
         Mirror half of the crops left to right.
     seed
@@ -262,7 +263,7 @@ class Crops:
         self._whites = np.minimum(whites, lut.provenance.white_level)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # The LUT has gigabytes; workers open it again from its folder.
+        # The LUT has gigabytes, so workers do not receive it but open its folder again.
         options = {name: getattr(self, name) for name in _OPTIONS}
         return _reopened, (self.lut.folder, self.gallery, self.size, options)
 

@@ -1,8 +1,8 @@
 """Decoded pictures for training, so that crops can be cut without decoding.
 
-A gallery is a folder of two files: `codes.u8`, the sRGB codes of all pictures one after another, row by row, R, G, B;
-and `gallery.json`, with the size of each. It is memory-mapped: workers share one copy, and unused pictures take no
-memory.
+A gallery is a folder with two files. `codes.u8` has the sRGB codes R, G, B of all pictures, one picture after another,
+row by row. `gallery.json` has the size of each picture. The codes are memory-mapped: workers share one copy, and unused
+pictures take no memory.
 """
 
 from __future__ import annotations

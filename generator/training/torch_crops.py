@@ -1,4 +1,4 @@
-"""Training batches for PyTorch; the only module that imports it, and no other module imports this one."""
+"""Training batches for PyTorch. Only this module imports PyTorch, and no other module imports this one."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Variation between images besides scene and illuminant: exposure, uneven light, noise of another ISO speed."""
+"""Random differences between images: exposure, uneven light, and the noise of a higher ISO speed."""

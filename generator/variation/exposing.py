@@ -1,22 +1,28 @@
-"""Expose a raw image again: multiply counts by a factor, with the noise of a camera at that exposure, up to saturation.
+"""Change the exposure of a raw image: scale its counts and add the noise of a camera at the new exposure.
 
-A count x of a look-up table (LUT) has mean m and variance read² + shot · m (`sensor_noise`). With the light a · m at k
-times the ISO speed, k ≥ a, the variance is read_k² + k · shot · a m, while a x has a² read² + a · shot · a m. So
+A count x of a look-up table (LUT) has the mean m and the variance read² + shot · m (`sensor_noise`). The new exposure
+multiplies counts by a, at k times the ISO speed of the LUT, with k ≥ a. Its mean is a m and its variance
+read_k² + k · shot · a m, where read_k is the read noise at this speed. The product a x has too little noise: its
+variance is a² read² + a · shot · a m. The missing noise is added, with a standard normal deviate z:
 
-    y = a x + √max(0, (read_k² − a² read²) + (k − a) shot · a x) · z,    z a standard normal deviate,
+    y = a x + √max(0, (read_k² − a² read²) + (k − a) shot · a x) · z
 
-has the correct mean and, because the second term is linear in x, on average the correct variance. For a < 1, a x alone
-would have too little noise: at half the light, shot noise is 1.41 times that of half the counts. For a > k no noise
-can be removed; the image has the noise of ISO speed a.
+y has the correct mean. Its variance is correct on average, because the second term is linear in x. For example, shot
+noise at half the light is 1.41 times the shot noise of halved counts. If a > k, noise would have to be removed, which
+is impossible, so k = a is used instead.
 
-y is rounded to the nearest whole number, halves to even, so that rounding has no bias, and clipped to 0 … saturation
-level. Deviates are a pure function of seed, image, row and column. The key of a row is the first two words of Philox
-with counter (y, 0, image, 14), the second above the first. The word of column x is that of SplitMix64 (G. Steele, D.
-Lea, C. Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014) with the state
-key + (x + 1) · 0x9E3779B97F4A7C15. Its upper three groups of 14 bits select the deviates of red, green and blue
-(`sensor_noise.normal_deviates`). Pixels use +, −, ×, √ in float32 only, which IEEE 754 rounds alike everywhere.
+y is rounded to the nearest whole number, halves to even, so that rounding has no bias. It is clipped to 0 … saturation
+level.
 
-Training crops (float32 planes multiplied by a gain) get noise by the same model, with image 0 and a seed for each crop.
+Deviates depend only on seed, image, row and column. The key of a row is the first two words of Philox with counter
+(y, 0, image, 14); the second word is the upper half. Column x has a word of SplitMix64 (G. Steele, D. Lea, C. Flood,
+"Fast splittable pseudorandom number generators", OOPSLA 2014) with the state key + (x + 1) · 0x9E3779B97F4A7C15. Its
+upper three groups of 14 bits select the deviates of red, green and blue (`sensor_noise.normal_deviates`). Pixels are
+calculated with +, −, × and √ in float32 only. IEEE 754 defines their rounding, so the result is the same on all
+machines.
+
+Noise is added to training crops (float32 planes multiplied by a gain) by the same model, with image 0 and one seed per
+crop.
 """
 
 from __future__ import annotations
@@ -36,7 +42,8 @@ from generator.variation.sensor_noise import BITS, SensorNoise, normal_deviates
 Image = npt.NDArray[np.uint16]
 Three = tuple[float, float, float]
 
-PURPOSE: Final = np.uint32(philox.NOISE)  # Purpose of the words that are keys of rows, for compiled code
+PURPOSE: Final = np.uint32(philox.NOISE)  # Purpose of the Philox words that are keys of rows, for compiled code
+# Constants of SplitMix64: increment of the state, and two multipliers.
 _STEP: Final = np.uint64(0x9E3779B97F4A7C15)
 _FIRST: Final = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND: Final = np.uint64(0x94D049BB133111EB)
@@ -75,8 +82,9 @@ def _expose(
     first_row: int,
     target: Any,
 ) -> int:
-    # Fills `target` and returns its number of saturated pixels. Rows of `numbers` (5, 3) float32, by channel: factor of
-    # the light, its decrease at the far end, target read variance, LUT read variance, LUT shot variance per count.
+    # Fills `target` and returns its number of saturated pixels. `numbers` (5, 3) float32 has one row for each of:
+    # factor on the light, its decrease at the far end, target read variance, LUT read variance, LUT shot variance per
+    # count. Columns are channels.
     rows, width = source.shape[0], source.shape[1]
     deviates = np.zeros(3 * width, np.float32)
     factors = np.empty(3 * width, np.float32)
@@ -98,7 +106,7 @@ def _expose(
                 for channel in range(3):
                     factors[3 * x + channel] = numbers[0, channel] - far_weight * numbers[1, channel]
         source_row, target_row = source[y].reshape(3 * width), target[y].reshape(3 * width)
-        # A separate buffer, because a loop that may overwrite its input is not vectorised.
+        # The buffer is separate, because a loop that may overwrite its input is not vectorised.
         for i in range(3 * width):
             values[i] = factors[i] * np.float32(source_row[i])
         if noisy:
@@ -117,7 +125,7 @@ def _expose(
 
 @compiled
 def _count_brightness(source: Any, weights: Any, uneven: bool, numbers: Any, counts: Any) -> None:
-    # Histogram of the brightness of pixels, with the light fallen off; `counts` (65536,).
+    # Adds the brightness of each pixel, after the fall-off of the light, to the histogram `counts` (65536,).
     for y in range(source.shape[0]):
         for x in range(source.shape[1]):
             brightest = _ZERO
@@ -132,8 +140,8 @@ def brightness_reached(
 ) -> float:
     """Return the brightness that a share of the pixels of an image reaches or exceeds, in counts.
 
-    The brightness of a pixel is its largest channel. `image`: (H, W, 3) uint16. `share`: 0 … 1; for 0, half a count
-    above the largest brightness. `weights`, `far_end`: fall-off of the light, as for `expose`.
+    The brightness of a pixel is its largest channel. `image`: (H, W, 3) uint16. `share`: 0 … 1; 0 gives half a count
+    more than the largest brightness. `weights`, `far_end`: fall-off of the light, as for `expose`.
     """
     counts = np.zeros(65536, np.int64)
     light_shares, is_uneven = _weights_of(image, weights)
@@ -160,7 +168,7 @@ def expose(
     first_row: int = 0,
     out: Image | None = None,
 ) -> float:
-    """Expose an image again, in place unless `out` is given; return the share of saturated pixels.
+    """Change the exposure of an image, in place unless `out` is given; return the share of saturated pixels.
 
     The module docstring has the formulas.
 
@@ -169,13 +177,13 @@ def expose(
     image
         (H, W, 3) uint16, contiguous, linear camera RGB, counts of a LUT.
     factor
-        Factor on the light, > 0. If it exceeds `iso_ratio`, the noise is that of the factor as ISO ratio.
+        Factor on the light, > 0. If it exceeds `iso_ratio`, the noise is that of an ISO ratio equal to the factor.
     noise
         Noise of the samples of the LUT.
     target_noise, iso_ratio
         Noise at the target ISO speed, and that speed relative to the LUT, ≥ 1; `noise` and 1 by default.
     weights
-        (H, W, 2) float32, shares of near-end and far-end light in each pixel; None for even light.
+        (H, W, 2) float32, weights of the near and the far end of the fall-off in each pixel; None for even light.
     far_end
         Red, green and blue light of the far end relative to the near end, > 0 and ≤ 1.
     white_level
@@ -247,7 +255,7 @@ def _weights_of(image: Image, weights: npt.NDArray[np.float32] | None) -> tuple[
 
 
 _ZERO: Final = np.float32(0)
-# Lower limit if values below black are kept: no noise reaches so far below 0.
+# Lower limit if values below black are kept. Noise does not reach so far below 0.
 _NO_FLOOR: Final = np.float32(-1)
 _ONE: Final = np.float32(1)
 
@@ -284,12 +292,12 @@ def add_noise(
     below_black: bool = False,
     threads: int = 1,
 ) -> None:
-    """Add noise to training crops, in place, as a camera at the exposure of their gains would.
+    """Add noise to training crops, in place: the noise of a camera whose exposure is changed by the gain.
 
     Parameters
     ----------
     images
-        (N, 3, H, W) float32, 0 … 1 = saturation, gains applied; clipped to 0 … 1 again.
+        (N, 3, H, W) float32, already multiplied by the gains; 1 is saturation. Results are clipped to 0 … 1.
     gains
         (N,) float64 > 0. Nothing is added for a gain above `iso_ratio`.
     noise
@@ -301,7 +309,7 @@ def add_noise(
     target_noise, iso_ratio
         Noise at the target ISO speed, and that speed relative to the LUT, ≥ 1; `noise` and 1 by default.
     below_black
-        Keep values below 0.
+        Keep results below 0.
     threads
         Number of threads that share the crops. The result does not depend on it.
 
@@ -323,7 +331,7 @@ def add_noise(
     gain_column = gains[:, None]
     dark = np.maximum((np.square(final_noise.read) - gain_column**2 * np.square(noise.read)) / white_level**2, -1)
     shot = np.maximum(iso_ratio - gain_column, 0) * np.array(noise.shot) / white_level
-    # A gain above the ratio already has the noise of a higher ISO speed.
+    # A crop with a gain above the ratio already has the noise of a higher ISO speed.
     dark = np.where(gain_column > iso_ratio, 0, dark)
     variances = dark.astype(np.float32), shot.astype(np.float32)
     deviates, lower_limit = normal_deviates(), _NO_FLOOR if below_black else _ZERO

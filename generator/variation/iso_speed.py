@@ -1,4 +1,4 @@
-"""The ISO speed whose noise images get, instead of the speed of their look-up table (LUT)."""
+"""Simulate a higher ISO speed: images get its noise instead of the noise of their look-up table (LUT)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class IsoSpeed:
-    """An ISO speed at or above that of the LUT; noise can be added, but not removed.
+    """Target ISO speed of images, not below the speed of the LUT, because noise cannot be removed.
 
     - `speed`: ISO speed of the images.
     - `base`: ISO speed at which the LUT was photographed.
-    - `sensor_electrons`: read noise of a photosite before the amplifier, electrons; see `sensor_noise`.
+    - `sensor_electrons`: read noise of a photosite that arises before the amplifier, electrons; see `sensor_noise`.
 
-    Raises `InputError` if the speed is below that of the LUT, or if a value is not above 0.
+    Raises `InputError` if the speed is below that of the LUT, or if a value is out of range.
     """
 
     speed: float
@@ -33,7 +33,7 @@ class IsoSpeed:
         if not (0 < self.base < float("inf") and 0 < self.speed < float("inf") and 0 <= self.sensor_electrons < 1e6):
             raise InputError(
                 f"the ISO speed is {self.speed:g} for a LUT of ISO {self.base:g} with {self.sensor_electrons:g} "
-                "electrons of read noise, expected numbers > 0"
+                "electrons of read noise, expected speeds > 0 and electrons ≥ 0"
             )
         if self.speed < self.base:
             raise InputError(
@@ -52,14 +52,14 @@ class IsoSpeed:
 
 
 def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SENSOR_ELECTRONS) -> IsoSpeed:
-    """Return the ISO speed of a text: ``1600/100``, images over LUT, optionally with ``:read=2.8`` electrons."""
+    """Return the ISO speed of a text such as ``1600/100`` (images / LUT), or ``1600/100:read=2.8`` with electrons."""
     speed_text, _, options = text.strip().partition(":")
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*(?:/\s*(\d+(?:\.\d*)?)\s*)?", speed_text, re.ASCII)
     table_speed = base if match is None or match[2] is None else float(match[2])
     if match is None or table_speed is None:
         raise InputError(
-            f"the ISO speed is {text!r}, and the LUT records none; write the speed of the images over that of the LUT, "
-            "such as 1600/100"
+            f"the ISO speed is {text!r}, expected a number; if the LUT records no ISO speed, write "
+            "the speeds of images and LUT, such as 1600/100"
         )
     if base is not None and table_speed != base:
         raise InputError(
@@ -72,8 +72,7 @@ def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SE
 def recorded_speed(lut: Lut) -> tuple[float | None, float]:
     """Return the ISO speed of a LUT, None if it is not recorded, and the read noise before the amplifier, electrons.
 
-    Computed LUTs record both. Photographed LUTs record the speed, unless they were built by an old version; their read
-    noise is `SENSOR_ELECTRONS`.
+    Computed LUTs record both. For photographed LUTs, the read noise is `SENSOR_ELECTRONS`.
     """
     computed, origin = lut.provenance.computed or {}, lut.provenance.origin
     try:

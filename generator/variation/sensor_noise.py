@@ -4,15 +4,16 @@ The model is photon transfer (EMVA 1288, release 4.0, section 2.4). A sample wit
 
     read² + shot · y,        shot = 1 / (electrons per count)
 
-A further term in y² (differences of photosites and print) scales with the sample and remains in it. The values are
-measured from the mean and variance of the samples of patches of all levels.
+Differences between photosites and within the print add a term in y². The model leaves it out, because it is scaled
+together with the sample. read and shot are measured from means and variances of the samples of dark and bright patches.
 
 At k times the ISO speed of the LUT, a count stands for k times fewer electrons, so shot becomes k · shot. Read noise
-from before the amplifier grows with k, read noise from after it does not. A LUT of one speed does not show the ratio of
-both; `SENSOR_ELECTRONS` is assumed unless a value is given.
+that arises before the amplifier grows with k, read noise after it does not. A LUT of one speed does not show how large
+the two are. Therefore `SENSOR_ELECTRONS` is assumed before the amplifier, unless a value is given.
 
-A normal deviate is one of 2¹⁴ numbers: the quantiles of the standard normal distribution at (i + ½) / 2¹⁴, scaled to
-variance 1. Their mean is exactly 0. They reach 4.0 standard deviations; 6 of 100 000 normal numbers lie beyond.
+Normal deviates come from a table of 2¹⁴ numbers: the quantiles of the standard normal distribution at (i + ½) / 2¹⁴,
+scaled to variance 1. Their mean is exactly 0. They reach 4.0 standard deviations; 6 of 100 000 normal numbers lie
+beyond.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
-BITS: Final = 14  # Bits of a random word that select a deviate: 64 KiB fit into the second-level cache
+BITS: Final = 14  # Bits of a random word that select a deviate: the table of 64 KiB fits into the second-level cache
 
 
 @lru_cache(maxsize=1)
 def normal_deviates() -> npt.NDArray[np.float32]:
-    """Return the deviates (16384,) float32 in ascending order."""
+    """Return the table of deviates, (16384,) float32, in ascending order."""
     half = 1 << (BITS - 1)
     upper = np.array([NormalDist().inv_cdf(0.5 + (index + 0.5) / (2 * half)) for index in range(half)])
     upper /= np.sqrt(np.mean(upper**2))
@@ -43,11 +44,12 @@ def normal_deviates() -> npt.NDArray[np.float32]:
 
 Three = tuple[float, float, float]
 
-# Read noise of a photosite before the amplifier, electrons. Sensors of 2008 to 2020 have about 2 to 3 at their highest
-# speeds, at which other read noise is negligible (W. Claff, photonstophotos.net, input-referred read noise); judgement.
+# Read noise of a photosite that arises before the amplifier, electrons (judgement). Sensors of 2008 to 2020 have about
+# 2 to 3 at their highest speeds, where other read noise is negligible (W. Claff, photonstophotos.net, input-referred
+# read noise).
 SENSOR_ELECTRONS: Final = 2.5
 
-# Number of photosites averaged in a red, green and blue sample: half-size pixels of a Bayer mosaic.
+# Photosites averaged for red, green and blue of a sample, a half-size pixel of a Bayer mosaic.
 _PHOTOSITES: Final = (1, 2, 1)
 
 

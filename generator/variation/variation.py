@@ -1,19 +1,19 @@
 """Variation of the images of a data set: exposure, fall-off of the light, and noise.
 
-The light falls off, then it is exposed, noise is adapted, and counts are rounded and clipped at saturation, all in one
-pass (`exposing`). The ground truth is that of the illuminant; exposure and noise do not change it.
+One pass (`exposing`) reduces the light towards one end of the image, scales the exposure and adds noise. Counts are
+then rounded and clipped at saturation. Exposure and noise do not change the ground truth.
 
 With fall-off, the light of a pixel is multiplied in each channel by
 
     (1 − w) + w · end,        0 < end ≤ 1,
 
-where w, 0 … 1, is the mask of a second illuminant (`generator.masks`), drawn for each image. No pixel becomes brighter
-than the photographed light, so noise can always be added. The end is 2 to the power of minus some stops, times a tint
-on request. Without a tint, the chromaticity of the light is equal in all pixels. With a tint, the image has two
-illuminants of one name, and masks and maps like other images with several illuminants.
+where `end` is the light of the far end relative to the near end. w, 0 … 1, is a random mask for each image, like that
+of a second illuminant (`generator.masks`). No pixel becomes brighter than the photographed light, so noise is added and
+never removed. `end` is 2⁻ˢ for s stops, times a tint on request. Without a tint, the chromaticity of the light is equal
+in all pixels. With a tint, the image has two illuminants of one name, with masks and maps as for several illuminants.
 
-The factor of an exposure is drawn for each image from the words of Philox with counter (0, 0, number of the image,
-12), or set so that a share of the pixels reaches a level, like the automatic exposure of a camera.
+The factor of an exposure is random for each image, from the words of Philox with counter (0, 0, number of the image,
+12). Automatic exposure sets the factor so that a share of the pixels reaches a level, as a camera does.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ class Gradient:
     """Random fall-off of the light.
 
     - `shape`: shape of the fall-off, as for masks of two illuminants.
-    - `stops`, `min_stops`: the far end is darker by a uniformly drawn number of stops between `min_stops` and `stops`.
-    - `colour`: largest difference of ln(R/G) and of ln(B/G) between far end and near end; both are drawn uniformly and
-      independently.
+    - `stops`, `min_stops`: the far end is darker by a random number of stops, uniform between `min_stops` and `stops`.
+    - `colour`: largest difference of ln(R/G) and of ln(B/G) between far end and near end. Both are random, uniform and
+      independent.
     """
 
     shape: Shape = SmoothFields()  # noqa: RUF009  frozen
@@ -111,9 +111,11 @@ def parse_gradient(text: str) -> Gradient:
 # Default of the largest factor of automatic exposure: 3 stops, like the automatic ISO of cameras.
 LARGEST_FACTOR: Final = 8.0
 
-# Smallest and largest stops: 2⁻¹² of the range of a 14-bit sensor is within its noise, 2⁶ shows only noise of the LUT.
+# Limits of an exposure in stops. At 2⁻¹² the whole range of a 14-bit sensor is within its noise; at 2⁶ only noise of
+# the LUT is visible.
 _STOPS: Range = (-12.0, 6.0)
-_TAIL_SIGMAS: Final = 3.0  # Standard deviations at which a normal distribution of stops is truncated, 0.3 % of it
+# A normal distribution of stops is truncated at this many standard deviations, which removes 0.3 %
+_TAIL_SIGMAS: Final = 3.0
 
 _EXPOSURE_OPTIONS: Final[dict[str, dict[str, Range]]] = {
     "stops": {"low": _STOPS, "high": _STOPS},
@@ -125,9 +127,9 @@ _EXPOSURE_OPTIONS: Final[dict[str, dict[str, Range]]] = {
 
 @dataclass(frozen=True)
 class DrawnExposure:
-    """A factor of 2 to the power of stops, drawn from quantiles at equally spaced probabilities, linear between them.
+    """Random factor, 2 to the power of stops; `stops` are quantiles at equally spaced probabilities.
 
-    Two quantiles are a uniform distribution between them, one is a fixed factor.
+    Between quantiles, stops are interpolated linearly. Two quantiles are a uniform distribution, one is a fixed factor.
     """
 
     stops: tuple[float, ...]
@@ -143,8 +145,8 @@ class DrawnExposure:
     def factor(self, seed: int, number: int, brightness: float) -> float:
         """Return the factor > 0 of image `number`.
 
-        `brightness`: largest channel, relative to saturation, that the share `metered_share` of the pixels reaches;
-        ignored if that is None.
+        `brightness`: value relative to saturation that the largest channel reaches in the share `metered_share` of the
+        pixels; ignored if this share is None.
         """
         del brightness
         return 2.0 ** _quantile(self.stops, _uniform(seed, number))
@@ -156,7 +158,7 @@ class DrawnExposure:
 
 @dataclass(frozen=True)
 class NormalExposure:
-    """A factor of 2 to the power of stops, normally distributed and truncated at 3 standard deviations."""
+    """Random factor, 2 to the power of stops that are normally distributed and truncated at 3 standard deviations."""
 
     mean: float
     sd: float
@@ -167,7 +169,7 @@ class NormalExposure:
 
     @property
     def metered_share(self) -> float | None:
-        """None: the image has no influence."""
+        """None, because the factor does not depend on the image."""
         return None
 
     def factor(self, seed: int, number: int, brightness: float) -> float:
@@ -184,12 +186,12 @@ class NormalExposure:
 
 @dataclass(frozen=True)
 class AutomaticExposure:
-    """The factor at which a share of the pixels reaches a level: automatic exposure.
+    """Automatic exposure: the factor at which a share of the pixels reaches a level.
 
-    - `share`: share of the pixels, the brightest by their largest channel; with 0 no pixel reaches the level.
-    - `levels`: quantiles of the level, relative to saturation, 0 … 1, as for `DrawnExposure` but interpolated in the
-      logarithm. Level 1 saturates the share.
-    - `limit`: limit of the factor, so that a dark picture stays dark.
+    - `share`: share of the pixels whose largest channel reaches the level; with 0 no pixel reaches it.
+    - `levels`: quantiles of the random level, relative to saturation, 0 … 1. Between quantiles, its logarithm is
+      interpolated linearly. Level 1 saturates the share.
+    - `limit`: largest factor, so that a dark picture stays dark.
     """
 
     share: float
@@ -220,15 +222,16 @@ class AutomaticExposure:
         return {"exposure": "automatic", "share": self.share, "levels": list(self.levels), "most": self.limit}
 
 
-ExposureChoice = DrawnExposure | NormalExposure | AutomaticExposure  # The factor on the counts of each image
+# How the factor on the counts of each image is chosen
+ExposureChoice = DrawnExposure | NormalExposure | AutomaticExposure
 
 
 def parse_exposure(text: str) -> ExposureChoice:
     """Return the exposure of a text.
 
     A number is a factor. ``stops:low=-2,high=1`` is uniform in stops, ``normal:mean=-1,sd=0.5`` normally distributed.
-    ``clip:share=0.01`` saturates that share of the pixels. ``level:share=0.01,low=0.3,high=0.9`` lets that share reach
-    a level in that range, relative to saturation. ``most=4`` limits the factor of the last two.
+    ``clip:share=0.01`` saturates 1 % of the pixels. ``level:share=0.01,low=0.3,high=0.9`` lets 1 % of the pixels reach
+    a random level from 0.3 to 0.9 of saturation. ``most=4`` limits the factor of ``clip`` and ``level``.
     """
     kind, _, numbers_text = text.strip().partition(":")
     if kind not in _EXPOSURE_OPTIONS:
@@ -285,8 +288,9 @@ def _uniform(seed: int, number: int) -> float:
     return (int(philox.words(seed, 0, 0, number, philox.EXPOSURES)[0]) + 0.5) / (1 << 32)
 
 
-# Trial exposures to include noise in the share of pixels that reach a level. For 60 photographs at ISO 3200 and a share
-# of 0.02, the result was 0.85 to 3.8 times the share without trials, within 3 % with one, 0.5 % with two.
+# Number of trials of automatic exposure. They are needed because noise lets more pixels reach the level. For 60
+# photographs at ISO 3200 and a share of 0.02, two trials gave the share within 0.5 %. Without trials, up to 3.8 times
+# as many pixels reached the level.
 _TRIALS: Final = 2
 _LARGEST_COUNT: Final = 65535  # Largest 16-bit count
 _EVEN_LIGHT: Final[Three] = (1.0, 1.0, 1.0)  # Far end of even light
@@ -296,8 +300,8 @@ _EVEN_LIGHT: Final[Three] = (1.0, 1.0, 1.0)  # Far end of even light
 class AppliedVariation:
     """The variation of one image.
 
-    - `details`: columns of `images.csv`.
-    - `weights`: (H, W, 2) float32, shares of near-end and far-end light in each pixel; None for even light.
+    - `details`: values for the columns of `images.csv`.
+    - `weights`: (H, W, 2) float32, weights of the near and the far end in each pixel; None for even light.
     - `end`: light of the far end relative to the near end, by channel.
     """
 
@@ -316,9 +320,9 @@ class AppliedVariation:
 class Variation:
     """Differences between images; at least one of the first three is set.
 
-    - `exposure`: amount of light; None for that of the LUT.
+    - `exposure`: amount of light; None for the exposure of the LUT.
     - `gradient`: fall-off over the image; None for even light.
-    - `iso`: ISO speed that determines the noise; None for that of the LUT.
+    - `iso`: ISO speed that determines the noise; None for the speed of the LUT.
     - `noise`: noise of the samples of the LUT; see `variation_of`.
     """
 
@@ -333,7 +337,7 @@ class Variation:
 
     @property
     def tints(self) -> bool:
-        """Whether the colour of the light varies over an image, so that images have maps of it."""
+        """Whether the colour of the light varies over an image; such images have maps of the illuminant."""
         return self.gradient is not None and self.gradient.colour > 0
 
     def apply(self, image: npt.NDArray[np.uint16], white_level: int, seed: int, number: int) -> AppliedVariation:

@@ -1,1 +1,1 @@
-"""Simulated ends of cables: USB, PTP/IP, serial port and memory."""
+"""Simulated device ends of the connections: USB, PTP/IP and serial port."""

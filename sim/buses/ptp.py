@@ -1,7 +1,8 @@
-"""PTP/IP server on a TCP port, for one initiator at a time (CIPA DC-005-2005, PTP-IP, clauses 2.2 and 2.3).
+"""PTP/IP server on a TCP port: the camera end of the connection (CIPA DC-005-2005, PTP-IP, clauses 2.2 and 2.3).
 
-Only the thread of the command connection calls the responder. It asks for events after each operation, before the
-response, and 20 times per second between operations.
+The server accepts one initiator (host) at a time, with a command connection and an event connection. The thread of the
+command connection calls the responder (camera). It asks the camera for events before each response, and 20 times per
+second between operations.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ GUID = bytes(range(16))  # Identifier of a simulated device.
 NAME = "CroP camera"  # Default name of a simulated device; ptpy fails on names of more than 19 characters.
 DATA_PIECE = 256 * 1024  # Bytes of data per packet to the initiator; smaller data are sent in one EndData.
 
-_TICK_S = 0.05  # Interval between two requests for events, s.
+_EVENT_INTERVAL_S = 0.05  # Interval between two requests for events, s.
 
-# Limit for the first packet, for a data phase, and for a slow host, s; transfers on one machine are much faster.
+# Time limit for one packet, s. Transfers on one machine are much faster.
 _TIMEOUT_S = 10.0
 
 
@@ -83,7 +84,7 @@ class PtpIpService:
             _send(channel, InitCommandAck(initiator.number, GUID, self._name))
             while True:
                 try:
-                    packet = channel.next(_TICK_S)
+                    packet = channel.next(_EVENT_INTERVAL_S)
                 except LinkTimeout:
                     self._send_events(initiator)
                     continue
@@ -93,7 +94,7 @@ class PtpIpService:
                     case Ping():
                         _send(channel, Pong())
                     case _:
-                        # Remaining packets of a cancelled transaction.
+                        # The remaining packets of a cancelled transaction are ignored.
                         pass
         finally:
             initiator.hang_up()
@@ -123,7 +124,7 @@ class PtpIpService:
                     pass
 
     def _operate(self, initiator: _Initiator, request: PtpRequest, sends_data: bool) -> None:
-        initiator.cancelled = None  # The transaction that was cancelled last has ended
+        initiator.cancelled = None  # An earlier cancelled transaction has ended
         command, data = initiator.command, None
         if sends_data:
             data = _collect(command)
@@ -192,7 +193,7 @@ class _Initiator:
                 _send(self._event, packet)
 
     def hang_up(self) -> None:
-        """End the event connection. Its handler closes it; the command connection has its own handler."""
+        """End the event connection; the thread that serves it then closes it."""
         with self._lock:
             self._is_over = True
             if self._event_link is not None:

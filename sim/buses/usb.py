@@ -1,8 +1,8 @@
-"""Simulated USB: a still-image device without time or threads, and a bus that pyusb uses like a real one.
+"""Simulated USB: a still-image device, and a bus that pyusb uses like a real one.
 
-Transfers consist of packets. A transfer ends with a packet that is not full; if the last packet is full, an empty
-packet follows. Nothing waits: if a pipe has no data (NAK), a read times out at once. Data that are not PTP halt the
-bulk pipes until the host clears them.
+A transfer consists of packets and ends with a packet that is not full. If its last packet is full, an empty packet
+follows. Calls never wait: if a pipe has no data (NAK), a read times out at once. If the host sends data that are not
+PTP, the bulk pipes are halted until the host clears them.
 
 Sources: `usb.backend` of pyusb; error codes of libusb 1.0; USB 2.0, clauses 8.5 (transactions), 9.4 (standard requests)
 and 9.6 (descriptors); USB Still Image Capture Device Definition 1.0, clauses 5 to 7.
@@ -42,10 +42,12 @@ from foundation.clock import SimulatedClock
 from foundation.errors import ProtocolError
 
 PACKET = HIGH_SPEED_PACKET
-INTERRUPT_PACKET = 8  # wMaxPacketSize of the interrupt pipe, bytes: an EOS splits its events into such packets.
-BULK_IN = 0x81  # Endpoint addresses of a real EOS. Bit 7 set: to the host (USB 2.0, 9.6.6).
-BULK_OUT = 0x02  # From the host.
-INTERRUPT_IN = 0x83  # To the host.
+INTERRUPT_PACKET = 8  # wMaxPacketSize of the interrupt pipe, bytes, as of an EOS.
+
+# Endpoint addresses of an EOS. Bit 7 marks the direction to the host (USB 2.0, 9.6.6).
+BULK_IN = 0x81
+BULK_OUT = 0x02
+INTERRUPT_IN = 0x83
 
 _BULK, _INTERRUPT = 2, 3  # Transfer types in bmAttributes of an endpoint (USB 2.0, 9.6.6).
 # Types of descriptors (USB 2.0, 9.4, table 9-5).
@@ -54,7 +56,7 @@ _LANGUAGE_ENGLISH = 0x0409  # Language of the string descriptors: LANGID of Engl
 
 
 class Stalled(Exception):
-    """The pipe is halted, or the request is refused."""
+    """The device answers with STALL: the pipe is halted, or the request is refused."""
 
 
 class Overflowed(Exception):
@@ -63,7 +65,7 @@ class Overflowed(Exception):
 
 @dataclass(frozen=True)
 class UsbIdentity:
-    """Identification of a device, by default of an EOS 550D; `serial` None means no serial number."""
+    """Identification of a device, by default of an EOS 550D; `serial` is None without a serial number."""
 
     vendor: int = VENDOR_CANON_USB
     product: int = 0x31EA
@@ -91,13 +93,13 @@ class Setup:
 
 @dataclass
 class _Exchange:
-    """State of the pipes; reset by the host and by a disconnection."""
+    """State of the pipes, which a disconnection or the host resets."""
 
     # Splits the bytes of the host into containers
     reader: ContainerReader = field(default_factory=lambda: ContainerReader(PACKET))
     request: PtpRequest | None = None  # Operation whose data phase is being received
-    payload: bytearray = field(default_factory=bytearray)  # Data received so far
-    # Operation with its data phase, before the end of its transfer
+    payload: bytearray = field(default_factory=bytearray)  # Data of this operation received so far
+    # Complete operation and its data, which is answered at the end of the transfer
     complete: tuple[PtpRequest, bytes | None] | None = None
     outgoing: deque[memoryview] = field(default_factory=deque[memoryview])  # Transfers to the host on the bulk pipe
     events: deque[memoryview] = field(default_factory=deque[memoryview])  # Transfers to the host on the interrupt pipe
@@ -111,7 +113,7 @@ def endpoint_descriptor(address: int, transfer_type: int, packet: int, interval:
 class PtpUsbDevice:
     """Still-image device at high speed: descriptors, standard requests, pipes."""
 
-    pipes: Final = frozenset({BULK_IN, BULK_OUT, INTERRUPT_IN})  # Addresses of its endpoints
+    pipes: Final = frozenset({BULK_IN, BULK_OUT, INTERRUPT_IN})  # Endpoint addresses
 
     def __init__(self, responder: Responder, identity: UsbIdentity | None = None) -> None:
         self.identity = identity or UsbIdentity()
@@ -192,7 +194,7 @@ class PtpUsbDevice:
         return interface + bulk + endpoint_descriptor(INTERRUPT_IN, _INTERRUPT, INTERRUPT_PACKET, 6)
 
     def write(self, endpoint: int, data: bytes) -> None:
-        """Receive packets: all are full, but the last may be short; b"" is an empty packet."""
+        """Receive packets, of which only the last may be short; b"" is an empty packet."""
         if BULK_OUT in self._halted:
             raise Stalled
         exchange = self._exchange
@@ -256,7 +258,7 @@ class PtpUsbDevice:
             self._exchange.outgoing.append(memoryview(b""))
 
     def _packets(self, endpoint: int, queue: deque[memoryview], packet: int, limit: int) -> bytes | None:
-        # One transfer of the host ends with a packet that is not full, or at `limit`.
+        # A read by the host ends with a packet that is not full, or after `limit` bytes.
         if endpoint in self._halted:
             raise Stalled
         if not queue:
@@ -312,8 +314,8 @@ _ERRORS = {
 }
 _HIGH_SPEED = 3  # LIBUSB_SPEED_HIGH, 480 Mbit/s, as in real bodies.
 
-# Fields of each descriptor type after length and type (USB 2.0, 9.6). Names with w, id or bcd have two bytes, others
-# one.
+# Fields of each descriptor type after length and type (USB 2.0, 9.6). Fields with the prefix w, id or bcd have two
+# bytes, others one.
 _FIELDS = {
     _DEVICE: "bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol bMaxPacketSize0 idVendor idProduct bcdDevice "
     "iManufacturer iProduct iSerialNumber bNumConfigurations",
@@ -342,7 +344,7 @@ class Handle:
 
 
 class SimulatedBus(IBackend):
-    """Bus with devices that can be plugged in and unplugged."""
+    """USB bus (a backend of pyusb) with devices that can be plugged in and unplugged."""
 
     def __init__(self, *devices: PtpUsbDevice) -> None:
         self._attachments: list[Attachment] = []
@@ -367,7 +369,7 @@ class SimulatedBus(IBackend):
             device.unplugged()
 
     def replug(self, device: PtpUsbDevice) -> None:
-        """Unplug a device and plug it in at the same port, as a restart does."""
+        """Unplug a device and plug it in at the same port, as if it had been restarted."""
         port = next((attachment.port for attachment in self._attachments if attachment.device is device), 1)
         self.unplug(device)
         self.plug(device, port)
@@ -399,7 +401,7 @@ class SimulatedBus(IBackend):
         return list(self._attachments)
 
     def get_parent(self, dev: Attachment) -> None:
-        """Return None: all ports belong to the root hub."""
+        """Return None, because all ports belong to the root hub."""
 
     def get_device_descriptor(self, dev: Attachment) -> SimpleNamespace:
         """Return the device descriptor with bus, address and port."""
@@ -573,7 +575,7 @@ def _descriptor(descriptors: bytes, code: int, index: int = 0) -> SimpleNamespac
 
 
 class MemoryTransport(UsbTransport):
-    """Transport (`drivers.ptp.protocol.Transport`) to a responder on a separate bus, without threads or waiting."""
+    """Transport (`drivers.ptp.protocol.Transport`) to a responder on its own simulated bus; calls never wait."""
 
     def __init__(self, responder: Responder) -> None:
         self._device = PtpUsbDevice(responder, UsbIdentity(name="the simulated Canon Digital Camera"))

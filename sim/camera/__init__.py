@@ -1,1 +1,1 @@
-"""Simulated camera: raw files, and a Canon EOS that uses PTP."""
+"""Simulated Canon EOS that is controlled over PTP, and its raw files."""

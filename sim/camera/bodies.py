@@ -1,11 +1,10 @@
 """EOS bodies of the simulated camera: identification, properties, and lists of allowed values.
 
-No recording of an EOS 550D or 6D Mark II has been published. Unknown data are taken from the one recorded body, an EOS
-60D; see the comments. Properties are in the order in which the 60D sends them. A property with value None is sent on
-request only, as by the 60D.
+There is no public recording of the PTP data of an EOS 550D or 6D Mark II. Unknown values are those of an EOS 60D, of
+which a recording exists. Properties are in the order in which the 60D sends them.
 
-Sources: a recorded EOS 60D (firmware 1.1.0); settings of an EOS 550D (firmware 1.0.9) and a 6D Mark II (1.0.2) listed
-by users of libgphoto2; libgphoto2 2.5.34 for structures; specifications of Canon for battery and burst.
+Sources: a recorded EOS 60D (firmware 1.1.0); settings of an EOS 550D (firmware 1.0.9) and a 6D Mark II (1.0.2) that
+users of libgphoto2 published; libgphoto2 2.5.34 for structures; specifications of Canon for battery and burst.
 """
 
 from __future__ import annotations
@@ -32,9 +31,10 @@ from drivers.ptp.codes import (
 )
 from drivers.ptp.protocol import DeviceInfo
 
-NO_LIST = 1  # Kind of a list record: no list; such a property can rarely be set.
-LIST = 3  # Kind of a list record: the values in the list are allowed; none if it is empty.
-FREE = 7  # Kind of a list record: no list, for texts, times and structures.
+# Kinds of the record that lists the allowed values of a property.
+NO_LIST = 1  # Without list; the property can usually not be set.
+LIST = 3  # With the list of all allowed values.
+FREE = 7  # Without list, for texts, times and structures.
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,8 @@ class PropertySpec:
     """A property as a body reports it."""
 
     code: int  # A `drivers.ptp.codes.Property`, or a number without name
-    value: bytes | None  # Encoded; None if sent on request only, `b""` if computed from the state
+    # Encoded; None if it is sent on request only, `b""` if it is calculated from the state of the camera
+    value: bytes | None
     kind: int = NO_LIST  # `NO_LIST`, `LIST` or `FREE`
     choices: tuple[int, ...] = ()  # Allowed values, in the order of the body
     formats: tuple[ImageFormat, ...] = ()  # Allowed image formats
@@ -50,14 +51,14 @@ class PropertySpec:
 
 @dataclass(frozen=True)
 class EosModel:
-    """An EOS body as seen by PTP."""
+    """Properties of an EOS body that PTP reports, and its speed and battery."""
 
     info: DeviceInfo  # DeviceInfo, without operations and serial number
     usb: tuple[int, int]  # USB vendor and product
-    properties: tuple[PropertySpec, ...]  # At power-on, with the dial at M and manual focus
-    shutter_codes: tuple[int, ...]  # Allowed shutter times if the dial lets them be set
+    properties: tuple[PropertySpec, ...]  # At power-on, with the mode dial at M and manual focus
+    shutter_codes: tuple[int, ...]  # Allowed shutter times in modes M and Tv
     aperture_codes: tuple[int, ...]  # Allowed apertures; empty for a lens without contacts
-    burst: int  # Raw frames in its memory
+    burst: int  # Number of raw frames that its memory can hold
     frame_bytes: int  # Expected size of a frame, for the number of free shots
     write_s: float  # Time from the end of an exposure until the file is ready
     shots_per_charge: int  # Frames per battery charge
@@ -118,20 +119,21 @@ def structure(*numbers: int) -> bytes:
 
 
 HALF_STOPS = 0x0101  # Custom function: exposure in half stops instead of third stops.
-MIRROR_LOCKUP = 0x060F  # Custom function: the first press raises the mirror, in bodies without a menu item (group 3).
+MIRROR_LOCKUP = 0x060F  # Custom function: the first press of the release raises the mirror.
 
 
 def custom_functions(group: int, functions: Mapping[int, int]) -> bytes:
-    """Return one group of custom functions (property 0xd1a0), from settings by function number."""
+    """Encode one group of custom functions (property 0xd1a0); `functions` are settings by function number."""
     settings = [number for function, setting in functions.items() for number in (function, 1, setting)]
     return structure(1, group, 8 + 4 * len(settings), len(functions), *settings)
 
 
 def focus_points() -> bytes:
-    """Return nine focus points, none of them in focus (property 0xd1d3).
+    """Return nine focus points, none of them in focus (property 0xd1d3), in the layout of the 60D.
 
-    Layout of the 60D as read by libgphoto2: length, length − 4, version, points, points in use, two frame sizes. Then
-    heights, widths, x and y of all points from the centre of the frame, and a bit per point that is in focus.
+    libgphoto2 reads this layout: length, length − 4, version, number of points, number of points in use, two frame
+    sizes; then heights, widths, x and y of all points, from the centre of the frame; then one bit for each point that
+    is in focus.
     """
     xs = (-1720, -860, -860, 0, 0, 0, 860, 860, 1720)
     ys = (0, 489, -489, 792, 0, -792, 489, -489, 0)
@@ -182,12 +184,12 @@ _WHITE_SHIFTS = tuple(number & 0xFFFFFFFF for number in range(-9, 10))
 
 
 def _thirds(first: int, last: int) -> tuple[int, ...]:
-    # Codes of corrections in thirds of a stop, from `first` to `last` stops; the unit is an eighth of a stop.
+    # Codes of thirds of a stop, from `first` to `last` stops. The unit of a code is an eighth of a stop.
     return tuple(code & 0xFF for code in range(8 * first, 8 * last + 1) if code % 8 in (0, 3, 5))
 
 
 def _jpegs(*sizes: tuple[int, bool]) -> tuple[ImageFile, ...]:
-    # JPEG files by size number: fine and normal, or only fine.
+    # JPEG formats. Each argument is a size number, and whether the size exists in normal quality besides fine quality.
     return tuple(ImageFile(1, size, quality) for size, normal in sizes for quality in ((3, 2) if normal else (3,)))
 
 
@@ -197,7 +199,7 @@ def _raw(size: int = 0) -> ImageFile:
 
 @dataclass(frozen=True)
 class _Choices:
-    """Differences between the bodies; lists are in the order of the body."""
+    """Properties that differ between the bodies; lists have the order of the body."""
 
     model_id: int
     formats: tuple[ImageFormat, ...]
@@ -295,9 +297,9 @@ _COMMON_WHITE = (
     WhiteBalance.FLASH,
     WhiteBalance.MANUAL,
 )
-# Codes of the picture styles: standard to monochrome, then the user's three (as libgphoto2 names them).
+# Codes of the picture styles: six styles of Canon, then three of the user (libgphoto2).
 _STYLES = (0x81, 0x82, 0x83, 0x84, 0x85, 0x86, 0x21, 0x22, 0x23)
-_BULB = 0x0C  # Code of the shutter time that has no number: B
+_BULB = 0x0C  # Code of the shutter time B (bulb).
 
 _CHOICES_550D = _Choices(
     model_id=0x80000270,
@@ -318,9 +320,9 @@ _CHOICES_550D = _Choices(
     lens="EF-S18-55mm f/3.5-5.6 IS",
 )
 
-# An EOS 550D with factory settings, which are generally known: third stops, no highlight priority, power off after
-# 30 s. Taken from the 60D: vendor extension id, operations, events, third-stop apertures, white balance shifts,
-# structures, order, capture destinations 2, 4, 6, and the reports of camera time and counters.
+# An EOS 550D with factory settings: third stops, no highlight priority, power off after 30 s. Assumed equal to the 60D:
+# vendor extension id, operations, events, third-stop apertures, white balance shifts, structures, order of properties,
+# capture destinations 2, 4, 6, and the reports of camera time and counters.
 EOS_550D = EosModel(
     info=_device_info("Canon EOS 550D", "3-1.0.9", "Canon Inc.", 200),
     usb=(VENDOR_CANON_USB, 0x31EA),
@@ -333,8 +335,8 @@ EOS_550D = EosModel(
     shots_per_charge=440,
 )
 
-# The EOS 550D of the user who listed its settings: half stops, no ISO 100 (probably highlight priority), and a
-# largest aperture of f/4.
+# The EOS 550D with the published settings: half stops, no ISO 100 (probably highlight priority), and a largest aperture
+# of f/4.
 EOS_550D_AS_LISTED = replace(
     EOS_550D,
     properties=_properties(
@@ -348,11 +350,11 @@ EOS_550D_AS_LISTED = replace(
 
 _JPEGS_6D2 = _jpegs((0, True), (1, True), (14, True), (15, False))
 
-# An EOS 6D Mark II. Bulb is on its dial, not in its list. mRAW and sRAW are listed, but frames have full size. Taken
-# from the 60D: vendor extension id, operations, events, structures, order, nine focus points (the 6D Mark II has 45),
-# capture destinations 2, 4, 6, and object events of 32 bits. Shutter times and apertures are third stops, within the
-# range of a body and lens that a user listed. Mirror lockup as property 0xd13a is from libgphoto2; the user's list does
-# not contain it.
+# An EOS 6D Mark II. Bulb is on its mode dial, not in its list of shutter times. mRAW and sRAW can be selected, but
+# frames have full size. Assumed equal to the 60D: vendor extension id, operations, events, structures, order of
+# properties, nine focus points (the 6D Mark II has 45), capture destinations 2, 4, 6, and object events of 32 bits.
+# Shutter times and apertures are third stops in the range of the published settings. Mirror lockup is property 0xd13a
+# in libgphoto2, but is missing in the published settings.
 EOS_6D_MARK_II = EosModel(
     info=_device_info("Canon EOS 6D Mark II", "3-1.0.2", "Canon.Inc", 100),
     usb=(VENDOR_CANON_USB, 0x32CA),

@@ -1,10 +1,10 @@
-"""Simulated Canon EOS: a PTP responder that behaves like a body of the series, with a `Film` in place of the sensor.
+"""Simulated Canon EOS: a PTP responder (camera) that gets its frames from a `Film`.
 
-The state advances with the clock, and only at calls: due actions are then carried out in their order. With a
-`SimulatedClock`, an initiator must wait by the same clock. Behaviour follows a recorded EOS 60D; if there is no
-public recording, a comment has the word "assumed". Methods may be called by several threads.
+Each call first carries out the actions that are due by the clock. With a `SimulatedClock`, the initiator (host) must
+wait by the same clock. Behaviour follows a recorded EOS 60D; comments with the word "assumed" mark behaviour that no
+public recording shows.
 
-Sources: a recorded EOS 60D; ISO 15740:2013 for the standard; libgphoto2 2.5.34 for expectations of initiators.
+Sources: a recorded EOS 60D; ISO 15740:2013 (PTP); libgphoto2 2.5.34 for the expectations of initiators.
 """
 
 from __future__ import annotations
@@ -80,9 +80,9 @@ CARD = 0x00020001  # Storage id of the card.
 EMPTY_SLOT = 0x00020000  # Storage id without a card.
 DCIM = 0x90000000  # Handle of the folder DCIM on the card.
 FOLDER = 0x91900000  # Handle of the folder 100CANON; files on the card have handles from here, in steps of 16.
-BULB = 0x0C  # Shutter speed code "as long as the release is pressed"; a press gives one frame of `_METERED_S` here.
+BULB = 0x0C  # Shutter speed code of bulb exposures, which are simulated with the shutter time `_METERED_S`.
 
-# Largest value of a parameter or time; in GetObjectHandles any store, any format, or the root (ISO 15740).
+# Largest 32-bit number. In GetObjectHandles it means any store, any format, or the root (ISO 15740).
 U32 = 0xFFFFFFFF
 _MEMORY = 0xA0000000  # First handle of objects in the camera's memory (assumed).
 _MOST_SHOTS = 0x7FFFFFFF  # Highest reported number of free shots: the largest signed 32-bit number.
@@ -106,7 +106,7 @@ class OperationResult(NamedTuple):
 
 
 class Arguments(NamedTuple):
-    """Parameters of a request, 0 if missing, and its data phase."""
+    """Parameters of a request (0 if missing), and the data that the initiator sent with it."""
 
     first: int
     second: int
@@ -159,7 +159,7 @@ class Card:
         return self.capacity - sum(len(item.data) for item in self.objects.values())
 
 
-_AUTO_ISO = 400  # ISO speed chosen by the body (assumed; there is no light meter).
+_AUTO_ISO = 400  # ISO speed chosen by the body (assumed, because no light meter is simulated).
 _METERED_S = 1 / 60  # Shutter time chosen by the body, s (assumed).
 _METERED_APERTURE = 5.6  # Aperture chosen by the body (assumed).
 _FORMATS_BY_SUFFIX = {".crw": ObjectFormat.CRW, ".cr3": ObjectFormat.CR3}
@@ -167,7 +167,7 @@ _JPEG_SIZE = (160, 240)  # Height and width, px: enough for the file name, fast 
 
 
 class _Refusal(Enum):
-    """Reasons to refuse a full press: response to RemoteReleaseOn, result of RemoteRelease."""
+    """Reasons to refuse a release, each with the response to RemoteReleaseOn and the result of RemoteRelease."""
 
     BUSY = (ResponseCode.DEVICE_BUSY, 0x2019)
     MIRROR_LOCKUP = (ResponseCode.DEVICE_BUSY, 3)
@@ -194,19 +194,19 @@ class _Frame:
 
 _FREELY_SET = (*_TEXTS, Property.EOS_CAMERA_TIME)
 
-_SHUTDOWN_WARNING_S = 10.0  # Time between the warning and switching off, s (assumed).
+_SHUTDOWN_WARNING_S = 10.0  # Time from the warning until the camera switches itself off, s (assumed).
 
 
 class SimulatedEos:
-    """EOS body on a cable; a `drivers.ptp.protocol.Responder`.
+    """EOS body, a `drivers.ptp.protocol.Responder`. Methods may be called by several threads.
 
     Parameters
     ----------
     card_bytes
         Capacity of the card; None for an empty slot.
     auto_power_off_s
-        Idle seconds before the body switches off; 0 for never, None for the setting of the body. GetEvent and
-        GetDeviceInfo do not end the idle time; other operations do.
+        Idle seconds after which the body switches itself off; 0 for never, None for the setting of the body. All
+        operations except GetEvent and GetDeviceInfo restart the idle time.
     battery
         Charge, 0 to 1.
     without
@@ -214,8 +214,8 @@ class SimulatedEos:
     forgetful
         Whether frames in the memory are lost when the session ends.
     executor
-        Develops the film, so that large frames do not delay answers. With None, the film is developed during the
-        release, as tests need.
+        Threads that calculate frames, so that large frames do not delay answers. With None, a frame is calculated
+        during the release, as tests need.
     """
 
     def __init__(
@@ -594,7 +594,7 @@ class SimulatedEos:
         return None
 
     def _settings(self) -> ExposureSettings:
-        """Return the nominal exposure settings; assumed values where the body would use its light meter."""
+        """Return the nominal exposure settings, with assumed values in place of those of a light meter."""
         iso = self._number_of(Property.EOS_ISO_SPEED)
         aperture = self._number_of(Property.EOS_APERTURE)
         shutter = self._number_of(Property.EOS_SHUTTER_SPEED)
@@ -656,7 +656,7 @@ class SimulatedEos:
         return future
 
     def _finish_frame(self, frame: _Frame) -> None:
-        # If the film takes longer than the body would, try again soon.
+        # The calculation may take longer than a real body needs.
         if not frame.raw.done():
             self._schedule(self._clock.monotonic() + 0.01, lambda: self._finish_frame(frame))
             return
@@ -701,7 +701,7 @@ class SimulatedEos:
         state = self._properties.get(setting.code)
         if state is None:
             raise OperationRefusal(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
-        # The recorded 60D answers 0x2019, not 0x201c, to a value that is not in its list.
+        # The recorded 60D answers DEVICE_BUSY to a value that is not in its list.
         if self._is_busy or not self._allows(setting, state):
             raise OperationRefusal(ResponseCode.DEVICE_BUSY)
         self._store(setting.code, setting.value)
@@ -793,13 +793,13 @@ class SimulatedEos:
             return Answer(PtpResponse(ResponseCode.OK, request.transaction, reply.parameters), reply.data)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return hints that GetEvent has events: one hint when an empty queue gets its first event."""
+        """Return hints that GetEvent has events. An empty queue that gets its first event causes one hint."""
         with self._updated():
             hints, self._hints = tuple(self._hints), []
             return hints
 
     def cancelled(self, transaction: int) -> None:
-        """Do nothing: operations are completed at once, so there is nothing to undo."""
+        """Do nothing, because each operation is complete before it can be cancelled."""
 
     def unplugged(self) -> None:
         """End the session; frames in the memory are kept unless the camera is `forgetful`."""
@@ -876,7 +876,7 @@ class SimulatedEos:
         return operation(Arguments(first, second, third, data)) or OperationResult()
 
     def _check_transaction(self, transaction: int) -> None:
-        # Numbers may be skipped, because a request can be lost.
+        # Transaction numbers may be skipped, because a request can be lost.
         advance = (transaction - self._last_transaction) & U32
         if transaction in (0, U32) or not 0 < advance < 1 << 31:
             raise OperationRefusal(ResponseCode.INVALID_TRANSACTION_ID)
@@ -945,7 +945,7 @@ class SimulatedEos:
         """Answer OK."""
 
     def _handlers(self) -> dict[int, Callable[[Arguments], OperationResult | None]]:
-        # In the order of the 60D. Real bodies support more (uploads, live view, formatting).
+        # In the order of the 60D. Real bodies support more operations, such as uploads and live view.
         return {
             Operation.GET_DEVICE_PROP_DESC: self._get_device_prop_desc,
             Operation.GET_DEVICE_PROP_VALUE: self._get_device_prop_value,
@@ -991,7 +991,7 @@ class SimulatedEos:
 
 
 def _small_jpeg(name: str) -> bytes:
-    # A small grey picture with the file name, in place of a rendered frame.
+    # A small grey picture with the file name instead of a frame.
     import cv2
     import numpy as np
 

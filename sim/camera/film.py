@@ -1,8 +1,9 @@
 """Frames of the simulated camera, and their raw files.
 
-`sim.camera.eos` simulates settings, file names and timing. A `Film` makes the frame: of the `World` under simulated
-light (`WorldFilm`) or under the picture of a real screen (`WatchedFilm`). Raw files are Adobe DNG 1.4 with one
-uncompressed 16-bit mosaic of the whole sensor; the tag `Software` marks the frame as simulated.
+A `Film` makes the frames of a simulated camera and writes their raw files; `sim.camera.eos` simulates settings, file
+names and timing. `WorldFilm` photographs the `World` under simulated light, `WatchedFilm` under the picture of a real
+screen. Raw files are Adobe DNG 1.4 with one uncompressed 16-bit mosaic of the whole sensor. The tag `Software` marks
+frames as simulated.
 
 Sources: DNG 1.4 chapters 2 and 4, Exif 2.32 section 4.6.
 """
@@ -32,13 +33,13 @@ from sim.world.world import UNDISTURBED, World
 
 SOFTWARE = "CroP simulated camera"
 
-# XYZ to camera RGB under D65, in 1/10000, from dcraw 9.28 `adobe_coeff`; converters need it for a viewable picture.
+# XYZ to camera RGB under D65, in 1/10000, from dcraw 9.28 `adobe_coeff`. Raw converters need this matrix.
 _COLOUR_MATRICES = {
     "Canon_EOS_600D": (6461, -907, -882, -4300, 12184, 2378, -819, 1944, 5931),
     "Canon_EOS_200D": (7377, -742, -998, -4235, 11981, 2549, -673, 1918, 5538),
 }
 
-# XYZ to linear sRGB, in 1/10000 (IEC 61966-2-1). Keeps neutral colours neutral for an unknown camera.
+# XYZ to linear sRGB, in 1/10000 (IEC 61966-2-1), for unknown cameras. It keeps neutral colours neutral.
 _LINEAR_SRGB = (32406, -15372, -4986, -9689, 18758, 415, 557, -2040, 10570)
 
 
@@ -81,7 +82,7 @@ def write_dng(
         TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [CFA]),
         TiffTag.MAKE: text(body.maker),
         TiffTag.MODEL: text(body.model),
-        TiffTag.ORIENTATION: (ValueType.SHORT, [1]),  # as it lies
+        TiffTag.ORIENTATION: (ValueType.SHORT, [1]),  # not rotated
         TiffTag.SAMPLES_PER_PIXEL: (ValueType.SHORT, [1]),
         TiffTag.ROWS_PER_STRIP: (ValueType.LONG, [rows]),
         TiffTag.PLANAR_CONFIGURATION: (ValueType.SHORT, [1]),
@@ -119,7 +120,7 @@ def _neutral(matrix: Sequence[int]) -> list[Fraction]:
 
 
 def _colour_matrix(body: Body) -> tuple[int, ...]:
-    # XYZ to camera RGB in 1/10000: from the table, else from LibRaw, else linear sRGB.
+    # XYZ to camera RGB in 1/10000: from the table, otherwise from LibRaw, otherwise linear sRGB.
     matrix = _COLOUR_MATRICES.get(body.sensitivities)
     if matrix is not None:
         return matrix
@@ -127,7 +128,8 @@ def _colour_matrix(body: Body) -> tuple[int, ...]:
     return _LINEAR_SRGB if rows is None else tuple(round(10_000 * value) for row in rows for value in row)
 
 
-_WATCHED = 256  # First component of the noise key of a watched frame: no colour code, so keys of other frames differ.
+# First integer of the noise key of a `WatchedFilm`. It is no colour code, so that it differs from keys of `WorldFilm`.
+_WATCHED_KEY = 256
 
 
 class Film(Protocol):
@@ -143,15 +145,16 @@ class Film(Protocol):
         ...
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> object:
-        """Write the raw file of a frame that is exposed now."""
+        """Expose a frame now, and write its raw file."""
         ...
 
 
 class WatchedFilm:
-    """Frames of a `World` under light from outside, in real time.
+    """Frames of a `World` under measured light, in real time.
 
-    `gather` is called with the number of the exposure, from 0, and its seconds. It waits for them and returns the mean
-    projected picture (h, w, 3) float32, 0 to 1 of the full light of each primary, and the relative lamp brightness.
+    `gather` measures the light of an exposure, given its number, from 0, and its duration in seconds. It waits until
+    the exposure has ended. It returns the mean projected picture (h, w, 3) float32, 0 to 1 of the full light of each
+    primary, and the relative lamp brightness. `opened`: time from which lamp drift counts.
     """
 
     suffix = ".dng"
@@ -174,20 +177,21 @@ class WatchedFilm:
         _accept(settings)
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
-        """Expose the world to the light during the exposure time from now."""
+        """Expose a frame now, for the exposure time, and write its raw file."""
         seconds = (released_at - self._opened).total_seconds()
         frame = next(self._frames)
         picture, lamp = self._gather(frame, settings.shutter_s)
         lamp *= 1 - self._world.room.lamp_drift_per_hour * seconds / 3600
         situation = replace(UNDISTURBED, picture=picture)
-        counts = self._world.expose(BLACK, settings, key=(_WATCHED, frame), lamp=lamp, situation=situation)
+        counts = self._world.expose(BLACK, settings, key=(_WATCHED_KEY, frame), lamp=lamp, situation=situation)
         write_dng(into, counts, self._world.body, settings=settings, taken_at=released_at, serial=self._serial)
 
 
 class WorldFilm:
     """Frames of a `World` under the light of the simulated projector.
 
-    `light` returns the relative light output of the projector now, 0 to 1.
+    `look` returns the displayed colour, `light` the relative light output of the projector, 0 to 1. `exposed`: number
+    of earlier frames by colour. `earlier_frames`: time in seconds and colour of each earlier frame.
     """
 
     suffix = ".dng"
@@ -216,12 +220,12 @@ class WorldFilm:
         _accept(settings)
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
-        """Expose the world under its light now."""
+        """Expose a frame now, and write its raw file."""
         colour = self._look()
         seconds = (released_at - SIM_START).total_seconds()
         moment = Moment(len(self._earlier_frames), seconds, colour, tuple(self._earlier_frames))
         lamp = self._light() * (1 - self._world.room.lamp_drift_per_hour * seconds / 3600)
-        # The noise depends on the ordered colour, not on the displayed one.
+        # The noise depends on the colour that the computer sent, even if a disturbance changes the displayed colour.
         key = (*colour, self._exposed[colour])
         self._exposed[colour] += 1
         self._earlier_frames.append((seconds, colour))

@@ -1,1 +1,1 @@
-"""Simulated projectors and screens with their protocols."""
+"""Simulated projectors with their control protocols, and light from real screens."""

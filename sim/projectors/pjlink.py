@@ -1,4 +1,4 @@
-"""PJLink of the simulated projector: the other end of a connection, and a TCP server."""
+"""PJLink protocol of the simulated projector, and a TCP server for it."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from sim.projectors.projector import INPUTS, SimulatedProjector
 class _Connection:
     """State of one connection."""
 
-    last_received_s: float  # Time of the last command, by the projector's clock
+    last_received_s: float  # Time of the last received data, by the clock of the projector
     received: bytes = b""  # Bytes of an incomplete line
     expected_digest: str = ""  # Digest of the password; empty if not required or already verified
     closed: bool = False  # Whether the projector closed the connection
 
 
 class PjLinkPeer:
-    """Projector end of one PJLink connection: bytes in, bytes out.
+    """Projector end of a PJLink connection: it receives bytes and returns the bytes of its answers.
 
-    `password` is required on each connection; None for no password. `seed` are the eight characters of the greeting;
-    None for random ones.
+    `password`: required on each connection; None for no password. `seed`: the eight characters of the greeting; None
+    for random characters.
     """
 
     def __init__(self, projector: SimulatedProjector, password: str | None = None, seed: str | None = None) -> None:
@@ -39,13 +39,13 @@ class PjLinkPeer:
         self._classes = _class_1(projector), _class_2(projector)
 
     def connect(self) -> bytes:
-        """Start a new connection in place of the last, and return the greeting."""
+        """Start a new connection that replaces the previous one, and return the greeting."""
         self._connection, greeting = self._new_connection()
         return greeting
 
     @property
     def closed(self) -> bool:
-        """Whether it closed the connection: after 30 s without a command, a wrong password, or invalid bytes."""
+        """Whether the connection was closed, after 30 s without data, a wrong password or invalid bytes."""
         connection = self._connection
         if self._projector.clock.monotonic() - connection.last_received_s >= wire.IDLE_LIMIT_S:
             connection.closed = True
@@ -129,7 +129,7 @@ def _class_1(projector: SimulatedProjector) -> _Answers:
             "31": mute,
             "10": show,
             "30": show,
-            # Sound only: it has no loudspeaker.
+            # Muting of sound only; the projector has no loudspeaker.
             "20": lambda: None,
             "21": lambda: None,
         },

@@ -1,6 +1,6 @@
-"""The simulated projector with its lamp, and the screen, which has one uniform colour.
+"""Simulated projector with a lamp, and simulated screen with one uniform colour.
 
-Each call of a method first updates the state to the current time. Protocols are in other modules.
+Other modules of this package implement the control protocols of the projector.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ REFRESH_S = 1 / 60  # Usual frame period of a screen, s.
 
 @dataclass
 class Screen:
-    """Displayed colour; the presenter writes it, the camera reads it."""
+    """Displayed colour: the presenter sets it, and the camera photographs it."""
 
     colour: Colour = BLACK
 
@@ -47,8 +47,8 @@ class SimulatedPresenter:
         self._open = False
 
 
-WARM_UP_S = 30.0  # Slightly less than the typical 40 s of PWR ON (Epson, ESC/VP21 Command User's Guide).
-COOL_DOWN_S = 60.0  # Slightly more than the 10 to 50 s of PWR OFF (same source), so that drivers have to wait.
+WARM_UP_S = 30.0  # Epson projectors typically need 40 s (ESC/VP21 Command User's Guide, PWR ON).
+COOL_DOWN_S = 60.0  # Epson projectors need 10 to 50 s (same source, PWR OFF).
 IDENTITY = ProjectorIdentity("CroP", "Simulated Projector", "dark room")
 INPUTS = ("11", "31", "32", "3A", "61")  # Codes of the inputs (PJLink INPT); class 1 has the first three.
 PANEL = Resolution(1920, 1080)
@@ -56,7 +56,7 @@ PANEL = Resolution(1920, 1080)
 
 @dataclass(frozen=True)
 class ProjectorTraits:
-    """Constant properties of a simulated projector; `lamp_hours` are its hours at the start."""
+    """Constant properties of a simulated projector; `lamp_hours` is the initial state of its lamp counter."""
 
     identity: ProjectorIdentity = IDENTITY
     warm_up_s: float = WARM_UP_S
@@ -66,7 +66,10 @@ class ProjectorTraits:
 
 
 class SimulatedProjector:
-    """Simulated lamp projector (`drivers.projector.Projector`); methods may be called by several threads."""
+    """Simulated lamp projector (`drivers.projector.Projector`); methods may be called by several threads.
+
+    Each method first updates the power state to the current time.
+    """
 
     def __init__(self, clock: Clock, power: Power = Power.STANDBY, traits: ProjectorTraits | None = None) -> None:
         self.clock = clock
@@ -144,19 +147,20 @@ class SimulatedProjector:
             return tuple(Fault(name, self._faults[name]) for name in FAULT_PARTS if name in self._faults)
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return the state of its only lamp."""
+        """Return the state of the only lamp."""
         with self._lock:
             self._update()
             burning_s = self.clock.monotonic() - self._state_since_s if self._lit() else 0.0
             return (Lamp(int((self._burnt_s + burning_s) / 3600.0), self._lit()),)
 
     def close(self) -> None:
-        """Do nothing: it has no connection."""
+        """Do nothing, because there is no connection."""
 
     def light(self) -> float:
         """Return the relative light output now, 0 to 1.
 
-        It is 0 if the projector is off, muted or its lamp is broken, and increases linearly during warm-up.
+        The output is 0 if the projector is off or muted, or if its lamp is broken. It increases linearly during
+        warm-up.
         """
         with self._lock:
             self._update()
@@ -167,7 +171,7 @@ class SimulatedProjector:
             return 1.0
 
     def break_part(self, part: str, severity: Severity) -> None:
-        """Inject a fault of one of `drivers.projector.FAULT_PARTS`; an error of the lamp switches it off."""
+        """Inject a fault of one of `drivers.projector.FAULT_PARTS`; a lamp with an error goes off."""
         if part not in FAULT_PARTS:
             raise ValueError(f"the part is {part!r}, expected one of {', '.join(FAULT_PARTS)}")
         with self._lock:

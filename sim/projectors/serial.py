@@ -1,8 +1,8 @@
-"""Simulated projector with a line protocol: the other end of a cable for any `Language`, bytes in, bytes out.
+"""Simulated projector that is controlled by lines of text, in any `Language` of a maker.
 
-Reopening the cable keeps the state; only an incomplete command is lost. `receive` without bytes returns pending output:
-late answers and unsolicited messages. If manuals are ambiguous, the projector behaves in the way that is more difficult
-for a driver: it does not answer, or refuses.
+A `LinePeer` is the projector end of a cable: it receives bytes and returns the bytes of its answers. A new connection
+discards an incomplete command. If manuals are ambiguous, the projector refuses or does not answer, because this is more
+difficult for a driver.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _TRANSITIONAL = (Power.WARMING, Power.COOLING)
 
 
 class LinePeer:
-    """Projector that uses a language; `network` if it is connected by TCP."""
+    """Projector that uses a language; `network` is true for a TCP connection."""
 
     def __init__(self, projector: SimulatedProjector, language: Language, network: bool = False) -> None:
         self._projector = projector
@@ -24,7 +24,7 @@ class LinePeer:
         self._network = network
         self._begin, end = (text.strip("\r\n") for text in language.line.command.split("{}"))
         self._end = end
-        # All makers use CR, but a language may define another character.
+        # Last character of a command, which is CR in the languages of all makers.
         self._last = language.line.command[-1:].encode("ascii")
         self._handshake = language.network.handshake if network and language.network is not None else None
         self._is_greeted = self._handshake is None
@@ -35,20 +35,20 @@ class LinePeer:
 
     @property
     def closed(self) -> bool:
-        """False: a serial cable is never disconnected by the projector."""
+        """False, because a projector does not disconnect a serial cable."""
         return False
 
     def connect(self) -> bytes:
-        """Discard an incomplete command and a handshake."""
+        """Discard an incomplete command, and require a new handshake."""
         self._received = b""
         self._is_greeted = self._handshake is None
         return b""
 
     def receive(self, data: bytes) -> bytes:
-        """Process bytes; return the answers to complete lines, and unsolicited messages."""
+        """Process bytes, of which there may be none; return answers to complete lines, and unsolicited messages."""
         answer = self._late_answer()
         if self._switching_to is not None:
-            # It accepts no command until the current one is completed.
+            # The projector accepts no command before it has completed the current one.
             return answer
         answer += self._news()
         self._received += data
@@ -166,7 +166,7 @@ class LinePeer:
         return words.done.replace("{}", words.value_of(power) or "")
 
     def _fault_code(self) -> str:
-        # One fault at a time, errors only.
+        # The answer has room for one fault; warnings are not reported.
         words = self._language.faults
         assert words is not None
         for faulty_part in self._errors():

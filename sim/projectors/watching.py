@@ -1,8 +1,8 @@
-"""Light on the chart from the pixels of a real screen and the lamp of a projector that is queried over PJLink.
+"""Light on a simulated chart, calculated from the pixels of a real screen and from the state of a PJLink projector.
 
-The screen is read repeatedly during an exposure, like a screenshot; codes are converted to light before averaging. A
-projector that does not answer gives no light; a screen that cannot be read is black. Power saving and gamma tables of
-the monitor cannot be detected.
+During an exposure, screenshots are taken repeatedly, converted to light and averaged. A projector that does not answer
+gives no light, and a screen that cannot be read is black. Power saving and gamma tables of the monitor have no effect,
+because screenshots do not show them.
 """
 
 from __future__ import annotations
@@ -25,19 +25,20 @@ from drivers.projector import Power
 from foundation.clock import Clock
 from foundation.errors import DeviceError, InputError
 
-# Interval of screenshots during an exposure, s. About one frame period, so that no relevant window is missed.
+# Interval of screenshots during an exposure, s. It is about one frame period of a screen.
 SAMPLE_S: Final = 0.02
 
 POLL_S: Final = 0.1  # Interval of queries of the projector, s.
 
-FINEST_PX: Final = 480  # Maximum width of an averaged picture, px: 2.6 mm on an A0 chart, less than a patch.
+FINEST_PX: Final = 480  # Maximum width of an averaged picture. One pixel is then 2.6 mm on an A0 chart.
 
-# Relative light of a lamp during warm-up, a chosen value: the control port does not report the progress.
+# Relative light of a lamp during warm-up (chosen), because PJLink does not report the progress.
 WARMING_SHARE: Final = 0.5
 
-_INSTANT_S: Final = 1e-4  # Shorter times than this, s, are treated as 0: clocks count in microseconds.
+_INSTANT_S: Final = 1e-4  # Remaining exposure times below this, s, are treated as 0.
 
-_ALIKE: Final = 1e-3  # Largest difference of light in a uniform picture: a quarter of a code at the bright end.
+# Largest difference of light in a uniform picture. It is a ninth of the difference between the two highest codes.
+_UNIFORM_TOLERANCE: Final = 1e-3
 
 _PLACE = re.compile(r"(?P<display>[^,]*:\d+(?:\.\d+)?)?(?:,|^)?(?P<region>\d+x\d+\+\d+\+\d+)?")
 
@@ -66,7 +67,7 @@ class ScreenPlace:
 
 
 class Screenshots:
-    """Pictures of an X screen; connects at the first call, and again after a failure."""
+    """Screenshots of an X screen. It connects at the first call, and connects again after a failure."""
 
     def __init__(self, screen_place: ScreenPlace) -> None:
         self._place = screen_place
@@ -96,8 +97,8 @@ class LampState:
 
     share: float  # Relative light output
     frozen: bool = False  # Whether the picture is frozen
-    source: str | None = None  # Input; None if not reported
-    trouble: str = ""  # Reason why the projector did not answer; its light is then 0. Empty if it answered
+    source: str | None = None  # Selected input; None if not reported
+    trouble: str = ""  # Reason why the projector did not answer; empty if it answered
 
 
 def lamp_state(projector: PjLinkProjector) -> LampState:
@@ -129,15 +130,15 @@ class ProjectedLight:
     def __str__(self) -> str:
         minimum, maximum = self.picture.min(axis=(0, 1)), self.picture.max(axis=(0, 1))
         mean = " ".join(f"{share:.3f}" for share in self.picture.mean(axis=(0, 1)))
-        shape = "plain" if float((maximum - minimum).max()) < _ALIKE else "not plain"
+        shape = "plain" if float((maximum - minimum).max()) < _UNIFORM_TOLERANCE else "not plain"
         return f"{shape} picture, mean light {mean}, lamp {self.lamp:.2f}"
 
 
 class Beam:
     """Picture of a screen, projected by a lamp; in a `with` block, the projector is queried continuously.
 
-    `projector` None is a lamp that is always on. `light_of` returns the light (256,) float64, 0 to 1, of the codes 0 to
-    255.
+    If `projector` is None, the lamp is always on. `light_of` converts the codes 0 to 255 to light, (256,) float64, 0 to
+    1.
     """
 
     def __init__(
@@ -196,7 +197,7 @@ class Beam:
             if at < half <= end:
                 halfway()
             at = end
-        # Without light the mean is undefined; the picture is then black.
+        # Without light the mean is undefined, so the picture is black.
         mean = total / lit if lit else total
         return ProjectedLight(mean.astype(np.float32), lit / seconds)
 
@@ -226,7 +227,7 @@ class Beam:
         with self._lock:
             self._state = state
             if self._screen_input is None:
-                # The screen is assumed at the input that is selected when the lamp is on for the first time.
+                # The screen is assumed to be connected to the first input that the projector reports.
                 self._screen_input = state.source
             if state.frozen:
                 self._frozen_picture = self._last_picture if self._frozen_picture is None else self._frozen_picture
@@ -255,7 +256,7 @@ def picture_light(pixels: NDArray[np.uint32], light: NDArray[np.float32]) -> NDA
 
 
 def _sum(total: NDArray[np.float64], addend: NDArray[np.float64]) -> NDArray[np.float64]:
-    # A change of the screen mode may change the size; the larger size is used.
+    # The size may change with the mode of the screen; the larger size is used.
     if total.shape != addend.shape and (1, 1) not in (total.shape[:2], addend.shape[:2]):
         rows, columns = (max(sizes) for sizes in zip(total.shape[:2], addend.shape[:2], strict=True))
         total, addend = (np.asarray(cv2.resize(p, (columns, rows)), dtype=np.float64) for p in (total, addend))

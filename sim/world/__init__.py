@@ -1,1 +1,1 @@
-"""The simulated room: print, light, lens and sensor noise."""
+"""Simulated room: print, light, lens, sensor and disturbances."""

@@ -1,11 +1,11 @@
-"""Disturbances of a simulated session: events with a time interval, as frozen values.
+"""Disturbances of a simulated session, such as a bumped chart: events that last for some frames or seconds.
 
-An event has first and last frame, or first and last second, both from the start of the session. Frames are numbered
-from 0 as the camera exposes them, including repeated ones; seconds follow the clock of the laboratory. An event changes
-the displayed colour, the `Situation` (light, chart, lens, sensor), or the counts in the file. All are functions of an
-event and a `Moment`, so a frame does not depend on earlier calls.
+Frames and seconds count from the start of the session. Frames are numbered from 0 as the camera exposes them, including
+repeated ones; seconds follow the clock of the laboratory. An event changes the displayed colour, the `Situation`
+(light, chart, lens, sensor), or the counts in the file. The effect depends only on the event and the `Moment`, not on
+earlier calls.
 
-Default sizes are chosen: large enough to be wrong, small enough to be overlooked.
+The default sizes are chosen so that the frame is wrong but looks right to a person.
 """
 
 from __future__ import annotations
@@ -25,17 +25,21 @@ from foundation.colorimetry import decode_srgb
 from foundation.errors import ConfigurationError
 from sim.world.world import UNDISTURBED, Blob, Glare, Patch, Place, Situation
 
-_HALF: Final[Place] = (-9.0, 0.5, 9.0, 9.0)  # Lower half of the picture, including its overscan.
+# Lower half of the picture, including the margin outside of the page.
+_LOWER_HALF: Final[Place] = (-9.0, 0.5, 9.0, 9.0)
 
-_QUARTER: Final[Place] = (0.5, 0.35, 1.1, 1.4)  # A shoulder over the lower right quarter of the chart.
+# Lower right quarter of the chart, which the shoulder of a person covers.
+_LOWER_RIGHT_QUARTER: Final[Place] = (0.5, 0.35, 1.1, 1.4)
 
-_SPOT: Final[Place] = (0.1, -0.2, 0.9, 0.8)  # Most of the upper half of the page: matt surfaces have broad reflections.
+# Most of the upper half of the page, because matt surfaces have broad reflections.
+_REFLECTION_PLACE: Final[Place] = (0.1, -0.2, 0.9, 0.8)
 
 _PRIMARIES: Final = ("red", "green", "blue")
 
-_PATCH: Final = 6.0  # Standard deviation of the patches of a screen saver, in 1/60 of the picture height.
+# Standard deviation of the blur that makes the soft patches of a screen saver, in pixels of its picture of 96 × 60.
+_SAVER_BLUR_PX: Final = 6.0
 
-_SLANTED_DEG: Final = 30.0  # Direction of a push, clockwise from the right, not along an axis.
+_PUSH_DIRECTION_DEG: Final = 30.0  # Default direction of a push, clockwise from the right.
 
 
 _Code = Annotated[int, Field(ge=0, le=255)]  # Code of a colour in settings files.
@@ -43,12 +47,12 @@ _Code = Annotated[int, Field(ge=0, le=255)]  # Code of a colour in settings file
 
 @dataclass(frozen=True)
 class Moment:
-    """Time of an exposure and ordered colour."""
+    """Time of an exposure, and the colour that the computer sends to the projector (ordered colour)."""
 
     frame: int  # Number of earlier exposures in the session
     at_s: float = 0.0  # Seconds since the start of the session
     colour: Colour = BLACK  # Ordered colour
-    earlier_frames: tuple[tuple[float, Colour], ...] = ()  # Second and ordered colour of each earlier frame
+    earlier_frames: tuple[tuple[float, Colour], ...] = ()  # Time in seconds and ordered colour of each earlier frame
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,7 @@ class Disturbance:
 
 @dataclass(frozen=True)
 class _Gradual(Disturbance):
-    """An event whose effect grows linearly until its end, and then stays."""
+    """An event whose effect grows linearly until its end and then remains constant."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -112,7 +116,7 @@ class _Gradual(Disturbance):
 
 @dataclass(frozen=True)
 class FrozenScreen(Disturbance):
-    """The picture is frozen: the projector still shows the colour of the last frame before."""
+    """The picture is frozen: the projector still shows the colour of the last frame before the event."""
 
     what: Literal["frozen screen"] = "frozen screen"
 
@@ -143,7 +147,7 @@ class HalfChanged(Disturbance):
     """A part of the picture, by default its lower half, still shows the previous frame."""
 
     what: Literal["half-changed"] = "half-changed"
-    place: Place = _HALF
+    place: Place = _LOWER_HALF
     share: float = 1.0
 
     def changed(self, situation: Situation, moment: Moment) -> Situation:
@@ -154,7 +158,7 @@ class HalfChanged(Disturbance):
 
 @dataclass(frozen=True)
 class Bump(Disturbance):
-    """The chart was pushed by `px` half-size pixels at its centre, `mm` millimetres, or both.
+    """The chart is shifted by `px` half-size pixels, by `mm` millimetres, or by the sum of both.
 
     `direction_deg` is clockwise from the right; `turn_deg` rotates the chart about its centre.
     """
@@ -162,7 +166,7 @@ class Bump(Disturbance):
     what: Literal["bump"] = "bump"
     px: float = 0.0
     mm: float = 0.0
-    direction_deg: float = _SLANTED_DEG
+    direction_deg: float = _PUSH_DIRECTION_DEG
     turn_deg: float = 0.0
 
     def changed(self, situation: Situation, moment: Moment) -> Situation:
@@ -179,7 +183,7 @@ class Bump(Disturbance):
 
 @dataclass(frozen=True)
 class LampStep(Disturbance):
-    """The lamp brightness changes suddenly by `percent`; `rgb` are additional changes of the primaries, in percent."""
+    """The lamp brightness changes suddenly by `percent`; `rgb` are further changes of each primary, in percent."""
 
     what: Literal["lamp step"] = "lamp step"
     percent: float = -10.0
@@ -192,7 +196,7 @@ class LampStep(Disturbance):
 
 @dataclass(frozen=True)
 class LampDrift(_Gradual):
-    """The lamp brightness changes linearly by `percent`; `rgb` are additional changes of the primaries, in percent."""
+    """The lamp brightness changes linearly by `percent`; `rgb` are further changes of each primary, in percent."""
 
     what: Literal["lamp drift"] = "lamp drift"
     percent: float = -2.0
@@ -205,7 +209,7 @@ class LampDrift(_Gradual):
 
 @dataclass(frozen=True)
 class AmbientStep(Disturbance):
-    """A lamp in the room is switched on: `percent` of the projector's white, `rgb` relative to its mean."""
+    """A lamp in the room is switched on. It adds `percent` of the full light to each primary, multiplied by `rgb`."""
 
     what: Literal["ambient step"] = "ambient step"
     percent: float = 1.0
@@ -233,10 +237,10 @@ class Defocus(Disturbance):
 
 @dataclass(frozen=True)
 class Person(Disturbance):
-    """A person in front of the chart: an ellipse in a rectangle of the page; `left` is the transmitted light."""
+    """A person in front of the chart: a dark ellipse in the rectangle `place`; `left` is the light that remains."""
 
     what: Literal["person"] = "person"
-    place: Place = _QUARTER
+    place: Place = _LOWER_RIGHT_QUARTER
     left: float = 0.08
 
     def changed(self, situation: Situation, moment: Moment) -> Situation:
@@ -258,7 +262,7 @@ class SensorWarming(_Gradual):
 
 @dataclass(frozen=True)
 class StaleFile(Disturbance):
-    """The camera delivers the counts of the previous frame again; with `new_header`, dated now."""
+    """The camera delivers the counts of the previous frame again; with `new_header`, the file has the new date."""
 
     what: Literal["stale file"] = "stale file"
     new_header: bool = False
@@ -298,10 +302,10 @@ class ScrambledRows(Disturbance):
 
 @dataclass(frozen=True)
 class Reflection(Disturbance):
-    """A specular reflection: `percent` of the light from bare paper, in the centre of a soft ellipse."""
+    """A specular reflection: a soft ellipse, whose centre has `percent` of the light from bare paper."""
 
     what: Literal["reflection"] = "reflection"
-    place: Place = _SPOT
+    place: Place = _REFLECTION_PLACE
     percent: float = 3.0
 
     def changed(self, situation: Situation, moment: Moment) -> Situation:
@@ -323,7 +327,7 @@ class DeadPrimary(Disturbance):
 
 @dataclass(frozen=True)
 class ScreenSaver(Disturbance):
-    """A picture of soft patches over the projected one; `share` is its share of the light."""
+    """A screen saver with soft patches over the projected picture; `share` is its share of the light."""
 
     what: Literal["screen saver"] = "screen saver"
     share: float = 1.0
@@ -334,7 +338,7 @@ class ScreenSaver(Disturbance):
         from scipy.ndimage import gaussian_filter
 
         noise = np.random.default_rng(self.seed).random((60, 96, 3))
-        soft = gaussian_filter(noise, (_PATCH, _PATCH, 0))
+        soft = gaussian_filter(noise, (_SAVER_BLUR_PX, _SAVER_BLUR_PX, 0))
         picture = (soft - soft.min()) / np.ptp(soft)
         ordered = decode_srgb(np.array(moment.colour) / 255)
         mixed = self.share * picture + (1 - self.share) * ordered

@@ -1,14 +1,12 @@
 """Geometry of the print and rendering of the light on each photosite.
 
-**Geometry.** Point (x, y) mm of the print is `height` mm above the plane of the print, towards the camera. The sheet is
-rotated by roll, then tilt, then pan, and projected by a pinhole with Brown's lens distortion (D. C. Brown, "Close-range
-camera calibration", 1971; coordinates and coefficients as in OpenCV). Paper does not stretch, and heights are small
-compared with wavelengths, so points keep their x and y. A fold is a crease above the plane; its flanks are inclined to
-the light.
+**Geometry.** Point (x, y) mm of the print is `height` mm above the plane of the print, towards the camera. Waves change
+the height of a point but not its x and y, because they are low compared with their wavelength. The sheet is rotated by
+roll, then tilt, then pan. A pinhole camera with Brown's lens distortion projects it (D. C. Brown, "Close-range camera
+calibration", 1971; coordinates and coefficients as in OpenCV).
 
-**Rendering.** `light` is compiled by numba, single-threaded, without interpreter lock; `sim.world.world` calls it for
-blocks of rows from several threads. A row depends only on its arguments, so blocks and threads do not change the
-result.
+**Rendering.** `light` is compiled by numba and runs without the interpreter lock, so `sim.world.world` calls it from
+several threads for blocks of rows. Blocks do not change the result, because a row depends only on its arguments.
 
 Pixels are half-size, centres at integers, x right, y down. Millimetres are on the print, from its top left corner.
 Photosites are counted in the visible frame.
@@ -25,17 +23,17 @@ from numpy.typing import NDArray
 
 from foundation.compiled import compiled
 
-_RIPPLE: Final = 0.1  # Height of the weaker short waves, relative to the first (chosen).
+_RIPPLE: Final = 0.1  # With `wave_mm`, height of the weak waves relative to the strong wave (chosen).
 
-_NEWTON_STEPS = 6  # Maximum number of steps; they end earlier if all errors are below 10⁻⁷ px.
+_NEWTON_STEPS = 6  # Maximum number of steps of `View.locate`, which ends earlier if all errors are below 10⁻⁷ px.
 
-# Half step of the numerical derivatives, mm: short against folds and waves, long against rounding errors.
+# Half step of the numerical derivatives, mm: small compared with folds, but large compared with rounding errors.
 _STEP_MM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Waviness:
-    """A smooth paper surface: the sum of some standing waves."""
+    """A smooth paper surface: the sum of some sine waves."""
 
     cycles: NDArray[np.float64]  # (M, 2) float64, cycles along x and y over the page
     phases: NDArray[np.float64]  # (M,) float64, radians
@@ -48,7 +46,7 @@ class Waviness:
     ) -> Waviness:
         """Draw a surface with a given distance between its highest and lowest points.
 
-        `wave_mm`: wavelength, within 15 %, of one strong wave and weak waves in random directions; 0: long waves.
+        `wave_mm`: approximate wavelength of one strong wave and of weak waves in random directions; 0 for long waves.
         """
         random = np.random.default_rng([seed, 0x77617679])
         longer = max(page_mm)
@@ -57,7 +55,7 @@ class Waviness:
         if wave_mm:
             length, direction = wave_mm * random.uniform(0.85, 1.15, modes), random.uniform(0, np.pi, modes)
             cycles = np.column_stack([np.cos(direction), np.sin(direction)]) * np.array(page_mm) / length[:, None]
-            # Damp paper has parallel ridges, not quite regular.
+            # Damp paper has almost parallel ridges.
             amplitudes = np.where(np.arange(modes) == 0, 1.0, _RIPPLE)
         shape = cls(cycles, random.uniform(0, 2 * np.pi, modes), amplitudes, page_mm)
         x, y = np.meshgrid(np.linspace(0, page_mm[0], 201), np.linspace(0, page_mm[1], 201))
@@ -85,7 +83,7 @@ class Fold:
     at_mm: tuple[float, float]  # A point of the crease
     along: tuple[float, float]  # Direction, a unit vector
     height_mm: float  # Height towards the camera
-    slant: float  # Relative change of light per slope: tangent of the angle of incidence
+    slant: float  # Tangent of the angle of incidence: relative change of the light on a slope of 1
 
     def _distance(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         # Positive on the right of the crease.
@@ -160,7 +158,7 @@ class View:
         return cls(surface, _rotation(*turn_deg), distance, focal, centre, distortion)
 
     def project(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the half-size pixels (..., 2) float64, x and y, of points (..., 2) mm, also off the page."""
+        """Return the positions (..., 2) float64 in the image, half-size pixels, of points (..., 2) mm of the print."""
         page = np.array(self.surface.page_mm)
         flat = points_mm - page / 2
         rotated = flat @ self.rotation[:, :2].T - self.surface.height(points_mm)[..., None] * self.rotation[:, 2]
@@ -177,8 +175,8 @@ class View:
     def locate(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the points (..., 2) float64 of the print, mm, at half-size pixels (..., 2): inverse of `project`.
 
-        Newton's method with central differences; the error is below 10⁻⁶ px for sheets that are flat within a few
-        millimetres. Points may be off the page.
+        Newton's method with central differences. For a sheet that is flat within a few millimetres, the error is below
+        10⁻⁶ px. Points may be off the page.
         """
         page = np.array(self.surface.page_mm)
         points = (pixels - np.array(self.centre_px)) * (self.distance_mm / self.focal_px) + page / 2
@@ -207,7 +205,7 @@ def _rotation(tilt_deg: float, pan_deg: float, roll_deg: float) -> NDArray[np.fl
 
 PAPER: Final = (255, 255, 255)  # Code that prints nothing.
 
-_FINEST_MM: Final = 1e-3  # Closer coordinates are treated as equal; they differ by rounding only.
+_FINEST_MM: Final = 1e-3  # Coordinates with a smaller distance are equal except for rounding.
 
 _MAX_LINES: Final = 6000  # Maximum number of distinct coordinates per axis, so that labels need less than 150 MB.
 
@@ -232,7 +230,7 @@ class Print:
 
 @dataclass(frozen=True, eq=False)
 class LabelMap:
-    """A print divided by a grid into areas of uniform colour."""
+    """A print divided by vertical and horizontal lines into areas of uniform colour."""
 
     x_lines: NDArray[np.float64]  # (A,) float64, ascending, mm: positions of vertical edges
     y_lines: NDArray[np.float64]  # (B,) float64, ascending, mm: positions of horizontal edges
@@ -255,9 +253,9 @@ def label_map(sheet: Print) -> LabelMap:
 
 
 def _lines(ends: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
-    """Return the sorted distinct coordinates of (N, 2) ends, and the indices of starts and ends in them.
+    """Return the sorted distinct coordinates of (N, 2) starts and ends, and the indices of starts and ends in them.
 
-    Coordinates within 1 µm are merged to their mean. The distance increases until at most `_MAX_LINES` remain.
+    Coordinates within 1 µm are replaced by their mean. If more than `_MAX_LINES` remain, this distance is increased.
     """
     resolution = _FINEST_MM
     while True:
@@ -272,7 +270,7 @@ def _lines(ends: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.i
 
 GRID_PX = 16  # Photosites between the nodes of the position grid.
 
-REACH = 4.0  # Radius of the blur in standard deviations; the rest, 3·10⁻⁵, is omitted.
+REACH = 4.0  # Radius of the blur in standard deviations. The share of 3·10⁻⁵ on each side is omitted.
 
 _PHI_STEPS = 1024  # Table entries per standard deviation; the error of linear interpolation is below 2·10⁻⁷.
 _PHI: NDArray[np.float32] = np.array(
@@ -304,7 +302,7 @@ def _cubic(t: float, weights: NDArray[np.float64]) -> None:
 
 @compiled
 def _touched_intervals(lines: NDArray[np.float64], centre: float, reach: float, near: int) -> tuple[int, int]:
-    """Return the first and last interval that `centre` ± `reach` touches, searching from `near`."""
+    """Return the first and last interval between `lines` that `centre` ± `reach` touches, searching from `near`."""
     first = near
     while first > 0 and lines[first - 1] > centre - reach:
         first -= 1
@@ -356,16 +354,16 @@ def light(
 ) -> None:
     """Write the signal of each photosite of some rows under each primary.
 
-    Blur and aperture of the photosite are one Gaussian with axes parallel to the edges of the print. The light of each
-    rectangle is a product of differences of normal distributions, exact for any position of its edges.
+    Blur and aperture of the photosite are one Gaussian, whose axes are parallel to the edges of the print. Its integral
+    over a rectangle is the product of two differences of the normal distribution function.
 
     Parameters
     ----------
     first_row
-        Row of the first row of `out` in the visible frame.
+        Row of the visible frame where `out` starts.
     nodes
-        (1 or 3, ny, nx, 2) float64, mm: at [:, j, i] the point on the print of the photosite in column 16 (i − 1) and
-        row 16 (j − 1). One array for all channels, or one for each.
+        (1 or 3, ny, nx, 2) float64, mm. Entry [:, j, i] is the point on the print that the photosite in column
+        16 (i − 1) and row 16 (j − 1) sees. The first axis has one entry for all channels, or one for each channel.
     sigma_px
         Standard deviation of blur and aperture, photosites.
     x_lines, y_lines, labels

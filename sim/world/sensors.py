@@ -1,14 +1,14 @@
 """Cameras of the simulated room: sensor, colour filters, noise, and conversion of light to counts.
 
-A `Body` is data without behaviour; `counts` is common to all sensors. Photosites are numbered from the top left of the
-sensor, including masked borders. Counts (DN) are the values in the raw file.
+A `Body` describes a sensor; `counts` calculates the counts of any sensor. Photosites are numbered from the top left of
+the sensor, including masked borders. Counts (DN) are the values in the raw file.
 
-Sizes and margins: dcraw 9.28 (`adobe_coeff` and the Canon table in `identify`). Masked rectangles: cameras.xml of
-rawspeed. Saturation: camconst.json of RawTherapee. Conversion gain and read noise: typical of EMVA 1288 measurements of
-such sensors, not measured on these bodies.
+Sources: sizes and margins from dcraw 9.28 (`adobe_coeff` and the Canon table in `identify`), masked rectangles from
+cameras.xml of rawspeed, saturation from camconst.json of RawTherapee. Gain and read noise are typical of EMVA 1288
+measurements of such sensors, not measured on these bodies.
 
-For bodies selected by sensitivities (`SENSITIVITY_BODIES`), sizes are the makers' numbers of recorded pixels. The other
-values are typical of such sensors, not measured. A settings file can replace them.
+Bodies in `SENSITIVITY_BODIES` are selected by the name of their sensitivities. Their sizes are the makers' numbers of
+recorded pixels; the other values are typical of such sensors. A settings file can replace all these values.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Rectangle(NamedTuple):
 class Body:
     """Sensor, colour filters and noise of a camera."""
 
-    maker: str  # As in its files, for example ``Canon``
-    model: str  # As in its files, for example ``Canon EOS 550D``
+    maker: str  # As in raw files, for example ``Canon``
+    model: str  # As in raw files, for example ``Canon EOS 550D``
     sensor: tuple[int, int]  # Rows and columns of the raw frame, including masked borders
     visible: Rectangle  # Photosites that receive light, as defined by raw converters
     pattern: str  # Colour filters of the 2×2 block at the top left of `visible`, by rows, for example ``RGGB``
@@ -55,7 +55,7 @@ class Body:
     # Part of the read noise before the amplifier, electrons; in DN, it increases with the ISO speed
     sensor_noise_e: float
     sensitivities: str  # Name in `sim.data`, or a file; see `sim.spectral.sensitivities`
-    masked: tuple[Rectangle, ...]  # Covered rectangles, which measure the black level
+    masked: tuple[Rectangle, ...]  # Rectangles covered from light, from which the black level is measured
 
     def __post_init__(self) -> None:
         rows, columns = self.sensor
@@ -67,7 +67,7 @@ class Body:
 
     @property
     def camera(self) -> str:
-        """Maker and model without repetition, as `drivers.raw.rawfile` reads them from its files."""
+        """Maker and model without repetition, as `drivers.raw.rawfile` reads them from raw files."""
         words = self.model.split(" ")
         has_maker = not self.maker or words[0].casefold() == self.maker.split(" ")[0].casefold()
         return self.model if has_maker else f"{self.maker} {self.model}"
@@ -89,14 +89,15 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class HotPattern:
-    """Photosites with high dark current, the same in all frames.
+    """Hot photosites: photosites with high dark current, the same in all frames.
 
-    Their excess is proportional to exposure time and gain, and has the shot noise of its electrons. Their number
-    increases with age and decreases with the size of photosites: about 128 in 20 million photosites of 4 µm after 3.2
-    years, detected at ISO 3200, proportional to size⁻³ and √ISO (G. Chapman and others, DFT 2022, doi
-    10.1109/DFT56152.2022.9962368; size⁻²·⁵ in Proc. SPIE 7875 (2011)). At ISO 100, this is about 3 per million on an
-    EOS 550D (4.3 µm) after ten years, and 0.4 on an EOS 6D Mark II (5.7 µm) after three. Hot photosites of new bodies
-    are not included. The exponential distribution is an assumption.
+    The excess is their dark signal. It is proportional to exposure time and ISO speed, and has the shot noise of its
+    electrons.
+
+    The number of hot photosites increases with age. It is proportional to size⁻³ of the photosites and to √ISO, by
+    G. Chapman and others (DFT 2022, doi 10.1109/DFT56152.2022.9962368; size⁻²·⁵ in Proc. SPIE 7875 (2011)). At ISO 100
+    this gives about 3 per million on an EOS 550D (4.3 µm) after ten years, and 0.4 on an EOS 6D Mark II (5.7 µm) after
+    three. Hot photosites of new bodies are not included. The exponential distribution is an assumption.
     """
 
     rows: NDArray[np.int64]  # (H,) int64, ascending rows of the sensor
@@ -114,7 +115,7 @@ class HotPattern:
         return cls(index // sensor[1], index % sensor[1], random.exponential(dn_per_s, count))
 
     def within(self, first: int, last: int) -> HotPattern:
-        """Return the hot photosites of rows first to last − 1, with rows numbered from `first`."""
+        """Return the hot photosites in the rows `first` to `last` − 1, with row numbers relative to `first`."""
         selected = slice(*np.searchsorted(self.rows, [first, last]).tolist())
         return HotPattern(self.rows[selected] - first, self.columns[selected], self.dn_per_s[selected])
 
@@ -127,14 +128,14 @@ class HotPattern:
         iso: int,
         shutter_s: float,
     ) -> None:
-        """Write the counts of hot photosites into a frame, with the noise of ordinary photosites.
+        """Write the counts of hot photosites into a frame.
 
         Parameters
         ----------
         frame
             (rows, columns) uint16, changed at hot photosites.
         noise
-            (rows, columns) float32, the standard normal values of this frame.
+            (rows, columns) float32, standard normal values from which the noise of the frame was calculated.
         light_dn
             (H,) float64, signal of the light alone, DN above black.
         iso, shutter_s
@@ -194,10 +195,11 @@ _TEST = replace(
 BODIES: Mapping[str, Body] = MappingProxyType({"EOS 550D": _EOS_550D, "EOS 6D Mark II": _EOS_6D_MARK_II, "Test": _TEST})
 
 
-_BORDER: Final = (50, 140)  # Masked rows above and masked columns left of the image; Canon sensors have about as many.
+_BORDER: Final = (50, 140)  # Typical masked rows above and masked columns left of the image on Canon sensors.
 
 
-def _areas(width: int, height: int) -> dict[str, Any]:
+def _sensor_areas(width: int, height: int) -> dict[str, Any]:
+    # Values of the size fields of `Body` for a number of visible photosites.
     rows, columns = _BORDER
     sensor = height + rows, width + columns
     return {
@@ -207,10 +209,10 @@ def _areas(width: int, height: int) -> dict[str, Any]:
     }
 
 
-def _body(
+def _canon(
     name: str, size: tuple[int, int], black: int, saturation: int, gain_e: float, noise_dn: float, sensor_noise_e: float
 ) -> Body:
-    # A Canon with `size` columns and rows of visible photosites.
+    # `size`: columns and rows of visible photosites.
     return replace(
         _EOS_550D,
         model=name.replace("_", " "),
@@ -220,7 +222,7 @@ def _body(
         read_noise_dn=noise_dn,
         sensor_noise_e=sensor_noise_e,
         sensitivities=name,
-        **_areas(*size),
+        **_sensor_areas(*size),
     )
 
 
@@ -228,10 +230,10 @@ def _body(
 SENSITIVITY_BODIES: Final[Mapping[str, Body]] = MappingProxyType(
     {
         "Canon_EOS_600D": replace(BODIES["EOS 550D"], model="Canon EOS 600D"),
-        "Canon_EOS_200D": _body("Canon_EOS_200D", (6000, 4000), 2048, 16383, 2.3, 5.2, 2.4),
-        "Canon_EOS-1Ds_Mark_III": _body("Canon_EOS-1Ds_Mark_III", (5616, 3744), 1024, 15600, 3.6, 6.0, 3.2),
-        "Canon_EOS_5D_Mark_II": _body("Canon_EOS_5D_Mark_II", (5616, 3744), 1024, 15760, 4.2, 6.4, 2.5),
-        "Canon_EOS_5DS": _body("Canon_EOS_5DS", (8688, 5792), 2048, 15500, 2.4, 5.6, 2.5),
+        "Canon_EOS_200D": _canon("Canon_EOS_200D", (6000, 4000), 2048, 16383, 2.3, 5.2, 2.4),
+        "Canon_EOS-1Ds_Mark_III": _canon("Canon_EOS-1Ds_Mark_III", (5616, 3744), 1024, 15600, 3.6, 6.0, 3.2),
+        "Canon_EOS_5D_Mark_II": _canon("Canon_EOS_5D_Mark_II", (5616, 3744), 1024, 15760, 4.2, 6.4, 2.5),
+        "Canon_EOS_5DS": _canon("Canon_EOS_5DS", (8688, 5792), 2048, 15500, 2.4, 5.6, 2.5),
     }
 )
 
@@ -239,15 +241,15 @@ SENSITIVITY_BODIES: Final[Mapping[str, Body]] = MappingProxyType(
 def find_body(
     camera: str, changes: Mapping[str, Any] = MappingProxyType({}), where: str = "--settings", key: str = "camera"
 ) -> Body:
-    """Return the camera of a name, or of a file of sensitivities, with changed properties.
+    """Return the camera with a name, or a camera with the sensitivities of a file, with changed properties.
 
-    `where`, `key`: file or option with the changes, and their table, for messages.
+    `where`, `key`: file or option that contains the changes, and the name of their table, for messages.
     """
     body = BODIES.get(camera) or _body_of_sensitivities(camera, read_sensitivities(camera, tuple(BODIES)))
     values = dict(changes)
     pixels = values.pop("pixels", None)
     if pixels is not None:
-        values = _areas(*_checked_pixels(pixels, where, key)) | values
+        values = _sensor_areas(*_checked_pixels(pixels, where, key)) | values
     properties = {field.name: getattr(body, field.name) for field in fields(Body)}
     changed = from_settings(Body, values, where, key, [*properties, "pixels"], **properties)
     _require_sensor(changed, where, key)
@@ -310,13 +312,13 @@ def counts(
 ) -> None:
     """Write the counts of some rows of the sensor.
 
-    Photon transfer of EMVA 1288 (release 4.0 linear, section 2.2): a normal distribution of variance signal / gain +
-    read noise².
+    Counts are normally distributed with the variance signal / gain + read noise² (EMVA 1288 release 4.0 linear, section
+    2.2).
 
     Parameters
     ----------
     light
-        (3, rows, visible columns) float32, from `sim.world.rendering.light`; no columns for rows of the masked border.
+        (3, rows, visible columns) float32, from `sim.world.rendering.light`. For masked rows, an array with 0 columns.
     weights
         (3,) float32, exposure to each primary.
     noise

@@ -1,20 +1,20 @@
-"""A printed chart under projector light in front of a camera: frames are calculated from the displayed colour.
+"""Simulated frames of a printed chart under projector light, calculated from the displayed colour.
 
-Light is additive, and signals are linear in the brightness of the three primaries. So the room is rendered once under
-each primary (`_render`); a frame is their weighted sum, noise and black level. Rules:
+Signals are linear in the light of the three primaries of the projector. So the room is rendered once under each
+primary (`_render`). A frame is the weighted sum of these three images, plus noise and black level. Rules:
 
 - The same print, camera, room, colour, settings and key give the same counts with any number of threads.
 - The noise of a frame depends only on the seed of the room and the key.
 - `project`, `white`, `reflected`, `camera_rgb_at` and `field` return exact values, without point spread and veiling
-  glare. An ideal LUT would contain these values; tests compare with them.
+  glare. An ideal look-up table would contain these values; tests compare with them.
 
-Signal = ∫ primary × reflectance × sensitivity dλ. It is scaled so that bare paper under full white has
-`Room.white_level_share` of the range in its strongest channel at 0.5 s, f/8, ISO 100. Positions are millimetres on the
-print or half-size pixels; DN are counts above the black level.
+The signal is ∫ primary × reflectance × sensitivity dλ. Its scale is given by bare paper under full white at 0.5 s, f/8
+and ISO 100: the strongest channel has the share `Room.white_level_share` of the range from black to saturation.
+Positions are millimetres on the print or half-size pixels; DN are counts above the black level.
 
 A `Room` describes light, lens and print. A `Situation` describes the differences of one frame from the undisturbed
-room. Its positions are relative to the page: (0, 0) is the top left corner, (1, 1) the bottom right corner, other
-values lie off the page.
+room. Positions in a situation are relative to the page: (0, 0) is the top left corner, (1, 1) the bottom right corner,
+and other values lie off the page.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ from sim.spectral import LampSpectrum, PaperName, ProfileName, printed_reflectan
 from sim.world.rendering import GRID_PX, PAPER, Fold, Print, Sheet, View, Waviness, label_map
 from sim.world.sensors import Body, HotPattern, counts
 
-_SLANT: Final = 0.36  # Tangent of 20°, for a projector next to the camera.
+_SLANT: Final = 0.36  # Tangent of the angle of incidence, 20° for a projector next to the camera.
 
 RIM_MM = 1.0  # Width of the soft edge of a stain, mm.
 
 _BACKDROP_REFLECTANCE: Final = 0.04  # Reflectance of the dark backdrop behind the print, at all wavelengths.
 
-_BLOCK_ROWS: Final = 64  # Rows per block of work. Noise is drawn for each block, so another number gives other frames.
+_BLOCK_ROWS: Final = 64  # Rows per task of a thread. Each task draws its own noise, so another number changes frames.
 
 _A0_DIAGONAL_MM: Final = math.hypot(1189, 841)  # Diagonal of an A0 sheet (ISO 216), mm.
 
@@ -54,13 +54,13 @@ _CHANNELS: Final = "RGB"
 
 Place = tuple[float, float, float, float]  # Rectangle on the page: left, top, right, bottom, relative to the page.
 
-# Share of the page by which the projected picture extends beyond its nearest edge, as an operator sets the zoom.
+# Smallest margin of the projected picture around the page, relative to the page. An operator sets the zoom like this.
 OVERSCAN: Final = 0.04
 
-# Width of the soft edge of a blob, relative to its radius: objects 1 m in front of the chart are out of focus.
+# Width of the soft edge of a `Blob`, relative to its radius. Objects 1 m in front of the chart are out of focus.
 _BLOB_RIM: Final = 0.15
 
-REFERENCE_APERTURE: Final = 8.0  # f-number; also of lenses without contacts, which are set by hand.
+REFERENCE_APERTURE: Final = 8.0  # f-number. Lenses without contacts are set to it by hand.
 
 # Exposure for which `Room.white_level_share` is defined.
 REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=REFERENCE_APERTURE, shutter_s=0.5)
@@ -75,7 +75,7 @@ class Room:
     seed
         Seed of the shape of the paper, the response of photosites and the noise; 0 or more.
     fill
-        Extent of the print relative to the frame, along the axis with less margin.
+        Width or height of the print relative to the frame, whichever is larger.
     focal_diagonals
         Focal length relative to the diagonal of the frame; 1.3 is 35 mm on APS-C.
     tilt_deg, pan_deg, roll_deg
@@ -83,19 +83,19 @@ class Room:
     k1, k2, p1, p2
         Distortion by Brown in normalised coordinates, as in OpenCV.
     waviness_mm
-        Peak-to-valley height of the paper on an A0 sheet; proportional to the diagonal of other sheets.
+        Peak-to-valley height of the waves of an A0 sheet. It is scaled with the diagonal of other sheets.
     wave_mm
-        Wavelength of the paper on an A0 sheet, also proportional; 150 is plausible for damp paper. 0: long waves,
-        up to three on the longer side.
+        Wavelength of the waves of an A0 sheet, scaled in the same way. 150 is plausible for damp paper. 0 gives at
+        most three waves on the longer side.
     curl_mm
-        Height of the left and right edges above the centre, towards the camera, on an A0 sheet, also proportional.
+        Height of the left and right edges of an A0 sheet above the centre, towards the camera, scaled in the same way.
     blur_px
         Standard deviation of the lens blur, half-size pixels, without the aperture of the photosite.
     shoulder_share, shoulder_px
-        Share of the light in the wide part of the point spread, and its standard deviation along each axis,
+        Share of the light in the wide tails of the point spread, and standard deviation of the tails along each axis,
         half-size pixels (`sim.optics`).
     veil
-        Veiling glare: share of the mean light of the frame that is uniform on it.
+        Veiling glare: share of the light that the lens distributes uniformly over the frame.
     lateral_red_px, lateral_blue_px
         Outward shift of the channel relative to green in the corner, half-size pixels (`sim.optics`).
     vignetting
@@ -103,41 +103,39 @@ class Room:
     projector_falloff
         Share of the projector's light that is lost half a page diagonal from its brightest point.
     primary_difference
-        Relative difference of `projector_falloff` between primaries, and distance of their brightest points in half
-        page diagonals.
+        Relative difference of `projector_falloff` between primaries. It is also the spread of their brightest points,
+        in half page diagonals.
     lamp_spectrum
         ``uhp`` (mercury lamp and colour wheel) or ``led``.
     transfer
-        From code to light: ``srgb`` (IEC 61966-2-1) or the exponent of a power law.
+        Conversion of codes to light: ``srgb`` (IEC 61966-2-1) or the exponent of a power law.
     black_leak
         Relative light of a primary at code 0: 1 / contrast.
     ambient
-        Ambient light of the projector's colour, relative to its white.
+        Ambient light with the colour of projector white, relative to full white.
     white_level_share
         Signal of bare paper under full white at `REFERENCE_EXPOSURE`, strongest channel, relative to saturation −
         black.
     lamp_drift_per_hour
-        Relative loss of lamp brightness per hour. The room has no time; callers apply it as `lamp`.
+        Relative loss of lamp brightness per hour. Callers calculate the argument `lamp` from it.
     response_spread
         Standard deviation of the response of photosites (PRNU).
     wheel_hz
-        Rotations of the colour wheel per second, a third each red, green and blue; 0 for steady light. Exposures
-        that are not a whole number of rotations get different amounts of the primaries.
+        Rotations of the colour wheel per second; 0 for steady light. Red, green and blue each fill a third of the
+        wheel. The primaries differ if an exposure is not a whole number of rotations.
     shutter_jitter_s
         Standard deviation of the exposure time, s; has an effect with a colour wheel only.
     stain_mm, stain_depth
-        Diameter of a stain on the print, 0 for none (a thumb: 25), and its absorption of blue light. It absorbs 0.6
-        times this share of green and 0.3 times of red.
+        Diameter of a stain on the print (25 for a thumb, 0 for no stain), and the share of blue light that it absorbs.
+        The stain absorbs 0.6 times this share of green light and 0.3 times this share of red light.
     fold_mm
         Height of a crease across the print, 0 for none.
     hot_per_million
         Photosites per million with high dark current, the same in all frames. 20 is plausible for an EOS 550D after
-        ten years, 2 for an EOS 6D Mark II after three. These are several times the numbers in
-        `sim.world.sensors.HotPattern`, because new bodies also have hot photosites (chosen). With dark frames,
-        `build-lut` lists patches with 30 counts of excess or more as unfit; `sim table` does not.
+        ten years, 2 for an EOS 6D Mark II after three. These numbers (chosen) also include hot photosites of a new
+        body, unlike those of `sim.world.sensors.HotPattern`.
     hot_dn_per_s
-        Mean excess of such a photosite, DN per second at ISO 100; exponentially distributed. At 0.5 s, the hottest
-        of a hundred is nearly saturated (chosen).
+        Mean dark signal of a hot photosite, DN per second at ISO 100 (chosen); exponentially distributed.
     profile
         ``unmanaged``: codes of the file are ink codes. ``managed``: a profile converts them, so that greys are
         neutral.
@@ -185,7 +183,7 @@ class Room:
     paper: PaperName = "poster"
 
     def light_of(self, codes: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
-        """Return the light of primaries, 0 to 1 of the full light, of integer codes 0 to 255 of any shape."""
+        """Convert integer codes 0 to 255 of any shape to the light of the primaries, 0 to 1 of the full light."""
         share = codes / 255
         return decode_srgb(share) if self.transfer == "srgb" else share**self.transfer
 
@@ -241,7 +239,7 @@ class Stain:
 
 
 def wear(room: Room, page_mm: tuple[float, float], random: np.random.Generator) -> tuple[Stain | None, Fold | None]:
-    """Draw the stain and the fold of a room at random positions away from the edges; None if it has none."""
+    """Draw the stain and the fold of a room at random positions away from the edges; None if the room has none."""
     page = np.array(page_mm)
     x, y = (page * random.uniform(0.25, 0.75, 2)).tolist()
     absorbed = room.stain_depth * np.array([0.3, 0.6, 1.0])
@@ -279,10 +277,10 @@ class Blob:
     """A dark object between chart and camera: an ellipse with a soft edge that fills a rectangle."""
 
     place: Place
-    left: float = 0.08  # Light that remains behind the object, relative to the light without it, 0 to 1
+    left: float = 0.08  # Light behind the object, relative to the light without the object, 0 to 1
 
     def transmittance(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the relative light (...) at points (..., 2), relative to the page."""
+        """Return the share of the light (...) that reaches points (..., 2), given relative to the page."""
         across, down = _relative_position(self.place, position)
         inside = np.clip((1 + _BLOB_RIM / 2 - np.hypot(across, down)) / _BLOB_RIM, 0, 1)
         return 1 - (1 - self.left) * inside * inside * (3 - 2 * inside)
@@ -292,11 +290,11 @@ class Blob:
 class Glare:
     """Specular reflection of the print: a broad, soft ellipse with the colour of projector and ambient light."""
 
-    place: Place  # The light at the sides of the rectangle is 1 / e² of its maximum
-    share: float = 0.03  # Relative to the light from bare paper
+    place: Place  # At the sides of the rectangle, the reflection is 1 / e² of its maximum
+    share: float = 0.03  # Maximum of the reflection, relative to the light from bare paper
 
     def reflected_light(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reflected light (...) at points (..., 2), relative to the page, relative to bare paper."""
+        """Return the reflection (...), relative to bare paper, at points (..., 2), given relative to the page."""
         across, down = _relative_position(self.place, position)
         return self.share * np.exp(-2 * (across**2 + down**2))
 
@@ -322,7 +320,7 @@ class Situation:
 
     @property
     def is_even(self) -> bool:
-        """Whether all positions of the chart have the same share of the light of each primary."""
+        """Whether the light of each primary changes by the same factor at all points of the chart."""
         plain = self.picture is None or self.picture.shape[:2] == (1, 1)
         return plain and not self.patches and not self.blobs and not self.glares
 
@@ -338,10 +336,10 @@ class Situation:
         plain: NDArray[np.float64],
         decoded: Callable[[Colour], NDArray[np.float64]],
     ) -> NDArray[np.float64]:
-        """Return the relative light (..., 3) float64 of each primary in the picture at points of the print.
+        """Return the projected light (..., 3) float64 of each primary at points of the print, 0 to 1.
 
-        `points_mm`: (..., 2) float64. `plain`: (3,) float64, uniform colour, if there is no `picture`. `decoded`
-        returns the light (3,) of the codes of a colour.
+        `points_mm`: (..., 2) float64. `plain`: (3,) float64, light of the uniform colour, if there is no `picture`.
+        `decoded` converts the codes of a colour to light (3,).
         """
         if self.picture is None:
             light = np.broadcast_to(plain, (*points_mm.shape[:-1], 3)).copy()
@@ -356,7 +354,7 @@ class Situation:
         return light
 
     def transmittance(self, points_mm: NDArray[np.float64], page_mm: tuple[float, float]) -> NDArray[np.float64]:
-        """Return the relative light (...) float64 that passes objects in front of points (..., 2) mm."""
+        """Return the share of the light (...) float64 that passes the objects in front of points (..., 2) mm."""
         position = points_mm / np.array(page_mm)
         transmitted = np.ones(points_mm.shape[:-1])
         for blob in self.blobs:
@@ -376,7 +374,7 @@ UNDISTURBED: Final = Situation()  # No differences.
 
 
 def projected_mm(page_mm: tuple[float, float], aspect: float) -> Place:
-    """Return the rectangle of the projected picture, mm on the print: centred, covering the page and `OVERSCAN`."""
+    """Return the rectangle of the projected picture, mm on the print: the centred page with the margin `OVERSCAN`."""
     width, height = (side * (1 + 2 * OVERSCAN) for side in page_mm)
     width, height = max(width, height * aspect), max(height, width / aspect)
     x, y = page_mm[0] / 2, page_mm[1] / 2
@@ -405,7 +403,7 @@ def displaced(
 ) -> NDArray[np.float64]:
     """Return the positions of points of the chart after a rotation about `middle_mm` and a shift `shift_mm`.
 
-    `points_mm`: (..., 2) float64. Returns (..., 2) float64, mm, in the coordinates of the chart before.
+    `points_mm`: (..., 2) float64. Returns (..., 2) float64, mm, in the coordinates of the undisturbed chart.
     """
     return (points_mm - np.asarray(middle_mm)) @ _rotation(turn_deg).T + np.asarray(middle_mm) + np.asarray(shift_mm)
 
@@ -425,8 +423,8 @@ def _rotation(turn_deg: float) -> NDArray[np.float64]:
 class World:
     """A print, a camera and a room.
 
-    The first frame takes some seconds for the rendering, which is kept: 12 bytes per photosite. Methods may be called
-    by several threads.
+    The first frame takes some seconds, because the room is rendered. The rendering stays in memory (12 bytes per
+    photosite). Methods may be called by several threads.
     """
 
     def __init__(self, sheet: Print, body: Body, room: Room) -> None:
@@ -478,7 +476,7 @@ class World:
         settings
             Exposure; the signal is proportional to shutter time, ISO speed and 1 / f-number².
         key
-            Key of the noise.
+            Integers that select the random numbers of the frame.
         lamp
             Relative lamp brightness.
         situation
@@ -511,7 +509,7 @@ class World:
         frame: NDArray[np.uint16],
         noise: NDArray[np.float32],
         light: NDArray[np.float32],
-        drive: NDArray[np.float32],
+        weights: NDArray[np.float32],
         settings: ExposureSettings,
         first: int,
     ) -> None:
@@ -520,13 +518,13 @@ class World:
         y, x = hot.rows + first - visible.top, hot.columns - visible.left
         is_visible = (y >= 0) & (y < visible.height) & (x >= 0) & (x < visible.width)
         hot_light = np.zeros(len(hot.rows))
-        hot_light[is_visible] = drive.astype(np.float64) @ light[:, y[is_visible], x[is_visible]]
+        hot_light[is_visible] = weights.astype(np.float64) @ light[:, y[is_visible], x[is_visible]]
         hot.raise_counts(frame, noise, hot_light, self.body, settings.iso, settings.shutter_s)
 
     def _lighting(
         self, colour: Colour, settings: ExposureSettings, lamp: NDArray[np.float64], situation: Situation
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return light (3, rows, columns) and weights (3,); their product is the signal of a frame."""
+        """Return the light (3, rows, columns) of each primary and weights (3,); their weighted sum is the signal."""
         (light, veil), ambient = self._render(situation), np.array(situation.ambient)
         plain = self.decoded(colour) if situation.picture is None else situation.picture[0, 0].astype(np.float64)
         if situation.is_even:
@@ -549,7 +547,7 @@ class World:
         return frame_light, np.ones(3, dtype=np.float32)
 
     def _mirrored(self, points: NDArray[np.float64], situation: Situation, first: int) -> NDArray[np.float32]:
-        """Return the specular reflection (3, rows, columns) float32 on rows from `first`, in the units of `_render`."""
+        """Return the specular reflection (3, rows, columns) float32 in rows from `first`, in the units of `_render`."""
         row, column = np.mgrid[first : first + len(points), : points.shape[1]]
         paper = self._signals(self._reflectance([PAPER]))[0][self._channels()[row % 2, column % 2]]
         added = situation.reflected_light(points, self.sheet.page_mm)[..., None] * self.field(points) * paper
@@ -566,32 +564,33 @@ class World:
     def signal(
         self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0, situation: Situation = UNDISTURBED
     ) -> NDArray[np.float32]:
-        """Return the signal (rows, columns) float32 of the visible photosites, DN above black, with their response.
+        """Return the signal (rows, columns) float32 of the visible photosites, DN above black.
 
-        Without noise, hot photosites, clipping and colour wheel.
+        It includes the response of each photosite, but no noise, hot photosites, clipping or colour wheel.
         """
-        light, drive = self._lighting(colour, settings, lamp * np.array(situation.lamp), situation)
-        return np.tensordot(drive, light, 1)
+        light, weights = self._lighting(colour, settings, lamp * np.array(situation.lamp), situation)
+        return np.tensordot(weights, light, 1)
 
     def project(
         self, points_mm: NDArray[np.float64], channel: str = "G", situation: Situation = UNDISTURBED
     ) -> NDArray[np.float64]:
-        """Return the half-size pixels (..., 2) float64, x and y, of points (..., 2) mm of the print."""
+        """Return the positions (..., 2) float64 in the image, half-size pixels, of points (..., 2) mm of the print."""
         points = np.asarray(points_mm, dtype=np.float64)
         if any(situation.view):
             points = displaced(points, np.array(self.sheet.page_mm) / 2, self._shift_mm(situation), situation.turn_deg)
         return self.lens.shifted(self.view.project(points), channel)
 
     def white(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
-        """Return R, G, B (3,) float64 of bare paper where `field` is 1, DN above black, without clipping."""
+        """Return R, G, B (3,) float64 of bare paper without fall-off (`field` = 1), DN above black, unclipped."""
         return self.reflected([PAPER], colour, settings, lamp)[0]
 
     def reflected(
         self, rgb: ArrayLike, colour: Colour, settings: ExposureSettings, lamp: float = 1.0
     ) -> NDArray[np.float64]:
-        """Return the exact linear camera RGB (N, 3) float64 of printed codes where `field` is 1.
+        """Return the exact linear camera RGB (N, 3) float64 of printed codes without fall-off (`field` = 1).
 
-        `rgb`: (N, 3) codes 0 to 255. In DN above black, with black leak and ambient light, without clipping.
+        `rgb`: (N, 3) codes 0 to 255. The result is in DN above black. It includes black leak and ambient light, and is
+        not clipped.
         """
         return self._signals(self._reflectance(rgb)) @ self.drive(colour, settings, lamp)
 
@@ -605,8 +604,8 @@ class World:
     ) -> NDArray[np.float64]:
         """Return the exact linear camera RGB (N, 3) float64 of printed codes at points of the print, without blur.
 
-        `rgb`: (N, 3) codes 0 to 255. `points_mm`: (N, 2) float64. In DN above black, with stain and fold, without
-        clipping.
+        `rgb`: (N, 3) codes 0 to 255. `points_mm`: (N, 2) float64. The result is in DN above black. It includes stain
+        and fold, and is not clipped.
         """
         light = self.field(points_mm) * self.drive(colour, settings, lamp)
         return np.einsum("ncp,np->nc", self._signals(self._reflectance(rgb)), light) * self.worn_light(points_mm)
@@ -615,8 +614,8 @@ class World:
         """Return the signal of printed codes at points of a clean flat print under each primary at full brightness.
 
         `rgb`: (N, 3) codes 0 to 255. `points_mm`: (N, 2) float64. Returns (N, 3, 3) float64 [point, channel, primary],
-        DN above black at the reference exposure, without blur. Its product with `drive` is `camera_rgb_at`
-        without stain and fold.
+        DN above black at the reference exposure, without blur. The product of this array and `drive` equals
+        `camera_rgb_at` of a print without stain and fold.
         """
         return self._signals(self._reflectance(rgb)) * self.field(points_mm)[:, None]
 
@@ -629,8 +628,8 @@ class World:
     ) -> NDArray[np.float64]:
         """Return the exposure (3,) float64 to each primary, relative to full brightness at the reference exposure.
 
-        Parameters as in `expose`. `lamp` and `ambient`, which is added to the ambient light of the room, may have one
-        value per primary.
+        `colour` and `settings` as in `expose`. `lamp` and `ambient` may have one value per primary; `ambient` is added
+        to the ambient light of the room.
         """
         return self._collected(self.decoded(colour), settings, lamp, ambient)
 
@@ -645,12 +644,12 @@ class World:
         relative_light = lamp * (leak + (1 - leak) * linear) + self.room.ambient + ambient
         reference = REFERENCE_EXPOSURE
         time = settings.shutter_s / reference.shutter_s
-        # A lens without contacts keeps the reference aperture.
+        # A lens without contacts has the reference aperture.
         opening = 1.0 if settings.aperture is None else (REFERENCE_APERTURE / settings.aperture) ** 2
         return relative_light * time * opening * (settings.iso / reference.iso)
 
     def worn_light(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the relative light (..., 3) float64 in R, G, B that stain and fold leave at points (..., 2) mm."""
+        """Return the light (..., 3) float64 of R, G, B at points (..., 2) mm, relative to a print without damage."""
         points = np.asarray(points_mm, dtype=np.float64)
         transmitted = np.ones((*points.shape[:-1], 3))
         if self.stain is not None:
@@ -662,10 +661,10 @@ class World:
     def field(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the light at points of the print: lens vignetting times fall-off of the projector.
 
-        `points_mm`: (..., 2) float64. Returns (..., 3) float64 for each primary. The lens is 1 on its axis and green is
-        1 at its brightest point. Red and blue are balanced to the same mean over the sheet, so `white` has the
-        chromaticity of the mean light. The field of a camera channel is the mean of the fields of the primaries,
-        weighted by the signal of the channel under each primary.
+        `points_mm`: (..., 2) float64. Returns (..., 3) float64 for each primary. The factor of the lens is 1 on its
+        axis, the factor of green is 1 at the brightest point of green. Red and blue are scaled to the mean of green
+        over the sheet, so `white` has the chromaticity of the mean light. The field of a camera channel is the mean of
+        the fields of the primaries, weighted by the signal of the channel under each primary.
         """
         points = np.asarray(points_mm, dtype=np.float64)
         photosites = 2 * self.project(points) + 0.5
@@ -675,7 +674,7 @@ class World:
         return passed[..., None] * self._falloff[:, 3] / (1 + self._falloff[:, 2] * from_spot)
 
     def _balance(self) -> NDArray[np.float64]:
-        # Gains of the primaries, so that all have the mean of green over the sheet.
+        # Gains that scale the mean of each primary over the sheet to the mean of green.
         width, height = self.sheet.page_mm
         x, y = np.meshgrid((np.arange(60) + 0.5) * width / 60, (np.arange(40) + 0.5) * height / 40)
         means = self.field(np.stack([x, y], axis=-1)).mean(axis=(0, 1))
@@ -693,7 +692,7 @@ class World:
         return np.random.Generator(np.random.SFC64([self.room.seed, *key]))
 
     def _render(self, situation: Situation = UNDISTURBED) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return DN (3, rows, columns) float32 under each primary, and its veiling glare (3, 2, 2) by parity."""
+        """Return DN (3, rows, columns) float32 under each primary, and their veiling glare (3, 2, 2) by parity."""
         with self._lock:
             if situation.view not in self._rendered:
                 undisturbed = self._rendered.get(UNDISTURBED.view)
@@ -747,7 +746,7 @@ class World:
 
     def _undisplaced(self, points_mm: NDArray[np.float64], situation: Situation) -> NDArray[np.float64]:
         if not any(situation.view):
-            # Rounding errors would change some counts of the undisturbed chart.
+            # The undisturbed chart is not transformed, because rounding errors would change some counts.
             return points_mm
         return undisplaced(points_mm, np.array(self.sheet.page_mm) / 2, self._shift_mm(situation), situation.turn_deg)
 
@@ -766,14 +765,14 @@ class World:
     def _worn_rows(
         self, nodes: NDArray[np.float64], channels: NDArray[np.int64], first: int, last: int
     ) -> NDArray[np.float32]:
-        # Relative light (rows, columns) float32 that stain and fold leave on the photosites of some rows.
+        # `worn_light` (rows, columns) float32 of the photosites of some rows.
         row, column = np.mgrid[first:last, : self.body.visible.width]
         points = self._points(nodes, first, last)
         channel = channels[row % 2, column % 2]
         return np.take_along_axis(self.worn_light(points), channel[..., None], axis=-1)[..., 0].astype(np.float32)
 
     def _nodes(self, situation: Situation, channel: str = "G") -> NDArray[np.float64]:
-        # Points of the print (ny, nx, 2), mm, at every 16th photosite, with one more node on each side.
+        # Points of the print (ny, nx, 2), mm, at every 16th photosite, with an additional node beyond each edge.
         visible = self.body.visible
         y, x = (np.arange(-1, (size - 1) // GRID_PX + 3) * GRID_PX for size in (visible.height, visible.width))
         photosites = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)

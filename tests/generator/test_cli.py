@@ -89,7 +89,7 @@ def test_matches_ground_truths_of_file_or_refuses_them(generate: Generate, capsy
         stream.write("0,0,1\n")
     assert generate(*options) == 2
     assert "of gt.csv are more than 3 degrees" in (error_text := capsys.readouterr().err)
-    assert "the first in line 8" in error_text
+    assert "first in line 8" in error_text
     assert not Path("out").exists()
     Path("gt.csv").write_text(Path("gt.csv").read_text().removesuffix("0,0,1\n"))
     assert generate(*options, "--lights-per-image", "2") == 0

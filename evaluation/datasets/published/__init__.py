@@ -1,4 +1,4 @@
-"""Readers of published data sets, one file per layout: its files, and the levels and masks that are applied.
+"""Readers of published data sets. The docstring of each module describes files, levels and masks.
 
 "Not verified against a real copy" marks layouts and values that were never tested on the published files.
 """

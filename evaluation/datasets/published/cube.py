@@ -53,11 +53,11 @@ from evaluation.datasets.options import DataOptions, choose_name, level_note
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError
 
-BELOW_PEAK = 2  # counts below the largest value of an image that are clipped too; advice of the authors, see `Peaks`
+BELOW_PEAK = 2  # values up to this number of counts below the largest value are clipped, see `Peaks`
 
 # Description of the rule in results.
 PEAK_RULE = (
-    "in each image from m - 2, m its largest value in any channel (advice of the authors of Cube+, "
+    "from m - 2, where m is the largest value in any channel of the image (advice of the authors of Cube+, "
     "ipg.fer.hr/ipg/resources/color_constancy)"
 )
 
@@ -66,8 +66,8 @@ PEAK_RULE = (
 class Peaks:
     """Cache of the largest values of images, from which saturation levels are derived.
 
-    The authors of Cube and Cube+ advise to discard all pixels with a channel of m - 2 or more; m is the largest value
-    of the image. Their page was not accessible; two independent public preprocessing programs apply this rule.
+    The authors of Cube and Cube+ advise to discard all pixels with a channel of m - 2 or more, where m is the largest
+    value of the image. Their page was not accessible, but two public preprocessing programs apply this rule.
     """
 
     _values: dict[str, float] = field(default_factory=dict[str, float])
@@ -108,7 +108,7 @@ BLACK = 2048
 # Upper left corner of the masked rectangle, which extends to the lower right corner, px; the data set's page.
 CUBE_ROW, CUBE_COLUMN = 1050, 2050
 
-# Name and number of images by file of ground truths; arXiv:1712.00436.
+# Name and number of images of each data set, by its file of ground truths; arXiv:1712.00436.
 _PUBLISHED_CUBES = {"cube+_gt.txt": ("Cube+", 1707), "cube_gt.txt": ("Cube", 1365)}
 
 
@@ -170,7 +170,7 @@ def open_cube_plus(location: str, options: DataOptions, scanned_folder: Folder |
 
 SIZE = (1728, 2592)  # height and width of Cube++, px (description.md)
 SIMPLE_SCALE = 4  # reduction of SimpleCube++ in both directions (code/build_simple_ds.py)
-# The rectangle with the SpyderCube, from the lower right corner, px of Cube++ (code/build_simple_ds.py).
+# Size of the rectangle with the SpyderCube in the lower right corner, px of Cube++ (code/build_simple_ds.py).
 CUBE_HEIGHT, CUBE_WIDTH = 1000, 700
 
 _TRUTHS = ("mean", "left", "right", "left_white", "right_white")
@@ -223,8 +223,8 @@ def open_cube_plus_plus(location: str, options: DataOptions, scanned_folder: Fol
     png_folders = [child for name, child in folder.folders.items() if name.upper().startswith("PNG")]
     images = gather_images(png_folders)
     indices, note = match_images(names, images, "gt.csv", folder.path / "PNG", options.partial)
-    unlit_count = len([index for index in indices if names[index] not in lights])
-    if unlit_count == len(indices):
+    without_truth_count = len([index for index in indices if names[index] not in lights])
+    if without_truth_count == len(indices):
         raise InputError(f"{location}: no image has the ground truth {truth!r}; choose another with --read truth=NAME")
     whites = _white_levels(folder.path / "properties.csv") if folder.has("properties.csv") else {}
     black, peaks = BLACK if options.black is None else options.black, Peaks()
@@ -235,10 +235,10 @@ def open_cube_plus_plus(location: str, options: DataOptions, scanned_folder: Fol
         for name in (names[index] for index in indices)
         if name in lights
     )
-    if unlit_count:
+    if without_truth_count:
         note += (
-            f"; {unlit_count} of these have no {truth} and are excluded (the authors give a mean if both grey faces "
-            "agree within 1° and are bright enough)"
+            f"; {without_truth_count} of these have no {truth} and are excluded (the authors give a mean "
+            "if both grey faces agree within 1° and are bright enough)"
         )
     return SceneSet(
         name="Cube++",
@@ -315,7 +315,7 @@ def _first_line(path: Path) -> list[str]:
 
 
 def _is_blank(row: Mapping[str, str], columns: Sequence[str]) -> bool:
-    # pandas writes missing values as NaN.
+    # Missing values may be written as NaN, for example by pandas.
     return all(row[column].strip().lower() in ("", "nan") for column in columns)
 
 

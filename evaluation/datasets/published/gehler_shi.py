@@ -2,20 +2,19 @@
 
     8D5U5524.png …           86 images of a Canon EOS-1Ds ("1D"), 12-bit values in 16-bit files, black not subtracted
     IMG_0281.png …           482 images of a Canon EOS 5D
-    coordinates/NAME_macbeth.txt   size of the annotated image, then four corners of the chart: 1 2, 3 4
+    coordinates/NAME_macbeth.txt   size of the annotated image, then four chart corners in reading order
     ColorCheckerData.mat     REC_groundtruth (568, 3): recommended ground truth; REC_groundtruth.mat is read too
     real_illum_568..mat      real_rgb (568, 3): Shi's ground truth of 2010
 
 Subfolders are searched to a depth of three, so that the archives may be unpacked unchanged (png/, Canon1D/png/ …).
 
 P. Gehler et al., "Bayesian color constancy revisited", CVPR 2008; L. Shi, B. Funt,
-www2.cs.sfu.ca/~colour/data/shi_gehler.
-G. Hemrit et al., "Rehabilitating the ColorChecker dataset for illuminant estimation" (CIC 26, 2018, arXiv:1805.12262)
-describe errors in the three earlier sets of ground truths, and recommend a new set (colorconstancy.com). Errors against
-Shi's ground truth and against the new one are not comparable. In both, rows are in the order of the image names. Black
-levels and saturation: internal/GehlerShiSensor.m of github.com/google/ffcc. According to this file, the saturation 3580
-of older papers is not correct. Some programs use black 1 for the 1D. Chart corners: internal/ReadImage.m there. Not
-verified against a real copy.
+www2.cs.sfu.ca/~colour/data/shi_gehler. G. Hemrit et al., "Rehabilitating the ColorChecker dataset for illuminant
+estimation" (CIC 26, 2018, arXiv:1805.12262) describe errors in the three earlier sets of ground truths, and recommend a
+new set (colorconstancy.com). Results with Shi's ground truth and with the new set are not comparable. Rows of both sets
+are in the order of the image names. Black levels and saturation are from internal/GehlerShiSensor.m of
+github.com/google/ffcc. According to this file, the saturation 3580 of older papers is not correct. Some programs use
+black 1 for the 1D. Chart corners are read as in internal/ReadImage.m of FFCC. Not verified against a real copy.
 """
 
 from __future__ import annotations
@@ -105,13 +104,13 @@ def is_gehler_shi(folder: Folder) -> bool:
 
 
 def open_gehler_shi(location: str, options: DataOptions, scanned_folder: Folder | None = None) -> SceneSet:
-    """Return the data set, or one camera of it; images are read on use."""
+    """Return the images of both cameras, or of the selected one; images are read on use."""
     folder = scanned_folder or Folder(Path(location))
     folders = list(folder.within(_SEARCH_DEPTH))
     truth = choose_name(options.truth, _TRUTHS, "truth", location) or "recommended"
     path, lights = _read_truth(folders, truth, location)
     camera = choose_name(options.camera, BLACK, "camera", location)
-    # Folders without any image of the data set may contain masks or previews.
+    # Folders without an image of the data set are ignored, because they may contain masks or previews.
     all_images = gather_images(
         candidate
         for candidate in folders
@@ -160,7 +159,7 @@ def open_gehler_shi(location: str, options: DataOptions, scanned_folder: Folder 
             + (
                 "recommended by Hemrit et al., 2018"
                 if truth == "recommended"
-                else "Shi's of 2010, replaced by Hemrit et al. in 2018; results with the two are not comparable"
+                else "by Shi, 2010, replaced by Hemrit et al. in 2018; results with the two are not comparable"
             ),
         },
     )

@@ -1,8 +1,8 @@
-"""Read INTEL-TAU: 7022 images of three cameras, half of them of the same scenes, as processed 1080p files.
+"""Read INTEL-TAU: 7022 images of three cameras as processed 1080p files.
 
     CAMERA/field_1_cameras/NAME_12.tiff   16 bits, black subtracted and scaled by the authors, privacy masked
-    CAMERA/field_1_cameras/NAME_12.wp     ground truth: red, green, blue (the number may be padded: NAME_012.wp)
-    CAMERA/field_3_cameras, lab_printouts, lab_realscene
+    CAMERA/field_1_cameras/NAME_12.wp     ground truth: red, green, blue (or with leading zeros: NAME_012.wp)
+    CAMERA/field_3_cameras, lab_printouts, lab_realscene: as field_1_cameras
     splits/Intel-TAU_v3_filelist_subset01.txt … 10   the authors' ten folds, optional
 
 Cameras: Canon_5DSR, Nikon_D810, Sony_IMX135_BLCCSC. F. Laakom et al., "INTEL-TAU: a color constancy dataset", IEEE
@@ -23,7 +23,7 @@ from foundation.errors import FormatError, first_few
 
 # Names of the subfolders of each camera.
 SUBSETS = ("field_1_cameras", "field_3_cameras", "lab_printouts", "lab_realscene")
-WHITE = 65535  # saturation of 16-bit files that are normalised by saturation, counts
+WHITE = 65535  # saturation of the files, counts: the authors scaled saturation to 16 bits
 
 _PUBLISHED = 7022  # images of the whole data set (arXiv:1910.10404)
 _FOLD_COUNT = 10  # number of the authors' folds, from their loader
@@ -35,7 +35,7 @@ def is_intel_tau(folder: Folder) -> bool:
 
 
 def open_intel_tau(location: str, options: DataOptions, scanned_folder: Folder | None = None) -> SceneSet:
-    """Return the images of all cameras and subsets, or of one; images and ground truths are read on use."""
+    """Return the images of all or the selected cameras and subsets; images and ground truths are read on use."""
     folder = scanned_folder or Folder(Path(location))
     cameras = _cameras(folder)
     if not cameras:
@@ -107,7 +107,7 @@ def _scenes(folder: Folder, prefix: str, black: float, white: float, partial: bo
 
 
 def _strip_zeros(name: str) -> str:
-    # The number may have leading zeros in the name of an image but not in that of its ground truth.
+    # The numbers in the names of an image and of its ground truth may have different leading zeros.
     stem, _, number = name.rpartition("_")
     return f"{stem}_{int(number)}" if number.isdecimal() else name
 

@@ -10,13 +10,14 @@ Layout::
     galaxy_512/meta.json, split.json     output of 2_preprocess_data.py: black subtracted, cropped and resized
     galaxy_512/test/Place1_12.tiff, Place1_12.npy, Place1_mask.png (0 on the charts)
 
-Run the authors' programs first: 0_cvt2tiff.py makes the .tiff files from the published raw files (dcraw -h -D -4 -T),
-1_make_mixture_map.py the .npy files and the illuminants in meta.json. D. Kim et al., "Large scale multi-illuminant
-(LSMI) dataset for developing white balance algorithm under mixed illumination", ICCV 2021, and
+Run the authors' programs first. 0_cvt2tiff.py makes the .tiff files from the published raw files (dcraw -h -D -4 -T).
+1_make_mixture_map.py makes the .npy files and the illuminants in meta.json. D. Kim et al., "Large scale
+multi-illuminant (LSMI) dataset for developing white balance algorithm under mixed illumination", ICCV 2021, and
 github.com/DY112/LSMI-dataset, the source of all levels and masks. Not verified against a real copy.
 
-The illuminant of a pixel is the sum of the illuminants, green 1, weighted by their fractions. As in the authors'
-programs, levels are constants for Sony's files and are read from a raw file for the Galaxy and Nikon.
+The illuminant of a pixel is the sum of the illuminants of the place, scaled to green 1 and weighted by their fractions
+in the pixel. As in the authors' programs, levels of the Sony are constants; levels of the Galaxy and Nikon are read
+from a raw file.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from foundation.errors import FormatError, InputError, first_few
 from generator.files import decode_png
 
 _SONY: Final = (128.0, 4095.0)  # black level and saturation of Sony's .tiff files, counts (1_make_mixture_map.py)
-_REDUCTION = 2  # chart corners are in px of the raw file, and its .tiff is half as large (1_make_mixture_map.py)
+_REDUCTION = 2  # chart corners are in px of the raw file; the .tiff is half as large (1_make_mixture_map.py)
 _SUBSETS = ("train", "val", "test")
 _MIXES: Final = {"single": (1,), "mixed": (2, 3)}
 _IMAGE_NAME = re.compile(r"(?P<place>.+)_(?P<lights>[123]{1,3})\.tiff?")
@@ -99,7 +100,7 @@ class LsmiMixedScene(LsmiScene):
         """Return the fraction of each illuminant in each pixel: (H, W, K) float32, 0 … 1, sum 1; NaN if unknown."""
         try:
             shares = np.load(self.shares_path, allow_pickle=False)
-        except Exception as error:  # NumPy evaluates file headers; damaged ones may raise any error.
+        except Exception as error:  # NumPy evaluates file headers, so a damaged file may raise any error.
             raise FormatError(
                 f"{self.shares_path} cannot be read: {error}; make it again with 1_make_mixture_map.py"
             ) from error
@@ -163,7 +164,7 @@ def open_lsmi(location: str, options: DataOptions, scanned_folder: Folder | None
             "images": ", ".join(notes),
             "black level": level_note(options.black, ", ".join(black)),
             "saturation": level_note(options.saturation, ", ".join(white)),
-            "mask": "the three charts of each place, in every subset (the authors' own test includes them)",
+            "mask": "the three charts of each place, in every subset (not masked in the test of the authors)",
             "ground truth": "illuminants of meta.json, green 1, weighted in each pixel by the fractions in the .npy "
             "file; unknown if these are -1 or all 0. Single-illuminant methods are compared with the mean over the "
             "known pixels",
@@ -275,7 +276,7 @@ class _Camera:
         return None
 
     def scenes(self, places: Mapping[str, str], subset: str | None, counts: Sequence[int]) -> Iterator[LsmiScene]:
-        """Yield the images of places, in order; only images with one of these numbers of illuminants."""
+        """Yield the images of places, in order. `counts`: numbers of illuminants of the images that are included."""
         black, white, _ = self.levels()
         folders = self.folder.folders
         missing: list[str] = []

@@ -1,20 +1,20 @@
-"""Read NUS 8 cameras: 1736 images of the same scenes with eight cameras, and 117 of a ninth (NikonD40), with charts.
+"""Read the NUS data set: 1736 images of the same scenes by eight cameras, and 117 by a ninth (NikonD40), with charts.
 
     CAMERA/CAMERA_gt.mat      groundtruth_illuminants (N, 3), darkness_level, saturation_level, CC_coords (N, 4),
                               all_image_names (N,)
-    CAMERA/CAMERA_0001.PNG    16 bits, demosaiced raw; also in CAMERA/PNG, or for all cameras in images/ and the .mat
-                              files in ground_truth/
-    CAMERA/CHECKER            chart boxes as text; used if there are no CC_coords, else compared with them
+    CAMERA/CAMERA_0001.PNG    16 bits, demosaiced raw; also read from CAMERA/PNG, or from images/ for all cameras (the
+                              .mat files are then in ground_truth/)
+    CAMERA/CHECKER            chart boxes as text; used if there are no CC_coords, else compared with CC_coords
 
 D. Cheng, D. Prasad, M. Brown, "Illuminant estimation for color constancy: why spatial-domain methods work and the role
-of the color distribution", JOSA A 31(5), 2014; its page, cvil.eecs.yorku.ca/projects/public_html/illuminant. Levels are
-in the units of the files, black not subtracted. `CC_coords` are first and last row, first and last column of the chart,
+of the color distribution", JOSA A 31(5), 2014; cvil.eecs.yorku.ca/projects/public_html/illuminant. Levels are in the
+units of the files, black not subtracted. `CC_coords` are first and last row, first and last column of the chart,
 counted from 1, as used by internal/ReadImage.m of github.com/google/ffcc. Not verified against a real copy.
 
-The first line of `CAMERA/CHECKER/CAMERA_0001_mask.txt` is x,y,width,height of the chart. The folder comes from the
-archives MASK; it may also be in the folder of all cameras. Source: github.com/mahmoudnafifi/WB_sRGB, issue 15, by a
-former member of the laboratory. The box is a rectangle for MATLAB's `imcrop`, px counted from 1; its last row and
-column are round(y + height) and round(x + width).
+The first line of `CAMERA/CHECKER/CAMERA_0001_mask.txt` is x,y,width,height of the chart. The folder CHECKER comes from
+the archives MASK; one folder CHECKER for all cameras is also read. Source: github.com/mahmoudnafifi/WB_sRGB, issue 15,
+by a former member of the laboratory. The box is a rectangle for MATLAB's `imcrop`, in px counted from 1. Its last row
+and column are round(y + height) and round(x + width).
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ Box = tuple[int, int, int, int]
 
 _COORDS = "CC_coords"
 _MASK_FOLDER = "CHECKER"
-# Smallest intersection of two boxes of one chart, fraction of their union. Sources use different margins, but
-# the overlap is smaller for boxes of rotated images, from another corner, or with exchanged rows and columns.
+# Smallest intersection of two boxes of the same chart, fraction of their union. Boxes may have different margins. The
+# intersection is smaller if an image was rotated, or if rows and columns were exchanged.
 _LEAST_OVERLAP = 0.5
 
 
@@ -58,7 +58,7 @@ def chart_boxes(
         return {index: read_mask(mask_files[names[index]]) for index in indices}, source
     rows = numeric_table(content, _COORDS, path, 4).astype(int)
     if len(rows) != len(names):
-        raise FormatError(f"{path} has {len(names)} images and {len(rows)} {_COORDS}, expected as many; restore it")
+        raise FormatError(f"{path} has {len(names)} images and {len(rows)} {_COORDS}, expected one each; restore it")
     boxes: dict[int, Box] = {}
     max_difference, compared_count = 0, 0
     for index in indices:
@@ -115,7 +115,7 @@ def _area(box: Box) -> int:
 
 
 def _round_like_matlab(value: float) -> int:
-    # MATLAB rounds halves away from 0. Values before the image become its first pixel.
+    # MATLAB rounds halves away from 0. Values below 1 become the first row or column.
     return max(math.floor(value + 0.5), 1)
 
 
@@ -134,7 +134,7 @@ def _mask_files(path: Path, root: Folder) -> dict[str, Path]:
 
 
 _MAT_ENDING = "_gt.mat"
-# Largest allowed distance of a chart box beyond the image edge, px: rounding and counting from 0 cause 2.
+# A chart box may extend this far beyond the image edge, px. Rounding and counting from 0 instead of 1 cause up to 2.
 _LARGEST_OVERHANG = 2
 # Number of images of each camera, from the list of ground truths in github.com/TheZino/COCOA.
 _PUBLISHED: Final = {
@@ -175,7 +175,7 @@ def is_nus8(folder: Folder) -> bool:
 
 
 def open_nus8(location: str, options: DataOptions, scanned_folder: Folder | None = None) -> SceneSet:
-    """Return the images of all cameras in a folder, or of one; they are read on use."""
+    """Return the images of all cameras in a folder, or of the selected one; images are read on use."""
     folder = scanned_folder or Folder(Path(location))
     tables = {path.name[: -len(_MAT_ENDING)]: path for path in _mat_files(folder)}
     if not tables:
@@ -220,7 +220,7 @@ def open_nus8(location: str, options: DataOptions, scanned_folder: Folder | None
 
 def _mat_files(folder: Folder) -> Iterator[Path]:
     for child in folder.within(1):
-        # A name in front of the ending is required.
+        # A file named only `_gt.mat` has no camera name and is ignored.
         yield from (child.path / name for name in child.files if name.endswith(_MAT_ENDING) and name != _MAT_ENDING)
 
 
@@ -233,7 +233,7 @@ def _open_camera(
     folder, images = _find_images(root, camera, path)
     names = names_or_none(content, "all_image_names", path)
     if names is None:
-        names = list(images)  # Some versions of the .mat have no names; the images are in the order of theirs.
+        names = list(images)  # Some versions of the .mat have no names; their rows are in the order of the file names.
     if len(names) != len(lights):
         raise FormatError(
             f"{path} has {len(lights)} ground truths for {len(names)} images of {camera} in {folder}, expected equal "

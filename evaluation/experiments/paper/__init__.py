@@ -1,1 +1,1 @@
-"""Experiments of section 4 of the paper, with the published numbers next to the results."""
+"""Experiments of section 4 of the CroP paper, with its published numbers next to our results."""

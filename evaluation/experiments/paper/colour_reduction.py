@@ -1,7 +1,7 @@
-"""Influence of colour reduction: estimates on linear images after low bits of their codes were set to zero (4.2).
+"""Influence of colour reduction on estimates (section 4.2 of the paper).
 
-Real linear images are tone mapped by Flash to 8-bit codes, the lowest n bits are set to zero, and the inverse operator
-gives linear images for the methods. With n = 0 only the rounding to codes remains.
+The tone mapping operator Flash converts real linear images to 8-bit codes. The lowest n bits of each code are set to
+zero. The inverse of Flash then gives linear images for the methods. If n is 0, the codes are only rounded.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ GRAY_EDGE_SIGMA: Final = 6.0  # Scale of Gray-Edge in the NUS tables, px, for im
 def reduce_colours(
     image: Image, bits: int | Sequence[int], mask: npt.NDArray[np.bool_] | None = None
 ) -> list[npt.NDArray[np.float32]]:
-    """Return the linear image after each of the numbers of bits of its tone-mapped codes was set to zero.
+    """Return a linear image for each number in `bits`, after this number of bits of its codes was set to zero.
 
-    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit. `mask`: (H, W) bool, True for
-    pixels that do not influence the operator. Returns (H, W, 3) float32 images, relative to the largest unmasked value.
+    `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit. `bits`: one or several numbers.
+    `mask`: (H, W) bool, True for pixels to which Flash is not fitted. The images are (H, W, 3) float32, relative to the
+    largest unmasked value.
 
     Examples
     --------
@@ -57,7 +58,7 @@ def reduce_colours(
 
 @dataclass(frozen=True, eq=False)
 class FittedCodes:
-    """Codes of a linear image after Flash."""
+    """Codes of a linear image, calculated by Flash."""
 
     codes: npt.NDArray[np.uint8]  # (H, W, 3) uint8
     operator: Flash  # The fitted operator, for values relative to `largest`
@@ -65,23 +66,23 @@ class FittedCodes:
 
 
 def fit_codes(image: Image, mask: npt.NDArray[np.bool_] | None = None) -> FittedCodes:
-    """Return the 8-bit codes of a linear image, by an operator fitted to it.
+    """Fit Flash to a linear image, and return its 8-bit codes.
 
     `image`, `mask`: as in `reduce_colours`.
     """
-    # k and scale of Flash are fitted to the image before reduction (`generator.files`).
+    # The parameters k and scale of Flash are fitted to the image, see `generator.files`.
     values = np.asarray(image, dtype=np.float64)
-    judged = values.reshape(-1, 3) if mask is None else values[~mask]
-    largest = float(judged.max(initial=0.0))
+    unmasked = values.reshape(-1, 3) if mask is None else values[~mask]
+    largest = float(unmasked.max(initial=0.0))
     if not largest:
         return FittedCodes(np.zeros(values.shape, np.uint8), Flash(1.0, 255.0, 1.0), 0.0)
-    operator = fit_flash(judged / largest)
+    operator = fit_flash(unmasked / largest)
     codes = np.clip(np.rint(operator.apply(values / largest)), 0, 255).astype(np.uint8)
     return FittedCodes(codes, operator, largest)
 
 
 def paper_methods(sigma: float = GRAY_EDGE_SIGMA) -> tuple[Method, ...]:
-    """Return the methods of the paper's figure: Gray-world, Shades-of-Gray, and first-order Gray-Edge, sigma in px."""
+    """Return the methods of the paper's figure; `sigma` is the scale of Gray-Edge, px."""
     methods = standard_methods()
     gray_edge = (
         methods["gray-edge-1"]
@@ -93,10 +94,10 @@ def paper_methods(sigma: float = GRAY_EDGE_SIGMA) -> tuple[Method, ...]:
 
 @dataclass(frozen=True, eq=False)
 class BitsResult:
-    """Results on the images of a data set without and with bits set to zero."""
+    """Results of methods on unchanged images, and on images with bits set to zero."""
 
     raw: tuple[Result, ...]  # One result for each method on the unchanged images
-    reduced: Mapping[int, tuple[Result, ...]]  # Number of bits set to zero to the results of the methods
+    reduced: Mapping[int, tuple[Result, ...]]  # Results of the methods, by number of bits set to zero
 
 
 def remove_bits(
@@ -106,12 +107,12 @@ def remove_bits(
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> BitsResult:
-    """Return errors of methods on images with bits set to zero; each image is read once."""
+    """Return the results of methods on images with bits set to zero; each image is read once."""
     truths = require_truths(scenes, methods)
 
     def answers_for(scene: Scene) -> list[list[SceneAnswer]]:
         image, mask = scene.read()
-        # Clipping is visible only before the reduction. Clipped pixels still influence the operator, as in a camera.
+        # Clipped pixels must be found before the reduction. Flash is still fitted to them, as in a camera.
         excluded = ~usable(image, scene.saturation, mask)
         versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
         return [[read_estimate(method.estimate(version, None, excluded)) for method in methods] for version in versions]
@@ -139,7 +140,7 @@ def bits_table(bits_result: BitsResult, metric: ErrorKind, name: str) -> Table:
     )
 
 
-PANEL: Final = 200  # Longest side of a panel, px: eight fit a page, and the steps of 3 bits are still visible
+PANEL: Final = 200  # Longest side of a panel, px. Eight panels fit a page, and effects of 3 bits are still visible
 
 _GAP: Final = 6  # White gap between panels, px
 
@@ -147,7 +148,7 @@ _PANELS_IN_ROW: Final = 4  # Panels in a row
 
 
 def reduction_strip(picture: npt.NDArray[np.uint8], bits: Sequence[int] = BITS) -> npt.NDArray[np.uint8]:
-    """Return the panels of a picture with bits set to zero, four in a row, as (h, w, 3) uint8, sRGB codes.
+    """Return an image with copies of a picture with bits set to zero, four in a row: (h, w, 3) uint8, sRGB codes.
 
     `picture`: (H, W, 3) uint8, sRGB codes; it is reduced if a side is longer than `PANEL`.
     """
@@ -168,7 +169,7 @@ def reduction_strip(picture: npt.NDArray[np.uint8], bits: Sequence[int] = BITS) 
 
 
 def reduction_table(picture: npt.NDArray[np.uint8], bits: Sequence[int] = BITS) -> Table:
-    """Return colours and peak signal-to-noise ratio of a picture (H, W, 3) uint8, sRGB codes, after each reduction."""
+    """Return number of colours and peak signal-to-noise ratio of a picture (H, W, 3) uint8 after each reduction."""
     rows: list[tuple[str | float | None, ...]] = []
     for count in bits:
         reduced = clear_bits(picture, count)

@@ -1,10 +1,10 @@
 """Material of the paper's experiments: pictures, ground truths, illuminants and scenes generated in memory.
 
-Image i of a set shows source i under the i-th chosen illuminant. Samples are drawn as by `generate` with the same
+Image i of a set shows picture i under the i-th chosen illuminant. Samples are drawn as in `generate` with the same
 seed, so `generate` can write the same images to files.
 
-The paper prints "the sRGB images of the Canon 1Ds Mark III" (section 4.3). Their development is not published; here,
-pictures are developed from linear raw images with known ground truth (`develop_image`).
+The pictures of the paper are "the sRGB images of the Canon 1Ds Mark III" (section 4.3). It does not describe how they
+were developed. Here, they are developed from linear raw images with known ground truth (`develop_image`).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class RenderedScene:
 
 @dataclass(frozen=True, eq=False)
 class ScaledSource:
-    """A picture scaled up or down to a longest side of `side` px."""
+    """A picture, enlarged or reduced to a longest side of `side` px."""
 
     source: Source
     side: int
@@ -83,7 +83,7 @@ class ScaledSource:
         return {**self.source.to_json(), "side": self.side}
 
     def read(self) -> SourcePicture:
-        """Return the picture, codes (H, W, 3) uint8: area averages if reduced, linear interpolation if enlarged."""
+        """Return the picture, codes (H, W, 3) uint8. It is reduced by area averages or enlarged by interpolation."""
         import cv2
 
         picture = self.source.read().picture
@@ -99,13 +99,13 @@ class ChosenLights:
     """One illuminant of a LUT for each image."""
 
     numbers: tuple[int, ...]  # Index of the illuminant of each image
-    how: str  # Method of selection, as text
+    how: str  # Text that describes the choice
 
 
 def lights_like(lut: Lut, truths: npt.NDArray[np.float64], count: int) -> ChosenLights:
-    """Return for each image the illuminant nearest by angle to its ground truth.
+    """Return for each image the illuminant of the LUT with the smallest angle to its ground truth.
 
-    `truths`: (N, 3) float64 ≥ 0, linear camera RGB of any length and any camera; image i has ground truth i mod N.
+    `truths`: (N, 3) float64 ≥ 0, linear camera RGB of any length and any camera. Image i has ground truth i modulo N.
     """
     matches = nearest_lights(lut, truths).matches
     numbers = tuple(matches[image % len(matches)].mixture.lights[0] for image in range(count))
@@ -138,7 +138,7 @@ def render_scenes(lut: Lut, sources: Sequence[Source], lights: ChosenLights, see
 
 WHITE_PERCENTILE: Final = 99.0  # Percentile that becomes white, as in dcraw ("99th-percentile white point")
 
-_MIN_WHITE: Final = 1e-12  # Replaces a white of 0: a black image stays black
+_MIN_WHITE: Final = 1e-12  # Replaces a white of 0, so that a black image stays black
 
 
 def develop_image(
@@ -157,7 +157,7 @@ def develop_image(
 
     Examples
     --------
-    A grey wedge stays grey for every illuminant and camera; one in a hundred values is clipped:
+    A grey wedge stays grey for every illuminant and camera:
 
     >>> from generator.rendering.matrices import camera_matrix
     >>> wedge = np.linspace(0, 1, 5)[:, None, None] * np.array([400.0, 1000.0, 700.0])
@@ -170,13 +170,13 @@ def develop_image(
     """
     if not (np.isfinite(light).all() and light.min() > 0):
         raise InputError(f"the illuminant is {light.tolist()}, expected three numbers above 0; correct it")
-    # Balanced with green unchanged, and cut where the first channel clips, so that clipped skies become white and not
-    # pink (dcraw -H 0). Thumbnails do not record clipping; a few of their skies stay pink.
+    # Channels are balanced with green unchanged. Then all channels are clipped at the lowest balanced saturation, so
+    # that clipped skies become white and not pink (dcraw -H 0). Without a saturation level, they stay pink.
     linear: npt.NDArray[np.float64] = np.asarray(image, dtype=np.float64) * (light[1] / light)
     if saturation is not None:
         linear = np.minimum(linear, saturation * float((light[1] / light).min()))
     if matrix is not None:
-        # The matrix keeps white.
+        # White is the same before and after the matrix.
         linear = np.asarray(linear @ np.linalg.inv(matrix.rows).T, dtype=np.float64)
     usable = linear.reshape(-1, 3) if mask is None else linear[~mask]
     white = float(np.percentile(usable, WHITE_PERCENTILE, axis=0).max()) if len(usable) else 0.0
@@ -185,9 +185,9 @@ def develop_image(
 
 @dataclass(frozen=True, eq=False)
 class DevelopedSource:
-    """A real image as source picture of the generator, developed with its ground truth.
+    """A real image that is developed with its ground truth and used as source picture of the generator.
 
-    `matrix`: colour matrix of its camera, or None.
+    `matrix`: colour matrix of the camera, or None.
     """
 
     scene: Scene
@@ -223,9 +223,9 @@ _TEXT_EXTENSIONS = (".csv", ".txt")  # File extensions of text files with ground
 class Truths:
     """Ground truths with a name for tables and legends."""
 
-    name: str  # Name of their source
+    name: str  # Name of the data set or file
     lights: npt.NDArray[np.float64]  # (N, 3) float64 ≥ 0, linear camera RGB of any length
-    images: tuple[str, ...] = ()  # Names of their N images; empty if unknown
+    images: tuple[str, ...] = ()  # Names of the N images; empty if unknown
 
 
 def read_truths(location: str) -> Truths:

@@ -1,7 +1,7 @@
-"""Numbers published in the paper, for comparison with results.
+"""Numbers published in the CroP paper, for comparison with our results.
 
 N. Banić, K. Koščević, M. Subašić, S. Lončarić, "CroP: Color constancy benchmark dataset generator", tables 1 and 2. The
-numbers of its figures are not published.
+numbers in its figures are not published.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class PublishedRow:
 Cell = tuple[str, str, str]  # Scenes, sensor and illuminants of a data set of table 1
 
 # Table 1, by data set and method in the order of the paper. C1 is the Canon 1Ds Mark III of the NUS data set.
-# Section 4.1 calls its errors reproduction errors. Not all can be: the largest possible reproduction error is
-# arccos(1/√3) = 54.74°, but one worst 25 % is 59.80°. The commands therefore give both kinds of error.
+# Section 4.1 calls the errors reproduction errors. This cannot be true for all: the largest possible reproduction error
+# is arccos(1/√3) = 54.74°, but one worst 25 % is 59.80°. The commands therefore report both kinds of error.
 TABLE1: Final[Mapping[Cell, Mapping[str, PublishedRow]]] = {
     ("C1", "6D", "C1"): {
         "White-Patch": PublishedRow(2.61, 2.59, 2.50, 1.03, 4.38, 2.38),
@@ -77,13 +77,13 @@ TABLE1: Final[Mapping[Cell, Mapping[str, PublishedRow]]] = {
     },
 }
 
-# Names of C1's images in every copy of the data set, without folder and extension.
+# Names of the images of C1 in every copy of the data set, without folder and extension.
 _C1_NAME: Final = re.compile(r"Canon1DsMkIII_\d{4}")
-_C1_IMAGES: Final = 259  # Images of C1: statistics of a part of them would differ from the published ones
+_C1_IMAGES: Final = 259  # Number of images of C1; only statistics of all of them are comparable
 
 
 def is_c1(images: Sequence[str]) -> bool:
-    """Return whether the names are those of all images of C1, in any order.
+    """Return True if the list has the names of all images of C1, in any order.
 
     Examples
     --------
@@ -96,7 +96,9 @@ def is_c1(images: Sequence[str]) -> bool:
 
 
 def cell_name(name: str, images: Sequence[str]) -> str:
-    """Return the name of pictures or illuminants in table 1: "C1" only for the images of C1.
+    """Return the name of pictures or illuminants in table 1.
+
+    Images of C1 get the name C1. Other images with the name C1 or Random get this name in quotes.
 
     Examples
     --------
@@ -108,7 +110,7 @@ def cell_name(name: str, images: Sequence[str]) -> str:
     return f'"{name}"' if name in ("C1", "Random") else name
 
 
-# Table 2, by training data, tested on Cube+; "real": cross-validation on Cube+.
+# Table 2: results on Cube+ by training data. "real" is cross-validation on Cube+.
 TABLE2: Final[Mapping[Literal["real", "generated"], Mapping[str, PublishedRow]]] = {
     "real": {
         "Smart Color Cat": PublishedRow(2.27, 1.35, 1.61, 0.34, 5.72, 1.58),

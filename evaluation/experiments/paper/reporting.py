@@ -1,4 +1,4 @@
-"""Reports of the paper's experiments as folders: a page, tables as CSV and LaTeX, figures as SVG or PNG.
+"""Write reports of the paper's experiments to folders: a page, tables as CSV and LaTeX, figures as SVG or PNG.
 
 The figures of chromaticities (sections 3.1 and 3.3) show the white under each illuminant of a look-up table (LUT), in
 camera RGB, with the ground truths of real data sets for comparison.
@@ -63,7 +63,7 @@ def chromaticity_rows(luts: Sequence[Lut]) -> Table:
 def coverage_table(luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float64]]) -> Table:
     """Return the angles from ground truths of data sets to the nearest illuminants of LUTs.
 
-    `sets`: name of a data set to its ground truths (N, 3) float64, linear camera RGB of any length.
+    `sets`: ground truths by name of the data set, (N, 3) float64, linear camera RGB of any length.
     """
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:
@@ -89,15 +89,15 @@ def coverage_table(luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float6
     )
 
 
-# Markers of series, so that they differ in print without colour.
+# Markers of series. They distinguish series in print without colour.
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 
-# Width of a dot in the figure of chromaticities; of all points in a square of this width only one is drawn.
+# Width of a dot in the figure of chromaticities. Only one point is drawn in each square of this width.
 _DOT_WIDTH: Final = 0.004
 
 
 def _draw_bits(figure: Any, bits_result: BitsResult, metric: ErrorKind) -> None:
-    # The paper's figure: median of each method against the number of bits; unchanged images as a dotted line.
+    # As in the paper: median of each method against the number of bits. Dotted lines are for unchanged images.
     axes = figure.add_subplot()
     counts = list(bits_result.reduced)
     for index, raw in enumerate(bits_result.raw):
@@ -134,7 +134,7 @@ def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:
 
 
 def _draw_chromaticities(figure: Any, luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float64]]) -> None:
-    # The paper's figures of illuminants, one for each camera, over the ground truths of data sets.
+    # As in the paper: illuminants of each camera in one panel, together with ground truths of data sets.
     axis_end = max(float(rb_chromaticities(lut.white).max()) for lut in luts) * 1.04
     for index, lut in enumerate(luts):
         axes = figure.add_subplot(1, len(luts), index + 1)
@@ -182,7 +182,7 @@ class PaperReport:
     title: str  # Title of the page
     tables: tuple[Table, ...]  # Printed tables, in order
     elements: tuple[Markup, ...]  # HTML elements of the page
-    files: Mapping[str, bytes]  # Name to content of the other files
+    files: Mapping[str, bytes]  # Contents of the other files, by name
 
 
 def write_report(report: PaperReport, folder: Path) -> None:
@@ -226,9 +226,7 @@ def table1_report(
         table = size_table(sizes)
         tables.append(table)
         files |= {"sizes.csv": table_to_csv(table).encode(), "sizes.svg": standalone_svg(size_plot)}
-        caption = (
-            "White-Patch uses the largest value, which increases with the number of pixels: of noise, and of whites."
-        )
+        caption = "White-Patch uses the largest values. They increase with the number of pixels, because of noise."
         elements += [pages.heading("Images of other sizes"), pages.figure(size_plot, caption), table_part(table)]
     elements += [pages.heading("Look-up tables"), table_part(noise), table_part(colours)]
     elements += [pages.heading(f"{other_metric.capitalize()} error, degrees"), *map(table_part, tables_two)]
@@ -236,7 +234,7 @@ def table1_report(
 
 
 def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperReport:
-    """Return the report of table 2: both halves as one table, then the ratios of medians."""
+    """Return the report of table 2; `tables` are the two halves and the ratios of their medians."""
     *halves, ratios = tables
     caption = "Comparison of performance of learning-based methods with respect to the training"
     files = {
@@ -254,7 +252,7 @@ def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperRe
 def bits_report(bits_result: BitsResult, metric: ErrorKind, name: str, conditions: Sequence[str]) -> PaperReport:
     """Return the report of colour reduction on the data set with this name."""
     plot, table = draw_svg(_draw_bits, bits_result, metric, inches=(6.4, 3.8)), bits_table(bits_result, metric, name)
-    caption = "Medians against the number of bits of each sRGB code set to zero; dotted: unchanged linear images."
+    caption = "Medians against the number of bits of each sRGB code set to zero. Dotted lines: unchanged linear images."
     files = {"bits.svg": standalone_svg(plot), **_table_files("bits", table)}
     elements = (*map(pages.paragraph, conditions), pages.figure(plot, caption), table_part(table))
     return PaperReport("The effect of colour reduction on illuminant estimation", (table,), elements, files)
@@ -280,7 +278,7 @@ def chromaticities_report(luts: Sequence[Lut], sets: Sequence[Truths]) -> PaperR
     plot = draw_svg(_draw_chromaticities, luts, truths, inches=(4.6 * len(luts), 4.7))
     caption = (
         "rb-chromaticities, r = R / (R + G + B) and b = B / (R + G + B), of the white under each illuminant of a "
-        "look-up table (LUT), in linear camera RGB; in colour, ground truths of data sets in their own camera RGB."
+        "look-up table (LUT), in linear camera RGB. In colour: ground truths of data sets, each in its own camera RGB."
     )
     elements, tables = [pages.figure(plot, caption)], list[Table]()
     files = {

@@ -1,9 +1,9 @@
-"""The paper's tables: statistics-based methods on eight generated data sets (4.3), learned methods (4.4).
+"""Tables of the paper: statistics-based methods on generated data sets (section 4.3), learned methods (section 4.4).
 
-Two sets of scenes (given pictures, random codes), two look-up tables (LUT) and two choices of illuminants (nearest to
-the ground truths of a real data set, drawn from the LUT) make eight data sets. The paper does not give the size and
-number of its images, nor the number of drawn illuminants. Here, there are as many random scenes as pictures, with a
-longest side of `side` px, each under one illuminant.
+Eight data sets are all combinations of two sets of scenes, two look-up tables (LUT) and two choices of illuminants.
+Scenes are given pictures or random codes. Illuminants are nearest to the ground truths of a real data set, or drawn
+from the LUT. The paper does not report sizes and numbers of images and illuminants. Here, there are as many random
+scenes as pictures, each image has a longest side of `side` px, and it is under one illuminant.
 """
 
 from __future__ import annotations
@@ -41,18 +41,19 @@ if TYPE_CHECKING:
     from generator import Lut
 
 
-# Colour temperature of the black body that prints are judged under, K: close to the white balance of pictures.
+# Colour temperature of the illuminant in `print_table`, K. It is close to the white balance of usual pictures.
 DAYLIGHT_K: Final = 5600.0
 
 
 def noise_table(luts: Sequence[Lut]) -> Table:
-    """Return level and noise of the white patch in LUTs, percent; they determine the errors of White-Patch.
+    """Return level and noise of the white patch in LUTs, percent. They determine the errors of White-Patch.
 
-    Medians over the illuminants: brightest channel over saturation level; standard deviation of the samples over their
-    mean; largest sample over their mean, minus 1.
+    Values are medians over the illuminants. Level: mean of the brightest channel / saturation level. Spread: standard
+    deviation of the samples / mean. Largest sample: largest sample / mean, minus 1.
     """
-    # The White-Patch errors of the paper's 550D LUTs (means of 9 to 26°) are too large for noise. A hot photosite can
-    # exceed every white of its channel; `sim table --hot` makes LUTs with hot photosites.
+    # The paper's White-Patch errors with the 550D (means of 9 to 26°) are too large to be caused by noise. A hot
+    # photosite could cause them, because it can exceed every white of its channel. `sim table --hot` simulates hot
+    # photosites.
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:
         white = np.asarray(lut.samples[:, -1], dtype=np.float64)
@@ -70,9 +71,10 @@ def noise_table(luts: Sequence[Lut]) -> Table:
 
 
 def print_table(luts: Sequence[Lut]) -> Table:
-    """Return mean and root mean square of all colours of prints; they determine the errors of Gray-world and its kind.
+    """Return mean and root mean square of all colours of prints, for the errors of Gray-world and Shades-of-Gray.
 
-    Percent of the white of the black body nearest to `DAYLIGHT_K`, or of the first illuminant; and the angle from grey.
+    Values are percent of white, and an angle from grey. The illuminant is the one with the colour temperature nearest
+    to `DAYLIGHT_K`; without colour temperatures, it is the first illuminant.
     """
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:
@@ -95,17 +97,17 @@ _Item = TypeVar("_Item")
 # Methods of table 1, by their names on the command line.
 METHODS: Final = ("white-patch", "gray-world", "shades-of-gray")
 
-# Default side of an image, px. White-Patch takes the largest of noisy values, so its error grows with the side.
+# Default longest side of an image, px. White-Patch uses the largest of noisy values, so its error grows with the side.
 SIDE: Final = 512
 
-# Most images for the study of image sizes. Among 64, medians differ by more than chance; more would cost time, because
-# every image of 1024 px is drawn again for each size.
+# Largest number of images in the study of image sizes. It is sufficient to show how medians depend on size. More images
+# would take long, because all are rendered again for each size.
 MAX_STUDIED: Final = 64
 
-# Camera name in a LUT to the name of the sensor in the paper.
+# Name of the sensor in the paper, by camera name in a LUT.
 SENSORS: Final[Mapping[str, str]] = {"Canon EOS 550D": "550D", "Canon EOS 6D Mark II": "6D"}
 
-# Names of pictures and of ground truths without published numbers.
+# Names of pictures and of ground truths if the paper has no numbers for them.
 UNPUBLISHED: Final = ("Given", "Given")
 
 # Columns of a CSV row before the statistics.
@@ -116,16 +118,16 @@ _BLOCK_COLUMNS: Final = ("scenes", "sensor", "illuminations", "images", "method"
 class Block:
     """One of the eight data sets, with the results of the methods."""
 
-    # Scenes, sensor and illuminants as the paper names them: ``("C1", "6D", "Random")``. Published numbers are looked
-    # up by it, so other scenes and illuminants need other names.
+    # Scenes, sensor and illuminants as in the paper: ``("C1", "6D", "Random")``. This is the key of published numbers,
+    # so other scenes and illuminants must have other names.
     cell: Cell
     scenes: tuple[RenderedScene, ...]
-    lights: str  # Method of choosing the illuminants, as text
+    lights: str  # Text that describes the choice of illuminants
     results: tuple[Result, ...] = ()  # One for each method, in the order of `METHODS`; empty before evaluation
 
 
 def sensor_of(lut: Lut) -> str:
-    """Return the paper's name of a LUT's camera, else the camera's own name."""
+    """Return the name of the LUT's camera in the paper, or its name in the LUT if the paper has none."""
     return SENSORS.get(lut.provenance.camera, lut.provenance.camera)
 
 
@@ -139,8 +141,9 @@ def settings(
 ) -> tuple[Block, ...]:
     """Return the data sets of table 1 in the order of the paper: scenes, then LUTs, then illuminants.
 
-    `truths`: (N, 3) float64 ≥ 0, ground truths for the first choice of illuminants; linear camera RGB of any length,
-    used unchanged although they are from another camera, as in the paper. `side`: longest side of every image, px.
+    `truths`: (N, 3) float64 ≥ 0, ground truths to which the nearest illuminants are chosen, linear camera RGB of any
+    length. As in the paper, they are not converted, although another camera measured them. `side`: longest side of
+    every image, px. `names`: names of the pictures and of the ground truths.
     """
     count = len(pictures)
     if not count:
@@ -194,7 +197,7 @@ def block_title(cell: Cell) -> str:
 
 
 def block_table(block: Block, metric: ErrorKind) -> Table:
-    """Return the table of one data set: statistics of each method, followed by the published ones if there are any."""
+    """Return the table of one data set: statistics of each method, each followed by published statistics if known."""
     published = TABLE1.get(block.cell, {})
     rows: list[tuple[str | float | None, ...]] = []
     for result in block.results:
@@ -244,7 +247,7 @@ def size_dependence(
     workers: int = 1,
     names: tuple[str, str] = UNPUBLISHED,
 ) -> tuple[SizeRow, ...]:
-    """Return the median reproduction errors for images of several sizes, of at most `MAX_STUDIED` pictures.
+    """Return median reproduction errors for several image sizes; at most `MAX_STUDIED` pictures are used.
 
     `truths`: as in `settings`. `sides`: longest sides of the images, px.
     """
@@ -266,7 +269,7 @@ def size_table(rows: Sequence[SizeRow]) -> Table:
     )
 
 
-# Learners of table 2: names of this suite, and names in the paper.
+# Names of the learners of table 2 in the paper, by their names in this suite.
 LEARNERS: Final[Mapping[str, str]] = {
     "regression-trees": "Regression trees (simple features)",
     "smart-color-cat": "Smart Color Cat",
@@ -276,7 +279,7 @@ LEARNERS: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True, eq=False)
 class TrainingComparison:
-    """Results of one learner on the real images, trained on `real` images (cross-validated) and on `generated` ones."""
+    """Results of one learner on real images: cross-validated (`real`), or trained on generated images (`generated`)."""
 
     learner: str
     real: Result
@@ -308,7 +311,7 @@ def table2(
 def table2_tables(
     comparisons: Sequence[TrainingComparison], metric: ErrorKind, name: str, with_published: bool = True
 ) -> list[Table]:
-    """Return the two halves of table 2, and the ratios of their medians."""
+    """Return the two halves of table 2 (training on real and on generated images), and the ratios of their medians."""
     titles: Mapping[str, str] = {
         "real": f"Trained and tested on {name} (through cross-validation)",
         "generated": f"Trained on the generated data set and tested on {name}",

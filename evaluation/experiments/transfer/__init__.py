@@ -1,1 +1,1 @@
-"""Benefit of generated training data: methods trained on them and tested on real images, with baselines."""
+"""Benefit of generated training images: methods are trained on them, and tested on real images with baselines."""

@@ -1,7 +1,7 @@
 """Outcome of a transfer: statistics with intervals, ratios of rows, tables, and the results folder.
 
-With several seeds, each statistic is averaged over the seeds. A bootstrap sample has the same images for all seeds.
-Intervals therefore show the effect of other test images only; the standard deviation over seeds is given separately.
+Each statistic is averaged over the seeds. A bootstrap sample has the same images for all seeds, so intervals show only
+the effect of other test images. The standard deviation over seeds is reported separately.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class RowFigures:
 
 @dataclass(frozen=True)
 class RowRatio:
-    """Statistics of a row relative to those of another row with the same method, paired by image."""
+    """Statistics of a row divided by the statistics of another row with the same method, paired by image."""
 
     # Numerator and denominator of the ratios
     row: TransferRow
@@ -65,7 +65,7 @@ class TransferFigures:
     rows: tuple[RowFigures, ...]  # Every row with its statistics
     to_real: tuple[RowRatio, ...]  # Rows trained on other data, relative to real cross-validation of the same method
     to_naive: tuple[RowRatio, ...]  # Generated rows relative to the naive rows of the same pictures and illuminants
-    # Adapted rows relative to training on real images alone or the set alone, whichever has the smaller mean error
+    # Adapted rows relative to the better of two rows: training on the real images alone, or on the set alone
     to_better: tuple[RowRatio, ...] = ()
     # Adapted generated rows relative to naive rows adapted to the same images
     to_naive_adapted: tuple[RowRatio, ...] = ()
@@ -101,7 +101,7 @@ def _batches(figures: Sequence[BoundedFigure]) -> Iterator[tuple[BoundedFigure, 
 
 
 def _pairs(rows: Sequence[TransferRow], means: Sequence[float]) -> dict[str, list[tuple[int, int]]]:
-    """Return the indices of row and base of each ratio, by the field of `TransferFigures`."""
+    """Return the indices of rows and their base rows, for each field of `TransferFigures` with ratios."""
     pairs: dict[str, list[tuple[int, int]]] = {"to_real": [], "to_naive": [], "to_better": [], "to_naive_adapted": []}
     for index, row in enumerate(rows):
         for base, base_row in enumerate(rows):
@@ -121,6 +121,7 @@ def _pairs(rows: Sequence[TransferRow], means: Sequence[float]) -> dict[str, lis
 
 
 def _unadapted_rows(rows: Sequence[TransferRow], adapted: TransferRow) -> list[int]:
+    # Rows of the same method trained on the real images alone, and on the set alone.
     row_keys = {("alone", adapted.real, "real", ""), ("", "", adapted.kind, adapted.data)}
     return [
         index
@@ -137,12 +138,12 @@ def _spread(seeds: Sequence[ErrorSample]) -> tuple[float, ...] | None:
     return tuple(float(deviation) for deviation in deviations)
 
 
-# All six statistics are in every table, because a single one can mislead.
+# All six statistics, because a single statistic can mislead.
 STATISTIC_HEADS: Final = PAPER_COLUMNS[1:]
 
 
 def errors_table(figures: TransferFigures, name: str, images: int) -> Table:
-    """Return the statistics of every row; with several seeds, their means."""
+    """Return the statistics of all rows without `real_use`; with several seeds, their means."""
     unadapted = [row for row in figures.rows if not row.row.real_use]
     notes = [
         f"{row.row.method}, {row.row.training}: no estimate for {guessed.sum()} images; grey was used instead"
@@ -163,7 +164,7 @@ def errors_table(figures: TransferFigures, name: str, images: int) -> Table:
 
 
 def intervals_table(figures: TransferFigures, name: str) -> Table:
-    """Return the confidence intervals of every row's statistics."""
+    """Return the confidence intervals of the statistics in `errors_table`."""
     return Table(
         f"{name}: {LEVEL * 100:.0f} % intervals of the {figures.error} angular error, degrees",
         ("Method", "Trained on", "Images", *STATISTIC_HEADS),
@@ -177,7 +178,7 @@ def intervals_table(figures: TransferFigures, name: str) -> Table:
 
 
 def real_ratios_table(figures: TransferFigures, name: str) -> Table:
-    """Return every row relative to cross-validation of the same method on the test images."""
+    """Return rows trained on other data, relative to cross-validation of the same method on the test images."""
     is_generated_base = any(ratio.base.data for ratio in figures.to_real)
     base_text = f"cross-validation on {name} (generated)" if is_generated_base else "real cross-validation"
     meaning = f"as good as {'images of the generated test set' if is_generated_base else 'real images'}"
@@ -245,14 +246,14 @@ def harm_notes(figures: TransferFigures) -> list[str]:
     """Return a note for each row whose adaptation increased the mean error significantly."""
     return [
         f"{ratio.row.method}, {ratio.row.training}: adaptation changes the mean error by a factor of "
-        f"{_ratio_text(ratio.ratios[0])}, 1 or less expected; use only {ratio.base.training} for training"
+        f"{_ratio_text(ratio.ratios[0])}, expected 1 or less; use only {ratio.base.training} for training"
         for ratio in figures.to_better
         if ratio.ratios[0].low > 1
     ]
 
 
 def naive_adapted_table(figures: TransferFigures, name: str) -> Table | None:
-    """Return adapted generated rows relative to adapted naive rows; None if there are none."""
+    """Return adapted generated rows relative to adapted naive rows; None without adapted naive rows."""
     if not figures.to_naive_adapted:
         return None
     rows = tuple(
@@ -333,7 +334,7 @@ def _draw_panels(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, B
         axes.set(title=method, xlabel="real images")
     grid[0].set_ylabel(f"mean {error} error, degrees")
     handles, names = grid[0].get_legend_handles_labels()
-    # Names are long: two columns need the width of two panels.
+    # Names are long, so two columns need the width of two panels.
     columns = min(2, len(panels))
     labelled = [legend_label(name) for name in names]
     figure.legend(handles, labelled, loc="outside lower center", ncols=columns, fontsize=8)

@@ -3,16 +3,17 @@
 A method must not be trained on a test image or on its scene. Images are compared by their sources:
 
 - two generated sets: by the hash of the source picture;
-- a generated and a real set: by name, because a generated image of a test photograph shows the same scene;
+- a generated and a real set: by name, because an image that was generated from a photograph shows the same scene;
 - two real sets: by name and by pixels.
 
-Names are compared without folder and extension; upper and lower case are equal.
+Names are compared without folder and extension, and without regard to case.
 
-The naive baseline is a counterpart of each generated image: the same picture under the same illuminant, equally bright
-and equally quantised, but without print, camera and noise. Its codes are converted to linear light by the sRGB curve,
-and optionally to camera RGB by a colour matrix. Each channel is multiplied by the illuminant. The advantage of training
-on generated images over training on their counterparts is the benefit of the look-up table (LUT). Masks of several
-illuminants are taken from the generated image. `generate --exposure` and `--iso` are not applied to counterparts.
+The naive baseline has a counterpart of each generated image: the same picture under the same illuminant, with the same
+brightness and quantisation, but without print, camera and noise. The codes of the picture are converted to linear light
+by the sRGB curve, and optionally to camera RGB by a colour matrix. Each channel is multiplied by the illuminant. The
+difference between training on generated images and on counterparts is the benefit of the look-up table (LUT). A
+counterpart with several illuminants uses the masks of the generated image. `generate --exposure` and `--iso` are not
+applied to counterparts.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class SharedImage:
     position: int  # Index in the training set, from 0
     name: str  # Name of the training image, or of its source picture
     test: str  # Name of the test image, or of its source picture
-    by: str  # Identified by "name" or by "content"
+    by: str  # Property that is equal: "name" or "content"
 
 
 def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]:
@@ -63,7 +64,7 @@ def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]
             "cross-validate on one set"
         )
     are_generated = [isinstance(scene_set.scenes[0], GeneratedScene) for scene_set in (training, test)]
-    # Hashes of source pictures are always available; names and pixels are compared if one set has none.
+    # Generated sets have hashes of their source pictures. Names are compared if a set is real, pixels if both are real.
     with_names, with_pixels = not all(are_generated), not any(are_generated)
     tests = {key: name for name, keys in _image_keys(test, with_names, with_pixels) for key in keys}
     shared: list[SharedImage] = []
@@ -77,7 +78,7 @@ def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]
 def trainable_images(
     training: SceneSet, test: SceneSet, leave_out: bool = True, test_name: str = "the test set"
 ) -> tuple[tuple[Scene, ...], str]:
-    """Return the images of a set that may be used for training, and a note on images shared with the test ("" if none).
+    """Return the images of a set that may be used for training, and a note on images shared with the test set, or "".
 
     `leave_out`: True excludes shared images; False keeps them, but refuses copies of test images.
     """
@@ -95,7 +96,7 @@ def trainable_images(
     return training.scenes, note
 
 
-_Key = tuple[str, str]  # "name" or "content", and the name or the hash
+_Key = tuple[str, str]  # ("name", name) or ("content", hash)
 
 
 def _image_keys(scenes: SceneSet, with_names: bool, with_pixels: bool) -> list[tuple[str, list[_Key]]]:
@@ -148,13 +149,13 @@ class FoundPicture:
 def find_source_pictures(dataset: Dataset, folder: Path | str) -> tuple[Mapping[str, FoundPicture], tuple[str, ...]]:
     """Return the source pictures of a data set in a folder, by name, and the names of missing ones.
 
-    A file is identified by the recorded hash; the file with the recorded name is tried first. Pictures of random
+    A file is identified by its recorded hash. The file with the recorded name is tried first. Pictures of random
     colours need no file.
     """
     preparation = preparation_of(dataset.description)
     if "://" in str(folder):
         raise InputError(f"{folder} is a URL, expected a folder of this machine; copy the pictures to one")
-    # A set of random colours needs no folder, but a folder that is given must exist.
+    # Random colours need no folder, but if a folder is given, it must exist.
     files = {file.name: Path(file.location) for file in find_pictures(folder)}
 
     @cache
@@ -206,14 +207,14 @@ def naive_image(
     """
     linear = _LINEAR_OF_CODE[codes]
     if matrix is not None:
-        # A colour outside the camera's gamut would be negative.
+        # Colours outside the camera's gamut are negative.
         linear = np.maximum(linear @ matrix.T, 0)
     return np.clip(np.rint(linear * light), 0, np.floor(saturation)).astype(np.uint16)
 
 
 @dataclass(frozen=True, eq=False)
 class NaiveScene:
-    """Naive counterpart of a generated image; it is computed when it is read."""
+    """Naive counterpart of a generated image; the image is calculated when it is read."""
 
     generated: GeneratedScene
     picture: FoundPicture
@@ -301,7 +302,7 @@ class RelitScene:
     scene: Scene
     truth: npt.NDArray[np.float64]  # (3,) float64, ground truth of the generated image, linear camera RGB
     name: str  # Name of the relit image; a scene may be used several times
-    saturation: None = None  # None; clipped pixels are masked, because channels are scaled differently
+    saturation: None = None  # Clipped pixels are masked instead, because channels are scaled differently
 
     def read(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_] | None]:
         """Return the image (H, W, 3) float32, and its mask (H, W) bool."""
@@ -328,14 +329,14 @@ def relit_scenes(scenes: Sequence[Scene], lights: Sequence[npt.NDArray[np.float6
 class TransferPlan:
     """Training sets of a transfer, and the notes on their preparation."""
 
-    # Without excluded images; each generated set is followed by its naive and relit counterparts, if requested
+    # Sets without excluded images. A generated set is followed by its naive and relit sets, if requested
     training: tuple[TrainingSet, ...]
     sets: tuple[SceneSet, ...]  # The data sets as opened
     notes: tuple[str, ...]  # Excluded images, colour matrices and cautions, as sentences
 
 
 def is_generated(scene_set: SceneSet) -> bool:
-    """Return whether images of the set were made by `generate`."""
+    """Return True if images of the set were made by `generate`."""
     return any(isinstance(scene, GeneratedScene) for scene in scene_set.scenes)
 
 
@@ -393,8 +394,8 @@ def _trainable(scene_set: SceneSet, test: SceneSet, notes: list[str]) -> tuple[S
         trainable = tuple(scene for scene in trainable if id(scene) not in held_out_ids)
     if not trainable:
         raise InputError(
-            f"{scene_set.name} has 0 images outside its test parts and the test set, at least 1 "
-            "expected; use another set"
+            f"{scene_set.name} has 0 images outside its test parts and the test set, expected at least 1; use another "
+            "set"
         )
     return trainable
 
@@ -415,7 +416,7 @@ def _with_naive(name: str, images: Sequence[GeneratedScene], folder: Path | str,
     if missing:
         notes.append(
             f"{name}: {len(missing)} of {len(missing) + len(found_pictures)} pictures are not in {folder}: "
-            f"{first_few(missing)}; {len(images) - len(with_picture)} images of them are excluded from all rows"
+            f"{first_few(missing)}; {len(images) - len(with_picture)} images of these are excluded from all rows"
         )
     sets = [
         TrainingSet(name, "generated", with_picture),

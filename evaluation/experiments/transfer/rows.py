@@ -1,8 +1,8 @@
 """Train on one data set, test on another: one row of results for each method and each kind of training.
 
-A method can also use N real images: it is trained on them alone, or trained on a set and then adapted to them. The N
-images are drawn from the training part of each fold of real cross-validation, so every test image is unseen by the
-model that estimates it. The images of a smaller N are among those of a larger N.
+A method can also use N real images. It is trained on these images alone, or it is trained on a set and then adapted to
+these images. For each fold of the test set, the N images are drawn from the other folds, so no model is tested on its
+training images. The images of a smaller N are a subset of the images of a larger N.
 """
 
 from __future__ import annotations
@@ -35,9 +35,14 @@ from evaluation.results.result import Result, SceneAnswer
 from evaluation.scene import Scene
 from foundation.errors import InputError
 
-# Training data of a method: other folds of the test set; generated images; their naive counterparts; real scenes of
-# another camera under their illuminants; a data set that was not generated; N images of the other folds of the test set
-# alone; or no training.
+# Training data of a method:
+# - cross-validation: other folds of the test set;
+# - generated: a set made by `generate`;
+# - naive, naive with matrix: naive counterparts of the generated set, see `plan`;
+# - relit: real scenes of another camera under the illuminants of the generated set;
+# - other: a set that was not generated;
+# - real: only N images of other folds of the test set;
+# - none: no training.
 Training = Literal["cross-validation", "generated", "naive", "naive with matrix", "relit", "other", "real", "none"]
 
 # Use of N real images: none; training on them alone; adaptation to them after training on a set.
@@ -50,23 +55,23 @@ NAIVE: Final[tuple[Training, ...]] = ("naive", "naive with matrix")  # Both naiv
 class TrainingSet:
     """Images for training."""
 
-    data: str  # Name of the data set of the images, or of the images that these are counterparts of
+    data: str  # Name of the data set; for naive and relit images, name of the generated set
     kind: Training
-    scenes: tuple[Scene, ...]  # The images; counterparts are in the order of the generated images
+    scenes: tuple[Scene, ...]  # Naive and relit images are in the order of the generated images
 
 
 @dataclass(frozen=True, eq=False)
 class TransferRow:
-    """Results on the test images of one method with one training."""
+    """Results of one method with one kind of training, on the test images."""
 
     method: str
     kind: Training  # Its training data
-    data: str  # Name of the training data set; for cross-validation only if the test set was generated
-    images: int  # Number of training images; for cross-validation, of the smallest training part; 0 without learning
-    # One for each seed, or one if the seed has no influence; in the order of the test images
+    data: str  # Name of the training data set; empty for images of a real test set, and without training
+    images: int  # Number of training images, 0 without training; for cross-validation, the minimum over folds and seeds
+    # One result for each seed, or only one if the seed has no influence
     results: tuple[Result, ...]
-    # Use and number ("all" or a number) of real images of the other folds; empty if none were used. They are counted in
-    # `images` only if they were used alone.
+    # Use and number ("all" or digits) of real images of the other folds; both are empty if no real images were used.
+    # `images` includes real images only if they were used alone.
     real_use: RealUse = ""
     real: str = ""
 
@@ -117,8 +122,8 @@ class TransferRow:
 def draw_images(count: int, drawn_count: int, seed: int) -> Indices:
     """Return the indices of the training images, (P,) int64, ascending, drawn from `count` images by a seed.
 
-    Data sets of equal size get the same indices: a generated set and its naive counterpart, or a set made with another
-    look-up table (LUT), are then trained on the same pictures under the same illuminants.
+    Data sets of equal size get the same indices. A method is then trained on the same pictures and illuminants from a
+    generated set, its naive counterpart, or a set made with another look-up table (LUT).
 
     Examples
     --------
@@ -150,16 +155,17 @@ def transfer(
 ) -> tuple[TransferRow, ...]:
     """Return the rows of every learner: cross-validated on the test set, trained on each set, and with real images.
 
-    `folds`: for each seed the folds of the test images, (N,) int64. Seed k is k, from 0; it is passed to every fit and
-    draws the training images. `side`: longest side to which images are reduced first, px; None keeps their size.
-    `generated_name`: name of the test set if it was generated, so that no row calls it real; else empty.
-    `real_counts`: numbers N of real images; None for all that a fold leaves.
+    `folds`: for each seed the folds of the test images, (N,) int64. Seeds are 0, 1, …; a seed is passed to every fit
+    and draws the training images. `images`: number of training images of each set. `side`: longest side to which images
+    are reduced first, px; None keeps their size. `generated_name`: name of the test set if it was generated, so that
+    rows do not call it real; else empty. `real_counts`: numbers N of real images; None for all images of the other
+    folds.
     """
     if not learners or not folds:
         raise InputError(f"{len(learners)} learned methods and {len(folds)} seeds, expected one each; add some")
     for seed_folds in folds:
         require_groups_together(test, seed_folds)
-    # Everything that can be refused is refused before the first image is read.
+    # All inputs are checked before the first image is read.
     indices_by_set = [_drawn_indices(train_set, len(folds), images) for train_set in training]
     tests = collect_material(test, learners, side, workers, on_scene)
     subsets = _RealSubsets(tests, folds)
@@ -170,18 +176,18 @@ def transfer(
         entries.append(TransferRow(learner.name, "cross-validation", generated_name, fewest, crossed))
         # The constant illuminant uses no image content, so it has no rows with N real images.
         for count in () if isinstance(learner, ConstantLight) else real_counts:
-            # All images that a fold leaves are the training images of cross-validation.
+            # Training on all images of the other folds is cross-validation.
             results = crossed if count is None else subsets.results(number, learner, count, subsets.alone)
             label = _count_label(count)
             entries.append(TransferRow(learner.name, "real", generated_name, count or fewest, results, "alone", label))
     for train_set, seed_indices in zip(training, indices_by_set, strict=True):
-        # Only the images that some seed needs are read.
+        # Only images that are drawn with at least one seed are read.
         used_indices = _used_indices(seed_indices)
         scenes = [train_set.scenes[int(index)] for index in used_indices.tolist()]
         material = collect_material(scenes, learners, side, workers, on_scene)
         positions = [np.searchsorted(used_indices, indices).astype(np.int64) for indices in seed_indices]
         for number, learner in enumerate(learners):
-            # Naive counterparts have the illuminants of the generated set: the row would be the same.
+            # Naive counterparts have the illuminants of the generated set, so the row would be the same.
             if isinstance(learner, ConstantLight) and train_set.kind in NAIVE:
                 continue
             fitted = [fit_on(learner, number, material, indices, seed) for seed, indices in enumerate(positions)]
@@ -203,7 +209,7 @@ def transfer(
     return tuple(rows)
 
 
-# Fits a learner: learner, its index, indices of N real images (N,) int64, seed.
+# Function that fits a learner. Arguments: learner, its index, indices of N real images (N,) int64, seed.
 _Fit = Callable[[AnyLearner, int, Indices, int], Method]
 
 
@@ -211,9 +217,9 @@ _Fit = Callable[[AnyLearner, int, Indices, int], Method]
 class _RealSubsets:
     """Test images, with subsets of N real images for training.
 
-    - `trials`: material of the test images.
+    - `tests`: material of the test images.
     - `folds`: for each seed the fold of each image, (N,) int64.
-    - `known`: models of N images alone, by learner, seed and images; they are shared by all training sets.
+    - `learned`: models trained on N images alone, by learner, seed and images; all training sets use them.
     """
 
     tests: Material
@@ -226,7 +232,7 @@ class _RealSubsets:
         return min(len(seed_folds) - int(np.bincount(seed_folds).max()) for seed_folds in self.folds)
 
     def results(self, number: int, learner: AnyLearner, real: int | None, fit: _Fit) -> tuple[Result, ...]:
-        """Return one result for each seed; each fold is estimated after a fit to `real` images of the other folds."""
+        """Return one result for each seed; each fold is estimated by a model of `real` images from the other folds."""
         results: list[Result] = []
         for seed, folds in enumerate(self.folds):
             order = np.random.default_rng(seed).permutation(len(folds))

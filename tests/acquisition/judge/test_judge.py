@@ -26,11 +26,11 @@ from acquisition.judge.judge import (
 )
 from acquisition.judge.measure import Frame
 from acquisition.judge.state import (
+    Deviations,
     ExaminedFrame,
     FrameLight,
     JudgeState,
     LampState,
-    Leaning,
     ProjectorModel,
     RecentFrame,
     Residuals,
@@ -351,13 +351,13 @@ def test_continues_without_earlier_measurements(few: Bench) -> None:
         few.judge.recall(step, b"of another version", True)
     judgements = [few.take(step).reason for step in (*link_steps(500), few.light(*SKY), DARK_STEP, few.light(*SKY))]
     assert judgements == [""] * 9
-    assert few.judge.state.modelled
+    assert few.judge.state.has_primaries
 
 
 @pytest.mark.slow
 def test_resumes_with_earlier_model(few: Bench, earlier: list[tuple[SessionStep, bytes]]) -> None:
     resumed = resume(few, earlier)
-    assert resumed.judge.state.modelled
+    assert resumed.judge.state.has_primaries
     # A lamp that is 3 % weaker after a day has drifted.
     weaker = LampStep(percent=-3)
     ties = [resumed.take(step, weaker) for step in link_steps(500)]
@@ -538,10 +538,10 @@ def test_limits_drift_of_paper_white(sign: int) -> None:
         now[1] += paper.sum() * (1 + percent / 100) - now.sum()
         return judge_white(first, replace(first, paper=now))
 
-    near, far = drift(sign * (limits.LAMP_TOTAL - 0.1)), drift(sign * (limits.LAMP_TOTAL + 0.1))
+    near, far = drift(sign * (limits.MAX_WHITE_DRIFT - 0.1)), drift(sign * (limits.MAX_WHITE_DRIFT + 0.1))
     assert (near.passed, far.passed) == (True, False)
-    assert far.value == pytest.approx(sign * (limits.LAMP_TOTAL + 0.1), abs=0.01)
-    assert (far.low, far.high) == (-limits.LAMP_TOTAL, limits.LAMP_TOTAL)
+    assert far.value == pytest.approx(sign * (limits.MAX_WHITE_DRIFT + 0.1), abs=0.01)
+    assert (far.low, far.high) == (-limits.MAX_WHITE_DRIFT, limits.MAX_WHITE_DRIFT)
 
 
 @pytest.mark.parametrize(
@@ -584,7 +584,7 @@ def test_compares_first_white_with_prediction(gain: npt.ArrayLike, name: str | N
 def test_judges_first_white_only_at_first_illuminant() -> None:
     odd = started_state(1.3)
     assert judge_first_frames(odd, replace(LIGHT, kind="response"), None, JUDGE) is None
-    assert judge_first_frames(replace(odd, founding=False), LIGHT, None, JUDGE) is None
+    assert judge_first_frames(replace(odd, is_starting=False), LIGHT, None, JUDGE) is None
     assert judge_first_frames(replace(odd, basis=None), LIGHT, None, JUDGE) is None
     assert judge_first_frames(replace(odd, first_frames=odd.first_frames[1:]), LIGHT, None, JUDGE) is None
     assert judge_first_frames(started_state(1.3, greys=0), LIGHT, None, JUDGE) is None
@@ -636,15 +636,15 @@ def test_computes_covariance_of_amounts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rested", "candidate", "rests"),
+    ("resumed", "to_confirm", "rests"),
     [(False, (np.nan, np.nan), (0.0, 0.0)), (False, (0.35, 0.0), (0.3, 0.0)), (True, (np.nan, np.nan), (0.3, 0.0))],
     ids=["creeps", "repeated", "after a pause"],
 )
 def test_changes_rest_position_after_two_frames_or_pause(
-    rested: bool, candidate: tuple[float, float], rests: tuple[float, float]
+    resumed: bool, to_confirm: tuple[float, float], rests: tuple[float, float]
 ) -> None:
     frame = Frame(measured(LIT), np.full(3, 500.0), np.array([0.3, 0.0]))
-    before = base_state(moved_px=np.zeros(2), rested=rested, candidate=(np.nan, *candidate))
+    before = base_state(moved_px=np.zeros(2), resumed=resumed, to_confirm=(np.nan, *to_confirm))
     after = before.updated(LIGHT, ExaminedFrame(frame, None, True)).moved_px
     assert after is not None
     assert after.tolist() == list(rests)
@@ -698,7 +698,7 @@ def test_accepts_lamp_step_shown_twice_up_to_limit() -> None:
 
     def lamp(level: float, before: float) -> tuple[bool, bool]:
         light = comparison_of((level, level, level)).light
-        state = replace(base_state(basis=basis, model=MODEL), candidate=(float(np.log(before)), np.nan, np.nan))
+        state = replace(base_state(basis=basis, model=MODEL), to_confirm=(float(np.log(before)), np.nan, np.nan))
         checks, lamp_state = judge._judge_light(state, step, light, (), 0.5, 1.0)
         assert [check.name for check in checks] == ["off_codes_deg", "off_brightness"]
         assert isinstance(lamp_state, LampState)
@@ -715,12 +715,12 @@ def test_accepts_lamp_step_shown_twice_up_to_limit() -> None:
 
 def test_detects_slow_change_in_several_frames() -> None:
     lamp = ((0.012, 0.003),)
-    assert judge.slow_change(Leaning(lamp * 2, ((0.0, 1.0),) * 2), 0.01)[0] == ""  # 6 deviations are 0.0127
-    assert "1.2 % stronger" in judge.slow_change(Leaning(lamp * 3, ((0.0, 1.0),) * 3), 0.01)[0]  # 0.0104
-    assert judge.slow_change(Leaning(lamp * 3, ((0.0, 1.0),) * 3), 0.0125)[0] == ""
-    assert judge.slow_change(Leaning(((0.0, 1.0),) * 2, ((0.0041, 0.001),) * 2), 0.01) == ("", pytest.approx(0.0041))
-    assert judge.slow_change(Leaning(((0.0, 1.0),) * 2, ((0.0039, 0.001),) * 2), 0.01) == ("", 0.0)
-    assert judge.slow_change(Leaning(((0.0, 1.0),) * 2, ((0.0041, 0.0014),) * 2), 0.01) == ("", 0.0)
+    assert judge.slow_change(Deviations(lamp * 2, ((0.0, 1.0),) * 2), 0.01)[0] == ""  # 6 deviations are 0.0127
+    assert "1.2 % stronger" in judge.slow_change(Deviations(lamp * 3, ((0.0, 1.0),) * 3), 0.01)[0]  # 0.0104
+    assert judge.slow_change(Deviations(lamp * 3, ((0.0, 1.0),) * 3), 0.0125)[0] == ""
+    assert judge.slow_change(Deviations(((0.0, 1.0),) * 2, ((0.0041, 0.001),) * 2), 0.01) == ("", pytest.approx(0.0041))
+    assert judge.slow_change(Deviations(((0.0, 1.0),) * 2, ((0.0039, 0.001),) * 2), 0.01) == ("", 0.0)
+    assert judge.slow_change(Deviations(((0.0, 1.0),) * 2, ((0.0041, 0.0014),) * 2), 0.01) == ("", 0.0)
 
 
 def moved(
@@ -741,7 +741,7 @@ def at_rest(x: float) -> JudgeState:
 
 
 def repeated(x: float, y: float) -> JudgeState:
-    return JudgeState(candidate=(np.nan, x, y))
+    return JudgeState(to_confirm=(np.nan, x, y))
 
 
 @pytest.mark.parametrize(
@@ -750,7 +750,7 @@ def repeated(x: float, y: float) -> JudgeState:
         ((0.19, 0.0), JudgeState(), 0.19, True),
         ((0.0, -0.21), JudgeState(), 0.21, False),
         ((0.3, 0.4), JudgeState(), 0.5, False),
-        ((0.3, 0.4), replace(JudgeState(), rested=True), 0.5, True),
+        ((0.3, 0.4), replace(JudgeState(), resumed=True), 0.5, True),
         ((0.5, 0.0), at_rest(0.31), 0.19, True),
         ((0.1, 0.0), at_rest(0.31), 0.21, False),
         ((0.5, 0.0), repeated(0.41, 0.0), 0.5, True),
@@ -809,8 +809,8 @@ def test_causes_are_lasting_or_void_other_frames() -> None:
     hidden = {"stray_share", "dark_drift", "leak_share"}
     unmodelled = hidden | {"rows", "uniformity", "off_codes_deg", "off_brightness", "white_drift"}
     assert {name for name in CAUSES if voids(white, name)} == unmodelled
-    modelled = replace(white, basis=started_state().basis, unmeasured=frozenset({"blur"}))
-    assert {name for name in CAUSES if voids(modelled, name)} == hidden | {"blur"}
+    with_primaries = replace(white, basis=started_state().basis, unmeasured=frozenset({"blur"}))
+    assert {name for name in CAUSES if voids(with_primaries, name)} == hidden | {"blur"}
 
 
 @pytest.mark.parametrize(("step", "rows", "ragged"), [(0.019, 9, False), (0.021, 9, True), (0.021, 3, False)])

@@ -65,14 +65,14 @@ def state_numbers(state: JudgeState) -> dict[str, Any]:
         "model": [model.state, model.covariance, model.chroma, model.brightness, model.overlap, model.curves()],
         "moved": [
             state.moved_px,
-            state.rested,
-            state.lost,
+            state.resumed,
+            state.has_lost_reference,
             sorted(state.unmeasured),
             state.refusals,
             state.restarts,
             state.restart_step,
         ],
-        "candidate": state.candidate,
+        "candidate": state.to_confirm,
         "paper": None if first is None else first.paper,
         "recent": [[one.codes, one.amounts] for one in state.recent],
         "basis": None if state.basis is None else [state.basis.maps, state.basis.dark],
@@ -89,7 +89,7 @@ def frame_numbers(measurement: bytes) -> Any:
         "shares": [one.clipped, one.empty],
         "paper": frame.paper,
         "moved": frame.moved_px,
-        "anchor": None if anchor is None else [anchor.paper, anchor.of_chart, anchor.boxes(), len(anchor.outlines)],
+        "anchor": None if anchor is None else [anchor.paper, anchor.has_chart, anchor.boxes(), len(anchor.outlines)],
     }
 
 
@@ -144,7 +144,7 @@ def test_judges_a_session(tmp_path: Path, pinned: Pinned) -> None:
         one = before.fork()
         again = [one.take(one.light(*codes), *events, before=Colour(*SKY)) for _ in range(REPEATS.get(name, 1))]
         failures[name] = {str(number): failed(each) for number, each in enumerate(again)}
-        failures[name] |= {"candidate": one.judge.state.candidate, "refused": one.judge.state.refusals}
+        failures[name] |= {"candidate": one.judge.state.to_confirm, "refused": one.judge.state.refusals}
     references = (
         (WHITE_STEP, ("a small bump", "a weaker lamp", "light in the room", "a hand", "a pop-up", "defocus")),
         (DARK_STEP, ("light in the room", "a pop-up")),
@@ -174,7 +174,7 @@ def test_learns_a_projector(pinned: Pinned) -> None:
     fits = [found.compare(truth.predict(one).amounts * 1.02 + 1e-3, one, np.eye(3) * 1e-6) for one in codes]
     facts = {
         "state": [found.state, found.covariance, found.chroma, found.brightness],
-        "after a rest": [found.rested().covariance, found.stepped(0.02).covariance, found.stepped(0.02).brightness],
+        "after a rest": [found.paused().covariance, found.stepped(0.02).covariance, found.stepped(0.02).brightness],
         "predictions": [found.predict(one) for one in codes],
         "fits": [[fit, fit.angle_limit(5.5)] for fit in fits],
         "curves": found.curves(),

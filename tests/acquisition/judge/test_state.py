@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.judge import state
-from acquisition.judge.state import LAMP_STEP, ProjectorModel
+from acquisition.judge.state import LAMP_SIGMA, ProjectorModel
 from experiment.session.records import TOP
 
 NODES = len(state._NODES)
@@ -50,7 +50,7 @@ def test_prior_covers_usual_tone_curves() -> None:
     bends = np.exp(-0.5 * ((x[:, None] - x) / 0.7) ** 2) - np.outer(full, full)
     np.testing.assert_allclose(own, 0.4**2 * np.outer(x, x) + 0.12**2 * bends, atol=1.1e-8)
     # Levels of the primaries, light added by each pair and by all three, the lamp.
-    np.testing.assert_allclose(covariance[LEVELS:, LEVELS:], np.diag([0.01**2] * 3 + [0.25**2] * 9 + [LAMP_STEP**2]))
+    np.testing.assert_allclose(covariance[LEVELS:, LEVELS:], np.diag([0.01**2] * 3 + [0.25**2] * 9 + [LAMP_SIGMA**2]))
     assert not covariance[:LEVELS, LEVELS:].any()
     assert (UNKNOWN.chroma_sd, UNKNOWN.brightness_sd) == pytest.approx((CHROMA, BRIGHTNESS))
 
@@ -66,7 +66,7 @@ def test_predicts_power_law_with_uncertainty(code: int) -> None:
         curve = (0.4 * x) ** 2 + 0.12**2 * (1 - np.exp(-((x / 0.7) ** 2)))
         without = (curve + 0.01**2 + CHROMA**2) * at(code) ** 2 + ABSOLUTE**2
         assert expected.covariance[0, 0] == pytest.approx(without, rel=2e-3)
-        assert expected.with_lamp[0, 0] == pytest.approx(without + (LAMP_STEP * at(code)) ** 2, rel=2e-3)
+        assert expected.with_lamp[0, 0] == pytest.approx(without + (LAMP_SIGMA * at(code)) ** 2, rel=2e-3)
 
 
 def test_overlap_follows_least_primary() -> None:
@@ -93,7 +93,7 @@ def test_overlap_follows_least_primary() -> None:
 def test_learns_level_and_lamp_by_their_variance(own: float) -> None:
     amount = 0.97
     learnt = UNKNOWN.learn(np.array([amount, 0, 0]), (TOP, 0, 0), np.eye(3) * own**2)
-    level, lamp = 0.01**2, LAMP_STEP**2 + LAMP_STEP**2
+    level, lamp = 0.01**2, LAMP_SIGMA**2 + LAMP_SIGMA**2
     noise = CHROMA**2 + BRIGHTNESS**2 + (ABSOLUTE**2 + own**2) / amount**2
     log_amount, total = np.log(amount), level + lamp + noise
     assert learnt.state[LEVELS] == pytest.approx(log_amount * level / total, rel=1e-4)
@@ -124,5 +124,5 @@ def test_compares_amounts_by_angle_and_brightness(
     sd = np.hypot(CHROMA, ABSOLUTE)
     assert fit.distance == pytest.approx(float(np.linalg.norm(measured - measured.mean())) / sd, abs=1e-6)
     # Their mean is known three times as well; the lamp scatters besides, and drifts.
-    assert fit.brightness_sd == pytest.approx(np.sqrt(sd**2 / 3 + BRIGHTNESS**2 + LAMP_STEP**2))
+    assert fit.brightness_sd == pytest.approx(np.sqrt(sd**2 / 3 + BRIGHTNESS**2 + LAMP_SIGMA**2))
     assert fit.angle_limit(5.5) == pytest.approx(fit.angle_deg * 5.5 / max(fit.distance, 1e-3))

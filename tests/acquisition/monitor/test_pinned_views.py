@@ -78,7 +78,7 @@ def test_view_of_a_night(tmp_path: Path, pinned: Pinned) -> None:
             "json": {name: status[name] for name in ("white_drift", "checks", "without_accepted_frame", "doubts")},
             "head": {name: status[name] for name in HEAD},
             "spread": [view._spread(count) for count in (0, 1, 5, 17)],
-            "places": [view.place_of(*item) for item in ((0, 0, 0), (1, 2, 3), (-1, 0, 0.5), (float("nan"), 1, 1))],
+            "places": [view.rb_of(*item) for item in ((0, 0, 0), (1, 2, 3), (-1, 0, 0.5), (float("nan"), 1, 1))],
             "seconds": [item.seconds for item in with_seconds(night.attempts[:9], [night.attempts[4].started_at])],
             "rounded": [view._rounded(item) for item in (1.23456789, 1e-9, float("inf"), 123456789.0)],
         },

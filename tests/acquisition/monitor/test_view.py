@@ -23,8 +23,8 @@ from acquisition.monitor.view import (
     SessionView,
     SessionWatch,
     head_of,
-    place_of,
-    planned_places,
+    planned_chromaticities,
+    rb_of,
     read_session,
     with_seconds,
     write_session_report,
@@ -306,16 +306,16 @@ def test_relates_colours_to_previous_white(run: MadeUpRun) -> None:
 
 
 def test_computes_chromaticities() -> None:
-    assert planned_places([(255, 255, 255), (255, 0, 0), (0, 0, 7), (0, 0, 0)]) == [
+    assert planned_chromaticities([(255, 255, 255), (255, 0, 0), (0, 0, 7), (0, 0, 0)]) == [
         pytest.approx([1 / 3, 1 / 3], rel=1e-5),
         [1, 0],
         [0, 1],
         None,
     ]
     # sRGB, IEC 61966-2-1: code 188 of 255 is half the light of 255.
-    assert planned_places([(255, 0, 188)])[0] == pytest.approx([0.6667, 0.3333], abs=0.002)
-    assert place_of(float("nan"), 1, 1) is None
-    assert place_of(-1, 0.5, 0.2) is None
+    assert planned_chromaticities([(255, 0, 188)])[0] == pytest.approx([0.6667, 0.3333], abs=0.002)
+    assert rb_of(float("nan"), 1, 1) is None
+    assert rb_of(-1, 0.5, 0.2) is None
 
 
 def test_shows_illuminants_without_their_file(run: MadeUpRun) -> None:

@@ -154,7 +154,7 @@ def test_counts_missing_images(copy: Path) -> None:
         open_scenes(copy)
     data = open_scenes(copy, options=DataOptions(partial=True))
     assert data.treatment["images"] == (
-        "2; 1 of gt.csv are missing and excluded; 1 in other folders without a row in gt.csv excluded"
+        "2; 1 of gt.csv are missing and excluded; 1 more in other folders excluded (no row in gt.csv)"
     )
 
 
@@ -165,7 +165,7 @@ def test_requires_choice_of_table(copy: Path) -> None:
         open_scenes(copy)
     data = open_scenes(copy / "other.csv")
     assert [scene.name for scene in data.scenes] == ["c"]
-    assert data.treatment["images"].startswith("1; 1 next to them without a row in other.csv excluded")
+    assert data.treatment["images"].startswith("1; 1 more in the same folders excluded (no row in other.csv)")
 
 
 def test_refuses_eight_bit_image_and_mask_of_wrong_size(copy: Path) -> None:
@@ -232,14 +232,14 @@ def test_images_without_row_require_partial(copy: Path) -> None:
         open_scenes(copy)
     data = open_scenes(copy, options=DataOptions(partial=True))
     assert [scene.name for scene in data.scenes] == ["a.png", "more/b", "c"]
-    assert data.treatment["images"] == "3; 2 next to them without a row in gt.csv excluded"
+    assert data.treatment["images"] == "3; 2 more in the same folders excluded (no row in gt.csv)"
 
 
 def test_counts_images_in_unlisted_folders(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_png(copy / "day2" / "e.png", image_of(8, 10))
     monkeypatch.chdir(copy)
     for location in (".", str(copy), "gt.csv"):
-        assert open_scenes(location).treatment["images"] == "3; 1 in other folders without a row in gt.csv excluded"
+        assert open_scenes(location).treatment["images"] == "3; 1 more in other folders excluded (no row in gt.csv)"
 
 
 def masked_right_half(shape: tuple[int, ...], dtype: type[np.generic], value: float) -> npt.NDArray[Any]:

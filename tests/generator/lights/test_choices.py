@@ -100,9 +100,9 @@ def test_refuses_ground_truths_far_outside_gamut() -> None:
     several = dict.fromkeys(range(2, 12), INSIDE)
     assert matched_lights(GAMUT, {1: outside_gamut(9.9), **several}).outside == 1
     assert matched_lights(GAMUT, {1: outside_gamut(3.1), 2: INSIDE, 3: INSIDE, 4: outside_gamut(2.9)}).outside == 2
-    with pytest.raises(InputError, match=r"^1 of the 11 .* of gt\.csv .* 10\.10 degrees, the first in line 9,"):
+    with pytest.raises(InputError, match=r"^1 of the 11 .* of gt\.csv .* 10\.10 degrees \(first in line 9\),"):
         matched_lights(GAMUT, {**several, 9: outside_gamut(10.1), 12: INSIDE}, "gt.csv")
-    with pytest.raises(InputError, match=r"^2 of the 4 .* 3\.20 degrees, the first in line 2, .*order R, G, B.*camera"):
+    with pytest.raises(InputError, match=r"^2 of the 4 .* 3\.20 degrees \(first in line 2\), .*order R, G, B.*camera"):
         matched_lights(GAMUT, {1: INSIDE, 2: outside_gamut(3.1), 3: INSIDE, 4: outside_gamut(3.2)})
 
 

@@ -11,7 +11,7 @@ from sim.spectral import PaperName
 
 def intended_lab(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
     """Return the target CIELAB (N, 3) float64 of the managed profile under D50, relative to paper, for codes (N, 3)."""
-    return spectral._lab(spectral._target_xyz(np.asarray(rgb, dtype=np.float64) / 255, spectral._black(on)))
+    return spectral._lab(spectral._target_xyz(np.asarray(rgb, dtype=np.float64) / 255, spectral._black_point(on)))
 
 
 def relative_lab(reflectance: NDArray[np.float64], on: PaperName = "poster") -> NDArray[np.float64]:

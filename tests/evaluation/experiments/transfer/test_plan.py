@@ -288,7 +288,7 @@ def test_naive_counterparts_match_images(maker: Maker, tmp_path: Path) -> None:
         assert [scene.name for scene in training.scenes] == ["000000.png", "000001.png", "000004.png", "000005.png"]
         np.testing.assert_array_equal(training.scenes[2].truth, generated.scenes[4].truth)
     assert "1 of 3 pictures are not in" in plan.notes[0]
-    assert "b.png; 2 images of them are excluded" in plan.notes[0]
+    assert "b.png; 2 images of these are excluded" in plan.notes[0]
     assert "Canon EOS 550D, ColorMatrix2" in plan.notes[1]
     shutil.rmtree(training_set)
     save_pictures(training_set, ["b.png"], seed=8)
