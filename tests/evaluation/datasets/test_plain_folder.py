@@ -110,7 +110,9 @@ def test_compares_names_in_normal_form(tmp_path: Path, file_form: Any, table_for
     np.save(tmp_path / f"{name}_mask.npy", np.ones((6, 8)))
     listed = unicodedata.normalize(table_form, "Büro")
     write_table(tmp_path, f"{listed},1,1,1,{name}_mask.npy", header="image,r,g,b,mask")
-    assert open_scenes(tmp_path).scenes[0].read()[1].all()
+    mask = open_scenes(tmp_path).scenes[0].read()[1]
+    assert mask is not None
+    assert mask.all()
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.jxl", "a.fits", "a"])
