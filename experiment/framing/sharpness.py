@@ -78,7 +78,7 @@ def _edge_blurs(plane: Plane, tag: DetectedTag) -> npt.NDArray[np.float64]:
         along = (pixels - start) @ tangent / length
         # The corners are clockwise with y down, so this vector points out of the tag.
         across = (pixels - start) @ np.array([tangent[1], -tangent[0]])
-        # Omit pixels near a corner, because the next edge blurs them, too.
+        # Omit pixels near a corner, because the next edge influences them, too.
         near = (along > 0.2) & (along < 0.8) & (np.abs(across) < module)
         counts, distances = values[near], across[near]
         blurs[edge] = _sigma(counts, distances, (-module, 0.0, module))
