@@ -233,7 +233,7 @@ class PaperReader:
         return self._shape(basis, _best_fit(basis, ones, total, self._counts, self._counts[-1], first[0]).solution)
 
     def _shape(self, basis: _Array, solution: _Array) -> tuple[_Array, _Array, _Array] | None:
-        """Return the normalised shape at references and patches, and its coefficients; None if it is constant or negative."""
+        """Return the normalised shape at references and patches, and its coefficients; None if it cannot be used."""
         count = len(solution)
         level = float((solution @ self._at_centres[:count]).mean())
         if count == 1 or level <= 0:
