@@ -245,8 +245,7 @@ class SimulatedSettings(Settings):
     """The simulated laboratory."""
 
     body: str = "EOS 550D"
-    """Camera body: EOS 550D, EOS 6D Mark II or Test. Also spectral sensitivities by name or file, as in `sim table
-    --camera`."""
+    """EOS 550D, EOS 6D Mark II or Test; or spectral sensitivities by name or file, as in `sim table --camera`."""
     camera: dict[str, Any] | None = None
     """Properties that differ from this body, with the field names of sim.world.sensors.Body."""
     seed: Annotated[int, Field(ge=0)] = 1

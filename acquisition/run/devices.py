@@ -61,8 +61,8 @@ QUERIES_SHARE: Final = 0.01  # If all queries take less than this fraction of a 
 _NAME: Final = "the projector"
 
 # Longest time between the answer to a switch-off command and its execution, s.
-OBEYS_S: Final = 5.0
-LOOK_S: Final = 0.5  # Interval between two queries of the power state, s
+SWITCH_OFF_LIMIT_S: Final = 5.0
+POWER_QUERY_S: Final = 0.5  # Interval between two queries of the power state, s
 
 TRIES: Final = 3  # Number of tries to switch the lamp off
 AGAIN_S: Final = 2.0  # Interval between these tries, s
@@ -305,11 +305,11 @@ def _set_lamp(projector: Projector, goes_out: bool, clock: Clock) -> str:
     if not goes_out:
         return f"it stays on, so that the next run needs no warm-up; if no run follows, {_BY_HAND}"
     projector.switch_off()
-    until = clock.monotonic() + OBEYS_S
+    until = clock.monotonic() + SWITCH_OFF_LIMIT_S
     while (power := projector.power()) is Power.ON and clock.monotonic() < until:
-        clock.sleep(LOOK_S)
+        clock.sleep(POWER_QUERY_S)
     if power is Power.ON:
-        return f"it is still on {OBEYS_S:g} s after the command to switch it off; {_BY_HAND}"
+        return f"it is still on {SWITCH_OFF_LIMIT_S:g} s after the command to switch it off; {_BY_HAND}"
     return "it was switched off"
 
 
@@ -677,8 +677,7 @@ def _general_class(fault: CropError) -> type[CropError]:
 
 TICK_S: Final = 1.0  # Interval between two checks of the time, s
 
-# If a check of the time is delayed by more than this, s, the program was stopped. A busy computer delays it by 1 to 2
-# s.
+# If a check of the time is delayed by more than this, s, the program was stopped. A busy computer delays it less.
 GAP_S: Final = 10.0
 
 # A step is late if it takes longer than this multiple of its expected duration, plus `LATE_S`.

@@ -181,7 +181,7 @@ class Pipeline:
             raise
 
     def _next_light(self) -> ShownLight | None:
-        """Show the next illuminant; None if no frame is left. If necessary, verdicts are awaited before."""
+        """Show the next illuminant; None if no frame is left. If necessary, wait for verdicts first."""
         while not self._ending.is_requested:
             if self._verdicts.is_spent:
                 self._collect(0)
@@ -356,7 +356,7 @@ class Pipeline:
             frame = replace(frame, timings={**frame.timings, **timings})
             if self._health is not None and not saved.judgement.accepted:
                 self._health.suspect()
-            self._verdicts.take_in(frame, saved, [exposed for exposed, _ in self._under_way])
+            self._verdicts.record_verdict(frame, saved, [exposed for exposed, _ in self._under_way])
             self._observe(Taken(frame.step, saved.judgement, len(self._job.queue)))
 
     def _fail_attempt(self, step: SessionStep, number: int, error: CropError) -> None:
@@ -449,7 +449,7 @@ class Verdicts:
                 f"{RUN_AGAIN}, with a new budget"
             )
 
-    def take_in(self, frame: Exposed, saved: Saved, under_way: Sequence[Exposed]) -> None:
+    def record_verdict(self, frame: Exposed, saved: Saved, under_way: Sequence[Exposed]) -> None:
         """Record a verdict; `under_way`: later frames without a verdict."""
         job, step, judgement = self._job, frame.step, saved.judgement
         job.on_disk(
@@ -563,8 +563,8 @@ class LastingCause:
     """A cause for which every frame would be refused. The run waits, and tests at growing intervals if it is removed.
 
     If the same colour is shown twice in a row, even a picture that is always late has the right colour. A test
-    therefore needs an accepted frame with a changed colour. It is passed when an illuminant or all test frames have
-    been accepted, too.
+    therefore needs an accepted frame with a changed colour. Then it ends when an illuminant or all test frames are
+    accepted.
 
     - `last_before`: newest attempt before the run, or before its last pause for a lasting cause.
     """

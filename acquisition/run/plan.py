@@ -192,10 +192,10 @@ SPARE_BYTES: Final = 500_000_000
 # Assumed size of lossless 14-bit raw files, bytes per photosite. At ISO 100, an EOS 550D needs 1.34; noise adds more.
 BYTES_PER_PIXEL: Final = 1.5
 # Assumed size for cameras that may write 16 bits per photosite (Sony), and for the simulated cameras, bytes.
-LOOSE_BYTES_PER_PIXEL: Final = 2.0
+PADDED_BYTES_PER_PIXEL: Final = 2.0
 UNKNOWN_BYTES: Final = 60_000_000  # Assumed size of a raw file of an unknown camera, bytes
-# Upper limit of the photosites in millions, and the models for which it is valid. It is the number of the maker plus 5
-# % for masked borders. Only the EOS 550D, 6D Mark II, 5D Mark II, 5DS and 1Ds Mark III were verified.
+# Largest number of photosites in millions, and its models. It is the number of the maker, plus 5 % for masked borders.
+# Only the numbers of the EOS 550D, 6D Mark II, 5D Mark II, 5DS and 1Ds Mark III were verified.
 _MODELS: Final = (
     (0.52, "CroP Test"),
     (18.7, "EOS 550D, EOS REBEL T2i, EOS Kiss X4, EOS 650D, EOS 700D, EOS REBEL T4i, EOS REBEL T5i, "
@@ -242,7 +242,7 @@ def frame_bytes(largest: int | None, model: str, simulated: int | None = None) -
     if megapixels is None:
         cause = f"the size of a frame of {model} is unknown" if model else "the camera did not answer"
         return Estimate(UNKNOWN_BYTES, f"assumed: {cause}; acquire check measures it", False)
-    density = LOOSE_BYTES_PER_PIXEL if model.startswith(("ILCE", "CroP ")) else BYTES_PER_PIXEL
+    density = PADDED_BYTES_PER_PIXEL if model.startswith(("ILCE", "CroP ")) else BYTES_PER_PIXEL
     return Estimate(megapixels * 1e6 * density, f"{megapixels:.1f} million photosites, {density:g} bytes each", True)
 
 

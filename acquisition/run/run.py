@@ -147,8 +147,7 @@ class Notices:
     def _run_command(self, event: str, message: str, body: bytes) -> str:
         variables = {"CROP_EVENT": event, "CROP_MESSAGE": message, "CROP_SESSION": self._session}
         try:
-            # The command has its own process group, so that Ctrl-C does not reach it and its children can be ended,
-            # too.
+            # In its own process group, the command is not reached by Ctrl-C, and its child processes can be ended.
             process = subprocess.Popen(
                 shlex.split(self._target),
                 stdin=subprocess.PIPE,
@@ -550,9 +549,9 @@ def clock_note(session: Session, clock: Clock) -> str:
     if not isinstance(clock, SteadyClock) or not clock.behind_s:
         return ""
     return (
-        f"clock: the computer's clock is {duration_text(clock.behind_s)} behind the last frame of {session.folder}, or "
-        "was ahead then; the time of the session continues from this frame, so that the order of its frames is kept; "
-        "set the clock"
+        f"clock: the computer's clock is {duration_text(clock.behind_s)} behind the last frame of {session.folder}; "
+        "one of the times is wrong. The session continues from the time of this frame, "
+        "so that frames keep their order; set the clock"
     )
 
 

@@ -68,7 +68,7 @@ _DOT_PX = 2  # Size of a dot of the text, px; capitals are 15 dots high, that is
 
 _LINE_PX = 48  # Distance of the lines of text, 2 mm
 
-_AIR_PX = 20  # Width of bare paper around each mark, 0.85 mm
+_MARK_GAP_PX = 20  # Width of bare paper around each mark, 0.85 mm
 
 _SEARCH_PX = 24  # Step of the search for free space along a margin, 1 mm
 
@@ -256,11 +256,11 @@ class Margins:
         # A box and a mark that overlap across the margin exclude an open interval of shifts.
         axis, across = (0, 1) if side in {"top", "bottom"} else (1, 0)
         boxes, marks = self._on_sheet(side, boxes), np.concatenate(self._taken)
-        lows, highs = boxes[:, None, across] - _AIR_PX, boxes[:, None, across + 2] + _AIR_PX
+        lows, highs = boxes[:, None, across] - _MARK_GAP_PX, boxes[:, None, across + 2] + _MARK_GAP_PX
         marks = marks[(lows.min() < marks[:, across + 2]) & (marks[:, across] < highs.max())]
         box_index, other_index = np.nonzero((lows < marks[:, across + 2]) & (marks[:, across] < highs))
-        starts = marks[other_index, axis] - boxes[box_index, axis + 2] - _AIR_PX
-        ends = marks[other_index, axis + 2] - boxes[box_index, axis] + _AIR_PX
+        starts = marks[other_index, axis] - boxes[box_index, axis + 2] - _MARK_GAP_PX
+        ends = marks[other_index, axis + 2] - boxes[box_index, axis] + _MARK_GAP_PX
         started = np.bincount(np.searchsorted(shifts, starts, "right"), minlength=len(shifts) + 1)
         ended = np.bincount(np.searchsorted(shifts, ends, "left"), minlength=len(shifts) + 1)
         return np.cumsum(started - ended)[: len(shifts)] > 0
@@ -271,7 +271,7 @@ class Margins:
         enlarged = np.concatenate([boxes[:, :2] - GAP_PX, boxes[:, 2:] + GAP_PX], axis=1)
         if not has_gap or is_outside or _any_overlap(enlarged, self._field[None]):
             return False
-        margin = np.array([-_AIR_PX, -_AIR_PX, _AIR_PX, _AIR_PX])
+        margin = np.array([-_MARK_GAP_PX, -_MARK_GAP_PX, _MARK_GAP_PX, _MARK_GAP_PX])
         # Only marks that overlap the bounding box can overlap one of the boxes.
         enlarged_hull = hull[None] + margin
         near_boxes = [mark_boxes[_overlapping(mark_boxes, enlarged_hull)] for mark_boxes in self._taken]

@@ -37,7 +37,7 @@ _SUPERSAMPLING = 8  # A preview pixel is the mean of this number of fine pixels 
 
 # In the PDF, a patch overlaps the next patches by the first length, so that no line of paper is visible between them.
 # Every rectangle is reduced by the second length on all sides, so that rounding errors do not paint the next pixel.
-_LAP_PX, _INSET_PX = 0.2, 0.01
+_OVERLAP_PX, _INSET_PX = 0.2, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,9 +254,9 @@ def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, operators
     corners = sheet.rectangles_mm * POINTS_PER_MM
     # Renderers paint every pixel that a rectangle touches. A slightly smaller rectangle does not touch the next pixel
     # after rounding.
-    inset, lap = _INSET_PX * PX_MM * POINTS_PER_MM, _LAP_PX * PX_MM * POINTS_PER_MM
+    inset, overlap = _INSET_PX * PX_MM * POINTS_PER_MM, _OVERLAP_PX * PX_MM * POINTS_PER_MM
     corners += np.array([inset, inset, -inset, -inset])
-    corners[len(corners) - sheet.tiles :, 2:] += lap
+    corners[len(corners) - sheet.tiles :, 2:] += overlap
     left, top, right, bottom = corners.T
     boxes = np.stack([left, height - bottom, right - left, bottom - top], axis=1)
     changes = np.flatnonzero((np.diff(sheet.rgb.astype(np.int64), axis=0) != 0).any(axis=1)) + 1

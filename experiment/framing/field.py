@@ -28,7 +28,7 @@ from foundation.robust import biweight, huber_weights, robust_sigma
 # Smallest usable level of the brightest parts of the image (`paper_level`), counts above black.
 MIN_SIGNAL = 12.0
 
-# Distance from the sides of the given quadrilateral up to which the edge is searched, half-size px.
+# The edge is searched up to this distance from the sides of the given quadrilateral, half-size px.
 CORNER_REACH_PX = 24.0
 
 SIDE_POINTS = 160  # Number of points on each side at which the edge is searched
@@ -50,8 +50,8 @@ MIRRORED = 4  # Orientations from this number on are mirrored: 0 … 3 are quart
 
 _SMALL_WIDTH_PX = 640  # Width of the reduced image in which the level of paper is estimated, px
 
-# Smallest signal of a channel, relative to the strongest channel: for the comparison of colours, and for edges.
-_LEAST_LIGHT, _MUCH_LIGHT = 0.03, 0.2
+# Smallest signal of a channel that is used for colours or for edges, relative to the strongest channel.
+_COLOUR_SIGNAL, _EDGE_SIGNAL = 0.03, 0.2
 
 _PROFILE_STEP_PX = 0.5  # Distance of the samples across an edge, half-size px: one photosite
 
@@ -74,7 +74,8 @@ _REFINE_STEPS = 6
 
 _INTERPOLATION_PX = 0.4  # σ of the blur that linear interpolation adds to an edge, half-size px
 
-_REFINED_PX = 1.5  # Largest accepted correction of an edge position, half-size px: the samples do not reach farther
+# Largest correction of an edge position, half-size px. The samples do not reach farther.
+_LARGEST_CORRECTION_PX = 1.5
 
 _CLEAR_EDGE = 0.15  # Smallest step whose position is accurate to 0.1 px, relative to paper
 
@@ -83,7 +84,7 @@ _CLEAR_EDGE = 0.15  # Smallest step whose position is accurate to 0.1 px, relati
 _SIDE_CURVE_ORDER = 8
 
 # Number of random patches in the comparison of colours: a hundred for each parameter of the fit.
-_TRIED_CELLS = 1500
+_COMPARED_CELLS = 1500
 
 _Float = npt.NDArray[np.float32]
 _Points = npt.NDArray[np.float64]
@@ -296,7 +297,7 @@ def _colour_misfit(picture: PreparedImage, placed: _PlacedChart, chart: Chart) -
     For each channel, the scatter of the patches around a fit of light and codes is divided by the scatter around a fit
     of light alone. The first misfit is the product of these ratios, the second is the mean of their squares.
     """
-    sampled_patches = np.random.default_rng(1).permutation(chart.colour_count)[:_TRIED_CELLS]
+    sampled_patches = np.random.default_rng(1).permutation(chart.colour_count)[:_COMPARED_CELLS]
     points = chart.centres_mm[sampled_patches]
     positions = placed.to_pixels(points)
     height, width = picture.shape
@@ -338,7 +339,7 @@ def _robust_fit(design: _Points, values: npt.NDArray[np.float64]) -> tuple[float
     ridge = 1e-9 * len(values) * np.eye(terms)
     for _ in range(4):
         weighted = design * weights[:, None]
-        # einsum, because for so few unknowns the threads of a linear-algebra library cost more time than they save.
+        # Use einsum, because for so few unknowns the threads of a linear-algebra library cost more time than they save.
         gram = np.einsum("ni,nj->ij", weighted, design) + ridge
         solution = np.asarray(np.linalg.solve(gram, np.einsum("ni,n->i", weighted, values)), dtype=np.float64)
         residual = np.abs(values - design @ solution)
@@ -416,7 +417,7 @@ class PreparedImage:
         factor = max(1, round(width / _SMALL_WIDTH_PX))
         size = (width // factor, height // factor)
         brightest = [paper_level(plane) for plane in planes]
-        usable = [k for k, level in enumerate(brightest) if level >= max(MIN_SIGNAL, _LEAST_LIGHT * max(brightest))]
+        usable = [k for k, level in enumerate(brightest) if level >= max(MIN_SIGNAL, _COLOUR_SIGNAL * max(brightest))]
         levels: list[_Float] = []
         for k in usable:
             cropped = planes[k].values[: size[1] * factor, : size[0] * factor]
@@ -427,7 +428,7 @@ class PreparedImage:
             level = np.maximum(level, np.float32(0.2 * brightest[k])).astype(np.float32)
             levels.append(level)
         smooth = tuple(replace(planes[k], values=cv2.blur(planes[k].values, (3, 3)).astype(np.float32)) for k in usable)
-        bright = tuple(brightest[k] >= _MUCH_LIGHT * max(brightest) for k in usable)
+        bright = tuple(brightest[k] >= _EDGE_SIGNAL * max(brightest) for k in usable)
         return cls(smooth, tuple(usable), tuple(levels), bright, (height, width), factor)
 
     def to_small(self, points_px: _Points) -> _Points:
@@ -463,7 +464,7 @@ class Outline:
 
 
 def _outward_normal(start: _Points, end: _Points) -> _Points:
-    """Return the unit normal (2,) that points out of a clockwise outline, of the side from start to end."""
+    """Return the outward unit normal (2,) of the side from start to end in a clockwise outline."""
     x, y = (end - start) / np.linalg.norm(end - start)
     return np.array([y, -x])
 
@@ -539,7 +540,7 @@ def refine_edges(
         counts = cv2.remap(plane.values, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
         profile = np.asarray(counts, dtype=np.float64).reshape(grid.shape[:-1]).mean(axis=1) / level
         offsets, step_heights = _fitted_step(profile, float(np.hypot(blur_px, _INTERPOLATION_PX)))
-        is_clear = (step_heights > _CLEAR_EDGE) & (np.abs(offsets) < _REFINED_PX)
+        is_clear = (step_heights > _CLEAR_EDGE) & (np.abs(offsets) < _LARGEST_CORRECTION_PX)
         positions[index] += np.where(is_clear, offsets, 0.0)[:, None] * normals
         heights[index] = np.where(is_clear, step_heights, 0.0)
     return positions, heights

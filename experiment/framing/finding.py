@@ -69,7 +69,7 @@ class ChartPose:
     residual_px: float  # RMS residual of tag corners or outline; includes lens distortion and waves of the paper
     module_px: float  # module of the smallest tag; NaN without tags
     fill: float  # larger of page width / image width and page height / image height
-    inside: bool  # all four page corners lie in the image
+    inside: bool  # whether all four page corners are in the image
     rotation_deg: float  # clockwise, page x axis against image x axis
     field: DetectedField | None = None  # patch area of a chart without tags, else None
 

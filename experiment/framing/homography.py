@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-# Largest ratio of width to length of a set of points that counts as collinear. Two small tags at opposite ends of an A0
-# sheet have a ratio of 1e-3.
+# Points count as collinear if their extent across a line is at most this fraction of their extent along it. Two small
+# tags at opposite ends of an A0 sheet have 1e-3.
 _COLLINEAR_RATIO = 1e-6
 
 _Points = npt.NDArray[np.float64]

@@ -287,7 +287,7 @@ _LETTER_PX = 7.4  # Width of a letter at `_SCALE`, px
 
 _SCALE = 0.42  # Scale of OpenCV's font: the smallest that is easy to read
 
-_FAINTEST = 0.01  # Lower limit of the level that is shown as white, relative to white; limits visible noise
+_LEAST_WHITE = 0.01  # Lower limit of the level that is shown as white, relative to white; limits visible noise
 
 
 def preview_jpeg(
@@ -312,7 +312,7 @@ def preview_jpeg(
         row, column = positions[channel][0]
         scale = np.float32(1 / max(float(white[index]), 1.0))
         small[:, :, 2 - index] = (blocks[row, column, ::step, ::step] - np.float32(black[row, column])) * scale
-    brightest = max(float(np.percentile(small[::4, ::4].max(axis=2), 99.5)), _FAINTEST)
+    brightest = max(float(np.percentile(small[::4, ::4].max(axis=2), 99.5)), _LEAST_WHITE)
     image = (np.sqrt(np.clip(small, 0, brightest) / np.float32(brightest)) * 255).astype(np.uint8)
     for corners in outlines_px:
         cv2.polylines(image, [(corners / step).round().astype(np.int32)], True, GREEN, 1, cv2.LINE_AA)

@@ -39,7 +39,8 @@ _LEAST_BLACK = 64.0
 
 _NOISE_BINS = 6  # Number of levels at which noise is measured, with more than a thousand blocks each
 
-_INNER = 0.3  # Fraction of the blocks of a level that are used for its noise: the blocks with the smallest differences
+# Fraction of the blocks of a level that are used for its noise: the blocks with the smallest differences.
+_INNER_FRACTION = 0.3
 
 _INNER_SIGMAS = 0.3853  # Limit of the inner 30 % of a normal distribution, in standard deviations: Φ⁻¹(0.65)
 
@@ -216,8 +217,9 @@ def _noise(greens: _Array) -> Noise:
         in_bin = (level >= low) & (level <= high)
         differences = difference[in_bin]
         centred = np.abs(differences - np.median(differences))
-        # In blocks on an edge between two patches, both greens differ by more than noise. These blocks are omitted.
-        sigma = float(np.quantile(centred, _INNER)) / _INNER_SIGMAS
+        # On an edge between two patches, the two greens of a block differ by more than noise, so such blocks are
+        # omitted.
+        sigma = float(np.quantile(centred, _INNER_FRACTION)) / _INNER_SIGMAS
         levels.append(float(np.median(level[in_bin])))
         variances.append(sigma**2 / 2)
     # Dark blocks have only read noise, bright blocks also photon noise. Residuals are relative to the variance.

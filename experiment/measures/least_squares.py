@@ -31,7 +31,7 @@ _POINTS_AT_A_TIME = 2048
 
 _RIDGE = 1e-10  # Ridge relative to the mean diagonal of the normal matrix, so that equal columns can be solved
 
-_CUT = 6.0  # Residuals beyond this many robust standard deviations get no weight (J. W. Tukey's biweight).
+_BIWEIGHT_SIGMAS = 6.0  # Residuals beyond this many robust standard deviations get no weight (J. W. Tukey's biweight).
 
 _Array = npt.NDArray[np.float64]
 
@@ -193,10 +193,10 @@ def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tup
     def radial(half_power: int) -> list[_Array]:
         return [x * r2 ** (half_power - 1), y * r2 ** (half_power - 1), r2**half_power]
 
-    # Order of the groups: constant, slope, curvature; radial terms r⁴ and r⁶, with the distance r from the centre;
-    # other terms of third and fourth order; r⁸; other terms of fifth and sixth order. The group of r⁴ also contains x
-    # r² and y r², which describe a shift of its centre. The groups of r⁶ and r⁸ contain the corresponding terms. Up to
-    # the sixth order, each radial term replaces another term of its order.
+    # Order of the groups, with the distance r from the centre: constant, slope, curvature; r⁴ and r⁶; other terms of
+    # third and fourth order; r⁸; other terms of fifth and sixth order. The group of r⁴ also contains x·r² and y·r²,
+    # which describe a shift of its centre. The groups of r⁶ and r⁸ contain similar terms. Up to the sixth order, each
+    # radial term replaces another term of its order.
     groups = (
         [power(0), power(1), power(2), power(3)]
         if outside_only
@@ -273,7 +273,7 @@ def _robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _A
             residual[point] = values[point] - predicted
         scale = MAD_TO_SIGMA * np.median(np.abs(residual)) + 1e-9
         for point in range(count):
-            inside = max(1 - (residual[point] / (_CUT * scale)) ** 2, 0.0)
+            inside = max(1 - (residual[point] / (_BIWEIGHT_SIGMAS * scale)) ** 2, 0.0)
             weights[point] = inside * inside
     return solution, weights, residual
 

@@ -49,12 +49,12 @@ REFERENCES_A_TERM = 3  # Smallest number of references for each term of a fit
 
 # Smallest number of references for each term of the fit that detects covered or dirty references. With fewer, the fit
 # would follow a large stain.
-JUDGING_A_TERM = 12
+OUTLIER_REFERENCES_A_TERM = 12
 
-_PLAIN = 6  # Number of terms up to second order: constant, slope and curvature
+_SECOND_ORDER_TERMS = 6  # Number of terms up to second order: constant, slope and curvature
 
-# A further term must reduce N log(mean squared error) by at least this value, with the cross-validated error of N
-# references. The value was chosen in simulations: with 0 the terms fit noise, with 4 they miss weak shapes.
+# Smallest decrease of N log(E) for which a further term is used, with the cross-validated mean squared error E of N
+# references. It was chosen in simulations: with 0, terms fit noise; with 4, weak shapes are missed.
 TERM_PRICE = 1.0
 
 # Signal at which photon noise equals read noise, counts. The variance of a reference is proportional to its signal plus
@@ -68,13 +68,13 @@ _ROUNDS = 4
 # detected.
 _RINGS = 10
 
-_NEAR = 4  # The largest deviation is averaged over this number of neighbouring references
+_AVERAGED_REFERENCES = 4  # The largest deviation is averaged over this number of neighbouring references
 
-_USUAL = 5.0  # Largest usual deviation of a reference, in standard deviations
+_OUTLIER_SIGMAS = 5.0  # Largest usual deviation of a reference, in standard deviations
 
-_UNLIKELY = 0.01  # Fits whose number of terms has a lower likelihood are ignored in the error
+_UNLIKELY = 0.01  # Fits with a lower likelihood are ignored when the error is calculated
 
-_EXACT = 1e-9  # Smaller coefficients are rounding errors
+_ROUNDING_ERROR = 1e-9  # Smaller coefficients are rounding errors
 
 _Array = npt.NDArray[np.float64]
 
@@ -192,7 +192,7 @@ class PaperReader:
                 factors = [(shared[2],), (shared[2],), (shared[2],)]
         # After division by a base, the light has a simple shape. Slope and curvature are then enough to detect
         # outliers.
-        limit = self._counts[-1] if not any(self.base.coefficients) else _PLAIN
+        limit = self._counts[-1] if not any(self.base.coefficients) else _SECOND_ORDER_TERMS
         fits = [_best_fit(basis, base[:, channel], values[:, channel], self._counts, limit) for channel in range(3)]
         solutions = np.zeros((3, basis.shape[1]))
         for channel, fit in enumerate(fits):
@@ -248,7 +248,7 @@ class PaperReader:
         """Convert terms (K,) to coefficients in the order of `page_powers`, up to the lowest sufficient order."""
         factor = self._terms[:, : len(terms)] @ terms
         order = order_of(len(factor))
-        while order > 0 and np.abs(self._terms[len(page_powers(order - 1)) :, : len(terms)]).max() < _EXACT:
+        while order > 0 and np.abs(self._terms[len(page_powers(order - 1)) :, : len(terms)]).max() < _ROUNDING_ERROR:
             order -= 1
         return factor[: len(page_powers(order))]
 
@@ -308,7 +308,7 @@ def _best_fit(
     design, scaled_values = basis * (base * inverse_noise)[:, None], values * inverse_noise
     allowed_counts = tuple(count for count in counts if REFERENCES_A_TERM * count <= len(values)) or counts[:1]
     # A fit with few terms would treat dim corners as outliers. A fit with too many terms would follow a stain.
-    outlier_limit = min(outlier_terms, len(values) // JUDGING_A_TERM)
+    outlier_limit = min(outlier_terms, len(values) // OUTLIER_REFERENCES_A_TERM)
     outlier_count = max((count for count in allowed_counts if count <= outlier_limit), default=allowed_counts[0])
     weights = robust_least_squares(design[:, :outlier_count], scaled_values, _ROUNDS)[1]
     held_out = held_out_squares(design[:, : allowed_counts[-1]], scaled_values, weights, allowed_counts)
@@ -329,7 +329,7 @@ def _field_residual(residuals: _Array, places_mm: _Array, page_mm: tuple[float, 
     sigma = max(robust_sigma(channel_residuals), 1e-9)
     worst = int(np.argmax(np.abs(channel_residuals)))
     squared_distances = ((places_mm - places_mm[worst]) ** 2).sum(axis=1)
-    nearest = np.argsort(squared_distances)[:_NEAR]
+    nearest = np.argsort(squared_distances)[:_AVERAGED_REFERENCES]
     # Average over the neighbours whose residuals have the same sign.
     same_sign = nearest[np.sign(channel_residuals[nearest]) == np.sign(channel_residuals[worst])]
     red, green, blue = residuals[same_sign].mean(axis=0).tolist()
@@ -342,7 +342,7 @@ def _field_residual(residuals: _Array, places_mm: _Array, page_mm: tuple[float, 
     return FieldResidual(
         at_mm=(x, y),
         deviation=(red, green, blue),
-        share=float((np.abs(channel_residuals) > _USUAL * sigma).mean()),
+        share=float((np.abs(channel_residuals) > _OUTLIER_SIGMAS * sigma).mean()),
         rim=float(rings[-1].mean()),
         radial=float(explained_squares / total_squares) if total_squares > 0 else 0.0,
     )

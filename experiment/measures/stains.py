@@ -56,7 +56,7 @@ _ROUNDS = 3  # Largest number of rounds; each predicts without the patches that 
 
 _LEAST_KNOWN = 9  # Smallest number of known codes, of 25, for a median curvature
 
-_LEAST_TIED = 3  # Smallest number of known codes with two equal values for a median bend
+_LEAST_EQUAL_CODES = 3  # Smallest number of known codes for the median curvature at equal values
 
 _LEAST_NEIGHBOURS = 5  # Smallest number of known patches in a neighbourhood for its mean
 
@@ -228,15 +228,15 @@ def _median_at_equal_codes(curvature: _Array, axis: int) -> _Array:
     for other_axis in {0, 1, 2} - {axis}:
         third = np.sign(values[3 - axis - other_axis] - values[axis])
         for side in (-1, 0, 1):
-            tied = np.nonzero((values[axis] == values[other_axis]) & (third == side))
-            value, bends = values[axis][tied], curvature[tied]
+            equal_codes = np.nonzero((values[axis] == values[other_axis]) & (third == side))
+            value, bends = values[axis][equal_codes], curvature[equal_codes]
             is_finite = np.isfinite(bends).all(axis=1)
             group_medians = np.full_like(bends, np.nan)
             for code in np.unique(value):
                 similar = bends[is_finite & (np.abs(value - code) <= 1)]
-                if len(similar) >= _LEAST_TIED:
+                if len(similar) >= _LEAST_EQUAL_CODES:
                     group_medians[value == code] = np.median(similar, axis=0)
-            medians[tied] = group_medians
+            medians[equal_codes] = group_medians
     return medians
 
 

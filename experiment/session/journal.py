@@ -861,7 +861,7 @@ class _Ledger:
         self._next = self._end
 
     def close(self) -> None:
-        """Release the file; a second call does nothing."""
+        """Close the file; a second call does nothing."""
         if self._handle >= 0:
             handle, self._handle = self._handle, -1
             with suppress(OSError):  # All data are on disk already.

@@ -240,8 +240,7 @@ def _connect_with(path: Path, parameters: str) -> sqlite3.Connection:
 
 
 def _is_lockless(path: Path) -> bool:
-    # This must not be called while a connection is open, because closing a file releases all locks of the process on
-    # it.
+    # Do not call this while a connection is open, because closing a file releases all locks of the process on it.
     try:
         with path.open("rb") as stream:
             fcntl.lockf(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
