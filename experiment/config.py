@@ -41,7 +41,7 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SECRETS = ("sequence.notify", "notify.alive", "lab.projector.password")
 
 # Value of `rig` in a session with imported frames. Messages do not suggest it, because no frames can be taken with it.
-NOT_TO_CHOOSE: Final = "imported"
+IMPORTED_RIG: Final = "imported"
 
 # Largest number of characters that are read from a file with a secret. Passwords and URLs are shorter.
 _SECRET_CHARACTERS = 4096
@@ -172,8 +172,8 @@ class NotifySettings(Settings):
     """Regular signs of life of a run."""
 
     alive: Annotated[str, AfterValidator(_check_target), Field(repr=False)] = ""
-    """Target of signs of life: a URL or a command, as in `sequence.notify`. It receives one at most once a minute, and
-    the result at the end of the run. A monitoring service can alert somebody if they stop."""
+    """Target of signs of life: a URL or a command, as in `sequence.notify`. A sign is sent at most once a minute, and
+    the result at the end of the run. A monitoring service can alert somebody if the signs stop."""
 
 
 class LimitSettings(Settings):
@@ -342,7 +342,7 @@ class LabSettings(Settings):
         """Name of the settings file in messages."""
         return self._file
 
-    def read_from(self, file: str) -> LabSettings:
+    def with_file_name(self, file: str) -> LabSettings:
         """Return a copy of the settings with the name of their file."""
         copy = self.model_copy()
         copy._file = file  # noqa: SLF001 - same class
@@ -392,7 +392,7 @@ def parse_lab(text: str, source_name: str, folder: Path | None = None) -> LabSet
     document = parse_toml(text, source_name)
     if folder is not None:
         _insert_secrets(document, folder, source_name)
-    return validate_settings(LabSettings, document, source_name).read_from(source_name)
+    return validate_settings(LabSettings, document, source_name).with_file_name(source_name)
 
 
 def validate_settings(model: type[_AnySettings], document: dict[str, Any], source_name: str) -> _AnySettings:
@@ -400,7 +400,7 @@ def validate_settings(model: type[_AnySettings], document: dict[str, Any], sourc
     try:
         return model.model_validate(document)
     except ValidationError as error:
-        mistakes = find_mistakes(model, document, error, _is_secret, NOT_TO_CHOOSE)
+        mistakes = find_mistakes(model, document, error, _is_secret, IMPORTED_RIG)
         # The original error would show the secret in the traceback.
         has_secret = any(_is_secret(".".join(map(str, mistake["loc"]))) for mistake in error.errors())
         raise ConfigurationError(f"{source_name}:{list_mistakes(mistakes)}") from (None if has_secret else error)

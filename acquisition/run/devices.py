@@ -449,8 +449,8 @@ PAUSE_S: Final = 5.0  # Interval between two tries in a pause, s
 SLOW_S: Final = 10.0
 # Longest time between two signs of life during a try, s. A camera driver may wait several minutes for a long exposure.
 TRY_S: Final = 300.0
-# Number of frames that must be accepted between two pauses for the same device. With fewer frames, their durations are
-# added and compared with the time limit, so that an intermittent fault also ends a run.
+# If fewer frames are accepted between two pauses for the same device, the durations of the pauses are added. Their sum
+# is compared with the time limit, so that an intermittent fault also ends a run.
 RECURS_WITHIN: Final = 10
 # Time between the second and the third try of a refused frame, s. Each later interval is twice the previous interval.
 BACK_OFF_S: Final = 5.0

@@ -106,7 +106,7 @@ class Taken:
 
 @dataclass(frozen=True)
 class ShownLight:
-    """A step whose colour is on the screen since `since` (clock, s); to show it took `show_s`.
+    """A step whose colour is on the screen since `since` (clock, s). Showing it took `show_s`.
 
     `replaced`: colour that was shown before; None if there was none.
     """
@@ -562,9 +562,8 @@ class Verdicts:
 class LastingCause:
     """A cause for which every frame would be refused. The run waits, and tests at growing intervals if it is removed.
 
-    If the same colour is shown twice in a row, even a picture that is always late has the right colour. A test
-    therefore needs an accepted frame with a changed colour. Then it ends when an illuminant or all test frames are
-    accepted.
+    A late picture has the right colour if the same colour is shown twice in a row. A test therefore needs an accepted
+    frame with a changed colour. After this frame, the test ends when an illuminant or all test frames are accepted.
 
     - `last_before`: newest attempt before the run, or before its last pause for a lasting cause.
     """
@@ -575,8 +574,8 @@ class LastingCause:
         self._sentence = ""
         self._step: SessionStep | None = None
         self._testing: Pause | None = None
-        self._to_show: set[int] = set()
-        self._is_changing = False
+        self._test_steps: set[int] = set()
+        self._has_changed = False
 
     @property
     def must_wait(self) -> bool:
@@ -598,9 +597,9 @@ class LastingCause:
         self._testing = self._testing or self._job.retry.pause(FRAMES)
         self._testing.back_off(fault)
         self._job.queue.retry()
-        self._to_show, self._is_changing = set(), False
+        self._test_steps, self._has_changed = set(), False
         if self._step is not None:
-            self._to_show.add(self._step.number)
+            self._test_steps.add(self._step.number)
             if self._step.kind != "dark":
                 self._link()
 
@@ -609,9 +608,9 @@ class LastingCause:
 
         A dark frame does not show it, because it is also accepted if no light reaches the chart.
         """
-        self._to_show.discard(step.number)
-        self._is_changing |= changed and step.kind != "dark"
-        if self._is_changing and (step.kind == "light" or not self._to_show):
+        self._test_steps.discard(step.number)
+        self._has_changed |= changed and step.kind != "dark"
+        if self._has_changed and (step.kind == "light" or not self._test_steps):
             self.over()
 
     def over(self) -> None:
@@ -627,7 +626,7 @@ class LastingCause:
         if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
             numbers = job.on_disk(lambda: link_runs(job.session, job.devices.clock.now()))
             job.queue.begin_with(step for step in job.session.steps if step.number in numbers)
-            self._to_show.update(numbers)
+            self._test_steps.update(numbers)
         self.last_before = attempts[-1].id
         # This call is allowed here, because all files were judged before the wait.
         if isinstance(job.judge, HandlesPauses):
@@ -694,7 +693,7 @@ class StepQueue:
     ) -> None:
         self._steps = {step.number: step for step in steps}
         self._first = list(first)
-        self._probes: list[int] = []
+        self._given_up_first: list[int] = []
         self._open = {step.number for step in steps if step.number not in done_numbers} | set(self._first)
         self._attempts = attempts
         self._tries: Counter[int] = Counter()
@@ -754,8 +753,8 @@ class StepQueue:
         for number in self._given_up:
             self._tries[number] = 0
         self._given_up.clear()
-        self._first = [*self._probes, *self._first]
-        self._probes = []
+        self._first = [*self._given_up_first, *self._first]
+        self._given_up_first = []
         self._in_a_row = 0
 
     def accept(self, step: SessionStep) -> None:
@@ -807,7 +806,7 @@ class StepQueue:
             self._in_a_row += 1
         self._given_up[number] = reason
         if number in self._first:
-            self._probes.append(number)
+            self._given_up_first.append(number)
         self._forget_first(number)
 
     def _forget_first(self, number: int) -> None:

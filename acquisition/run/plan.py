@@ -194,7 +194,7 @@ BYTES_PER_PIXEL: Final = 1.5
 # Assumed size for cameras that may write 16 bits per photosite (Sony), and for the simulated cameras, bytes.
 PADDED_BYTES_PER_PIXEL: Final = 2.0
 UNKNOWN_BYTES: Final = 60_000_000  # Assumed size of a raw file of an unknown camera, bytes
-# Largest number of photosites in millions, and its models. It is the number of the maker, plus 5 % for masked borders.
+# Number of photosites in millions, and models with at most this number: as stated by the maker, plus 5 % for borders.
 # Only the numbers of the EOS 550D, 6D Mark II, 5D Mark II, 5DS and 1Ds Mark III were verified.
 _MODELS: Final = (
     (0.52, "CroP Test"),

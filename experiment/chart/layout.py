@@ -4,7 +4,7 @@
   for this, the side is the largest multiple of 5 pixels that fits. All edges of patches and tag modules are then edges
   of pixels at 600 dpi.
 - Each colour is printed once, in random order. A random chart can be registered more accurately than a smooth one, and
-  an error of one patch is detected.
+  a registration that is wrong by one patch is detected.
 - The tags form a regular grid that reaches the edges. Each tag takes 4 × 4 slots, for the 10 modules of an AprilTag
   36h11 with its rim.
 - All other slots are achromatic references. They are spread evenly but irregularly, because a regular grid would cause
@@ -52,7 +52,7 @@ PAPER_REFERENCE_MM = 100.0  # Largest distance between the white references in t
 # Side of these references, 5 mm. It is even, so that the centre is a whole pixel.
 PAPER_REFERENCE_PX = 118
 
-PAPER_REFERENCES = 4  # Smallest number of intervals between these references, along the top and the right margin
+PAPER_REFERENCE_INTERVALS = 4  # Smallest number of intervals between white references in the top and right margin
 
 # Landscape sheets of ISO 216, largest first.
 A_SERIES_MM: dict[str, tuple[float, float]] = {
@@ -268,7 +268,7 @@ def _margin_whites(field_px: tuple[int, int, int, int]) -> list[Reference]:
     left, top, right, bottom = field_px
     side, distance, step = PAPER_REFERENCE_PX, GAP_PX + PAPER_REFERENCE_PX // 2, PAPER_REFERENCE_MM / PX_MM
     sides = ((left, right), (top, bottom))
-    across, down = (max(PAPER_REFERENCES, math.ceil((high - low) / step)) for low, high in sides)
+    across, down = (max(PAPER_REFERENCE_INTERVALS, math.ceil((high - low) / step)) for low, high in sides)
     centres = [(x, y) for y in (top - distance, bottom + distance) for x in (left - distance, right + distance)]
     centres += [(left + round(k * (right - left) / across), top - distance) for k in range(1, across)]
     centres += [(right + distance, top + round(k * (bottom - top) / down)) for k in range(1, down)]
@@ -306,8 +306,8 @@ def _references(grid: _Grid, is_reference: _Slots, rng: np.random.Generator) -> 
     codes[is_reference] = PAPER_WHITE[0]
     is_white = is_reference.copy()
     count = int(is_reference.sum())
-    # An eighth of the references has each grey. If there are few references, each grey has fewer of them, so that at
-    # least `LEAST_WHITES` are white.
+    # Each grey gets an eighth of the references. If there are few references, each grey gets fewer, so that at least
+    # `LEAST_WHITES` are white.
     grey_count = min(count // (2 * len(GREY_CODES)), (count - LEAST_WHITES) // len(GREY_CODES))
     for code in GREY_CODES:
         is_grey = spread(is_white, grey_count, rng)
@@ -365,7 +365,7 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
 
 
 def _nearness(count: int, sigma: float) -> npt.NDArray[np.float64]:
-    """Return Gaussian weights of slots (columns) for positions (rows), (count, count) float64; row sums are 1."""
+    """Return the Gaussian weight [i, j] of slot j at position i, (count, count) float64; sum over j is 1."""
     positions = np.arange(count)
     weights = np.exp(-0.5 * ((positions[:, None] - positions[None, :]) / sigma) ** 2)
     # Subnormal numbers are slow and do not change any sum.

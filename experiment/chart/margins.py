@@ -25,7 +25,7 @@ DESIGN_DPI = 600  # Resolution of the design, dpi. Photo printers and plotters u
 
 PX_MM = MM_PER_INCH / DESIGN_DPI  # Size of a pixel of the design, mm
 
-# Largest distance of a coordinate in a file from a whole pixel: six decimals of a millimetre are 2e-5 px.
+# A coordinate this close to a whole pixel counts as whole. Files round coordinates by up to 2e-5 px.
 _ROUNDING_PX = 1e-3
 
 Boxes = npt.NDArray[np.int64]  # (N, 4) int64: left, top, right, bottom, px at 600 dpi
@@ -253,7 +253,7 @@ class Margins:
 
     def _taken_at(self, side: Side, boxes: Boxes, shifts: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
         """Return for each shift (M,) px along a margin whether boxes (N, 4) px in (u, v) overlap other marks."""
-        # A box and a mark that overlap across the margin exclude an open interval of shifts.
+        # If a box and a mark overlap in v, one open interval of shifts makes them overlap in u.
         axis, across = (0, 1) if side in {"top", "bottom"} else (1, 0)
         boxes, marks = self._on_sheet(side, boxes), np.concatenate(self._taken)
         lows, highs = boxes[:, None, across] - _MARK_GAP_PX, boxes[:, None, across + 2] + _MARK_GAP_PX

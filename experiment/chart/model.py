@@ -36,7 +36,7 @@ TAG_MODULES = 8
 
 
 def colour_of_index(index: npt.ArrayLike, bits: int) -> npt.NDArray[np.uint8]:
-    """Return the printed 8-bit RGB codes (..., 3) uint8 of colour indices; the low 8 − bits bits are 0.
+    """Return the printed 8-bit RGB codes (..., 3) uint8 of colour indices; unused low bits are 0.
 
     `bits`: bits per channel, 1 … 5 (the paper has 5, that is 32³ colours, section 3.2).
     """

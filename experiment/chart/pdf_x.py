@@ -9,8 +9,8 @@ PDF/X-4 has these requirements. The numbers are clauses of ISO 32000-1 (PDF 1.7)
 - No fonts, actions or external files; no transparency, no transfer functions.
 
 The codes on the page are not tagged, so they are not changed if colour management is off. For printing with colour
-management, both ICC profiles declare sRGB (IEC 61966-2-1). Neither profile describes a printer. The output intent of a
-PDF needs the profile of an output device, and a TIFF needs the profile of an input device or display.
+management, the output intent of a PDF needs the ICC profile of an output device, and a TIFF needs that of an input
+device or display. Both profiles declare sRGB (IEC 61966-2-1). Neither describes a printer.
 
 Source of the profiles: ICC.1:2001-04 (version 2.4), header 6.1, required tags 6.3, lut16Type 6.5.8,
 textDescriptionType 6.5.17. The primaries of sRGB are adapted to D50 by the Bradford transform, as in the sRGB profiles

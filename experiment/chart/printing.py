@@ -109,8 +109,8 @@ def _marks_px(chart: Chart) -> Boxes:
 def tag_modules(tag: Tag) -> npt.NDArray[np.bool_]:
     """Return the modules of a tag on the upright print, (8, 8) bool, true for white.
 
-    OpenCV's `DICT_APRILTAG_36h11` shows the tags of the AprilTag authors rotated by half a turn. The detector of these
-    authors returns the same ids, and the corners of `corners_mm` in the order [1, 0, 3, 2].
+    OpenCV's `DICT_APRILTAG_36h11` has each tag rotated by 180° against the tag of the AprilTag authors. Their detector
+    returns the same id, and the corners of `corners_mm` in the order [1, 0, 3, 2].
     """
     import cv2
 

@@ -432,7 +432,7 @@ class PreparedImage:
         return cls(smooth, tuple(usable), tuple(levels), bright, (height, width), factor)
 
     def to_small(self, points_px: _Points) -> _Points:
-        """Return points (..., 2) float64 half-size px in pixels of the reduced image."""
+        """Convert points (..., 2) float64 from half-size px to pixels of the reduced image."""
         return (points_px - (self.factor - 1) / 2) / self.factor
 
     def paleness_at(self, points_px: _Points) -> _Float:

@@ -174,7 +174,7 @@ def _tag_shift(reference: Plane, plane: Plane, tag: DetectedTag) -> _Points | No
     for _ in range(_STEPS):
         remapped = cv2.remap(plane_crop, columns + np.float32(shift[0]), rows + np.float32(shift[1]), cv2.INTER_CUBIC)
         moved = np.asarray(remapped, dtype=np.float64).ravel()
-        # moved = gain · (template + g · step + laplacian · growth / 2) + offset, linear in the products.
+        # moved = gain · (template + g · step + laplacian · growth / 2) + offset. The products with gain are fitted.
         solution = inverse @ np.asarray(np.einsum("ni,n->i", design, moved), dtype=np.float64)
         if solution[0] <= 0:
             return None

@@ -242,7 +242,7 @@ def _sum_rows(
     sums: npt.NDArray[np.int64],
     totals: npt.NDArray[np.int64],
 ) -> None:
-    """Write sums of counts (H, W) of tiles to `sums` (rows, tiles, 4), clipped and empty counts to `totals` (2,)."""
+    """Sum counts (H, W) by tile into `sums` (rows, tiles, 4); count clipped and empty ones in `totals` (2,)."""
     clipped, empty = 0, 0
     for row in range(sums.shape[0]):
         for half in range(2):

@@ -196,7 +196,7 @@ def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tup
     # Order of the groups, with the distance r from the centre: constant, slope, curvature; r⁴ and r⁶; other terms of
     # third and fourth order; r⁸; other terms of fifth and sixth order. The group of r⁴ also contains x·r² and y·r²,
     # which describe a shift of its centre. The groups of r⁶ and r⁸ contain similar terms. Up to the sixth order, each
-    # radial term replaces another term of its order.
+    # radial term replaces a monomial of its order.
     groups = (
         [power(0), power(1), power(2), power(3)]
         if outside_only

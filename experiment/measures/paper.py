@@ -84,7 +84,7 @@ class FlatField:
     """Spatial distribution of the light over the print, mean 1 over the patches."""
 
     page_mm: tuple[float, float]
-    # For each channel, coefficients (terms,) float64 of polynomials. Their product is the flat field.
+    # For each channel, coefficients (terms,) float64 of the polynomials whose product is the flat field.
     coefficients: tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ...]]
 
     @classmethod
@@ -274,16 +274,15 @@ class _Fit:
         normal, right = weighted.T @ self.design, weighted.T @ self.values
         residual = self.values - self.design[:, :terms] @ self.solution
         variance = float(self.weights @ residual**2) / max(float(self.weights.sum()) - terms, 1.0)
-        # Variance from the scatter of the references, plus the squared changes of the mean with other likely numbers of
-        # terms.
+        # One part of the variance comes from the scatter of the references, the other from the choice of terms.
         variance_sum, level = 0.0, float(term_means[:terms] @ self.solution)
         for count, likelihood in self.likelihoods:
             if count == terms or likelihood > _UNLIKELY:
-                mean_per_right = np.linalg.lstsq(normal[:count, :count], term_means[:count], rcond=None)[0]
+                right_weights = np.linalg.lstsq(normal[:count, :count], term_means[:count], rcond=None)[0]
                 if count == terms:
-                    variance_sum += variance * float(mean_per_right @ term_means[:count])
+                    variance_sum += variance * float(right_weights @ term_means[:count])
                 else:
-                    variance_sum += likelihood * (float(mean_per_right @ right[:count]) - level) ** 2
+                    variance_sum += likelihood * (float(right_weights @ right[:count]) - level) ** 2
         return float(np.sqrt(variance_sum))
 
 

@@ -109,8 +109,8 @@ def _deviation(levels: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array
     if not rows or is_measured.sum() < 2:
         return np.full(len(nodes), np.nan), np.inf
     # A power law appears as a slope of the deviation over the logarithm of the level. Noise causes such a slope, too,
-    # so the slope is constrained to 0. A deviation that repeats after each exposure step has no effect on the factors,
-    # so every deviation gets a weak constraint towards 0.
+    # so the slope is constrained to 0. Equal deviations at levels one exposure step apart cancel in every ratio, so
+    # every deviation gets a weak constraint towards 0.
     centred_log_nodes = np.where(is_measured, np.log(nodes) - np.log(nodes)[is_measured].mean(), 0)
     constraints = np.zeros((2 + len(nodes), frames - 1 + len(nodes)))
     constraints[0, frames - 1 :], constraints[1, frames - 1 :] = _HARD * is_measured, _HARD * centred_log_nodes

@@ -54,9 +54,9 @@ OWN_KEPT = 0.85
 
 _ROUNDS = 3  # Largest number of rounds; each predicts without the patches that were stained in the previous round
 
-_LEAST_KNOWN = 9  # Smallest number of known codes, of 25, for a median curvature
+_LEAST_KNOWN = 9  # Smallest number of known codes among 25 neighbours for a median curvature
 
-_LEAST_EQUAL_CODES = 3  # Smallest number of known codes for the median curvature at equal values
+_LEAST_EQUAL_CODES = 3  # Smallest number of known codes with two equal values for a median curvature
 
 _LEAST_NEIGHBOURS = 5  # Smallest number of known patches in a neighbourhood for its mean
 
@@ -68,8 +68,7 @@ _BRIGHT_PERCENTILE = 99.0  # Percentile of the patch levels that represents whit
 # Largest distance between neighbouring patches of one spot, in patch sides. One clean patch may lie between them.
 _SPOT_DISTANCE = 2.3
 
-# Largest distance from a spot, in patch sides, of the unlisted patches in which its added light is measured: two rings
-# of patches (judgement).
+# The added light of a spot is measured in unlisted patches within this distance, in patch sides: two rings (judgement).
 _SURROUNDING_DISTANCE = 2.5
 
 _Array = npt.NDArray[np.float64]

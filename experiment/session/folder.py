@@ -1,8 +1,8 @@
 """Create, open and check the folder of a session. No device is used here.
 
 A frame is recorded in two steps: first its raw file is written, flushed and renamed, then its row in the journal is
-committed. If a crash happens between the steps, the file is renamed; it is neither used nor deleted. The journal is
-authoritative, and `frames.csv` is derived from it.
+committed. If a crash happens between the steps, the next run appends `.stray` to the file name and ignores the
+file. The journal is authoritative, and `frames.csv` is derived from it.
 """
 
 from __future__ import annotations
@@ -321,7 +321,7 @@ def _own_copy(load: Callable[[Path], _Loaded], path: Path, content: str) -> _Loa
     except FormatError as error:
         remedy = (
             f"restore it from a copy of the session, or copy the {content} of the session there; session.toml has "
-            "their path"
+            "the path"
         )
         raise FormatError(error.problem, about=error.about, remedy=remedy, value=error.value) from error
 

@@ -110,7 +110,7 @@ class HandlesPauses(Protocol):
     """A judge that accepts changes of the laboratory during a pause of the run."""
 
     def after_pause(self) -> None:
-        """Prepare for the first frames after a pause for a lasting cause (`link_steps`).
+        """Prepare for the frames of `link_steps`, which follow a pause for a lasting cause.
 
         It is called after all earlier frames are judged, and before the next frame is judged.
         """
@@ -332,7 +332,7 @@ def plan_steps(
 
 
 def link_steps(first_number: int) -> tuple[SessionStep, ...]:
-    """Return the first frames of a resumed run, with which its frames can be compared with the earlier frames.
+    """Return the first frames of a resumed run, which make its frames comparable with earlier frames.
 
     A grey and the primaries measure the response of the projector again. A white and a dark frame are the new
     references of the next illuminants, because the lamp may have changed during the pause.
