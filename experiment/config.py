@@ -1,6 +1,7 @@
-"""Settings of `LAB.toml`: typed, frozen and checked; an unknown key is an error that names the closest known key.
+"""Read the settings in `LAB.toml` and check every value.
 
-No device is opened here. Paths are resolved against the folder of the file, and values are checked.
+An unknown key is an error, and its message suggests the closest known key. Relative paths are resolved against the
+folder of the file. No device is opened here.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 # Keys whose values must not appear in messages or in `session.toml`, because sessions are copied and published.
 _SECRETS = ("sequence.notify", "notify.alive", "lab.projector.password")
 
-# Rig of a session with imported frames, in which no more frames can be taken. Messages do not offer it for LAB.toml.
-NOT_TO_CHOOSE: Final = "imported"
+# Value of `rig` in a session with imported frames. Messages do not suggest it, because no frames can be taken with it.
+IMPORTED_RIG: Final = "imported"
 
-# Characters read from a file with a secret: passwords and addresses are shorter. A longer file was given by mistake.
+# Largest number of characters that are read from a file with a secret. Passwords and URLs are shorter.
 _SECRET_CHARACTERS = 4096
 
 
-# A target of notices is a URL with a host, or a command line. No message contains it, because it may hold a secret.
+# Notices are sent to a URL or to a command. Messages do not show this target, because it may contain a secret.
 def _check_target(target: str) -> str:
     if not is_webhook(target):
         # Raises ValueError for an unclosed quotation mark.
@@ -61,9 +62,9 @@ def _check_target(target: str) -> str:
 
 
 def spdx_expression(licence: str) -> str:
-    """Return an SPDX licence expression in canonical spelling, ``CC-BY-4.0``; an empty text stays empty.
+    """Return a licence expression in canonical spelling, for example ``CC-BY-4.0`` (SPDX 2.3, annex D).
 
-    SPDX specification 2.3, annex D. Other texts raise a ValueError.
+    An empty text stays empty. Any other text that is not an SPDX expression raises a `ValueError`.
     """
     if not licence.strip():
         return ""
@@ -120,9 +121,9 @@ class CameraSettings(Settings):
     iso: Annotated[int, Field(gt=0)] = 100
     """ISO speed."""
     aperture: Annotated[float | Literal["none"], PlainValidator(_parse_f_number)] = 8.0
-    """f-number; ``"none"`` if the body does not control the aperture: lens without contacts, adapter, telescope."""
+    """f-number; ``"none"`` if the camera cannot set the aperture, for example on a telescope."""
     shutter_s: Positive = 0.5
-    """Shutter time in seconds; under a DLP projector at least 0.5 and a whole multiple of 1/60."""
+    """Shutter time in seconds. With a DLP projector, use at least 0.5 s and a whole multiple of 1/60 s."""
 
     @cached_property
     def exposure(self) -> ExposureSettings:
@@ -131,51 +132,52 @@ class CameraSettings(Settings):
 
 
 class SequenceSettings(Settings):
-    """How the session is taken."""
+    """Order, timing and repetition of the frames of a session, and reactions to failures."""
 
     settle_s: NotNegative = 0.5
-    """Seconds between the appearance of a colour on the screen and the release."""
+    """Waiting time between a new colour on the screen and the exposure, seconds."""
     reference_every: Annotated[int, Field(ge=1)] = 25
     """Number of illuminants between two pairs of white and dark frames."""
     attempts: Annotated[int, Field(ge=1, le=20)] = 3
-    """Attempts at a frame before it is left to the next run."""
+    """Largest number of attempts at a frame in one run. The next run tries the frame again."""
     warm_up_s: NotNegative = 1200.0
-    """Seconds that the lamp warms up before the first frame."""
+    """Warm-up time of the lamp before the first frame, seconds."""
     patience_s: Annotated[float, BeforeValidator(_parse_seconds), Field(ge=0)] = 600.0
-    """Seconds that a run waits for a device (camera, screen, projector) or the disk after a failure, before it ends;
-    ``inf`` or ``"forever"``: no limit. Each of them restarts within ten minutes. When a run ends, the lamp goes out."""
+    """Longest time that a run waits after a failure of a device or the disk, seconds; ``inf`` or ``"forever"``: no
+    limit. Then the run ends. Most devices restart within ten minutes."""
     order: Literal["shuffled", "listed"] = "shuffled"
-    """Order of the illuminants: shuffled by `seed`, so that drift of the lamp and unchanged images do not correlate
-    with colour; or as listed."""
+    """Order of the illuminants. ``"shuffled"``: a random order from `seed`, so that lamp drift does not correlate with
+    colour. ``"listed"``: the order of the file."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the shuffled order."""
     switch_off: bool = True
     """Switch the projector off when the session is complete."""
     lamp_if_unfinished: Literal["off", "on"] = "off"
-    """State of the lamp when a run ends with an incomplete session: off, because nobody may be present, or on, so that
-    the next run needs no warm-up. Ctrl-C does not change it."""
+    """State of the lamp after a run that ends with an incomplete session. If it is on, the next run needs no warm-up.
+    Ctrl-C leaves the lamp as it is."""
     relight: bool = False
-    """Switch a projector on again that is in standby during a run, for example after a power cut; the run continues
-    when the lamp is warm. Off by default, because somebody may have switched the projector off on purpose."""
+    """Switch the projector on again if it goes to standby during a run, for example after a power cut. The run
+    continues after the warm-up. Off by default, because somebody may have switched the projector off on purpose."""
     refused_gb: Annotated[float, Field(gt=0)] = 5.0
-    """Disk space in gigabytes for refused and void frames of one run, after which it ends: 200 frames of 18 megapixels,
-    a quarter of a session; ``inf``: no limit."""
+    """Largest disk space for the refused and voided frames of one run, gigabytes; ``inf``: no limit. If they need more,
+    the run ends."""
     notify: Annotated[str, AfterValidator(_check_target), Field(repr=False)] = ""
-    """Receiver of notices when a run pauses, resumes and ends: a URL that gets JSON by POST, or a command that gets
-    it on its standard input; empty: none. ``{ env = "NAME" }`` or ``{ file = "PATH" }`` read it from an environment
-    variable or a file. Messages and `session.toml` contain only the host or the name of the program."""
+    """Target of notices when a run pauses, resumes or ends: a URL that receives JSON by POST, or a command that
+    receives JSON on its standard input. If empty, no notices are sent. ``{ env = "NAME" }`` or ``{ file = "PATH" }``
+    read the target from an environment variable or a file. Messages and `session.toml` contain only the host or the
+    name of the program."""
 
 
 class NotifySettings(Settings):
-    """Signs of life of a run."""
+    """Regular signs of life of a run."""
 
     alive: Annotated[str, AfterValidator(_check_target), Field(repr=False)] = ""
-    """A URL or a command, as in `sequence.notify`, that gets a sign of life of the run at most once a minute, and its
-    result at the end. A service that expects it and alerts somebody if it is missing is a dead man's switch."""
+    """Target of signs of life: a URL or a command, as in `sequence.notify`. A sign is sent at most once a minute, and
+    the result at the end of the run. A monitoring service can alert somebody if the signs stop."""
 
 
 class LimitSettings(Settings):
-    """Limits of exposure beyond which a frame is refused."""
+    """Limits of the exposure of a frame. A frame beyond a limit is refused."""
 
     clipped_percent: NotNegative = 0.1
     """Largest fraction of photosites at or above 98 % of saturation, per cent."""
@@ -186,69 +188,68 @@ class LimitSettings(Settings):
 
 
 class JudgeSettings(Settings):
-    """Limits of the measurements of every frame, beyond which it is refused.
+    """Limits of the measurements on every frame. A frame beyond a limit is refused.
 
-    Pixels are half-size pixels, one for each 2×2 block of photosites. Limits without a measurement are judgement.
+    Lengths are in half-size pixels (px), one for each 2×2 block of photosites.
     """
 
     chart: bool = True
-    """Detect the chart in the frames; false for a bare wall, of which only the light is judged."""
+    """Detect the chart in the frames. Use false for a bare wall: then only the light is checked."""
     response: bool = True
-    """Start a session with primaries and greys of the projector, from which the light of all codes is predicted; false
-    saves about 20 frames, but illuminants are then checked less."""
+    """Start a session with response frames (primaries and greys), from which the light of all codes is predicted. With
+    false, a session has about 20 frames fewer, but wrong illuminants are detected less reliably."""
     moved_px: NotNegative = 0.2
-    """Largest displacement of the chart from its rest position, px. That is the position in the first white frame, or a
-    later one less than a pixel away at which it stays. The limit is ten times the error on a dark frame (0.02 px at
-    66 counts), and below the margin of the 25 samples of a patch (about 0.3 px)."""
+    """Largest displacement of the chart from its reference position, px. The reference is the position in the first
+    white frame. If the chart is displaced slightly and then rests, its new position becomes the reference. The limit
+    is ten times the measurement error in a dark image."""
     blur_px: NotNegative = 0.3
-    """Largest growth of the blur σ since the first white frame, px, as root of the difference of squares: less than the
-    blur of a lens (0.5 px)."""
+    """Largest growth of the blur since the first white frame, px: √(σ² − σ₀²) for the blur σ₀ of that frame and the
+    blur σ of a later one. The blur of a good lens is about 0.5 px."""
     drift_percent: NotNegative = 1.0
-    """Deviation of the lamp from its expected level that is always allowed, per cent: usual for a warm lamp;
-    `build-lut` warns from the same value. If levels scatter, more is allowed."""
+    """Deviation of the lamp from its expected level that is always allowed, per cent. A warm lamp usually stays within
+    it. If the levels of the lamp scatter, a larger deviation is allowed. `build-lut` warns from the same value."""
     dark_percent: NotNegative = 5.0
-    """Largest light in a dark frame, per cent of white: half of the limit of `build-lut`, which warns from 0.5 %, as
-    does `acquire check`. Constant stray light harms dark colours, and repeating a frame does not remove it."""
+    """Largest level of a dark frame, per cent of white. The limit is half of the limit of `build-lut`. `build-lut` and
+    `acquire check` already warn from 0.5 %, because stray light harms dark colours."""
     ambient_percent: NotNegative = 0.2
-    """Largest change of that light since the first dark frame, per cent of white: `build-lut` warns from the same
-    value."""
+    """Largest change of the level of dark frames since the first dark frame, per cent of white. `build-lut` warns from
+    the same value."""
     light_deg: NotNegative = 0.5
-    """Angle between the measured and the predicted illuminant that is always allowed, degrees; if the prediction is
-    uncertain, more is allowed. The prediction uses the response frames. A fifth of the 707 illuminants have a neighbour
-    within 2 degrees, four times this value."""
+    """Angle between the measured and the predicted illuminant that is always allowed, degrees. If the prediction is
+    uncertain, a larger angle is allowed. The prediction is calculated from the response frames."""
 
 
 class CitationSettings(Settings):
-    """Information that no device provides; `build-lut` writes it into the look-up table (LUT) and its data sets."""
+    """Information that no device provides. `build-lut` writes it into the look-up table (LUT)."""
 
     title: Annotated[str, Field(max_length=500)] = ""
-    """Title of the LUT in citations; empty: its camera and illuminants."""
+    """Title of the LUT in citations. If empty, the camera and the illuminants are named."""
     authors: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ()
     """Authors, each as "Family, Given" or the name of an institution."""
     licence: Annotated[str, Field(max_length=500), AfterValidator(spdx_expression)] = ""
-    """Licence of the LUT, an SPDX expression such as "CC-BY-4.0"; empty: not recorded."""
+    """Licence of the LUT, an SPDX expression such as "CC-BY-4.0". If empty, no licence is recorded."""
     note: Annotated[str, Field(max_length=20_000)] = ""
-    """Note for readers of the LUT, for example the order at the print shop, or what went wrong."""
+    """Note for users of the LUT, for example on the print shop or on faults of the session."""
     url: Annotated[str, Field(max_length=500)] = ""
     """Address of the LUT, for example its DOI."""
     lens: Annotated[str, Field(max_length=500)] = ""
-    """The lens, if it has no contacts and raw files do not name it."""
+    """Name of the lens, if raw files do not contain it."""
     projector: Annotated[str, Field(max_length=500)] = ""
-    """The projector, if it has no control port that names it."""
+    """Name of the projector, if it cannot be read through a control port."""
     camera_serial: Literal["hash", "plain", "withheld"] = "hash"
-    """Serial number of the body in the LUT: "hash" only distinguishes bodies, "plain" is the number itself, "withheld"
-    leaves it out."""
+    """Serial number of the camera in the LUT. "hash": a hash, which only distinguishes cameras. "plain": the number
+    itself. "withheld": no entry."""
 
 
 class SimulatedSettings(Settings):
     """The simulated laboratory."""
 
     body: str = "EOS 550D"
-    """Camera body: EOS 550D, EOS 6D Mark II, Test; or sensitivities by name or file, as in `sim table --camera`."""
+    """EOS 550D, EOS 6D Mark II or Test; or spectral sensitivities by name or file, as in `sim table --camera`."""
     camera: dict[str, Any] | None = None
-    """Properties of the body that differ, with the names of sim.world.sensors.Body."""
+    """Properties that differ from this body, with the field names of sim.world.sensors.Body."""
     seed: Annotated[int, Field(ge=0)] = 1
-    """Seed of all random numbers: paper, noise."""
+    """Seed of all random numbers, for example of noise and paper structure."""
     room: dict[str, bool | int | float | str] = {}
     """Physical parameters of the room that differ from the default; see sim.world.world.Room."""
     events: tuple[dict[str, Any], ...] = ()
@@ -280,17 +281,17 @@ class ProjectorCable(Settings):
     """Control and light of the projector of a real laboratory."""
 
     control: Literal["none", "pjlink", "serial"] = "none"
-    """pjlink: PJLink; serial: language of the manufacturer over a serial port or TCP; none: switched by hand."""
+    """pjlink: PJLink; serial: commands of the manufacturer over a serial port or TCP; none: switched by hand."""
     language: str | None = None
-    """For ``serial``: name of a language (docs/devices.md), or path of a language file (.toml), relative to the
+    """For ``serial``: name of a command language (docs/devices.md), or path of a language file (.toml) relative to the
     settings file."""
     host: Host | None = None
     """Address, for PJLink and for languages over TCP."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
     """TCP port, if different from the default of the language."""
     password: Annotated[str | None, Field(repr=False)] = None
-    """PJLink password. ``{ env = "NAME" }`` or ``{ file = "PATH" }`` read it from an environment variable or a file. It
-    is not in `session.toml`."""
+    """PJLink password. ``{ env = "NAME" }`` or ``{ file = "PATH" }`` read it from an environment variable or a file.
+    `session.toml` does not contain it."""
     device: str | None = None
     """Serial port, such as /dev/ttyUSB0."""
     baud: Annotated[int, Field(ge=300)] | None = None
@@ -320,8 +321,8 @@ class LabSettings(Settings):
     """All settings of LAB.toml."""
 
     rig: Literal["lab", "simulated", "imported"]
-    """Devices: lab (real devices) or simulated (simulated laboratory). `imported` marks a session with frames
-    that were taken by other means."""
+    """Devices: lab (real devices) or simulated (simulated laboratory). `imported` marks a session whose frames were
+    taken with other software."""
     chart: Path
     """chart.json of the print, relative to the settings file."""
     illuminations: Path
@@ -338,10 +339,10 @@ class LabSettings(Settings):
 
     @property
     def file(self) -> str:
-        """File of the settings, for messages."""
+        """Name of the settings file in messages."""
         return self._file
 
-    def read_from(self, file: str) -> LabSettings:
+    def with_file_name(self, file: str) -> LabSettings:
         """Return a copy of the settings with the name of their file."""
         copy = self.model_copy()
         copy._file = file  # noqa: SLF001 - same class
@@ -352,13 +353,13 @@ class LabSettings(Settings):
         values = self.model_dump(mode="json", exclude_none=True)
         values["sequence"]["notify"] = target_label(self.sequence.notify)
         values["notify"]["alive"] = target_label(self.notify.alive)
-        # Commands that need the password read it from LAB.toml.
+        # Only LAB.toml contains the password.
         values["lab"]["projector"].pop("password", None)
         return tomli_w.dumps(values)
 
 
 def load_lab(path: Path) -> LabSettings:
-    """Read `LAB.toml` and resolve every path against its folder; `ConfigurationError` if a value is not usable."""
+    """Read `LAB.toml`, and resolve every path against its folder; `ConfigurationError` if a value is not valid."""
     if path.is_dir():
         remedy = f"give {path / 'LAB.toml'}"
         raise ConfigurationError("a folder, expected a settings file", about=path, remedy=remedy)
@@ -377,7 +378,7 @@ def load_lab(path: Path) -> LabSettings:
 
 
 def parse_lab(text: str, source_name: str, folder: Path | None = None) -> LabSettings:
-    """Parse the settings in a TOML text without resolving paths; `ConfigurationError` if a value is not usable.
+    """Parse the settings in a TOML text without resolving paths; `ConfigurationError` if a value is not valid.
 
     Parameters
     ----------
@@ -386,27 +387,27 @@ def parse_lab(text: str, source_name: str, folder: Path | None = None) -> LabSet
     source_name
         Name of the text in errors.
     folder
-        Folder to which files with secrets are relative; if None, secrets are not read, as in `session.toml`.
+        Folder of relative paths to files with secrets. None for `session.toml`, which contains no secrets.
     """
     document = parse_toml(text, source_name)
     if folder is not None:
         _insert_secrets(document, folder, source_name)
-    return validate_settings(LabSettings, document, source_name).read_from(source_name)
+    return validate_settings(LabSettings, document, source_name).with_file_name(source_name)
 
 
 def validate_settings(model: type[_AnySettings], document: dict[str, Any], source_name: str) -> _AnySettings:
-    """Validate the settings in a document; `ConfigurationError` lists every unusable key without secrets."""
+    """Validate the settings in a document; `ConfigurationError` lists every invalid key, but no secret."""
     try:
         return model.model_validate(document)
     except ValidationError as error:
-        mistakes = find_mistakes(model, document, error, _is_secret, NOT_TO_CHOOSE)
-        # The cause would show the secret in the traceback.
+        mistakes = find_mistakes(model, document, error, _is_secret, IMPORTED_RIG)
+        # The original error would show the secret in the traceback.
         has_secret = any(_is_secret(".".join(map(str, mistake["loc"]))) for mistake in error.errors())
         raise ConfigurationError(f"{source_name}:{list_mistakes(mistakes)}") from (None if has_secret else error)
 
 
 def _is_secret(key: str) -> bool:
-    # Tables above a secret contain it, too.
+    # A table that contains a secret is secret, too.
     return any(f"{secret_key}.".startswith(f"{key}.") or key.startswith(f"{secret_key}.") for secret_key in _SECRETS)
 
 
@@ -414,15 +415,15 @@ def _insert_secrets(document: dict[str, Any], folder: Path, source_name: str) ->
     errors: list[ConfigurationError] = []
     for key in _SECRETS:
         *tables, name = key.split(".")
-        holder: Any = document
+        level: Any = document
         for table_name in tables:
-            holder = cast("dict[str, Any]", holder).get(table_name) if isinstance(holder, dict) else None
-        table = cast("dict[str, Any]", holder) if isinstance(holder, dict) else {}
+            level = cast("dict[str, Any]", level).get(table_name) if isinstance(level, dict) else None
+        table = cast("dict[str, Any]", level) if isinstance(level, dict) else {}
         value = table.get(name)
         if isinstance(value, dict):
             source = cast("dict[str, Any]", value)
             if tables[0] == "lab" and document.get("rig") != "lab":
-                # Only real devices need a password, so a session can be rehearsed without it.
+                # Only real devices need a password. A simulated session can run without it.
                 del table[name]
                 continue
             try:

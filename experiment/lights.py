@@ -1,8 +1,9 @@
-"""Illuminants of an experiment (707 in the paper), their file `illuminations.csv`, and their plot.
+"""Plan the illuminants of an experiment, read and write `illuminations.csv`, and plot the illuminants.
 
-The paper (section 3.1) requires uniformly spread chromaticities and black bodies, without a recipe. Here they are the
-points of a triangular grid r = i/n, b = j/n, g = 1 − r − b in linear light, and black bodies from 2000 K to 10 000 K.
-Each is scaled to its brightest channel and encoded with the transfer function of the projector (sRGB unless measured).
+The paper (Banić et al. 2019, section 3.1) uses 707 illuminants: uniformly spread chromaticities and black bodies. It
+does not list them. Here the uniform chromaticities form a triangular grid in linear light: r = i/n, b = j/n,
+g = 1 − r − b. The black bodies have 2000 K to 10 000 K. Every illuminant is scaled until its brightest channel is 1,
+and encoded with the sRGB transfer function.
 """
 
 from __future__ import annotations
@@ -25,19 +26,19 @@ from foundation.files import atomic_file, csv_text, read_csv, write_atomic
 Kind = Literal["uniform", "blackbody", "spectrum"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")  # Columns of `illuminations.csv` (docs/formats.md)
 
-NAME = "name"  # Additional column with names of illuminants, for computed LUTs with other spectra
+NAME = "name"  # Additional column with names of illuminants, for LUTs that are computed from spectra
 
-# Steps along an edge of the chromaticity triangle: 666 points; with 41 black bodies these are the 707 of the paper.
+# Steps along an edge of the chromaticity triangle. They give 666 points, which together with 41 black bodies are 707.
 GRID = 35
 
 CCTS_K = tuple(range(2000, 10001, 200))  # Black bodies of the plan, K: from candle light to blue sky
 
-MOST_CCTS = 10_000  # Largest number of temperatures in a text; a larger number comes from a wrong step
+MOST_CCTS = 10_000  # Largest number of temperatures in a range; more are probably a typing error in the step
 
 
 FORMATS = ("png", "pdf", "svg")  # File extensions of plots, and Matplotlib's names of the formats
 
-# Temperatures with a label in the plot, K: few enough that labels do not touch.
+# Temperatures with a label in the plot, K. More labels would overlap.
 _NAMED_CCTS_K = (2000, 3000, 4000, 6000, 10000)
 
 
@@ -46,30 +47,30 @@ class Illuminant:
     """One illuminant of the plan."""
 
     index: int
-    kind: Kind  # "spectrum" for a computed illuminant with its own spectrum
+    kind: Kind  # "spectrum": an illuminant of a LUT that was computed from spectra
     cct_k: float | None  # temperature of a black body, K
-    colour: Colour  # codes that the projector shows; for a computed illuminant, codes of the nearest colour
-    name: str | None = None  # name of a computed illuminant, such as "D65"
+    colour: Colour  # codes that the projector shows; for kind "spectrum", codes of the nearest colour
+    name: str | None = None  # name of an illuminant of kind "spectrum", such as "D65"
 
 
 def shown_colour(linear: npt.ArrayLike) -> Colour:
-    """Return the codes of a linear RGB colour (3,) float ≥ 0, scaled to its brightest channel."""
+    """Return the codes of a linear RGB colour (3,) float ≥ 0, scaled until its brightest channel is 255."""
     linear = np.maximum(np.asarray(linear, dtype=np.float64), 0.0)
     codes = np.rint(255 * encode_srgb(linear / linear.max())).astype(int)
     return Colour(*(int(code) for code in codes))
 
 
 def uniform_lights(grid: int = GRID) -> list[npt.NDArray[np.float64]]:
-    """Return the (grid+1)(grid+2)/2 points of the triangular grid as linear (r, g, b), (3,) float64 of sum 1."""
+    """Return the (grid+1)(grid+2)/2 points of the triangular grid: linear r, g, b, (3,) float64 with the sum 1."""
     return [
         np.array([i, grid - i - j, j], dtype=np.float64) / grid for i in range(grid + 1) for j in range(grid + 1 - i)
     ]
 
 
 def blackbody_light(cct_k: float) -> npt.NDArray[np.float64]:
-    """Return the linear sRGB of a black body, (3,) float64, with 1 in the brightest channel.
+    """Return the linear sRGB (3,) float64 of a black body with the temperature `cct_k`; the brightest channel is 1.
 
-    Planck's law at `cct_k` kelvin, CIE 1931 2° observer, sRGB primaries (IEC 61966-2-1), clipped to the gamut.
+    Planck's law, CIE 1931 2° observer and sRGB primaries (IEC 61966-2-1). Negative channels become 0.
     """
     wavelengths = np.arange(360.0, 781.0)
     linear = np.maximum(linear_srgb(xyz_of(wavelengths, planck(wavelengths, cct_k))), 0.0)
@@ -90,7 +91,7 @@ def illuminants_to_csv(illuminations: Sequence[Illuminant]) -> str:
     """Return the text of `illuminations.csv`."""
     rows: list[Sequence[object]] = [COLUMNS]
     for light in illuminations:
-        # Whole kelvin without a point, anything else with all its digits.
+        # Whole numbers are written without ".0", other numbers with all digits.
         cct = "" if light.cct_k is None else repr(light.cct_k).removesuffix(".0")
         rows.append([light.index, light.kind, cct, *light.colour])
     return csv_text(rows)
@@ -104,7 +105,7 @@ def save_illuminants(illuminations: Sequence[Illuminant], path: Path) -> None:
 def load_illuminants(path: Path, *, computed: bool = False) -> tuple[Illuminant, ...]:
     """Read `illuminations.csv`; additional columns are ignored.
 
-    `computed`: whether the file belongs to a computed LUT, with names and other spectra.
+    `computed`: whether the file belongs to a LUT computed from spectra, whose illuminants have names.
     """
     rows = read_csv(path, "make one with: acquire illuminations", "illuminations")[1]
     if not rows or any(column not in rows[0] for column in COLUMNS):
@@ -137,7 +138,7 @@ def load_illuminants(path: Path, *, computed: bool = False) -> tuple[Illuminant,
 
 
 def parse_ccts(text: str) -> tuple[float, ...]:
-    """Parse temperatures in K as ``FIRST:LAST:STEP`` or ``K,K,…``; an empty text has none."""
+    """Parse temperatures in K, written as ``FIRST:LAST:STEP`` or ``K,K,…``; an empty text gives no temperature."""
     description = f"black bodies {text!r}"
     try:
         ccts = [float(field) for field in text.split(":" if ":" in text else ",") if field.strip()]
@@ -151,8 +152,8 @@ def parse_ccts(text: str) -> tuple[float, ...]:
         steps = (last - first) / step if step else math.nan
         if not 0 <= steps < MOST_CCTS:
             raise InputError(
-                f"{description}: a range from {first:g} to {last:g} K in steps of {step:g} K; at most {MOST_CCTS} "
-                "temperatures expected, and a step below 0 for a falling range; change the step"
+                f"{description}: a range from {first:g} to {last:g} K in steps of {step:g} K, expected at most "
+                f"{MOST_CCTS} temperatures, and a negative step if the range falls; change the step"
             )
         return tuple(first + step * number for number in range(int(steps + 1e-9) + 1))
     _require_kelvin(ccts, description)
@@ -166,7 +167,7 @@ def _require_kelvin(ccts: Sequence[float], description: str) -> None:
 
 
 def plot_illuminants(illuminations: Sequence[Illuminant], path: Path) -> None:
-    """Plot the rb-chromaticities of illuminants (paper, section 3.1), each point in its colour.
+    """Plot the rb-chromaticities of illuminants, each point in its colour (as in the paper, section 3.1).
 
     Chromaticities r = R / (R + G + B) and b = B / (R + G + B) are computed from the codes, decoded to linear light
     with the sRGB transfer function. An illuminant with the codes 0, 0, 0 is omitted.
@@ -183,7 +184,7 @@ def plot_illuminants(illuminations: Sequence[Illuminant], path: Path) -> None:
     r, _, b = (linear / linear.sum(axis=1, keepdims=True)).T
     is_black_body = np.array([light.kind == "blackbody" for light in lit_lights], dtype=np.bool_)
 
-    # Matplotlib's types do not include the keyword arguments.
+    # Matplotlib's type annotations lack the keyword arguments.
     figure: Any = Figure(figsize=(7.2, 6.8), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -211,7 +212,7 @@ def plot_illuminants(illuminations: Sequence[Illuminant], path: Path) -> None:
     )
     for light, x, y in zip(lit_lights, r, b, strict=True):
         if light.cct_k in _NAMED_CCTS_K:
-            # Labels are outside the triangle, so that they hide no point.
+            # Place the labels outside the triangle, so that they hide no point.
             shift = (1.04 - float(x) - float(y)) / 2
             axes.annotate(
                 f"{light.cct_k:g} K",
@@ -228,7 +229,7 @@ def plot_illuminants(illuminations: Sequence[Illuminant], path: Path) -> None:
     axes.set_aspect("equal")
     axes.legend(loc="upper right", frameon=False)
     axes.set_title(f"rb-chromaticities of {len(lit_lights)} illuminants")
-    # The date is not written, so that the same illuminants give the same PNG.
+    # Without date and software name, the same illuminants give the same file.
     metadata = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}[ending]
     with atomic_file(path) as stream:
         figure.savefig(stream, format=ending, dpi=150, metadata=metadata)

@@ -1,1 +1,1 @@
-"""Take a session: plan, devices, frames, retries, notices; and import of raw files taken by other means."""
+"""Take a session: plan, devices, frames, retries and notices. Import raw files that were taken by other means."""

@@ -1,17 +1,18 @@
-"""Devices of a session behind their protocols: make them ready, ask them, and wait if one fails or hangs.
+"""Make the devices of a session ready, query them, and wait if a device or the disk fails.
 
-A device or disk that fails is tried again after a second (`retry`). If it fails again, the run pauses (`paused`), with
-the current cause in every message. Another cause is reported at once (`still paused`); a change of digits alone is no
-other cause. `resumed` ends the pause. After `patience_s` the run ends with an error of the class of the first cause.
+After a failure, the run tries again after a second (event `retry`). If the second try also fails, the run pauses (event
+`paused`). Every message contains the current cause. If the cause changes, this is reported at once (event `still
+paused`), except if only numbers in the message change. The event `resumed` ends the pause. If the pause exceeds
+`patience_s`, the run ends with an error of the same class as the first cause.
 
 At the end of a run the screen is set to black, and the lamp is left in this state:
 
 ====================  =====================================  =========================================
 end of the run        lamp                                   reason
 ====================  =====================================  =========================================
-all frames are taken  off (`sequence.switch_off`)            its hours are limited
-ended by a fault      off (`sequence.lamp_if_unfinished`)    nobody may be there until the morning
-interrupted           unchanged                              somebody is there, and may continue at once
+all frames are taken  off (`sequence.switch_off`)            a lamp lasts a limited number of hours
+ended by a fault      off (`sequence.lamp_if_unfinished`)    perhaps nobody is present for hours
+interrupted           unchanged                              the operator may continue at once
 ====================  =====================================  =========================================
 """
 
@@ -48,33 +49,33 @@ from foundation.errors import (
     StorageError,
 )
 
-# Receiver of an event and its sentence: the terminal first, then the journal, then the target of notices.
+# Receives the name of an event, and a sentence about it.
 Report = Callable[[str, str], object]
 
-POWER_LIMIT_S: Final = 300.0  # Time for a lamp to light, s; makers state up to 130 s with repeated ignition
-# Shortest time, s, in which a lamp can light again and its projector be on the network again.
+POWER_LIMIT_S: Final = 300.0  # Longest time for a lamp to light, s; makers state up to 130 s with repeated ignition
+# Shortest time in which a projector that lost its power can light its lamp and answer again, s.
 RELIGHT_S: Final = 15.0
 
-QUESTIONS_SHARE: Final = 0.01  # Share of a frame's time that questions may always take: five answers of 4 ms in 2.3 s
+QUERIES_SHARE: Final = 0.01  # If all queries take less than this fraction of a frame's time, all are made at each frame
 
 _NAME: Final = "the projector"
 
-# Time for a projector to begin to switch off, s: projectors confirm the command before they execute it.
-OBEYS_S: Final = 5.0
-LOOK_S: Final = 0.5  # Interval between two questions for the power state, s
+# Longest time between the answer to a switch-off command and its execution, s.
+SWITCH_OFF_LIMIT_S: Final = 5.0
+POWER_QUERY_S: Final = 0.5  # Interval between two queries of the power state, s
 
-TRIES: Final = 3  # Tries to switch off the lamp: after one lost answer it must not stay on until the morning
-AGAIN_S: Final = 2.0  # Interval between two such tries, s: enough for a busy controller to answer
+TRIES: Final = 3  # Number of tries to switch the lamp off
+AGAIN_S: Final = 2.0  # Interval between these tries, s
 
 _BY_HAND: Final = "switch it off by hand"
 
 
 def make_ready(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> None:
-    """Switch the lamp on if necessary, wait until it is warm and the projector is healthy.
+    """Switch the lamp on if necessary, and wait until it is warm and the projector is healthy.
 
-    With a time limit of 0 in `retry`, the first fault is raised.
+    If the time limit of `retry` is 0, the first fault is raised.
     """
-    # A lamp that is lit at the first question is assumed to be warm.
+    # A lamp that is lit at the first query is assumed to be warm.
     was_lit = _light(projector, retry)
     retry.attempt(lambda: _unmute(projector), _NAME)
     pause = retry.pause(_NAME)
@@ -117,25 +118,25 @@ def _picture_fault(projector: Projector) -> DeviceFault | None:
     return DeviceFault(fault) if fault else None
 
 
-# Questions to a projector, one or two messages each; causes come before their consequences.
-_QUESTIONS: Final = (reported_error, _power_fault, _mute_fault, _picture_fault)
+# Queries for the health of a projector. Causes come before their consequences.
+_QUERIES: Final = (reported_error, _power_fault, _mute_fault, _picture_fault)
 
 
 def health_fault(
-    projector: Projector, questions: Iterable[Callable[[Projector], DeviceFault | None]] = _QUESTIONS
+    projector: Projector, queries: Iterable[Callable[[Projector], DeviceFault | None]] = _QUERIES
 ) -> DeviceError | None:
-    """Return why the projector is unhealthy, or did not answer; None if it is healthy."""
+    """Return the first fault of the projector, which may be a missing answer; None if it is healthy."""
     try:
-        return next((fault for question in questions if (fault := question(projector)) is not None), None)
+        return next((fault for query in queries if (fault := query(projector)) is not None), None)
     except DeviceError as fault:
         return fault
 
 
 class HealthWatch:
-    """Asks for the health of a projector between frames: all questions if they are fast, otherwise one per frame.
+    """Queries the health of a projector between frames: all queries if they are fast, otherwise one per frame.
 
-    On a slow line, questions would lengthen every frame. The judge detects a lamp that is out and a picture that is
-    muted or frozen, except in dark frames. All questions are therefore asked at dark frames, and after a refused frame.
+    On a slow connection, all queries would delay every frame. The judge detects a dark lamp and a muted or frozen
+    picture in all frames but dark frames. All queries are therefore made at dark frames, and after a refused frame.
     """
 
     def __init__(self, projector: Projector, clock: Clock) -> None:
@@ -147,34 +148,34 @@ class HealthWatch:
         self._suspected = False
 
     def suspect(self) -> None:
-        """Ask all questions the next time: a frame was refused."""
+        """Make all queries the next time, because a frame was refused."""
         self._suspected = True
 
     def fault(self, thorough: bool) -> DeviceError | None:
-        """Return why the projector is not healthy, according to the questions that are due; None if it is."""
+        """Make the queries that are due, or all if `thorough`; return the first fault, or None."""
         started = self._clock.monotonic()
         frame_s, self._started = started - self._started, started
         suspected, self._suspected = self._suspected, False
-        if thorough or suspected or math.isinf(self._cost_s) or self._cost_s <= QUESTIONS_SHARE * frame_s:
+        if thorough or suspected or math.isinf(self._cost_s) or self._cost_s <= QUERIES_SHARE * frame_s:
             fault = health_fault(self._projector)
             self._cost_s = self._clock.monotonic() - started
             return fault
-        question = _QUESTIONS[self._next]
-        self._next = (self._next + 1) % len(_QUESTIONS)
-        return health_fault(self._projector, (question,))
+        query = _QUERIES[self._next]
+        self._next = (self._next + 1) % len(_QUERIES)
+        return health_fault(self._projector, (query,))
 
 
 def _wait_until_healthy(projector: Projector, retry: RetryPolicy, pause: Pause, relight: bool) -> bool:
     """Wait until the projector is healthy; return whether its lamp went out, or may have gone out."""
-    # A projector out of reach for as long as a lamp takes to light may have lost its power.
+    # If the projector does not answer for `RELIGHT_S`, it may have lost its power.
     answered = retry.clock.monotonic()
     went_out = False
     while (fault := health_fault(projector)) is not None:
         if not isinstance(fault, LinkError):
             answered = retry.clock.monotonic()
             went_out = went_out or not _is_lit(projector)
-        # Only on request, since somebody may have switched it off on purpose; and once per pause, since repeated tries
-        # would wear out a lamp that does not light.
+        # This is done only with `relight`, because somebody may have switched the projector off on purpose. It is done
+        # once per pause, because repeated ignition wears out a lamp.
         if relight and _power(projector) is Power.STANDBY:
             relight = False
             with suppress(DeviceError):
@@ -185,7 +186,7 @@ def _wait_until_healthy(projector: Projector, retry: RetryPolicy, pause: Pause, 
 
 
 def _light(projector: Projector, retry: RetryPolicy) -> bool:
-    """Wait until the lamp is lit, switch it on if necessary; return whether it was lit at the first question."""
+    """Switch the lamp on if necessary, and wait until it is lit; return whether it was lit at the first query."""
     power: Power | None = retry.attempt(projector.power, _NAME)
     if power is Power.ON:
         return True
@@ -197,7 +198,7 @@ def _light(projector: Projector, retry: RetryPolicy) -> bool:
             started_s, switched = clock.monotonic(), True
         if clock.monotonic() - started_s > POWER_LIMIT_S:
             state = "does not answer" if power is None else f"is still in {power.value}"
-            start = "it was switched on" if switched else "the first question"
+            start = "it was switched on" if switched else "the first query"
             raise DeviceFault(
                 f"the projector {state} {POWER_LIMIT_S:g} s after {start}", remedy="check its lamp and its display"
             )
@@ -208,7 +209,7 @@ def _light(projector: Projector, retry: RetryPolicy) -> bool:
 
 
 def _power(projector: Projector) -> Power | None:
-    # Some projectors do not answer while the lamp is lighting.
+    # Some projectors do not answer while their lamp ignites.
     try:
         return projector.power()
     except (LinkError, DeviceRefused):
@@ -220,7 +221,7 @@ def _unmute(projector: Projector) -> None:
     if muted:
         projector.set_muted(False)
     elif muted is None:
-        # Some projectors report mute only after it was set once, and some cannot set it.
+        # Some projectors report mute only after it was set once, and others cannot set it.
         with suppress(DeviceRefused):
             projector.set_muted(False)
 
@@ -270,7 +271,7 @@ class RunEnd(Enum):
 
 
 def leave_lab(devices: Devices, end: RunEnd, sequence: SequenceSettings, report: Report) -> None:
-    """Set the screen to black, and switch the lamp off or leave it on; failures are reported and not raised."""
+    """Set the screen to black, and switch the lamp off or leave it on; faults are reported, not raised."""
     try:
         devices.presenter.show(BLACK)
     except DeviceError as error:
@@ -283,7 +284,7 @@ def settle_lamp(projector: Projector | None, end: RunEnd, sequence: SequenceSett
     if projector is None:
         return f"the projector is not controlled: {_BY_HAND}"
     if end is RunEnd.INTERRUPTED:
-        # The operator is waiting for the end, which a projector that does not answer would delay.
+        # The operator waits for the end. A query could delay it, if the projector does not answer.
         return f"it is left as it is, so that the next run needs no warm-up; if no run follows, {_BY_HAND}"
     goes_out = sequence.switch_off if end is RunEnd.COMPLETE else sequence.lamp_if_unfinished == "off"
     for _ in range(TRIES - 1):
@@ -304,16 +305,16 @@ def _set_lamp(projector: Projector, goes_out: bool, clock: Clock) -> str:
     if not goes_out:
         return f"it stays on, so that the next run needs no warm-up; if no run follows, {_BY_HAND}"
     projector.switch_off()
-    until = clock.monotonic() + OBEYS_S
+    until = clock.monotonic() + SWITCH_OFF_LIMIT_S
     while (power := projector.power()) is Power.ON and clock.monotonic() < until:
-        clock.sleep(LOOK_S)
+        clock.sleep(POWER_QUERY_S)
     if power is Power.ON:
-        return f"it is still on {OBEYS_S:g} s after the command to switch it off; {_BY_HAND}"
+        return f"it is still on {SWITCH_OFF_LIMIT_S:g} s after the command to switch it off; {_BY_HAND}"
     return "it was switched off"
 
 
 def _report_safely(report: Report, event: str, sentence: str) -> None:
-    # A fault here, such as a full disk, must not hide how the run ended.
+    # A fault here, such as a full disk, must not hide the reason why the run ended.
     with suppress(CropError):
         report(event, sentence)
 
@@ -324,7 +325,7 @@ class Devices:
 
     - `presenter`: fills the picture of the projector with one colour.
     - `projector`: control port of the projector; None if it is not controlled.
-    - `clock`: measures and makes every pause.
+    - `clock`: used for all waiting and for all times of the session.
     """
 
     camera: Camera
@@ -337,7 +338,7 @@ class Devices:
 class LightNotShown:
     """Presenter of a dry run, which shows nothing.
 
-    `display_texts`: warnings about the display that can be determined without showing anything.
+    `display_texts`: warnings about the display, which are known although nothing is shown.
     """
 
     display_texts: tuple[str, ...]
@@ -355,7 +356,7 @@ class LightNotShown:
 
 
 def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
-    """Ask the question of every device, and raise all faults together."""
+    """Query every device, and raise all faults together."""
     faults: dict[str, CropError] = {}
     for name, question in questions.items():
         try:
@@ -374,7 +375,7 @@ def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
 
 
 def fault_of(device: str, fault: CropError) -> CropError:
-    """Return a fault with the name of its device in front: an address alone does not identify it."""
+    """Add the name of the device to a fault, because an address alone does not identify the device."""
     if str(fault).startswith((device, f"the {device}")):
         return fault
     if fault.about is not None:
@@ -383,10 +384,11 @@ def fault_of(device: str, fault: CropError) -> CropError:
     return fault
 
 
-# Largest deviation of a shutter time from whole turns of the colour wheel, relative: shutters are not more exact.
+# Largest relative deviation of a shutter time from a whole number of turns of the colour wheel. Shutters are not more
+# exact.
 MAX_TURN_ERROR = 0.005
 
-# Shutter times in thirds of a stop as cameras show them, s: proposed if no camera can be asked.
+# Nominal shutter times of cameras in thirds of a stop, s, which messages propose.
 ENGRAVED_S = (
     *(1 / 60, 1 / 50, 1 / 40, 1 / 30, 1 / 25, 1 / 20, 1 / 15, 1 / 13, 1 / 10, 1 / 8, 1 / 6, 1 / 5, 1 / 4),
     *(0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.0, 8.0, 10.0, 13.0, 15.0, 20.0, 25.0, 30.0),
@@ -405,7 +407,7 @@ def wheel_of(settings: LabSettings) -> float:
 
 
 def period_s(settings: LabSettings) -> float:
-    """Return the period of the light, s: a turn of the colour wheel, or the duration of a picture."""
+    """Return the period of the light, s: a turn of the colour wheel, or without a wheel the duration of an image."""
     wheel_hz = wheel_of(settings)
     return 1 / wheel_hz if wheel_hz else _light_period_s(settings.lab.projector)
 
@@ -413,12 +415,12 @@ def period_s(settings: LabSettings) -> float:
 def holds_whole_turns(shutter_s: float, period_s: float) -> bool:
     """Return whether a shutter time is a whole number of periods, at least one, within `MAX_TURN_ERROR`."""
     turns = shutter_s / period_s
-    # A time slightly below one period may have been rounded.
+    # A time slightly below one period is accepted, because it may have been rounded.
     return round(turns) >= 1 and abs(turns - round(turns)) <= MAX_TURN_ERROR * max(turns, 1)
 
 
 def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> None:
-    """Require that an exposure holds whole turns of the colour wheel, or whole pictures if there is no wheel."""
+    """Require that an exposure is a whole number of turns of the colour wheel, or of images if there is no wheel."""
     period = _light_period_s(projector)
     shutter = camera.shutter_s
     if holds_whole_turns(shutter, period):
@@ -440,44 +442,43 @@ def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> No
     )
 
 
-# Time before the second try, s: enough for a notification over the picture, or a cable that is plugged in again.
+# Time before the second try, s. Many disturbances are shorter, for example a notification over the picture.
 RETRY_S: Final = 1.0
-PAUSE_S: Final = 5.0  # Interval between two tries in a pause, s: too short for an operator to notice
-# Duration of a failed try, s, after which the pause is reported at once: its driver has already tried often.
+PAUSE_S: Final = 5.0  # Interval between two tries in a pause, s
+# If the first try takes longer than this, s, its driver has already tried several times, and the pause starts at once.
 SLOW_S: Final = 10.0
-# Longest time between signs of life during a try, s: a camera's driver waits 90 s for a frame of 30 s, then 70 s over a
-# new connection, and a question may take 20 s.
+# Longest time between two signs of life during a try, s. A camera driver may wait several minutes for a long exposure.
 TRY_S: Final = 300.0
-# Frames that must be accepted after a pause before the next pause counts as a new fault. With fewer frames, the pauses
-# of one fault are added up and share time limit and back-off, so that an intermittent fault also ends a run. After half
-# a minute of work a session makes progress, after one or two frames it does not.
+# If fewer frames are accepted between two pauses for the same device, the durations of the pauses are added. Their sum
+# is compared with the time limit, so that an intermittent fault also ends a run.
 RECURS_WITHIN: Final = 10
-# Time between the second and the third try of a refused frame, s; every later interval is twice the one before.
+# Time between the second and the third try of a refused frame, s. Each later interval is twice the previous interval.
 BACK_OFF_S: Final = 5.0
-LONGEST_BACK_OFF_S: Final = 300.0  # Longest such time, s: an operator can wait for five minutes
-FRAMES: Final = "the frames"  # Name of the "device" in pauses for refused frames
-REPORTED_LATE: Final = " (this was at "  # End of a sentence that the full disk could not store at once
+LONGEST_BACK_OFF_S: Final = 300.0  # Longest interval between two such tries, s
+FRAMES: Final = "the frames"  # Name of pauses for refused frames, instead of a device
+# Appended with a time to a sentence that was stored late, because the disk was full.
+REPORTED_LATE: Final = " (this was at "
 INSTANT_S: Final = 1e-6  # Resolution of simulated time, s
 
 _Result = TypeVar("_Result")
 
 
 def is_curable(fault: CropError) -> bool:
-    """Return whether waiting may help: faults of a device or of the disk, not of the user's input."""
+    """Return whether waiting may help: after a fault of a device or the disk, but not after wrong input."""
     return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, BusyJournalError | LostJournalError)
 
 
 class RetryPolicy:
-    """How a run waits for a device or disk that fails, and how long.
+    """Waits for a device or disk that fails, up to a time limit.
 
-    An error that is no `CropError` ends a pause at once, such as Ctrl-C. A report never ends the run: if the disk is
-    full, it is stored when there is space again.
+    An exception that is not a `CropError`, such as Ctrl-C, ends a pause at once. If the disk is full, reports are
+    stored later, when there is space again.
 
     - `report`: receives an event, such as ``retry`` or ``paused``, and a sentence.
-    - `idle`: keeps the other devices awake every few seconds; its `DeviceError` is ignored.
-    - `on_wait`: receives every few seconds the state (``paused`` or ``waiting``), cause and duration of the wait, and
-      the seconds until the next sign of life.
-    - `breakable`: context in which a request of the operator ends the run at once; used for every wait.
+    - `idle`: called every few seconds to keep the other devices awake; its `DeviceError` is ignored.
+    - `on_wait`: called every few seconds with the state (``paused`` or ``waiting``), a sentence with cause and duration
+      of the wait, and the seconds until the next sign of life.
+    - `breakable`: context of every wait, in which a request of the operator ends the run at once.
     """
 
     def __init__(
@@ -497,7 +498,7 @@ class RetryPolicy:
         self._histories: dict[str, _History] = {}
 
     def accepted(self) -> None:
-        """Note an accepted frame; after `RECURS_WITHIN` of them a fault counts as removed."""
+        """Count an accepted frame. A fault counts as removed after `RECURS_WITHIN` accepted frames."""
         for name, history in list(self._histories.items()):
             history.frames += 1
             if history.frames >= RECURS_WITHIN:
@@ -529,7 +530,7 @@ class RetryPolicy:
         return Pause(self, name, idle, self._histories.setdefault(name, _History()))
 
     def report(self, event: str, sentence: str) -> None:
-        """Report an event; if the disk is full, the report is repeated with the next one."""
+        """Report an event; if the disk is full, the report is stored together with the next report."""
         self._unreported.append((event, sentence, self.clock.now()))
         with suppress(StorageError):
             while self._unreported:
@@ -539,7 +540,7 @@ class RetryPolicy:
                 self._unreported.pop(0)
 
     def wait(self, seconds: float, state: str, sentence: Callable[[], str], *, idle: bool = True) -> None:
-        """Wait for `seconds`, and report the result of `sentence` every few seconds."""
+        """Wait for `seconds`, and report the current text of `sentence` every few seconds."""
         until = self.clock.monotonic() + seconds
         while (left_s := until - self.clock.monotonic()) >= INSTANT_S:
             self.sign_of_life(state, sentence(), 2 * PAUSE_S + TRY_S * idle)
@@ -556,7 +557,7 @@ class RetryPolicy:
 
 @dataclass
 class _History:
-    """Earlier waits for one name: `pauses` of `spent_s` in total, and accepted `frames` since the last."""
+    """Earlier pauses for one name: number, total duration, next back-off, and frames accepted since the last pause."""
 
     pauses: int = 0
     spent_s: float = 0.0
@@ -565,7 +566,7 @@ class _History:
 
 
 class Pause:
-    """The wait for one device or disk that fails; made by `RetryPolicy.pause`."""
+    """The wait for a device or disk that fails; created by `RetryPolicy.pause`."""
 
     def __init__(self, policy: RetryPolicy, name: str, idle: bool, history: _History) -> None:
         self._policy = policy
@@ -583,7 +584,7 @@ class Pause:
             self._wait(fault)
 
     def back_off(self, fault: CropError) -> None:
-        """Wait as `wait` does, but longer each time, for a try that costs a frame."""
+        """Wait like `wait`, but longer each time, because every try takes a frame."""
         clock, history = self._policy.clock, self._history
         until = clock.monotonic() + history.back_off_s
         self.wait(fault)
@@ -605,7 +606,7 @@ class Pause:
             policy.report("retry", _with_name(self._name, fault.while_waiting()))
             policy.clock.sleep(min(RETRY_S, left_s))
             return
-        cause_text = _kind(fault)
+        cause_text = _numberless(fault)
         if cause_text != self._reported:
             how_long = "without limit" if math.isinf(policy.limit_s) else f"up to {duration_text(left_s)}"
             policy.report(
@@ -617,7 +618,7 @@ class Pause:
         policy.sign_of_life("paused", self._countdown(fault), TRY_S)
 
     def over(self) -> None:
-        """End the pause, and report it if the pause was reported."""
+        """End the pause. If its start was reported, report its end, too."""
         if self._reported:
             are = "are" if self._name.endswith("s") else "is"
             lasted = duration_text(self._lasted_s())
@@ -644,50 +645,50 @@ class Pause:
             return first
         # The first fault is reported without its remedy, because only the remedy of the last fault can help.
         cause, current = first.without_remedy(), fault.while_waiting()
-        sentence = current if _kind(cause) in _kind(current) else f"{cause}; last fault: {current}"
+        sentence = current if _numberless(cause) in _numberless(current) else f"{cause}; last fault: {current}"
         waited = duration_text(self._policy.limit_s)
         if self._history.pauses:
             waited += f", in {self._history.pauses + 1} pauses with few frames between them,"
-        return _family(first)(
+        return _general_class(first)(
             _with_name(self._name, sentence),
             remedy=f"the run waited {waited} and ended: remove the cause, {RUN_AGAIN}",
         )
 
 
 def pause_cause(sentence: str) -> str:
-    """Return the cause of a pause from its sentence: equal for each time of day, and for all refused frames."""
+    """Return the cause in the sentence of a pause, without numbers; it is `FRAMES` for all refused frames."""
     name, *_ = sentence.partition(": ")
-    return name if name == FRAMES else _kind(sentence.partition(REPORTED_LATE)[0].rpartition(" (")[0])
+    return name if name == FRAMES else _numberless(sentence.partition(REPORTED_LATE)[0].rpartition(" (")[0])
 
 
 def _with_name(name: str, sentence: str) -> str:
     return sentence if sentence.startswith(name) else f"{name}: {sentence}"
 
 
-def _kind(fault: CropError | str) -> str:
+def _numberless(fault: CropError | str) -> str:
     # Numbers in a message may change from one try to the next.
     return re.sub(r"\d+(?:[.,]\d+)*", "#", str(fault))
 
 
-def _family(fault: CropError) -> type[CropError]:
-    # Classes of drivers have other parameters than a message.
+def _general_class(fault: CropError) -> type[CropError]:
+    # Return the base class in `foundation.errors`, because error classes of drivers may need more than a message.
     return next(error_class for error_class in type(fault).__mro__ if error_class.__module__ == errors.__name__)
 
 
-TICK_S: Final = 1.0  # Interval between two looks at the time, s
+TICK_S: Final = 1.0  # Interval between two checks of the time, s
 
-# Delay of a look at the time, s, that proves a stopped program: a busy machine delays a thread by 1 to 2 s
+# If a check of the time is delayed by more than this, s, the program was stopped. A busy computer delays it less.
 GAP_S: Final = 10.0
 
-# Factor of the expected duration after which a step is late: a download that is tried again takes twice as long.
+# A step is late if it takes longer than this multiple of its expected duration, plus `LATE_S`.
 LATE_TIMES: Final = 3.0
 
-LATE_S: Final = 10.0  # Additional time, s: a busy disk or machine may stall for some seconds
+LATE_S: Final = 10.0  # Additional time for a step, s, because a busy disk or computer may stall for some seconds
 
 
 @dataclass
 class _Step:
-    """What `device` has been doing since `started` (elapsed s); `expected_s` is the expected duration."""
+    """A step in progress: its device, activity, expected duration, and start (elapsed s)."""
 
     device: str
     doing: str
@@ -700,7 +701,7 @@ class RunWatch:
     """Watches the duration of steps in its own thread; use it in a `with` block.
 
     `on_late`: called by this thread, once for a late step, with a sentence and the start of the step. `elapsed`:
-    returns seconds that include sleep of the machine; None for `elapsed_s`.
+    returns seconds, including the time during which the computer slept; None for `elapsed_s`.
     """
 
     def __init__(
@@ -728,7 +729,7 @@ class RunWatch:
 
     def gap_s(self) -> float:
         """Return for how many seconds the program was stopped since the last call; 0 if it was not."""
-        self.look()
+        self.check_time()
         with self._lock:
             gap_s, self._gap_s = self._gap_s, 0.0
         return gap_s
@@ -750,8 +751,8 @@ class RunWatch:
                 if not step.is_reported:
                     self._took[step_kind] = self._elapsed() - step.started
 
-    def look(self) -> None:
-        """Look at the time."""
+    def check_time(self) -> None:
+        """Check whether the program was stopped, and whether the current step is late."""
         late: _Step | None = None
         with self._lock:
             now = self._elapsed()
@@ -775,4 +776,4 @@ class RunWatch:
 
     def _watch(self) -> None:
         while not self._over.wait(TICK_S):
-            self.look()
+            self.check_time()

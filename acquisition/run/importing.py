@@ -1,7 +1,7 @@
-"""Import a session from raw files taken by other means: a list of frames, the chart, the illuminants.
+"""Make a session from existing raw files, with a list of these frames, the chart, and the illuminants.
 
-Every file is copied unchanged, checked against its hash if the list has one, and judged if the list has no verdict. The
-result is a session like any other.
+Every file is copied unchanged. It is checked against its hash if the list has one, and judged if the list has no
+verdict.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Imported:
 
     - `refused`: one sentence for each refused frame.
     - `missing`: illuminants and kinds of frames without an accepted frame, in words.
-    - `unchecked`: suffixes of formats that cannot be checked for completeness.
+    - `unchecked`: suffixes of the files that could not be checked for completeness.
     """
 
     refused: tuple[str, ...]
@@ -58,8 +58,8 @@ class Imported:
 def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illuminant, ...]]:
     """Read a list of frames (columns as in `frames.csv`, paths relative to it) and the illuminants next to it.
 
-    Only `kind`, `illumination` and `file` must be filled. Rows of the kind ``response`` are ignored: only a running
-    session needs them, and the list does not contain their codes.
+    Only `kind`, `illumination` and `file` must be filled. Rows of the kind ``response`` are ignored, because only a
+    running session needs them.
     """
     columns, rows = read_csv(path, "name a CSV file in UTF-8", "the list of frames")
     if not rows or not set(columns).issuperset(FRAME_COLUMNS[:3]):
@@ -67,14 +67,14 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illuminant, ..
         raise FormatError(f"{problem}{','.join(FRAME_COLUMNS[:3])}; correct the list", about=path)
     lights = load_illuminants(path.parent / "illuminations.csv")
     frames = [
-        _listed(row, f"{path}, line {number}", path.parent, len(lights))
+        _parse_row(row, f"{path}, line {number}", path.parent, len(lights))
         for number, row in enumerate(rows, 2)
         if (row["kind"] or "").strip() != "response"
     ]
     return frames, lights
 
 
-def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int) -> ListedFrame:
+def _parse_row(row: Mapping[str, str | None], where: str, folder: Path, lights: int) -> ListedFrame:
     def cell(column: str) -> str:
         return (row.get(column) or "").strip()
 
@@ -185,7 +185,7 @@ def _import_frame(
     attempt = session.journal.begin(step, f"frames/{step.stem}", frame.taken_at)
     received = session.receive(step.stem, copy)
     if frame.verdict == ACCEPTED:
-        # The file may have been damaged after this verdict, or the damage was not noticed.
+        # An accepted file may still be damaged.
         content = whole_frame(received.path)
         reason = content if isinstance(content, str) else None
     elif frame.verdict:

@@ -1,9 +1,10 @@
-"""Take the frames of a run: download one while the next illuminant settles, and judge one while the next is exposed.
+"""Take the frames of a run in overlapping steps.
 
-docs/explanation/steps.md has the order of the steps. `StepQueue` selects the next frame, `Pipeline` moves the devices,
-`Verdicts` records verdicts and their consequences for other frames, `LastingCause` waits for a cause that would refuse
-every frame. The saving thread uses no device and no journal: the thread of the devices commits rows in the
-order of exposure.
+While a frame is downloaded, the next illuminant settles on the screen. While a frame is judged, the next frame is
+exposed (docs/explanation/steps.md). `StepQueue` selects the next frame, and `Pipeline` operates the devices. `Verdicts`
+records verdicts and their consequences for other frames. `LastingCause` waits if every frame would be refused. A second
+thread saves and judges files. It uses neither the devices nor the journal, so rows are committed in the order of
+exposure.
 """
 
 from __future__ import annotations
@@ -54,16 +55,15 @@ from foundation.console import EndRequest
 from foundation.errors import RUN_AGAIN, CropError, DeviceError, QualityError, StorageError, counted, first_few
 from foundation.files import write_atomic
 
-# Frames without a verdict when the next is exposed. A frame is judged during the next exposure and download, which take
-# several times as long. With more frames ahead, a refusal would cost more of them.
+# Number of frames that may wait for their verdicts when the next frame is exposed. One is enough, because a verdict
+# takes less time than an exposure. After a refusal, more frames would have to be repeated.
 AHEAD = 1
 
-# Tries to download a frame before it is exposed again: by then a driver has renewed its connection several times.
+# Number of tries to download a frame before it is exposed again.
 DOWNLOADS = 2
 
-# Expected durations of the first steps of a kind, s: a write to the journal; showing or reading back a picture; release
-# and readout, in addition to the shutter time and as much again for the camera's own dark frame; the verdict on a large
-# frame; its download over a slow cable.
+# Expected durations of steps that have not been measured yet, s: writing to the journal; showing or reading back a
+# colour; exposing, in addition to twice the shutter time; judging; downloading.
 COMMIT_S, SHOW_S, RELEASE_S, JUDGE_S, DOWNLOAD_S = 1.0, 2.0, 3.0, 5.0, 10.0
 
 PROMISE = "ending after this frame; press Ctrl-C again to end at once"  # Answer to a request to end the run
@@ -97,7 +97,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Taken:
-    """A judged frame; `remaining` steps of the plan have no accepted frame."""
+    """A judged frame. `remaining`: number of steps of the plan without an accepted frame."""
 
     step: SessionStep
     judgement: Judgement
@@ -106,9 +106,9 @@ class Taken:
 
 @dataclass(frozen=True)
 class ShownLight:
-    """A step with its illuminant on the screen since `since`, s of the clock; showing it took `show_s`.
+    """A step whose colour is on the screen since `since` (clock, s). Showing it took `show_s`.
 
-    `replaced`: the previous colour; None for the first.
+    `replaced`: colour that was shown before; None if there was none.
     """
 
     step: SessionStep
@@ -122,8 +122,8 @@ class ShownLight:
 class Exposed:
     """An exposed frame, with the checks of the devices.
 
-    `number`: of its attempt in the journal. `stem`: name of its file without suffix. `changed`: whether another colour
-    was shown and exposed before it, so that a late or frozen picture would be detected.
+    `number`: number of the attempt in the journal. `stem`: name of its file without suffix. `changed`: whether the
+    colour differs from the colours that were shown and exposed before. Only then is a late or frozen picture detected.
     """
 
     step: SessionStep
@@ -139,7 +139,7 @@ class Exposed:
 class Saved:
     """A complete raw file and its verdict.
 
-    - `save_s`, `judge_s`: durations of hashing, flushing and renaming, and of judging, s of the computer's clock.
+    - `save_s`, `judge_s`: durations of saving and of judging the file, s, by the clock of the computer.
     - `preview_fault`: the reason for a missing preview; "" if there was no fault.
     """
 
@@ -151,7 +151,7 @@ class Saved:
 
 
 class Pipeline:
-    """Moves the devices; `saving` is the thread that completes and judges files, one after another."""
+    """Operates the devices. `saving`: thread that saves and judges files, one after another."""
 
     def __init__(
         self, job: Job, saving: ThreadPoolExecutor, observe: Callable[[Taken], object], ending: EndRequest
@@ -169,7 +169,7 @@ class Pipeline:
     def run(self) -> None:
         """Take frames until the queue is empty or the end is requested.
 
-        Frames that the camera has delivered are completed, judged and recorded in any case.
+        Frames that the camera has delivered are always saved, judged and recorded, also after an error.
         """
         try:
             with self._ending.postponed(PROMISE):
@@ -181,7 +181,7 @@ class Pipeline:
             raise
 
     def _next_light(self) -> ShownLight | None:
-        """Show the next illuminant, after verdicts on which it depends; None if nothing is left to take."""
+        """Show the next illuminant; None if no frame is left. If necessary, wait for verdicts first."""
         while not self._ending.is_requested:
             if self._verdicts.is_spent:
                 self._collect(0)
@@ -206,14 +206,14 @@ class Pipeline:
         frame = self._expose(light, settling_s)
         if frame is None:
             return self._next_light()
-        # One frame at a time while frames test whether a lasting cause has gone.
+        # Take one frame at a time while frames test whether a lasting cause has been removed.
         ahead = 0 if self._lasting.is_testing else AHEAD
         following = self._show_following() if ahead else None
         frame = replace(frame, checks=(*frame.checks, *self._projector_check(frame.step)))
         self._hand_over(frame)
         self._collect(ahead)
         if not all(check.passed for check in frame.checks):
-            # A device must be healthy before the next frame.
+            # The projector must be healthy before the next frame.
             self._collect(0)
             if self._job.devices.projector is not None:
                 with self._ending.at_once():
@@ -232,7 +232,7 @@ class Pipeline:
         return ShownLight(step, shown_at, since, since - start_s, replaced)
 
     def _show_following(self) -> ShownLight | None:
-        # A fault is handled later, when no frame waits in the camera.
+        # A fault of the screen is handled later, when no frame is left in the camera.
         step = None if self._ending.is_requested else self._job.queue.next()
         if step is None:
             return None
@@ -242,7 +242,7 @@ class Pipeline:
             return None
 
     def _settle(self, light: ShownLight) -> float:
-        # Settling begins with the new picture, so that it continues during download and verdicts.
+        # The settling time starts when the colour is shown, so it includes downloads and verdicts.
         clock = self._job.devices.clock
         rest = self._job.settings.sequence.settle_s - (clock.monotonic() - light.since)
         if rest > 0:
@@ -250,12 +250,12 @@ class Pipeline:
         return max(rest, 0.0)
 
     def _expose(self, light: ShownLight, settling_s: float) -> Exposed | None:
-        """Release the shutter; return None after waiting for a camera that failed."""
+        """Expose a frame. If the camera fails, wait for it and return None."""
         clock, step, journal = self._job.devices.clock, light.step, self._job.session.journal
         shutter_s = self._job.settings.camera.shutter_s
         kept_count = journal.kept_files(step)
         stem = step.stem if kept_count == 0 else f"{step.stem}_try{kept_count + 1}"
-        # An attempt lasts from the new picture to the end of the exposure, so that attempts do not overlap.
+        # An attempt starts when its colour is shown and ends with its exposure, so attempts do not overlap.
         number = self._job.on_disk(lambda: journal.begin(step, f"frames/{stem}", light.shown_at))
         self._job.queue.begin(step)
         self._note_gap()
@@ -266,7 +266,7 @@ class Pipeline:
             with self._job.watch.step(_CAMERA, f"exposes {step_name(step)}", 2 * shutter_s + RELEASE_S, "expose"):
                 self._job.devices.camera.expose()
         except DeviceError as error:
-            self._give_up(step, number, error)
+            self._fail_attempt(step, number, error)
             self._pause_for(_CAMERA, error)
             return None
         timings = {"show": light.show_s, "settle": settling_s, "expose": clock.monotonic() - start_s}
@@ -274,7 +274,7 @@ class Pipeline:
         return Exposed(step, number, stem, clock.now(), checks, timings, changed)
 
     def _note_gap(self) -> float:
-        """Report a time during which the program was stopped, and a change of the clock; return the time, s."""
+        """Report if the program was stopped or the clock was set; return how long the program was stopped, s."""
         clock = self._job.devices.clock
         if isinstance(clock, SteadyClock) and (set_by_s := clock.step_s()):
             change = f"{'ahead' if set_by_s > 0 else 'back'} by {duration_text(abs(set_by_s))}"
@@ -319,7 +319,7 @@ class Pipeline:
         try:
             complete = self._fetch(frame)
         except DeviceError as error:
-            self._give_up(frame.step, frame.number, error)
+            self._fail_attempt(frame.step, frame.number, error)
             self._pause_for(_CAMERA, error)
             return
         self._clear_pause(_CAMERA)
@@ -327,17 +327,17 @@ class Pipeline:
         self._under_way.append((frame, self._saving.submit(_save, self._job, complete, frame)))
 
     def _fetch(self, frame: Exposed) -> Callable[[], ReceivedFile]:
-        """Download the frame under a hidden name; return the function that completes the file.
+        """Download the frame under a hidden name, if necessary again; return the function that completes the file.
 
-        If the disk is full, the frame stays in the camera.
+        While the disk is full, the frame stays in the camera.
         """
         download = partial(_download, self._job, frame)
         for _ in range(DOWNLOADS - 1):
             try:
-                return self._job.retry.attempt(download, _DISK, curable=_is_of_disk)
+                return self._job.retry.attempt(download, _DISK, curable=_is_disk_fault)
             except DeviceError as error:
                 self._job.retry.report("retry", f"{step_name(frame.step)}: {error}")
-        return self._job.retry.attempt(download, _DISK, curable=_is_of_disk)
+        return self._job.retry.attempt(download, _DISK, curable=_is_disk_fault)
 
     def _collect(self, keep: int) -> None:
         """Record the oldest frames with their verdicts until only `keep` frames wait for a verdict."""
@@ -348,7 +348,7 @@ class Pipeline:
                 with self._job.watch.step(_DISK, f"stores {step_name(frame.step)}, which is judged", JUDGE_S, "judge"):
                     saved = awaited.result()
             except (DeviceError, StorageError) as error:
-                self._give_up(frame.step, frame.number, error)
+                self._fail_attempt(frame.step, frame.number, error)
                 self._pause_for(_DISK, error)
                 continue
             self._clear_pause(_DISK)
@@ -356,18 +356,18 @@ class Pipeline:
             frame = replace(frame, timings={**frame.timings, **timings})
             if self._health is not None and not saved.judgement.accepted:
                 self._health.suspect()
-            self._verdicts.take_in(frame, saved, [exposed for exposed, _ in self._under_way])
+            self._verdicts.record_verdict(frame, saved, [exposed for exposed, _ in self._under_way])
             self._observe(Taken(frame.step, saved.judgement, len(self._job.queue)))
 
-    def _give_up(self, step: SessionStep, number: int, error: CropError) -> None:
-        # The attempt failed for a device or the disk, not for its content.
+    def _fail_attempt(self, step: SessionStep, number: int, error: CropError) -> None:
+        # The attempt failed because of a device or the disk, so it does not count as a try.
         self._job.queue.withdraw(step)
         self._collect(0)
         moment = self._job.devices.clock.now()
         self._job.on_disk(lambda: self._job.session.journal.fail(number, moment, str(error)))
 
     def _pause_for(self, name: str, fault: CropError) -> None:
-        """Wait for the camera or disk that lost a frame; the pause lasts until the next frame succeeds."""
+        """Wait for the camera or the disk after a frame was lost. The pause ends when a frame succeeds."""
         self._pauses.setdefault(name, self._job.retry.pause(name, idle=name != _CAMERA)).wait(fault)
 
     def _clear_pause(self, name: str) -> None:
@@ -379,13 +379,13 @@ class Pipeline:
             try:
                 self._collect(0)
             except CropError as second_error:
-                # The first error ended the run, and must not be hidden.
+                # The second error must not hide the first error, which ended the run.
                 if str(second_error) == str(error):
                     continue
                 error.add_note(f"then: {second_error}")
 
 
-def _is_of_disk(fault: CropError) -> bool:
+def _is_disk_fault(fault: CropError) -> bool:
     return isinstance(fault, StorageError) and is_curable(fault)
 
 
@@ -397,7 +397,7 @@ def _download(job: Job, frame: Exposed) -> Callable[[], ReceivedFile]:
             captured = job.devices.camera.download(incoming.stream)
         size = incoming.stream.seek(0, 2)
         if size != captured.size or size == 0:
-            # Checked before the file is completed, because the camera may still have the frame.
+            # Check this before the file is completed, because the camera may still have the frame.
             raise DeviceError(
                 f"{captured.name}: {size} bytes arrived, expected {captured.size} as announced by the camera"
             )
@@ -416,7 +416,7 @@ def _save(job: Job, complete: Callable[[], ReceivedFile], frame: Exposed) -> Sav
         verdict = job.judge.judge(received.path, frame.step)
         judgement = replace(verdict, checks=(*frame.checks, *verdict.checks), preview=b"")
         if verdict.preview:
-            # A preview may be lost, because it can be derived again; flushing it would cost as much as a row.
+            # A missing preview is no reason to refuse a frame.
             try:
                 write_atomic(preview_path(job.session.folder, received.path.name), verdict.preview)
             except CropError as error:
@@ -437,11 +437,11 @@ class Verdicts:
 
     @property
     def is_spent(self) -> bool:
-        """Whether unused frames of this run take more space than allowed."""
+        """Whether refused and voided frames of this run take more space than allowed."""
         return self._unused_bytes > self._budget_gb * 1e9
 
     def require_budget(self) -> None:
-        """Raise if `is_spent`: so many refusals have a systematic cause, and fill the disk."""
+        """Raise an error if `is_spent`, because so many refused frames have a systematic cause."""
         if self.is_spent:
             raise QualityError(
                 f"refused and voided frames of this run take {self._unused_bytes / 1e9:.3g} GB of the disk, at most "
@@ -449,7 +449,7 @@ class Verdicts:
                 f"{RUN_AGAIN}, with a new budget"
             )
 
-    def take_in(self, frame: Exposed, saved: Saved, under_way: Sequence[Exposed]) -> None:
+    def record_verdict(self, frame: Exposed, saved: Saved, under_way: Sequence[Exposed]) -> None:
         """Record a verdict; `under_way`: later frames without a verdict."""
         job, step, judgement = self._job, frame.step, saved.judgement
         job.on_disk(
@@ -491,7 +491,7 @@ class Verdicts:
             self._unused_bytes = job.on_disk(lambda: job.session.journal.unused_bytes(self._last_before))
 
     def void_lost(self) -> bool:
-        """Open the steps of deleted or truncated files again; return whether there are any."""
+        """Void and repeat accepted frames with deleted or truncated files; return whether there are any."""
         queue, files = self._job.queue, self._job.on_disk(self._job.session.lost_files)
         lost = [frame for frame in files if not queue.is_open(frame.step)]
         if lost:
@@ -502,7 +502,7 @@ class Verdicts:
 
     def _refuse(self, step: SessionStep, judgement: Judgement) -> None:
         queue = self._job.queue
-        # A reference that voids other frames is repeated before them, to show whether the cause has gone.
+        # If a reference voids other frames, it is repeated before them. This shows whether the cause has been removed.
         is_first = judgement.lasting or (judgement.voids and step.kind in REFERENCES)
         is_repeated = queue.refuse(step, judgement.reason, before_others=is_first)
         # Without a good reference, repeated frames would be voided again and again.
@@ -515,9 +515,9 @@ class Verdicts:
             self._lasting.note(sentence, step)
 
     def _void_since_reference(self, refused: Exposed, cause: str, under_way: Sequence[Exposed]) -> None:
-        """Void all frames since the last good reference of this kind, frames without a verdict included.
+        """Void all frames since the last good reference of this kind, including frames without a verdict.
 
-        References of another kind next to the good one, before any illuminant, stay valid.
+        References of the other kind that directly follow the good reference stay valid.
         """
         queue, reference_kind = self._job.queue, refused.step.kind
         reason = f"taken between a good reference and {step_name(refused.step)}, which was refused: {cause}"
@@ -535,7 +535,7 @@ class Verdicts:
         self._void_ahead(under_way, reason)
 
     def _void_first_frames(self, refused: Exposed, cause: str, under_way: Sequence[Exposed]) -> None:
-        """Void all frames of this run since its last pause for a lasting cause: the model depends on them."""
+        """Void all frames of this run since its last pause for a lasting cause. The judge's model depends on them."""
         reason = f"the first frames contradict {step_name(refused.step)}: {cause}"
         since = {
             attempt.id: attempt.step
@@ -560,10 +560,10 @@ class Verdicts:
 
 
 class LastingCause:
-    """A cause that would refuse every frame. The run waits, and tests at growing intervals whether it is removed.
+    """A cause for which every frame would be refused. The run waits, and tests at growing intervals if it is removed.
 
-    A picture that is always late shows the right illuminant if it is shown twice in a row. The cause is therefore
-    removed after an accepted change of the illuminant, or after all test frames if one of them changes it.
+    A late picture has the right colour if the same colour is shown twice in a row. A test therefore needs an accepted
+    frame with a changed colour. After this frame, the test ends when an illuminant or all test frames are accepted.
 
     - `last_before`: newest attempt before the run, or before its last pause for a lasting cause.
     """
@@ -574,8 +574,8 @@ class LastingCause:
         self._sentence = ""
         self._step: SessionStep | None = None
         self._testing: Pause | None = None
-        self._to_show: set[int] = set()
-        self._is_changing = False
+        self._test_steps: set[int] = set()
+        self._has_changed = False
 
     @property
     def must_wait(self) -> bool:
@@ -584,7 +584,7 @@ class LastingCause:
 
     @property
     def is_testing(self) -> bool:
-        """Whether frames are testing, after a wait, if the cause has gone."""
+        """Whether the next frames test, after a wait, if the cause has been removed."""
         return self._testing is not None
 
     def note(self, sentence: str, step: SessionStep | None) -> None:
@@ -597,20 +597,20 @@ class LastingCause:
         self._testing = self._testing or self._job.retry.pause(FRAMES)
         self._testing.back_off(fault)
         self._job.queue.retry()
-        self._to_show, self._is_changing = set(), False
+        self._test_steps, self._has_changed = set(), False
         if self._step is not None:
-            self._to_show.add(self._step.number)
+            self._test_steps.add(self._step.number)
             if self._step.kind != "dark":
                 self._link()
 
     def accepted(self, step: SessionStep, changed: bool) -> None:
-        """Note an accepted frame, which may show that the cause has gone; `changed`: see `Exposed`.
+        """Note an accepted frame, which may show that the cause has been removed; `changed`: see `Exposed`.
 
-        A dark frame is no evidence: it is also accepted if no light reaches the chart.
+        A dark frame does not show it, because it is also accepted if no light reaches the chart.
         """
-        self._to_show.discard(step.number)
-        self._is_changing |= changed and step.kind != "dark"
-        if self._is_changing and (step.kind == "light" or not self._to_show):
+        self._test_steps.discard(step.number)
+        self._has_changed |= changed and step.kind != "dark"
+        if self._has_changed and (step.kind == "light" or not self._test_steps):
             self.over()
 
     def over(self) -> None:
@@ -620,15 +620,15 @@ class LastingCause:
             self._testing = None
 
     def _link(self) -> None:
-        # The cause may have changed chart, camera or lamp.
+        # Chart, camera or lamp may have changed during the wait, so the frames that link runs are taken again.
         job = self._job
         attempts = job.on_disk(job.session.journal.attempts)
         if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
             numbers = job.on_disk(lambda: link_runs(job.session, job.devices.clock.now()))
             job.queue.begin_with(step for step in job.session.steps if step.number in numbers)
-            self._to_show.update(numbers)
+            self._test_steps.update(numbers)
         self.last_before = attempts[-1].id
-        # All files have been judged before the wait.
+        # This call is allowed here, because all files were judged before the wait.
         if isinstance(job.judge, HandlesPauses):
             job.judge.after_pause()
 
@@ -636,7 +636,7 @@ class LastingCause:
 def _accepted_changes(
     step: SessionStep, judgement: Judgement, steps: Sequence[SessionStep], judge: JudgeSettings
 ) -> list[tuple[str, str]]:
-    """Return events and sentences about accepted changes, and about light in all frames."""
+    """Return events with sentences about accepted changes of position and brightness, and about stray light."""
     values = {check.name: check.value for check in judgement.checks if check.value is not None}
     events: list[tuple[str, str]] = []
     moved_px = values.get("movement", 0.0)
@@ -648,7 +648,7 @@ def _accepted_changes(
         )
         events.append(("moved", sentence))
     percent = values.get(OFF_BRIGHTNESS.name, 0.0)
-    # An accepted step of the lamp is beyond its limit. Frames that connect runs have wide limits.
+    # A step of the lamp can be accepted although it is beyond its limit. Frames that connect runs have wide limits.
     stepped = any(check.name == OFF_BRIGHTNESS.name and check.is_beyond for check in judgement.checks)
     connects_runs = step.kind == "response" and any(lit.kind == "light" and lit.number < step.number for lit in steps)
     if stepped or (connects_runs and abs(percent) > judge.drift_percent):
@@ -668,18 +668,17 @@ def _accepted_changes(
     return events
 
 
-# Consecutive steps without a usable frame that end the normal run: there must be a lasting cause. One may be chance,
-# and two neighbours may share a passing cause.
+# If this number of consecutive steps is given up, there must be a lasting cause. Fewer may have a temporary cause.
 GIVEN_UP_IN_A_ROW = 3
 
 
 class StepQueue:
     """The steps of a session that this run has to take, in the order of the plan.
 
-    A refused step is therefore repeated before later ones.
+    A refused step is therefore repeated before later steps.
 
-    `append`: adds a reference of a kind to the end of the plan and returns it. `reference_every`: illuminants in a row
-    without a reference between them; None for any number.
+    `append`: adds a reference of a kind to the end of the plan and returns it. `reference_every`: largest number of
+    illuminants between two references; None for no limit.
     """
 
     def __init__(
@@ -694,7 +693,7 @@ class StepQueue:
     ) -> None:
         self._steps = {step.number: step for step in steps}
         self._first = list(first)
-        self._probes: list[int] = []
+        self._given_up_first: list[int] = []
         self._open = {step.number for step in steps if step.number not in done_numbers} | set(self._first)
         self._attempts = attempts
         self._tries: Counter[int] = Counter()
@@ -714,7 +713,7 @@ class StepQueue:
 
     @property
     def given_up(self) -> tuple[str, ...]:
-        """For each step left for the next run, a sentence with the reason, in this order."""
+        """A sentence with the reason for each step that is left for the next run."""
         return tuple(f"{step_name(self._steps[number])}: {reason}" for number, reason in self._given_up.items())
 
     @property
@@ -742,20 +741,20 @@ class StepQueue:
         self._tries[step.number] += 1
 
     def withdraw(self, step: SessionStep) -> None:
-        """Note that an attempt failed for another reason than its content: it does not count as a try."""
+        """Note that an attempt failed for another reason than its image; it does not count as a try."""
         self._under_way.discard(step.number)
         self._tries[step.number] -= 1
 
     def retry(self) -> None:
         """Open the given-up steps again, with all their tries.
 
-        Steps that had priority have it again, because they show whether the cause has gone.
+        Steps that had priority have it again, because they show whether the cause has been removed.
         """
         for number in self._given_up:
             self._tries[number] = 0
         self._given_up.clear()
-        self._first = [*self._probes, *self._first]
-        self._probes = []
+        self._first = [*self._given_up_first, *self._first]
+        self._given_up_first = []
         self._in_a_row = 0
 
     def accept(self, step: SessionStep) -> None:
@@ -769,7 +768,7 @@ class StepQueue:
         elif step.kind in self._lights_since:
             self._lights_since[step.kind] = 0
         self._unclosed.discard(step.kind)
-        # A dark frame is no evidence of progress: it is also accepted if no light reaches the chart.
+        # A dark frame does not show progress, because it is also accepted if no light reaches the chart.
         if step.kind != "dark":
             self._in_a_row = 0
 
@@ -792,7 +791,7 @@ class StepQueue:
                 self._give_up(number, reason)
 
     def begin_with(self, steps: Iterable[SessionStep]) -> None:
-        """Take old or new steps before all others, in the order of the plan, with all their tries."""
+        """Take the given steps before all other steps, in the order of the plan, with all their tries."""
         steps = sorted(steps, key=lambda step: step.number)
         numbers = [step.number for step in steps]
         self._steps |= {step.number: step for step in steps}
@@ -807,7 +806,7 @@ class StepQueue:
             self._in_a_row += 1
         self._given_up[number] = reason
         if number in self._first:
-            self._probes.append(number)
+            self._given_up_first.append(number)
         self._forget_first(number)
 
     def _forget_first(self, number: int) -> None:
@@ -822,9 +821,9 @@ class StepQueue:
         return None
 
     def _light_or_reference(self, light: int) -> int:
-        """Return the illuminant, or a reference if too many illuminants were taken since the last one.
+        """Return the illuminant, or a reference if too many illuminants were taken since the last reference.
 
-        The references that will follow are added to the plan first, so that a killed run does not look complete.
+        If no references follow the illuminant in the plan, they are added first. So a killed run never looks complete.
         """
         for reference in self._closing:
             if not any(number > light and self._steps[number].kind == reference for number in self._open):
@@ -843,7 +842,7 @@ class StepQueue:
 
 
 def unclosed_kinds(kinds: Iterable[str]) -> frozenset[str]:
-    """Return the kinds of references missing after the last illuminant; `kinds`: of accepted frames in order."""
+    """Return the kinds of references missing after the last illuminant; `kinds`: kinds of the accepted frames."""
     unclosed: set[str] = set()
     for name in kinds:
         if name == "light":
@@ -858,11 +857,11 @@ def step_name(step: SessionStep) -> str:
 
 
 def link_runs(session: Session, moment: datetime) -> tuple[int, ...]:
-    """Add the frames to the plan that connect this run to the earlier ones; return the numbers of their steps.
+    """Add the frames to the plan that connect this run to earlier runs; return the numbers of their steps.
 
-    They show changes of chart, camera or lamp before the first illuminant. A set that an earlier run did not finish is
-    voided and repeated, because the chart may have been moved since. Nothing is added to a session without frames, or
-    without frames of the primaries.
+    They show changes of chart, camera or lamp before the next illuminant. If an earlier run did not finish its set of
+    these frames, the set is voided and repeated. Nothing is added to a session without accepted frames, or without
+    response frames.
     """
     accepted = [attempt for attempt in session.journal.attempts() if attempt.verdict == ACCEPTED]
     if not accepted or all(step.kind != "response" for step in session.steps):
@@ -885,7 +884,7 @@ def _add_steps(session: Session, steps: Sequence[SessionStep]) -> tuple[int, ...
 def _unfinished(
     tail: Sequence[SessionStep], links: Sequence[SessionStep], accepted: Sequence[Attempt]
 ) -> Sequence[SessionStep]:
-    """Return the last steps of the plan if they connect runs and nothing was taken after them; else nothing."""
+    """Return the last steps of the plan if they connect runs and no other frame was accepted later; else none."""
     if [(step.kind, step.colour) for step in tail] != [(step.kind, step.colour) for step in links]:
         return ()
     numbers = {step.number for step in tail}

@@ -1,8 +1,8 @@
-"""Plan of a run: its frames, time and space, and faults that would end it.
+"""Plan a run: its frames, the time and disk space that it needs, and faults that would end it.
 
-The plan is made before a device is used, from files (`Work`), estimates of size and time (`Estimate`), and answers of
-the devices (`Answers`). The queries do not change the devices. A dry run prints the plan (`plan_lines`), a run requires
-it. A fault would end the run and has a remedy; a doubt is a warning.
+The plan is made before a device is used. It is based on files (`Work`), on estimates of size and time (`Estimate`), and
+on answers of the devices (`Answers`), which are only queried, not changed. A dry run prints the plan (`plan_lines`). A
+run does not start if its plan has a fault, that is a problem that would end it. A doubt is only a warning.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ FIXED: Final = (
     "sequence.reference_every",
 )  # fmt: skip
 
-KNOWN_AFTER: Final = 5  # Frames after which their measured times and sizes replace assumptions
+KNOWN_AFTER: Final = 5  # Smallest number of frames from which times and sizes are measured instead of assumed
 
 
 @dataclass(frozen=True)
 class Work:
-    """Frames of a run with chart and illuminants, as read from files.
+    """Frames, chart and illuminants of a run, as read from files.
 
     - `new`: whether the session does not exist yet.
     - `done`: numbers of the steps with an accepted frame.
@@ -133,7 +133,7 @@ def nothing_to_retake(folder: Path) -> InputError:
 
 
 def require_same(session: Session, settings: LabSettings) -> None:
-    """Require unchanged settings (those that change frames), chart and illuminants since the start of the session."""
+    """Require that chart, illuminants and the settings in `FIXED` are the same as at the start of the session."""
     try:
         earlier = parse_lab(session.settings_text(), str(session.folder / "session.toml"))
     except ConfigurationError as error:
@@ -167,7 +167,7 @@ def _value(settings: LabSettings, key: str) -> Any:
 
 
 def order_of(steps: Sequence[SessionStep], settings: LabSettings) -> str:
-    """Return the order of the illuminants in words; an existing session keeps its own."""
+    """Return the order of the illuminants in words; an existing session keeps its order."""
     indices = [step.illumination for step in steps if step.illumination is not None]
     sequence = settings.sequence
     # The order depends on the indices, not on the codes.
@@ -177,25 +177,25 @@ def order_of(steps: Sequence[SessionStep], settings: LabSettings) -> str:
         return f"shuffled by seed {sequence.seed}"
     if indices == sorted(indices):
         return "as listed" + (
-            f", kept from the start of the session; {settings.file} has shuffled" * (sequence.order != "listed")
+            f", kept from the start of the session; {settings.file} has 'shuffled'" * (sequence.order != "listed")
         )
     if indices == shuffled:
-        return f"shuffled by seed {sequence.seed}, kept from the start of the session; {settings.file} has listed"
+        return f"shuffled by seed {sequence.seed}, kept from the start of the session; {settings.file} has 'listed'"
     return "shuffled by another seed, kept from the start of the session"
 
 
-# Share of repeated frames for which space is required (judgement): disturbances during one hour of a run.
+# Fraction of the frames that may have to be repeated, for which space is required (judgement).
 RETAKEN_SHARE: Final = 0.1
-EXTRA_BYTES: Final = 150_000  # Per frame: a preview of 640 px, and its rows in the journal
-# Reserve for other users of the disk, and for file systems that are slow when they are full.
+EXTRA_BYTES: Final = 150_000  # Space for the preview of a frame and its rows in the journal, bytes
+# Space that remains free, bytes, because other programs need it and full disks are slow.
 SPARE_BYTES: Final = 500_000_000
-# Assumed for lossless 14-bit raw files: measured 1.34 at ISO 100 (EOS 550D, EOS 6D Mark II), and more with noise.
+# Assumed size of lossless 14-bit raw files, bytes per photosite. At ISO 100, an EOS 550D needs 1.34; noise adds more.
 BYTES_PER_PIXEL: Final = 1.5
-# Cameras that may write each photosite in 16 bits (Sony), and the simulated cameras, which do.
-LOOSE_BYTES_PER_PIXEL: Final = 2.0
-UNKNOWN_BYTES: Final = 60_000_000  # Assumed for an unknown camera: 40 million photosites
-# Millions of photosites, and the models with at most as many: the makers' numbers plus 5 % for masked borders. From
-# general knowledge, except for the EOS 550D, 6D Mark II, 5D Mark II, 5DS and 1Ds Mark III.
+# Assumed size for cameras that may write 16 bits per photosite (Sony), and for the simulated cameras, bytes.
+PADDED_BYTES_PER_PIXEL: Final = 2.0
+UNKNOWN_BYTES: Final = 60_000_000  # Assumed size of a raw file of an unknown camera, bytes
+# Number of photosites in millions, and models with at most this number: as stated by the maker, plus 5 % for borders.
+# Only the numbers of the EOS 550D, 6D Mark II, 5D Mark II, 5DS and 1Ds Mark III were verified.
 _MODELS: Final = (
     (0.52, "CroP Test"),
     (18.7, "EOS 550D, EOS REBEL T2i, EOS Kiss X4, EOS 650D, EOS 700D, EOS REBEL T4i, EOS REBEL T5i, "
@@ -221,7 +221,7 @@ MEGAPIXELS: Final = {model: size for size, models in _MODELS for model in models
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value, its basis in words, and whether it is more than an assumption."""
+    """A value, its basis in words, and whether it is reliable or only an assumption."""
 
     value: float
     basis: str
@@ -242,7 +242,7 @@ def frame_bytes(largest: int | None, model: str, simulated: int | None = None) -
     if megapixels is None:
         cause = f"the size of a frame of {model} is unknown" if model else "the camera did not answer"
         return Estimate(UNKNOWN_BYTES, f"assumed: {cause}; acquire check measures it", False)
-    density = LOOSE_BYTES_PER_PIXEL if model.startswith(("ILCE", "CroP ")) else BYTES_PER_PIXEL
+    density = PADDED_BYTES_PER_PIXEL if model.startswith(("ILCE", "CroP ")) else BYTES_PER_PIXEL
     return Estimate(megapixels * 1e6 * density, f"{megapixels:.1f} million photosites, {density:g} bytes each", True)
 
 
@@ -269,7 +269,7 @@ def free_bytes_at(folder: Path) -> int:
 
 
 def bytes_text(number: float, up: bool = False) -> str:
-    """Return bytes as GB or MB with one digit; rounded `up` if they are needed.
+    """Return bytes as GB or MB with one decimal; `up`: whether to round up.
 
     Examples
     --------
@@ -290,7 +290,7 @@ class Answers:
 
     - `offered_s`: shutter times that the camera offers, s.
     - `projector`: name and state, in words.
-    - `lit`: whether its lamp burns.
+    - `lit`: whether the lamp is on.
     - `warnings`: settings that change the colours on the screen, each with its remedy.
     - `unasked`: values that are not reported or not queried, each with the reason.
     - `faults`: faults that would end the run.
@@ -307,7 +307,7 @@ class Answers:
 
 
 def ask(devices: Devices) -> Answers:
-    """Query the values of a plan from open devices; a device that does not answer is a fault."""
+    """Query the devices for a plan; a device that does not answer is a fault."""
     faults: list[CropError] = []
     unasked: list[str] = []
 
@@ -347,7 +347,7 @@ def ask(devices: Devices) -> Answers:
 
 
 def projector_state(projector: Projector) -> tuple[str, bool | None]:
-    """Return name and state of a projector in words, and whether its lamp burns."""
+    """Return name and state of a projector in words, and whether its lamp is on."""
     identity = projector.identity()
     name = " ".join(word for word in (identity.maker, identity.model, identity.name) if word) or "projector"
     hours = ", ".join(f"{lamp.hours} h" for lamp in projector.lamps())
@@ -357,25 +357,26 @@ def projector_state(projector: Projector) -> tuple[str, bool | None]:
     return f"{name}{f', lamp {hours}' if hours else ''}, {state}", lit
 
 
-# Assumed transfer rate before the first frame: USB 2.0 carries 30 to 40 million bytes/s.
+# Assumed transfer rate, as long as none is measured. USB 2.0 transfers 30 to 40 million bytes per second.
 DOWNLOAD_BYTES_PER_S: Final = 25e6
-# Assumed time per frame in addition to exposure and transfer, s: release, mirror, read-back of the screen, journal.
+# Assumed time of a frame in addition to exposure and transfer, s: mirror, read-back of the screen, journal.
 STEP_S: Final = 0.4
-LIGHTING_S: Final = 60.0  # Assumed time to light the lamp, s; makers state 30 to 40 s, and up to 130 s
-# Charge at which a long series needs mains power: cameras report it in steps of a quarter, and soon below this step
-# they release no more frames.
+LIGHTING_S: Final = 60.0  # Assumed time until the lamp is lit, s; makers state 30 to 130 s
+# Battery level at which a long run is refused. Cameras report the level in steps of a quarter, and a camera at this
+# step soon stops.
 LOW_BATTERY: Final = 0.25
-FEW_FRAMES: Final = 50  # Frames that are taken even with a low battery
-# Largest relative difference of a shutter time from one that the camera offers; drivers accept no more.
+FEW_FRAMES: Final = 50  # Number of frames that are taken even with a low battery
+# Largest relative difference between a shutter time and the nearest time that the camera offers. Drivers accept no
+# larger difference.
 OFFERED_WITHIN: Final = 0.01
 
 
 @dataclass(frozen=True)
 class RunPlan:
-    """Needs of a run, and faults that would end it.
+    """Time and space that a run needs, and faults that would end it.
 
     - `frame_bytes`, `frame_s`: size of a raw file, bytes, and time of a frame, s.
-    - `warm_up_s`: warm-up of the lamp before the first frame, s; 0 if it is known to burn.
+    - `warm_up_s`: warm-up of the lamp before the first frame, s; 0 if the lamp is on.
     - `free_bytes`: free space on the disk of the session.
     - `faults`: faults that would end the run, each with its remedy.
     - `doubts`: warnings.
@@ -413,7 +414,7 @@ def make_plan(
 ) -> RunPlan:
     """Return the plan of a run with all its faults."""
     size = frame_bytes(work.frame_bytes, answers.camera.model if answers.camera is not None else "", given_bytes)
-    # A lamp of unknown state is assumed to be cold.
+    # If the state of the lamp is unknown, it is assumed to be cold.
     is_cold = answers.lit is False or (answers.lit is None and has_lamp_control(settings))
     warm_up_s = LIGHTING_S + settings.sequence.warm_up_s if is_cold and settings.sequence.warm_up_s > 0 else 0.0
     problems = (
@@ -439,15 +440,14 @@ def make_plan(
     )
 
 
-# Settling time, s, above which seconds may have been confused with milliseconds (judgement): many times the settling
-# time of projectors.
+# Longest plausible settling time, s (judgement). A longer one was probably given in milliseconds.
 LONG_SETTLE_S: Final = 10.0
-# Warm-up, s, below which a lamp is not steady (judgement): makers recommend 10 to 30 minutes.
+# Shortest warm-up after which a lamp is steady, s (judgement). Makers recommend 10 to 30 minutes.
 SHORT_WARM_UP_S: Final = 300.0
 
 
 def settings_doubts(settings: LabSettings) -> tuple[str, ...]:
-    """Return warnings about settings that may be mistakes, a sentence each."""
+    """Return warnings about settings that may be mistakes, one sentence for each."""
     doubts = [doubt for key, target in _targets(settings) if (doubt := _target_doubt(key, target))]
     settle_s, warm_up_s = settings.sequence.settle_s, settings.sequence.warm_up_s
     if settle_s > LONG_SETTLE_S:
@@ -467,7 +467,7 @@ def _targets(settings: LabSettings) -> tuple[tuple[str, str], ...]:
 
 
 def _target_doubt(key: str, target: str) -> str:
-    """Return why notices may not reach a target; "" for a URL, an executable command, or no target."""
+    """Return why notices may not reach a target; "" if it is a URL, an executable command, or empty."""
     command = shlex.split(target)[:1]
     if is_webhook(target) or not command or shutil.which(command[0]):
         return ""
@@ -485,7 +485,7 @@ def has_lamp_control(settings: LabSettings) -> bool:
 
 
 def is_offered(shutter_s: float, offered_s: Sequence[float]) -> bool | None:
-    """Return whether a camera offers a shutter time; None if it lists none. All in s."""
+    """Return whether a camera offers a shutter time; None if it lists no times. All times are in s."""
     if not offered_s:
         return None
     return any(abs(shutter_s / time - 1) <= OFFERED_WITHIN for time in offered_s)
@@ -645,7 +645,7 @@ def _frames_text(work: Work) -> str:
 
 
 def _turns_text(settings: LabSettings) -> str:
-    """Return the number of turns of the colour wheel, or pictures, in an exposure; "" for a steady light."""
+    """Return the number of turns of the colour wheel, or of images, in an exposure; "" for a steady light."""
     wheel = wheel_of(settings)
     if settings.rig != "lab" and not wheel:
         return ""
@@ -658,7 +658,7 @@ def _turns_text(settings: LabSettings) -> str:
 
 
 def dry_run(settings: LabSettings, folder: Path, retake: str | None = None) -> RunPlan:
-    """Return the plan of the run of `settings` and `folder`; devices that cannot be opened are faults."""
+    """Return the plan of a run without taking frames; a device that cannot be opened is a fault."""
     with ExitStack() as opened:
         session = opened.enter_context(Session.open(folder)) if session_exists(folder) else None
         if session is not None:
@@ -672,7 +672,7 @@ def dry_run(settings: LabSettings, folder: Path, retake: str | None = None) -> R
 
 
 def require_plan(settings: LabSettings, folder: Path, session: Session | None, devices: Devices) -> None:
-    """Refuse a run that could not be completed; its devices are open and were not used yet.
+    """Refuse a run that could not be completed. Its devices must be open, but not used yet.
 
     `session`: the resumed session; None for a new one in `folder`.
     """

@@ -1,6 +1,6 @@
-"""Take a session from LAB.toml: create or resume it, open the rig, take all missing frames, and send notices.
+"""Take a session as set in LAB.toml: create or resume it, open the rig, take all missing frames, and send notices.
 
-Notices go to the terminal, a command, a URL, systemd and a dead man's switch (docs/how-to/night-run.md). A separate
+Notices go to the terminal, a command, a URL, systemd and a monitoring service (docs/how-to/night-run.md). A separate
 thread delivers them, so that frames do not wait. A notice that cannot be delivered is reported once.
 """
 
@@ -69,15 +69,15 @@ from foundation.errors import CropError, DeviceRefused, InputError, StorageError
 from foundation.secret_texts import is_webhook, target_label
 from foundation.version import software
 
-LIMIT_S: Final = 20.0  # Longest time for a receiver to accept a notice, s; a message to a telephone takes seconds
-ENDING_S: Final = 2.0  # Additional time for the last notice, s, so that a slow receiver is reported by name
-# Shortest interval between two notices of pauses with the same cause, s: nobody needs more of them.
+LIMIT_S: Final = 20.0  # Longest time for a receiver to accept a notice, s
+ENDING_S: Final = 2.0  # Additional time at the end of a run, s, so that the failure of the last notice is reported
+# Shortest interval between two notices of pauses with the same cause, s.
 QUIET_S: Final = 3600.0
-QUEUED: Final = 100  # Notices that can wait for a slow receiver; more are dropped
+QUEUED: Final = 100  # Largest number of notices that wait for a slow receiver; more are dropped
 
 
 class Notices:
-    """Sends events to a target; `close` waits for the delivery of the last one.
+    """Sends events to a target; `close` waits for the delivery of all events.
 
     `target`: a URL or a command line; empty for none.
     """
@@ -131,23 +131,23 @@ class Notices:
         """Report notices that could not be delivered; called by the thread of the run."""
         while not self._failed.empty():
             sentence = self._failed.get()
-            # A receiver that cannot be reached usually stays so, therefore each failure is reported once.
+            # Each failure is reported only once, because it usually repeats with every notice.
             if sentence not in self._reported:
                 self._reported.add(sentence)
                 self._warn(sentence)
 
     def _deliver_all(self) -> None:
         while (notice := self._waiting.get()) is not None:
-            failure = self._posted(*notice) if is_webhook(self._target) else self._run(*notice)
+            failure = self._post_notice(*notice) if is_webhook(self._target) else self._run_command(*notice)
             if failure:
-                # Only scheme and host, or the program, are named: the rest of the target may be a secret.
+                # The message contains only scheme and host, or the program. The rest of the target may be secret.
                 label = target_label(self._target)
                 self._failed.put(f"{label} did not receive a notice: {failure}; the run continues; check the receiver")
 
-    def _run(self, event: str, message: str, body: bytes) -> str:
+    def _run_command(self, event: str, message: str, body: bytes) -> str:
         variables = {"CROP_EVENT": event, "CROP_MESSAGE": message, "CROP_SESSION": self._session}
         try:
-            # In its own process group: Ctrl-C does not reach it, and its child processes can be ended with it.
+            # In its own process group, the command is not reached by Ctrl-C, and its child processes can be ended.
             process = subprocess.Popen(
                 shlex.split(self._target),
                 stdin=subprocess.PIPE,
@@ -167,7 +167,7 @@ class Notices:
                 return f"it has not ended within {LIMIT_S:g} s"
         return f"it ended with {process.returncode}, expected 0" if process.returncode else ""
 
-    def _posted(self, event: str, message: str, body: bytes) -> str:
+    def _post_notice(self, event: str, message: str, body: bytes) -> str:
         url = urlsplit(self._target)
         headers = {"Content-Type": "application/json; charset=utf-8", "User-Agent": "CroP"}
         if event.isascii():
@@ -182,7 +182,7 @@ class Notices:
 def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
 
     class Unredirected(urllib.request.HTTPRedirectHandler):
-        """Follows no redirection, which would lose the body and still return success."""
+        """Follows no redirection, because a redirected request would lose its body and still succeed."""
 
         def redirect_request(self, req: object, fp: object, code: int, msg: str, headers: object, newurl: str) -> None:
             return None
@@ -191,7 +191,7 @@ def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
     try:
         with urllib.request.build_opener(Unredirected).open(request, timeout=LIMIT_S):
             return ""
-    # Texts of library errors may contain the secret address, so only the code or the kind of an error is reported.
+    # Error messages of libraries may contain the secret address, so only the code or the kind of an error is reported.
     except urllib.error.HTTPError as error:
         error.close()
         return f"it answered {error.code}"
@@ -202,7 +202,7 @@ def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
 
 
 class PauseNotices:
-    """Sends notices of pauses, at most one per cause in `QUIET_S`, and of the end of a reported pause.
+    """Sends notices of pauses and of their ends, but at most one notice per cause in `QUIET_S`.
 
     `send`: receives an event and a sentence.
     """
@@ -213,7 +213,7 @@ class PauseNotices:
         self._is_reported = False
 
     def paused(self, sentence: str) -> None:
-        """Report a pause; called at its start and repeatedly during it, so that a delayed notice is sent later."""
+        """Report a pause. This is called repeatedly during a pause, so that a delayed notice is sent later."""
         if self._is_reported:
             return
         cause, now_s = pause_cause(sentence), self._clock.monotonic()
@@ -223,7 +223,7 @@ class PauseNotices:
             self._send("paused", sentence)
 
     def resumed(self, sentence: str) -> None:
-        """Report the end of the pause."""
+        """Report the end of the pause, if its start was reported."""
         if self._is_reported:
             self._is_reported = False
             self._send("resumed", sentence)
@@ -249,12 +249,12 @@ def _number_text(check: Check) -> str:
     return f"{check.name} {check.value:.3g}{unit}{' (beyond its limit)' if check.is_beyond else ''}"
 
 
-# Interval between two lines of progress in a file, s: short enough to show progress, long enough to be read.
+# Interval between two lines of progress if the output is not a terminal, s.
 PLAIN_S: Final = 30.0
 
 
 class Terminal:
-    """Shows a run as a progress bar on a terminal, otherwise as lines; use it in a `with` block.
+    """Shows the progress of a run as a bar on a terminal, otherwise as lines; use it in a `with` block.
 
     `clock`: returns seconds.
     """
@@ -295,7 +295,7 @@ class Terminal:
 
     def progress(self, done_count: int, total: int) -> None:
         """Show the number of accepted frames."""
-        # A run that is refused before its first frame shows no bar.
+        # The bar is not started earlier, so that a run that is refused shows no bar.
         if not self._bar.live.is_started:
             self._bar.start()
         left_s = time_left(self._attempts, total - done_count)
@@ -318,7 +318,7 @@ class Terminal:
         _print(sentence)
 
     def state(self, sentence: str) -> None:
-        """Show the reason of a wait; its time is not included in the time per frame."""
+        """Show the reason of a wait; the duration of the wait is not included in the time per frame."""
         self._since = None
         self._bar.update(self._task, status=sentence, remaining="")
         self._print_line(sentence)
@@ -332,21 +332,23 @@ class Terminal:
 
 
 def _print(line: str) -> None:
-    # A log on a full disk must not end the run: the journal has all important events.
+    # Errors of a log file must not end the run, because the journal has all important events.
     with suppress(OSError):
         print(line, file=sys.stderr)
 
 
-ALIVE_S: Final = 60.0  # Interval between two signs to a dead man's switch, s: such services allow minutes
+ALIVE_S: Final = 60.0  # Interval between two signs of life to a monitoring service, s
 
-# Share of the watchdog's time between two signs: sd_watchdog_enabled(3) recommends at most half.
+# Interval between two signs of life to the watchdog of systemd, as a fraction of its time limit. sd_watchdog_enabled(3)
+# recommends at most half.
 WATCHDOG_SHARE: Final = 0.25
 
 
 class Life:
-    """Sends signs of life from the steps of a run, so that a hanging run sends none; close it at the end.
+    """Sends signs of life to a monitoring service and to systemd; close it at the end.
 
-    `target`: dead man's switch, a URL or a command; empty for none. `environment`: variables set by a service manager.
+    The steps of a run call it, so a run that hangs sends no signs. `target`: the service, a URL or a command; empty for
+    none. `environment`: variables set by a service manager.
     """
 
     def __init__(
@@ -369,7 +371,7 @@ class Life:
         self.sign("running")
 
     def sign(self, activity: str) -> None:
-        """Report the current activity; may be called often, because signs are sent at intervals."""
+        """Report the current activity. This may be called often, because signs are sent only at intervals."""
         now_s = self._clock.monotonic()
         if now_s - self._watchdog_fed_s >= self._watchdog_s * WATCHDOG_SHARE:
             self._watchdog_fed_s = now_s
@@ -407,7 +409,7 @@ def _watchdog_s(environment: Mapping[str, str]) -> float:
         return 0.0
 
 
-# Expected time for a camera to accept its settings, s: a dozen messages with answers
+# Expected time for a camera to accept its settings, s.
 CONFIGURE_S = 10.0
 
 
@@ -421,11 +423,11 @@ def run_session(
     on_frame: Callable[[Taken], object] = lambda frame: None,
     state: Callable[[str], object] = lambda sentence: None,
 ) -> RunOutcome:
-    """Take the session `folder`, new or interrupted, with the rig of the settings.
+    """Take a new or interrupted session in `folder` with the rig of the settings.
 
     `retake`: frames to repeat (`Session.retake`); None for none.
     """
-    # Damaged files are detected before a device is opened, and taken again.
+    # Damaged files are detected before a device is opened. Their frames are repeated.
     with ExitStack() as at_last, ExitStack() as opened:
         session = opened.enter_context(_resumed(settings, folder, announce)) if session_exists(folder) else None
         if session is None and retake is not None:
@@ -465,7 +467,7 @@ def run_session(
         def count(frame: Taken) -> None:
             sign("")
             on_frame(frame)
-            # A white or dark frame may have been added at the end of the plan.
+            # The plan may have become longer by a white or dark frame.
             total = len(session.steps)
             observe(total - frame.remaining, total)
 
@@ -478,14 +480,14 @@ def _signs_of_session(session: Session) -> Generator[SignOfLife]:
     """Send signs of life of this run. If the previous run was killed, first record this in the journal."""
     journal = session.journal
     if note := killed_note(session):
-        # The clock of the lab, which may differ from the clock of the computer, is not open yet.
+        # The clock of the laboratory is not open yet, and it may differ from the clock of the computer.
         journal.note(last_frame_time(journal.attempts()) or datetime.now(UTC), "killed", note)
     with signs_of_life(journal.beat, journal.run_state, TRY_S) as alive:
         yield alive
 
 
 def _report(session: Session, announce: Callable[[str], object]) -> None:
-    # A disk error must not change the result of the run, because the report can be written again.
+    # An error of the report must not change the result of the run, because the report can be written again.
     try:
         write_session_report(session.folder)
     except CropError as error:
@@ -516,10 +518,10 @@ def _created(settings: LabSettings, folder: Path) -> Session:
 
 def require_same_devices(session: Session, devices: Devices, settings: LabSettings) -> None:
     """Raise an error unless camera and projector are those recorded in the session; record them if it is new."""
-    # A LUT of two sensors, even of the same model, is worthless, and the frames would not show it.
+    # A LUT from two cameras, even of the same model, would be wrong, and the frames would not show it.
     recorded = session.journal.records()
     body = devices.camera.identity()
-    # Firmware versions and the name in a projector's menu are not compared, because they may change.
+    # Firmware versions and the user's name of a projector are not compared, because they may change.
     names = {"camera": f"{body.maker} {body.model}, serial number {body.serial}"}
     if devices.projector is not None:
         projector = devices.projector.identity()
@@ -547,14 +549,14 @@ def clock_note(session: Session, clock: Clock) -> str:
     if not isinstance(clock, SteadyClock) or not clock.behind_s:
         return ""
     return (
-        f"clock: the computer's clock is {duration_text(clock.behind_s)} behind the last frame of {session.folder}, or "
-        "was ahead then; the time of the session continues from this frame, so that the order of its frames is kept; "
-        "set the clock"
+        f"clock: the computer's clock is {duration_text(clock.behind_s)} behind the last frame of {session.folder}; "
+        "one of the times is wrong. The session continues from the time of this frame, "
+        "so that frames keep their order; set the clock"
     )
 
 
 def killed_note(session: Session) -> str:
-    """Return the journal's note about a previous run that did not end normally; else ""."""
+    """Return a sentence about the previous run if it did not end normally; else ""."""
     beat = session.journal.heartbeat()
     if beat is None or beat.state == "ended" or beat.belongs_to(SessionPlace.of(session.journal.path)) is False:
         return ""
@@ -567,7 +569,7 @@ class RunOutcome:
     """Result of a run.
 
     - `total`, `remaining`: number of planned steps, and of steps without an accepted frame.
-    - `refused`: for each step that was given up, the reason.
+    - `refused`: a sentence with the reason for each step that was given up.
     - `doubts`: warnings of this run and of earlier runs of the session.
     """
 
@@ -638,7 +640,7 @@ def take_session(
     except BaseException as error:
         interrupted = isinstance(error, KeyboardInterrupt)
         leave_lab(devices, RunEnd.INTERRUPTED if interrupted else RunEnd.UNFINISHED, sequence, reports.report)
-        # frames.csv is written again at the next opening: its errors must not hide this one.
+        # Errors of frames.csv must not hide this error. The file is written again by the next run.
         with suppress(StorageError):
             session.write_frames_csv()
         reports.end("interrupted" if interrupted else "ended", str(error) or "by the operator")
@@ -694,7 +696,11 @@ SignOfLife = Callable[[str], None]
 def signs_of_life(
     beat: Callable[[RunState, str, datetime], None], newest: Callable[[], RunState | None], within_s: float
 ) -> Generator[SignOfLife]:
-    """Send signs of life while the block runs, and finally the reason of its end."""
+    """Send signs of life while the block runs, and finally the reason of its end.
+
+    `beat` sends a sign with the latest time of the next sign, which is `within_s` later. `newest` returns the last
+    state.
+    """
     last_s, reported_state = -math.inf, ""
 
     def send(state: RunState, sentence: str) -> None:
@@ -758,7 +764,7 @@ class _Reports:
         self._notices.report_failures()
 
     def doubt(self, sentence: str) -> None:
-        """Report a warning that does not stop the run; errors of the disk are reported elsewhere."""
+        """Report a problem that does not stop the run; errors of the disk are ignored here."""
         self._announce(f"{DOUBT}: {sentence}")
         with suppress(StorageError):
             self._journal.note(self._clock.now(), DOUBT, sentence)
@@ -787,7 +793,7 @@ class _Reports:
         thread_beat(self._journal.path, "late", sentence, started + timedelta(seconds=TRY_S))
 
     def end(self, event: str, sentence: str) -> None:
-        """Report the reason of the end; errors of the disk are reported elsewhere."""
+        """Report why the run ended; errors of the disk are ignored here."""
         self._notify(event, sentence)
         self._life.end(event, sentence)
         with suppress(StorageError):

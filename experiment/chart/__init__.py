@@ -1,1 +1,1 @@
-"""The printed chart: contents, layout, and the files for a print shop."""
+"""The printed chart: its layout, its data, and the files for the print shop."""

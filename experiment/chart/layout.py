@@ -1,16 +1,17 @@
-"""Design of the chart: positions of colours, tags and references.
+"""Design a chart: choose the positions of colours, tags and references.
 
-- The sheet is a grid of square slots of 125 pixels at 600 dpi (5.292 mm), whose origin is a whole pixel. So all printed
-  edges of patches and tag modules are between two pixels, and sizes are whole pixels at any multiple of 24 dpi. On a
-  smaller page the slot is the largest multiple of 5 pixels that fits. So a tag module (2/5 of a slot) has whole pixels.
-- Each colour is printed once, in random order. A random chart is registered four times more accurately than a smooth
-  one, and shows an error by one patch.
-- Tags are on a regular grid up to the edges. They take 4 × 4 slots: the 10 modules of an AprilTag 36h11 with its rim.
-- All other slots are achromatic references. They are spread evenly but not regularly, because a regular grid causes
+- The sheet is divided into square slots, with a side of 125 pixels at 600 dpi (5.292 mm). On a page that is too small
+  for this, the side is the largest multiple of 5 pixels that fits. All edges of patches and tag modules are then edges
+  of pixels at 600 dpi.
+- Each colour is printed once, in random order. A random chart can be registered more accurately than a smooth one, and
+  a registration that is wrong by one patch is detected.
+- The tags form a regular grid that reaches the edges. Each tag takes 4 × 4 slots, for the 10 modules of an AprilTag
+  36h11 with its rim.
+- All other slots are achromatic references. They are spread evenly but irregularly, because a regular grid would cause
   streaks in the fitted flat field.
 
-`paper_chart` makes the plain grid of the paper, 256 × 128 patches, for existing sheets. The same bits, page and
-seed give the same chart. On A0, 221 × 155 slots hold 32 768 colours, 35 tags and 927 references.
+The same bits, page and seed give the same chart. On A0, 221 × 155 slots hold 32 768 colours, 35 tags and 927
+references. For existing sheets, `paper_chart` makes the plain grid of the paper with 256 × 128 patches.
 """
 
 from __future__ import annotations
@@ -26,30 +27,32 @@ from experiment.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, 
 from foundation.errors import InputError
 from foundation.version import software
 
-SLOT_PX = 125  # Usual side of a slot, 5.29 mm: the largest with which 32 768 colours, tags and references fit on A0
+SLOT_PX = 125  # Normal side of a slot: the largest with which 32 768 colours, tags and references fit on A0
 
-SLOT_STEP_PX = 5  # Slots are multiples of this, because the ten modules of a tag are four slots
+# The side of a slot is a multiple of this length, so that a tag module (2/5 of a slot) has whole pixels.
+SLOT_STEP_PX = 5
 
-# Smallest slot: a patch of 1.06 mm, a module of 0.42 mm; with fewer dots a printer cannot mix a colour
+# Smallest side of a slot, 1.06 mm. A printer cannot mix a colour from fewer dots.
 LEAST_SLOT_PX = 25
 
-TAG_SLOTS = 4  # Slots along a tag with its white rim: each of its ten modules is 2/5 of a slot, whole pixels
+TAG_SLOTS = 4  # Number of slots along a tag with its white rim
 
-TAG_SPACING_SLOTS = 38  # Largest distance between tags in slots: 35 tags on A0, seven by five
+TAG_SPACING_SLOTS = 38  # Largest distance between neighbouring tags, in slots
 
 TAG_IDS = 587  # Number of codes in the family 36h11
 
-MARGIN_MM = 8.0  # Smallest white margin: printers leave 3 to 5 mm, and rulers and targets need the rest
+MARGIN_MM = 8.0  # Smallest white margin. Printers need 3 to 5 mm, rulers and targets need the rest.
 
-# Columns and rows of blocks in the grid of the paper, by bits: one block for each level of blue.
+# Columns and rows of blocks in the grid of the paper, for each number of bits. There is one block for each level of
+# blue.
 PAPER_BLOCKS = {1: (2, 1), 2: (2, 2), 3: (4, 2), 4: (4, 4), 5: (8, 4)}
 
-PAPER_REFERENCE_MM = 100.0  # Largest distance between white references in the margin of the grid of the paper
+PAPER_REFERENCE_MM = 100.0  # Largest distance between the white references in the margins of `paper_chart`
 
-# Side of these references, 5 mm: about the side of a patch, and even, so that the centre is a whole pixel.
+# Side of these references, 5 mm. It is even, so that the centre is a whole pixel.
 PAPER_REFERENCE_PX = 118
 
-PAPER_REFERENCES = 4  # Smallest number of intervals of these references along the upper and the right margin
+PAPER_REFERENCE_INTERVALS = 4  # Smallest number of intervals between white references in the top and right margin
 
 # Landscape sheets of ISO 216, largest first.
 A_SERIES_MM: dict[str, tuple[float, float]] = {
@@ -64,16 +67,14 @@ A_SERIES_MM: dict[str, tuple[float, float]] = {
     "A8": (74, 52),
 }
 
-# Codes of grey references. In sRGB each reflects half the light of the previous one, 1/2 … 1/16 of white. Four equal
-# stops show whether a frame is linear, and the darkest still has several hundred counts if white is well exposed.
-# None is a colour of the chart, because its low bits are not 0.
+# Codes of the grey references. In sRGB, each grey reflects half the light of the previous grey: 1/2, 1/4, 1/8 and 1/16
+# of white. These levels show whether a frame is linear. No grey is a colour of a patch, because its low bits are not 0.
 GREY_CODES = (188, 137, 99, 71)
 
-# With at least this number of white references, calibration can measure the fall-off to the corners; with fewer, only a
-# slope.
+# Smallest number of white references with which calibration can measure the fall-off to the corners.
 LEAST_WHITES = 18
 
-# Longest side of a page: no printer has wider rolls, so a larger number is an error of units.
+# Longest side of a page. A larger number is probably in a wrong unit.
 LARGEST_PAGE_MM = 10_000.0
 
 _Slots = npt.NDArray[np.bool_]
@@ -81,7 +82,7 @@ _Slots = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class _Grid:
-    """The slots of a page: their numbers, and size and origin in pixels at 600 dpi."""
+    """The grid of slots on a page: numbers of columns and rows, side of a slot, and origin, px at 600 dpi."""
 
     columns: int
     rows: int
@@ -112,7 +113,7 @@ class _Grid:
         return self.columns * self.rows - len(self.tag_slots) * TAG_SLOTS**2
 
     def holds(self, bits: int) -> bool:
-        # At least two by two tags.
+        # A chart needs at least two by two tags.
         if min(self.columns, self.rows) < 2 * TAG_SLOTS or len(self.tag_slots) > TAG_IDS:
             return False
         return self.free_slot_count >= 8**bits + _least_references(bits)
@@ -124,14 +125,14 @@ class _Grid:
 
 
 def _tag_starts(slots: int) -> list[int]:
-    # Evenly spaced, the outermost tags at the edges.
+    # Space the tags evenly; the outermost tags are at the edges.
     last = slots - TAG_SLOTS
     steps = max(1, math.ceil(last / TAG_SPACING_SLOTS))
     return [round(step * last / steps) for step in range(steps + 1)]
 
 
 def _least_references(bits: int) -> int:
-    # Three of each grey and 20 whites, or one reference for each 40 colours.
+    # 20 whites and three of each grey, or one reference for 40 colours if that is more.
     return max(32, 8**bits // 40)
 
 
@@ -154,8 +155,8 @@ def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, s
 
     Returns
     -------
-        The chart. Its patches have a side of 5.292 mm. On a page that is too small for that, they have the largest side
-        that fits, a multiple of 5 pixels at 600 dpi.
+        The chart. The side of its patches is 5.292 mm. On a page that is too small for this, it is the largest multiple
+        of 5 pixels at 600 dpi that fits.
     """
     if not 1 <= bits <= 5:
         raise InputError(f"{bits} bits per channel are given, expected 1 to 5; give another number")
@@ -210,13 +211,12 @@ def _choose_grid(bits: int, page: str | tuple[float, float] | None) -> tuple[_Gr
 def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) -> Chart:
     """Return the plain grid of the paper: 256 × 128 patches, each of the 32 768 colours once, without tags.
 
-    The figure in the paper shows no order, so this is a reconstruction: 8 × 4 blocks of 32 × 32 patches. In a block red
-    rises by column and green by row. Blue rises from block to block, row by row, the second row from right to left, and
-    so on. In every second column of blocks red falls; in every second row green falls. So neighbours differ by one
-    step in one channel, except for blue between blocks above each other.
+    The paper does not describe the order of the colours, so this order is a reconstruction. There are 8 × 4 blocks of
+    32 × 32 patches. Red changes along the columns of a block, green along its rows, and blue from block to block. The
+    directions alternate between blocks, so that neighbouring patches usually differ by one step in one channel.
 
-    References are squares of bare paper in the margin, 5 mm wide, at the corners and every 100 mm or less above and to
-    the right of the patches. The sheet is assumed to have this margin.
+    The references are squares of bare paper in the margin, 5 mm wide. They are at the corners, and at most 100 mm apart
+    above the patches and to their right. The sheet is assumed to have this margin.
 
     Parameters
     ----------
@@ -227,8 +227,8 @@ def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) ->
 
     Returns
     -------
-        The chart. Sides of its patches are whole pixels at 600 dpi, the largest with a margin of 8 mm: 108 × 152 on A0,
-        that is 4.57 × 6.43 mm.
+        The chart. Its patches are as large as possible with a margin of 8 mm and whole pixels at 600 dpi. On A0 they
+        measure 4.57 × 6.43 mm.
     """
     if bits not in PAPER_BLOCKS:
         raise InputError(f"{bits} bits per channel are given, expected 1 to 5; give another number")
@@ -268,7 +268,7 @@ def _margin_whites(field_px: tuple[int, int, int, int]) -> list[Reference]:
     left, top, right, bottom = field_px
     side, distance, step = PAPER_REFERENCE_PX, GAP_PX + PAPER_REFERENCE_PX // 2, PAPER_REFERENCE_MM / PX_MM
     sides = ((left, right), (top, bottom))
-    across, down = (max(PAPER_REFERENCES, math.ceil((high - low) / step)) for low, high in sides)
+    across, down = (max(PAPER_REFERENCE_INTERVALS, math.ceil((high - low) / step)) for low, high in sides)
     centres = [(x, y) for y in (top - distance, bottom + distance) for x in (left - distance, right + distance)]
     centres += [(left + round(k * (right - left) / across), top - distance) for k in range(1, across)]
     centres += [(right + distance, top + round(k * (bottom - top) / down)) for k in range(1, down)]
@@ -306,7 +306,7 @@ def _references(grid: _Grid, is_reference: _Slots, rng: np.random.Generator) -> 
     codes[is_reference] = PAPER_WHITE[0]
     is_white = is_reference.copy()
     count = int(is_reference.sum())
-    # An eighth of the references for each grey. If there are few references, each grey gets fewer, so that
+    # Each grey gets an eighth of the references. If there are few references, each grey gets fewer, so that at least
     # `LEAST_WHITES` are white.
     grey_count = min(count // (2 * len(GREY_CODES)), (count - LEAST_WHITES) // len(GREY_CODES))
     for code in GREY_CODES:
@@ -326,12 +326,11 @@ def _references(grid: _Grid, is_reference: _Slots, rng: np.random.Generator) -> 
 
 
 def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
-    """Choose `count` of the allowed slots (rows, columns), spread evenly over the grid, but not regularly.
+    """Choose `count` of the allowed slots (rows, columns), spread evenly but irregularly over the grid.
 
-    After the void-and-cluster method (Ulichney, "The void-and-cluster method for dither array generation", 1993).
-    The first choice is random; then each chosen slot in turn moves to the emptiest position of its quarter of the grid.
-    One pass is enough: on A0, no two references are closer than 4 slots. No slot is farther than 6 slots from a
-    reference. The spectrum is that of blue noise, equal in all directions.
+    Source: R. Ulichney, "The void-and-cluster method for dither array generation", 1993. The first choice is random.
+    Then each chosen slot in turn moves to the emptiest position in its quarter of the grid. One pass is enough: on A0,
+    no two references are closer than 4 slots, and no slot is farther than 6 slots from a reference.
     """
     rows, columns = allowed.shape
     middle_row, middle_column = (rows + 1) // 2, (columns + 1) // 2
@@ -347,17 +346,17 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
         is_chosen.flat[rng.choice(slots, quota, replace=False)] = True
     if count == 0:
         return is_chosen
-    # 0.4 times the mean distance between neighbours is best for the closest pair and the largest gap on A0.
+    # On A0, 0.4 times the mean distance between neighbours gives the most even pattern.
     sigma = 0.4 * math.sqrt(allowed.size / count)
     down, across = _nearness(rows, sigma), _nearness(columns, sigma)
-    # Random numbers decide between equal slots; they are smaller than any relevant difference.
+    # Small random numbers decide between slots with equal densities.
     density = down @ is_chosen.astype(np.float64) @ across.T + 1e-6 * rng.random(allowed.shape)
     penalty, contribution = np.where(allowed & ~is_chosen, 0.0, np.inf), np.empty_like(density)
     for row, column in rng.permutation(np.argwhere(is_chosen)):
         density -= np.multiply(down[:, row, None], across[:, column], out=contribution)
         penalty[row, column] = 0.0
         quarter = quarters[2 * int(row >= middle_row) + int(column >= middle_column)]
-        # Slots that may not be chosen have infinite scores.
+        # The score of a slot that must not be chosen is infinite.
         score = density[quarter] + penalty[quarter]
         row, column = divmod(int(slot_numbers[quarter].flat[score.argmin()]), columns)
         density += np.multiply(down[:, row, None], across[:, column], out=contribution)
@@ -366,12 +365,12 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
 
 
 def _nearness(count: int, sigma: float) -> npt.NDArray[np.float64]:
-    """Return the weight of each slot (column) at each position (row), (count, count) float64, rows of sum 1."""
+    """Return the Gaussian weight [i, j] of slot j at position i, (count, count) float64; sum over j is 1."""
     positions = np.arange(count)
     weights = np.exp(-0.5 * ((positions[:, None] - positions[None, :]) / sigma) ** 2)
     # Subnormal numbers are slow and do not change any sum.
     weights[weights < 1e-40] = 0
-    # A position at the edge has neighbours on one side only; without normalisation, all slots would move to the edges.
+    # A position at the edge has neighbours on one side only. Without normalisation, the slots would move to the edges.
     return weights / weights.sum(axis=1, keepdims=True)
 
 

@@ -1,13 +1,13 @@
-"""Marks in the margins of a sheet: crop marks, two rulers, sharpness targets, and lines of text.
+"""Place the marks in the margins of a sheet: crop marks, rulers, sharpness targets and lines of text.
 
-- Positions and sizes are whole pixels at 600 dpi, so that TIFF and PDF show the same. Marks are black rectangles, so
-  that no file needs a font.
-- Marks keep 1.5 mm away from the patches, stay on the sheet, and do not touch references in the margin. A mark without
-  enough room is omitted.
-- Each tick of a ruler is at the closest whole pixel, within 0.022 mm, and errors do not accumulate: 127 mm are exactly
-  3000 pixels.
+- Every mark consists of black rectangles, so no file needs a font. Positions and sizes are whole pixels at 600 dpi, so
+  TIFF and PDF show the same.
+- A mark is at least 1.5 mm away from the patches and does not touch the references in the margin. A mark without enough
+  room is omitted.
+- Each tick of a ruler is rounded to a whole pixel, with an error of at most 0.022 mm. Errors do not accumulate.
 
-Local positions (u, v): u along a margin from the left or top end of the patch area, v outwards from its edge.
+Positions in a margin are (u, v): u along the margin, from the left or top end of the patch area; v outwards from the
+edge of the patch area.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ import numpy.typing as npt
 
 MM_PER_INCH = 25.4  # Exact, by definition of the international inch
 
-DESIGN_DPI = 600  # Resolution of the design, dpi: photo printers and plotters have this resolution or a multiple
+DESIGN_DPI = 600  # Resolution of the design, dpi. Photo printers and plotters use this resolution or a multiple.
 
 PX_MM = MM_PER_INCH / DESIGN_DPI  # Size of a pixel of the design, mm
 
-# Largest distance of a coordinate in a file from a whole pixel: six decimals of a millimetre are 2e-5 px.
+# A coordinate this close to a whole pixel counts as whole. Files round coordinates by up to 2e-5 px.
 _ROUNDING_PX = 1e-3
 
 Boxes = npt.NDArray[np.int64]  # (N, 4) int64: left, top, right, bottom, px at 600 dpi
@@ -39,36 +39,36 @@ def whole_px(boxes_mm: npt.ArrayLike) -> Boxes:
     )
 
 
-# Bare paper around the patches: 1.5 mm are three half-size pixels of the EOS 550D, more than its blur.
+# Width of bare paper around the patches, 1.5 mm: three half-size pixels of the EOS 550D, which is more than its blur.
 GAP_PX = 35
 
-# Length and width of the strokes of a crop mark, 5 mm and 0.2 mm: long enough for a ruler, and visible.
+# Length and width of the strokes of a crop mark, 5 mm and 0.2 mm.
 CROP_PX, CROP_STROKE_PX = 120, 5
 
-TICK_PX = 4  # Width of a tick of a ruler: 0.17 mm, as on a steel ruler
+TICK_PX = 4  # Width of a tick of a ruler, 0.17 mm, as on a steel ruler
 
-TICKS_PX = ((100, 60), (10, 47), (5, 36), (1, 24))  # Ticks of a ruler: distance in mm, and length
+TICKS_PX = ((100, 60), (10, 47), (5, 36), (1, 24))  # Ticks of a ruler: distance in mm, and length in px
 
-NUMBERS_PX = 100  # Distance of the numbers of a ruler from the patches
+NUMBERS_PX = 100  # Distance of the numbers of a ruler from the patches, px
 
-# Widths of the bars, in groups of three: 0.39, 0.59, 0.79, 0.98, 1.2 … 11.8 line pairs a millimetre. The half-size
-# image of an A0 sheet by an EOS 550D resolves 0.97, a print at 600 dpi 11.8.
+# Widths of the bars, three bars of each: 0.39 to 11.8 line pairs per millimetre. A half-size image of an A0 sheet by an
+# EOS 550D resolves 0.97 line pairs per millimetre.
 BARS_PX = (30, 20, 15, 12, 10, 8, 6, 5, 4, 3, 2, 1)
 
-BAR_LENGTH_PX = 75  # Length of the bars, 3.2 mm: several pixels of a half-size image of A0, for averaging
+BAR_LENGTH_PX = 75  # Length of the bars, 3.2 mm: several half-size pixels, which can be averaged
 
-# Diameter and number of spokes of the Siemens star: 0.75 line pairs a millimetre at its edge, finer inwards; a
-# half-size image of the EOS 550D resolves the edge.
+# Diameter and number of spokes of the Siemens star. At its edge it has 0.75 line pairs per millimetre, which a
+# half-size image of the EOS 550D resolves.
 STAR_PX, STAR_CYCLES = 120, 12
 
-# Slanted edge of ISO 12233: 24 steps of one pixel in twelve, 4.8 degrees.
+# Slanted edge of ISO 12233 with 4.8 degrees: number of steps, length of a step, and smallest depth of the black area.
 EDGE_STEPS, EDGE_RUN_PX, EDGE_DEPTH_PX = 24, 12, 60
 
-_DOT_PX = 2  # Pixels of a dot of text: capitals with 15 dots are 1.3 mm high
+_DOT_PX = 2  # Size of a dot of the text, px; capitals are 15 dots high, that is 1.3 mm
 
-_LINE_PX = 48  # Distance of lines of text, 2 mm
+_LINE_PX = 48  # Distance of the lines of text, 2 mm
 
-_AIR_PX = 20  # Bare paper around each mark, 0.85 mm
+_MARK_GAP_PX = 20  # Width of bare paper around each mark, 0.85 mm
 
 _SEARCH_PX = 24  # Step of the search for free space along a margin, 1 mm
 
@@ -76,7 +76,7 @@ Side = Literal["left", "top", "right", "bottom"]
 
 
 def text_boxes(text: str, dot_px: int = _DOT_PX) -> Boxes:
-    """Return a line of ASCII as black boxes (N, 4) int64 px from (0, 0); capitals are 15 dots high."""
+    """Return a line of ASCII text as black boxes (N, 4) int64 px, starting at (0, 0); capitals are 15 dots high."""
     import cv2
 
     font, scale, stroke = cv2.FONT_HERSHEY_SIMPLEX, 0.7, 2
@@ -89,7 +89,7 @@ def text_boxes(text: str, dot_px: int = _DOT_PX) -> Boxes:
 
 
 def _boxes_of(bitmap: npt.NDArray[np.bool_]) -> Boxes:
-    """Return a bitmap (H, W) as boxes (N, 4): runs along its rows, with equal runs below each other joined."""
+    """Convert a bitmap (H, W) to boxes (N, 4). Each box joins equal runs of true pixels in successive rows."""
     edges = np.diff(np.pad(bitmap.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     rows, starts = np.nonzero(edges == 1)
     ends = np.nonzero(edges == -1)[1]
@@ -106,9 +106,9 @@ def _boxes_of(bitmap: npt.NDArray[np.bool_]) -> Boxes:
 
 
 def star_boxes() -> Boxes:
-    """Return a Siemens star of 12 black spokes, 5.1 mm wide, as boxes (N, 4) int64 px from (0, 0).
+    """Return a Siemens star of 12 black spokes, 5.1 mm wide, as boxes (N, 4) int64 px, starting at (0, 0).
 
-    Source: ISO 15775. Print or lens are limited at the radius at which the spokes merge.
+    Source: ISO 15775. The radius at which the spokes merge shows the resolution of the print or the lens.
     """
     size = STAR_PX // _DOT_PX
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
@@ -119,14 +119,14 @@ def star_boxes() -> Boxes:
 def edge_boxes() -> Boxes:
     """Return a black area with a lower edge that falls by one pixel in twelve (ISO 12233): (24, 4) int64."""
     step = np.arange(EDGE_STEPS)
-    # Each box overlaps the next: boxes that only touch can show a hairline.
+    # Each box overlaps the next box, because a hairline may be visible between boxes that only touch.
     return np.stack(
         [step * EDGE_RUN_PX, 0 * step, 0 * step + EDGE_STEPS * EDGE_RUN_PX, EDGE_DEPTH_PX + step], axis=1
     ).astype(np.int64)
 
 
 def bar_boxes() -> Boxes:
-    """Return groups of three bars along u, from the widest of `BARS_PX` to the finest: (36, 4) int64 px."""
+    """Return groups of three bars along u, from the widest of `BARS_PX` to the narrowest: (36, 4) int64 px."""
     boxes: list[tuple[int, int, int, int]] = []
     start = 0
     for width in BARS_PX:
@@ -136,7 +136,7 @@ def bar_boxes() -> Boxes:
 
 
 def ruler_ticks(length_px: int) -> list[tuple[int, int, int]]:
-    """Return (millimetre, u of the first pixel, length) of every tick of a ruler with `length_px`."""
+    """Return (position in mm, u of the first pixel, length in px) of every tick of a ruler with `length_px`."""
     ticks: list[tuple[int, int, int]] = []
     for mm in range(math.floor(length_px * PX_MM) + 1):
         start = round(mm / PX_MM)
@@ -146,15 +146,15 @@ def ruler_ticks(length_px: int) -> list[tuple[int, int, int]]:
 
 
 def number_every_mm(length_px: int) -> int:
-    """Return the distance of the numbers of a ruler: 100 mm, or 10 mm on a short sheet."""
+    """Return the distance between the numbers of a ruler: 100 mm, or 10 mm on a short sheet."""
     return 100 if length_px * PX_MM > 300 else 10
 
 
 class Margins:
     """The four margins of a sheet around its patches, and the marks in them.
 
-    `field`: (4,) int64 px, box of the patch area. `occupied`: (N, 4) int64 px, boxes outside it that marks must not
-    touch.
+    `field`: (4,) int64 px, box of the patch area. `occupied`: (N, 4) int64 px, boxes in the margins that marks must not
+    touch, for example references.
     """
 
     def __init__(self, field: Boxes, page_px: tuple[int, int], occupied: Boxes) -> None:
@@ -174,21 +174,21 @@ class Margins:
         return right - left if side in {"top", "bottom"} else bottom - top
 
     def put(self, side: Side, boxes: Boxes) -> bool:
-        """Put boxes (N, 4) int64 px, as (u, v), into a margin if the space is free; return whether it was free."""
+        """Put boxes (N, 4) int64 px in (u, v) into a margin if the space is free; return whether it was free."""
         placed = self._on_sheet(side, boxes)
         return self._put(placed, boxes[:, 1].min() >= GAP_PX)
 
     def put_somewhere(self, side: Side, boxes: Boxes, start: int) -> bool:
-        """Put boxes (N, 4) int64 px at the first free position along a margin from u = `start`; return success."""
+        """Put boxes (N, 4) int64 px at the first free position of a margin with u ≥ `start`; return success."""
         positions = np.arange(max(0, start), self.length(side) - int(boxes[:, 2].max()) + 1, _SEARCH_PX)
-        # Usually the first position is free.
+        # Try the first position alone, because it is usually free.
         if len(positions) and self.put(side, boxes + np.array([positions[0], 0, positions[0], 0])):
             return True
         is_taken = self._taken_at(side, boxes, positions)
         return any(self.put(side, boxes + np.array([u, 0, u, 0])) for u in positions[~is_taken].tolist())
 
     def crop_marks(self) -> None:
-        """Mark the corners of the sheet by two strokes each, along the edges to be cut."""
+        """Mark each corner of the sheet by two strokes along the edges to be cut."""
         width, height = self._page
         long, stroke = CROP_PX, CROP_STROKE_PX
         strokes = [(0, 0, long, stroke), (0, 0, stroke, long)]
@@ -204,7 +204,7 @@ class Margins:
         self._put(np.array(boxes, dtype=np.int64)[:, [0, 2, 1, 3]], has_gap=True)
 
     def ruler(self, side: Literal["left", "bottom"]) -> bool:
-        """Put a millimetre ruler along the whole patch area, numbered from its left or top end; return success."""
+        """Put a millimetre ruler along the whole patch area; return success. Its numbers start at the left or top."""
         length = self.length(side)
         ticks = ruler_ticks(length)
         boxes = [np.array([[start, GAP_PX, start + TICK_PX, GAP_PX + end] for _, start, end in ticks], dtype=np.int64)]
@@ -215,14 +215,14 @@ class Margins:
             number = text_boxes(f"{mm}")
             width, height = number[:, 2:].max(axis=0).tolist()
             if side == "left":
-                # Read upwards: the top of the text is towards the edge of the sheet.
+                # Turn the number by 180°, so that its top points to the edge of the sheet.
                 number = np.array([width, height, width, height]) - number[:, [2, 3, 0, 1]]
             offset = start + TICK_PX // 2 - width // 2
             boxes.append(number + np.array([offset, NUMBERS_PX, offset, NUMBERS_PX]))
         return bool(ticks) and self.put(side, np.concatenate(boxes))
 
     def lines(self, lines: Sequence[str], start: int) -> bool:
-        """Put lines of text into the top margin, at half the size if necessary; return success."""
+        """Put lines of text into the top margin, if necessary at half the size; return success."""
         for dot_px in (_DOT_PX, 1):
             boxes: list[Boxes] = []
             for row, line in enumerate(lines):
@@ -230,7 +230,7 @@ class Margins:
                 boxes.append(text_boxes(line, dot_px) + np.array([0, offset, 0, offset]))
             text = np.concatenate(boxes)
             bottom = int(text[:, 3].max()) + GAP_PX
-            # v increases upwards.
+            # In the top margin, v increases upwards.
             if self.put_somewhere(
                 "top", np.stack([text[:, 0], bottom - text[:, 3], text[:, 2], bottom - text[:, 1]], 1), start
             ):
@@ -252,15 +252,15 @@ class Margins:
         return np.stack(placed, axis=1)
 
     def _taken_at(self, side: Side, boxes: Boxes, shifts: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """Return whether boxes (N, 4) px, (u, v), overlap other marks at each of the shifts (M,) px along a margin."""
-        # All shifts at once: two boxes that overlap across the margin exclude an open interval of shifts.
+        """Return for each shift (M,) px along a margin whether boxes (N, 4) px in (u, v) overlap other marks."""
+        # If a box and a mark overlap in v, one open interval of shifts makes them overlap in u.
         axis, across = (0, 1) if side in {"top", "bottom"} else (1, 0)
         boxes, marks = self._on_sheet(side, boxes), np.concatenate(self._taken)
-        lows, highs = boxes[:, None, across] - _AIR_PX, boxes[:, None, across + 2] + _AIR_PX
+        lows, highs = boxes[:, None, across] - _MARK_GAP_PX, boxes[:, None, across + 2] + _MARK_GAP_PX
         marks = marks[(lows.min() < marks[:, across + 2]) & (marks[:, across] < highs.max())]
         box_index, other_index = np.nonzero((lows < marks[:, across + 2]) & (marks[:, across] < highs))
-        starts = marks[other_index, axis] - boxes[box_index, axis + 2] - _AIR_PX
-        ends = marks[other_index, axis + 2] - boxes[box_index, axis] + _AIR_PX
+        starts = marks[other_index, axis] - boxes[box_index, axis + 2] - _MARK_GAP_PX
+        ends = marks[other_index, axis + 2] - boxes[box_index, axis] + _MARK_GAP_PX
         started = np.bincount(np.searchsorted(shifts, starts, "right"), minlength=len(shifts) + 1)
         ended = np.bincount(np.searchsorted(shifts, ends, "left"), minlength=len(shifts) + 1)
         return np.cumsum(started - ended)[: len(shifts)] > 0
@@ -271,8 +271,8 @@ class Margins:
         enlarged = np.concatenate([boxes[:, :2] - GAP_PX, boxes[:, 2:] + GAP_PX], axis=1)
         if not has_gap or is_outside or _any_overlap(enlarged, self._field[None]):
             return False
-        margin = np.array([-_AIR_PX, -_AIR_PX, _AIR_PX, _AIR_PX])
-        # Boxes that overlap one of them also overlap their hull, so the hull excludes most pairs quickly.
+        margin = np.array([-_MARK_GAP_PX, -_MARK_GAP_PX, _MARK_GAP_PX, _MARK_GAP_PX])
+        # Only marks that overlap the bounding box can overlap one of the boxes.
         enlarged_hull = hull[None] + margin
         near_boxes = [mark_boxes[_overlapping(mark_boxes, enlarged_hull)] for mark_boxes in self._taken]
         if any(_any_overlap(boxes + margin, mark_boxes) for mark_boxes in near_boxes):
@@ -283,7 +283,7 @@ class Margins:
 
 
 def target_boxes() -> Boxes:
-    """Return star, slanted edge and bars along u, 52 mm long, with a gap to the patches: (N, 4) int64 px."""
+    """Return star, slanted edge and bars along u, together 52 mm long: (N, 4) int64 px, with the gap to the patches."""
     targets: list[Boxes] = []
     start = 0
     for target in (star_boxes(), edge_boxes(), bar_boxes()):
@@ -305,8 +305,8 @@ def _overlapping(boxes: Boxes, marks: Boxes) -> npt.NDArray[np.bool_]:
 def margin_marks(field: Boxes, page_px: tuple[int, int], occupied: Boxes, lines: Iterable[str]) -> Boxes:
     """Return all marks of a sheet, black on bare paper, (N, 4) int64 px; arguments as in `Margins`.
 
-    Crop marks at the corners, rulers below and on the left, lines of text above, and sharpness targets above and on the
-    right, as many as there is room for.
+    Crop marks are at the corners, rulers below and on the left, and lines of text above. Sharpness targets are above
+    and on the right, as many as fit.
     """
     margins = Margins(field, page_px, occupied)
     margins.crop_marks()
@@ -316,7 +316,7 @@ def margin_marks(field: Boxes, page_px: tuple[int, int], occupied: Boxes, lines:
     targets = target_boxes()
     target_length = int(targets[:, 2].max()) + GAP_PX
     across, down = margins.length("top"), margins.length("right")
-    # A short sheet has no room for both; it gets the text above and targets on the right only.
+    # If text and targets do not both fit above, the targets are only on the right.
     name_length = max(int(text_boxes(line)[:, 2].max(initial=0)) for line in text_lines) if text_lines else 0
     has_room = across >= 2 * target_length + name_length
     if has_room:

@@ -1,8 +1,8 @@
-"""The chart: positions of all printed patches, tags and references, and its file `chart.json`.
+"""The chart as data: positions of all printed patches, tags and references, and the file `chart.json`.
 
-A chart is data only. `experiment.chart.layout` designs it, `experiment.chart.printing` prints it, and registration and
-sampling read it. The position of every patch is listed, so the rule of the layout is not needed. Positions are
-millimetres on the print; origin at its top-left corner, x right, y down.
+`experiment.chart.layout` designs a chart, and `experiment.chart.printing` draws it. Registration and sampling only need
+the positions of the patches, not the rule of the layout. Positions are in millimetres on the print: the origin is its
+top-left corner, x to the right, y down.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from foundation.files import reading_error, write_atomic
 from foundation.records import from_json
 
 FORMAT = "crop.chart"
-VERSION = 1  # `format` and `version` of the `chart.json` that this software writes and reads (docs/formats.md)
+VERSION = 1  # Values of `format` and `version` in `chart.json` (docs/formats.md)
 
 PAPER_WHITE = (255, 255, 255)  # Printed code of bare paper: no ink
 
-# Family of the AprilTags: codes of 36 bits that differ in 11 bits or more (E. Olson, ICRA 2011).
+# Family of the AprilTags: codes of 36 bits, any two of which differ in at least 11 bits (E. Olson, ICRA 2011).
 TAG_FAMILY = "36h11"
 
-# Modules along the black square of a tag 36h11: 6 of data, and a black border of one on each side. The white rim is
-# outside.
+# Number of modules along the black square of a tag: 6 modules of data, and a border of one module on each side. The
+# white rim is outside the square.
 TAG_MODULES = 8
 
 
 def colour_of_index(index: npt.ArrayLike, bits: int) -> npt.NDArray[np.uint8]:
-    """Return the printed 8-bit RGB codes (..., 3) uint8 of colour indices; the low 8 − bits bits are 0.
+    """Return the printed 8-bit RGB codes (..., 3) uint8 of colour indices; unused low bits are 0.
 
     `bits`: bits per channel, 1 … 5 (the paper has 5, that is 32³ colours, section 3.2).
     """
@@ -65,7 +65,7 @@ _Colour = Annotated[int, Field(ge=0, lt=8**5)]
 
 @dataclass(frozen=True)
 class Reference:
-    """One achromatic area; `rgb` is its printed code, (255, 255, 255) for bare paper."""
+    """One achromatic area. `rgb` is its printed code; (255, 255, 255) is bare paper."""
 
     __pydantic_config__ = _STRICT
 
@@ -89,7 +89,7 @@ class Chart:
     page_mm
         Width and height of the sheet.
     bits
-        Bits per channel, 1 … 5. The chart has each of the 8**bits colours once.
+        Bits per channel, 1 … 5. The chart contains each of the 8**bits colours once.
     cell_mm
         Width and height of a patch.
     centres_mm
@@ -97,9 +97,10 @@ class Chart:
     colours
         (8**bits,) int64, colour index of each patch, in the same order.
     tags, references
-        AprilTags (may be empty), and achromatic areas.
+        AprilTags (possibly none), and achromatic areas.
     seed, software
-        Seed of the layout, and software that made it, if the file has them; printed in the margin.
+        Seed of the layout and version of the software that designed it; None if unknown. Both are printed in the
+        margin.
     """
 
     page_mm: tuple[float, float]
@@ -124,18 +125,18 @@ class Chart:
 
     @cached_property
     def cell_of_colour(self) -> npt.NDArray[np.int64]:
-        """(8**bits,) int64, position in `centres_mm` of each colour index."""
+        """(8**bits,) int64, row in `centres_mm` of each colour index."""
         position = np.empty(self.colour_count, dtype=np.int64)
         position[self.colours] = np.arange(self.colour_count)
         return position
 
     @property
     def white_references(self) -> tuple[Reference, ...]:
-        """References of bare paper."""
+        """References that are bare paper."""
         return tuple(reference for reference in self.references if reference.is_white)
 
     def to_json(self) -> str:
-        """Return the text of `chart.json`. Equal charts have equal text, also after they are saved and read."""
+        """Return the text of `chart.json`. Equal charts have the same text, also after they are saved and read."""
         document = {
             "format": FORMAT,
             "version": VERSION,
@@ -157,7 +158,7 @@ class Chart:
                 for reference in self.references
             ],
         }
-        # If seed and software are unknown, the text has no such keys, so that the hash of a chart does not change.
+        # Omit keys without a value, so that a chart that is read and saved again keeps its hash.
         document |= {
             key: value for key, value in (("seed", self.seed), ("software", self.software)) if value is not None
         }

@@ -1,21 +1,23 @@
-"""Write a one-page PDF of filled rectangles for print shops, PDF/X-4 (ISO 15930-7:2010), and its ICC profiles.
+"""Write one page of filled rectangles as PDF/X-4 (ISO 15930-7:2010), and the ICC profiles that it needs.
 
-Requirements of the standard, with the clauses of ISO 32000-1 (PDF 1.7) that define them:
+PDF/X-4 has these requirements. The numbers are clauses of ISO 32000-1 (PDF 1.7):
 
 - Version 1.6, a binary comment after the header, no encryption, a file identifier (7.5.2, 14.4).
-- MediaBox and TrimBox, the latter within the former (14.11.2); here the TrimBox is the sheet.
-- Device colours of the same kind as the output intent (14.11.5): DeviceRGB, with an embedded RGB profile. The page
-  contains plain codes; without colour management they are not changed.
+- A MediaBox, and a TrimBox inside it (14.11.2). Here both are the sheet.
+- Device colours of the same kind as the output intent (14.11.5): DeviceRGB, with an embedded RGB profile.
 - XMP metadata with the version of PDF/X, dates, identifiers and trapping (14.3.2, 14.11.6).
 - No fonts, actions or external files; no transparency, no transfer functions.
 
-The profiles declare sRGB (IEC 61966-2-1) for colour-managed printing; neither describes a printer. A TIFF needs the
-profile of an input device or display; the output intent of PDF/X needs the profile of an output device. Sources:
-ICC.1:2001-04 (version 2.4): header 6.1, required tags 6.3, lut16Type 6.5.8, textDescriptionType 6.5.17. The primaries
-of sRGB are adapted to D50 by the Bradford transform, as in the sRGB profiles of the ICC.
+The codes on the page are not tagged, so they are not changed if colour management is off. For printing with colour
+management, the output intent of a PDF needs the ICC profile of an output device, and a TIFF needs that of an input
+device or display. Both profiles declare sRGB (IEC 61966-2-1). Neither describes a printer.
 
-This is our own code because libraries that write PDF add fonts, dates or dictionaries, and no maintained library writes
-PDF/X. Without dates, the same chart gives the same bytes.
+Source of the profiles: ICC.1:2001-04 (version 2.4), header 6.1, required tags 6.3, lut16Type 6.5.8,
+textDescriptionType 6.5.17. The primaries of sRGB are adapted to D50 by the Bradford transform, as in the sRGB profiles
+of the ICC.
+
+No maintained library writes PDF/X, and PDF libraries add fonts, dates or dictionaries. Here the same chart always gives
+the same bytes.
 """
 
 from __future__ import annotations
@@ -33,16 +35,16 @@ import numpy.typing as npt
 from foundation.colorimetry import decode_srgb, encode_srgb
 from foundation.files import atomic_file
 
-# Date in the metadata, which is required. It is constant, so that the same chart gives the same bytes.
+# Date in the metadata. PDF/X requires a date, and a constant keeps the bytes of a chart equal.
 DATE = "2000-01-01T00:00:00+00:00"
 
-# Name of the printing condition in the output intent: not a registered name, because no printer is characterised.
+# Name of the printing condition in the output intent. Registered names belong to characterised printers.
 CONDITION = "RGB codes, unmanaged"
 
 # Description of the printing condition in the output intent.
 CONDITION_INFO = (
-    "The codes name inks: print them without colour management. A workflow that manages colours all the same takes "
-    "them as sRGB."
+    "The codes are amounts of ink: print them without colour management. If a workflow manages colours, it takes the "
+    "codes as sRGB."
 )
 
 # XYZ of full red, green and blue (columns), relative to D50.
@@ -52,13 +54,13 @@ _PRIMARIES = np.array(
 
 _WHITE = (0.9642, 1.0, 0.8249)  # D50, white of the profile connection space (ICC.1:2001-04, 6.1.11)
 
-_CURVE = 4096  # Entries of a curve, the maximum of lut16Type
+_CURVE = 4096  # Number of entries of a curve: the maximum of lut16Type
 
-_DISPLAY_CURVE = 1024  # Entries of a curve of the display profile, as in the sRGB profile of the ICC
+_DISPLAY_CURVE = 1024  # Number of entries of a curve in the display profile, as in the sRGB profile of the ICC
 
-_GAMUT_GRID = 17  # Points along each side of the gamut table: enough for a warning
+_GAMUT_GRID = 17  # Number of points along each side of the gamut table, which only serves for warnings
 
-_FULL = 65535  # Encoding of the device value 1, 16 bits (ICC.1:2001-04, 6.5.8)
+_FULL = 65535  # 16-bit encoding of the device value 1 (ICC.1:2001-04, 6.5.8)
 
 _ONE_XYZ = 32768  # Encoding of X, Y or Z = 1 as u1Fixed15 (ICC.1:2001-04, 5.3.4.2)
 
@@ -76,7 +78,7 @@ def filled(boxes: Iterable[Box], code: Code) -> bytes:
 
 
 def row_of_pixels(codes: Sequence[Code], box: Box) -> bytes:
-    """Return the operators that draw one row of pixels as an image inside the page (ISO 32000-1, 8.9.7)."""
+    """Return the operators that draw one row of pixels as an inline image (ISO 32000-1, 8.9.7)."""
     left, bottom, width, height = (_number(value) for value in box)
     pixels = bytes(channel for code in codes for channel in code).hex()
     head = f"q\n{width} 0 0 {height} {left} {bottom} cm\nBI /W {len(codes)} /H 1 /CS /RGB /BPC 8 /F /AHx ID\n"
@@ -122,7 +124,7 @@ def save_page(path: Path, size_pt: tuple[float, float], content: bytes, title: s
 
 
 def _number(value: float) -> str:
-    # Five decimals: 3.5 nm on paper, 1/400 of an 8-bit code.
+    # Five decimals are much finer than a printed dot or a step of an 8-bit code.
     return f"{value:.5f}".rstrip("0").rstrip(".")
 
 
@@ -162,14 +164,13 @@ def _metadata(title: str, subject: str, name: str) -> str:
 
 
 def srgb_output_profile() -> bytes:
-    """Return an ICC profile of an output device with sRGB as RGB codes.
+    """Return an ICC profile of an output device whose RGB codes are sRGB.
 
     The class is ``prtr``, which output intents need (ISO 32000-1, 14.11.5), with the tags of a table-based output
-    profile. All rendering intents are equal: relative to the white of the medium. Tables of two points are exact in
-    both directions.
+    profile. All rendering intents are the same: relative to the white of the medium.
     """
     corners = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
-    # XYZ is linear in linear RGB between the corners, so two points a side are exact.
+    # XYZ is a linear function of linear RGB, so a table with two points on each axis is exact.
     xyz, rgb = np.rint(_ONE_XYZ * (corners @ _PRIMARIES.T)).astype(np.uint16), (_FULL * corners).astype(np.uint16)
     to_pcs = _lut16(np.eye(3), _curves(decode_srgb(np.linspace(0, 1, _CURVE))), xyz, _LINEAR)
     # The matrix is applied to encoded values; an encoded 1 is 65535 / 32768 in XYZ.
@@ -187,7 +188,7 @@ def srgb_output_profile() -> bytes:
 
 
 def srgb_display_profile() -> bytes:
-    """Return an ICC profile of a display with sRGB as RGB codes: three primaries and a curve, class ``mntr``."""
+    """Return an ICC profile of a display whose RGB codes are sRGB (class ``mntr``, three primaries and a curve)."""
     curve = np.rint(_FULL * decode_srgb(np.linspace(0, 1, _DISPLAY_CURVE))).astype(">u2").tobytes()
     curve = b"curv" + bytes(4) + struct.pack(">I", _DISPLAY_CURVE) + curve
     tags = {
@@ -208,7 +209,7 @@ _LINEAR = _curves(np.array([0.0, 1.0]))  # The identity as a curve
 
 
 def _gamut() -> bytes:
-    # 0 for colours in the gamut, 65535 for colours outside of it.
+    # The table is 0 inside the gamut and 65535 outside.
     side = np.linspace(0, _FULL / _ONE_XYZ, _GAMUT_GRID)
     xyz = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     rgb = xyz @ np.linalg.inv(_PRIMARIES).T
@@ -236,13 +237,13 @@ def _text(text: str) -> bytes:
 
 
 def _description(text: str) -> bytes:
-    # textDescriptionType with ASCII only; the two other scripts are empty.
+    # textDescriptionType: the ASCII text, followed by empty Unicode and ScriptCode texts.
     data = text.encode("ascii") + b"\0"
     return b"desc" + bytes(4) + struct.pack(">I", len(data)) + data + bytes(8) + bytes(3) + bytes(67)
 
 
 def _profile(kind: bytes, tags: Mapping[str, bytes]) -> bytes:
-    """Return an RGB profile with connection space XYZ; equal data of several tags are stored once."""
+    """Return an RGB profile with the connection space XYZ. If several tags have equal data, these are stored once."""
     offset = 128 + 4 + 12 * len(tags)
     entries, body = b"", b""
     offsets: dict[bytes, int] = {}

@@ -1,12 +1,11 @@
-"""Files of the print: TIFF, PDF and preview, drawn as a list of rectangles on bare paper.
+"""Draw the sheet as rectangles on bare paper, and save it as TIFF, PDF and preview.
 
-- A file has true size: print it at 100 %, never with "fit to page". In the TIFF, all patches and tag modules are the
-  same whole number of pixels, because unequal modules move the corners that detectors measure.
-- The codes are amounts of ink, not colours; the colours are measured later. They are untagged on the page of the PDF
-  and in the TIFF. The output intent of the PDF (required by PDF/X) and the tagged TIFF declare sRGB for printing with
-  colour management.
-- An A0 sheet at 600 dpi has 1.7 GB of pixels, so it is never in memory: equal rows are drawn once and compressed strip
-  by strip.
+- The files have true size: print them at 100 %, never with "fit to page". In the TIFF, all patches and all tag modules
+  have the same whole number of pixels. Unequal modules would shift the detected corners of a tag.
+- The codes are amounts of ink, not colours. The colours are measured later. Therefore the codes are untagged on the
+  page of the PDF and in the normal TIFF. For printing with colour management, the output intent of the PDF and the
+  tagged TIFF declare sRGB.
+- An A0 sheet at 600 dpi has 1.7 GB of pixels, so it is compressed strip by strip and never completely in memory.
 """
 
 from __future__ import annotations
@@ -27,18 +26,18 @@ from experiment.chart.pdf_x import filled, save_page, srgb_display_profile
 from foundation.errors import InputError
 from foundation.files import atomic_file, write_atomic
 
-POINTS_PER_MM = 72 / MM_PER_INCH  # Points per millimetre: a PDF has 72 points to the inch (ISO 32000-1, 8.3.2.3)
+POINTS_PER_MM = 72 / MM_PER_INCH  # A PDF has 72 points per inch (ISO 32000-1, 8.3.2.3)
 
-# Rows in a strip of the TIFF: 5 MB of an A0 sheet at 600 dpi, small in memory and long enough to compress.
+# Number of rows in a strip of the TIFF. A strip of an A0 sheet at 600 dpi has 5 MB.
 _STRIP_ROWS = 64
 
-_BANDS = 64  # Bands of equal rows that are painted at a time, which limits memory on sheets with many edges
+_BANDS = 64  # Number of bands of equal rows that are painted at a time, which limits memory
 
-_SUPERSAMPLING = 8  # Fine pixels along each side of a preview pixel: edges are then accurate to 1/8 of it
+_SUPERSAMPLING = 8  # A preview pixel is the mean of this number of fine pixels in each direction
 
-# Overlap of a patch of the PDF with the next patches, so that no line of paper is visible between them; and reduction
-# of each rectangle on all sides, so that rounding does not paint the next pixel.
-_LAP_PX, _INSET_PX = 0.2, 0.01
+# In the PDF, a patch overlaps the next patches by the first length, so that no line of paper is visible between them.
+# Every rectangle is reduced by the second length on all sides, so that rounding errors do not paint the next pixel.
+_OVERLAP_PX, _INSET_PX = 0.2, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +47,7 @@ class Drawing:
     page_mm: tuple[float, float]  # width and height of the sheet
     rectangles_mm: npt.NDArray[np.float64]  # (N, 4), left, top, right, bottom, from the top-left corner of the sheet
     rgb: npt.NDArray[np.uint8]  # (N, 3), printed code of each rectangle; (255, 255, 255) is bare paper
-    tiles: int = 0  # number of the last rectangles that are adjacent patches and references, row by row
+    tiles: int = 0  # number of adjacent patches and references, row by row, at the end of the rectangles
 
 
 def drawing(chart: Chart) -> Drawing:
@@ -60,14 +59,14 @@ def drawing(chart: Chart) -> Drawing:
 
 
 def field_drawing(chart: Chart, within_mm: tuple[float, float, float, float] | None = None) -> Drawing:
-    """Return the rectangles of tags (white rim, black square, white modules), then of patches and references.
+    """Return the rectangles of the tags (white rim, black square, white modules), then of patches and references.
 
-    `within_mm`: left, top, right, bottom; parts that are not completely inside are omitted.
+    `within_mm`: left, top, right, bottom of a window; parts that are not completely inside are omitted.
     """
     left, top, right, bottom = (-math.inf, -math.inf, math.inf, math.inf) if within_mm is None else within_mm
     boxes = _part_boxes(chart)
     codes = np.array([reference.rgb for reference in chart.references], dtype=np.uint8).reshape(-1, 3)
-    # A thousandth of a millimetre is invisible on paper, and more than the rounding in a file.
+    # Allow for the rounding of coordinates in a file.
     limits = np.array([left, top, -right, -bottom]) - 1e-3
     is_inside = np.asarray((boxes * [1, 1, -1, -1] >= limits).all(axis=1))
     rectangles, rgb = [np.empty((0, 4))], [np.empty((0, 3), dtype=np.uint8)]
@@ -94,7 +93,7 @@ def _part_boxes(chart: Chart) -> npt.NDArray[np.float64]:
 
 
 def field_px(chart: Chart) -> Boxes:
-    """Return the box of all tags and patches, (4,) int64 px at 600 dpi: left, top, right, bottom."""
+    """Return the bounding box of all tags and patches, (4,) int64 px at 600 dpi: left, top, right, bottom."""
     boxes = whole_px(_part_boxes(chart)[: len(chart.tags) + len(chart.centres_mm)])
     return np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
 
@@ -108,10 +107,10 @@ def _marks_px(chart: Chart) -> Boxes:
 
 
 def tag_modules(tag: Tag) -> npt.NDArray[np.bool_]:
-    """Return the modules of a tag, (8, 8) bool, true for white, as seen on the upright print.
+    """Return the modules of a tag on the upright print, (8, 8) bool, true for white.
 
-    OpenCV's `DICT_APRILTAG_36h11` shows the tags of the AprilTag authors rotated by half a turn. Their detectors return
-    the same ids, and the corners of `corners_mm` in the order [1, 0, 3, 2].
+    OpenCV's `DICT_APRILTAG_36h11` has each tag rotated by 180° against the tag of the AprilTag authors. Their detector
+    returns the same id, and the corners of `corners_mm` in the order [1, 0, 3, 2].
     """
     import cv2
 
@@ -143,7 +142,7 @@ def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.u
 
 
 def label_lines(chart: Chart) -> tuple[str, str]:
-    """Return the two lines printed in the margin: identity of the sheet, and how to print it."""
+    """Return the two lines of text in the margin: identity of the sheet, and print instruction."""
     width, height = chart.page_mm
     bits = "1 bit" if chart.bits == 1 else f"{chart.bits} bits"
     facts = [f"CroP chart, {bits}, {width:g} x {height:g} mm", f"chart.json {chart.sha256[:16]}"]
@@ -153,14 +152,14 @@ def label_lines(chart: Chart) -> tuple[str, str]:
 
 
 def label(chart: Chart) -> str:
-    """Return `label_lines` as one line."""
+    """Return `label_lines` in one line."""
     return ". ".join(label_lines(chart))
 
 
 def _bands(
     sheet: Drawing, pixels_per_mm: float, size: tuple[int, int]
 ) -> Iterator[tuple[int, int, npt.NDArray[np.uint8]]]:
-    """Yield bands of equal rows from top to bottom: `top`, `bottom`, and one row (width, 3) uint8.
+    """Yield bands of equal rows from top to bottom: first row, end row, and the pixels (width, 3) uint8 of one row.
 
     `size`: width and height of the image in pixels. Edges are rounded to pixels.
     """
@@ -169,7 +168,7 @@ def _bands(
     boxes = np.clip(boxes, 0, [width, height, width, height])
     xs, ys = (np.unique(np.append(boxes[:, axis::2], [0, end])) for axis, end in enumerate(size))
     (left, right), (top, bottom) = np.searchsorted(xs, boxes[:, 0::2]).T, np.searchsorted(ys, boxes[:, 1::2]).T
-    # Between two adjacent edges all rows are equal, so a rectangle is painted once for many rows.
+    # All rows between two adjacent edges are equal, so a rectangle is painted once for many rows.
     for first in range(0, len(ys) - 1, _BANDS):
         band_edges = ys[first : first + _BANDS + 1].tolist()
         band_rows = np.full((len(band_edges) - 1, len(xs) - 1, 3), PAPER_WHITE, dtype=np.uint8)
@@ -185,7 +184,7 @@ def _packed_strips(bands: Iterator[tuple[int, int, npt.NDArray[np.uint8]]], heig
         for y in range(top, bottom):
             rows.append(row)
             if len(rows) == _STRIP_ROWS or y == height - 1:
-                # Rows repeat so often that stronger compression saves a quarter of the size for three times the time.
+                # Fast compression is sufficient, because rows are repeated so often.
                 yield zlib.compress(np.stack(rows).tobytes(), 1)
                 rows = []
 
@@ -213,10 +212,10 @@ def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI, tagged: bool = Fa
     Parameters
     ----------
     dpi
-        Resolution at which patches and tag modules are whole pixels: 600 or 1200 for every page of
-        `experiment.chart.layout`, any multiple of 24 for A0. An A0 sheet at 600 dpi has 28 087 × 19 866 pixels.
+        Resolution at which patches and tag modules are whole pixels. 600 and 1200 are suitable for every chart of
+        `experiment.chart.layout`, and any multiple of 24 for a chart on A0.
     tagged
-        Whether the codes are tagged as sRGB, for a shop that prints through the profile of its printer.
+        Whether the codes are tagged as sRGB, for a print shop that uses the colour profile of its printer.
     """
     import tifffile
 
@@ -242,7 +241,7 @@ def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI, tagged: bool = Fa
 
 
 def save_pdf(chart: Chart, path: Path) -> None:
-    """Write the sheet as a PDF/X-4 with one page of its size: filled rectangles in DeviceRGB.
+    """Write the sheet as PDF/X-4: one page of filled rectangles in DeviceRGB.
 
     The same chart gives the same bytes.
     """
@@ -250,18 +249,18 @@ def save_pdf(chart: Chart, path: Path) -> None:
 
 
 def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, operators: bytes = b"") -> None:
-    """Write any drawing as a PDF/X-4 with one page of its size. `operators`: operators added to the page."""
+    """Write a drawing as PDF/X-4 with one page. `operators`: further PDF operators at the end of the page."""
     width, height = (side * POINTS_PER_MM for side in sheet.page_mm)
     corners = sheet.rectangles_mm * POINTS_PER_MM
-    # Renderers paint every pixel that a rectangle touches. Slightly smaller rectangles do not touch the next pixel,
-    # even after rounding.
-    inset, lap = _INSET_PX * PX_MM * POINTS_PER_MM, _LAP_PX * PX_MM * POINTS_PER_MM
+    # Renderers paint every pixel that a rectangle touches. A slightly smaller rectangle does not touch the next pixel
+    # after rounding.
+    inset, overlap = _INSET_PX * PX_MM * POINTS_PER_MM, _OVERLAP_PX * PX_MM * POINTS_PER_MM
     corners += np.array([inset, inset, -inset, -inset])
-    corners[len(corners) - sheet.tiles :, 2:] += lap
+    corners[len(corners) - sheet.tiles :, 2:] += overlap
     left, top, right, bottom = corners.T
     boxes = np.stack([left, height - bottom, right - left, bottom - top], axis=1)
     changes = np.flatnonzero((np.diff(sheet.rgb.astype(np.int64), axis=0) != 0).any(axis=1)) + 1
-    # Successive rectangles of one colour share a path, which keeps the order and saves bytes.
+    # Successive rectangles of the same colour share one path, which saves bytes.
     paths: list[bytes] = []
     for first, last in zip([0, *changes.tolist()], [*changes.tolist(), len(corners)], strict=True):
         red, green, blue = (int(code) for code in sheet.rgb[first])
@@ -280,7 +279,7 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     height_px = max(1, round(width_px * chart.page_mm[1] / chart.page_mm[0]))
     fine_size = (width_px * _SUPERSAMPLING, height_px * _SUPERSAMPLING)
     bands = list(_bands(drawing(chart), fine_size[0] / chart.page_mm[0], fine_size))
-    # Means over whole pixels, for which OpenCV is much faster than numpy.
+    # Means along the rows. OpenCV calculates them much faster than numpy.
     means = np.stack(
         [
             cv2.resize(row[None].astype(np.float32), (width_px, 1), interpolation=cv2.INTER_AREA)[0]
@@ -290,7 +289,7 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     band_tops, band_bottoms = np.array([[top, bottom] for top, bottom, _ in bands]).T
     tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
     shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)
-    # Sparse, because a row overlaps few bands.
+    # The matrix is sparse, because each row overlaps few bands.
     weights = sparse.csr_array(np.maximum(shared, 0) / _SUPERSAMPLING)
     picture = np.asarray(weights @ means.reshape(len(bands), -1), dtype=np.float64)
     return np.rint(picture).reshape(height_px, width_px, 3).astype(np.uint8)

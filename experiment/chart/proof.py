@@ -1,8 +1,8 @@
-"""Proof page on A4, and instructions for the print shop.
+"""Make a proof page on A4, and instructions for the print shop.
 
-The proof shows a part of the sheet at true size, to judge colour management, scale and sharpness cheaply before the
-sheet is ordered. A strip of greys is printed twice, as rectangles and as an image: printers with colour management
-treat them differently, and a seam becomes visible.
+The proof shows a part of the sheet at true size. Before the sheet is ordered, it reveals errors of scale, sharpness and
+colour management. A strip of greys is printed twice, as rectangles and as an image. If colour management is on,
+printers convert rectangles and images differently, and a seam becomes visible between them.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from foundation.files import write_atomic
 
 PAGE_MM = (297.0, 210.0)  # A4, landscape (ISO 216), which every printer has
 
-# Largest size of the part of the patches: rulers, targets, greys and text need the rest of the page
+# Largest width and height of the area with patches.
 WINDOW_MM = (262.0, 107.0)
 
-CORNER_PX = (360, 330)  # Left and top of the part of the patches, px at 600 dpi
+CORNER_PX = (360, 330)  # Left and top of the area with patches, px at 600 dpi
 
-# Position and size of the greys: below the part of the patches, and about as wide.
+# Top, height and step width of the strip of greys below the patches.
 WEDGE_TOP_MM, WEDGE_HEIGHT_MM, WEDGE_STEP_MM = 137.0, 12.0, 8.0
 
-WEDGE_CODES = (*range(0, 256, 8), 255)  # The 32 levels of a channel of the chart, and bare paper
+WEDGE_CODES = (*range(0, 256, 8), 255)  # Codes of the greys: the 32 levels of a channel of the chart, and bare paper
 
-# Position, line distance and dot size of the text: capitals are 1.9 mm high.
+# Top, line distance and dot size of the text.
 TEXT_TOP_MM, TEXT_LINE_MM, TEXT_DOT_PX = 154.0, 4.8, 3
 
 # Text on the proof page.
 LOOK_FOR = (
-    "1 Scale: each 100 mm of both rulers are 100 mm on a steel ruler, within 0.3 mm. Else the page was scaled.",
-    "2 Colour management: the grey steps consist of two halves, the upper drawn, the lower an image of the same codes.",
-    "  A seam or a difference in colour between them shows that colour management is on: switch it off.",
-    "3 Range: adjacent steps look different at both ends, and steps become lighter from left to right without",
-    "  a jump. The last step is bare paper. No patch is mottled or striped.",
-    "4 Sharpness: the spokes of the star are separate up to 1 mm from its centre or closer, the bars up to the",
-    "  seventh group (2 line pairs a millimetre). The edges of the black squares are straight, without a halo.",
-    "5 Surface: matte from every side, no varnish, no lamination. Let it dry for a day before you judge colours.",
+    "1 Scale: 100 mm on each printed ruler are 100 mm on a steel ruler, within 0.3 mm. Otherwise the page was scaled.",
+    "2 Colour management: each grey step has two halves with the same code. The lower half is printed as an image.",
+    "  If a seam or a colour difference is visible between the halves, colour management is on: switch it off.",
+    "3 Range: adjacent steps look different at both ends. The steps become lighter from left to right without a",
+    "  jump. The last step is bare paper. No patch is mottled or striped.",
+    "4 Sharpness: the spokes of the star are separate down to 1 mm from its centre, and the bars up to the seventh",
+    "  group (2 line pairs per millimetre). The edges of the black squares are straight, without a halo.",
+    "5 Surface: matte from every side, no varnish, no lamination. Let the page dry for a day before you judge colours.",
     "Keep this page: the sheet must be printed with the same paper, ink and settings.",
 )
 
 
 def proof_drawing(chart: Chart) -> Drawing:
-    """Return the proof page: the top-left part of the chart with rulers and targets, greys, and text."""
+    """Return the proof page: the top-left part of the chart with rulers and targets, a strip of greys, and text."""
     left, top, right, bottom = field_px(chart).tolist()
     cell = [side / PX_MM for side in chart.cell_mm]
-    # Whole patches; tags and references that the window cuts are omitted.
+    # The window contains whole patches. Tags and references that it would cut are omitted.
     sides = [
         min(high - low, round(math.floor(room / PX_MM / size) * size))
         for low, high, room, size in zip((left, top), (right, bottom), WINDOW_MM, cell, strict=True)
@@ -104,16 +104,16 @@ def save_proof(chart: Chart, path: Path) -> None:
 
 
 def instructions(chart: Chart, tiff: bool = True) -> str:
-    """Return instructions for the print shop with the sizes of the sheet; `tiff`: whether there is a TIFF."""
+    """Return instructions for the print shop; `tiff`: whether the sheet is also available as a TIFF."""
     width, height = chart.page_mm
     left, top, right, bottom = (field_px(chart) * PX_MM).tolist()
     across, down = (math.floor((end - start) / 100) * 100 for start, end in ((left, right), (top, bottom)))
     pixels = " × ".join(f"{round(side / MM_PER_INCH * DESIGN_DPI)}" for side in chart.page_mm)
     raster = f" or chart.tif ({pixels} pixels, {DESIGN_DPI} dpi, untagged); both show the same" if tiff else ""
     scale = (
-        f"Marks 0 and {across} below the patches are {across} mm apart, 0 and {down} on its left {down} mm."
+        f"Marks 0 and {across} below the patches are {across} mm apart, marks 0 and {down} on the left {down} mm."
         if min(across, down) > 0
-        else "The distances of the marks on the rulers are their numbers, in mm."
+        else "The numbers on the rulers are distances from mark 0, in mm."
     )
     return f"""How to print this chart
 =======================
@@ -121,7 +121,7 @@ def instructions(chart: Chart, tiff: bool = True) -> str:
 {label_lines(chart)[0]}
 
 Send chart.pdf (vector){raster}.
-First print proof.pdf on A4 with the same printer, paper and settings; its text lists what to check.
+First print proof.pdf on A4 with the same printer, paper and settings, and check it as its text describes.
 
 For the print shop
 ------------------
@@ -129,29 +129,29 @@ Page            {width:g} × {height:g} mm on one sheet, not tiled. The margins 
 Scale           100 %, "actual size"; never "fit to page". On a roll, cut along the corner marks.
 File            chart.pdf is PDF/X-4: vector, trim box = sheet, no fonts, no transparency, no bleed. Its page is
                 untagged RGB (DeviceRGB).
-Colours         NO COLOUR MANAGEMENT. Print as you print a profiling target: the RGB numbers in the file must reach the
-                driver of the printer unchanged. RGB stays RGB; only the driver converts it to inks.
+Colours         NO COLOUR MANAGEMENT. Print the file like a profiling target: its RGB values must reach the printer
+                driver unchanged. Only the driver converts RGB to inks.
 In the RIP      Colour management: off / "none" / "as target (profiling chart)". Input profile for RGB: none. Embedded
                 profiles and the PDF's output intent: IGNORE. Rendering intent, black point compensation, grey balance,
                 "pure hues", spot colour replacement, "enhancement", ink saving: off. Calibration (linearisation) of the
                 printer: as usual.
 In a driver     "No colour adjustment" / "application manages colours", from a program that does not convert colours
                 (Adobe Color Printer Utility, ColorSync Utility "print as colour target").
-If you need     "Which profile?": none. "CMYK?": no; do not convert. The output intent of the PDF is sRGB only because
-a profile       PDF/X requires one; do not convert to it.
+If you need     Use none, and do not convert to CMYK. The output intent of the PDF is sRGB only because PDF/X requires
+a profile       an output intent. Do not convert to it.
 Quality         The best of the printer, at least 600 dpi; no smoothing, sharpening or interpolation of the image.
-Paper           Matte, white, heavy enough to hang flat (180 g/m² or more), if possible without optical brighteners.
+Paper           Matte, white, heavy enough to hang flat (180 g/m² or more). If possible, no optical brighteners.
 Finish          None: no varnish, no lamination, no mounting under film or glass.
-Drying          A day, flat and unrolled, before anything is measured.
+Drying          One day, flat and unrolled, before anything is measured.
 
 When it comes back
 ------------------
 Scale           {scale}
-                Check with a steel ruler. 3 mm in a metre is allowed, because paper changes with humidity.
+                Check with a steel ruler. An error of 3 mm per metre is allowed, because paper changes with humidity.
 Sharpness       The stars and bars in the margin are as sharp as on the proof.
-Colours         The references of one grey (there are many) look the same everywhere on the sheet.
-Mounting        Flat, on a board or wall, held all round, no glass; waves below 3 mm. Do not trim into the margins.
-Keep            This folder: chart.json is needed to read the photographs. Its hash is printed above the patches.
+Colours         All squares of the same grey look equal everywhere on the sheet.
+Mounting        Flat on a board or wall, fixed on all sides, no glass, waves below 3 mm. Do not trim the margins.
+Keep            This folder. chart.json is needed to read the photographs; its hash is printed above the patches.
 """
 
 

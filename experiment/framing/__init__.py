@@ -1,1 +1,1 @@
-"""Find the chart in a frame: homography, tags, outline, sharpness and movement."""
+"""Find the chart in a frame, and measure its pose, sharpness and movement."""

@@ -1,11 +1,11 @@
 """Find a chart without tags: trace the outline of its patch area near given corners.
 
-The corners are given by the user, or they are those in another frame of the session. The colours of the chart must fit
-the image inside the outline, so corners in a wrong order and a mirrored image are errors.
+The corners come from the user or from another frame of the session. Their order determines the orientation of the
+chart. The image is compared with the printed codes, so a wrong order and a mirrored image are detected.
 
-The user gives corners in pixels of the raw file as it is stored, not as a viewer rotates it: x right, y down, the first
-pixel of the visible image is 0,0, clockwise from the corner that is printed top-left. All other positions are
-half-size pixels. The outline follows lens distortion; `homography` is the closest map without distortion.
+Users give corners in pixels of the raw file before any rotation: x to the right, y down, (0, 0) is the first visible
+pixel. The first corner is the one that is printed top-left, and the others follow clockwise. All other positions are
+in half-size pixels. The traced outline includes lens distortion; `homography` does not.
 """
 
 from __future__ import annotations
@@ -25,63 +25,66 @@ from experiment.framing.homography import fit_homography, project
 from foundation.errors import InputError, RegistrationError
 from foundation.robust import biweight, huber_weights, robust_sigma
 
-# Smallest level, counts above black, of the brightest parts of the brightest colour plane; a darker image is refused.
+# Smallest usable level of the brightest parts of the image (`paper_level`), counts above black.
 MIN_SIGNAL = 12.0
 
-CORNER_REACH_PX = 24.0  # Largest distance of the outline from the given corners, half-size px
+# The edge is searched up to this distance from the sides of the given quadrilateral, half-size px.
+CORNER_REACH_PX = 24.0
 
-SIDE_POINTS = 160  # Points per side at which the edge is searched: many times the six coefficients of its curve
+SIDE_POINTS = 160  # Number of points on each side at which the edge is searched
 
 
-# Shortest side of the patch area, raw pixels: four times the 24 half-size pixels (`CORNER_REACH_PX`) that are searched
-# on either side of its edge.
+# Shortest side of the patch area, raw pixels: twice the width of the band in which its edge is searched.
 LEAST_SIDE_PX = 192
 
 
-# Smallest fraction of the variation between patches that the chart's colours must explain. With another order of
-# patches, they explain nothing.
+# Smallest fraction of the variance between patches that the printed codes must explain. The codes of a different chart
+# explain almost nothing.
 MIN_EXPLAINED = 0.5
 
-# The residual of the given orientation must be less than this many times the residual of the best one.
+# The given orientation is refused if its residual exceeds the residual of the best orientation by more than this
+# factor.
 MIN_ADVANTAGE = 1.3
 
-MIRRORED = 4  # First mirrored orientation among the eight orientations of a rectangle
+MIRRORED = 4  # Orientations from this number on are mirrored: 0 … 3 are quarter turns, 4 … 7 mirrored quarter turns
 
-_SMALL_WIDTH_PX = 640  # Width in px of the small image in which the level of paper is estimated
+_SMALL_WIDTH_PX = 640  # Width of the reduced image in which the level of paper is estimated, px
 
-# Smallest signal of a channel that is used for colours, and for edges, relative to the strongest channel.
-_LEAST_LIGHT, _MUCH_LIGHT = 0.03, 0.2
+# Smallest signal of a channel that is used for colours or for edges, relative to the strongest channel.
+_COLOUR_SIGNAL, _EDGE_SIGNAL = 0.03, 0.2
 
-_PROFILE_STEP_PX = 0.5  # Step of the profiles across an edge: half a half-size pixel, that is one photosite
+_PROFILE_STEP_PX = 0.5  # Distance of the samples across an edge, half-size px: one photosite
 
-# σ by which profiles are smoothed before their steepest rise is searched: the blur of an image that is just usable.
+# σ of the Gaussian that smooths a profile before its steepest rise is searched, half-size px.
 _EDGE_SIGMA_PX = 1.0
 
-# For each round: search distance, order of the curve through the edge, and standard deviation of the expected position,
-# half-size px.
+# Rounds of the search: search distance in half-size px, order of the curve along a side, and standard deviation of the
+# prior for the edge position in half-size px.
 _ROUNDS = ((CORNER_REACH_PX, 2, 1e3), (CORNER_REACH_PX / 2, 5, 12.0), (6.0, 5, 6.0))
 
-_MIN_EDGE = 0.05  # Smallest step from patches to paper that counts as outline, relative to paper white
+_MIN_EDGE = 0.05  # Smallest step from patches to paper that counts as an edge, relative to paper
 
+# Sample positions around an edge point, along and across the edge, half-size px. Outwards, the samples end before the
+# marks in the margin.
 _REFINE_ALONG_PX = np.arange(-2.0, 2.1)
-# Samples around a point of the edge, half-size px: one patch inwards; outwards they end before the marks in the margin.
 _REFINE_ACROSS_PX = np.arange(-3.5, 2.1, 0.5)
 
-# Rounds of the fit of a blurred step; each moves the step by at most 0.5 px, and 3 px are searched.
+# Iterations of the fit of a blurred step. Each iteration moves the step by at most 0.5 px.
 _REFINE_STEPS = 6
 
-_INTERPOLATION_PX = 0.4  # σ that linear interpolation adds to an edge, half-size px
+_INTERPOLATION_PX = 0.4  # σ of the blur that linear interpolation adds to an edge, half-size px
 
-_REFINED_PX = 1.5  # Largest correction of an edge, half-size px: beyond it, the profile ends before the blur does
+# Largest correction of an edge position, half-size px. The samples do not reach farther.
+_LARGEST_CORRECTION_PX = 1.5
 
-_CLEAR_EDGE = 0.15  # Smallest step, relative to paper, that has a position accurate to 0.1 px
+_CLEAR_EDGE = 0.15  # Smallest step whose position is accurate to 0.1 px, relative to paper
 
-# Order of the curve through the deviations of a side. It follows corners that curl by 6 px, with an error of 0.1 px. It
-# does not follow marks in the margin along a twelfth of a side.
+# Order of the curve through the deviations along a side. It is high enough for curled corners, and too low to follow
+# marks in the margin.
 _SIDE_CURVE_ORDER = 8
 
-# Number of random patches for the comparison of colours: a hundred for each parameter of the fit.
-_TRIED_CELLS = 1500
+# Number of random patches in the comparison of colours: a hundred for each parameter of the fit.
+_COMPARED_CELLS = 1500
 
 _Float = npt.NDArray[np.float32]
 _Points = npt.NDArray[np.float64]
@@ -90,7 +93,7 @@ Corners = tuple[tuple[float, float], ...]
 
 def paper_level(plane: Plane) -> float:
     """Return the level of the brightest parts of a plane, counts above black: 99.5th percentile of 4×4 means."""
-    # Means of 4×4, because single pixels of a dark frame would be bright by noise alone.
+    # In a dark frame, noise makes single pixels bright; means over 4×4 pixels suppress it.
     height, width = plane.values.shape
     size = (max(1, width // 4), max(1, height // 4))
     return float(np.percentile(cv2.resize(plane.values, size, interpolation=cv2.INTER_AREA), 99.5))
@@ -103,23 +106,24 @@ class DetectedField:
     corners_px: _Points  # (4, 2), clockwise from the printed top-left
     homography: npt.NDArray[np.float64]  # (3, 3), print (mm) to half-size px, without lens distortion
     outline_mm: _Points  # (N, 2), points of the outline on the print
-    outline_px: _Points  # (N, 2), the same points in the image; only their position across the outline is accurate
+    outline_px: _Points  # (N, 2), the same points in the image, accurate only across the outline
     normals: _Points  # (N, 2), unit vectors across the outline, outwards
-    explained: float  # fraction of the variation between patches that the chart's colours explain, 0 … 1
+    explained: float  # fraction of the variance between patches that the printed codes explain, 0 … 1
 
     def curve_residual_px(self, residual_px: _Points) -> _Points:
-        """Return the distances of outline points from a smooth curve through the residuals of their side, (N,) px.
+        """Fit a smooth curve to the residuals of each side, and return the distance (N,) px of each point from it.
 
-        `residual_px`: (N, 2), deviation of the points from a map of the chart.
+        `residual_px`: (N, 2), measured minus modelled positions of the outline points. Only the components across the
+        outline are used.
         """
         across: _Points = (residual_px * self.normals).sum(axis=1)
         low, high = self.outline_mm.min(axis=0), self.outline_mm.max(axis=0)
-        share: _Points = (self.outline_mm - low) / (high - low)
+        fraction: _Points = (self.outline_mm - low) / (high - low)
         distances = np.abs(across)
         for axis in (0, 1):
             for end in (0.0, 1.0):
-                on_side = np.abs(share[:, axis] - end) < 1e-6
-                along: _Points = share[on_side, 1 - axis]
+                on_side = np.abs(fraction[:, axis] - end) < 1e-6
+                along: _Points = fraction[on_side, 1 - axis]
                 if len(along) > 2 * _SIDE_CURVE_ORDER:
                     curve, _ = robust_curve(along, across[on_side], _SIDE_CURVE_ORDER)
                     distances[on_side] = np.abs(across[on_side] - np.polynomial.legendre.legval(2 * along - 1, curve))
@@ -134,7 +138,7 @@ def field_mm(chart: Chart) -> _Points:
     return np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
 
 
-# The remedy of every message about a patch area without position.
+# Remedy in messages about a patch area whose position is unknown.
 HOW_TO_GIVE_CORNERS = (
     "give the corners of its patch area with --corners, for example --corners 297,90 4866,160 4805,3319 296,3326: "
     "x,y in pixels of the raw file as it is stored, clockwise from the corner that is printed top-left; read them from "
@@ -206,7 +210,7 @@ def _find_given_field(picture: PreparedImage, chart: Chart, corners_px: _Points,
     if outline is None:
         raise RegistrationError(
             f"{image_name}: not all four sides near the given corners {given_corners} have an edge between patches and "
-            "paper; give the corners of the patch area (not of the sheet) to 40 pixels, and uncover its margin"
+            "paper; give the corners of the patch area (not of the sheet) within 40 pixels, and uncover its margin"
         )
     placed_charts = [_PlacedChart.of(outline, chart, turn) for turn in range(8)]
     misfits = [_colour_misfit(picture, placed, chart) for placed in placed_charts]
@@ -234,18 +238,18 @@ def _find_given_field(picture: PreparedImage, chart: Chart, corners_px: _Points,
 
 @dataclass(frozen=True, eq=False)
 class _PlacedChart:
-    """The chart fitted to an outline in one orientation; its sides are top, right, bottom, left."""
+    """The chart fitted to an outline in one orientation. The order of its sides is top, right, bottom, left."""
 
     corners_mm: _Points
     corners_px: _Points
     homography: npt.NDArray[np.float64]
-    sides_mm: tuple[_Points, ...]  # points (N, 2) of each side, rising along x or y
+    sides_mm: tuple[_Points, ...]  # points (N, 2) of each side, in ascending x or y
     sides_px: tuple[_Points, ...]  # the same points in the image
     normals: tuple[_Points, ...]
 
     @classmethod
     def of(cls, outline: Outline, chart: Chart, turn: int) -> _PlacedChart:
-        """Fit the chart in orientation `turn`: 0 … 3 quarter turns, 4 … 7 the same mirrored."""
+        """Fit the chart in orientation `turn`: 0 … 3 are quarter turns, 4 … 7 mirrored quarter turns."""
         order = np.roll(np.arange(4), -turn)
         if turn >= MIRRORED:
             order = order[::-1]
@@ -267,11 +271,11 @@ class _PlacedChart:
         return cls(corners_mm, corners_px, homography, mm, px, normals)
 
     def to_pixels(self, points_mm: _Points) -> _Points:
-        """Map points (N, 2) of the patch area by the homography, corrected by its blended deviations on the sides."""
+        """Map points (N, 2) to the image by the homography, corrected by its interpolated errors at the four sides."""
         mapped = project(self.homography, points_mm)
         (left, top), (right, bottom) = self.corners_mm[0], self.corners_mm[2]
-        share = (points_mm - (left, top)) / (right - left, bottom - top)
-        weights = (1 - share[:, 1], share[:, 0], share[:, 1], 1 - share[:, 0])
+        fraction = (points_mm - (left, top)) / (right - left, bottom - top)
+        weights = (1 - fraction[:, 1], fraction[:, 0], fraction[:, 1], 1 - fraction[:, 0])
         for side, weight in enumerate(weights):
             along = side % 2
             mm, normals = self.sides_mm[side], self.normals[side]
@@ -288,12 +292,12 @@ class _PlacedChart:
 
 
 def _colour_misfit(picture: PreparedImage, placed: _PlacedChart, chart: Chart) -> tuple[float, float]:
-    """Return two misfits of the chart's colours, 0 … 1.
+    """Return two misfits between the image and the printed codes, each 0 … 1.
 
-    The first is the product over the channels of residual / variation, in standard deviations. The second is the mean
-    over the channels of the unexplained variance.
+    For each channel, the scatter of the patches around a fit of light and codes is divided by the scatter around a fit
+    of light alone. The first misfit is the product of these ratios, the second is the mean of their squares.
     """
-    sampled_patches = np.random.default_rng(1).permutation(chart.colour_count)[:_TRIED_CELLS]
+    sampled_patches = np.random.default_rng(1).permutation(chart.colour_count)[:_COMPARED_CELLS]
     points = chart.centres_mm[sampled_patches]
     positions = placed.to_pixels(points)
     height, width = picture.shape
@@ -303,7 +307,7 @@ def _colour_misfit(picture: PreparedImage, placed: _PlacedChart, chart: Chart) -
     positions, points = positions[inside], points[inside]
     codes = chart.rgb[sampled_patches[inside]] / 255.0
     page = 2 * points / chart.page_mm - 1
-    # Logarithms of counts are a polynomial over the page (the light) plus one in the codes.
+    # The logarithm of the counts is modelled by a polynomial over the page (light) and a polynomial of the codes (ink).
     light = np.column_stack([np.ones(len(page)), page, page**2, page[:, 0] * page[:, 1]])
     pairs = [(i, j) for i in range(3) for j in range(i, 3)] if chart.bits > 1 else []
     colour = np.column_stack([codes, *(codes[:, i] * codes[:, j] for i, j in pairs)])
@@ -320,22 +324,22 @@ def _colour_misfit(picture: PreparedImage, placed: _PlacedChart, chart: Chart) -
             slope += solution[len(light[0]) + 3 + index] * (
                 (i == channel) * codes[:, j].mean() + (j == channel) * codes[:, i].mean()
             )
-        # A channel that does not rise with its own code is not explained.
-        share = min(colour_spread / light_spread, 1.0) if slope > 0 else 1.0
-        product *= share
-        unexplained.append(share**2)
+        # If a channel does not become brighter with its own code, the codes explain nothing.
+        ratio = min(colour_spread / light_spread, 1.0) if slope > 0 else 1.0
+        product *= ratio
+        unexplained.append(ratio**2)
     return product, float(np.mean(unexplained))
 
 
 def _robust_fit(design: _Points, values: npt.NDArray[np.float64]) -> tuple[float, npt.NDArray[np.float64]]:
-    """Return residual spread and coefficients of a robust linear fit; covered patches get low weights."""
+    """Return the standard deviation of the residuals and the coefficients of a linear fit, both robust to outliers."""
     weights = np.ones(len(values))
     terms = int(design.shape[1])
     solution, spread = np.zeros(terms), 1.0
     ridge = 1e-9 * len(values) * np.eye(terms)
     for _ in range(4):
         weighted = design * weights[:, None]
-        # By einsum, because the threads of a linear-algebra library cost more than they gain here.
+        # Use einsum, because for so few unknowns the threads of a linear-algebra library cost more time than they save.
         gram = np.einsum("ni,nj->ij", weighted, design) + ridge
         solution = np.asarray(np.linalg.solve(gram, np.einsum("ni,n->i", weighted, values)), dtype=np.float64)
         residual = np.abs(values - design @ solution)
@@ -364,7 +368,7 @@ def parse_corners(texts: Sequence[str]) -> Corners:
 
 
 def corners_text(corners_px: npt.ArrayLike) -> str:
-    """Return corners (N, 2) float half-size px as "X,Y X,Y" in whole raw pixels, as users give them."""
+    """Return corners (N, 2) float half-size px as the text "X,Y X,Y" in whole raw pixels."""
     return " ".join(f"{2 * x + 0.5:.0f},{2 * y + 0.5:.0f}" for x, y in np.asarray(corners_px).reshape(-1, 2))
 
 
@@ -374,24 +378,24 @@ def require_corners(corners_px: _Points, shape: tuple[int, int] | None = None) -
     `corners_px`: (4, 2) float64, half-size px, clockwise from the printed top-left.
     """
     given_corners = corners_text(corners_px)
-    clockwise = "give four positions X,Y, clockwise from the printed top-left corner of the patch area"
+    remedy = "give four positions X,Y, clockwise from the printed top-left corner of the patch area"
     contour = corners_px.astype(np.float32)[:, None]
     if corners_px.shape != (4, 2) or not cv2.isContourConvex(contour) or cv2.contourArea(contour) < 1:
-        raise InputError(f"the given corners {given_corners} are not a convex quadrilateral; {clockwise}")
+        raise InputError(f"the given corners {given_corners} are not a convex quadrilateral; {remedy}")
     if cv2.contourArea(contour, oriented=True) < 0:
         raise InputError(
-            f"the given corners {given_corners} run counter-clockwise; {clockwise}, and take the frame without a mirror"
+            f"the given corners {given_corners} run counter-clockwise; {remedy}, and take the frame without a mirror"
         )
     if shape is not None and ((corners_px < -0.5).any() or (corners_px > (shape[1] - 0.5, shape[0] - 0.5)).any()):
         raise InputError(
             f"the given corners {given_corners} are outside the image of {2 * shape[1]}×{2 * shape[0]} pixels; "
-            "give pixels of the raw file as it is stored, not rotated"
+            "give pixels of the raw file before any rotation"
         )
     shortest = 2 * float(np.linalg.norm(corners_px - np.roll(corners_px, 1, axis=0), axis=1).min())
     if shortest < LEAST_SIDE_PX:
         raise InputError(
-            f"the given corners {given_corners} are {shortest:.0f} pixels apart, expected at least {LEAST_SIDE_PX} "
-            "pixels; give the corners of the whole patch area"
+            f"two of the given corners {given_corners} are {shortest:.0f} pixels apart, expected at least "
+            f"{LEAST_SIDE_PX} pixels; give the corners of the whole patch area"
         )
 
 
@@ -401,10 +405,10 @@ class PreparedImage:
 
     planes: tuple[Plane, ...]  # planes with enough light, slightly smoothed
     channels: tuple[int, ...]  # channel of each plane: 0, 1, 2
-    levels: tuple[_Float, ...]  # estimated level of paper in each plane, on the small image
-    bright: tuple[bool, ...]  # whether each plane has enough light to distinguish patches from the noise of paper
+    levels: tuple[_Float, ...]  # for each plane, the local level of paper, estimated in a reduced image
+    bright: tuple[bool, ...]  # for each plane, whether patches differ from paper by more than noise
     shape: tuple[int, int]  # height and width, half-size px
-    factor: int  # half-size pixels per pixel of the small image
+    factor: int  # half-size pixels per pixel of the reduced image
 
     @classmethod
     def of(cls, planes: Sequence[Plane]) -> PreparedImage:
@@ -413,26 +417,29 @@ class PreparedImage:
         factor = max(1, round(width / _SMALL_WIDTH_PX))
         size = (width // factor, height // factor)
         brightest = [paper_level(plane) for plane in planes]
-        usable = [k for k, level in enumerate(brightest) if level >= max(MIN_SIGNAL, _LEAST_LIGHT * max(brightest))]
+        usable = [k for k, level in enumerate(brightest) if level >= max(MIN_SIGNAL, _COLOUR_SIGNAL * max(brightest))]
         levels: list[_Float] = []
         for k in usable:
             cropped = planes[k].values[: size[1] * factor, : size[0] * factor]
             small = cv2.blur(cv2.resize(cropped, size, interpolation=cv2.INTER_AREA), (3, 3))
-            # Near every point there is paper, or a patch as bright as paper in this channel.
+            # The local maximum is the level of paper, because paper or an equally bright patch is near every point.
             reach = size[0] // 5 | 1
             level = cv2.blur(cv2.dilate(small, np.ones((reach, reach), dtype=np.uint8)), (reach, reach))
             level = np.maximum(level, np.float32(0.2 * brightest[k])).astype(np.float32)
             levels.append(level)
         smooth = tuple(replace(planes[k], values=cv2.blur(planes[k].values, (3, 3)).astype(np.float32)) for k in usable)
-        bright = tuple(brightest[k] >= _MUCH_LIGHT * max(brightest) for k in usable)
+        bright = tuple(brightest[k] >= _EDGE_SIGNAL * max(brightest) for k in usable)
         return cls(smooth, tuple(usable), tuple(levels), bright, (height, width), factor)
 
     def to_small(self, points_px: _Points) -> _Points:
-        """Return points (..., 2) float64 half-size px in pixels of the small image."""
+        """Convert points (..., 2) float64 from half-size px to pixels of the reduced image."""
         return (points_px - (self.factor - 1) / 2) / self.factor
 
     def paleness_at(self, points_px: _Points) -> _Float:
-        """Return the level relative to paper (...) float32 at points (..., 2) float64 half-size px."""
+        """Return the brightness relative to paper, (...) float32, at points (..., 2) float64 half-size px.
+
+        It is the minimum over the channels with enough light.
+        """
         x, y = (np.ascontiguousarray(points_px[..., axis], dtype=np.float32) for axis in (0, 1))
         small_points = self.to_small(points_px).astype(np.float32)
         sx, sy = small_points[..., 0], small_points[..., 1]
@@ -457,7 +464,7 @@ class Outline:
 
 
 def _outward_normal(start: _Points, end: _Points) -> _Points:
-    """Return the unit normal (2,) that points out of a clockwise outline, of the side from start to end."""
+    """Return the outward unit normal (2,) of the side from start to end in a clockwise outline."""
     x, y = (end - start) / np.linalg.norm(end - start)
     return np.array([y, -x])
 
@@ -465,8 +472,8 @@ def _outward_normal(start: _Points, end: _Points) -> _Points:
 def trace_outline(picture: PreparedImage, corners_px: _Points) -> Outline | None:
     """Trace the edge between patches and paper near a quadrilateral; None if one side has no such edge.
 
-    In each round of `_ROUNDS` the steepest rise to paper is searched across each side. A Legendre series is fitted to
-    the detected points (iteratively reweighted least squares with Tukey's biweight).
+    Each round searches the steepest rise towards paper across each side. Then a Legendre series is fitted to the
+    detected points by iteratively reweighted least squares with Tukey's biweight.
 
     `corners_px`: (4, 2) float64 half-size px, clockwise in the image, accurate to `CORNER_REACH_PX`.
     """
@@ -533,20 +540,20 @@ def refine_edges(
         counts = cv2.remap(plane.values, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
         profile = np.asarray(counts, dtype=np.float64).reshape(grid.shape[:-1]).mean(axis=1) / level
         offsets, step_heights = _fitted_step(profile, float(np.hypot(blur_px, _INTERPOLATION_PX)))
-        is_clear = (step_heights > _CLEAR_EDGE) & (np.abs(offsets) < _REFINED_PX)
+        is_clear = (step_heights > _CLEAR_EDGE) & (np.abs(offsets) < _LARGEST_CORRECTION_PX)
         positions[index] += np.where(is_clear, offsets, 0.0)[:, None] * normals
         heights[index] = np.where(is_clear, step_heights, 0.0)
     return positions, heights
 
 
 def _fitted_step(profile: _Points, sigma: float) -> tuple[_Points, _Points]:
-    """Return offsets (N,) px and heights (N,) of steps blurred by `sigma` px in profiles (N, M) across edges."""
+    """Fit a step blurred by `sigma` px to each profile (N, M); return the offsets (N,) px and heights (N,)."""
     offsets: _Points = np.zeros(len(profile))
     heights: _Points = np.zeros(len(profile))
     for _ in range(_REFINE_STEPS):
         distances = (_REFINE_ACROSS_PX[None] - offsets[:, None]) / sigma
         step, slope = ndtr(distances), np.exp(-0.5 * distances**2) / np.sqrt(2 * np.pi) / sigma
-        # Patches are not uniform, so their side of the step has a slope of its own.
+        # The brightness changes between patches, so their side of the step also has a slope.
         design = np.stack([np.ones_like(step), step, slope, np.minimum(_REFINE_ACROSS_PX[None], 0) + 0 * step], axis=-1)
         gram = np.einsum("kni,knj->kij", design, design) + 1e-9 * np.eye(4)
         solution = np.linalg.solve(gram, np.einsum("kni,kn->ki", design, profile)[..., None])[..., 0].astype(np.float64)
@@ -556,7 +563,7 @@ def _fitted_step(profile: _Points, sigma: float) -> tuple[_Points, _Points]:
 
 
 def _bent_points(share: _Points, curve: _Points, start: _Points, end: _Points) -> _Points:
-    """Return the points (N, 2) at fractions (N,) of a chord, moved outwards by a Legendre series."""
+    """Return points (N, 2) at fractions (N,) of the line from start to end, moved outwards by a Legendre series."""
     outwards = np.polynomial.legendre.legvander(2 * share - 1, len(curve) - 1) @ curve
     return start + share[:, None] * (end - start) + outwards[:, None] * _outward_normal(start, end)
 
@@ -569,17 +576,17 @@ def _sum_series(first: _Points, second: _Points) -> _Points:
 
 
 def _steepest_rises(paleness: _Float, across: _Points, sigma_px: float) -> tuple[_Points, _Points]:
-    """Return the position and size (N,) of the steepest rise to the level of paper in each profile (N, M).
+    """Return the position and height (N,) of the steepest rise to the level of paper in each profile (N, M).
 
-    `sigma_px`: standard deviation of the expected position 0.
+    `sigma_px`: standard deviation of the prior for the position, whose mean is 0.
     """
-    # Neighbours along the side have the same edge; their mean suppresses ticks and noise.
+    # Average neighbouring profiles, which suppresses noise and the ticks of a ruler.
     profile = cv2.blur(cv2.GaussianBlur(paleness, (0, 0), _EDGE_SIGMA_PX / _PROFILE_STEP_PX, sigmaY=0.1), (1, 3))
     step = round(_EDGE_SIGMA_PX / _PROFILE_STEP_PX)
     rise = np.zeros_like(profile)
     rise[:, step:-step] = profile[:, 2 * step :] - profile[:, : -2 * step]
     level_beyond = np.roll(profile, -2 * step, axis=1)
-    # If there are several rises, as next to marks in the margin, the weights prefer the expected position.
+    # If a profile has several rises, for example at marks in the margin, the weights prefer the expected position.
     weights = np.exp(-2 * (across / sigma_px) ** 2).astype(np.float32)
     coarse = (rise * weights * np.clip(level_beyond, 0, 1) ** 4).argmax(axis=1)
     row = np.arange(len(coarse))
@@ -593,8 +600,8 @@ def _steepest_rises(paleness: _Float, across: _Points, sigma_px: float) -> tuple
 def robust_curve(along: _Points, offsets: _Points, order: int) -> tuple[_Points, npt.NDArray[np.bool_]]:
     """Fit a Legendre series to the majority of the points on a side.
 
-    `along`: (N,) float64, position along the side, 0 … 1. `offsets`: (N,) float64, position across it, half-size px.
-    Returns the coefficients (order + 1,) float64 on −1 … 1, and (N,) bool, the points that fit.
+    `along`: (N,) float64, position along the side, 0 … 1. `offsets`: (N,) float64, distance from the side, half-size
+    px. Returns the coefficients (order + 1,) float64 on −1 … 1, and a mask (N,) bool of the points that fit.
     """
     basis = np.polynomial.legendre.legvander(2 * along - 1, order)
     scale = max(robust_sigma(offsets - np.median(offsets)), 0.5)

@@ -24,14 +24,14 @@ from experiment.framing.field import MIN_SIGNAL, DetectedField, corners_text, fi
 from experiment.framing.homography import project, rms, robust_homography
 from foundation.errors import InputError, RegistrationError
 
-MIN_TAGS = 2  # Fewest tags for a homography: two give eight points, and four are needed.
+MIN_TAGS = 2  # Smallest number of tags for a homography: two tags have eight corners, and four points are needed.
 
-# Smallest fraction of the tags that must be detected. If fewer are, part of the chart is covered, dark or outside.
+# Smallest fraction of the tags that must be detected. Otherwise a part of the chart is covered, dark or outside.
 MIN_TAG_SHARE = 0.75
 
-MIN_MODULE_PX = 3.0  # Smallest module of a tag, half-size px; with smaller modules, detectors miss single tags.
+MIN_MODULE_PX = 3.0  # Smallest module of a tag, half-size px; tags with smaller modules are often missed
 
-_CORNERS = [1, 0, 3, 2]  # Order of pyapriltags' corners that is clockwise from the printed top-left
+_CORNERS = [1, 0, 3, 2]  # Reorders the corners of pyapriltags clockwise from the printed top-left
 
 _Points = npt.NDArray[np.float64]
 
@@ -66,10 +66,10 @@ class ChartPose:
     tags: tuple[DetectedTag, ...]  # detected tags of the chart, by id
     missing: tuple[int, ...]  # ids of the tags that were not detected
     homography: npt.NDArray[np.float64]  # (3, 3), print (mm) to image (px), without lens distortion
-    residual_px: float  # RMS distance of tag corners or outline from the homography, with distortion and waviness
+    residual_px: float  # RMS residual of tag corners or outline; includes lens distortion and waves of the paper
     module_px: float  # module of the smallest tag; NaN without tags
     fill: float  # larger of page width / image width and page height / image height
-    inside: bool  # all four page corners lie in the image
+    inside: bool  # whether all four page corners are in the image
     rotation_deg: float  # clockwise, page x axis against image x axis
     field: DetectedField | None = None  # patch area of a chart without tags, else None
 
@@ -119,8 +119,8 @@ def find_chart(
             f"{image_name}: the chart has {len(chart.tags)} tags, expected at least {MIN_TAGS}; "
             "print a chart made by acquire chart"
         )
-    # Tags are detected in one linear plane. A square root would move their corners by 0.25 px. A sum of the planes
-    # would move them by 0.2 px under deep red or blue illuminants.
+    # Detect the tags in one plane of linear counts. A tone curve or the sum of the planes would shift their corners by
+    # 0.2 px.
     plane = strongest_plane(frame) if isinstance(frame, Mosaic) else frame
     detected_tags = detect_tags(plane)
     printed_tags = {tag.id: tag for tag in chart.tags}
@@ -241,7 +241,7 @@ def _detect(image: npt.NDArray[np.uint8], offset_px: tuple[float, float]) -> tup
     detector: Detector = _detectors.detector
     tags: dict[int, DetectedTag] = {}
     for detection in detector.detect(np.ascontiguousarray(image)):
-        # In AprilTag, whole numbers are the corners of pixels; here they are the centres.
+        # In AprilTag, whole coordinates are the corners of pixels. Here they are the centres.
         corners = detection.corners[_CORNERS] - 0.5 + np.asarray(offset_px)
         tag = DetectedTag(detection.tag_id, corners, float(detection.decision_margin))
         if detection.hamming <= 1 and (tag.id not in tags or tags[tag.id].margin < tag.margin):
@@ -254,7 +254,7 @@ GREEN, RED, AMBER, _GREY = (60, 200, 60), (40, 40, 255), (40, 200, 255), (200, 2
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
-# Raw pixels between ticks on the border: about ten ticks on the longer side of a frame of 18 megapixels.
+# Distance of the ticks on the border of a drawing, raw pixels.
 _TICK_RAW_PX = 500
 
 _Image = npt.NDArray[np.uint8]
@@ -335,14 +335,13 @@ def _draw_text(image: _Image, *lines: str) -> None:
         cv2.putText(image, line, origin, FONT, scale, AMBER, 1, cv2.LINE_AA)
 
 
-# Smallest side of a patch, half-size px: 5 for its 25 samples, and the rest for rounding, registration and blur. With
-# 8.6 px and a blur of σ = 0.7 px, neighbours still contribute 1 % of the light.
+# Smallest side of a patch, half-size px: 5 px for its 5 × 5 samples, and 3 px for rounding, registration and blur.
 MIN_CELL_PX = 8.0
 
-# Width and height of the half-size images of the cameras of the paper (section 3.3), px.
+# Width and height of a half-size image, px, for the cameras of the paper (Banić et al. 2019, section 3.3).
 HALF_SIZE_PX = {"EOS 550D": (2601, 1732), "EOS 6D Mark II": (3132, 2090)}
 
-FILL = 0.94  # Fraction of the frame that a sheet fills, along the axis with the smaller margin
+FILL = 0.94  # Assumed fraction of the image that the page fills in width or height, whichever is larger
 
 
 @dataclass(frozen=True)

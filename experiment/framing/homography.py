@@ -1,7 +1,7 @@
-"""Homographies between two planes: mapping points, and fitting a homography to pairs of points.
+"""Fit homographies to pairs of points, and map points by them.
 
-Source: R. Hartley and A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., chapter 4 (direct linear
-transform, algorithm 4.1, and its robust estimate by RANSAC, algorithm 4.6), as in OpenCV's `findHomography`.
+Source: R. Hartley and A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., chapter 4: direct linear
+transform (algorithm 4.1) and RANSAC (algorithm 4.6), as in OpenCV's `findHomography`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-# Extent of points across a line, divided by that along it, below which they count as collinear. Rounding of coordinates
-# leaves 1e-9; the corners of two small tags at the ends of an A0 sheet have 1e-3.
-FLAT = 1e-6
+# Points count as collinear if their extent across a line is at most this fraction of their extent along it. Two small
+# tags at opposite ends of an A0 sheet have 1e-3.
+_COLLINEAR_RATIO = 1e-6
 
 _Points = npt.NDArray[np.float64]
 
@@ -39,12 +39,12 @@ def robust_homography(
     chart_points, frame_points
         (N, 2) float64, mm on the print and half-size px.
     tolerance_px
-        Largest distance of a fitting pair from the homography, half-size px.
+        Largest residual of a pair that fits the homography, half-size px.
 
     Returns
     -------
-        Homography (3, 3) float64, and (N,) bool, the pairs within the tolerance. The identity and no pair if the points
-        do not determine a homography.
+        Homography (3, 3) float64, and a mask (N,) bool of the pairs that fit. If the points do not determine a
+        homography, it is the identity, and no pair fits.
     """
     homography = fit_homography(chart_points, frame_points, tolerance_px)
     if homography is None:
@@ -57,11 +57,11 @@ def robust_homography(
 
 
 def on_one_line(points: _Points) -> bool:
-    """Return whether points (N, 2) float64 are collinear to `FLAT`; points with NaN are not."""
+    """Return whether points (N, 2) float64 are collinear; false if a coordinate is NaN."""
     if not np.isfinite(points).all():
         return False
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(extents[-1] <= FLAT * extents[0])
+    return bool(extents[-1] <= _COLLINEAR_RATIO * extents[0])
 
 
 def fit_homography(points: _Points, targets: _Points, tolerance: float | None = None) -> npt.NDArray[np.float64] | None:
@@ -70,15 +70,15 @@ def fit_homography(points: _Points, targets: _Points, tolerance: float | None = 
     Parameters
     ----------
     points, targets
-        (N, 2) float64, from and to.
+        (N, 2) float64. The homography maps `points` to `targets`.
     tolerance
-        In units of `targets`. If given, pairs that are further off are ignored (RANSAC); else all pairs count (least
+        Largest residual, in units of `targets`, of the pairs that are used (RANSAC). If None, all pairs are used (least
         squares).
     """
-    # OpenCV returns a matrix for some collinear points, which do not determine a homography.
+    # Collinear points do not determine a homography, but OpenCV may return one.
     if on_one_line(points) or on_one_line(targets):
         return None
-    # OpenCV returns None for other degenerate pairs, which becomes an array without shape.
+    # For other degenerate pairs OpenCV returns None, so the array has no shape.
     method, threshold = (0, 3.0) if tolerance is None else (cv2.RANSAC, tolerance)
     matrix = np.asarray(cv2.findHomography(points, targets, method, threshold)[0], dtype=np.float64)
     return matrix if matrix.shape == (3, 3) else None

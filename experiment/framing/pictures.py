@@ -1,7 +1,8 @@
 """Measure the movement of the chart between frames, and draw previews of frames.
 
-Movement is measured in one colour plane on a few gauges, in half-size pixels. A gauge is a tag. On a chart without
-tags it is a strip across the edge of the patch area, which is visible under every illuminant.
+Movement is measured in half-size pixels, in one colour plane, at a few small regions called gauges. Each gauge is a
+tag. On a chart without tags, each gauge is a strip across the edge of the patch area, which is visible under every
+illuminant.
 
 Source: B. D. Lucas and T. Kanade, "An iterative image registration technique", IJCAI 1981.
 """
@@ -21,37 +22,39 @@ from experiment.framing.field import DetectedField
 from experiment.framing.finding import AMBER, FONT, GREEN, RED, ChartPose, DetectedTag
 from foundation.robust import huber_weights, robust_sigma
 
-# Largest measured movement, half-size px: an edge that moved further has left the crop around its tag or strip.
+# Largest movement that can be measured, half-size px. After a larger one, the edge is outside the crop around its
+# gauge.
 MAX_SHIFT_PX = 3.0
 
-# Movement from which the sampling grid follows the chart, half-size px: a fifth of the rounding of sample positions.
+# Largest movement after which the sampling grid stays where it is, half-size px.
 STILL_PX = 0.1
 
-# Movement from which the chart is registered again, half-size px: it was knocked, and may have turned too.
+# Largest movement after which the grid is only shifted, half-size px. After a larger one, the chart is registered
+# again, because it may also have rotated.
 REREGISTER_PX = 0.5
 
-_GAUGE_TAGS = 8  # Measured tags: the median of eight has an error of 0.005 px if paper has 290 counts
+_GAUGE_TAGS = 8  # Number of measured tags; the error of the median of eight is about 0.005 px
 
-_STEPS = 5  # Largest number of Gauss-Newton steps
+_STEPS = 5  # Largest number of Gauss-Newton iterations
 
-_SETTLED_PX = 1e-3  # Smallest step that is followed by another, half-size px: a fifth of the error
+_SETTLED_PX = 1e-3  # The iteration ends after a step below this length, half-size px
 
-# Margin around a tag that is read, half-size px: the largest movement, the smoothing, and the corners of a rotated tag.
+# Margin that is read around a tag, half-size px: space for the largest movement and for the smoothing.
 _AROUND_TAG_PX = 12
 
-_STRIPS = 32  # Strips along the outline: eight a side, so that covered strips are outvoted
+_STRIPS = 32  # Number of strips along the outline: enough to outvote some covered strips
 
-_STRIP_ALONG, _STRIP_ACROSS = 30, 8  # Half the length and half the width of a strip, px
+_STRIP_ALONG, _STRIP_ACROSS = 30, 8  # Half the extent of a strip along and across the edge, px
 
-# Margin around a strip that is read, half-size px: the largest movement, overshoot of a step and cubic interpolation.
+# Margin that is read around a strip, half-size px: space for the largest movement and for cubic interpolation.
 _STRIP_REACH_PX = 6
 
-_MIN_STRIPS = 8  # Fewest strips: twice as many as the four parameters of the movement
+_MIN_STRIPS = 8  # Smallest number of strips: twice the number of parameters of the movement
 
-_LEAST_CORRELATION = 0.5  # Smallest correlation of a tag or strip with the earlier frame (judgement)
+_LEAST_CORRELATION = 0.5  # Smallest correlation of a gauge between the two frames (judgement)
 
-# Smallest eigenvalue of the scaled normal matrix of a tag; below it, the image of the tag has too little structure.
-_LEAST_INDEPENDENT = 1e-6
+# Smallest eigenvalue of the scaled normal matrix of a tag. Below it, the image of the tag has too little structure.
+_LEAST_EIGENVALUE = 1e-6
 
 _Points = npt.NDArray[np.float64]
 
@@ -61,11 +64,11 @@ class Shift:
     """Movement of the chart between two frames, half-size px."""
 
     dx: float  # median over tags, or robust fit of the strips; positive to the right
-    dy: float  # likewise, positive downwards
-    largest_px: float  # largest movement of a tag or of a corner of the patch area; shows rotation
+    dy: float  # the same in the other direction; positive downwards
+    largest_px: float  # largest movement of a tag or of a corner of the patch area, which includes rotation
     gauges: int  # number of measured tags or strips; 0 means that the movement is unknown
-    # Variance of the blur in the later frame minus the variance in the earlier one, px², median. Above 1 px² it is too
-    # low, because it comes from a linear approximation.
+    # Variance σ² of the blur in the later frame minus σ² in the earlier frame, px²; median over the gauges. Values
+    # above 1 px² are too low, because the calculation is a linear approximation.
     blur_growth_px2: float = 0.0
 
     @property
@@ -78,7 +81,7 @@ _UNKNOWN = Shift(0.0, 0.0, 0.0, 0)
 
 
 def gauge_boxes(pose: ChartPose) -> list[tuple[int, int, int, int]]:
-    """Return the regions of a plane that `shift_between` reads, in elements: left, top, right, bottom (exclusive)."""
+    """Return the regions of a plane that `shift_between` reads: left, top, right, bottom (exclusive), array indices."""
     if pose.field is None:
         outlines, margin = [tag.corners_px for tag in _gauge_tags(pose)], _AROUND_TAG_PX
     else:
@@ -90,9 +93,9 @@ def gauge_boxes(pose: ChartPose) -> list[tuple[int, int, int, int]]:
 
 
 def gauges_of(mosaic: Mosaic, channel: Channel, black: npt.NDArray[np.float64], pose: ChartPose) -> Plane:
-    """Return one channel of a frame, float32 counts above black, around its gauges, and 0 elsewhere.
+    """Return one channel of a frame, float32 counts above black, around the gauges of the chart, and 0 elsewhere.
 
-    `black`: (2, 2) float64 counts.
+    `black`: (2, 2) float64, black level, counts.
     """
     positions = phases(mosaic)[channel]
     blocks = mosaic.block_planes()
@@ -108,8 +111,8 @@ def gauges_of(mosaic: Mosaic, channel: Channel, black: npt.NDArray[np.float64], 
 def shift_between(reference: Plane, pose: ChartPose, plane: Plane) -> Shift:
     """Measure movement and growth of blur of the chart between two planes of the same channel.
 
-    Gain and offset of the light may change. Movements up to `MAX_SHIFT_PX` are measured, with an error of 0.005 px if
-    paper has some hundred counts.
+    The brightness may change between the frames by a factor and an offset. Movements up to `MAX_SHIFT_PX` are measured.
+    The error is about 0.005 px if paper has some hundred counts.
 
     Parameters
     ----------
@@ -132,7 +135,7 @@ def shift_between(reference: Plane, pose: ChartPose, plane: Plane) -> Shift:
 
 
 def _gauge_tags(pose: ChartPose) -> list[DetectedTag]:
-    # A few tags, evenly spaced by id.
+    # A few tags with evenly spaced ids.
     tags = sorted(pose.tags, key=lambda tag: tag.id)
     last = len(tags) - 1
     return [tags[index] for index in sorted({round(last * step / (_GAUGE_TAGS - 1)) for step in range(_GAUGE_TAGS)})]
@@ -164,19 +167,19 @@ def _tag_shift(reference: Plane, plane: Plane, tag: DetectedTag) -> _Points | No
     # Normal equations, because a linear-algebra library would start threads that compete with decoding.
     gram = np.asarray(np.einsum("ni,nj->ij", design, design), dtype=np.float64)
     scale = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-9))
-    if np.linalg.eigvalsh(gram * scale * scale[:, None])[0] < _LEAST_INDEPENDENT:
+    if np.linalg.eigvalsh(gram * scale * scale[:, None])[0] < _LEAST_EIGENVALUE:
         return None
     inverse = np.asarray(np.linalg.inv(gram), dtype=np.float64)
     shift, blur_growth = np.zeros(2), 0.0
     for _ in range(_STEPS):
         remapped = cv2.remap(plane_crop, columns + np.float32(shift[0]), rows + np.float32(shift[1]), cv2.INTER_CUBIC)
         moved = np.asarray(remapped, dtype=np.float64).ravel()
-        # moved = gain · (template + g · step + laplacian · growth / 2) + offset, linear in the products.
+        # moved = gain · (template + g · step + laplacian · growth / 2) + offset. The products with gain are fitted.
         solution = inverse @ np.asarray(np.einsum("ni,n->i", design, moved), dtype=np.float64)
         if solution[0] <= 0:
             return None
         step, blur_growth = solution[2:4] / solution[0], 2 * float(solution[4] / solution[0])
-        # The crop read at x + shift shows the tag at x + shift − movement.
+        # A step is the difference between the current shift and the movement.
         shift -= np.clip(step, -1, 1)
         if np.abs(shift).max() > MAX_SHIFT_PX + 1:
             return None
@@ -210,10 +213,10 @@ def _field_shift(reference: Plane, plane: Plane, field: DetectedField) -> Shift:
         return _UNKNOWN
     earlier = _sampled(reference, samples)
     slope = np.asarray(np.gradient(earlier, axis=2))
-    # As for a tag, but only across the edge: blur along an edge has no effect.
+    # The blur term is as for a tag, but only across the edge, because blur along an edge has no effect.
     bend = np.zeros_like(earlier)
     bend[:, :, 1:-1] = np.diff(earlier, 2, axis=2)
-    # The ends of a strip have no neighbours on both sides, so their differences are not used.
+    # The samples at the ends of a strip lack a neighbour, so they are not used.
     inner = np.s_[:, :, 1:-1]
     template, slope, bend = (array[inner].reshape(len(middles), -1) for array in (earlier, slope, bend))
     design = np.stack([template, np.ones_like(template), slope, bend], axis=-1)
@@ -245,7 +248,7 @@ def _field_shift(reference: Plane, plane: Plane, field: DetectedField) -> Shift:
 
 
 def _sampled(plane: Plane, positions: _Points) -> _Points:
-    """Return the counts of a plane, slightly smoothed, at positions (K, …, 2) relative to its offset."""
+    """Return the counts of a plane at positions (K, …, 2) relative to its offset, slightly smoothed along the edge."""
     x, y = (np.ascontiguousarray(positions[..., axis].reshape(len(positions), -1), dtype=np.float32) for axis in (0, 1))
     counts = np.asarray(cv2.remap(plane.values, x, y, cv2.INTER_CUBIC), dtype=np.float64).reshape(positions.shape[:-1])
     return (np.roll(counts, 1, axis=1) + 2 * counts + np.roll(counts, -1, axis=1)) / 4
@@ -276,15 +279,15 @@ def _similarity(
     return Shift(dx, dy, largest, len(offsets), blur_growth)
 
 
-WIDTH_PX = 640  # Longest side of a preview, px; also used by the journal
+WIDTH_PX = 640  # Longest side of a preview, px
 
-_QUALITY = 80  # JPEG quality: about 40 kB a preview, 30 MB a session
+_QUALITY = 80  # JPEG quality, for about 40 kB per preview
 
 _LETTER_PX = 7.4  # Width of a letter at `_SCALE`, px
 
 _SCALE = 0.42  # Scale of OpenCV's font: the smallest that is easy to read
 
-_FAINTEST = 0.01  # Smallest level that is shown as white, relative to white: else a dark preview would show only noise
+_LEAST_WHITE = 0.01  # Lower limit of the level that is shown as white, relative to white; limits visible noise
 
 
 def preview_jpeg(
@@ -295,10 +298,10 @@ def preview_jpeg(
     boxes: Sequence[tuple[int, int, int, int]],
     cause: str,
 ) -> bytes:
-    """Return a frame as JPEG bytes, at most 640 px wide or high, with marked regions and a text.
+    """Return a preview of a frame as JPEG bytes, at most 640 px wide or high, with marked regions and a text.
 
-    `black`: (2, 2) float64, black level, counts. `white`: (3,) float64, camera RGB above black that is shown as white.
-    `outlines_px`: outlines (K, 2) float64 half-size px. `boxes`: left, top, right, bottom of regions, half-size px.
+    `black`: (2, 2) float64, black level, counts. `white`: (3,) float64, camera RGB of white, counts above black.
+    `outlines_px`: polygons (K, 2) float64 half-size px. `boxes`: left, top, right, bottom of regions, half-size px.
     """
     blocks = mosaic.block_planes()
     height, width = blocks.shape[2:]
@@ -309,7 +312,7 @@ def preview_jpeg(
         row, column = positions[channel][0]
         scale = np.float32(1 / max(float(white[index]), 1.0))
         small[:, :, 2 - index] = (blocks[row, column, ::step, ::step] - np.float32(black[row, column])) * scale
-    brightest = max(float(np.percentile(small[::4, ::4].max(axis=2), 99.5)), _FAINTEST)
+    brightest = max(float(np.percentile(small[::4, ::4].max(axis=2), 99.5)), _LEAST_WHITE)
     image = (np.sqrt(np.clip(small, 0, brightest) / np.float32(brightest)) * 255).astype(np.uint8)
     for corners in outlines_px:
         cv2.polylines(image, [(corners / step).round().astype(np.int32)], True, GREEN, 1, cv2.LINE_AA)

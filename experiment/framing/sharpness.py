@@ -1,4 +1,4 @@
-"""Sharpness of an image of the chart: blur of the edges of its tags or of its patch area, in half-size pixels."""
+"""Measure the blur of an image at the edges of the tags or of the patch area, in half-size pixels."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from experiment.framing.finding import ChartPose, DetectedTag
 
 _Points = npt.NDArray[np.float64]
 
-# σ up to which patches of any size are located to a few hundredths of a pixel. Beyond it, more than 1 % of the light in
-# the 25 samples of a patch of 10 px comes from its neighbours.
+# Largest acceptable σ of the blur, half-size px. Above it, a patch of 10 px gets more than 1 % of its light from its
+# neighbours.
 MAX_BLUR_PX = 1.0
 
-# Candidate σ, half-size px, in steps of 7 %: from below the blur of a single photosite to far above useful values.
+# Candidates for the σ of the blur, half-size px.
 _BLURS = np.geomspace(0.15, 4, 48)
 
-# Points of the outline at which blur is measured: so many that marks in the margin do not change the median.
+# Number of outline points at which blur is measured; marks in the margin disturb few of them.
 _OUTLINE_POINTS = 80
 
-# Half-size px read around a point of the outline: about one patch inwards; outwards less than the distance to marks.
+# Extent of the pixels that are used around an outline point, half-size px: inwards, outwards, and along the outline.
 _INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0
 
 
 def blur_px(pose: ChartPose) -> float:
-    """Return the blur of the image: median over edges of the σ of the blurring Gaussian, half-size px.
+    """Return the blur of the image as the σ of a Gaussian, half-size px: the median over the measured edges.
 
-    The edges belong to the tags, or to the patch area if the chart has no tags. NaN if no edge is measured. The value
-    includes lens, focus and movement, and the size and spacing of the photosites: 0.29 px for green (two photosites
-    half a pixel apart), 0.14 px for red and blue. It is accurate to 0.01 px up to a quarter of a tag module. Above that
-    it is up to a tenth too high, because the tag corners are less accurate.
+    The edges belong to the tags, or to the patch area if the chart has no tags. NaN if no edge can be measured. The
+    blur includes lens, focus, movement and the size of the photosites. The photosites alone give 0.29 px in green,
+    where two of them are averaged, and 0.14 px in red and blue. If the blur exceeds a quarter of a tag module, the
+    result is up to 10 % too high.
     """
     if pose.field is not None:
         blurs = _outline_blurs(pose.plane, pose.field)[1]
@@ -45,9 +45,10 @@ def blur_px(pose: ChartPose) -> float:
 
 
 def edge_blurs(pose: ChartPose) -> tuple[_Points, npt.NDArray[np.float64]]:
-    """Return the points (N, 2) half-size px at which blur was measured, and the σ there, (N,) px, as in `blur_px`.
+    """Return points (N, 2) half-size px, and the blur at each of them, σ (N,) px, as in `blur_px`.
 
-    One point per tag, with the median of its four edges, or points along the outline if the chart has no tags.
+    The points are the centres of the tags, each with the median of its four edges. If the chart has no tags, the points
+    are on the outline of the patch area.
     """
     if pose.field is not None:
         return _outline_blurs(pose.plane, pose.field)
@@ -57,9 +58,9 @@ def edge_blurs(pose: ChartPose) -> tuple[_Points, npt.NDArray[np.float64]]:
 
 
 def _edge_blurs(plane: Plane, tag: DetectedTag) -> npt.NDArray[np.float64]:
-    # Across an edge of a tag lie its data, black border, white rim and the surroundings; border and rim are one module
-    # wide. So four unknown levels with three known steps are blurred and fitted to the pixels, each at its own distance
-    # from the edge. Interpolation would add blur (slanted edge, as in ISO 12233).
+    # A line across the edge of a tag crosses data modules, the black border, the white rim and the surroundings. Border
+    # and rim are one module wide, so the positions of the three steps are known. Blurred steps are fitted to the pixels
+    # at their own distances from the edge, because interpolation would add blur (slanted edge, as in ISO 12233).
     module = tag.side_px / TAG_MODULES
     corners = tag.corners_px - plane.offset_px
     left, top = np.floor(corners.min(axis=0) - module).astype(int)
@@ -75,9 +76,9 @@ def _edge_blurs(plane: Plane, tag: DetectedTag) -> npt.NDArray[np.float64]:
         length = float(np.linalg.norm(end - start))
         tangent = (end - start) / length
         along = (pixels - start) @ tangent / length
-        # Corners run clockwise with y down, so this points out of the tag.
+        # The corners are clockwise with y down, so this vector points out of the tag.
         across = (pixels - start) @ np.array([tangent[1], -tangent[0]])
-        # Pixels near the corners are omitted, because another edge is near.
+        # Omit pixels near a corner, because the next edge influences them, too.
         near = (along > 0.2) & (along < 0.8) & (np.abs(across) < module)
         counts, distances = values[near], across[near]
         blurs[edge] = _sigma(counts, distances, (-module, 0.0, module))
@@ -107,10 +108,10 @@ def _outline_blurs(plane: Plane, field: DetectedField) -> tuple[_Points, npt.NDA
 
 
 def _sigma(counts: _Points, distances: _Points, step_positions: Sequence[float]) -> float:
-    # For each candidate σ, blurred steps of unknown height are fitted.
+    # For each candidate σ, fit blurred steps of unknown height.
     sigma = _BLURS[:, None]
     steps = [ndtr((distances - position) / sigma) for position in step_positions]
-    # The derivative of the edge absorbs an error of its position.
+    # The derivative of the step at 0 corrects an error of the edge position.
     slope = np.exp(-0.5 * (distances / sigma) ** 2)
     basis = np.linalg.qr(np.stack([np.ones_like(slope), *steps, slope], axis=-1)).Q
     misfit = (counts**2).sum() - ((counts @ basis) ** 2).sum(axis=-1)

@@ -1,1 +1,1 @@
-"""Measurements of frames: sensor, light, print, robust fits and smooth fields."""
+"""Measurements on frames: exposure, sensor, light and print, and the fits for them."""

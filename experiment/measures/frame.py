@@ -1,7 +1,7 @@
-"""Measure one frame in a single pass: light in all regions, noise, exposure and camera.
+"""Measure one frame: light in all regions, noise and exposure.
 
-Every photosite of the visible area belongs to one tile and one strip, so that every local change is measured. No result
-depends on other frames, on the chart or on the requested illuminant.
+Every photosite of the visible area belongs to one tile and one strip, so every local change of the light is measured.
+No result depends on other frames, on the chart or on the requested illuminant.
 
 Positions are in 2×2 blocks of the mosaic (half-size pixels). There are T = 384 tiles, S strips (four in each row of
 blocks) and M sampled blocks.
@@ -21,27 +21,28 @@ from drivers.raw.rawfile import CHANNELS, CLIPPING_SHARE, Channel, Mosaic, frame
 from experiment.measures.exposure import BRIGHTEST_PERCENTILE
 from foundation.compiled import compiled
 
-# Tiles over a frame of 3 : 2: 384 squares of 108 px on an EOS 550D. Each has about a hundred patches, so that its mean
-# is accurate to 0.1 %; a hand in front of the chart covers several tiles.
+# Number of tiles across and down a frame. A tile contains about a hundred patches, and a hand in front of the chart
+# covers several tiles.
 TILE_COLUMNS, TILE_ROWS = 24, 16
 
-# Strips along a row: 650 px on an EOS 550D, that is 65 patches, whose mean differs between rows of patches.
+# Number of strips in a row of blocks.
 SEGMENTS = 4
 
-# Sampled blocks for the comparison of the noise of two frames: correlations are then accurate to 1 %.
+# Number of sampled blocks in which the noise of two frames is compared; correlations are then accurate to 1 %.
 SAMPLES = 8192
 
-# Fraction of black below which a photosite is empty: noise lowers counts by tens, and black is hundreds of counts.
+# A photosite is empty (without data) if its count is below this fraction of the black level. Noise lowers counts less.
 _EMPTY_SHARE = 0.5
 
-# Smallest black level, counts, at which empty photosites can be detected: older bodies by Nikon subtract black.
+# Smallest black level at which empty photosites can be detected, counts. Older cameras by Nikon subtract black.
 _LEAST_BLACK = 64.0
 
-_NOISE_BINS = 6  # Levels at which noise is measured: enough for a line, with a thousand blocks each
+_NOISE_BINS = 6  # Number of levels at which noise is measured, with more than a thousand blocks each
 
-_INNER = 0.3  # Fraction of the blocks of a level, with the smallest differences, that are used for the noise
+# Fraction of the blocks of a level that are used for its noise: the blocks with the smallest differences.
+_INNER_FRACTION = 0.3
 
-_INNER_SIGMAS = 0.3853  # Standard deviations within which this fraction of normal deviates lies: Φ⁻¹(0.65)
+_INNER_SIGMAS = 0.3853  # Limit of the inner 30 % of a normal distribution, in standard deviations: Φ⁻¹(0.65)
 
 _Array = npt.NDArray[np.float64]
 
@@ -85,19 +86,19 @@ class FramePlaces:
 def _mean_counts(
     counts: npt.NDArray[np.uint16], division: FramePlaces, clipping: float, floor: float
 ) -> tuple[_Array, _Array, _Array]:
-    """Return mean counts of tiles (T, 4) and strips (rows, 4, 4), and shares (2,) of clipped and empty photosites.
+    """Return mean counts of tiles (T, 4) and strips (rows, 4, 4), and fractions (2,) of clipped and empty photosites.
 
-    The last axis of the means has the four positions of the block, row by row.
+    The last axis of the means is the position in the block, row by row.
     """
     sums = np.zeros((division.rows, TILE_COLUMNS, 4), dtype=np.int64)
     top = min(int(np.ceil(clipping)), 65535)
-    tallies = np.zeros(2, dtype=np.int64)
-    _sum_rows(counts, division.x_edges, top, max(int(floor), 0), sums, tallies)
+    totals = np.zeros(2, dtype=np.int64)
+    _sum_rows(counts, division.x_edges, top, max(int(floor), 0), sums, totals)
     tiles = np.add.reduceat(sums, division.y_edges[:-1], axis=0).reshape(-1, 4) / division.tile_blocks
     ends = np.arange(0, TILE_COLUMNS, TILE_COLUMNS // SEGMENTS)
     widths = np.add.reduceat(np.diff(division.x_edges), ends)
     strips = np.add.reduceat(sums, ends, axis=1) / widths[:, None]
-    return tiles, strips, tallies / counts.size
+    return tiles, strips, totals / counts.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class GreenNoise:
-    """Noise of blocks, as the difference of their two green photosites, which cancels colour and light."""
+    """Noise of blocks: the difference of their two green photosites, in which colour and light cancel."""
 
     pattern: _Array  # (M,), counts, centred at 0, outliers clipped
     deviation: float  # standard deviation of the pattern, counts
@@ -122,7 +123,7 @@ class GreenNoise:
 
     @classmethod
     def of(cls, samples: npt.NDArray[np.uint16]) -> GreenNoise:
-        """Measure the noise of counts (M, 2) of both greens of blocks."""
+        """Measure the noise in the counts (M, 2) of both green photosites of blocks."""
         first, second = samples.astype(np.float64).T
         difference = first - second
         limit = 4 * float(np.median(np.abs(difference))) + 3
@@ -139,11 +140,11 @@ class Measured:
     strips: _Array  # (S, 3), mean R, G, B of each strip, counts above black
     samples: npt.NDArray[np.uint16]  # (M, 2), counts of both greens of the sampled blocks
     digest: bytes  # hash of the counts of all sampled blocks; differs between any two exposures
-    noise: Noise  # photon transfer from the differences of the greens, with fixed-pattern noise
+    noise: Noise  # photon transfer, from the differences of both greens; includes fixed-pattern noise
     black: float  # mean black level, counts
-    black_measured: bool  # the frame has a masked border in which black was measured
+    black_measured: bool  # whether black was measured in a masked border of the frame
     range_dn: float  # saturation level minus black level
-    brightest_dn: float  # brightest counts above black, of the brightest channel
+    brightest_dn: float  # `BRIGHTEST_PERCENTILE` of the counts above black, at the brightest position of the block
     clipped: float  # fraction of photosites close to saturation, 0 … 1
     empty: float  # fraction of photosites without counts, 0 … 1
     camera: str  # from the file; "" if missing
@@ -216,12 +217,12 @@ def _noise(greens: _Array) -> Noise:
         in_bin = (level >= low) & (level <= high)
         differences = difference[in_bin]
         centred = np.abs(differences - np.median(differences))
-        # Blocks on an edge between two patches differ by more than noise. Small patches have many such blocks.
-        sigma = float(np.quantile(centred, _INNER)) / _INNER_SIGMAS
+        # On an edge between two patches, the two greens of a block differ by more than noise, so such blocks are
+        # omitted.
+        sigma = float(np.quantile(centred, _INNER_FRACTION)) / _INNER_SIGMAS
         levels.append(float(np.median(level[in_bin])))
         variances.append(sigma**2 / 2)
-    # The darkest blocks contain the read noise, brighter ones also the photon noise. The weight of a level is
-    # the inverse of its variance.
+    # Dark blocks have only read noise, bright blocks also photon noise. Residuals are relative to the variance.
     x, y = np.maximum(np.array(levels), 0), np.maximum(np.array(variances), 1e-3)
     design = np.column_stack([np.ones_like(x), x]) / y[:, None]
     floor, slope = np.linalg.lstsq(design, np.ones_like(y), rcond=None)[0].tolist()
@@ -239,9 +240,9 @@ def _sum_rows(
     top: int,
     floor: int,
     sums: npt.NDArray[np.int64],
-    tallies: npt.NDArray[np.int64],
+    totals: npt.NDArray[np.int64],
 ) -> None:
-    """Write sums of counts (H, W) of tiles to `sums` (rows, tiles, 4), clipped and empty counts to `tallies` (2,)."""
+    """Sum counts (H, W) by tile into `sums` (rows, tiles, 4); count clipped and empty ones in `totals` (2,)."""
     clipped, empty = 0, 0
     for row in range(sums.shape[0]):
         for half in range(2):
@@ -259,5 +260,5 @@ def _sum_rows(
                 sums[row, tile, 2 * half + 1] = right
                 clipped += high
                 empty += low
-    tallies[0] = clipped
-    tallies[1] = empty
+    totals[0] = clipped
+    totals[1] = empty

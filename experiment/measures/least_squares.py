@@ -1,8 +1,8 @@
-"""Weighted linear least squares without threads, and polynomial bases for the fits.
+"""Weighted linear least squares in the calling thread, and polynomial bases for the fits.
 
-Frames are decoded in threads. A linear-algebra library that starts its own threads is slower for a few dozen unknowns.
-The inner loops are compiled without permission to reorder sums, so that a look-up table (LUT) depends on neither
-processor nor thread. Bases are Legendre polynomials, which keep normal equations well conditioned.
+Frames are processed in parallel threads, so a linear-algebra library with threads of its own would be slower. The
+compiled loops keep the order of sums, so that a look-up table (LUT) is the same on every processor. The bases are
+Legendre polynomials, which keep the normal equations well conditioned.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ import numpy.typing as npt
 from foundation.compiled import compiled
 from foundation.robust import MAD_TO_SIGMA
 
-# Highest order of flat fields. All orders up to it share one cached basis, because lower ones are its beginning.
+# Highest order of flat fields. The basis of this order is cached, and its first columns are the bases of lower orders.
 _CACHED_ORDER: Final = 8
 
 
 _LINE_ROUNDS = 8  # Iterations of a line fit
 
-# Smallest residual for the weights, relative to the median residual, so that a point on the line does not get all the
-# weight.
+# Lower limit of the residuals in the weights, relative to the median residual. It limits the weight of a point that is
+# exactly on the line.
 _LEAST_RESIDUAL = 0.1
 
-# Points per block of the sum: three channels and one row of the basis then fit into the level 2 cache.
+# Number of points that are summed at a time; their data fit into the level 2 cache.
 _POINTS_AT_A_TIME = 2048
 
-_RIDGE = 1e-10  # Ridge relative to the mean diagonal of the normal matrix: keeps equal columns solvable
+_RIDGE = 1e-10  # Ridge relative to the mean diagonal of the normal matrix, so that equal columns can be solved
 
-_CUT = 6.0  # Residuals beyond this many robust standard deviations get no weight (J. W. Tukey's biweight).
+_BIWEIGHT_SIGMAS = 6.0  # Residuals beyond this many robust standard deviations get no weight (J. W. Tukey's biweight).
 
 _Array = npt.NDArray[np.float64]
 
@@ -120,7 +120,7 @@ def held_out_squares(design: _Array, values: _Array, weights: _Array, counts: tu
 
 
 def _contiguous(array: _Array) -> _Array:
-    # float64, C order, writable: numba compiles a function again for each other kind.
+    # float64, C order and writable, because numba compiles a function again for each other kind of array.
     return np.require(array, np.float64, ["C", "W"])
 
 
@@ -148,7 +148,7 @@ def page_polynomial(points_mm: npt.ArrayLike, page_mm: tuple[float, float], orde
     `points_mm`: (N, 2) float, mm on the page. Returns (N, terms) float64, read-only, terms as in `page_powers`.
     """
     points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 2)
-    # Terms are in ascending order, so a basis of lower order is the beginning of a higher one.
+    # The first columns of the cached basis are the basis of the lower order.
     return _page_basis(points.tobytes(), page_mm, max(order, _CACHED_ORDER))[:, : len(page_powers(order))]
 
 
@@ -177,9 +177,9 @@ def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tup
 
     Returns
     -------
-        Terms (legendre, T) float64: each column has the coefficients of a polynomial in the terms of `page_powers`, is
-        orthogonal to the columns before it, and has the mean square 1 over the page. The second value has the numbers
-        of terms that a fit may use.
+        Terms (L, T) float64: each column has the L coefficients of a polynomial, in the order of `page_powers`. The
+        polynomials are orthogonal, and their mean square over the page is 1. The second value lists the numbers of
+        leading terms that a fit may use.
     """
     half = float(np.hypot(*page_mm)) / 2
     node, _ = np.polynomial.legendre.leggauss(_CACHED_ORDER + 2)
@@ -193,10 +193,10 @@ def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tup
     def radial(half_power: int) -> list[_Array]:
         return [x * r2 ** (half_power - 1), y * r2 ** (half_power - 1), r2**half_power]
 
-    # Order of the groups: constant, slope and curvature; r⁴ and r⁶, with r the distance from a centre; the other terms
-    # of third and fourth order; r⁸; the other terms of fifth and sixth order. x r² and y r² are in the group of r⁴,
-    # because they are its change if the centre moves; r⁶ and r⁸ have such terms too. Up to the sixth order, each term
-    # replaces one of the other terms of its order.
+    # Order of the groups, with the distance r from the centre: constant, slope, curvature; r⁴ and r⁶; other terms of
+    # third and fourth order; r⁸; other terms of fifth and sixth order. The group of r⁴ also contains x·r² and y·r²,
+    # which describe a shift of its centre. The groups of r⁶ and r⁸ contain similar terms. Up to the sixth order, each
+    # radial term replaces a monomial of its order.
     groups = (
         [power(0), power(1), power(2), power(3)]
         if outside_only
@@ -219,7 +219,7 @@ def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tup
 
 
 def code_powers(degree: int) -> list[tuple[int, int, int]]:
-    """Return the degrees in red, green and blue of the terms of total degree up to `degree`.
+    """Return the degrees in red, green and blue of all terms with a total degree up to `degree`.
 
     >>> code_powers(1)
     [(0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)]
@@ -273,7 +273,7 @@ def _robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _A
             residual[point] = values[point] - predicted
         scale = MAD_TO_SIGMA * np.median(np.abs(residual)) + 1e-9
         for point in range(count):
-            inside = max(1 - (residual[point] / (_CUT * scale)) ** 2, 0.0)
+            inside = max(1 - (residual[point] / (_BIWEIGHT_SIGMAS * scale)) ** 2, 0.0)
             weights[point] = inside * inside
     return solution, weights, residual
 
@@ -281,8 +281,8 @@ def _robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _A
 @compiled
 def _held_out_squares(design: _Array, values: _Array, weights: _Array, counts: npt.NDArray[np.int64]) -> _Array:
     # The error of a held-out point is its residual / (1 − leverage), so no fit is repeated (R. D. Cook, S. Weisberg,
-    # *Residuals and Influence in Regression*, section 2.2). In coordinates in which the normal matrix of the largest
-    # fit is the identity, the leverages of nested fits are sums over one row of the design.
+    # *Residuals and Influence in Regression*, section 2.2). The design is transformed so that the normal matrix becomes
+    # the identity. Then the leverage in a smaller fit is a partial sum over one row of the design.
     points, unknowns = design.shape
     gram, right = _normal_equations(design, values, weights)
     _factorise(gram)
@@ -351,7 +351,7 @@ def _solve_lower(factor: _Array, solution: _Array) -> None:
 
 @compiled
 def _solve_positive_definite(gram: _Array, solution: _Array) -> None:
-    # Cholesky; `gram` has the lower half of the matrix.
+    # Cholesky decomposition; `gram` contains the lower half of the matrix.
     unknowns = len(solution)
     _factorise(gram)
     _solve_lower(gram, solution)

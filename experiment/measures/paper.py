@@ -1,11 +1,11 @@
-"""Flat field and ground truth of a frame, measured on its white references.
+"""Measure the flat field and the ground truth of a frame on its white references.
 
-The flat field is the spatial distribution of the light over the print, fitted to each channel of the white references.
-The ground truth of an illuminant is their level after division by the flat field. The mean of the flat field over the
-patches is 1, so that dividing by it keeps the mean level of the look-up table (LUT).
+The flat field is the spatial distribution of the light over the print, fitted to the white references in each channel.
+The ground truth of an illuminant is the mean of the white references after division by the flat field. The mean of the
+flat field over the patches is 1, so division by it does not change the mean level of the look-up table (LUT).
 
-The number of terms is chosen by cross-validation over references. A criterion on residuals of the fit (BIC) was worse
-for dark corners: few references show them, so their misfit counts less than the price of the terms.
+The number of terms is chosen by cross-validation over the references. The Bayesian information criterion was worse for
+dark corners, because few references lie in them.
 """
 
 from __future__ import annotations
@@ -29,52 +29,52 @@ from foundation.errors import QualityError
 from foundation.records import FloatArray
 from foundation.robust import robust_sigma
 
-# Lower limit of the flat field relative to its mean, for extrapolated polynomials: samples are divided by it, and no
-# print is lit so unevenly.
+# Lower limit of the flat field relative to its mean, because samples are divided by it. No print is lit so unevenly,
+# but an extrapolated polynomial may be lower.
 LEAST_FIELD = 0.05
 
 
-# Highest order of a flat field. On simulated frames, corners with 42 to 52 % of the light of the centre need the sixth
-# power of the distance, and the eighth if the mount shades the rim.
+# Highest order of a flat field. A strong fall-off of the lens needs the sixth power of the distance from the centre,
+# and the eighth power if the lens mount also shades the corners.
 MAX_ORDER = 8
 
-# The same if references surround the patches and are not between them: from order 4 on, some shapes vanish in all the
-# margin.
+# Highest order if all references are in the margin around the patches. From order 4 on, some shapes are zero everywhere
+# in the margin.
 MAX_ORDER_AROUND = 3
 
-# Fewest white references of a frame (judgement): with fewer, the error of their mean is meaningless.
+# Smallest number of usable white references in a frame (judgement).
 MIN_REFERENCES = 6
 
-REFERENCES_A_TERM = 3  # Fewest references for each term of a fit
+REFERENCES_A_TERM = 3  # Smallest number of references for each term of a fit
 
-# References for each term of the fit that detects covered or dirty references: with three, the terms would describe a
-# stain over a tenth of the references.
-JUDGING_A_TERM = 12
+# Smallest number of references for each term of the fit that detects covered or dirty references. With fewer, the fit
+# would follow a large stain.
+OUTLIER_REFERENCES_A_TERM = 12
 
-_PLAIN = 6  # Number of terms of slope and bend
+_SECOND_ORDER_TERMS = 6  # Number of terms up to second order: constant, slope and curvature
 
-# Price of a term, as decrease of N log(cross-validated mean squared error of N references), chosen by tests: 0 accepts
-# a shape in a quarter of the frames without one, and adds noise of 0.2 % at 60 counts; 4 misses shapes of 0.3 % at 300
-# counts.
+# Smallest decrease of N log(E) for which a further term is used, with the cross-validated mean squared error E of N
+# references. It was chosen in simulations: with 0, terms fit noise; with 4, weak shapes are missed.
 TERM_PRICE = 1.0
 
-# Signal with a photon noise equal to the read noise, counts: 6 counts at 1.8 electrons a count. It is added to the
-# light of a reference to get its variance, so that dim corners get the right weight.
+# Signal at which photon noise equals read noise, counts. The variance of a reference is proportional to its signal plus
+# this value.
 READ_COUNTS = 65.0
 
-# Iterations of the robust fit; few references are covered or dirty, so the weights settle at once.
+# Number of iterations of the robust fit.
 _ROUNDS = 4
 
-# Rings with equal numbers of references around the centre of the page, for detecting a remaining fall-off.
+# Number of rings around the centre of the page, with equal numbers of references, in which a remaining fall-off is
+# detected.
 _RINGS = 10
 
-_NEAR = 4  # Number of references in the worst deviation, one and its neighbours: a tenth of a page side on A0
+_AVERAGED_REFERENCES = 4  # The largest deviation is averaged over this number of neighbouring references
 
-_USUAL = 5.0  # Outlier limit of references in standard deviations: by chance one in two million
+_OUTLIER_SIGMAS = 5.0  # Largest usual deviation of a reference, in standard deviations
 
-_UNLIKELY = 0.01  # Numbers of terms with a lower likelihood are ignored in the error
+_UNLIKELY = 0.01  # Fits with a lower likelihood are ignored when the error is calculated
 
-_EXACT = 1e-9  # Smaller coefficients of terms are rounding errors
+_ROUNDING_ERROR = 1e-9  # Smaller coefficients are rounding errors
 
 _Array = npt.NDArray[np.float64]
 
@@ -84,7 +84,7 @@ class FlatField:
     """Spatial distribution of the light over the print, mean 1 over the patches."""
 
     page_mm: tuple[float, float]
-    # For each channel, polynomials (terms,) float64; their product is the flat field.
+    # For each channel, coefficients (terms,) float64 of the polynomials whose product is the flat field.
     coefficients: tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ...]]
 
     @classmethod
@@ -111,7 +111,7 @@ class FlatField:
 
 @dataclass(frozen=True)
 class FieldResidual:
-    """Residuals of the references after the flat field, for diagnosing their cause."""
+    """Residuals of the references after division by the flat field, for the diagnosis of their cause."""
 
     at_mm: tuple[float, float] = (0.0, 0.0)  # position of the largest residual on the print
     deviation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # relative residual there, R, G, B
@@ -128,15 +128,16 @@ class Paper:
     white: FloatArray  # (3,), ground truth: level of bare paper divided by the flat field, counts above black
     error: FloatArray  # (3,), standard error of `white`, counts
     references: int  # number of white references used
-    spread: FloatArray  # (3,), RMS residual of all references, also stained ones, relative to `white`
-    left: FieldResidual = FieldResidual()  # residuals of the references
+    spread: FloatArray  # (3,), RMS residual of all references including stained ones, relative to `white`
+    left: FieldResidual = FieldResidual()  # details of the residuals
 
 
 class PaperReader:
     """Measures flat field and ground truth of frames with the same references. Threads may share a reader.
 
-    `places_mm`: (N, 2) white references on the print. `centres_mm`: (C, 2) patches, over which the mean of the flat
-    field is 1. `base`: common factor of the flat fields of the frames. `order`: highest order of the flat field.
+    `places_mm`: (N, 2), centres of the white references on the print. `centres_mm`: (C, 2), centres of the patches,
+    over which the mean of the flat field is 1. `base`: factor that all flat fields have in common. `order`: highest
+    order of the flat field.
     """
 
     def __init__(
@@ -152,7 +153,7 @@ class PaperReader:
         self._terms, self._counts = light_terms(page_mm, order <= MAX_ORDER_AROUND)
         self._base_at_places, self._base_at_centres = self.base.at(places_mm), self.base.at(centres_mm)
         self._at_places = page_polynomial(places_mm, page_mm, MAX_ORDER) @ self._terms
-        # Terms first, so that the compiled loop runs along the patches.
+        # The terms are the first axis, so that the compiled loop runs along the patches.
         self._at_centres = np.ascontiguousarray((page_polynomial(centres_mm, page_mm, MAX_ORDER) @ self._terms).T)
         self._means = product(self._at_centres, self._base_at_centres) / len(centres_mm)
 
@@ -182,15 +183,16 @@ class PaperReader:
         factors: list[tuple[_Array, ...]] = list(self.base.coefficients)
         if not any(factors):
             shared = self._shared_shape(basis, values)
-            # A lens darkens its corners equally in all channels, so without a base the channels first get a common
-            # shape, from their sum, and then each its own on top.
+            # A lens darkens its corners equally in all channels. Without a base, a common shape is therefore fitted
+            # to the sum of the channels first. Then each channel gets an additional shape.
             if shared is not None:
                 base = base * shared[0][:, None]
                 shape *= shared[1][:, None]
                 means = product(self._at_centres, shape) / len(shape)
                 factors = [(shared[2],), (shared[2],), (shared[2],)]
-        # On a base, the remaining light has a simple shape: slope and bend are enough for detecting outliers.
-        limit = self._counts[-1] if not any(self.base.coefficients) else _PLAIN
+        # After division by a base, the light has a simple shape. Slope and curvature are then enough to detect
+        # outliers.
+        limit = self._counts[-1] if not any(self.base.coefficients) else _SECOND_ORDER_TERMS
         fits = [_best_fit(basis, base[:, channel], values[:, channel], self._counts, limit) for channel in range(3)]
         solutions = np.zeros((3, basis.shape[1]))
         for channel, fit in enumerate(fits):
@@ -201,7 +203,7 @@ class PaperReader:
         for channel, fit in enumerate(fits):
             solution, weights = fit.solution, fit.weights
             level = float((local[channel] * shape_before[:, channel]).mean())
-            # The light may be too weak for a shape of its own, or absent.
+            # Without enough light in a channel, its shape is constant.
             terms = solution / level if level > 0 and local[channel].min() > LEAST_FIELD * level else np.ones(1)
             if len(terms) > 1:
                 shape[:, channel] *= local[channel] / level
@@ -213,7 +215,7 @@ class PaperReader:
                 error[channel] = fit.level_error(means[:, channel])
             else:
                 error[channel] = np.sqrt(float((weights * residual**2).sum())) / float(weights.sum())
-            # All references count here: a stain that the fit correctly ignores must still be reported.
+            # Use all references, because a stain must be reported even if the fit ignores it.
             residuals[:, channel] = residual / max(abs(white[channel]), 1e-9)
             spread[channel] = float(np.sqrt((residuals[:, channel] ** 2).mean()))
         field = FlatField(self._page_mm, (factors[0], factors[1], factors[2]))
@@ -222,16 +224,16 @@ class PaperReader:
 
     def _shared_shape(self, basis: _Array, values: _Array) -> tuple[_Array, _Array, _Array] | None:
         """Return the common shape of all channels at references (N,) and patches (C,), and its coefficients."""
-        # An unweighted sum, so that each channel counts by its light, as photon noise requires.
+        # Photon noise grows with the light, so the unweighted sum of the channels has the smallest error.
         total, ones = values.sum(axis=1), np.ones(len(values))
         first = self._shape(basis, _best_fit(basis, ones, total, self._counts, self._counts[-1]).solution)
         if first is None:
             return None
-        # Repeat with the references weighted by the light of the first fit.
+        # Repeat the fit with weights from the light of the first fit.
         return self._shape(basis, _best_fit(basis, ones, total, self._counts, self._counts[-1], first[0]).solution)
 
     def _shape(self, basis: _Array, solution: _Array) -> tuple[_Array, _Array, _Array] | None:
-        """Return the normalised shape at references and patches, and its coefficients; None if it is uniform."""
+        """Return the normalised shape at references and patches, and its coefficients; None if it cannot be used."""
         count = len(solution)
         level = float((solution @ self._at_centres[:count]).mean())
         if count == 1 or level <= 0:
@@ -243,16 +245,16 @@ class PaperReader:
         return np.maximum(basis[:, :count] @ terms, LEAST_FIELD), at_centres, self._factor(terms)
 
     def _factor(self, terms: _Array) -> _Array:
-        """Return the coefficients in `page_powers` of terms (K,), of the lowest order that contains them."""
+        """Convert terms (K,) to coefficients in the order of `page_powers`, up to the lowest sufficient order."""
         factor = self._terms[:, : len(terms)] @ terms
         order = order_of(len(factor))
-        while order > 0 and np.abs(self._terms[len(page_powers(order - 1)) :, : len(terms)]).max() < _EXACT:
+        while order > 0 and np.abs(self._terms[len(page_powers(order - 1)) :, : len(terms)]).max() < _ROUNDING_ERROR:
             order -= 1
         return factor[: len(page_powers(order))]
 
 
 def falloff(light: _Array) -> _Array:
-    """Return the difference (3,) between the brightest and darkest of N positions, relative; `light` (N, 3)."""
+    """Return 1 − darkest / brightest of N positions in each channel, (3,) float64. `light`: (N, 3) float64."""
     return np.asarray(1 - light.min(axis=0) / light.max(axis=0), dtype=np.float64)
 
 
@@ -264,7 +266,7 @@ class _Fit:
     weights: _Array  # (N,), 0 … 1
     design: _Array  # (N, T), all tried terms, divided by the noise of the references
     values: _Array  # (N,), counts divided by the noise of the references
-    likelihoods: tuple[tuple[int, float], ...]  # tried numbers of terms, and their likelihoods
+    likelihoods: tuple[tuple[int, float], ...]  # tried numbers of terms with their likelihoods
 
     def level_error(self, term_means: _Array) -> float:
         """Return the standard error of the mean light, counts. `term_means`: (T,) float64, mean of each term."""
@@ -272,15 +274,15 @@ class _Fit:
         normal, right = weighted.T @ self.design, weighted.T @ self.values
         residual = self.values - self.design[:, :terms] @ self.solution
         variance = float(self.weights @ residual**2) / max(float(self.weights.sum()) - terms, 1.0)
-        # Scatter of the references, plus the differences to the means by other likely numbers of terms.
+        # One part of the variance comes from the scatter of the references, the other from the choice of terms.
         variance_sum, level = 0.0, float(term_means[:terms] @ self.solution)
         for count, likelihood in self.likelihoods:
             if count == terms or likelihood > _UNLIKELY:
-                mean_per_right = np.linalg.lstsq(normal[:count, :count], term_means[:count], rcond=None)[0]
+                right_weights = np.linalg.lstsq(normal[:count, :count], term_means[:count], rcond=None)[0]
                 if count == terms:
-                    variance_sum += variance * float(mean_per_right @ term_means[:count])
+                    variance_sum += variance * float(right_weights @ term_means[:count])
                 else:
-                    variance_sum += likelihood * (float(mean_per_right @ right[:count]) - level) ** 2
+                    variance_sum += likelihood * (float(right_weights @ right[:count]) - level) ** 2
         return float(np.sqrt(variance_sum))
 
 
@@ -292,11 +294,11 @@ def _best_fit(
     outlier_terms: int,
     light: _Array | None = None,
 ) -> _Fit:
-    """Return the fit with the best cross-validated number of terms in `counts`.
+    """Fit with the number of terms in `counts` that has the smallest cross-validated error.
 
-    `basis`: (N, T), the terms. `base`: (N,), shape of the base. `values`: (N,), counts above black. `light`: (N,),
-    relative light that determines the noise; by default the base. At most `outlier_terms` terms are used to detect
-    outliers.
+    `basis`: (N, T), the terms. `base`: (N,), factor of the flat field. `values`: (N,), counts above black. `light`:
+    (N,), relative light, from which the noise is calculated; by default the base. Outliers are detected with at most
+    `outlier_terms` terms.
     """
     light = base if light is None else light
     level = max(float(np.median(values / light)), 0.0)
@@ -304,8 +306,8 @@ def _best_fit(
     inverse_noise /= inverse_noise.max()
     design, scaled_values = basis * (base * inverse_noise)[:, None], values * inverse_noise
     allowed_counts = tuple(count for count in counts if REFERENCES_A_TERM * count <= len(values)) or counts[:1]
-    # A large fit keeps dim corners from being outliers. One larger than the references allow would follow a stain.
-    outlier_limit = min(outlier_terms, len(values) // JUDGING_A_TERM)
+    # A fit with few terms would treat dim corners as outliers. A fit with too many terms would follow a stain.
+    outlier_limit = min(outlier_terms, len(values) // OUTLIER_REFERENCES_A_TERM)
     outlier_count = max((count for count in allowed_counts if count <= outlier_limit), default=allowed_counts[0])
     weights = robust_least_squares(design[:, :outlier_count], scaled_values, _ROUNDS)[1]
     held_out = held_out_squares(design[:, : allowed_counts[-1]], scaled_values, weights, allowed_counts)
@@ -314,7 +316,7 @@ def _best_fit(
     best_count = allowed_counts[int(np.argmin(prices))]
     likelihoods = np.exp(-0.5 * (prices - prices.min()))
     likelihoods /= likelihoods.sum()
-    # Start with these weights, so that the additional terms do not accept a hand in a corner again.
+    # Keep these weights, so that additional terms do not fit a hand in a corner.
     root = np.sqrt(weights)
     solution, factor, _ = robust_least_squares(design[:, :best_count] * root[:, None], scaled_values * root, _ROUNDS)
     likely = tuple(zip(allowed_counts, likelihoods.tolist(), strict=True))
@@ -326,8 +328,8 @@ def _field_residual(residuals: _Array, places_mm: _Array, page_mm: tuple[float, 
     sigma = max(robust_sigma(channel_residuals), 1e-9)
     worst = int(np.argmax(np.abs(channel_residuals)))
     squared_distances = ((places_mm - places_mm[worst]) ** 2).sum(axis=1)
-    nearest = np.argsort(squared_distances)[:_NEAR]
-    # Average over the neighbours with the same sign.
+    nearest = np.argsort(squared_distances)[:_AVERAGED_REFERENCES]
+    # Average over the neighbours whose residuals have the same sign.
     same_sign = nearest[np.sign(channel_residuals[nearest]) == np.sign(channel_residuals[worst])]
     red, green, blue = residuals[same_sign].mean(axis=0).tolist()
     x, y = places_mm[worst].tolist()
@@ -339,7 +341,7 @@ def _field_residual(residuals: _Array, places_mm: _Array, page_mm: tuple[float, 
     return FieldResidual(
         at_mm=(x, y),
         deviation=(red, green, blue),
-        share=float((np.abs(channel_residuals) > _USUAL * sigma).mean()),
+        share=float((np.abs(channel_residuals) > _OUTLIER_SIGMAS * sigma).mean()),
         rim=float(rings[-1].mean()),
         radial=float(explained_squares / total_squares) if total_squares > 0 else 0.0,
     )

@@ -1,4 +1,4 @@
-"""Orientation of the chart in an image: rotation about the optical axis, and tilt against the sensor."""
+"""Orientation of the chart in an image: rotation about the optical axis, and tilt relative to the sensor."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 
 def off_level_deg(rotation_deg: float) -> tuple[float, int]:
-    """Split a rotation into quarter turns (−1 … 2) and the remaining angle (−45 … 45 degrees, clockwise).
+    """Split a rotation into an angle of −45 … 45 degrees, clockwise, and a number of quarter turns, −1 … 2.
 
     >>> off_level_deg(92.0), off_level_deg(358.5), off_level_deg(180.0)
     ((2.0, 1), (-1.5, 0), (0.0, 2))
@@ -18,7 +18,7 @@ def off_level_deg(rotation_deg: float) -> tuple[float, int]:
 
 
 def keystone(corners_px: npt.NDArray[np.float64]) -> tuple[float, float]:
-    """Return the ratios of opposite sides minus 1, longer / shorter: left and right, then top and bottom.
+    """Return by which fraction the longer of two opposite sides exceeds the shorter: left or right, top or bottom.
 
     `corners_px`: (4, 2) float64 px, corners of the page clockwise from the printed top-left.
     """

@@ -1,11 +1,12 @@
-"""Drift of the black level and linearity of a sensor, measured in frames.
+"""Measure the drift of the black level and the linearity of a sensor.
 
-EMVA 1288 (release 4.0, linearity error) plots the mean of a sensor against exposure, and measures its deviation from a
-straight line between 5 and 95 % of saturation. Here every patch of the chart is such a curve. Patches have all levels,
-so the exposure of a frame need not be known: between two frames, the counts of all patches must rise by the same
-factor. A factor that depends on the level is nonlinearity. Only a power law of the light cannot be detected in this
-way. Its exponent is measured from the exposure times of all frames together, because cameras round the time of each
-frame (0.3 s for 0.315 s).
+EMVA 1288 (release 4.0, linearity error) plots the mean counts of a sensor against exposure, and measures the deviation
+from a straight line between 5 and 95 % of saturation. Here every patch of the chart gives such a curve. If a sensor is
+linear, the counts of all patches rise by the same factor from one frame to the next. This factor need not be known. If
+it depends on the level, the sensor is not linear.
+
+One nonlinearity is not visible in this way: counts that follow a power of the light. Its exponent is determined from
+the exposure times of all frames together, because cameras round the single times (0.3 s for 0.315 s).
 """
 
 from __future__ import annotations
@@ -17,28 +18,29 @@ import numpy.typing as npt
 
 from experiment.measures.least_squares import least_squares
 
-# Largest drift of the black level over a session without a remark, counts (judgement): a sixth of the read noise of a
-# photosite, and a thirtieth of the darkest patches in use.
+# Largest drift of the black level during a session without a remark, counts (judgement). It is a thirtieth of the
+# darkest patches in use.
 MAX_BLACK_DRIFT = 1.0
 
 LOWEST, HIGHEST = 0.05, 0.95  # Range of levels relative to saturation in which a sensor must be linear (EMVA 1288)
 
-_NODES = 10  # Levels at which the deviation is measured: about half a stop apart
+_NODES = 10  # Number of levels at which the deviation is measured: about two per stop
 
-_LEAST_PATCHES = 50.0  # Fewest patches near a level: their mean is accurate to a seventh of the noise of a patch
+_LEAST_PATCHES = 50.0  # Smallest number of patches near a level for a measurement
 
-_STOPS = 3  # Shutter speeds per stop
+_STEPS_PER_STOP = 3  # Number of shutter speeds per stop
 
-_LEAST_POWER = 0.1  # Smallest exponent: below it the frames do not follow their exposure times
+_LEAST_POWER = 0.1  # Lower limit of the exponent, if the counts do not follow the exposure times
 
-# Weights of the constraints on deviations (patches have weight 1): mean and slope are 0; each deviation is close to 0.
+# Weights of the constraints, relative to the weight of a patch. Hard: mean and slope of the deviations are 0. Soft:
+# each deviation is small.
 _HARD, _SOFT = 1e2, 0.1
 
 _Array = npt.NDArray[np.float64]
 
 
 def black_drift(blacks: Sequence[_Array]) -> float:
-    """Return the largest range of the black level over the frames, at the worst position of the Bayer block, counts.
+    """Return the range of the black level over the frames, counts, for the worst position of the Bayer block.
 
     `blacks`: black level (2, 2) float64 of each frame, counts.
     """
@@ -67,21 +69,21 @@ def deviations(levels: _Array, exposure_s: _Array) -> tuple[_Array, _Array]:
     for channel in range(3):
         both_times = (exposure_s, _exact_times(exposure_s))
         fits = [_deviation(levels[..., channel], np.log(times), nodes) for times in both_times]
-        # Cameras record 0.3 s for 0.315 s, a step of a third of a stop; some really expose for 0.3 s. The times with
-        # the better fit are used.
+        # If a camera records 0.3 s, it may have exposed for 0.3 s or for 0.315 s, a step of a third of a stop. The
+        # times with the better fit are used.
         deviation[channel] = min(fits, key=lambda fit: fit[1])[0]
     return nodes, deviation
 
 
 def _exact_times(exposure_s: _Array) -> _Array:
-    # Cameras round the powers of two in thirds of a stop to nominal times.
-    return np.asarray(2.0 ** (np.round(_STOPS * np.log2(exposure_s)) / _STOPS), dtype=np.float64)
+    # Exact times are powers of two in steps of a third of a stop. Cameras record rounded times.
+    return np.asarray(2.0 ** (np.round(_STEPS_PER_STOP * np.log2(exposure_s)) / _STEPS_PER_STOP), dtype=np.float64)
 
 
 def _deviation(levels: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array, float]:
-    """Return the relative deviation (B,) at nodes, and the RMS residual of the log factors against the log times.
+    """Return the relative deviation (B,) at the levels `nodes`, and the RMS residual of log exposure against log time.
 
-    `levels`: (K, P), one channel, relative to saturation. The deviation is NaN at nodes with too few patches.
+    `levels`: (K, P), one channel, relative to saturation. The deviation is NaN at levels with too few patches.
     """
     frames = len(levels)
     rows: list[_Array] = []
@@ -106,9 +108,9 @@ def _deviation(levels: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array
     is_measured = patch_counts >= _LEAST_PATCHES
     if not rows or is_measured.sum() < 2:
         return np.full(len(nodes), np.nan), np.inf
-    # A power of the light appears as a slope of the deviation over the logarithmic level. Noise in both frames has the
-    # same effect, so the slope is set to 0. A pattern that repeats with the steps of the frames cannot be measured, so
-    # the other deviations get a weak constraint towards 0.
+    # A power law appears as a slope of the deviation over the logarithm of the level. Noise causes such a slope, too,
+    # so the slope is constrained to 0. Equal deviations at levels one exposure step apart cancel in every ratio, so
+    # every deviation gets a weak constraint towards 0.
     centred_log_nodes = np.where(is_measured, np.log(nodes) - np.log(nodes)[is_measured].mean(), 0)
     constraints = np.zeros((2 + len(nodes), frames - 1 + len(nodes)))
     constraints[0, frames - 1 :], constraints[1, frames - 1 :] = _HARD * is_measured, _HARD * centred_log_nodes
@@ -116,16 +118,14 @@ def _deviation(levels: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array
     design = np.concatenate([*rows, constraints])
     values = np.concatenate([*log_ratios, np.zeros(len(constraints))])
     solution = least_squares(design, values, np.ones(len(values)))
-    # The slope of the factors against the exposure times is the exponent.
+    # The exponent is the slope of the measured log exposures against the log times.
     has_patches = np.array([row[:, : frames - 1].any(axis=0) for row in rows]).any(axis=0)
     steps, factors = np.diff(log_times)[has_patches], solution[: frames - 1][has_patches]
-    measured_course, nominal_course = (np.concatenate([[0.0], np.cumsum(log_steps)]) for log_steps in (factors, steps))
-    measured_course, nominal_course = measured_course - measured_course.mean(), nominal_course - nominal_course.mean()
-    power = max(
-        float(measured_course @ nominal_course) / max(float(nominal_course @ nominal_course), 1e-12), _LEAST_POWER
-    )
+    log_exposures, log_nominal = (np.concatenate([[0.0], np.cumsum(log_steps)]) for log_steps in (factors, steps))
+    log_exposures, log_nominal = log_exposures - log_exposures.mean(), log_nominal - log_nominal.mean()
+    power = max(float(log_exposures @ log_nominal) / max(float(log_nominal @ log_nominal), 1e-12), _LEAST_POWER)
     deviation = np.where(is_measured, solution[frames - 1 :] + (1 - 1 / power) * centred_log_nodes, np.nan)
-    residual = measured_course - power * nominal_course
+    residual = log_exposures - power * log_nominal
     return np.asarray(deviation - np.nanmean(deviation), dtype=np.float64), float(np.sqrt((residual**2).mean()))
 
 

@@ -1,12 +1,11 @@
-"""Stains, folds, shadows and reflections on the print: patches that do not have the colour of their code.
+"""Find stains, folds, shadows and reflections on the print.
 
-A stain changes whole patches, so that neither edges nor noise of a patch show it, and the look-up table (LUT) would
-contain the colours of a dirty print. It is detected as a neighbourhood that deviates from patches
-with similar codes elsewhere on the sheet. A deviation must be significant and exceed a limit. It is listed and never
-corrected.
+A stain changes whole patches, so neither the edges nor the noise of a patch reveal it. It is detected because
+neighbouring patches deviate from patches with similar codes elsewhere on the sheet. A patch is listed as unfit if this
+deviation is statistically significant and exceeds a limit. No patch is corrected.
 
-A stain absorbs a fraction of the light of a patch; a reflection adds the same light to all patches. In a spot, the
-measured light is therefore a linear function of the expected light. The slope is the fraction that remains, the
+A stain absorbs a fraction of the light of a patch. A reflection adds the same light to all patches. In a spot, the
+measured light is therefore a linear function of the predicted light. The slope is the fraction that remains, and the
 intercept is the added light (dichromatic reflection: S. Shafer, Color Research & Application 10, 1985, eq. 1).
 """
 
@@ -23,54 +22,53 @@ from scipy.spatial import cKDTree
 from experiment.measures.least_squares import least_absolute_line
 from foundation.robust import robust_sigma
 
-# A patch and the twelve patches within two patch sides: a tenth of a stain the size of a thumb, with patches of 5 mm
+# Number of patches in a neighbourhood: a patch and the twelve patches within two patch sides.
 NEIGHBOURS = 13
 
-STAINED = 0.02  # Relative deviation of a neighbourhood from which its patches are listed as unfit
+STAINED = 0.02  # Smallest relative deviation of a neighbourhood whose central patch is listed as unfit
 
-# Relative deviation from which patches are counted and shown. In clean prints of the simulated laboratory, only one
-# patch exceeds it.
+# Smallest relative deviation of a neighbourhood whose central patch is counted as doubtful. Clean simulated prints have
+# almost no doubtful patches.
 DOUBTFUL = 0.01
 
-# Deviation that is required in addition, in standard errors; by chance, one neighbourhood in 5·10⁸ exceeds it
+# Smallest significant deviation, in standard errors. By chance, one neighbourhood in 5·10⁸ exceeds it.
 SIGNIFICANT = 6.0
 
-# Deviation of a patch next to a stain, in standard deviations of single patches, from which it belongs to the stain
+# Smallest deviation of a patch at the rim of a stain, in standard deviations of single patches.
 RIM_SIGMA = 4.0
 
-LEAST_COUNTS = 30.0  # Darker patches are not judged: one count of stray light is 3 % of them
+LEAST_COUNTS = 30.0  # Smallest level of a judged patch: one count of stray light is already 3 % of it
 
-# Fewest bits per channel: with 2, the curvature over the four levels of a code cannot be predicted.
+# Smallest number of bits per channel. Two bits give four levels, too few to predict the curvature of the ink curve.
 LEAST_BITS = 3
 
 
-LEAST_CELLS = 6  # Fewest patches for a line fit
+LEAST_CELLS = 6  # Smallest number of patches for the fit of a line
 
-# Fraction of the patches from which a spot is large: the limit of unfit patches. A smaller reflection is listed too,
-# and outside its listed patches it affects only a few others.
+# A spot is large if it contains more than this fraction of all patches. A smaller reflection affects few patches that
+# are not listed.
 LARGE_SPOT = 0.005
 
-# Smallest fraction of its own light that a patch keeps under a reflection. Below this value, an object covers the patch
-# (the table of causes reports a hand).
+# Smallest fraction of its own light that a patch keeps under a reflection. If it keeps less, an object covers it.
 OWN_KEPT = 0.85
 
-_ROUNDS = 3  # Largest number of repetitions, each without the previously stained patches in the predictions
+_ROUNDS = 3  # Largest number of rounds; each predicts without the patches that were stained in the previous round
 
-_LEAST_KNOWN = 9  # Fewest known codes of the 25 across an axis for a median curvature
+_LEAST_KNOWN = 9  # Smallest number of known codes among 25 neighbours for a median curvature
 
-_LEAST_TIED = 3  # Fewest known codes with two equal values for a median bend
+_LEAST_EQUAL_CODES = 3  # Smallest number of known codes with two equal values for a median curvature
 
-_LEAST_NEIGHBOURS = 5  # Fewest known patches of a neighbourhood for its mean
+_LEAST_NEIGHBOURS = 5  # Smallest number of known patches in a neighbourhood for its mean
 
-# With this many stained neighbours, a patch belongs to the stain even if its neighbourhood does not deviate.
+# With this many stained neighbours, a deviating patch belongs to the stain even if its neighbourhood does not deviate.
 _MANY_STAINED = 2
 
-_BRIGHT_PERCENTILE = 99.0  # Percentile of the patch levels that counts as white paper
+_BRIGHT_PERCENTILE = 99.0  # Percentile of the patch levels that represents white paper
 
-_SPOT_DISTANCE = 2.3  # Largest distance between patches of one spot, in patch sides: one patch may lie between them
+# Largest distance between neighbouring patches of one spot, in patch sides. One clean patch may lie between them.
+_SPOT_DISTANCE = 2.3
 
-# Largest distance from a spot, in patch sides, at which added light is measured in unlisted patches: two rings of
-# patches. Half of the first ring is in neighbourhoods of the spot (judgement).
+# The added light of a spot is measured in unlisted patches within this distance, in patch sides: two rings (judgement).
 _SURROUNDING_DISTANCE = 2.5
 
 _Array = npt.NDArray[np.float64]
@@ -84,14 +82,14 @@ class Stains:
 
     deviation: _Array  # (C, 3), measured / expected − 1 of the neighbourhood of each patch; NaN if unknown
     error: _Array  # (C, 3), standard error of `deviation`
-    alone: _Array  # (C, 3), deviation of each patch alone, with noise and error of the prediction; NaN if unknown
-    stained: _Mask  # (C,), patches to be listed
+    alone: _Array  # (C, 3), deviation of each single patch, including noise and prediction error; NaN if unknown
+    stained: _Mask  # (C,), whether each patch is listed as unfit
     level: _Array  # (C, 3), mean counts above black
     places_mm: _Array  # (C, 2), positions of the patches on the sheet
 
     @property
     def doubtful(self) -> _Mask:
-        """(C,) bool, patches in neighbourhoods that deviate by 1 % or more: folds, faint stains, shadows."""
+        """(C,) bool, whether the neighbourhood of each patch deviates by 1 % or more (fold, faint stain, shadow)."""
         return _is_significant(self.deviation, self.error, DOUBTFUL)
 
     @property
@@ -104,7 +102,7 @@ class Stains:
         return _largest_of_channels(self.deviation)
 
     def deviation_of(self, cell: int) -> float:
-        """Return the signed deviation of a stained patch: of its neighbourhood or its own, whichever is larger."""
+        """Return the signed deviation of a patch or of its neighbourhood, whichever is larger."""
         deviations = np.array(
             [_largest_of_channels(self.deviation[[cell]])[0], _largest_of_channels(self.alone[[cell]])[0]]
         )
@@ -118,7 +116,7 @@ def _largest_of_channels(deviation: _Array) -> _Array:
 
 
 def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | None = None) -> Stains:
-    """Find patches in neighbourhoods that do not have the colours of their codes.
+    """Find neighbourhoods whose patches do not have the colours of their codes.
 
     Parameters
     ----------
@@ -141,8 +139,8 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     clean = usable.copy()
     deviation, error, log_ratios = (np.full(level.shape, np.nan) for _ in range(3))
     stained = np.zeros(len(level), dtype=np.bool_)
-    # Patches of neighbouring codes, which lie elsewhere on the sheet, predict a patch. The prediction needs no model of
-    # ink or paper, and hardly depends on the position. It is repeated without stained patches, which reduce accuracy.
+    # A patch is predicted from patches with neighbouring codes, which are elsewhere on the sheet. This needs no model
+    # of ink or paper. The prediction is repeated without the stained patches.
     for _ in range(_ROUNDS):
         log_ratios = _log_ratios(np.where(clean[:, None], level, np.nan), level, usable, bits)
         deviation, error = _neighbourhood_means(log_ratios, neighbours)
@@ -154,8 +152,8 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     with np.errstate(invalid="ignore"):
         limit = np.maximum(RIM_SIGMA * _patch_sigma(log_ratios), STAINED)
         is_deviating = (np.abs(np.expm1(log_ratios)) > limit).any(axis=1)
-    # Next to a stain a patch is judged alone, because only half of its neighbourhood is stained. That half must
-    # deviate too; otherwise, the prediction of the patch is wrong.
+    # At the rim of a stain, only half of a neighbourhood is stained, so a patch is judged by its own deviation. Stained
+    # neighbours must confirm it, because the prediction of a single patch may be wrong.
     stained_neighbours = stained[neighbours].sum(axis=1)
     is_affected = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (stained_neighbours >= _MANY_STAINED)
     rim = is_deviating & is_affected & (stained_neighbours > 0)
@@ -172,10 +170,11 @@ def _is_significant(deviation: _Array, error: _Array, threshold: float) -> _Mask
 
 
 def _log_ratios(clean_level: _Array, level: _Array, usable: _Mask, bits: int) -> _Array:
-    """Return the log ratio (C, 3) of each patch to the prediction by its neighbours in colour; NaN without them."""
-    # Along each axis of the code, the mean logarithm of both neighbours predicts the patch, except for the curvature.
-    # The curvature changes slowly across the axis, so its median over neighbouring codes is subtracted. At equal values
-    # of a code there is a bend, because black replaces the ink that all three colours have in common.
+    """Return the logarithm (C, 3) of measured / predicted level of each patch; NaN without a prediction."""
+    # Along each axis of the code, a patch is predicted by the mean logarithm of its two neighbours. The curvature of
+    # the ink curve is missing in this mean. It changes slowly, so its median over neighbouring codes is subtracted. If
+    # two values of a code are equal, the curve has a bend, because printers replace equal amounts of three inks by
+    # black.
     side = 1 << bits
     with np.errstate(invalid="ignore", divide="ignore"):
         logs = np.log(np.where(clean_level > LEAST_COUNTS, clean_level, np.nan)).reshape(side, side, side, 3)
@@ -197,7 +196,7 @@ def _log_ratios(clean_level: _Array, level: _Array, usable: _Mask, bits: int) ->
 
 
 def _median_over_neighbour_codes(cube: _Array, axis: int) -> _Array:
-    """Return the median (n, n, n, 3) over the 25 codes with the same value on an axis, up to two steps away."""
+    """Return the median (n, n, n, 3) over 25 codes: equal on `axis`, and up to two steps away on the other axes."""
     across = [other_axis for other_axis in range(3) if other_axis != axis]
     padding = [(2, 2) if other_axis in across else (0, 0) for other_axis in range(3)]
     padded = np.pad(cube, (*padding, (0, 0)), constant_values=np.nan)
@@ -209,7 +208,7 @@ def _median_over_neighbour_codes(cube: _Array, axis: int) -> _Array:
             window[across[0]], window[across[1]] = slice(i, i + n), slice(j, j + n)
             shifted.append(padded[tuple(window)])
     stack = np.stack(shifted)
-    # NaN is sorted last, so the median is at half the number of finite values.
+    # NaN is sorted to the end, so the index of the median is half the number of finite values.
     known_count = np.isfinite(stack).sum(axis=0)
     ranked = np.sort(stack, axis=0)
     low, high = (np.maximum(known_count - 1, 0) // 2)[None], (known_count // 2)[None]
@@ -218,24 +217,25 @@ def _median_over_neighbour_codes(cube: _Array, axis: int) -> _Array:
 
 
 def _median_at_equal_codes(curvature: _Array, axis: int) -> _Array:
-    """Return the median (n, n, n, 3) over similar codes with equal values on an axis and another one; 0 elsewhere.
+    """Return the median curvature (n, n, n, 3) of similar codes with equal values on `axis` and on another axis.
 
-    Codes with a third value below, equal to or above the two equal ones are separate groups. NaN if too few are known.
+    Codes are grouped by their third value: below, equal to or above the two equal values. NaN if too few codes are
+    known; 0 for codes without equal values.
     """
     values = np.indices(curvature.shape[:3])
     medians = np.zeros_like(curvature)
     for other_axis in {0, 1, 2} - {axis}:
         third = np.sign(values[3 - axis - other_axis] - values[axis])
         for side in (-1, 0, 1):
-            tied = np.nonzero((values[axis] == values[other_axis]) & (third == side))
-            value, bends = values[axis][tied], curvature[tied]
+            equal_codes = np.nonzero((values[axis] == values[other_axis]) & (third == side))
+            value, bends = values[axis][equal_codes], curvature[equal_codes]
             is_finite = np.isfinite(bends).all(axis=1)
             group_medians = np.full_like(bends, np.nan)
             for code in np.unique(value):
                 similar = bends[is_finite & (np.abs(value - code) <= 1)]
-                if len(similar) >= _LEAST_TIED:
+                if len(similar) >= _LEAST_EQUAL_CODES:
                     group_medians[value == code] = np.median(similar, axis=0)
-            medians[tied] = group_medians
+            medians[equal_codes] = group_medians
     return medians
 
 
@@ -258,7 +258,7 @@ def _neighbourhood_means(log_ratios: _Array, neighbours: npt.NDArray[np.intp]) -
 
 
 def cell_mm(stains: Stains) -> float:
-    """Return the side of the square area of one patch, mm."""
+    """Return the side of a square with the mean area of a patch, mm."""
     size = np.ptp(stains.places_mm, axis=0)
     return float(np.sqrt(size[0] * size[1] / len(stains.places_mm)))
 
@@ -286,9 +286,10 @@ def spot_colour(stains: Stains, spot: _Index) -> _Array:
 
 
 def light_of_spot(stains: Stains, spot: _Index, channel: int) -> tuple[float, float]:
-    """Return the light added in a spot, relative to white paper, and the fraction of their light that its patches keep.
+    """Return the light added in a spot, relative to white paper, and the fraction of its own light that remains.
 
-    A line is fitted to one channel by least absolute deviations. NaN if there are too few patches.
+    They are intercept and slope of a line fitted to one channel by least absolute deviations. NaN if there are too few
+    patches.
     """
     levels, alone = stains.level[:, channel], stains.alone[:, channel]
     patches = spot[np.isfinite(alone[spot]) & (alone[spot] > -0.99)]
@@ -303,9 +304,9 @@ def light_of_spot(stains: Stains, spot: _Index, channel: int) -> tuple[float, fl
 def added_light(stains: Stains) -> float:
     """Return the light that a large reflection adds to patches that are not listed, 0 … 1 of white paper.
 
-    A reflection is a spot of more than `LARGE_SPOT` of the patches that are brighter than predicted and keep `OWN_KEPT`
-    of their own light. The patches of the spot are listed as unfit, so they are not used. A broad reflection continues
-    around the spot, and is measured there. Return the largest value of all reflections; 0 without one.
+    A spot is a large reflection if it has more than `LARGE_SPOT` of all patches, is brighter than predicted, and keeps
+    at least `OWN_KEPT` of its own light. Its patches are listed as unfit, but a broad reflection continues around
+    them. The added light is measured there. The result is the largest value of all reflections; 0 without reflections.
     """
     largest = 0.0
     for spot in spots_of(stains):

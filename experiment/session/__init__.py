@@ -1,1 +1,1 @@
-"""A session on disk: plan, journal, folder, and progress."""
+"""A session on disk: its plan, its journal, its folder, and the state of its run."""

@@ -1,8 +1,8 @@
-"""The folder of a session, without any device.
+"""Create, open and check the folder of a session. No device is used here.
 
-A frame counts as taken when its raw file is complete on disk (written, flushed, renamed) and its journal row is
-committed, in this order. Files that a crash leaves between the two are renamed, never counted and never deleted. The
-journal is authoritative; `frames.csv` is derived from it.
+A frame is recorded in two steps: first its raw file is written, flushed and renamed, then its row in the journal is
+committed. If a crash happens between the steps, the next run appends `.stray` to the file name and ignores the
+file. The journal is authoritative, and `frames.csv` is derived from it.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure
 
 @dataclass(frozen=True)
 class Retake:
-    """Illuminants and frames that are to be repeated."""
+    """Illuminants and frames that must be repeated."""
 
     lights: tuple[int, ...]  # numbers of the illuminants
     frames: tuple[AcceptedFile, ...]  # accepted frames that will be voided
-    reason: str  # reason for the journal; empty if the frames are already void
-    text: str = ""  # the illuminants as a record of the journal; empty if a report names the frames
+    reason: str  # reason for the journal; empty if the frames are already voided
+    text: str = ""  # numbers of the illuminants, as recorded in the journal; empty if a report lists the frames
 
 
 _Loaded = TypeVar("_Loaded")
@@ -75,7 +75,7 @@ _Loaded = TypeVar("_Loaded")
 class Session:
     """An open session folder; close it, or use it in a `with` block.
 
-    `hold`: lock of the folder against other runs, released on close; None for a reader.
+    `hold`: lock of the folder against other runs, which is released by `close`; None for a reader.
     """
 
     def __init__(self, folder: Path, journal: Journal, hold: ExitStack | None = None) -> None:
@@ -91,7 +91,7 @@ class Session:
         self.steps: tuple[SessionStep, ...] = journal.steps()
         self._require_planned_lights()
 
-    # If the illuminants differed from the plan, frames would get wrong codes.
+    # If the file differed from the plan, frames would be assigned to wrong codes.
     def _require_planned_lights(self) -> None:
         for step in self.steps:
             if step.illumination is None:
@@ -154,7 +154,7 @@ class Session:
         Parameters
         ----------
         patience_s
-            Seconds to wait for other programs that hold the journal.
+            Longest time to wait for other programs that use the journal, seconds.
         announce
             Called with messages for the user.
         """
@@ -181,7 +181,7 @@ class Session:
         self.close()
 
     def close(self) -> None:
-        """Release journal and folder; a second call does nothing."""
+        """Close the journal and unlock the folder; a second call does nothing."""
         if self._hold is None:
             self.journal.close()
         else:
@@ -196,7 +196,7 @@ class Session:
         return text
 
     def receive(self, stem: str, fill: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
-        """Write a raw file into `frames/` with `fill`; it is complete and on disk when this returns."""
+        """Write a raw file into `frames/` with `fill`; the file is complete on disk when this returns."""
         with IncomingFile(self.frames_folder / stem) as incoming:
             return incoming.complete(fill(incoming.stream))
 
@@ -206,7 +206,7 @@ class Session:
         self.steps = self.journal.steps()
 
     def verify(self, observe: Callable[[int, int], None] = lambda done, total: None) -> tuple[str, ...]:
-        """Void accepted frames with missing or changed files, so that the frames are repeated; return the reasons."""
+        """Void accepted frames whose files are missing or changed, so that they are repeated; return the reasons."""
         damaged = damaged_files(self.folder, self.journal.accepted_files(), observe)
         for attempt, reason in damaged.items():
             self.journal.void([attempt], datetime.now(UTC), reason)
@@ -236,7 +236,7 @@ class Session:
         text = lights_text(lights)
         accepted_lights = {frame.illumination for frame in accepted}
         if self.journal.records().get("retake") == text and not accepted_lights.issuperset(lights):
-            # The same request was made before, and is not finished.
+            # The same request was made before, and its frames are not complete yet.
             return Retake(lights, (), "", text)
         retaken = tuple(frame for frame in accepted if frame.illumination in lights)
         return Retake(lights, retaken, f"to be repeated, as requested with --retake {text}", text)
@@ -250,7 +250,7 @@ class Session:
         return plan.lights
 
     def done_steps(self) -> set[int]:
-        """Return the numbers of the steps with an accepted frame and a file of full size."""
+        """Return the numbers of the steps whose accepted frame has a complete file."""
         accepted = self.journal.accepted_files()
         return {frame.step for frame in accepted} - {frame.step for frame in lost_files(self.folder, accepted)}
 
@@ -259,7 +259,7 @@ class Session:
         return self.journal.frames()
 
     def lost_files(self) -> list[AcceptedFile]:
-        """Return the current frame of each step with a missing or shorter file."""
+        """Return the newest accepted frame of each step, if its file is missing or has another size."""
         require_frames_folder(self.folder)
         return lost_files(self.folder, self.journal.accepted_files())
 
@@ -280,7 +280,7 @@ class Session:
         write_atomic(self.folder / "frames.csv", csv_text([FRAME_COLUMNS, *rows]))
 
     def set_aside_strays(self) -> list[Path]:
-        """Delete hidden partial files of a crash, and rename complete files without a row in the journal."""
+        """Delete partial files that a crash left, and rename complete files without a row in the journal."""
         try:
             return self._set_aside_strays()
         except OSError as error:
@@ -321,7 +321,7 @@ def _own_copy(load: Callable[[Path], _Loaded], path: Path, content: str) -> _Loa
     except FormatError as error:
         remedy = (
             f"restore it from a copy of the session, or copy the {content} of the session there; session.toml has "
-            "their path"
+            "the path"
         )
         raise FormatError(error.problem, about=error.about, remedy=remedy, value=error.value) from error
 
@@ -347,14 +347,14 @@ def journal_path(folder: Path) -> Path:
 def _require_mounted(folder: Path) -> None:
     if mount_point := unmounted_folder(folder):
         raise StorageError(
-            f"no disk is mounted at {mount_point}, where /etc/fstab has one, so {folder} is not the folder on it",
+            f"no disk is mounted at {mount_point}, but /etc/fstab lists one, so {folder} is not on that disk",
             remedy="mount the disk, or give a folder on another disk",
         )
     if os.path.isdir(folder / "frames"):  # noqa: PTH112 - a fault of the disk is reported later
         raise FormatError(
-            f"{folder} is not a session but has frames/: it is part of one, or remained under the mount point of a "
-            "disk; mount the disk of the session, or give another folder, and keep these files until their origin is "
-            "clear",
+            f"{folder} is not a session but has frames/: it is a part of a session, or was written while its disk was "
+            "not mounted; mount the disk of the session, or give another folder, and keep these files until their "
+            "origin is clear",
         )
 
 

@@ -1,9 +1,10 @@
-"""Signs of life that a run leaves in its journal, and how a reader interprets them.
+"""Write and interpret the signs of life of a run.
 
-A run regularly writes its state, its session, and the time of the next sign of life. A reader on the same computer asks
-the system whether the process is still alive. Elsewhere, or if processes are not visible, it waits `LATE_S` after the
-next sign of life was due. A copy of the folder contains the same sign without a run; it is recognised by the numbers of
-its files. Times are of the wall clock of the computer, also in a simulated laboratory, which has its own time.
+A run regularly writes its state, its session, and the time of its next sign of life into the journal. A reader on the
+same computer asks the operating system whether the process is alive. On another computer, a run counts as dead if its
+next sign of life is late by more than `LATE_S`. A copy of the folder contains the same sign of life, although no run
+uses the copy. It is recognised by the inode numbers of its files. Times are read from the clock of the computer, also
+if a simulated laboratory has its own clock.
 """
 
 from __future__ import annotations
@@ -22,16 +23,14 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Literal
 
-# State of a run: taking frames, late in a step, waiting for something that happens automatically, paused until somebody
-# acts, or ended.
+# State of a run: it takes frames, a step takes longer than expected, it waits for something that happens automatically,
+# it is paused until somebody acts, or it has ended.
 RunState = Literal["running", "late", "waiting", "paused", "ended"]
 
-# Seconds after which a due sign of life counts as missing (judgement): clocks synchronised over a network differ by
-# less than 1 s, and a disk may block for seconds.
+# Delay after which a sign of life counts as missing, seconds (judgement). A disk may block for seconds.
 LATE_S = 30.0
 
-# Seconds between two signs of life of a run that takes frames: each is a write to the disk, and "5 s ago" does not
-# alarm anybody.
+# Interval between two signs of life while frames are taken, seconds. Each is a write to the disk.
 BEAT_S = 5.0
 
 
@@ -40,16 +39,16 @@ AGAIN = "run the same command again"  # Remedy after a run was killed
 
 @dataclass(frozen=True)
 class Process:
-    """Identity of a process, which distinguishes it from a later one with the same number."""
+    """Identity of a process, which distinguishes it from a later process with the same number."""
 
     pid: int
     started: str  # start time in the units of the system; empty if unknown
     host: str  # name of the computer
-    boot: str  # boot of the computer and process namespace (containers have their own numbers); empty if unknown
+    boot: str  # id of the boot and of the process namespace (containers number their processes); empty if unknown
 
     @classmethod
     def own(cls) -> Process:
-        """Return the calling process."""
+        """Return the identity of the calling process."""
         pid = os.getpid()
         return cls(pid, _process_start(pid) or "", socket.gethostname(), _boot())
 
@@ -64,7 +63,7 @@ class Process:
         return bool(self.is_alive()) and _proc_fields(self.pid)[:1] in (["T"], ["t"])
 
 
-# File systems, as in /proc/self/mounts, that may invent numbers of files, which then identify nothing.
+# File systems that may invent inode numbers, which then do not identify a file; names as in /proc/self/mounts.
 INVENTED_NUMBERS = ("fuse", "cifs", "smb3", "smbfs", "virtiofs")
 
 
@@ -75,29 +74,29 @@ def file_system_of(path: Path) -> str:
     except OSError:
         return ""
     resolved = path.resolve()
-    above = [
+    containing = [
         (len(mount), kind) for _, mount, kind, *_ in mounts if resolved.is_relative_to(mount.replace("\\040", " "))
     ]
-    return max(above, default=(0, ""))[1]
+    return max(containing, default=(0, ""))[1]
 
 
-# `FS_IOC_GETVERSION` of linux/fs.h, `_IOR('v', 1, long)`; other systems refuse it.
+# Request `FS_IOC_GETVERSION` of linux/fs.h, `_IOR('v', 1, long)`; other systems refuse it.
 _GETVERSION = 0x80007601 | struct.calcsize("l") << 16
 
 
 @dataclass(frozen=True)
 class SessionPlace:
-    """Path of a session, and numbers of its files, which differ in a copy.
+    """Path of a session, and the inode numbers of its files, which differ in a copy.
 
     A renamed folder keeps its numbers, and NFS shows the numbers of the server. A restored journal may get the number
-    of the previous one; then the process decides.
+    of the previous journal. Then the state of the process shows whether there is a run.
     """
 
     folder: str  # path of the folder, without links
-    device: int  # number of the file system on this computer; may change with a boot
-    inode: int  # number of the folder; 0 if the file system invents numbers
-    journal: int  # number of the journal; 0 if the file system invents numbers
-    generation: int  # distinguishes the folder from an earlier one with the same number; 0 if unknown
+    device: int  # number of the file system on this computer; may change after a restart
+    inode: int  # inode number of the folder; 0 if the file system invents numbers
+    journal: int  # inode number of the journal; 0 if the file system invents numbers
+    generation: int  # distinguishes the folder from an earlier folder with the same number; 0 if unknown
 
     @classmethod
     def of(cls, journal: Path) -> SessionPlace | None:
@@ -138,7 +137,7 @@ class Heartbeat:
     place: SessionPlace | None = None  # session of the run; None if unknown
 
     def belongs_to(self, here: SessionPlace | None) -> bool | None:
-        """Return whether the sign was given for the session at `here` and not for its original; None if unknown."""
+        """Return whether the run used the session at `here`; False if `here` is a copy, None if unknown."""
         session_place = self.place
         if session_place is None or here is None or not (session_place.inode and here.inode):
             return None
@@ -152,7 +151,7 @@ class Heartbeat:
         return (session_place.inode, session_place.journal) == (here.inode, here.journal)
 
     def is_dead(self, now: datetime, alive: bool | None) -> bool:
-        """Return whether the run was killed: it has no end, and its process is gone or its sign overdue.
+        """Return whether the run was killed: it did not end, but its process is gone or its sign of life is overdue.
 
         `alive`: result of `Process.is_alive`.
         """
@@ -163,13 +162,13 @@ class Heartbeat:
         return now > self.until + timedelta(seconds=LATE_S)
 
     def sentence_for(self, now: datetime, alive: bool | None) -> str:
-        """Return the sentence of the run, or after a kill that it was killed and the remedy."""
+        """Return the sentence of the run; if it was killed, a sentence with the remedy."""
         if not self.is_dead(now, alive):
             return self.sentence
         return f"stopped at {_moment(self.at)}, killed or power lost: {AGAIN}"
 
     def sentence_of_copy(self, here: SessionPlace, alive: bool | None) -> str:
-        """Return the state of a session that is a copy and is located at `here`."""
+        """Return a sentence on the state of a session that is a copy, located at `here`."""
         assert self.place is not None
         origin, moment = self.place.folder, _moment(self.at)
         if origin == here.folder and self.process.host == socket.gethostname():
@@ -181,7 +180,7 @@ class Heartbeat:
             )
         if alive:
             return (
-                f"copied from {origin} at {moment} or later, and the run there continues; use that folder, because "
+                f"copied from {origin} at {moment} or later, and the run continues there; use that folder, because "
                 "this copy gets no new frames"
             )
         return (
@@ -215,7 +214,7 @@ def _boot() -> str:
 
 
 def _process_start(pid: int) -> str | None:
-    """Return the start of a process, in ticks since boot or as text of ps(1); None if it is gone or a zombie."""
+    """Return the start time of a process, in ticks since boot or as printed by ps(1); None if it has ended."""
     fields = _proc_fields(pid)
     if len(fields) < 20:
         return None if Path("/proc/self/stat").exists() else _start_by_ps(pid)
@@ -223,8 +222,8 @@ def _process_start(pid: int) -> str | None:
 
 
 def _proc_fields(pid: int) -> list[str]:
-    # proc(5): the name is in brackets and may contain any character; state is the third field, start the 22nd. So the
-    # result has state first and start as twentieth.
+    # The second field is the name of the process in brackets, which may contain any character (proc(5)). Only the
+    # fields after it are returned: the state is the first, and the start time is the twentieth.
     try:
         return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
     except OSError:
@@ -232,7 +231,7 @@ def _proc_fields(pid: int) -> list[str]:
 
 
 def _start_by_ps(pid: int) -> str | None:
-    # For systems without /proc: start time by ps(1).
+    # This is for systems without /proc.
     try:
         columns = subprocess.run(
             ["ps", "-o", "state=,lstart=", "-p", str(pid)], capture_output=True, text=True, check=False

@@ -1,15 +1,16 @@
 """The journal of a session, `journal.sqlite`: plan, attempts at frames, verdicts and events.
 
-- Every write is a transaction that is on disk when the call returns, because a frame without a committed row is not
-  accepted. Rows are never deleted; an accepted frame can be voided.
-- During a run the journal is in SQLite's write-ahead mode if the disk allows it: readers get the last commit and
-  block no writer. After a normal end the journal is one file again. A reader creates and changes no file.
-- A session may come from somebody else: `experiment.session.opening` refuses everything except valid rows.
-- Another program may delete, replace or truncate the file, but SQLite does not read cached pages again. So a run
-  checks that the journal on disk is the open one and complete (`_JournalGuard`).
-- All facts are also written to `ledger.jsonl`, from which a lost journal is restored. Each line is a transaction: its
-  rows by table as a JSON object, on disk before the journal commits it. Signs of life and the place of the session are
-  not in it. A crash can truncate only the last line.
+- Every write is a transaction that is on disk when the call returns. A frame without a committed row is not accepted.
+  Rows are never deleted, but an accepted frame can be voided.
+- During a run the journal is in SQLite's write-ahead mode, if the disk allows it. Readers then see the last commit and
+  block no writer. After a normal end the journal is a single file again. A reader creates and changes no file.
+- A session may come from an unknown source, so `experiment.session.opening` refuses invalid rows.
+- Another program may delete, replace or truncate the file. SQLite would not notice this, because it caches pages. So a
+  run checks that the journal on disk is the open journal and is complete (`_JournalGuard`).
+- All rows except signs of life and the place of the session are called facts. They are also written to the ledger,
+  `ledger.jsonl`, from which a lost journal can be restored. Each line of the ledger is a JSON object with the rows of
+  one transaction, by table. It is on disk before the journal commits the transaction, and a crash can truncate only
+  the last line.
 
 Source: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvantages".
 """
@@ -79,8 +80,7 @@ from foundation.files import (
 
 JOURNAL_FILE = "journal.sqlite"  # Name of the journal in the folder of a session
 
-# Seconds that a write waits for another program by default: as long as a run waits for a device
-# (`sequence.patience_s`).
+# Default time that a write waits for another program, seconds; the same as the default of `sequence.patience_s`.
 PATIENCE_S = 600.0
 
 
@@ -99,12 +99,12 @@ class _Abandoned(Exception):
 
 
 class IncomingFile:
-    """A raw file that is being written under a hidden name; deleted at the end of a `with` block unless completed."""
+    """A raw file that is written under a hidden name. If it is not completed in a `with` block, it is deleted."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._final = path
-        # A missing folder means that the disk was unmounted. A new folder with this path would be on another disk.
+        # If the folder is missing, its disk was unmounted, and a new folder would be on another disk.
         self._file = atomic_file(path, lambda: self._final, make_parents=False)
         self._open = True
         self.stream: BinaryIO = self._file.__enter__()
@@ -149,7 +149,7 @@ class IncomingFile:
 class Journal:
     """An open journal, for one thread; close it after use.
 
-    `retry`: repeats operations while other programs hold the file; None for a reader, because SQLite itself waits then.
+    `retry`: repeats writes while other programs use the file; None for a reader, because reads wait in SQLite.
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection, retry: Retry | None = None) -> None:
@@ -186,7 +186,7 @@ class Journal:
 
     @staticmethod
     def rebuild(path: Path, rows: Rows) -> None:
-        """Write a journal with these facts; the existing file is kept under another name."""
+        """Write a journal with the given facts; the existing file is kept under another name."""
         copy = partial_path(path)
         copy.unlink(missing_ok=True)
         with closing(create_file(copy)) as connection, connection:
@@ -200,7 +200,7 @@ class Journal:
         sync_folder(path.parent)
 
     def attach_ledger(self, ledger: Path) -> None:
-        """Write all facts to a ledger, too, and check from now on that the journal on disk is the open one."""
+        """From now on, write all facts to a ledger, too, and check that the journal on disk is the open journal."""
         try:
             rows = self._retry.run(lambda: rows_of(self._connection))
         except sqlite3.DatabaseError as error:
@@ -215,7 +215,7 @@ class Journal:
             self._guard.require_whole()
 
     def close(self) -> None:
-        """Release the file; a second call does nothing."""
+        """Close the file; a second call does nothing."""
         if self._ledger is not None:
             self._ledger.close()
         if self._writes:
@@ -224,12 +224,12 @@ class Journal:
             self._connection.close()
 
     def retry_locked(self, patience_s: float, announce: Callable[[str], object]) -> None:
-        """Change the waiting time of writes for other programs, and the receiver of its message."""
+        """Change how long writes wait for other programs, and the receiver of the message about it."""
         self._retry = _LockRetry(self.path, patience_s, announce)
 
     @contextmanager
     def snapshot(self) -> Generator[None]:
-        """Read everything in the block from one state of the journal, so that each verdict has its checks."""
+        """All reads in the block see the same state of the journal, so that each verdict has its checks."""
         self._rows("BEGIN")
         yield
         self._rows("ROLLBACK")
@@ -264,9 +264,9 @@ class Journal:
         exposure_s: float,
         ended_at: datetime,
     ) -> None:
-        """Record the complete raw file and the judgement of an attempt; the frame has a verdict only after this call.
+        """Record the complete raw file and the judgement of an attempt.
 
-        `timings`: seconds of each stage by name. `exposure_s`: requested exposure, seconds.
+        `timings`: seconds of each stage by name. `exposure_s`: requested exposure time, seconds.
         """
         file = received.path.relative_to(self.path.parent).as_posix()
         verdict = ACCEPTED if judgement.accepted else REFUSED
@@ -311,12 +311,12 @@ class Journal:
         self._is_run_alive = state != "ended"
 
     def record(self, key: str, text: str) -> None:
-        """Record a fact of the session, such as the identity of a device; replaces the text of `key`."""
+        """Record a property of the session, such as the identity of a device; replaces the text of `key`."""
         with self._writing() as change:
             change.put("records", {"key": key, "text": text})
 
     def records(self) -> dict[str, str]:
-        """Return the facts of the session, by key."""
+        """Return the properties of the session, by key."""
         return dict(self._rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
 
     def heartbeat(self) -> Heartbeat | None:
@@ -347,7 +347,7 @@ class Journal:
         return [_attempt(*row) for row in rows]
 
     def verdicts(self) -> list[tuple[int, datetime, str | None]]:
-        """Return number, start and verdict of every attempt, oldest first, for scanning a whole session."""
+        """Return number, start and verdict of every attempt, oldest first; faster than `attempts`."""
         rows = self._rows("SELECT id, started_at, verdict, kind FROM attempts ORDER BY id")
         self._require_known_kinds(row[3] for row in rows)
         return [(number, datetime.fromisoformat(at), verdict) for number, at, verdict, _ in rows]
@@ -387,7 +387,7 @@ class Journal:
         }
 
     def measurements(self) -> Iterator[tuple[SessionStep, int, bytes, bool]]:
-        """Yield the data of the judge for each frame, in order: step, attempt, bytes, whether it is accepted."""
+        """Yield for each frame, in order: step, attempt, data of the judge, and whether the frame is accepted."""
         plan = {step.number: step for step in self.steps()}
         for attempt, step, data, verdict in self._rows(
             "SELECT id, step, data, verdict FROM attempts JOIN measurements ON attempt = id ORDER BY id"
@@ -447,7 +447,7 @@ class Journal:
             )
 
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        # All rows at once, so that no lock remains.
+        # Read all rows at once, so that no lock remains.
         try:
             return self._retry.run(lambda: self._connection.execute(query, values).fetchall())
         except sqlite3.DatabaseError as error:
@@ -463,7 +463,7 @@ class Journal:
             if self._ledger is not None and change.rows:
                 self._append(self._ledger, change.rows)
             if self._is_run_alive and change.rows:
-                # Each write is also a sign of life: a killed run was alive at its last write.
+                # Each write is also a sign of life.
                 self._connection.execute("UPDATE heartbeat SET at = ?", (time_text(datetime.now(UTC)),))
             if self._guard is not None:
                 self._guard.require_same()
@@ -473,7 +473,7 @@ class Journal:
             if self._ledger is not None:
                 self._ledger.confirm()
         except LostJournalError:
-            # The ledger keeps a transaction that is lost with the journal.
+            # The ledger keeps the transaction, although the journal is lost.
             if self._ledger is not None:
                 self._ledger.confirm()
             raise
@@ -486,14 +486,15 @@ class Journal:
 
     def _append(self, ledger: _Ledger, rows: Mapping[str, Sequence[Row]]) -> None:
         if not ledger.is_intact():
-            # Rows of the open journal, because the file on disk may be missing, too.
+            # Read the rows through the open connection, because the journal on disk may be missing, too.
             ledger.restore(rows_of(self._connection))
         ledger.append(rows)
 
 
 def open_journal(folder: Path) -> Journal:
     """Open the journal of a session for reading; refuse a journal that lacks frames of the ledger."""
-    # A run writes the ledger first. If the ledger is also read first, the journal lacks at most its last transaction.
+    # A run writes to the ledger first. If the ledger is also read first, the journal lacks at most the last
+    # transaction.
     settled = settled_frames(ledger_path(folder))
     journal = Journal.open(folder / JOURNAL_FILE)
     try:
@@ -507,7 +508,7 @@ def open_journal(folder: Path) -> Journal:
 def lost_files(folder: Path, accepted: Sequence[AcceptedFile]) -> list[AcceptedFile]:
     """Return the newest accepted frame of each step, if its file is missing or has another size."""
     newest = {frame.step: frame for frame in accepted}
-    # As text: creating 800 path objects takes twice as long as the check.
+    # The paths are texts, because creating 800 path objects would take longer than the check.
     return [frame for frame in newest.values() if not _has_size(f"{folder}/{frame.file}", frame.size)]
 
 
@@ -525,7 +526,7 @@ def no_journal_text(folder: Path) -> str:
 
 
 def thread_beat(path: Path, state: RunState, sentence: str, until: datetime) -> None:
-    """Write a sign of life from a thread that has no open journal; failures are ignored."""
+    """Write a sign of life from a thread that has no open journal; errors are ignored."""
     with suppress(sqlite3.Error), closing(connect(path, "rw")) as connection:
         connection.execute("BEGIN IMMEDIATE")
         _put_beat(connection, path, state, sentence, until)
@@ -580,14 +581,14 @@ def time_text(at: datetime) -> str:
     return at.isoformat(timespec="microseconds")
 
 
-# Cached rows of each kind: a reader that follows a session reads its 800 frames again after each frame.
+# Number of cached rows of each kind. During a run, a reader reads all frames again after each new frame.
 _ROWS_KEPT: Final = 8192
 
 _accepted_file: Final = lru_cache(_ROWS_KEPT)(AcceptedFile)
 
 
 def _condition_of(column: str, numbers: Sequence[int] | None) -> tuple[str, tuple[str, ...]]:
-    # SQL condition that a column is one of the numbers, and the value of its parameter.
+    # Return the SQL condition that a column has one of the numbers, and its parameter.
     if numbers is None:
         return "TRUE", ()
     return f"{column} IN (SELECT value FROM json_each(?))", (json.dumps(list(numbers)),)
@@ -634,7 +635,7 @@ class _FileState:
 
 
 class _JournalGuard:
-    """Checks the journal that a run has open; `ledger` has the same facts."""
+    """Checks that the journal on disk is the journal that a run has open. `ledger` has the same facts."""
 
     def __init__(self, path: Path, ledger: _Ledger) -> None:
         self._path, self._ledger = path, ledger
@@ -645,7 +646,7 @@ class _JournalGuard:
         self.remember()
 
     def remember(self) -> None:
-        """Remember the state of the journal after a write of the run itself."""
+        """Remember the state of the files after the run has written to the journal."""
         self._states = {file: state for file in self._files if (state := self._file_state(file)) is not None}
 
     def require_same(self) -> None:
@@ -731,11 +732,10 @@ class _LockRetry:
 
 LEDGER_FILE: Final = "ledger.jsonl"  # Name of the ledger in the folder of a session
 
-# Largest ledger that is read, in bytes: twenty times the size for 707 illuminants, to limit the memory for a foreign
-# file.
+# Largest accepted ledger, bytes: twenty times the size for 707 illuminants.
 _MOST_LEDGER_BYTES: Final = 1 << 30
 
-PLACE: Final = "place"  # Key of the record with the place of the session, written with each sign of life
+PLACE: Final = "place"  # Key of the place of the session in the table `records`; written with each sign of life
 
 # Key columns of each table.
 _ROW_KEYS: Final = {
@@ -748,7 +748,7 @@ _ROW_KEYS: Final = {
     "records": ("key",),
 }
 
-# Columns of an attempt that are unknown at its start, with their values.
+# Values of the columns of an attempt that are unknown at its start.
 _START: Final = dict.fromkeys(("ended_at", "taken_at", "exposure_s", "size", "sha256", "verdict")) | {"reason": ""}
 
 Row = dict[str, Any]
@@ -845,8 +845,8 @@ def _ledger_lines(rows: Rows) -> bytes:
 class _Ledger:
     """A ledger that a run writes; close it after use.
 
-    `rows`: facts of the journal. A file with other facts is written again; if it has frames that the journal lacks, a
-    `FormatError` is raised.
+    `rows`: facts of the journal. If the file has other facts, it is written again. If it has frames that the journal
+    lacks, a `FormatError` is raised.
     """
 
     def __init__(self, path: Path, rows: Rows) -> None:
@@ -861,14 +861,14 @@ class _Ledger:
         self._next = self._end
 
     def close(self) -> None:
-        """Release the file; a second call does nothing."""
+        """Close the file; a second call does nothing."""
         if self._handle >= 0:
             handle, self._handle = self._handle, -1
             with suppress(OSError):  # All data are on disk already.
                 os.close(handle)
 
     def append(self, changes: Mapping[str, Sequence[Row]]) -> None:
-        """Write a transaction over an unconfirmed one; it is on disk when this method returns."""
+        """Write a transaction, which replaces an unconfirmed transaction; it is on disk when this method returns."""
         line = _ledger_line(changes)
         try:
             os.pwrite(self._handle, line, self._end)
@@ -881,7 +881,7 @@ class _Ledger:
         self._next = self._end + len(line)
 
     def confirm(self) -> None:
-        """Keep the last transaction: the journal has it, too, or is lost."""
+        """Keep the last transaction, because the journal also has it, or because the journal is lost."""
         self._end = self._next
 
     def is_intact(self) -> bool:
@@ -926,7 +926,7 @@ Frames = set[tuple[int, str, str | None]]  # Frames by attempt and hash, with th
 
 
 def settled_frames(path: Path) -> Frames:
-    """Return the frames that a journal opened later must have: all except frames of the last transaction.
+    """Return the frames of a ledger that a journal opened later must also have: all but those of the last transaction.
 
     Empty if the ledger is missing or damaged, because the journal may be intact.
     """
@@ -937,7 +937,7 @@ def settled_frames(path: Path) -> Frames:
 
 
 def _missing_frames(settled: Frames, journal_frames: Frames) -> Frames:
-    # A void frame in the journal is not an older state, because no verdict follows `VOIDED`.
+    # If the journal has voided a frame, its state is newer, because `VOIDED` is always the last verdict.
     voided = {(attempt, sha256) for attempt, sha256, verdict in journal_frames if verdict == VOIDED}
     return {frame for frame in settled - journal_frames if frame[:2] not in voided}
 
@@ -945,8 +945,8 @@ def _missing_frames(settled: Frames, journal_frames: Frames) -> Frames:
 def _require_no_missing_frames(path: Path, missing: Frames) -> None:
     if missing:
         raise FormatError(
-            f"the journal of {path.parent} lacks {counted(len(missing), 'frame')} that {path} has, or their verdicts: "
-            "it is older or damaged",
+            f"the journal of {path.parent} lacks {counted(len(missing), 'frame')} or verdicts that {path} has: "
+            "the journal is older or damaged",
             remedy=f"restore it with acquire rebuild {shlex.quote(str(path.parent))}",
         )
 

@@ -1,8 +1,8 @@
-"""Open the SQLite file of a journal on any disk, check its contents, and explain its faults.
+"""Open the SQLite file of a journal on any disk, check its contents, and explain errors.
 
-A reader never writes. A run switches the file to write-ahead mode. Both check the file first: the schema has only
-tables, because views, triggers and generated columns could run foreign SQL. Each row has valid types, and no path
-leads out of the session.
+A reader never changes the file. A run switches the file to write-ahead mode. Both check the contents first. The schema
+may contain only tables, because views, triggers and generated columns could run foreign SQL. All values must have valid
+types, and no path may lead out of the session.
 
 Sources: sqlite.org/wal.html, sqlite.org/lockingv3.html, sqlite.org/fileformat.html.
 """
@@ -41,20 +41,18 @@ _log = logging.getLogger(__name__)
 
 _DAMAGED: Final = "it is damaged or was manipulated"
 
-JOURNAL_VERSION = 2  # `PRAGMA user_version` of the journals that this software writes and reads (docs/formats.md)
+JOURNAL_VERSION = 2  # Value of `PRAGMA user_version` in a journal (docs/formats.md)
 
-# Seconds that SQLite itself waits for another program before it returns: Ctrl-C may be delayed by this time.
+# Longest time that one call of SQLite waits for another program, seconds. Ctrl-C may be delayed by this time.
 TRY_S = 1.0
 
-# Seconds that a reader waits if the journal is not in write-ahead mode: a commit takes milliseconds, but a disk may
-# block for seconds.
+# Longest time that a reader waits for the end of a commit, seconds. In write-ahead mode a reader never waits.
 READING_LIMIT_S = 10.0
 
-# Longest text, blob or row that SQLite reads: the measurement of a frame has about 100 kilobytes.
+# Largest text, blob or row that SQLite reads, bytes. The measurement of a frame has about 100 kilobytes.
 _MOST_VALUE_BYTES: Final = 64 << 20
 
-# Largest sizes of files that are read completely, in bytes: forty times the sizes for 707 illuminants and 32 768
-# colours.
+# Largest accepted sizes of files, bytes: forty times the sizes for 707 illuminants and 32 768 colours.
 MOST_BYTES: Final = {"chart.json": 256 << 20, "illuminations.csv": 16 << 20, "session.toml": 1 << 20}
 
 _TABLES = """
@@ -97,18 +95,18 @@ CREATE TABLE heartbeat (
 CREATE TABLE records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
 """
 
-# Errors of SQLite if a file cannot be read without writing.
+# Error codes of SQLite if it would have to write in order to read a file.
 _NEEDS_WRITING = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
 
 # Errors of a file system without locks (fcntl(2); Lustre, FUSE, NFS without its lock service).
 _NO_LOCKS = {errno.ENOLCK, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EBADF}
 
-# Faults of a disk that can still be read.
+# Errors of a test write on a disk that can still be read.
 _READABLE_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
 
 _SIDE_FILES = ("-wal", "-shm", "-journal")  # Suffixes of SQLite's files next to a journal
 
-_PROBE_BYTES = 65536  # Size of a test write: as a commit with the pages of its log
+_PROBE_BYTES = 65536  # Size of a test write, bytes; about the size of a commit
 
 # Network file systems, as named in /proc/self/mounts. They have no shared memory, which write-ahead mode needs.
 _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "ceph", "fuse.glusterfs", "lustre"}
@@ -116,7 +114,7 @@ _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "
 
 def restore_remedy(path: Path) -> str:
     """Return the remedy for a damaged or missing journal."""
-    # Callers report a fault of the disk first.
+    # Errors of the disk can be ignored here, because callers report them first.
     if os.path.isfile(path.with_name("ledger.jsonl")):  # noqa: PTH113 - it never raises
         return f"restore it from ledger.jsonl with acquire rebuild {shlex.quote(str(path.parent))}"
     return "restore it from a copy"
@@ -153,7 +151,7 @@ def open_to_read(path: Path) -> sqlite3.Connection:
     """Return a read-only connection."""
     require_plain_folder(path.parent, MOST_BYTES)
     try:
-        # During a run, the file `-shm` exists. Without it there is no run, and reading in place would create it.
+        # During a run, the file `-shm` exists. If it does not exist, reading the journal in place would create it.
         if _is_write_ahead(path) and not side_file(path, "-shm").exists():
             connection = _copy_to_memory(path)
         else:
@@ -165,9 +163,9 @@ def open_to_read(path: Path) -> sqlite3.Connection:
 
 
 def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
-    """Return a writing connection, after switching the journal to write-ahead mode.
+    """Switch the journal to write-ahead mode, and return a connection for writing.
 
-    The caller has locked the folder of the session against other runs. `retry` waits for other writers.
+    The caller must have locked the folder of the session against other runs. `retry` waits for other writers.
     """
     require_plain_folder(path.parent, MOST_BYTES)
     try:
@@ -176,7 +174,7 @@ def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_fault(path, error) from error
     try:
-        with suppress(OSError):  # A run that was killed during a copy leaves this file.
+        with suppress(OSError):  # Delete the file that a run leaves if it is killed during a copy.
             partial_path(path).unlink(missing_ok=True)
         if not _on_network(path):
             connection = _switch_to_write_ahead(path, connection, retry)
@@ -190,17 +188,17 @@ def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
 
 
 def close_after_run(connection: sqlite3.Connection) -> None:
-    """Merge the journal into one file unless it is being read, and close it; a second call does nothing."""
+    """Close a journal; a second call does nothing. Unless it is being read, it becomes a single file."""
     try:
         connection.execute("PRAGMA journal_mode = DELETE").fetchall()
     except sqlite3.Error:
-        pass  # It is being read or closed, or the disk is missing: the next run or reader handles this.
+        pass  # The journal is being read or already closed, or its disk is missing. The next run handles this.
     finally:
         connection.close()
 
 
 def set_aside(path: Path) -> None:
-    """Rename a journal that is not used any more, with SQLite's files next to it."""
+    """Rename a journal that is not used any more, and the files that SQLite keeps next to it."""
     number = 1
     while any(side_file(path, f"{suffix}.{number}.lost").exists() for suffix in ("", *_SIDE_FILES)):
         number += 1
@@ -210,7 +208,7 @@ def set_aside(path: Path) -> None:
 
 
 def connect(path: Path, mode: Literal["ro", "rw", "rwc"]) -> sqlite3.Connection:
-    """Return a connection in a mode of SQLite's URIs, without checks; without locks if the file system has none."""
+    """Connect to a file without checking its contents. If its file system has no locks, none are used."""
     try:
         return _connect_with(path, mode)
     except sqlite3.OperationalError:
@@ -235,14 +233,14 @@ def _connect_with(path: Path, parameters: str) -> sqlite3.Connection:
         connection.close()
         raise
     except UnicodeDecodeError as error:
-        # SQLite's message quotes the damaged schema byte by byte.
+        # The message of SQLite contains bytes of the damaged schema that are not text.
         connection.close()
         raise sqlite3.DatabaseError(f"malformed database schema, not a text: {error.reason}") from error
     return connection
 
 
 def _is_lockless(path: Path) -> bool:
-    # Called only if no connection could be opened: closing a file releases all locks of the process on it.
+    # Do not call this while a connection is open, because closing a file releases all locks of the process on it.
     try:
         with path.open("rb") as stream:
             fcntl.lockf(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -275,8 +273,8 @@ def _copy_to_memory(path: Path) -> sqlite3.Connection:
 
 
 def _is_write_ahead(path: Path) -> bool:
-    # Bytes 18 and 19 of the header are 2 (sqlite.org/fileformat.html, 1.3.3). The file is opened only without `-shm`:
-    # closing it releases all locks of the process on it.
+    # In write-ahead mode, bytes 18 and 19 of the header are 2 (sqlite.org/fileformat.html, 1.3.3). During a run, the
+    # file is not opened here, because closing it would release all locks of the process on it.
     if side_file(path, "-shm").exists():
         return True
     with path.open("rb") as stream:
@@ -284,8 +282,8 @@ def _is_write_ahead(path: Path) -> bool:
 
 
 def _switch_to_write_ahead(path: Path, connection: sqlite3.Connection, retry: Retry) -> sqlite3.Connection:
-    # The mode cannot be changed during a read. If a reader does not end, a copy replaces the file, and the run uses the
-    # copy. The reader keeps the old file, which then has no name.
+    # The mode cannot be changed while another program reads. If a reader does not end, the file is replaced by a copy,
+    # which the run uses. The reader keeps the old file, which then has no name.
     try:
         connection.execute("PRAGMA journal_mode = WAL").fetchall()
     except sqlite3.OperationalError as error:
@@ -350,8 +348,8 @@ def _require_journal(path: Path, connection: sqlite3.Connection) -> None:
 
 def reading_fault(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
     """Return the error for a journal that cannot be read, with a remedy."""
-    # SQLite also reports damage if the disk fails, and an intact journal must not be replaced by a copy. So the disk is
-    # tested, and the file is checked again.
+    # If the disk fails, SQLite may report an intact journal as damaged. So the disk is tested, and the file is checked
+    # again.
     if isinstance(error, OSError):
         is_missing = isinstance(error, FileNotFoundError)
         return reading_error(path, error, restore_remedy(path) if is_missing else "check its permissions")
@@ -394,7 +392,7 @@ def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | Inp
 
 def _disk_fault(path: Path) -> OSError | None:
     try:
-        # A file without a name, so that nothing remains.
+        # The file has no name, so nothing remains.
         with tempfile.TemporaryFile(dir=path.parent, buffering=0) as stream:
             stream.write(bytes(_PROBE_BYTES))
             os.fsync(stream.fileno())
@@ -419,7 +417,7 @@ def _primary_code(error: sqlite3.DatabaseError) -> int:
     return getattr(error, "sqlite_errorcode", 0) & 0xFF
 
 
-# Conditions of values in SQL; {0} is the column.
+# SQL conditions of valid values; {0} is the name of the column.
 _WHOLE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 1000000000"
 
 _MAYBE_WHOLE = "({0} IS NULL OR " + _WHOLE + ")"
@@ -443,9 +441,9 @@ _ZONE = "[+-]??:??"
 _FORMS = f"{{0}} GLOB '{_MOMENT}.{6 * '[0-9]'}{_ZONE}' OR {{0}} GLOB '{_MOMENT}{_ZONE}'"
 
 
-# SQLite checks the zone and all digits except fractions of a second. But it ends a text at a zero byte, reads
-# 30 February as 2 March, and accepts 24:00. The cheapest condition is first, because the page of a session reads the
-# journal every two seconds.
+# `julianday` checks the zone and all digits except fractions of a second. It ignores text after a zero byte, reads
+# 30 February as 2 March, and accepts 24:00, so these cases have conditions of their own. The fastest condition is
+# first, because monitoring reads the journal every two seconds.
 _TIME = (
     f"typeof({{0}}) = 'text' AND ({_FORMS}) AND length(CAST({{0}} AS BLOB)) = length({{0}}) "
     "AND {0} BETWEEN '1970' AND '9999' AND julianday({0}) IS NOT NULL AND substr({0}, 12, 2) < '24' "
@@ -457,7 +455,7 @@ _MAYBE_TIME = "({0} IS NULL OR {0} = '' OR (" + _TIME + "))"
 
 _SHA256 = "({0} IS NULL OR (typeof({0}) = 'text' AND length({0}) <= 64 AND trim({0}, '0123456789abcdef') = ''))"
 
-# Conditions by table and column; times must be readable by `datetime.fromisoformat`.
+# Conditions by table and column. Times must be readable by `datetime.fromisoformat`.
 _COLUMNS: Final = {
     "plan": {
         "step": _WHOLE,
@@ -528,7 +526,7 @@ _JOINT_CONDITIONS: Final = {
 def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
     for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
         is_plain = kind == "table" and not str(sql or "").lstrip().upper().startswith("CREATE VIRTUAL")
-        # SQLite creates an index for each primary key, without a text.
+        # SQLite itself creates an index for each primary key; its `sql` is NULL.
         if not (is_plain or (kind == "index" and sql is None)):
             raise FormatError(
                 f"{path} has the {kind} {str(name)[:80]!r}, which is not part of a journal: {_DAMAGED}; "
@@ -537,7 +535,7 @@ def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
 
 
 def require_sound_rows(path: Path, connection: sqlite3.Connection) -> None:
-    """Refuse a journal with values that no run writes; takes milliseconds."""
+    """Refuse a journal with values that no run writes."""
     for table in _COLUMNS:
         columns = {row[1]: row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")}
         missing = _COLUMNS[table].keys() - columns.keys()

@@ -1,7 +1,7 @@
-"""Values of a session: its plan, and attempts, frames, events and verdicts in its journal.
+"""Data types of a session: its plan, and the attempts, frames, events and verdicts in its journal.
 
-A `FrameJudge` measures frames and applies the limits. The journal contains every judgement with its values, so that
-each refusal can be read later, and a resumed run has the measurements of earlier frames.
+A `FrameJudge` measures frames and applies the limits. The journal contains every judgement with its measured values.
+They explain a refusal later, and a resumed run reads the measurements of earlier frames.
 """
 
 from __future__ import annotations
@@ -26,10 +26,9 @@ FAILED = "failed"  # Verdict of an attempt without a frame
 VOIDED = "voided"  # Verdict of a frame that was accepted first and must not be used because of a later finding
 
 
-DOUBT = "doubt"  # Event of a finding that does not stop the run and is reported at its end
+DOUBT = "doubt"  # Name of an event: a problem that does not stop the run and is reported at its end
 
-# Attempts from which the remaining time is estimated: enough that repeated frames and references do not change the
-# median, and few enough to follow a change of the settings.
+# Number of last attempts from which the remaining time is estimated.
 RECENT = 50
 
 
@@ -37,7 +36,7 @@ RECENT = 50
 class Check:
     """One check of a frame."""
 
-    name: str  # name of the corresponding figure of the look-up table (LUT); without one, "movement", "file" …
+    name: str  # name of the corresponding figure of the look-up table (LUT), or another name, such as "movement"
     value: float | None = None  # result in `unit`; None if it is not a number
     low: float | None = None  # lower limit of `value`; None without limit
     high: float | None = None  # upper limit of `value`; None without limit
@@ -51,7 +50,7 @@ class Check:
 
     @property
     def is_beyond(self) -> bool:
-        """Whether the value is outside its limits. The check may pass all the same, if the change is allowed."""
+        """Whether the value is outside its limits. A judge may accept such a value, for example after a pause."""
         if self.value is None:
             return False
         return (self.low is not None and self.value < self.low) or (self.high is not None and self.value > self.high)
@@ -65,14 +64,15 @@ class Judgement:
     seen: tuple[float, float, float] | None = None  # camera RGB of the paper above black, counts; None if not measured
     measurement: bytes = b""  # data of the judge for later frames, opaque to all others
     preview: bytes = b""  # JPEG of the frame; empty if there is none
-    # Whether earlier frames must not be used. If this frame is a reference: all frames after the last good reference.
-    # If it is another frame: all frames of the run, or all after its last pause for a lasting cause.
+    # Whether this frame shows that earlier frames must not be used. For a reference, these are all frames after the
+    # last good reference. For another frame, these are all frames since the start of the run, or since its last pause
+    # for a lasting cause.
     voids: bool = False
     lasting: bool = False  # whether a repetition is useless until somebody has removed the cause
 
     @classmethod
     def of_reason(cls, name: str, reason: str | None) -> Judgement:
-        """Return the judgement of one check without a value; accepted if `reason` is None."""
+        """Return a judgement with one check and no value; the frame is accepted if `reason` is None."""
         return cls((Check(name, reason=reason or ""),))
 
     @property
@@ -107,10 +107,10 @@ class FrameJudge(Protocol):
 
 @runtime_checkable
 class HandlesPauses(Protocol):
-    """A judge that allows for changes during a pause of the run."""
+    """A judge that accepts changes of the laboratory during a pause of the run."""
 
     def after_pause(self) -> None:
-        """Prepare for the first frames after a pause for a lasting cause, which link the run to its earlier frames.
+        """Prepare for the frames of `link_steps`, which follow a pause for a lasting cause.
 
         It is called after all earlier frames are judged, and before the next frame is judged.
         """
@@ -121,8 +121,8 @@ class HandlesPauses(Protocol):
 class Attempt:
     """One attempt at a step, as in the journal.
 
-    Times are those of the laboratory's clock, and None for a stage that was not reached. The verdict is None if the
-    attempt is in progress or was interrupted.
+    Times are read from the clock of the laboratory. The time of a stage is None if the attempt did not reach it. The
+    verdict is None if the attempt is in progress or was interrupted.
     """
 
     id: int
@@ -138,7 +138,7 @@ class Attempt:
 
     @property
     def has_frame(self) -> bool:
-        """Whether there is a raw file. The field `file` of a failed attempt may name the file of the next attempt."""
+        """Whether there is a raw file. Without one, the field `file` may name the file of the next attempt."""
         return self.taken_at is not None
 
 
@@ -162,7 +162,7 @@ class FrameRecord:
     taken_at: datetime
     exposure_s: float
     verdict: str  # "accepted" or "refused: reason", also for a voided frame
-    attempt: int = 0  # number in the journal: the order in which frames were taken, independent of clocks
+    attempt: int = 0  # number of the attempt; frames were taken in this order
 
     @property
     def accepted(self) -> bool:
@@ -193,7 +193,7 @@ class SessionEvent:
 
 
 def doubts_of(events: Iterable[SessionEvent]) -> list[str]:
-    """Return the findings that did not stop the run, each once, in the order of the events."""
+    """Return the problems that did not stop the run, each once, in the order of the events."""
     return list(dict.fromkeys(event.detail for event in events if event.what == DOUBT))
 
 
@@ -205,7 +205,7 @@ def last_frame_time(attempts: Iterable[Attempt]) -> datetime | None:
 
 def preview_path(folder: Path, file: str) -> Path:
     """Return the path of the preview of a raw file in the folder of a session, whether it exists or not."""
-    # Only the last part of `file` is used, so that no row of a journal leads to a file outside of `previews/`.
+    # Only the last part of `file` is used, so that the path is always inside `previews/`.
     return folder / "previews" / f"{Path(file).stem}.jpg"
 
 
@@ -242,7 +242,7 @@ def time_left(attempts: Iterable[TimedAttempt], remaining_frames: int) -> float 
     accepted_count = sum(attempt.is_accepted for attempt in recent)
     if not intervals or not accepted_count:
         return None
-    # The median, so that a pause does not change the estimate until the end.
+    # A single long interval does not change the median.
     return statistics.median(intervals) * len(recent) / accepted_count * remaining_frames
 
 
@@ -257,26 +257,26 @@ def duration_text(seconds: float | None) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
-# Kind of a frame: a planned illuminant, full white, a black picture, or a colour that shows the response of the
-# projector. Response frames are judged during the session, and are not used for a LUT.
+# Kind of a frame: an illuminant of the plan, full white, black, or a colour that shows the response of the projector.
+# Response frames are used during the session, but not for a LUT.
 FrameKind = Literal["light", "white", "dark", "response"]
 
 KINDS: tuple[FrameKind, ...] = get_args(FrameKind)  # All kinds, as in the journal
 
 REFERENCES: tuple[FrameKind, ...] = ("white", "dark")  # Kinds of frames with which frames of illuminants are compared
 
-# Highest code of a response frame. It is below 255, so that no response frame has the codes of a white frame or of an
-# illuminant with full code.
+# Highest code of a response frame. It is below 255, so that response frames differ from white frames and from all
+# illuminants.
 TOP = 250
 
-# Red, green and blue of the projector, each alone
+# Full red, green and blue of the projector.
 PRIMARIES = (Colour(TOP, 0, 0), Colour(0, TOP, 0), Colour(0, 0, TOP))
 
-MIDDLE = 136  # Code of a quarter of the light, at which the curve of each primary is compared with that of grey
+MIDDLE = 136  # Code with a quarter of the light, at which the response of each primary is compared with grey
 
-# First frames of a session, from which the light of any codes is predicted: primaries; greys for the curve from codes
-# to light; pairs of primaries for the light added by overlaps; and primaries at half code for the curve of each.
-# Steps of the greys (judgement): equal, and smaller for dark codes, because the curve is relatively steep there.
+# First frames of a session, from which the light of all codes is predicted. Greys show how light depends on the code.
+# Pairs of primaries show whether their light adds up. Primaries at `MIDDLE` show whether each responds like grey. Dark
+# greys are closer together, because there the light changes faster, relative to its level (judgement).
 RESPONSE = (
     *PRIMARIES,
     *(Colour(code, code, code) for code in (TOP, 232, 208, 184, 160, 136, 112, 88, 64, 48, 32, 16)),
@@ -310,8 +310,8 @@ def plan_steps(
 ) -> tuple[SessionStep, ...]:
     """Return the plan: a white and a dark frame at the start, every `reference_every` illuminants, and at the end.
 
-    `seed`: seed of the shuffled order (numpy's PCG64), so that neither time nor an unchanged picture correlates with
-    colour; None keeps the order. `response`: colours of the response frames, after the first pair.
+    `seed`: seed of a random order of the illuminants (numpy's PCG64), so that time does not correlate with colour; None
+    keeps the given order. `response`: colours of the response frames, which follow the first pair.
     """
     steps: list[SessionStep] = []
 
@@ -332,10 +332,10 @@ def plan_steps(
 
 
 def link_steps(first_number: int) -> tuple[SessionStep, ...]:
-    """Return the first frames of a resumed run, which link it to the earlier frames.
+    """Return the first frames of a resumed run, which make its frames comparable with earlier frames.
 
-    A grey and the primaries measure the response of the projector again. The next illuminants are compared with the
-    white and the dark frame, because the lamp may have changed during the pause.
+    A grey and the primaries measure the response of the projector again. A white and a dark frame are the new
+    references of the next illuminants, because the lamp may have changed during the pause.
     """
     colours = (Colour(TOP, TOP, TOP), *PRIMARIES)
     frames: list[tuple[FrameKind, Colour]] = [*(("response", colour) for colour in colours), ("white", WHITE)]

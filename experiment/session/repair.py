@@ -1,7 +1,7 @@
-"""Find damaged files of a session, and illuminants that are to be repeated.
+"""Find the damaged files of a session, and the illuminants that must be repeated.
 
-Raw files are compared with the hashes in the journal. The session voids frames with missing, truncated or changed
-files, so that the next run repeats them. Nothing is deleted.
+Raw files are compared with the hashes in the journal. If a file is missing, truncated or changed, its frame is voided,
+so that the next run repeats it. Nothing is deleted.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from foundation.compiled import ordered_map, processor_count
 from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError
 from foundation.files import file_sha256, storage_error
 
-BAD = "bad"  # Selection of the illuminants that the newest report refused
+BAD = "bad"  # Text that selects the illuminants refused by the newest report
 
 
-# Files with a read error (EIO) that are given up: bad sectors are few, a loose cable affects all files.
+# Largest number of files with a read error (EIO) whose frames are repeated. If more files have one, the cause is
+# probably a loose cable, not bad sectors.
 MOST_UNREADABLE = 3
 
-# Largest number of files hashed at a time (judgement): SHA-256 runs at 0.5 to 2 GB/s a thread, so the threads together
-# are faster than any disk.
+# Largest number of files that are hashed at the same time (judgement): so many threads are faster than any disk.
 MOST_THREADS = 8
 
 _RANGE = re.compile(r"\s*(\d{1,9})\s*(?:[-–]\s*(\d{1,9})\s*)?")
 
 
 def damaged_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callable[[int, int], None]) -> dict[int, str]:
-    """Return the attempts with missing or changed files, and the reasons."""
+    """Return the reason for each attempt whose file is missing or changed."""
     try:
         require_frames_folder(folder)
     except OSError as error:
@@ -65,7 +65,7 @@ def require_frames_folder(folder: Path) -> None:
 
 
 def _require_readable(folder: Path, unread: Sequence[tuple[AcceptedFile, OSError]]) -> None:
-    # The frames may be intact, and should not be repeated because of a cable.
+    # The files may be intact, so their frames must not be repeated because of a cable.
     other_faults = [(frame, error) for frame, error in unread if error.errno != errno.EIO]
     lasting = other_faults or (unread if len(unread) > MOST_UNREADABLE else ())
     if lasting:
@@ -78,7 +78,7 @@ def _require_readable(folder: Path, unread: Sequence[tuple[AcceptedFile, OSError
 
 
 def _fault(folder: Path, frame: AcceptedFile) -> str | OSError:
-    """Return the damage of the file of a frame, or the error of reading it; empty if there is none."""
+    """Describe the damage of the file of a frame; return the error if it cannot be read, or "" if it is intact."""
     path = folder / frame.file
     try:
         size = path.stat().st_size
@@ -148,12 +148,12 @@ def lights_text(lights: Collection[int]) -> str:
 
 
 def newest_report(session: Path, attempts: Mapping[str, int]) -> RefusedFrames:
-    """Return the refused frames of the newest report on a session, in it or next to it.
+    """Return the frames that the newest report refuses. Reports are searched in the session folder and next to it.
 
-    The newest report has the newest frame. The times of the files decide only between reports
-    on the same frames, because a clock may have been wrong.
+    The newest report is the report with the newest frame. File times decide only between reports with the same newest
+    frame, because clocks may be wrong.
 
-    `taken`: attempt of each frame of the session, by hash.
+    `attempts`: attempt of each frame of the session, by hash.
     """
     home = session.resolve()
     reports: list[tuple[int, int, RefusedFrames]] = []

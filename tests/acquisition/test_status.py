@@ -120,7 +120,7 @@ def test_copy_is_no_active_run(folder: Path, tmp_path: Path, capsys: pytest.Capt
     shutil.copytree(folder, copy)
     output = say(copy, capsys)
     assert f"state       copied from {folder.resolve()} at 20" in output
-    assert "or later, and the run there continues; use" in output
+    assert "or later, and the run continues there; use" in output
     assert "left        4 frames; this is a copy without a run\n" in output
     assert main(["status", "--json", str(copy)]) == 0
     values = json.loads(capsys.readouterr().out)

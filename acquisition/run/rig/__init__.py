@@ -1,1 +1,1 @@
-"""Open the devices of a rig: real ones, or the simulated laboratory."""
+"""Open the devices of a rig, that is of a real or a simulated laboratory."""

@@ -1,4 +1,4 @@
-"""Open the devices of a real laboratory that LAB.toml names, and list the available ones."""
+"""Open the devices of a real laboratory as set in LAB.toml, and list the available devices."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from foundation.holds import hold
 __all__ = ["Attached", "attached_devices", "identify_displays"]
 
 
-CONNECT_S = 5.0  # Time for a projector to accept a connection, s; milliseconds on a local network
+CONNECT_S = 5.0  # Longest time for a projector to accept a connection, s
 
 
 def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, opens_display: bool = True) -> Devices:
     """Open the camera, the projector and its display.
 
-    `session`: the resumed session, whose last frame sets the time; None for a new one. `opens_display`: whether to open
-    the display; if not, a `LightNotShown` replaces it.
+    `session`: the resumed session, after whose last frame the clock continues; None for a new session. `opens_display`:
+    whether to open the display; if not, a `LightNotShown` replaces it.
     """
     _hold_lab(settings.file, opened)
     clock = session_clock(session)
@@ -73,22 +73,22 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, 
             presenters.append(LightNotShown(display_warnings(display)))
         opened.callback(presenters[0].close)
 
-    # All faults are reported together. The display is opened last: its black would cover the picture of another run
-    # that uses the camera.
+    # All faults are reported together. The display is opened last, and only if camera and projector are free, because
+    # it would cover the picture of another run.
     ask_all({"camera": open_camera, "projector": open_projector, "display": open_presenter})
     return Devices(cameras[0], presenters[0], projectors[0], clock)
 
 
 def _hold_lab(file: str, opened: ExitStack) -> None:
-    # Two programs on one cable would read each other's answers.
-    # Settings without a file cannot be used by another command.
+    # Lock the laboratory, because two programs on one cable would read each other's answers. Settings without a file
+    # need no lock, because no other command can use them.
     with suppress(OSError):
         status = Path(file).stat()
         opened.enter_context(hold(f"the lab of {file}", f"lab {status.st_dev} {status.st_ino}"))
 
 
 def session_clock(session: Session | None) -> SteadyClock:
-    """Return the computer's clock, continued after the last frame of a session."""
+    """Return the computer's clock, which is never behind the last frame of a session."""
     return SteadyClock(SystemClock(), None if session is None else last_frame_time(session.journal.attempts()))
 
 
@@ -105,7 +105,7 @@ def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:
             return CanonEos(lambda: UsbTransport(usb(), clock), clock)
         case "ptpip":
             host = _required(cable.host, "lab.camera.host", "the camera's address", file)
-            # The camera identifies paired computers by this number.
+            # The camera recognises a paired computer by this number.
             guid = uuid.uuid5(uuid.NAMESPACE_DNS, f"croplab.{uuid.getnode()}").bytes
             return CanonEos(
                 lambda: IpTransport.connect(
@@ -175,7 +175,7 @@ def _required(value: str | None, key: str, meaning: str, file: str) -> str:
 
 @dataclass(frozen=True)
 class Attached:
-    """Available devices of one kind (in the plural), or the reason why they could not be listed."""
+    """Available devices of one kind, or the reason why they could not be listed; `kind` is a plural."""
 
     kind: str
     found: tuple[str, ...]

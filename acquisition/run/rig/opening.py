@@ -1,4 +1,4 @@
-"""Open the rig of the settings, and close it in any case: `rig = "lab"` or `rig = "simulated"`."""
+"""Open the devices of the settings (`rig = "lab"` or `rig = "simulated"`), and close them in any case."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def open_rig(
     *,
     opens_display: bool = True,
 ) -> Generator[Devices]:
-    """Open every device of the settings; close them all at the end.
+    """Open every device of the settings; close all devices at the end.
 
-    `session`: the resumed session; None for a new one, and for a check. `opens_display`: whether to open the display,
-    which is black then; a dry run does not.
+    `session`: the resumed session; None for a new session or a check. `opens_display`: whether to open the display,
+    which then shows black; false in a dry run.
     """
     if settings.rig == "imported":
         raise ConfigurationError(

@@ -1,7 +1,7 @@
-"""Build the simulated laboratory: real drivers in memory, connected to a simulated camera, projector and room.
+"""Build the simulated laboratory: real drivers, connected in memory to a simulated camera, projector and room.
 
-A resumed simulated laboratory has the state of the session's journal: the same time, the lamp on, the same number of
-frames. An interrupted session therefore ends in the same bytes as an undisturbed one.
+If a session is resumed, the time, the lamp and the number of frames continue as in its journal. An interrupted session
+therefore gives the same files as an uninterrupted session.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from sim.world.rendering import Print
 from sim.world.sensors import BODIES, Body, find_body
 from sim.world.world import Room, World, read_room
 
-SERIAL = "0000000001"  # Serial number of the simulated camera, also in its frames; a laboratory has one camera
+SERIAL = "0000000001"  # Serial number of the simulated camera, also in its frames
 
 
 def open_simulated(settings: LabSettings, chart: Chart, session: Session | None, opened: ExitStack) -> Devices:
@@ -51,10 +51,10 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     world = World(sheet(chart), sensor, simulated_room(settings))
     events = read_disturbances(settings.simulated.events, settings.file)
     film = WorldFilm(world, lambda: screen.colour, simulated_projector.light, SERIAL, colour_counts, events, exposures)
-    # A body given by its sensitivities alone uses the protocol of an EOS 550D.
+    # A body that is defined only by its sensitivities uses the protocol of an EOS 550D.
     protocol = EOS_BODIES.get(settings.simulated.body, EOS_BODIES["EOS 550D"])
     apertures = () if settings.camera.exposure.aperture is None else protocol.aperture_codes
-    # The camera runs on mains power, as for any long session.
+    # The battery never runs empty, because cameras run on mains power in a long session.
     body = replace(protocol, shots_per_charge=10**9, aperture_codes=apertures)
     eos = SimulatedEos(body, film, clock, serial=SERIAL, auto_power_off_s=0)
     peer = PjLinkPeer(simulated_projector)
@@ -95,7 +95,7 @@ def simulated_room(settings: LabSettings) -> Room:
 
 
 def _earlier_exposures(session: Session | None) -> list[tuple[float, Colour]]:
-    # Time in seconds since `SIM_START`, and colour, of every earlier exposure.
+    # Return time (seconds since `SIM_START`) and colour of every earlier exposure.
     if session is None:
         return []
     colours = {step.number: step.colour for step in session.steps}

@@ -621,7 +621,7 @@ def test_reports_late_step_once() -> None:
         """Let time pass in steps that are shorter than a gap."""
         for _ in range(round(seconds)):
             time.now += 1
-            watch.look()
+            watch.check_time()
 
     with watch.step("the camera", "exposes light 3", 4.0, "expose"):
         pass_s(3 * 4 + 10)
@@ -680,7 +680,7 @@ def test_reports_hanging_device(
                 assert entered.wait_for(lambda: kinds == [hangs], timeout=60)
             for _ in range(60):
                 time.now += 1
-                watches[0].look()
+                watches[0].check_time()
             heads.append(read_session(lab.session.folder).head(datetime.now(UTC)))
         return real(*given)
 
