@@ -411,7 +411,7 @@ def _light_figures(accumulator: Accumulator, by_light: Sequence[FrameMeasurement
     gains = drift_gains(*_times_s(by_light, whites), paper)
     dark = np.zeros(3) if options.subtract_dark else accumulator.dark_summary().light
     full_white = whites[0].paper.white if whites else None
-    compared = whites[:1] if _differ_by_drift(whites) else whites
+    compared = whites[:1] if _differ_only_by_drift(whites) else whites
     agreement = _code_agreement(
         illuminations, by_light, compared, dark, gains if len(compared) < 2 else np.ones_like(gains)
     )
@@ -429,8 +429,8 @@ def _light_figures(accumulator: Accumulator, by_light: Sequence[FrameMeasurement
     )
 
 
-def _differ_by_drift(whites: Sequence[FrameMeasurements]) -> bool:
-    # Frames of other illuminants or exposures differ by more than lamp drift.
+def _differ_only_by_drift(whites: Sequence[FrameMeasurements]) -> bool:
+    # White frames of another illuminant or exposure differ by more than lamp drift.
     levels = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
     if len(levels) < 2:
         return True
