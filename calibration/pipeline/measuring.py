@@ -1,10 +1,11 @@
 """Measure one frame in steps: decode, locate, sample, measure. All frames of a LUT share one baseline.
 
-Patches are in the order of colour indices. References follow them, the white references first. A measurement depends
-only on the frame, the baseline, the frame registered last and the dark light. The dark light is from the last dark
-frame before; if there is none, from the first dark frame. Therefore several threads may measure frames in any order.
+Patches are in the order of colour indices. White references follow them, and grey references are last. A measurement
+depends only on the frame, the baseline, the frame registered last and the dark light. The dark light is from the last
+dark frame before this frame; if there is none, from the first dark frame. Therefore several threads may measure frames
+in any order.
 
-C patches of S samples, W white and N grey references; positions on the print in mm, in frames in half-size px.
+C patches of S samples, W white and N grey references. Positions are in mm on the print, and in half-size px in frames.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ _RETAKE_HINT = "or take it again with acquire run LAB.toml SESSION, which detect
 # Distance from the median, in robust standard deviations, above which a grey reference counts as covered or dirty.
 _OUTLIER_SIGMAS = 6.0
 
-_MAX_WITHOUT_OUTLIERS = 4  # Largest number of grey references among which a wrong one cannot be identified
+_MAX_WITHOUT_OUTLIERS = 4  # With at most this number of grey references, a wrong one cannot be identified
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,13 +209,16 @@ class RegisteredFrame:
     cells: Sites
     references: Sites
     gauges: dict[Channel, Plane]  # Areas around the tags, or the outline of the patches, to measure movement
-    lens: FrameCorrection | None = None  # Of light spread by the lens, for frames sampled at these positions
+    lens: FrameCorrection | None = None  # Correction of light spread by the lens, at these sampling positions
 
 
 def register_frame(
     decoded: DecodedFrame, chart: Chart, points: ChartPoints, options: BuildOptions, near: Registration | None = None
 ) -> RegisteredFrame:
-    """Return a frame with the chart registered in it."""
+    """Return a frame with the chart registered in it.
+
+    `near`: registration of an earlier frame, which gives the approximate position of a chart without tags.
+    """
     registration = register(decoded.mosaic, chart, decoded.record.file, options.corners, near)
     cells, references = sites_of(registration, points, decoded.shape, options.window)
     gauges: dict[Channel, Plane] = {
@@ -259,14 +263,14 @@ class Baseline:
     means: _Array  # (C + W + N, 3) counts above black of patches and references
     paper: PaperReader  # Reads flat field and white of a frame, based on the shape of the first frame
     transfer: PhotonTransfer
-    # Linearity, from the first frame and the primaries; a usual value if primaries are missing or the chart moved
+    # Linearity, from the first frame and the primaries; a usual one if primaries are missing or the chart moved
     superposition: Superposition
     primaries: Primaries | None = None  # The primaries alone; None if missing or unusable
     lens: LensCorrection | None = None  # Measured light spread; None if not measured
 
     @cached_property
     def consistency_check(self) -> ConsistencyCheck:
-        """Comparison of frames with the first frame, with the flat field for each patch's colour if known."""
+        """Comparison of frames with the first frame. The flat field is for the colour of each patch, if known."""
         level = self.means[: len(self.points.cells_mm)]
         if self.primaries is None:
             field = self.paper.base.at(self.points.cells_mm)
@@ -370,7 +374,7 @@ class LocatedFrame:
     decoded: DecodedFrame
     registered: RegisteredFrame  # The frame registered last; this one, if it was registered again
     moved: RegisteredFrame  # `registered` with its sampling positions moved by `shift`
-    shift: Shift  # Movement since the frame registered before
+    shift: Shift  # Movement since the frame registered before this one
     reregistered: bool
 
 
@@ -464,7 +468,7 @@ def sample(baseline: Baseline, located: LocatedFrame, dark: DarkLight | None, ke
         samples, highest = gather(decoded.mosaic, decoded.black, moved.cells)
         values, noise = table_values(samples, shape, dark_of_cells), sample_noise(samples)
         if dark_of_cells is not None:
-            # Subtract only light spread by the lens: samples with dark light show hot photosites and stains.
+            # These samples are used to find faulty patches. Their dark light is kept; light spread by the lens is not.
             added = dark_of_cells if dark is None else dark_of_cells - dark.patches[: len(dark_of_cells)]
             samples -= added[:, None]
     else:
@@ -493,7 +497,7 @@ def measure(baseline: Baseline, sampled: SampledFrame) -> MeasuredFrame:
     located, points, values = sampled.located, baseline.points, sampled.values
     decoded, shift, origin = located.decoded, located.shift, located.decoded.mosaic.origin
     greys, grey_errors = points.levels.read(sampled.greys, sampled.paper.field.at(points.greys_mm))
-    # Blur of the registered frame, plus the increase of blur at the gauges.
+    # Blur of the registered frame, plus the increase of blur in the areas that measure movement.
     blur_growth_px2 = 0.0 if located.reregistered else shift.blur_growth_px2
     mean = patch_means(values)
     variance = baseline.transfer.variance(mean) / baseline.options.samples
