@@ -52,7 +52,7 @@ def table(
         str | None,
         typer.Option(
             help="CSV file with a column of wavelengths and a column for each spectrum, or published spectra: D65,A,"
-            "FL2,cie-led,5600K,2000:10000:200K,daylight:4000:10000:500; by default the 707 illuminants of the simulated "
+            "FL2,cie-led,5600K,2000:10000:200K,daylight:4000:10000:500; by default the illuminants of the simulated "
             "projector."
         ),
     ] = None,
