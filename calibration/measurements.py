@@ -92,7 +92,7 @@ class LinearityMeasurements:
 
 @dataclass(frozen=True)
 class SessionMeasurements:
-    """The session that was read."""
+    """Properties of the session."""
 
     folder: Path
     camera: str

@@ -2,7 +2,7 @@
 
 The samples of a patch are the 5×5 half-size pixels around its rounded centre (Banić et al. 2019, section 3.2). Other
 odd windows are possible. Photosites are not interpolated, because interpolation would change the noise. The compiled
-loops must not reorder sums: a LUT has the same bytes on every processor.
+loops must not reorder sums, so that a LUT has the same bytes on every processor.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ SAMPLE_REACH_PX = 3.25
 
 _MIN_BLUR_PX = 1e-3  # Avoids division by 0 for a perfectly sharp image
 
-WINDOW = 5  # Default side of the window, px, as in the paper (section 3.2)
+WINDOW = 5  # Default side of the window, px, as in Banić et al. 2019 (section 3.2)
 
 _Array = npt.NDArray[np.float64]
 _Float = npt.NDArray[np.float32]
@@ -93,10 +93,10 @@ def _sample(
 ) -> None:
     """Fill `samples` (N, window², 3) with counts above black, and `peak` (N,) with the highest raw counts.
 
-    Patches outside the frame get 0. `sensor`: (photosites,). `corner`: (N,) top-left photosite of each window. `order`:
-    (N,) patches as ordered in memory, which is faster. `inside`: (N,) whether the window is in the frame. `step`:
-    photosites from one row of 2×2 blocks to the next. `offsets`: (4,) from the top-left photosite of a block to red,
-    both greens and blue. `black`: (3,) counts of red, green and blue.
+    Patches outside the frame get 0. `sensor`: (photosites,) raw counts. `corner`: (N,) top-left photosite of each
+    window. `order`: (N,) patches in the order of their photosites in memory. `inside`: (N,) whether the window is in
+    the frame. `step`: photosites from one row of 2×2 blocks to the next. `offsets`: (4,) from the top-left photosite of
+    a block to red, both greens and blue. `black`: (3,) counts of red, green and blue.
     """
     red, green, green2, blue = uint64(offsets[0]), uint64(offsets[1]), uint64(offsets[2]), uint64(offsets[3])
     for patch in order:
@@ -251,7 +251,7 @@ def unevenness(samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating
 
 
 def has_dead_photosite(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
-    """Return a mask (N,) bool of the patches in which a photosite has less than half of the light of the patch.
+    """Return a mask (N,) bool of the patches with a photosite that has less than half of the light of the others.
 
     `samples`: (N, S, 3) counts above black, the mean of frames with equal light.
     """
@@ -471,7 +471,7 @@ def _photosites(
 def table_values(
     samples: npt.NDArray[np.float32], field: _Array, dark: npt.NDArray[np.float32] | None = None
 ) -> npt.NDArray[np.uint16]:
-    """Return samples as stored in a LUT, (N, S, 3) uint16: divided by the field, rounded, and clipped at 0.
+    """Return samples as stored in a LUT, (N, S, 3) uint16: divided by the flat field, rounded, and clipped at 0.
 
     Clipping raises the mean of a patch without light by 0.4 standard deviations of one sample. The ground truth is not
     clipped.
@@ -494,7 +494,7 @@ def gather_values(
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
     """Return `table_values` of the samples of `gather`, (N, S, 3) uint16, and the highest raw counts (N,) uint16.
 
-    This is three times faster than the two functions. `black`: (2, 2). `field`, `dark`: (N, 3).
+    This is three times faster than `gather` and `table_values`. `black`: (2, 2). `field`, `dark`: (N, 3).
     """
     dark = np.zeros(field.shape, dtype=np.float32) if dark is None else dark
     values = np.empty((len(sites.rows), sites.window**2, 3), dtype=np.uint16)

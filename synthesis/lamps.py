@@ -362,7 +362,7 @@ class SpectralLamp:
     powers: _Array  # (L, 81) float64, relative power per nm of each illuminant
     sensor: PatchSensor
     reflectance: _Array  # (N, 81) float64, reflectance of each patch
-    field: _Array  # (N,) float64, illumination of each patch relative to the brightest position, as for green
+    field: _Array  # (N,) float64, illumination of each patch, as by the green primary of the simulated projector
 
     def signals(self, light: int) -> _Array:
         """Return the signal of each patch under an illuminant, (N, 3) float64, DN above black."""

@@ -29,8 +29,8 @@ MAX_POSITIONS = 12  # Largest number of positions per figure; more marks would c
 # If at least this fraction of frames differs at a position from the frame registered first, that frame is faulty.
 IN_FIRST = 0.8
 
-# Another frame has the same spot if its deviation is at least this fraction of the spot's. White frames are listed as
-# single frames if they are at most this fraction of all white frames.
+# Another frame shows the same spot if it deviates by at least this fraction of the deviation of the spot. White frames
+# with a deviation are listed as single frames if they are at most this fraction of all white frames.
 _HALF = 0.5
 
 # Relative residual of references from which an object is reported: ten times their noise under white.
@@ -502,8 +502,8 @@ def sum_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
 
 
 # The amounts of the primaries in white differ significantly if they differ by this factor times the colour range of
-# white frames. One primary is faulty if it differs by this factor more than the two others differ from each other
-# (judgement).
+# white frames. One primary is faulty if its difference from the next one is this factor times the difference of the
+# other two (judgement).
 _LONE_RATIO = 3.0
 
 # If the frame of one primary contains another illuminant, white has an excess of one primary and a similar deficit of

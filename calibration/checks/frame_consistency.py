@@ -27,7 +27,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from calibration import kernels
-from calibration.checks.small_places import AROUND, LEAST_MODEL_ERROR, SmallPlaces, cells_without_hot
+from calibration.checks.small_places import AROUND, LEAST_MODEL_ERROR, CoveredPatchFinder, cells_without_hot
 from drivers.raw.rawfile import FrameOrigin
 from experiment.measures.least_squares import (
     code_polynomial,
@@ -115,9 +115,9 @@ class _Deviations:
 
     solution: _Array  # (K,) coefficients of the polynomial
     measured: _Array  # (N,) counts of the patches compared for blocks; NaN if not comparable
-    expected: _Array  # (N,) the same from the polynomial
-    scatter: float  # estimate from all patches
-    significant_scatter: float  # scatter beyond its uncertainty
+    expected: _Array  # (N,) counts that the polynomial predicts for these patches
+    scatter: float  # relative scatter of all patches, without noise
+    significant_scatter: float  # part of `scatter` that exceeds its uncertainty
     mean: _Array  # (B,) relative deviation of each block
     excess: _Array  # (B,) part of the absolute deviation that exceeds noise
 
@@ -126,11 +126,11 @@ class _Deviations:
 class _Channel:
     """One channel of the reference frame, prepared for comparisons."""
 
-    terms: _Array  # (N, K) of the compared patches
-    level: _Array  # (N,) their counts
+    terms: _Array  # (N, K) terms of the polynomial for each compared patch
+    level: _Array  # (N,) counts of these patches
     bright: npt.NDArray[np.int64]  # indices of patches that are bright enough
-    fitted: npt.NDArray[np.int64]  # indices for the fit
-    design: _Array  # (F, K) of the fit
+    fitted: npt.NDArray[np.int64]  # indices of the F patches to which the polynomial is fitted
+    design: _Array  # (F, K) design matrix of the fit
 
     @staticmethod
     def of(terms: _Array, level: _Array, usable: _Mask) -> _Channel:
@@ -169,7 +169,7 @@ class ConsistencyCheck:
         self._basis = np.ascontiguousarray(all_terms.T)
         self._level = np.where(usable[:, None] & (level > LEAST_COUNTS), level, np.nan).T.copy()
         self._noise2 = np.ascontiguousarray((variance / np.maximum(level, 1.0) ** 2).T)
-        self._places = SmallPlaces(rgb, cells_mm, usable)
+        self._covered_finder = CoveredPatchFinder(rgb, cells_mm, usable)
         compared_mm = cells_mm[self._selection]
         block, self._block_centres, self._block_mm2 = _blocks(compared_mm)
         self._members = _members(block, len(self._block_centres))
@@ -236,7 +236,7 @@ class ConsistencyCheck:
             sigma[row] += self._noise2[channel]
             sigma[row] += max(valid[channel].scatter, LEAST_MODEL_ERROR) ** 2
         np.sqrt(sigma, out=sigma)
-        cells, worst_deviation, seeds, alone = self._places.disturbed(deviation, sigma)
+        cells, worst_deviation, seeds, alone = self._covered_finder.disturbed(deviation, sigma)
         disturbed = tuple(zip(cells.tolist(), worst_deviation.round(6).tolist(), strict=True))
         return disturbed, tuple(seeds.tolist()), tuple(alone.tolist())
 

@@ -41,7 +41,7 @@ VERIFIED_DEG = 8.0
 # Largest standard uncertainty of the prediction of a verified illuminant, degrees. Red and blue are 85° apart.
 _VERIFIED_SD_DEG = 10.0
 
-_FEW = 24  # Up to this number of illuminants, each is omitted in turn; with more, the fit is robust
+_FEW = 24  # Up to this number of illuminants, each is omitted in turn; with more, robust weights are sufficient
 
 _SUSPECTS = 8  # Number of illuminants tested for exchanges: those whose omission improves the fit most
 
@@ -232,7 +232,10 @@ def _best_exchange(
 
 
 def _directions(mean: _Array, cov: _Array, white: _Array) -> tuple[_Array, _Array, _Array]:
-    """Return angles (L,) of the whites from their predictions: degrees, in units of σ, and the largest σ, degrees."""
+    """Return the angle (L,) of each white to its prediction in degrees and in units of σ, and the largest σ in degrees.
+
+    σ is the standard uncertainty of the angle. It is largest for one direction of the error.
+    """
     # Brightness is ignored, so that a flickering lamp does not look like a wrong name.
     direction = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     along = np.asarray(_FREE_BRIGHTNESS_SD**2 * (white**2).sum(axis=1), dtype=np.float64)

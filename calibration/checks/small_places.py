@@ -3,7 +3,7 @@
 Such an area is too small to change the mean of a block of patches. The deviation of a patch from the polynomial of
 `calibration.checks.frame_consistency` is large if it exceeds noise and model error. It must also differ as much from
 the deviations of patches with similar codes. Model errors are distributed at random over the print, and hot photosites
-are isolated. Two adjacent patches with large deviations are therefore evidence of a cover. If a frame has many large
+are isolated. Two adjacent patches with large deviations are therefore evidence of an object. If a frame has many large
 deviations, more of them must be adjacent. Neighbours of an area are added to it if they deviate less or are too dark to
 be compared. The colours of the chart must be in random order.
 """
@@ -33,7 +33,7 @@ _ALSO = 3.0  # Standard deviations above which a patch next to an area is added 
 # Smallest relative standard deviation of a prediction, because the response of photosites differs by 0.4 %.
 LEAST_MODEL_ERROR = 0.004
 
-# An area is significant if a frame has fewer areas of this size by chance (judgement).
+# An area is significant if chance gives fewer areas of its size in a frame than this number (judgement).
 _BY_CHANCE = 0.1
 
 # Largest distance of adjacent patches, relative to the distance of patches in a row; diagonal neighbours have 1.41.
@@ -44,7 +44,7 @@ AROUND = 8  # Largest number of patches adjacent to a patch
 _ALIKE = 6  # Number of patches with similar codes: both neighbours along each axis of the colour cube
 
 
-class SmallPlaces:
+class CoveredPatchFinder:
     """Finds covered patches in a frame from their deviations.
 
     `rgb`: (C, 3) printed codes. `cells_mm`: (C, 2) positions. `usable`: (C,) bool, patches inside the frame that were
@@ -64,7 +64,7 @@ class SmallPlaces:
     def disturbed(self, deviation: _Array, sigma: _Array) -> tuple[_Index, _Array, _Index, _Index]:
         """Find covered patches and isolated deviations.
 
-        `deviation`: (K, C) float64, relative deviation from the code's value in each lit channel; NaN if not compared.
+        `deviation`: (K, C) float64, relative deviation from the model in each lit channel; NaN if not compared.
         `sigma`: (K, C) float64, its standard deviation: noise of both frames and error of the model.
 
         Returns covered patches (N,) int64 in ascending order, their relative deviations (N,), the covered patches with
@@ -140,9 +140,9 @@ def cells_without_hot(cells: _Index, seeds: _Index, hot: _Mask, cells_mm: _Array
     An area remains if at least two of its patches with large deviations have no hot photosite. If only one of them has
     none, it becomes an isolated patch. The second result is the isolated patches (M,) int64.
 
-    `cells`, `seeds`: (N,) and (K,) int64 in ascending order, from `SmallPlaces.disturbed`: disturbed patches, and those
-    with large deviations. `hot`: (C,) bool, patches with a photosite that is hot in the dark frames. `cells_mm`: (C, 2)
-    positions.
+    `cells`, `seeds`: (N,) and (K,) int64 in ascending order, from `CoveredPatchFinder.disturbed`: disturbed patches,
+    and those of them with large deviations. `hot`: (C,) bool, patches with a photosite that is hot in the dark frames.
+    `cells_mm`: (C, 2) positions.
     """
     nearest = np.asarray(cKDTree(cells_mm).query(cells_mm, k=2)[0])[:, 1]
     pairs = cKDTree(cells_mm[cells]).query_pairs(_ADJACENT * float(np.median(nearest)), output_type="ndarray")

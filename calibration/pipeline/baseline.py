@@ -23,7 +23,7 @@ from calibration.pipeline.measuring import (
     ChartPoints,
     DecodedFrame,
     RegisteredFrame,
-    beyond_print,
+    background_counts,
     compared_cells,
     locate,
     register_frame,
@@ -106,7 +106,7 @@ def _baseline_of_first(
     variance = cells.var(axis=1, ddof=1)
     if registered.lens is not None:
         means = np.concatenate([cells.mean(axis=1), references.mean(axis=1, dtype=np.float64)])
-        added = registered.lens.added(FrameLevels(means, beyond_print(first, registered.lens.background)))
+        added = registered.lens.added(FrameLevels(means, background_counts(first, registered.lens.background)))
         cells -= added[: len(cells), None]
         references = references - added[len(cells) :, None].astype(np.float32)
     level = cells.mean(axis=1)
@@ -213,7 +213,7 @@ def _spread_frame(baseline: Baseline, frames: _Frames, view: PrintView, is_mixed
         means, highest = baseline.patches(decoded.mosaic, decoded.black)
         usable &= np.isfinite(means).all(axis=1) & (highest < CLIPPING_SHARE * decoded.saturation)
         total += np.nan_to_num(means)
-        beyond += beyond_print(decoded, view.background)
+        beyond += background_counts(decoded, view.background)
         count, file = count + 1, file or decoded.record.file
     if not count:
         return None

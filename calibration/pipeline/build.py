@@ -301,7 +301,7 @@ def _accumulate_all(
 def _accumulate(
     accumulator: Accumulator, records: Sequence[FrameRecord]
 ) -> Generator[tuple[Accumulator, MeasuredFrame | MeasuredDarkFrame]]:
-    """Yield the accumulator after each frame, with the measured frame; threads measure the next ones."""
+    """Yield the accumulator after each frame, with the measured frame; threads measure the next frames."""
 
     def measure_early(record: FrameRecord) -> EarlyMeasurement:
         # Runs in a thread, with the accumulator at that moment.

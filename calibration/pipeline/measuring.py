@@ -98,7 +98,7 @@ class GreyLevels:
     def read(self, means: _Array, field: _Array) -> tuple[_Array, _Array]:
         """Return value and standard error of each level, (G, 3) float64 counts; NaN without a usable reference.
 
-        `means`: (N, 3) counts above black of each grey reference, NaN if unusable. `field`: (N, 3) flat field there.
+        `means`: (N, 3) counts above black of each grey reference, NaN if unusable. `field`: (N, 3) their flat field.
         """
         flat = means / field
         value, error = np.full((len(self.names), 3), np.nan), np.full((len(self.names), 3), np.nan)
@@ -261,7 +261,7 @@ class Baseline:
     first: RegisteredFrame
     whites: _Array  # (W, 3) counts above black of the white references; NaN if unusable
     means: _Array  # (C + W + N, 3) counts above black of patches and references
-    paper: PaperReader  # Reads flat field and white of a frame, based on the shape of the first frame
+    paper: PaperReader  # Measures flat field and white of a frame, based on the flat field of the first frame
     transfer: PhotonTransfer
     # Linearity, from the first frame and the primaries; a usual one if primaries are missing or the chart moved
     superposition: Superposition
@@ -342,7 +342,7 @@ class Baseline:
         return reflectances(self.means, field, paper.white)
 
 
-def beyond_print(decoded: DecodedFrame, beyond: Sites) -> _Array:
+def background_counts(decoded: DecodedFrame, beyond: Sites) -> _Array:
     """Return the mean (3,) float64 counts above black of the background behind the print; 0 if not visible."""
     if not len(beyond.rows):
         return np.zeros(3)
@@ -488,7 +488,7 @@ def _to_subtract(
     means = np.concatenate([cells, references.mean(axis=1, dtype=np.float64)])
     if dark is not None:
         means -= dark.patches
-    added = moved.lens.added(FrameLevels(means, beyond_print(decoded, moved.lens.background))).astype(np.float32)
+    added = moved.lens.added(FrameLevels(means, background_counts(decoded, moved.lens.background))).astype(np.float32)
     return added if dark is None else added + dark.patches
 
 

@@ -28,8 +28,8 @@ _LEAST_WHITE = 50.0  # minimum counts of paper in a channel for measuring reflec
 
 _MOST_REFLECTANCE = 1.5  # upper bound relative to paper, against noise in a dim channel
 
-# Largest deviation of a sample from the median of its patch, in σ: read noise exceeds it once in 2.5 million samples,
-# the number in a chart.
+# Largest deviation of a sample from the median of its patch, in σ. Read noise alone exceeds it in less than one of a
+# hundred charts.
 _FAR_SIGMA = 6.0
 
 _Array = npt.NDArray[np.float64]
@@ -46,8 +46,8 @@ _NEVER = 32767  # initial value of the least excess, before the first dark frame
 class DarkLight:
     """Dark light to subtract from frames."""
 
-    paper: _Array  # (3,) counts of paper without field, for the record
-    patches: npt.NDArray[np.float32]  # (P, 3) counts of each patch as seen by the camera, with field
+    paper: _Array  # (3,) counts of paper, divided by the flat field; only recorded
+    patches: npt.NDArray[np.float32]  # (P, 3) counts of each patch in the frame, not divided by the flat field
     share: _Array  # (3,) weight of the mean residuals, 0 … 1
 
 
@@ -120,7 +120,7 @@ class DarkSummary:
     """Summary of all dark frames of a session."""
 
     files: tuple[str, ...] = ()
-    # (3,) leak and ambient light on paper, counts, without field: median of frames; NaN without frames
+    # (3,) dark light on paper, counts, divided by the flat field: median of all frames; NaN without frames
     light: _Array = field(default_factory=lambda: np.full(3, np.nan))
     error: _Array = field(default_factory=lambda: np.full(3, np.nan))  # (3,) its standard uncertainty
     blacks: tuple[_Array, ...] = ()  # (2, 2) counts of each frame
@@ -137,7 +137,7 @@ class DarkFrameFigures:
 
     record: FrameRecord
     black: FloatArray  # (2, 2) counts
-    light: FloatArray  # (3,) counts above black level on paper, without field
+    light: FloatArray  # (3,) counts above black level on paper, divided by the flat field
     error: FloatArray  # (3,) its standard uncertainty
     noise: FloatArray  # (3,) standard deviation of a sample, counts
     origin: FrameOrigin = field(default_factory=FrameOrigin)

@@ -146,7 +146,7 @@ class DriftCorrection:
     """Gains by which the illuminants of a LUT are divided, so that all have the brightest state of the lamp."""
 
     gains: _Array  # (L, 3) lamp relative to the brightest white frame, in (0, 1], rounded to `DIGITS`
-    left: float  # relative uncertainty of the lamp between white frames (`undetermined`)
+    left: float  # relative uncertainty of the lamp between white frames (`drift_uncertainty`)
 
 
 def drift_correction(at_s: _Array, white_at_s: _Array, white: _Array) -> DriftCorrection:
@@ -161,10 +161,10 @@ def drift_correction(at_s: _Array, white_at_s: _Array, white: _Array) -> DriftCo
     gains: _Array = np.ones((len(at_s), 3))
     for channel in range(3):
         gains[:, channel] = np.interp(at_s, white_at_s, relative[:, channel])
-    return DriftCorrection(np.round(gains, DIGITS), undetermined(at_s, white_at_s, white))
+    return DriftCorrection(np.round(gains, DIGITS), drift_uncertainty(at_s, white_at_s, white))
 
 
-def undetermined(at_s: _Array, white_at_s: _Array, white: _Array) -> float:
+def drift_uncertainty(at_s: _Array, white_at_s: _Array, white: _Array) -> float:
     """Return the largest relative deviation of the lamp from linear changes between white frames.
 
     Each white frame is predicted from the frames before and after it, and the largest error of a channel is returned.
