@@ -226,7 +226,7 @@ AGREEMENT = Figure(
     "agreement", "Correlation of patches and chart", "geometry", "", "at least", 0.97, MIN_AGREEMENT,
     why="the colours differ from the chart",
     source=SIMULATED + ": at least 0.99; about 0 for another order of the patches",
-    remedy="give the chart.json of this print, and print without colour management",
+    remedy="use the chart.json of this print, and print without colour management",
     measure=lambda table: table.registration.agreement, of_one_frame="known",
     cause=Explanation("chart", chart_evidence), drawing="chart", lines=(Line(110, _agreement_row),),
 )  # fmt: skip

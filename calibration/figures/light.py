@@ -118,7 +118,7 @@ def _drift_residual(table: TableMeasurements) -> float | None:
 
 
 DRIFT_LEFT = Figure(
-    "drift_left", "Drift between white frames that may remain", "light", "share", "at most", 0.002, 0.005,
+    "drift_left", "Drift that may remain between white frames", "light", "share", "at most", 0.002, 0.005,
     why="the lamp jumps or flickers between two white frames, so that an illuminant gets a wrong brightness; the "
     "colour of its ground truth is correct",
     source=SIMULATED + ": 0.1 % for a steady drift on a small chart; 0.5 % for a jump of 1 %",
@@ -264,7 +264,7 @@ def _linearity_detail(table: TableMeasurements) -> tuple[str, str] | None:
 LINEARITY_KNOWN = Figure(
     "linearity_known", "Linearity measured", "radiometry", "", "at least", 1.0, None,
     why="the proportionality of counts and light is unknown; the uncertainty of the ground truth assumes a typical "
-    "camera", source="uncertainty budget",
+    "camera", source="definition of the uncertainty budget",
     remedy="plan red, green and blue alone (acquire illuminations does) for a chart of at least 512 colours, or give "
     "a series of exposures of the chart with --linearity",
     detail=_linearity_detail, before_session=False, measure=_is_linearity_measured,
@@ -324,8 +324,8 @@ def _sum_row(table: TableMeasurements) -> SummaryRow | None:
 
 ADDITIVITY = Figure(
     "additivity", "White above the sum of the primaries", "light", "share", "at most", 0.02, None,
-    why="codes do not predict an illuminant: the projector brightens or converts white, or frames have wrong names "
-    "or exposures", source=JUDGEMENT + "; the drift of the lamp is corrected first",
+    why="an illuminant cannot be predicted from its codes: the projector brightens or converts white, or frames have "
+    "wrong names or exposures", source=JUDGEMENT + "; the drift of the lamp is corrected first",
     remedy="switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
     measure=_sum_deviation(-1), cause=Explanation("sum", _sum_evidence), lines=(Line(260, _sum_row),),
 )  # fmt: skip
@@ -428,8 +428,8 @@ OFF_BRIGHTNESS = Figure(
 
 EXCHANGED_LIGHTS = Figure(
     "exchanged_lights", "Pairs of illuminants with exchanged names", "light", "", "at most", 0, None,
-    why="their whites fit each other's codes; each ground truth is correct, but its codes and colour temperature "
-    "belong to the other",
+    why="the whites of two illuminants fit each other's codes; each ground truth is correct, but has the codes and "
+    "the colour temperature of the other illuminant",
     source=SIMULATED + ": none in rooms without faults; all exchanges at a larger angle than exchange_deg are detected",
     remedy="correct the list of imported frames, or take both frames again",
     measure=_code_value(lambda codes: float(len(codes.exchanges))), where=_exchanges_text,
@@ -470,7 +470,7 @@ def _checked_row(table: TableMeasurements) -> SummaryRow | None:
 CROSS_CHECKED_SHARE = Figure(
     "cross_checked_share", "Illuminants that could be compared with their codes", "light", "share", "at least", 0.9,
     None,
-    why="a wrong name of the others would not be detected",
+    why="wrong names of the other illuminants would not be detected",
     source="a wrong name must be detectable if its illuminant differs by 8°, which is refused",
     remedy="take white, red, green and blue in the session, and expose longer", before_session=False,
     measure=_code_value(lambda codes: float(codes.is_verified.mean())), where=_checked_text,
@@ -563,7 +563,7 @@ def _tint_row(table: TableMeasurements) -> SummaryRow | None:
 
 GREY_TINT_DEG = Figure(
     "grey_tint_deg", "Tint of the print's greys against paper", "radiometry", "°", "at most", 6.0, None,
-    why="the greys have another colour than paper, which is the ground truth; on images rendered by codes, methods "
+    why="the colour of paper is the ground truth, and the greys differ from it; on images rendered by codes, methods "
     "that rely on grey have this error",
     source=JUDGEMENT + "; simulated prints: 1° to 2.5° with the printer's profile; with ink codes, as in the "
     "publication, 4.5° (poster paper) to 8° (glossy)",

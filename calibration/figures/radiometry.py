@@ -101,7 +101,7 @@ ADDED_LIGHT = Figure(
     why="this light is equal on dark and bright patches, and changes more patches than those listed as unfit",
     source=SIMULATED + ": 0 in rooms without faults; light of 1 % of paper white makes a patch of 10 % of paper white "
     "10 % brighter, and a patch of 3 % 30 % brighter",
-    remedy="turn the print or the projector until it shows no reflection, or print on matt paper",
+    remedy="turn the print or the projector until the print shows no reflection, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.is_known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
@@ -179,8 +179,8 @@ def _disturbed_count(table: TableMeasurements) -> float | None:
 DISTURBED_CELLS = Figure(
     "disturbed_cells", "Adjacent patches with large deviations in an illuminant's frame", "radiometry", "", "at most",
     0, None,
-    why="their samples under that illuminant do not have the colours of these patches; they are listed as unfit, and "
-    "other patches are not affected",
+    why="the samples of these patches under the illuminant are wrong; the patches are listed as unfit, and other "
+    "patches are not affected",
     source=SIMULATED + ": none in rooms without faults; two adjacent patches that deviate by five standard deviations "
     "are sufficient, unless the dark frames show hot photosites there",
     remedy="keep the space between lamp, print and camera free", measure=_disturbed_count, of_one_frame="bounded",
@@ -255,7 +255,7 @@ OTHER_EXPOSURE = Figure(
 
 OTHER_ISO = Figure(
     "other_iso", "Frames of another ISO speed", "radiometry", "", "at most", 0, None,
-    why="they differ in noise and saturation; their exposure is judged separately",
+    why="these frames differ in noise and saturation; their exposure is judged separately",
     source="by definition", remedy=_KEEP_EXPOSURE,
     measure=lambda table: float(len(table.origins.other_iso)), of_one_frame="bounded",
     where=lambda table, accepted: _foreign_frames_text(table.origins.other_iso), cause=Explanation("iso", iso_evidence),
@@ -263,7 +263,7 @@ OTHER_ISO = Figure(
 
 WHITE_FRAMES = Figure(
     "white_frames", "White frames", "light", "", "at least", 1, None,
-    why="without them, drift of the lamp, stains on the print and the uniformity of patches cannot be measured",
+    why="without white frames, drift of the lamp, stains and the uniformity of patches cannot be measured",
     source="by definition; drift needs two white frames",
     remedy="take white frames during the session (sequence.reference_every)",
     before_session=False, measure=lambda table: float(len(table.white_frames)), drawing="course",

@@ -93,7 +93,7 @@ def _frame_reference_spread(frame: FrameMeasurements) -> float:
 REFERENCE_SPREAD = Figure(
     "reference_spread", "Scatter of white references about the flat field, under white", "truth", "share", "at most",
     0.01, 0.05,
-    why="the flat field does not describe local changes or an unusual fall-off of light; they remain in the samples",
+    why="the flat field does not describe local changes or an unusual fall-off of light, which remain in the samples",
     source=SIMULATED + ": 0.3 % of noise and photosite response",
     remedy="clean or flatten the print, and look for shadows on it",
     measure=lambda table: max(map(_frame_reference_spread, table.white_frames), default=None), of_one_frame="bounded",
