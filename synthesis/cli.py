@@ -51,9 +51,8 @@ def table(
     lights: Annotated[
         str | None,
         typer.Option(
-            help="CSV file with a column of wavelengths and a column for each spectrum, or published spectra: D65,A,"
-            "FL2,cie-led,5600K,2000:10000:200K,daylight:4000:10000:500; by default the illuminants of the simulated "
-            "projector."
+            help="CSV file with columns of wavelengths and spectra, or published spectra: D65,A,FL2,cie-led,"
+            "5600K,2000:10000:200K,daylight:4000:10000:500; by default the 707 illuminants of the simulated projector."
         ),
     ] = None,
     settings: Annotated[

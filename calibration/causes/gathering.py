@@ -245,7 +245,7 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
     added, kept = light_of_spot(stains, spot, int(np.argmax(np.abs(colour))))
     size_mm, min_deviation = max(position.size_mm, 1e-9), _HALF * abs(deviation)
     hottest = table.dark_frames.hottest
-    deviating_whites = _whites_deviating_at(table, at_mm, position.size_mm, min_deviation)
+    deviating_whites = _faulty_whites(table, at_mm, position.size_mm, min_deviation)
     white_residual = len(deviating_whites) / max(len(table.white_frames), 1)
     evidence = Evidence(
         **_frame_evidence(table, at_mm, size_mm, min_deviation),
@@ -268,16 +268,14 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
     elif 0 < white_residual <= _HALF:
         frames = deviating_whites
     elif evidence.even_showing > 0:
-        frames = _frames_deviating_at(table, at_mm, size_mm, min_deviation)
+        frames = _faulty_frames(table, at_mm, size_mm, min_deviation)
         frames = [frame for frame in frames if frame.record.kind == "white"]
     if frames:
         position = replace(position, file=frames[0].record.file)
     return CauseEvidence(evidence, tuple(frame.record for frame in frames), (position,))
 
 
-def _whites_deviating_at(
-    table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float
-) -> list[FrameMeasurements]:
+def _faulty_whites(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float) -> list[FrameMeasurements]:
     reach = max(size_mm, 3 * cell_mm(table.cells.stains))
     return [
         frame
@@ -353,7 +351,7 @@ def _frame_evidence(table: TableMeasurements, at_mm: _Array, size_mm: float, min
     other_frames = [frame for frame in table.frames if frame is not first]
     if not other_frames:
         return {}
-    deviating_frames = _frames_deviating_at(table, at_mm, size_mm, min_deviation)
+    deviating_frames = _faulty_frames(table, at_mm, size_mm, min_deviation)
     whites = [frame for frame in other_frames if frame.record.kind == "white"]
     showing = len(deviating_frames) / len(other_frames)
     return {
@@ -364,9 +362,7 @@ def _frame_evidence(table: TableMeasurements, at_mm: _Array, size_mm: float, min
     }
 
 
-def _frames_deviating_at(
-    table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float
-) -> list[FrameMeasurements]:
+def _faulty_frames(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float) -> list[FrameMeasurements]:
     """Return the frames that deviate at a position from the frame registered first, worst first."""
     first = table.registered_frame
     frames = [

@@ -382,8 +382,7 @@ def _codes_row(table: TableMeasurements) -> SummaryRow | None:
 
 
 OFF_CODES_DEG = Figure(
-    "off_codes_deg", "Angle of an illuminant's white to the prediction from its codes", "light", "°", "at most", 2.0,
-    8.0,
+    "off_codes_deg", "Angle of an illuminant's white to its prediction from codes", "light", "°", "at most", 2.0, 8.0,
     why="a frame has the name of another illuminant, or was taken before the projected image changed: the codes do "
     "not belong to the whites",
     source=SIMULATED + ": 0 in rooms without faults; at least 28° if a list of frames is shifted by a row",
@@ -500,8 +499,7 @@ _above_angle = _white_frames_above(lambda white: white.off_deg)
 _above_brightness = _white_frames_above(lambda white: white.off_brightness)
 
 WHITE_FRAME_DEG = Figure(
-    "white_frame_deg", "Angle of a white frame to the prediction from the illuminants", "light", "°", "at most", 2.0,
-    8.0,
+    "white_frame_deg", "Angle of a white frame to the prediction from illuminants", "light", "°", "at most", 2.0, 8.0,
     why="the frame shows another illuminant than white, or the illuminants have wrong names",
     source=SIMULATED + ": 0 in rooms without faults",
     remedy="correct the list of imported frames, or take the white frame again",
