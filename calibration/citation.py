@@ -102,8 +102,8 @@ class OriginRecord(Record):
     first_frame: Line | None = None  # Time of the first frame, ISO 8601, UTC
     last_frame: Line | None = None  # Time of the last frame, ISO 8601, UTC
     frames: int = Field(default=0, ge=0)
-    projector: Line | None = None  # Maker and model from its control port, else from the lab
-    screen: Line | None = None  # Display of the colours, as the session names it
+    projector: Line | None = None  # From the lab, else from the projector's control port
+    screen: Line | None = None  # Display that shows the colours, as the session names it
     taken_by: Line | None = None  # Software that took the session; `Provenance.software` built the LUT
     title: Line | None = None
     authors: list[Line] = Field(default_factory=list[Line])

@@ -23,8 +23,8 @@ _Slot = npt.NDArray[np.int32]
 # module of a tag is two parts wide, so that every printed edge lies between two parts.
 PARTS = 5
 
-# Number of slots on each side of a patch whose light is calculated separately. For light from further away, the
-# position of the sampling window within its slot does not matter.
+# On each side of a patch, the light of this number of slots is calculated separately. For light from further away,
+# the position of the sampling window within its slot does not matter.
 REACH = 2
 
 ACROSS = 2 * REACH + 1  # Slots along one side of the square around a patch
@@ -83,8 +83,8 @@ def weights_around(
     `row`, `column`, `neighbours`, `parts`: (N,), (N,) int64, (N, 25) and (5 R, 5 C) int32, as in `PrintedGrid`.
     `offset`: (N, 3, 2) px along the print's axes, from the patch centre to the window centre of each channel. `pitch`:
     (N, 2) px, width and height of a slot at each patch. `shares`: of K kernels, (K, pitches, offsets, 25), by
-    `window_shares`.
-    `grid`: (4,) first pitch and step, first offset and step. `amount`: (N, 3, K), amount of each kernel.
+    `window_shares`. `grid`: (4,) first pitch and step, first offset and step. `amount`: (N, 3, K), fraction of
+    light that each kernel spreads.
     """
     kernels, patch_count = shares.shape[0], len(row)
     x, y = np.empty(ACROSS * PARTS), np.empty(ACROSS * PARTS)

@@ -122,8 +122,8 @@ class LightMeasurements:
     additivity: Additivity | None  # White against the sum of the primaries; None if a frame is missing
     # Agreement of illuminants and codes; None after a check. In `exchanges` and `seen_as`, indices ≥ L are white frames
     codes: CodeAgreement | None
-    # Agreement of white frames and full white: of the first, or of all if they differ by more than drift; None without
-    # white frames
+    # Agreement of white frames and full white; None without white frames. If they differ by drift alone,
+    # only the first is compared
     white_frames: CodeAgreement | None
     # Drift correction in the LUT; None if not requested. All other values are as measured
     drift: DriftCorrection | None = None

@@ -24,11 +24,11 @@ from foundation.compiled import compiled, inlined
 # A smaller difference between the rim and the centre of a patch, relative to its mean, is negligible (judgement).
 UNEVEN_SHARE = 0.01
 
-# Standard deviations from which this difference is significant. Noise alone exceeds 5 σ once in 1.7 million
-# comparisons; a full chart needs 98 304.
+# The difference is significant from this number of standard deviations. Noise alone exceeds 5 σ once in 1.7 million
+# comparisons, and a full chart has 98 304.
 UNEVEN_SIGMA = 5.0
 
-# A photosite with less than this fraction of the light of its patch is dead. The rim next to a dark patch has more.
+# A photosite with less than this fraction of the light of its patch is dead. Next to a dark patch, the rim keeps more.
 DEAD_SHARE = 0.5
 
 # Patches with fewer counts are not searched for dead photosites, so that noise is not mistaken for them.
@@ -46,7 +46,7 @@ _CURVE_BINS = 48  # Largest number of such groups for the photon-transfer curve
 # Possible sides of a sampling window, half-size px. They are odd, so that a window has a central pixel.
 WINDOWS = (3, 5, 7, 9)
 
-# Negligible fraction of a sample's light that comes from outside its patch. A remark needs five times as much.
+# Negligible fraction of a sample's light that comes from outside its patch. The accepted limit is 5 times higher.
 SAFE_BLEED = 0.002
 
 MISPLACEMENT_PX = 0.75  # Largest error of a sample's position: rounding 0.5 px, registration 0.25 px

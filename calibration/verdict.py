@@ -146,7 +146,7 @@ def findings(verdict: Verdict, table: TableMeasurements) -> dict[str, ProbableCa
 
 
 def retake_command(records: Sequence[FrameRecord]) -> str:
-    """Return the command that repeats frames: by illuminant number, or from the report if there are other frames."""
+    """Return the command that repeats frames: by number if all show illuminants, else from the report."""
     lights = [record.illumination for record in records if record.kind == "light"]
     numbers = [light for light in lights if light is not None]
     return COMMAND if len(numbers) < len(records) else COMMAND.replace("bad", lights_text(numbers))

@@ -355,7 +355,7 @@ class SpectralLamp:
     """A luminaire at a fixed position that emits one spectrum per illuminant. All illuminants have one flat field.
 
     Spectra have no absolute brightness. Each exposure is set so that the strongest channel of bare paper reaches
-    `white_level_share` of the room.
+    the fraction `Room.white_level_share` of saturation.
     """
 
     world: World  # Camera, print and room

@@ -123,7 +123,7 @@ def _require_unclipped(whites: _Array, frame_name: str) -> None:
     if usable < MIN_REFERENCES:
         raise QualityError(
             f"{frame_name}: {usable} of {len(whites)} references are unclipped, expected {MIN_REFERENCES} or more; "
-            "expose less: reduce room.white_level_share, or with the projector exposure.shutter_s, in the settings"
+            "reduce room.white_level_share in the settings; without --lights, exposure.shutter_s may be reduced instead"
         )
 
 

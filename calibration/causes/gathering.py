@@ -29,8 +29,8 @@ MAX_POSITIONS = 12  # Largest number of positions per figure; more marks would c
 # If at least this fraction of frames differs at a position from the frame registered first, that frame is faulty.
 IN_FIRST = 0.8
 
-# Another frame shows the same spot if it deviates by at least this fraction of the deviation of the spot. White frames
-# with a deviation are listed as single frames if they are at most this fraction of all white frames.
+# Another frame shows the same spot if it deviates by at least this fraction of the deviation of the spot. If at most
+# this fraction of the white frames shows the spot, these frames are faulty, and not the print.
 _HALF = 0.5
 
 # Relative residual of references from which an object is reported: ten times their noise under white.
@@ -45,8 +45,8 @@ _MIN_BRIGHT = 4
 # A thin shadow darkens at least this fraction of the patches on which it falls (judgement).
 _MOSTLY = 0.8
 
-# If fewer patches are darker, one of them must deviate by this fraction. The reflectance of a hand is rarely so close
-# to a printed colour (judgement).
+# If fewer patches are darker, one of them must deviate by this fraction. A hand and a printed colour rarely differ less
+# (judgement).
 _COVERED = 0.1
 
 # If at least this fraction of the noisy patches is in spots of the print, the spots explain the noise.

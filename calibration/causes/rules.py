@@ -168,7 +168,7 @@ class Evidence:
     - `frames`: number of compared frames.
     - `showing`: fraction of these frames that show the deviation.
     - `even_showing`: fraction of the white frames among them that show the deviation; 0 without white frames.
-    - `white_residual`: fraction of white frames with white references that deviate at the position, at least by half.
+    - `white_residual`: fraction of white frames with white references that have at least half of this deviation.
     - `some_whites`: 1 if white references deviate at the position in some white frames but not in all; else 0.
     - `spot`: fraction of the patches at the position with a wrong colour in the mean of the white frames.
     - `in_first`: 1 if at least 80 % of the frames differ at the position from the frame registered first; else 0.
@@ -192,8 +192,8 @@ class Evidence:
     - `cameras`: number of cameras or lenses that the raw files name.
     - `room`: light while the projector shows black, as a fraction of white.
     - `room_change`: change of `room` between dark frames, as a fraction of white.
-    - `stray`: light of a primary in frames with its code 0, beyond the dark frames, as a fraction of that primary.
-    - `stray_primaries`: additional light in all frames of primaries, as a fraction of white: their sum exceeds white.
+    - `stray`: light of a primary although its code is 0, minus the dark light, as a fraction of that primary.
+    - `stray_primaries`: room light in the frames of primaries, as a fraction of white; it makes their sum exceed white.
     - `lone_primary`: relative difference between the amount of one primary in white and the amounts of both others.
     - `mixed`: relative excess of one primary in white, if white lacks about as much of another primary.
     - `colour_scatter`: relative scatter of white's colour between successive white frames, beyond drift.
@@ -201,7 +201,7 @@ class Evidence:
     - `lit`: fraction of the unfit patches that are too bright because of added light.
     - `misplaced`: fraction of the unfit patches with an uncertain position.
     - `uneven`: fraction of the unfit patches with a rim that differs from the centre.
-    - `waves_px`: RMS distance of the tags from their positions on a flat sheet, half-size px, for patches of 10 px.
+    - `waves_px`: RMS distance of the tags from a flat sheet, half-size px, scaled to patches of 10 px.
     - `beyond_cell`: fraction of the worst sample's light that comes from outside its patch.
     """
 
@@ -307,7 +307,7 @@ DARK = _subjects("dark")
 STRAY = _subjects("stray")
 CHART = _subjects("chart")
 
-# At the position, the white frames agree with the frame registered first. The deviation is therefore in all frames.
+# No white frame differs from the frame registered first at the position. All frames therefore deviate there equally.
 _IN_ALL_FRAMES = (
     Condition("in_first", 0, 0), Condition("even_showing", 0, 0), Condition("some_whites", 0, 0),
     Condition("frames", 2, _INFINITY),
@@ -389,13 +389,13 @@ RULES: tuple[Rule, ...] = (
         ROOM_LIGHT,
         STRAY,
         (Condition("stray", 0.004, 0.1),),
-        "frames of illuminants with a code of 0 have more or less light of this primary than the dark frames",
+        "a primary with code 0 has more or less light in frames of illuminants than in the dark frames",
     ),
     Rule(
         ROOM_LIGHT,
         STRAY,
         (Condition("stray_primaries", 0.004, 0.1),),
-        "the frames of red, green and blue add up to more than white, each by the same amount, and the lamp is steady; "
+        "red, green and blue alone add up to more than white by the same fraction of each, and the lamp is steady; "
         "a projector that reduces full white has the same effect",
     ),
     Rule(

@@ -81,7 +81,7 @@ _MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0  # Standard uncertainty of a predicted pa
 class FrameConsistency:
     """Differences between a frame and the reference frame; 0 if no patch can be compared."""
 
-    # relative scatter about the polynomial without noise, beyond 4 standard uncertainties, in the worst channel
+    # relative scatter about the polynomial, minus noise and 4 standard uncertainties, in the worst channel
     scatter: float = 0.0
     block: float = 0.0  # relative deviation of the worst block, beyond 4 standard uncertainties
     at_mm: tuple[float, float] = (0.0, 0.0)  # centre of the worst block on the print

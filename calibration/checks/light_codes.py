@@ -30,8 +30,8 @@ _Array = npt.NDArray[np.float64]
 # Number of standard uncertainties subtracted from an angle or a brightness, so that noise is not reported.
 CERTAIN_SIGMAS = 4.0
 
-# Two names are reported as exchanged if twice the logarithm of the odds for it is larger. A part of 25 allows for the
-# 250 000 pairs of 707 illuminants. The remaining 5 are odds of ten to one.
+# Two names are reported as exchanged if twice the logarithm of the odds exceeds this value. It is the
+# sum of 25 for the 250 000 pairs of 707 illuminants, and 5 for odds of ten to one.
 EXCHANGE_EVIDENCE = 30.0
 
 # An illuminant is verified if any exchange with an illuminant at a larger angle would be detected. Errors above this
@@ -57,8 +57,8 @@ _CHROMA_SD, _MOST_CHROMA_SD = 0.003, 0.012
 # missing.
 _BRIGHTNESS_SD, _UNKNOWN_DRIFT_SD = 0.03, 0.06
 
-# Largest misfit of few illuminants with correct names: constant part, and part per illuminant. Simulated rooms without
-# faults were below 6 + 1.7 per illuminant, rooms with an exchange over 6° or more above 12 + 3.3.
+# Largest misfit of few illuminants with correct names: constant part, and part per illuminant. In simulated rooms, it
+# was below 6 + 1.7 per illuminant without faults. With an exchange at 6° or more, it was above 12 + 3.3.
 _MAX_MISFIT, _MAX_MISFIT_EACH = 8.0, 2.5
 
 # Largest squared distance (χ² of six values) of two whites from the prediction for their exchanged codes. Noise alone
@@ -96,10 +96,10 @@ class CodeAgreement:
     off_deg: _Array  # (L,) angle beyond four standard uncertainties, or 0
     brightness: _Array  # (L,) relative difference of brightness from the prediction; −0.5 is half as bright
     off_brightness: _Array  # (L,) amount of `brightness` beyond four standard uncertainties, ≥ 0
-    seen_as: _Integers  # (L,) illuminant whose codes predict a deviating white; −1: none
+    seen_as: _Integers  # (L,) illuminant whose codes predict the white, if it deviates; −1: none
     exchanges: tuple[ExchangedLights, ...]  # most likely first
     is_verified: npt.NDArray[np.bool_]  # (L,) whether the white is verified by its codes (`VERIFIED_DEG`)
-    exchange_deg: float  # largest angle between two illuminants with an undetected exchange; 0: none
+    exchange_deg: float  # largest angle between illuminants at which an exchange is not detectable; 0: none
     misfit: float  # χ² of the fit to few illuminants, relative to its limit for correct names; 0 with many illuminants
 
     def rows(self, lights: slice) -> CodeAgreement:
@@ -299,7 +299,7 @@ def _evaluate_pairs(fit: ProjectorFit, pairs: _Integers) -> tuple[_Array, _Array
 
 
 def _seen_as(mean: _Array, cov: _Array, white: _Array, off_deg: _Array) -> _Integers:
-    """Return for each deviating illuminant the illuminant (L,) with codes that predict its white; −1 for the others."""
+    """Return the index (L,) of the illuminant whose codes predict a deviating white; −1 for the other whites."""
     seen_as = np.full(len(white), -1, dtype=np.int64)
     for light in np.flatnonzero(off_deg > 0).tolist():
         own_white = np.broadcast_to(white[light], mean.shape)

@@ -20,7 +20,8 @@ _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
-_FAR = 5.0  # Standard deviations of a large deviation: noise alone exceeds them once in a million comparisons
+# A deviation is large above this number of standard deviations. Noise alone exceeds it once in a million comparisons.
+_FAR = 5.0
 
 # Standard deviations above which an isolated patch is reported (judgement). More are required, because a session has
 # millions of comparisons, and the polynomial is less accurate at the corners of the colour cube.
@@ -137,8 +138,8 @@ class CoveredPatchFinder:
 def cells_without_hot(cells: _Index, seeds: _Index, hot: _Mask, cells_mm: _Array) -> tuple[_Mask, _Index]:
     """Remove deviations that hot photosites cause: return a mask (N,) of the remaining disturbed patches.
 
-    An area remains if at least two of its patches with large deviations have no hot photosite. If only one of them has
-    none, it becomes an isolated patch. The second result is the isolated patches (M,) int64.
+    An area remains if at least two of its patches with large deviations have no hot photosite. If only one such patch
+    is left, it becomes an isolated patch. The second result is the isolated patches (M,) int64.
 
     `cells`, `seeds`: (N,) and (K,) int64 in ascending order, from `CoveredPatchFinder.disturbed`: disturbed patches,
     and those of them with large deviations. `hot`: (C,) bool, patches with a photosite that is hot in the dark frames.

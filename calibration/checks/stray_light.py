@@ -42,7 +42,7 @@ _Mask = npt.NDArray[np.bool_]
 class StrayLight:
     """Room light in some frames of L illuminants that is not in the dark frames."""
 
-    # (L,) amount furthest from 0 among the primaries with code 0, where 1 is full code; NaN: not checked
+    # (L,) amount of a primary with code 0, furthest from 0; 1 at full code; NaN: not checked
     at_zero: _Array
     certain: _Array  # (L,) absolute amount beyond four standard uncertainties, ≥ 0; 0 if not checked
     of_primaries: float  # certain room light in the frames of the primaries, relative to white; 0 if not checked
@@ -117,7 +117,7 @@ def stray_light(
         return None
     inverse = np.linalg.inv(primary_whites)
     amounts = white @ inverse
-    # An error in the counts of a primary has the weight of its amount.
+    # Each primary adds the variance of its counts, multiplied by the square of its amount.
     variance = error**2 + amounts**2 @ error[list(primaries)] ** 2
     spread = np.sqrt(variance @ inverse**2)
     has_primary = codes > 0
@@ -172,8 +172,8 @@ def _are_clean(amounts: _Array, has_primary: _Mask, spread: _Array, share: float
     return bool(missing[contains.any(axis=1)].max() <= _MAX_MISSING * share)
 
 
-# Smallest amount of a primary in a mixture that is used as a proof. If the frame of this primary contained room light,
-# the primary with code 0 would have a negative amount, at least half as large as the room light.
+# Smallest amount of a primary with which a mixture shows whether the frame of this primary contains room light. Room
+# light then gives the primary with code 0 a negative amount, at least half as large as the room light.
 _MIN_AMOUNT = 0.5
 
 _MIN_MIXTURES = 3  # Number of mixtures per primary that must agree (judgement: in one, errors may cancel)

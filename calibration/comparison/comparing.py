@@ -162,7 +162,7 @@ def table_of(folder: Path, progress: Callable[[int, int, str], None] | None = No
         try:
             build(session, lut, progress)
         finally:
-            # `acquire run --retake bad` expects the report of a refused frame in SESSION.refused.
+            # `acquire run --retake bad` finds the report of a refused LUT next to the session.
             refused_report = refused_folder(lut) / REPORT_JSON
             if refused_report.is_file():
                 write_atomic(refused_folder(folder.resolve()) / REPORT_JSON, refused_report.read_bytes())

@@ -1,8 +1,8 @@
 """Type of a figure: a measured property of a session or LUT, with its limits, explanation and report lines.
 
 A value within `accept` is accepted. Between `accept` and `refuse`, the LUT is accepted with a remark. Beyond `refuse`,
-the LUT is not written. A figure without `refuse` only leads to remarks. Most limits are defined in this package. A
-limit that a measurement applies itself is imported from there, for example from `calibration.registration.register`.
+the LUT is not written. A figure without `refuse` only leads to remarks. Most limits are defined in this package.
+Limits that other modules apply as well are imported from them, for example from `calibration.registration.register`.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class Figure(Limit):
     - `drawing`: the plot that shows the figure, if any.
     - `lines`: lines of the figure in the summary.
     - `foremost`: True if a refusal reports this figure first, because other figures may follow from it.
-    - `detail`: returns a text added to messages and the remedy, if both depend on the detected fault.
+    - `detail`: returns an addition to messages, and the remedy, if they depend on the detected fault.
     """
 
     _: KW_ONLY

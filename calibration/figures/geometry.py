@@ -92,7 +92,7 @@ BLEED = Figure(
     "bleed", "Light of neighbouring patches in the worst sample", "geometry", "share", "at most", 0.01, 0.03,
     why="the lens's blur mixes neighbouring patches into the outermost pixels of the window",
     source="integral of the blur beyond the patch's edge, for a sample misplaced by 0.75 px: with a sharp lens, 0.2 % "
-    "in patches of 10 px and 0.6 % in patches of 8.6 px; the mean of a patch contains a thirtieth of it",
+    "in patches of 10 px and 0.6 % in patches of 8.6 px; a thirtieth of these values in the mean of a patch",
     remedy="focus on the print, stop down to f/8, move the camera closer, or use a smaller window (build-lut "
     "--window)", measure=_worst_sample_bleed, of_one_frame="known", drawing="chart",
     lines=(
@@ -154,8 +154,8 @@ CORRECTION_WORST = Figure(
     0.03, None,
     why="veiling glare adds as much to dark patches as to bright ones; the relative error of dark ones is several "
     "times the mean",
-    source="3 % is three standard deviations of a mean of 300 counts; " + SIMULATED + ": 0.3 to 1.9 % if the error of "
-    "all patches is accepted", remedy=_REDUCE_GLARE,
+    source="3 % is three standard deviations of a mean of 300 counts; " + SIMULATED + ": 0.3 to 1.9 % if "
+    "correction_residual is accepted", remedy=_REDUCE_GLARE,
     before_session=False, measure=_uncorrected_in_worst_cell, where=_glare_text,
 )  # fmt: skip
 

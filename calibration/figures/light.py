@@ -286,7 +286,7 @@ def _oversubtracted_share(table: TableMeasurements) -> float | None:
     return float(certain.max()) if is_dark_light else 0.0
 
 
-_DARK_MARGIN = 1.25  # Largest excess that dark light explains, relative to the dark light and with its error
+_DARK_MARGIN = 1.25  # Dark light with its error explains an excess up to this multiple of the dark light
 
 
 TOO_DARK = Figure(
@@ -444,7 +444,7 @@ CODE_MISFIT = Figure(
 )  # fmt: skip
 
 EXCHANGE_DEG = Figure(
-    "exchange_deg", "Angle above which exchanged names are excluded", "light", "°", "at most", 8.0, None,
+    "exchange_deg", "Angle above which exchanged names are detected", "light", "°", "at most", 8.0, None,
     why="exchanged names of two illuminants at a smaller angle would not be detected",
     source=SIMULATED + ": 0.3° with 707 illuminants, 0° with eight very different illuminants",
     remedy="take white and the primaries in the session, and expose longer",
@@ -461,7 +461,7 @@ def _checked_row(table: TableMeasurements) -> SummaryRow | None:
     codes = table.lights.codes
     if codes is None:
         return None
-    value = f"{_checked_text(table, 0.0)}; exchanged names excluded down to {format_value(codes.exchange_deg, '°')}"
+    value = f"{_checked_text(table, 0.0)}; exchanged names detectable above {format_value(codes.exchange_deg, '°')}"
     note = "a wrong name of the other illuminants would not be detected"
     return SummaryRow("Illuminants compared with codes", value, note)
 
@@ -470,7 +470,7 @@ CROSS_CHECKED_SHARE = Figure(
     "cross_checked_share", "Illuminants that could be compared with their codes", "light", "share", "at least", 0.9,
     None,
     why="wrong names of the other illuminants would not be detected",
-    source="a wrong name must be detectable if its illuminant differs by 8°, which is refused",
+    source="a wrong name must be detectable from 8° on, the angle at which a LUT is refused",
     remedy="take white, red, green and blue in the session, and expose longer", before_session=False,
     measure=_code_value(lambda codes: float(codes.is_verified.mean())), where=_checked_text,
     lines=(Line(230, _checked_row),),

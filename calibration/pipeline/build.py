@@ -135,7 +135,7 @@ def build(
     report : WriteReport, optional
         Writes a report into the folder before it gets its final name.
     options : BuildOptions
-        Samples and corrections, by default as in the paper.
+        Samples and corrections.
     linearity : Path, optional
         Folder with a series of exposures, to measure the sensor's linearity.
     judged_by : Sequence[Figure]

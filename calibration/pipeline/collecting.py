@@ -77,8 +77,8 @@ class Accumulator:
     ) -> Accumulator:
         """Return the state before the first frame.
 
-        `saturation`: raw count of the first registered frame. `first_dark`: dark frame to subtract from the frames
-        before it.
+        `saturation`: raw count of the first registered frame. `first_dark`: first dark frame, to subtract from frames
+        taken earlier.
         """
         count, samples, first = baseline.chart.colour_count, baseline.options.samples, baseline.first
         inside = np.concatenate([first.cells.inside, first.references.inside])

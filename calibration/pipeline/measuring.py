@@ -263,14 +263,14 @@ class Baseline:
     means: _Array  # (C + W + N, 3) counts above black of patches and references
     paper: PaperReader  # Measures flat field and white of a frame, based on the flat field of the first frame
     transfer: PhotonTransfer
-    # Linearity, from the first frame and the primaries; a usual one if primaries are missing or the chart moved
+    # Linearity, from the first frame and the primaries; usual values if primaries are missing or the chart moved
     superposition: Superposition
     primaries: Primaries | None = None  # The primaries alone; None if missing or unusable
     lens: LensCorrection | None = None  # Measured light spread; None if not measured
 
     @cached_property
     def consistency_check(self) -> ConsistencyCheck:
-        """Comparison of frames with the first frame. The flat field is for the colour of each patch, if known."""
+        """Comparison of frames with the first frame. With primaries, the flat field depends on a patch's colour."""
         level = self.means[: len(self.points.cells_mm)]
         if self.primaries is None:
             field = self.paper.base.at(self.points.cells_mm)

@@ -145,8 +145,8 @@ def _darkness_component(table: TableMeasurements, white: _Array, cells: _Array) 
 
 
 def _oversubtracted_counts(table: TableMeasurements, dark: _Array) -> _Array:
-    # If `dark` (3,) counts are too high, white exceeds the primaries' sum by twice the excess, because each primary
-    # lacks it. A projector with a white segment has the same effect.
+    # If `dark` (3,) counts are too high, white lacks the excess once, and the primaries' sum three times. White then
+    # exceeds the sum by twice the excess. A projector with a white segment has the same effect.
     additivity = table.lights.additivity
     if additivity is None:
         return _USUAL_OVERSUBTRACTION * dark

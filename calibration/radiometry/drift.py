@@ -135,7 +135,7 @@ def _dark_correction(subtracted: _Array) -> dict[str, Any]:
         "how": "light of the previous dark frame (projector leak and room light), subtracted from samples, ground "
         "truth and references before division by the field; for a patch, it is paper times field of the dark frame "
         "times reflectance of the patch under white, plus the mean residual of the patch in all dark frames so far, "
-        "with a weight that is small if noise is large; the values are for paper, without field",
+        "with a weight that is small if noise is large; per_light is this light on paper, without field",
         "unit": "counts",
         "per_light": np.round(subtracted, 4).tolist(),
     }
@@ -170,8 +170,8 @@ def drift_uncertainty(at_s: _Array, white_at_s: _Array, white: _Array) -> float:
     Each white frame is predicted from the frames before and after it, and the largest error of a channel is returned.
     The error of interpolated gains is a quarter of this value if the drift is smooth, and at most twice this value if
     the lamp jumps. With two white frames, their whole difference is returned, because it may be a jump. Illuminants
-    before the first or after the last white frame get the gain of that frame. Their error is the change of the lamp
-    in an equal time next to that frame.
+    before the first or after the last white frame get the gain of that frame. Their error is estimated
+    from the rate of change next to that frame.
 
     `at_s`, `white_at_s`, `white`: as for `drift_correction`.
     """

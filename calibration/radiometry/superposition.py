@@ -126,7 +126,7 @@ class Superposition:
         return weights @ self.covariance @ np.swapaxes(weights, 1, 2) + chromatic[:, :, None] * chromatic[:, None, :]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of `report.json`, relative to the level of each node."""
+        """Return the values for `report.json`, each divided by the level of its node."""
         level = np.array(NODES) * self.full
         shares = {"deviation": self.deviation / level, "standard_error": np.sqrt(np.diag(self.covariance)) / level}
         rounded = {name: [float(f"{value:.4g}") for value in values.tolist()] for name, values in shares.items()}
@@ -166,8 +166,8 @@ def superposition(
     hats, size = _hats(levels / full), _AMOUNTS + len(NODES)
     whites = _WHITES if white else ((_LOOSE, _LOOSE, 1.0),)
     priors = [(_prior(full, scale, *sigmas), odds) for scale, (*sigmas, odds) in product(_SCALES, whites)]
-    # The unknowns are differences from this start. The squares of the full light are so large that they would hide the
-    # differences between priors.
+    # The unknowns are differences from this start. Otherwise, the large squares of counts would hide the differences
+    # between priors.
     start = np.zeros(size)
     start[:3] = 1.0 if white else np.linalg.lstsq(levels[1:].reshape(3, -1).T, levels[0].ravel(), rcond=None)[0]
     solution, covariance = start, np.zeros((size, size))
@@ -244,7 +244,7 @@ def _usual(full: float) -> _Array:
     level = np.array(NODES)
     bends = [_USUAL_BEND * level**2, _USUAL_BEND * level**3]
     losses = [_USUAL_LOSS * (1 - np.exp(-level / scale)) for scale in _LOSS_SCALES]
-    # A straight line has the same effect as other amounts of the primaries. It is removed from each shape.
+    # The straight part of a shape cannot be distinguished from the amounts of the primaries, so it is removed.
     shapes = [shape - level * float((shape / level).mean()) for shape in (*bends, *losses)]
     covariance: _Array = full**2 * (
         np.sum([np.outer(shape, shape) for shape in shapes], axis=0) + np.diag(_USUAL_REST * level) ** 2
