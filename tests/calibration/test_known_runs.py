@@ -222,7 +222,7 @@ def test_places_of_cells(pinned: Pinned) -> None:
         ]
         result.append([*map(brief, blocks), *(brief(one.error_px) for one in errors)])
     marks = random.uniform(0, 100, (300, 2))
-    unfollowed = matching.unfollowed_px(marks[:40] + 0.5, marks, random.normal(0, 0.2, (300, 2)), 0.7, 20.0)
+    unfollowed = matching.unfollowed_wave_sigma_px(marks[:40] + 0.5, marks, random.normal(0, 0.2, (300, 2)), 0.7, 20.0)
     pinned("places of cells", [result, brief(unfollowed)], **LOOSE)
 
 
