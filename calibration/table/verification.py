@@ -83,7 +83,7 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
         ("Session", session),
         ("Chart", source.chart_sha256),
         ("Samples", source.samples_sha256 or ""),
-        ("Hashes", f"of all files in {SUMS}; the hash of {SUMS} identifies the LUT"),
+        ("Hashes", f"of all files in {SUMS}; the hash of this list identifies the LUT"),
         ("LUT", lut.sha256),
     ]
 

@@ -4,9 +4,9 @@ Zarr specification version 3 with the codec `sharding_indexed`: one chunk per il
 compressed by Blosc (Zstandard after bit shuffle). The other files of the LUT are stored unchanged as attributes. The
 attribute `whole` is set to true at the end; only an array without it may be overwritten.
 
-Data from a store are not trusted. Files, shape and chunks of the array and the header of `samples.npy` must agree. Sizes
-are limited, and only the file names and codecs of published LUTs are accepted. A fetched LUT appears in its folder
-complete and verified, or not at all. Needs zarr, the extra `cluster`.
+Data from a store are not trusted. Files, shape and chunks of the array and the header of `samples.npy` must agree.
+Sizes are limited, and only the file names and codecs of published LUTs are accepted. A fetched LUT appears in its
+folder complete and verified, or not at all. Needs zarr, the extra `cluster`.
 """
 
 from __future__ import annotations
