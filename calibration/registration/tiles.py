@@ -319,14 +319,14 @@ class LocatedBlocks:
     centres_mm: _Array  # (B, 2) expected positions on the print
     moves_mm: _Array  # (B, 2) located minus expected positions
     score: _Array  # (B,) correlation of frame and predicted print, −1 … 1
-    minimum_score: float = _MIN_BLOCK_SCORE  # blocks with a lower score are not used
+    least_score: float = _MIN_BLOCK_SCORE  # blocks with a lower score are not used
 
     def information(self, moves_px: _Array, spacing_mm: _Array, cell_px: float) -> _Array:
         """Return the inverse covariance (B, 2, 2) float64 px⁻² of the positions of the blocks.
 
         `moves_px`: (B, 2) `moves_mm` converted to the frame. `spacing_mm`: (2,) distance of blocks in x and y.
         """
-        score = np.where(self.score > self.minimum_score, self.score, 0.0)
+        score = np.where(self.score > self.least_score, self.score, 0.0)
         weight = _weights(self.centres_mm, moves_px, score, spacing_mm, cell_px)
         return (weight / (_MOVE_SIGMA_CELLS * cell_px) ** 2)[:, None, None] * np.eye(2)
 
