@@ -102,8 +102,8 @@ PLAN: Final = "plan.json"
 RECORDS: Final = "shards"  # Folder of the records of shards
 NOTES: Final = ".plan"  # Folder of plan and records in an object store
 _SHARD_PIECE: Final = "shard"  # Name of the piece of a complete shard; pieces of images have their numbers as names
-_HEAD_BYTES: Final = 80  # Bytes of a record file that contain the name of its first piece, after a SHA-256
-_READERS: Final = 16  # Record files that are read in parallel, because most of the time is waiting for the store
+_HEAD_BYTES: Final = 80  # Number of bytes at the start of a record file that contain the name of its first piece
+_READERS: Final = 16  # Number of record files read in parallel, because a read mostly waits for the store
 
 PlanIdentity = Mapping[str, Any]
 
@@ -117,8 +117,8 @@ _WORD: Final = 1 << 64  # Number of values of the eight bytes of a hash that sel
 
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
     """Return the split of a source; `shares` of train, validation and test have the sum 1."""
-    # It depends on the seed and the content (the name, if there is no file), but on no other source. Copies of one file
-    # are therefore in the same split, and the shares are exact only on average.
+    # The split depends only on the seed and on the content of the source (the name, if there is no file). Copies of a
+    # file are therefore in the same split, and the shares are exact only on average.
     if shares is None:
         return None
     digest = hashlib.sha256(f"split {seed} {sha256 or name}".encode()).digest()[:8]
@@ -183,7 +183,7 @@ def photograph(
 
     For rendering by codes, all colours must have samples in the LUT. `number` is the number of the image.
     """
-    # The data set records only the hash of the LUT, so samples must match their hashes.
+    # The data set records the hash of the LUT, so the samples must still match the hashes in the LUT.
     for mixture in lighting.mixtures:
         for light in mixture.lights:
             lut.require_unchanged(light)
@@ -310,12 +310,12 @@ SILENT: Final = Callbacks()  # Callbacks that do nothing
 class _ReadSource:
     """A source picture that was read."""
 
-    cuts: tuple[Cut, ...]  # its crops, or one of the full picture; empty if all its images are finished
+    cuts: tuple[Cut, ...]  # its crops, or the full picture as one crop; empty if all its images are finished
     record: SourceRecord
 
 
 class ShardCancelled(Exception):
-    """A shard was cancelled because of an error elsewhere, which is handled there."""
+    """A shard was cancelled because of an error in another shard, which is reported there."""
 
 
 def make_shard(
@@ -526,7 +526,7 @@ def _unchanged_source(job: ShardJob, position: int, finished: Mapping[int, Finis
     first = records[0] if records else None
     if first is None or any(source != first for source in records):
         return None
-    # For a file in a store the hash is unknown before reading it.
+    # The hash of a file in a store is unknown until the file is read.
     return first if changed_sha256(job.sources[position - job.position], -math.inf) == first.sha256 else None
 
 
@@ -765,7 +765,7 @@ def _image_rows(name: str, source: str, image: ImageRecord, used_lights: Mapping
 
 def _uncertainty(label: str, lights: Mapping[int, Light]) -> str:
     # Expanded uncertainty in degrees; empty if the LUT does not report it. A mixture gets the largest value of its
-    # illuminants, because their errors have common causes and do not cancel.
+    # illuminants, because their errors have common causes and do not average out.
     uncertainties = [lights[int(term.partition(":")[0])].uncertainty_deg for term in label.split("+")]
     reported = [uncertainty for uncertainty in uncertainties if uncertainty is not None]
     return f"{max(reported):.4g}" if len(reported) == len(uncertainties) else ""
