@@ -324,7 +324,7 @@ def encode_dng(image: Image, metadata: ImageMetadata) -> bytes:
         TiffTag.COMPRESSION: (ValueType.SHORT, [1]),  # none
         TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [CFA]),
         TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
-        # The maker is not the maker of the camera, so that raw developers do not apply the black level of this camera.
+        # With the maker of the camera, raw developers would apply the black level and other properties of this camera.
         TiffTag.MAKE: text("CroP"),
         TiffTag.MODEL: text(model),
         TiffTag.ORIENTATION: (ValueType.SHORT, [1]),  # not rotated

@@ -356,7 +356,7 @@ class VariationOptions:
             "KIND",
             "Change the exposure: a factor such as 0.5; stops:low=-2,high=1 or normal:mean=-1,sd=0.5, drawn for each "
             "image; clip:share=0.01 saturates that share of the pixels; level:share=0.01,low=0.3,high=0.9 exposes "
-            "this share to a random level relative to saturation (most=8 limits the factor). The noise is adapted.",
+            "this share to a random level relative to saturation (most=8 limits the factor). Noise follows exposure.",
         ),
     ] = None
     gradient: Annotated[

@@ -227,7 +227,7 @@ class TileComparison:
         return self.of(self.points_mm, information, pull - np.einsum("cnij,cnj->cni", information, shift), self.score)
 
     def weakened(self, times: float) -> TileComparison:
-        """Return the comparison with `times` less information, because `times` measurements have the same error."""
+        """Return the comparison with information divided by `times`, if `times` measurements have the same error."""
         information, pull = self.of_channels
         return self.of(self.points_mm, information / times, pull / times, self.score)
 
