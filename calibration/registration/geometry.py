@@ -76,7 +76,7 @@ _REWEIGHTING_ROUNDS = 4
 _HUBER = 2.0  # Misfit, in standard deviations, above which the weight of a block decreases
 
 # Smallest ratio of the eigenvalues of an information matrix. A smaller eigenvalue is a rounding error and set to zero.
-_MIN_EIGENVALUE_RATIO = 1e-9
+_MIN_EIGEN_RATIO = 1e-9
 
 _MEDIAN_CHI2 = 3.357  # Median of χ² with 4 degrees of freedom: two colours, two directions
 
@@ -406,9 +406,7 @@ class LateralColour:
             return self
         positions, precisions, pulls = positions_px[is_used], information[:, is_used], pull[:, is_used]
         # The matrix may be singular, because the position of an edge point is only measured across the edge.
-        inverse = np.asarray(
-            np.linalg.pinv(total[is_used], rcond=_MIN_EIGENVALUE_RATIO, hermitian=True), dtype=np.float64
-        )
+        inverse = np.asarray(np.linalg.pinv(total[is_used], rcond=_MIN_EIGEN_RATIO, hermitian=True), dtype=np.float64)
         offset = (positions - self.centre_px) / self.radius_px
         design = np.stack([offset, offset * (offset**2).sum(axis=1, keepdims=True)], axis=-1)
         colours = [CHANNELS.index("R"), CHANNELS.index("B")]
