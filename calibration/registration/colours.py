@@ -34,9 +34,9 @@ _MISMATCH_NEIGHBOURS = 0.35
 
 _MAX_AREA_CELLS = 16  # Largest width of an area that is tested for a displacement, in patches
 
-_MIN_DISPLACEMENT_CELLS = 0.5  # Smallest apparent displacement of a displaced area, in patches
+_MIN_SHIFT_CELLS = 0.5  # Smallest apparent displacement of a displaced area, in patches
 
-_MIN_DISPLACEMENT_SIGMAS = 6.0  # The same in standard uncertainties
+_MIN_SHIFT_SIGMAS = 6.0  # The same in standard uncertainties
 
 # Number of independent measurements in an area. It is small, because model errors of neighbouring patches are
 # correlated.
@@ -127,9 +127,7 @@ def displaced_areas(
             gram = design.T @ design
             shift = np.linalg.solve(gram + 1e-9 * np.eye(2), design.T @ values[2][is_known])
             precision = np.sqrt(np.diag(gram) * _AREA_MEASUREMENTS / is_known.sum())
-            if (
-                (np.abs(shift) > _MIN_DISPLACEMENT_CELLS) & (np.abs(shift) * precision > _MIN_DISPLACEMENT_SIGMAS)
-            ).any():
+            if ((np.abs(shift) > _MIN_SHIFT_CELLS) & (np.abs(shift) * precision > _MIN_SHIFT_SIGMAS)).any():
                 displaced.append(np.array([first_column, first_row]) + size / 2)
     return np.array(displaced).reshape(-1, 2), area_count
 

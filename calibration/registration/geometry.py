@@ -68,7 +68,7 @@ _TERM_PRIOR_PX = 2.0
 
 # Systematic standard uncertainty of each term, at the frame corner (simulated frames). It is caused by errors of the
 # colour model, which are the same in all blocks.
-_SYSTEMATIC_TERM_PX = 0.01
+_SYSTEMATIC_PX = 0.01
 
 # Rounds of reweighted least squares. Covered blocks and blocks with colour errors get a low weight.
 _REWEIGHTING_ROUNDS = 4
@@ -438,6 +438,4 @@ class LateralColour:
             chi2: _Array = np.einsum("ni,nij,nj->n", misfit, misfit_precision, misfit)
             scale = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
             weight = np.minimum(1.0, _HUBER * np.sqrt(4 * scale / np.maximum(chi2, 1e-9)))
-        return replace(
-            self, terms_px=terms.reshape(2, 2), covariance_px2=covariance + np.eye(4) * _SYSTEMATIC_TERM_PX**2
-        )
+        return replace(self, terms_px=terms.reshape(2, 2), covariance_px2=covariance + np.eye(4) * _SYSTEMATIC_PX**2)

@@ -205,9 +205,9 @@ def register(
         # The blur is measured again at the refined edges. One pixel beside an edge it is too large, and a blur that is
         # too large would shift the edges outwards.
         refined_blur = blur_px(replace(framing, field=field))
-        field, _, lens, _ = _fit_lens_to_outline(field, (width, height))
+        field, _, lens, _ = _fit_outline(field, (width, height))
         field, marks, lateral = _refine_outline(_add_missing_outline(field, lens, chart), planes, refined_blur, lateral)
-        field, is_inlier, lens, residual = _fit_lens_to_outline(field, (width, height))
+        field, is_inlier, lens, residual = _fit_outline(field, (width, height))
         framing, marks = replace(framing, field=field), marks.select(is_inlier)
     lens_rms = rms(residual)
     if lens_rms > MAX_TAG_RESIDUAL_PX:
@@ -232,7 +232,7 @@ def register(
         rms_step_px, largest_step_px = matcher.step()
         if rms_step_px < _CONVERGED_RMS_PX and largest_step_px < _CONVERGED_MAX_PX:
             break
-    registration = _make_registration(chart, framing, matcher, marks, lens_rms)
+    registration = _registration(chart, framing, matcher, marks, lens_rms)
     _require_match(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, frame_name)
     if not chart.tags:
         _refuse_displaced_areas(matcher, registration.mismatched_cells, frame_name)
@@ -292,9 +292,7 @@ def _add_missing_outline(field: DetectedField, lens: Lens, chart: Chart) -> Dete
     return replace(field, outline_mm=points, outline_px=places, normals=normals)
 
 
-def _fit_lens_to_outline(
-    field: DetectedField, frame_size: tuple[int, int]
-) -> tuple[DetectedField, _Mask, Lens, _Array]:
+def _fit_outline(field: DetectedField, frame_size: tuple[int, int]) -> tuple[DetectedField, _Mask, Lens, _Array]:
     # Outliers are pins, text or lines in the margin of the sheet.
     is_kept = np.ones(len(field.outline_mm), dtype=np.bool_)
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
@@ -346,9 +344,7 @@ def _require_size_and_focus(cell_px: float, blur: float, frame_name: str) -> Non
         )
 
 
-def _make_registration(
-    chart: Chart, framing: ChartPose, matcher: Matcher, marks: Anchors, lens_rms: float
-) -> Registration:
+def _registration(chart: Chart, framing: ChartPose, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
     measured, expected, paper = matcher.patches()
     is_inside = np.asarray(np.isfinite(measured).all(axis=1))
     residual = marks.residual_px(matcher.in_channels(marks.points_mm))

@@ -176,9 +176,7 @@ def channel_terms(channel: int) -> npt.NDArray[np.int64]:
 
 def kernel_of_terms() -> list[tuple[int, int | None]]:
     """Return kernel and frame term of each unknown of a channel; the term is None for far kernels and veiling glare."""
-    near: list[tuple[int, int | None]] = [
-        (kernel, place) for kernel in range(len(NEAR_PX)) for place in range(FRAME_TERMS)
-    ]
+    near: list[tuple[int, int | None]] = [(k, term) for k in range(len(NEAR_PX)) for term in range(FRAME_TERMS)]
     return near + [(kernel, None) for kernel in range(len(NEAR_PX), len(NEAR_PX) + len(FAR_PX) + 1)]
 
 

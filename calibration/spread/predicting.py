@@ -32,7 +32,7 @@ FULL_BITS = 5
 VARYING_BITS = 4  # minimum bits per channel for prediction by neighbours; other charts have few colours
 
 # Side of a square of codes perpendicular to an axis. The curvature along the axis is averaged over this square.
-_CURVATURE_WINDOW = 5
+_SIDE = 5
 
 # Length scale of the random function, in code steps of a chart with three bits (judgement; fitted values are 7 to 20).
 _LENGTH_SCALE = 16.0
@@ -127,11 +127,9 @@ def _residual_without_curvature(columns: npt.NDArray[np.floating], side: int) ->
             (*(slice(None),) * axis, indices) for indices in (slice(1, side - 1), slice(0, side - 2), slice(2, side))
         )
         difference = cube[inner] - 0.5 * (cube[previous] + cube[following])
-        window = [1 if dimension == axis else _CURVATURE_WINDOW for dimension in range(3)]
+        window = [1 if dimension == axis else _SIDE for dimension in range(3)]
         # The mean over the surrounding codes excludes the patch itself.
-        total[inner] += (difference - uniform_filter(difference, [*window, 1], mode="nearest")) / (
-            1 - 1 / _CURVATURE_WINDOW**2
-        )
+        total[inner] += (difference - uniform_filter(difference, [*window, 1], mode="nearest")) / (1 - 1 / _SIDE**2)
         count[inner] += 1
     return (total / np.maximum(count, 1)).reshape(columns.shape)
 
