@@ -231,9 +231,8 @@ class Displacement:
 
         Minimises ``Σ ½ dᵀ A d − pullᵀ d + ½ |second differences|² / roughness²``.
 
-        `points_mm`: (N, 2), measured points. `information`: (N, 2, 2) A, inverse covariance of each measurement, px⁻²;
-        0 without a measurement. `pull`: (N, 2) A times the measured displacement, px⁻¹. `roughness_px`: prior standard
-        deviation of second differences.
+        `points_mm`: (N, 2), measured points. `information`: (N, 2, 2) A, px⁻²; 0 without a measurement. `pull`: (N, 2),
+        px⁻¹. `roughness_px`: prior standard deviation of second differences.
         """
         basis = self.basis(points_mm)
         rows, columns = self.coefficients.shape[:2]
@@ -394,9 +393,9 @@ class LateralColour:
     def remeasured(self, positions_px: _Array, information: _Array, pull: _Array) -> LateralColour:
         """Return the most likely shifts after a comparison of blocks in each channel.
 
-        `positions_px`: (B, 2) float64, centres of the blocks. `information`: (3, B, 2, 2) float64 px⁻², inverse
-        covariance of the displacement measured in red, green and blue; 0 without a measurement. `pull`: (3, B, 2)
-        float64 px⁻¹, information times displacement; displacements are relative to the current shifts.
+        `positions_px`: (B, 2) float64, centres of the blocks. `information`: (3, B, 2, 2) float64 px⁻², of the
+        displacements from the current shifts in red, green and blue; 0 without a measurement. `pull`: (3, B, 2)
+        float64 px⁻¹.
         """
         # A displacement common to all channels is no lateral colour and is eliminated from each block.
         total: _Array = information.sum(axis=0)

@@ -6,8 +6,7 @@ patch off. Then Gauss-Newton steps (`compare_tiles`) fit a smooth displacement t
 channels are used, each at its own position; the map is valid for green.
 
 A chart without tags is in smooth order: the colours of neighbouring patches are similar. Its first steps use blurred
-images in place of blocks. Names: `information` is the inverse covariance of a displacement; `pull` is information times
-displacement.
+images in place of blocks. `information` and `pull` are defined in `calibration.registration.tiles`.
 """
 
 from __future__ import annotations
@@ -210,8 +209,7 @@ def place_errors(
     """Estimate the standard uncertainty of positions from noise and from residual displacements of patches.
 
     The first part is the posterior uncertainty of the smooth fit; it grows in areas without measurements. The second
-    part covers shapes that the smooth fit cannot follow, such as folds and curled edges. In simulation, at least 98 %
-    of the patches of a sheet that is not flat lie within three standard uncertainties.
+    part covers shapes that the smooth fit cannot follow, such as folds and curled edges.
 
     `anchors`: (N, 2) mm and (N, 2, 2) px⁻², other points that fix the map, and their information. `systematic_px`:
     additional standard uncertainty, one value or (N,) per tile. `correlated`: neighbouring patches have common errors.
@@ -443,7 +441,6 @@ class Matcher:
         """Make one Gauss-Newton step with print and frame blurred by `sigma_cells` patches."""
         # The blur removes the steps between patches, so the result cannot be one patch off. Only large structures of
         # the colour order remain; areas with an even gradient get the displacement of their neighbours.
-        # Colour errors are correlated over many patches, so a window counts as few measurements.
         repeat = (_BLURRED_WINDOW_CELLS * _COARSE_PER_CELL) ** 2 / _WINDOW_MEASUREMENTS
         self._move(self._compare_blurred(sigma_cells).weakened(repeat))
         self.colours = self._fit_colours()

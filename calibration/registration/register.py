@@ -51,8 +51,7 @@ MIN_PLAIN_AGREEMENT = 0.95
 
 MIN_GOOD_BLOCKS = 0.75  # Minimum share of blocks of patches that match the chart (judgement)
 
-# Largest RMS residual of the blocks, for patches of 10 px. Simulated sheets with waves of 3 mm have less than a tenth
-# of it.
+# Largest RMS residual of the blocks, for patches of 10 px. Waves of 3 mm give less than a tenth of it in simulation.
 MAX_BLOCK_RESIDUAL_PX = 0.5
 
 # Maximum number of Gauss-Newton steps. A flat print needs two or three steps, a curled print five.
@@ -76,7 +75,7 @@ _OUTLIER_SIGMAS, _OUTLIER_PX = 5.0, 1.0
 _COARSE_BLURS = (1.0, 1.0, 0.6)
 
 # The frame is refused if at least this number and at least this share of the tested areas appear to be displaced by
-# one patch. Correct registrations in simulation have no such area.
+# one patch.
 _MIN_DISPLACED_AREAS, _MIN_DISPLACED_SHARE = 2, 0.015
 
 
