@@ -59,9 +59,10 @@ of a store supported by fsspec. OUT appears when it is complete: images/ (linear
 --layout), previews/, ground_truth.csv, gt.txt, sources.csv, dataset.json and SHA256SUMS.
 
 Each image shows a print of the picture under an illuminant, as the camera would record it. By default, a pixel is the
-mean response to its colour, interpolated between patches of the chart, plus noise. With --rendering codes, a pixel is
-one sample of the patch with its code. Equal seed, pictures and LUT give equal bytes with any number of workers. A
-picture that cannot be read is skipped and listed. To resume an interrupted run, run the same command again.
+mean response to the colour of the picture, interpolated between patches of the chart, plus noise. With --rendering
+codes, a pixel is one sample of the patch with the code of the picture. Equal seed, pictures and LUT give equal bytes
+with any number of workers. A picture that cannot be read is skipped and listed. To resume an interrupted run, run the
+same command again.
 
 The examples make a first data set from a computed LUT; training crops under illuminants of any chromaticity; and test
 images with two illuminants each, rendered as in the paper.

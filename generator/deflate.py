@@ -348,7 +348,7 @@ def find_repeats(image: Any, history: Any, distances: Any) -> None:
     open_bits = (uint64(1) << shift) - uint64(1)
     for slot in range(_HASHES):
         history[slot] = 0
-    samples, backs = image.reshape(-1), distances.reshape(-1)
+    samples, flat_distances = image.reshape(-1), distances.reshape(-1)
     # Positions start above the window size, so that empty entries are never in the window. All numbers are unsigned,
     # because numba adds a branch to each index that may be negative.
     position = uint64(_WINDOW + 1)
@@ -368,8 +368,8 @@ def find_repeats(image: Any, history: Any, distances: Any) -> None:
             history[slot] = entry
             # The distance to the last pixel with this hash. If that pixel differs, high bits are not 0. There is no
             # branch, because the processor cannot predict repeats.
-            back = (difference >> shift) | (difference << rotation)
-            backs[pixels] = uint16(back) if back - uint64(1) < uint64(_WINDOW) else uint16(0)
+            distance = (difference >> shift) | (difference << rotation)
+            flat_distances[pixels] = uint16(distance) if distance - uint64(1) < uint64(_WINDOW) else uint16(0)
             index += uint64(3)
             pixels += uint64(1)
             position += uint64(6)
@@ -388,17 +388,17 @@ def _symbol_of(distance: Any) -> Any:
 
 
 @compiled
-def _count(rows: Any, distances: Any, step: int, literals: Any, backs: Any) -> None:
+def _count(rows: Any, distances: Any, step: int, literals: Any, distance_counts: Any) -> None:
     # Add the symbols of one row in `step` to the frequencies of literals and distances. There is no branch on a match,
     # because it cannot be predicted. Each byte of a pixel has its own counter, so that increments do not wait.
     counts = np.zeros((6, 256), np.uint32)
     matches = 0
     for y in range(step // 2, rows.shape[0], step):
-        row, back = rows[y], distances[y]
+        row, row_distances = rows[y], distances[y]
         literals[row[0]] += 1
         run, previous = 1, uint32(0)
-        for x in range(len(back)):
-            distance = uint32(back[x])
+        for x in range(len(row_distances)):
+            distance = uint32(row_distances[x])
             if distance == previous and distance != uint32(0) and run < _LONGEST_RUN:
                 literals[_RUNS[run, 0]] -= 1
                 run += 1
@@ -409,7 +409,7 @@ def _count(rows: Any, distances: Any, step: int, literals: Any, backs: Any) -> N
             for i in range(6):
                 counts[i, row[1 + 6 * x + i]] += literal
             match = np.int64(uint32(1) - literal)
-            backs[_symbol_of(distance)] += match
+            distance_counts[_symbol_of(distance)] += match
             matches += match
     literals[_ONE_PIXEL] += matches
     for value in range(256):
@@ -418,14 +418,14 @@ def _count(rows: Any, distances: Any, step: int, literals: Any, backs: Any) -> N
 
 
 @compiled
-def _bits(literals: Any, backs: Any) -> int:
+def _bits(literals: Any, distance_counts: Any) -> int:
     # Total number of bits of symbols with these frequencies.
-    lengths, back_lengths = code_lengths(literals, LONGEST), code_lengths(backs, LONGEST)
+    lengths, distance_lengths = code_lengths(literals, LONGEST), code_lengths(distance_counts, LONGEST)
     total = 0
     for symbol in range(LITERALS):
         total += literals[symbol] * (lengths[symbol] + _LENGTH_BITS[symbol])
     for symbol in range(DISTANCES):
-        total += backs[symbol] * (back_lengths[symbol] + _DISTANCE_BITS[symbol])
+        total += distance_counts[symbol] * (distance_lengths[symbol] + _DISTANCE_BITS[symbol])
     return total
 
 
@@ -439,23 +439,23 @@ def _are_repeats_smaller(image: Any, plain: Any, filtered: Any, distances: Any, 
     counted = top + min(trial_rows - 1, _WINDOW_PIXELS // width)
     end = top + trial_rows
     find_repeats(image[top:end], history, distances[top:end])
-    literals, backs = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
-    _count(plain[counted:end], distances[counted:end], 1, literals, backs)
+    literals, distance_counts = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
+    _count(plain[counted:end], distances[counted:end], 1, literals, distance_counts)
     _subtract(plain[counted:end], filtered[counted:end])
     differences = np.zeros(LITERALS, np.int64)
     _count_bytes(filtered[counted:end], differences)
-    return _bits(literals, backs) <= _bits(differences, np.zeros(DISTANCES, np.int64))
+    return _bits(literals, distance_counts) <= _bits(differences, np.zeros(DISTANCES, np.int64))
 
 
 @compiled
-def _estimate(plain: Any, distances: Any, literals: Any, backs: Any) -> None:
+def _estimate(plain: Any, distances: Any, literals: Any, distance_counts: Any) -> None:
     # Estimate the frequencies of literals and distances of a band; every symbol that may occur gets at least 1.
     step = max(1, min(_STEP, len(distances) // _FEW_ROWS))
-    _count(plain, distances, step, literals, backs)
+    _count(plain, distances, step, literals, distance_counts)
     if step > 1 and literals.sum() < _FEW_SYMBOLS:
-        literals[:], backs[:], step = 0, 0, 1
+        literals[:], distance_counts[:], step = 0, 0, 1
         literals[END] = 1
-        _count(plain, distances, step, literals, backs)
+        _count(plain, distances, step, literals, distance_counts)
     if step > 1:
         for value in range(256):
             literals[value] = step * literals[value] + 1
@@ -465,7 +465,7 @@ def _estimate(plain: Any, distances: Any, literals: Any, backs: Any) -> None:
         for run in range(1, _LONGEST_RUN + 1):
             literals[_RUNS[run, 0]] += 1
         for symbol in range(DISTANCES):
-            backs[symbol] = step * backs[symbol] + 1
+            distance_counts[symbol] = step * distance_counts[symbol] + 1
 
 
 @compiled
@@ -546,7 +546,7 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
     # `joined` has the codes of both bytes of each sample value (`_join_codes`).
     offset, waiting, bit_count = writer[0], writer[1], writer[2]
     u0, u1, u2, u3, byte, low = uint64(0), uint64(1), uint64(2), uint64(3), uint64(8), uint64(63)
-    samples, backs = image.reshape(-1), distances.reshape(-1)
+    samples, flat_distances = image.reshape(-1), distances.reshape(-1)
     runs = _run_codes(codes)
     single = runs[1] & low
     matches = _match_codes(runs[1], back_codes)
@@ -558,12 +558,12 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
         offset, waiting, bit_count = flush(out, offset, waiting, bit_count + (row_code >> uint64(16)))
         end = x + width
         while x < end:
-            distance = uint64(backs[x])
-            following = uint64(backs[x + u1]) if x + u1 < end else u0
+            distance = uint64(flat_distances[x])
+            following = uint64(flat_distances[x + u1]) if x + u1 < end else u0
             # A match rarely continues. One sign bit tests it, because LLVM compiles two conditions to two branches.
             if (((following ^ distance) - u1) & (u0 - distance)) >> low:
                 run = u2
-                while run < uint64(_LONGEST_RUN) and x + run < end and uint64(backs[x + run]) == distance:
+                while run < uint64(_LONGEST_RUN) and x + run < end and uint64(flat_distances[x + run]) == distance:
                     run += u1
                 bits, length = _match(matches, distance)
                 bits, length = (bits >> single) << (runs[run] & low), length - single + (runs[run] & low)
@@ -597,21 +597,21 @@ def _pack(image: Any, last: int, plain: Any, filtered: Any, distances: Any, hist
     # one compiled call, because several short calls would often take the interpreter lock and slow other threads.
     largest = _split(image, plain)
     uses_repeats = _are_repeats_smaller(image, plain, filtered, distances, history)
-    literals, backs = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
+    literals, distance_counts = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
     literals[END] = 1
     if uses_repeats:
         find_repeats(image, history, distances)
-        _estimate(plain, distances, literals, backs)
+        _estimate(plain, distances, literals, distance_counts)
     else:
         _subtract(plain, filtered)
         _count_bytes(filtered, literals)
-    lengths, back_lengths = code_lengths(literals, LONGEST), code_lengths(backs, LONGEST)
+    lengths, distance_lengths = code_lengths(literals, LONGEST), code_lengths(distance_counts, LONGEST)
     codes = codes_of(lengths)
     writer = np.zeros(3, np.uint64)
-    put_head(out, writer, lengths, back_lengths, last)
+    put_head(out, writer, lengths, distance_lengths, last)
     if uses_repeats:
         _join_codes(codes, largest, joined)
-        _put_repeats(out, writer, image, distances, codes, codes_of(back_lengths), joined)
+        _put_repeats(out, writer, image, distances, codes, codes_of(distance_lengths), joined)
     else:
         _put_bytes(out, writer, filtered, codes)
     put(out, writer, codes[END] & 0xFFFF, codes[END] >> 16)

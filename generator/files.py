@@ -63,8 +63,8 @@ _ZLIB: Final = bytes([0x78, 0x01])  # zlib header: deflate, window of 32 KiB, fa
 # Compression level of ISA-L (0 to 3) for maps, and for OpenEXR after prediction. With the filter Up, ISA-L compresses
 # maps as well as OpenCV in a fifth of the time.
 _LEVEL: Final = 1
-# Number of bytes at the start that are compressed separately. ISA-L uses its fast loop for more than 16 bytes, and the
-# first hash of this loop is undefined (docs/decisions/0051-first-bytes-apart.md).
+# Number of bytes at the start that are compressed separately. ISA-L compresses so few bytes in another loop; the
+# first hash of its usual loop is undefined (docs/decisions/0051-first-bytes-apart.md).
 _APART: Final = 8
 _UP: Final = 2  # Filter type Up (clause 9.2)
 # Colour types (clause 11.2.2).

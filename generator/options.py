@@ -160,9 +160,9 @@ class LightOptions:
         Path | None,
         _light_option(
             "GT.csv",
-            "Use for picture or crop i the illuminant of the LUT nearest in angle to ground truth i of this file "
-            "(columns GT_R,GT_G,GT_B or r,g,b, or lines of three numbers). After its last line, the file is used again "
-            "from the start.",
+            "For picture or crop i, use the illuminant of the LUT with the smallest angle to ground truth i of this "
+            "file (columns GT_R,GT_G,GT_B or r,g,b, or lines of three numbers). After its last line, the file is used "
+            "again from the start.",
         ),
     ] = None
     match: Annotated[

@@ -92,7 +92,7 @@ _WITH_FOLDERS: Final = frozenset({"ftp", "sftp", "ssh", "smb", "webdav", "webdav
 
 @dataclass(frozen=True)
 class LocalStore:
-    """A folder of this machine. It must exist, so that late writes cannot change a completed data set."""
+    """A folder of this machine, which must exist. Publishing a data set renames it, so that later writes fail."""
 
     root: Path
 

@@ -77,7 +77,7 @@ def _with_neighbours(is_mismatched: _Mask, centres: _Array) -> _Mask:
 
 
 def agreement(measured: _Array, expected: _Array) -> float:
-    """Return the correlation of `measured` and `expected` colours, (N, 3), as the mean of the bright channels."""
+    """Return the correlation of `measured` and `expected` colours, (N, 3), mean over the bright channels."""
     light = np.median(measured, axis=0)
     channels = np.flatnonzero(light >= 0.3 * light.max())
     return float(np.mean([np.corrcoef(measured[:, channel], expected[:, channel])[0, 1] for channel in channels]))
@@ -172,8 +172,8 @@ def fit_colours(
     Polynomial and illumination are fitted in turn by least squares with Huber's weights.
 
     `rgb`: (N, 3) printed codes, 0 … 255. `points_mm`: (N, 2) centres. `measured`: (N, 3) float64 camera RGB, counts
-    above black level. `is_fine`: use degree 6 or 8 in place of 3 if there are enough patches; a smooth order needs
-    the higher accuracy.
+    above black level. `is_fine`: use degree 6 or 8 in place of 3 if there are enough patches. Charts without tags
+    need this accuracy, because their neighbouring patches are similar.
     """
     degree = (
         (8 if len(rgb) >= 4000 else 6)

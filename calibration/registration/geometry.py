@@ -4,7 +4,7 @@
 - `Displacement`: penalised tensor-product B-splines over the print (P. H. C. Eilers and B. D. Marx, "Flexible smoothing
   with B-splines and penalties", Statistical Science 1996). For a chart without tags, most of the displacement is
   modelled as height of the sheet above its plane. Height moves a point along a known line in the frame, so one measured
-  component determines both.
+  component determines the other.
 - `LateralColour`: red and blue lie a ρ + b ρ³ further out than green, where ρ is the distance from the frame centre, 1
   at the corner. The linear term is the chromatic difference of magnification, the cubic term the chromatic difference
   of distortion (W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 10).
@@ -141,7 +141,7 @@ def fit_lens(
     frame_size : (int, int)
         Width and height in half-size px.
     normals : (N, 2) float64, optional
-        Unit vectors across the edges, if the points lie on edges. Only this component of a position is then measured.
+        Unit vectors across the edges, if the points lie on edges. Only the component along the normal is then used.
 
     Returns
     -------
@@ -188,8 +188,7 @@ class Displacement:
     knot_mm: _Array  # (2,) distance of knots in x and y
     coefficients: _Array  # (rows, columns, 2) half-size px (dx, dy)
     lens: Lens | None = None  # maps heights to the frame; None: displacement without heights
-    # (rows, columns) heights as the movement that they cause at half the frame diagonal from the foot of the camera's
-    # perpendicular, half-size px; None without `lens`
+    # (rows, columns) heights, as the movement in half-size px where `Lens.parallax` is 1; None without `lens`
     heights: _Array | None = None
 
     @classmethod
@@ -393,8 +392,8 @@ class LateralColour:
     def remeasured(self, positions_px: _Array, information: _Array, pull: _Array) -> LateralColour:
         """Return the most likely shifts after a comparison of blocks in each channel.
 
-        `positions_px`: (B, 2) float64, centres of the blocks. `information`: (3, B, 2, 2) float64 px⁻², of the
-        displacements from the current shifts in red, green and blue; 0 without a measurement. `pull`: (3, B, 2)
+        `positions_px`: (B, 2) float64, centres of the blocks. `information`: (3, B, 2, 2) float64 px⁻², for the
+        distance of each channel from its current position; 0 without a measurement. `pull`: (3, B, 2)
         float64 px⁻¹.
         """
         # A displacement common to all channels is no lateral colour and is eliminated from each block.

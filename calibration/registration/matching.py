@@ -177,7 +177,7 @@ def unfollowed_wave_sigma_px(
     outline, and near the outline as large as the residual of the nearest outline points, if this is larger.
 
     `points_mm`: (N, 2) float64. `marks_mm`, `residual_px`: (M, 2) float64, outline points and their distance from the
-    map. `departure_px`: RMS displacement of the outline. `reach_mm`: distance that is near the outline.
+    map. `departure_px`: RMS displacement of the outline. `reach_mm`: largest distance of points near the outline.
     """
     squared_residual = (residual_px**2).sum(axis=1)
     distance, neighbours = cKDTree(marks_mm).query(points_mm, k=min(_NEAR_MARKS, len(squared_residual)))
@@ -185,7 +185,7 @@ def unfollowed_wave_sigma_px(
     local = np.where(distance[:, 0] <= reach_mm, squared_residual[neighbours].mean(axis=1), 0.0)
     squared = _INSIDE_FACTOR * np.maximum(local, squared_residual.mean())
     low, high = marks_mm.min(axis=0), marks_mm.max(axis=0)
-    # A corner point may belong to either side, and measures the position only across this side.
+    # Corner points are left out: each measures the position across only one of its two sides.
     on_side = (marks_mm - low < reach_mm / 4) | (high - marks_mm < reach_mm / 4)
     for axis in (0, 1):
         for end in (low[axis], high[axis]):

@@ -201,8 +201,8 @@ def register(
         lens, residual = fit_lens(marks.points_mm, marks.positions_px.sum(axis=0), (width, height))
     else:
         field, _, lateral = _refine_outline(framing.field, planes, blur, lateral)
-        # The blur is measured again at the refined edges. One pixel beside an edge it is too large, and a blur that is
-        # too large would shift the edges outwards.
+        # The blur is measured again at the refined edges. A blur measured one pixel beside an edge is too large, and
+        # would shift the edges outwards.
         refined_blur = blur_px(replace(framing, field=field))
         field, _, lens, _ = _fit_outline(field, (width, height))
         field, marks, lateral = _refine_outline(_add_missing_outline(field, lens, chart), planes, refined_blur, lateral)

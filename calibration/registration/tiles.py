@@ -292,17 +292,17 @@ def compare_tiles(
 class _LocalMean:
     """Weighted mean over a window around each element."""
 
-    def __init__(self, weight: _Float, window: int, keep_gradient: bool) -> None:
+    def __init__(self, weight: _Float, window: int, includes_gradient: bool) -> None:
         self._weight, self._window = weight, window
         # (H, W) valid share of each window
         self.share = np.maximum(box_mean(weight, window), np.float32(1e-3))
         rows, columns = (np.flatnonzero(weight.any(axis=axis)) for axis in (1, 0))
         self._inner: tuple[slice, slice] | None = None
-        if keep_gradient and min(len(rows), len(columns)) > window:
+        if includes_gradient and min(len(rows), len(columns)) > window:
             self._inner = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
     def __call__(self, image: _Float) -> _Float:
-        """Return the mean (H, W). With `keep_gradient`, the mean of an even gradient equals it, also at the border."""
+        """Return the mean (H, W). With `includes_gradient`, it contains even gradients, also at the border."""
         if self._inner is None:
             return np.asarray(box_mean(image * self._weight, self._window) / self.share, dtype=np.float32)
         margin = self._window // 2 + 1

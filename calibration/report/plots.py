@@ -349,7 +349,7 @@ def draw_course(figure: Any, table: TableMeasurements) -> None:
 
 
 def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], table: TableMeasurements) -> None:
-    axes.set(title="deviation of patches from similar codes", ylabel="%", xlabel="frame")
+    axes.set(title="deviation from similar patches", ylabel="%", xlabel="frame")
     if not has_enough_cells(len(table.registration.mismatched_cells)):
         axes.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=axes.transAxes)
         return
@@ -373,7 +373,7 @@ _Array = npt.NDArray[np.float64]
 
 
 def draw_errors(figure: Any, table: TableMeasurements, chart: Chart) -> None:
-    """Draw the deviation of patches from similar codes, and the uncertainty of their positions, over the print.
+    """Draw the deviation from patches with similar codes, and the uncertainty of their positions, over the print.
 
     Rings mark the worst patches. On charts with too few colours the first plot contains only a note.
     """
@@ -396,7 +396,7 @@ def draw_errors(figure: Any, table: TableMeasurements, chart: Chart) -> None:
     image = draw_squares(right, chart.page_mm, chart.centres_mm, side_mm, error, 4.1, cmap="cividis", vmin=0, vmax=top)
     figure.colorbar(image, ax=right, label="half-size px", shrink=0.8, extend="max")
     _mark(right, chart.centres_mm[int(np.argmax(error))])
-    left.set(title="deviation of patches from similar codes", ylabel="mm")
+    left.set(title="deviation from similar patches", ylabel="mm")
     right.set(title="standard uncertainty of positions")
     for axes in (left, right):
         axes.set(xlabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal", facecolor="#f2f3f5")

@@ -248,8 +248,8 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
         ),
         _Picture(
             "Course of the session",
-            "Black level, movement and blur of the chart, level of bare paper under white, deviation of patches from "
-            "similar codes, and number of white references in each frame. Rings mark the worst frames. A loss of "
+            "Black level, movement and blur of the chart, level of bare paper under white, deviation from patches "
+            "with similar codes, and number of white references in each frame. Rings mark the worst frames. A loss of "
             "focus affects all patches; a hand or a shadow affects a block of patches.",
             draw_png(draw_course, table),
             "radiometry",
@@ -293,7 +293,7 @@ def _main_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np.
         ),
         _Picture(
             "Errors of patches",
-            "Left: deviation of each patch with its neighbours from patches of similar codes elsewhere on the sheet. "
+            "Left: deviation of the neighbourhood of each patch from patches with similar codes elsewhere. "
             "Right: uncertainty of the position of each patch. Rings mark the worst patches.",
             draw_png(draw_errors, table, chart),
             name="errors",

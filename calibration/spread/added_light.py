@@ -20,10 +20,10 @@ from calibration.spread.predicting import LevelModel
 from experiment.measures.least_squares import page_polynomial
 from foundation.robust import biweight, sigma_by_level
 
-# Number of knots along the longer side of the print. The smallest spot that they can model is an eighth of it.
+# Number of knots along the longer side of the print. The smallest spot that they can model is an eighth of this side.
 _KNOTS = 9
 
-_FACTOR_ORDER = 4  # order of a polynomial over the page by which errors of the flat field multiply levels
+_FACTOR_ORDER = 4  # order of the polynomial over the page that multiplies levels, for errors of the flat field
 
 _FACTOR_SIGMA = 0.003  # prior standard deviation of the coefficients of this polynomial (judgement)
 
@@ -59,7 +59,7 @@ class AddedLight:
 
     @property
     def mean_square(self) -> _Array:
-        """(C, 3) float64, mean square error of each patch that added light causes, with its uncertainty."""
+        """(C, 3) float64, mean square error that added light causes: its square plus its variance."""
         return self.share**2 + self.error**2
 
 

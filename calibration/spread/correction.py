@@ -2,7 +2,7 @@
 
 The correction subtracts one number per patch and channel from the samples: the light that the lens added, minus the
 light that it removed. The noise of samples is unchanged. The light is calculated from the levels of the uncorrected
-frame, as in the fit of the point spread.
+frame. `calibration.spread.fitting` defines near and far kernels, their shares, and the T unknowns of a channel.
 
 Levels are counts above black level; lengths are half-size pixels; P is the number of patches in `PrintedGrid`.
 """
@@ -67,7 +67,7 @@ _Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PrintView:
-    """Properties common to all frames of a session: grid of the print, usual light, and background samples."""
+    """Properties common to all frames of a session: grid of the print, first flat field, background samples."""
 
     grid: PrintedGrid
     whites: slice  # indices of the white references
@@ -355,7 +355,7 @@ def _changes(
     bits: int,
     channel: int,
 ) -> tuple[_Array, _Array, _Array]:
-    """Return the effects of each of T unknowns on a channel, if the share is 1.
+    """Return the effects on a channel of T unknowns, each with the share 1.
 
     1. (T, P), change of levels: added light minus the change of the flat field, which is fitted to white references.
     2. (T,), mean change of the white references.

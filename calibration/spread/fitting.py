@@ -120,6 +120,10 @@ _SCATTERED = 0.04  # prior standard deviation of all scattered light of a lens t
 # Prior standard deviation of the difference between a share and the law, relative to the law (judgement).
 _OFF_LAW = 0.35
 
+# Standard deviation of the difference between a channel's far share and the common share of R, G and B, relative to the
+# share (judgement). Scatter and coatings vary over the visible spectrum.
+CHANNELS_APART = 1 / 3
+
 _LAW_APART = 0.7  # as `CHANNELS_APART`, for these differences (judgement)
 
 _SCATTER_APART = 0.5  # as `CHANNELS_APART`, for a lens that follows a law
@@ -127,11 +131,7 @@ _SCATTER_APART = 0.5  # as `CHANNELS_APART`, for a lens that follows a law
 # Expected share of a far kernel relative to the previous kernel. It would be 1 for a decrease with r⁻², 0.25 for r⁻³.
 _FAR_FALL = 0.5
 
-# Standard deviation of the difference between a channel's far share and the common share of R, G and B, relative to the
-# share (judgement). Scatter and coatings vary over the visible spectrum.
-CHANNELS_APART = 1 / 3
-
-# The same for three kinds of lenses: similar channels, different channels, and coatings for one channel.
+# `CHANNELS_APART` for three kinds of lenses: similar channels, different channels, and coatings for one channel.
 _APART = (0.03, CHANNELS_APART, 0.7)
 
 _APART_ODDS = (0.4, 0.4, 0.2)  # prior probabilities of `_APART` (judgement)
@@ -217,7 +217,7 @@ class PointSpread:
     covariance: _Array  # (TERMS, TERMS) of all unknowns, proven or not
     gain: float  # χ² gain of the proven kernels; by chance, each unknown gains 1
     held_out: float  # χ² gain in cross-validation
-    misfit: float  # χ² gain per unknown of smooth light that no kernel explains, ≥ 1; factor of the covariance
+    misfit: float  # χ² gain from smooth light that no kernel explains, per unknown, ≥ 1; factor of the covariance
     likeliest: _Array  # (TERMS,) most likely shares, also if no kernel is proven
 
     @property
@@ -322,7 +322,7 @@ def fit_spread(
         factors[_bend_of(item.channel)] = 1 / max(item.bend, _MIN_BEND) ** 2
         factors[row.unknowns[-(len(page_powers(_INK_ORDER)) - 1) :]] = 1 / USUAL_UNEVENNESS**2
     prior = np.diag(factors)
-    usual = np.asarray(np.linalg.inv(_usual_shares(bits, _Lens())), dtype=np.float64)
+    usual = np.asarray(np.linalg.inv(_prior_covariance(bits, _Lens())), dtype=np.float64)
     prior[:TERMS, :TERMS] = usual
     shape = np.arange(TERMS, TERMS + shapes)
     others = np.delete(np.arange(size), shape)
@@ -399,7 +399,7 @@ class _Lenses:
         """
         matrix, vector = weakened
         lenses = _assumed_lenses(bits < VARYING_BITS)
-        priors = np.array([np.linalg.inv(_usual_shares(bits, lens)) for lens in lenses])
+        priors = np.array([np.linalg.inv(_prior_covariance(bits, lens)) for lens in lenses])
         # Twice the logarithm of the evidence (D. MacKay, Bayesian interpolation, 1992). Veiling glare is restricted to
         # values ≥ 0, because a negative value is no evidence of veiling glare.
         gains = np.array([_positive(matrix + prior, vector, np.arange(TERMS))[1] for prior in priors])
@@ -463,11 +463,11 @@ def _usual_wide_light(bits: int, scatters: bool) -> _Array:
     mean_squares = np.zeros((TERMS, TERMS))
     for lens in lenses:
         probability = lens.odds / sum(lens.odds for lens in lenses)
-        mean_squares[np.ix_(wide, wide)] += probability * _usual_shares(bits, lens)[np.ix_(wide, wide)]
+        mean_squares[np.ix_(wide, wide)] += probability * _prior_covariance(bits, lens)[np.ix_(wide, wide)]
     return mean_squares
 
 
-def _usual_shares(bits: int, lens: _Lens) -> _Array:
+def _prior_covariance(bits: int, lens: _Lens) -> _Array:
     usual = np.diag(np.full(TERMS, (lens.near * _PRIOR_SHARE) ** 2))
     if bits < VARYING_BITS:
         varying = np.concatenate([group for group in groups_of_terms() if len(group) > _EVEN_TERMS])
@@ -514,7 +514,7 @@ def _take(normal: _Array, right: _Array, prior: _Array, terms: npt.NDArray[np.in
 
 
 def _misfit(normal: _Array, right: _Array, prior: _Array, shapes: int) -> float:
-    """Return the χ² gain per unknown of smooth light that no kernel explains; at least 1, the value by chance."""
+    """Return the χ² gain from smooth light that no kernel explains, per unknown; at least 1, the value by chance."""
     # This light adds equally to dark and bright patches.
     with_shape = _without_factors(normal, right, prior, TERMS + shapes)
     others = np.delete(np.arange(len(prior)), np.arange(TERMS, TERMS + shapes))

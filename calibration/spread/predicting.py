@@ -95,7 +95,7 @@ def _root(level: _Array) -> _Array:
 
 
 def neighbour_residual(columns: npt.NDArray[np.floating], bits: int) -> _Array:
-    """Return measured minus predicted values of patches, if neighbouring codes predict them; linear in the values.
+    """Return measured values of patches minus predictions from neighbouring codes; linear in the values.
 
     The prediction is the mean of both neighbours along each axis of the code. On charts with fewer than 32 codes per
     axis, it is corrected for curvature along the axis, which is averaged over the surrounding codes.

@@ -292,7 +292,7 @@ class Plan:
             "split": dict(zip(SPLITS, options.split, strict=True)) if options.split else None,
             "shard_images": options.shard_images,
         }
-        # Unused options add no key, so that such data sets keep their bytes between versions.
+        # Unused options add no key, so that data sets without them keep their bytes between versions.
         if options.variation is not None:
             recorded["variation"] = options.variation.describe()
         if options.crops > 1:

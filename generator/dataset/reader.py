@@ -60,7 +60,7 @@ _KEPT: Final = 4096  # Number of cached illuminants, several times the number in
 
 def read_entries(store: Store, description: Description) -> Iterator[Entry]:
     """Yield the entries of a data set in the order of their numbers, without reading images."""
-    # Both lists are in this order, and rows of an image are consecutive, so one line of each list is in memory.
+    # Only one line of `gt.txt` and of `ground_truth.csv` is in memory, because both are in this order.
     name = f"{store.location}/{GROUND_TRUTH}"
     split_of_image: dict[int, Split] = {}
     for split in SPLITS:

@@ -14,8 +14,8 @@ OUT. An object store has no rename: files are written to their final location, p
 - Each worker keeps about three pictures in memory.
 
 An image with one illuminant has the ground truth of this illuminant, also with a fall-off of brightness. With a
-coloured fall-off (`generator.variation.variation`), the illuminant is listed twice, for the near and the far end.
-Masks and ground truth maps then have the weights of both in each pixel.
+coloured fall-off (`generator.variation.variation`), the illuminant is listed twice, for both ends of the fall-off.
+Masks then have the weights of both ends in each pixel.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ _threads: Final = threading.local()
 # Shorter side in px below which a picture gets a note: probably an icon or a failed download, not a photograph.
 TINY_PX: Final = 16
 
-_WORD: Final = 1 << 64  # Number of values of the eight bytes of a hash that select the split of a source
+_HASH_VALUES: Final = 1 << 64  # Number of values of eight bytes; eight bytes of a hash select the split
 
 
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
@@ -122,7 +122,7 @@ def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str |
     if shares is None:
         return None
     digest = hashlib.sha256(f"split {seed} {sha256 or name}".encode()).digest()[:8]
-    position = int.from_bytes(digest, "big") / _WORD
+    position = int.from_bytes(digest, "big") / _HASH_VALUES
     bound = 0.0
     for split, share in zip(SPLITS, shares, strict=True):
         bound += share
@@ -181,7 +181,8 @@ def photograph(
 ) -> RawImage:
     """Return the raw image of a print of `picture` (H, W, 3) uint8, sRGB codes.
 
-    For rendering by codes, all colours must have samples in the LUT. `number` is the number of the image.
+    For rendering by codes, all colours must have samples in the LUT. `number` is the number of the image;
+    `white_level` limits the counts of images with masks.
     """
     # The data set records the hash of the LUT, so the samples must still match the hashes in the LUT.
     for mixture in lighting.mixtures:
@@ -647,14 +648,14 @@ def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
         has_uncertainty = bool(options.get("uncertainty"))
         table.write(csv_text([[*GROUND_TRUTH_COLUMNS, *([UNCERTAINTY_COLUMN] if has_uncertainty else [])]]))
         sources_file.write(csv_text([SOURCE_COLUMNS]))
-        for record, fresh, left_out in _records(workplace, int(identity["shards"])):
+        for record, new_sources, new_skipped in _records(workplace, int(identity["shards"])):
             names = {source.position: source for source in record.sources}
-            for source in fresh:
+            for source in new_sources:
                 sources_file.write(_source_row(source))
                 counts["sources"] += 1
                 counts["pixels"] += source.width * source.height * int(options.get("crops", 1))
                 counts["replaced"] += source.replaced_pixels
-            skipped += left_out
+            skipped += new_skipped
             used.update((light.illumination, light) for light in record.lights)
             for image in record.images:
                 source = names[image.position]
@@ -727,15 +728,15 @@ def _records(workplace: Workplace, shards: int) -> Iterator[tuple[ShardRecord, l
                     f"the picture {last.name} differs between two shards, expected no change while the data set is "
                     f"made; remove {workplace.notes.location} and the files next to it, then start again"
                 )
-            fresh = ordered[1:]
+            new = ordered[1:]
         else:
-            fresh = ordered
+            new = ordered
         if ordered:
             last = ordered[-1]
         yield (
             record,
-            [source for source in fresh if isinstance(source, SourceRecord)],
-            [source for source in fresh if isinstance(source, Skipped)],
+            [source for source in new if isinstance(source, SourceRecord)],
+            [source for source in new if isinstance(source, Skipped)],
         )
 
 
@@ -837,7 +838,7 @@ class Workplace:
         return _record_in(piece, FinishedImage) if piece.is_complete(self.files.open) else None
 
     def has_finished(self, shard: bool = False) -> bool:
-        """Return whether an image (or a complete shard, if `shard`) of any plan is finished."""
+        """Return whether any plan has a finished image, or with `shard` a complete shard."""
         names = self.notes.names(RECORDS)
         return any(not shard or _SHARD_PIECE in read_pieces(self.notes.get(name)) for name in names)
 
