@@ -222,7 +222,7 @@ def test_places_of_cells(pinned: Pinned) -> None:
         ]
         result.append([*map(brief, blocks), *(brief(one.error_px) for one in errors)])
     marks = random.uniform(0, 100, (300, 2))
-    unfollowed = matching.unfollowed_px(marks[:40] + 0.5, marks, random.normal(0, 0.2, (300, 2)), 0.7, 20.0)
+    unfollowed = matching.unfollowed_wave_sigma_px(marks[:40] + 0.5, marks, random.normal(0, 0.2, (300, 2)), 0.7, 20.0)
     pinned("places of cells", [result, brief(unfollowed)], **LOOSE)
 
 
@@ -352,7 +352,7 @@ def test_shares_of_a_lens(pinned: Pinned) -> None:
     random = np.random.default_rng(16)
     spots = random.uniform(-5, 60, (30, 2))
     laws = [fitting._law(power) for power in (0.5, 1.0, 1.5, 3.0, 6.0)]
-    pinned("shares of a lens", [result, brief(fitting.place_terms(spots, (40, 50))), laws], **LOOSE)
+    pinned("shares of a lens", [result, brief(fitting.frame_terms(spots, (40, 50))), laws], **LOOSE)
 
 
 def brighter(means: _Array) -> _Array:
