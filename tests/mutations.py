@@ -5,8 +5,10 @@ tests that reach it, and prints one JSON object for each mutation and one for th
 operators, applied also on module level and in decorated functions. Each place is equally likely. A mutation is noticed
 if a test fails that passes without it, or if the type checker refuses it.
 
-The tests of a place are those that run its line, then the others in their files. If no test runs it (constants,
-compiled functions), they are those that run any line of its module, or of a module that imports it. One run of all
+The tests of a place in a function are those that run its line, then the others in their files. A place outside
+functions runs once, at import, and the first test that imports the module says nothing about its use. For such a place,
+and if no test runs the line (compiled functions), the tests are those that run any line of its module, or of a module
+that imports it. One run of all
 tests finds these lines (a quarter of an hour); it is kept in `build/mutations` until product or tests change.
 Annotations and raised exceptions are not changed.
 """
@@ -82,6 +84,7 @@ class Mutation:
     last_line: int
     before: str
     after: str
+    is_in_function: bool
 
     @contextmanager
     def applied(self, folder: Path) -> Generator[None]:
@@ -89,7 +92,7 @@ class Mutation:
         path = folder / self.file
         text = path.read_text(encoding="utf-8")
         visitor = _Places(text)
-        node, changed, _ = visitor.places[self.number]
+        node, changed, _, _ = visitor.places[self.number]
         path.write_text(cst.ensure_type(visitor.module.deep_replace(node, changed), cst.Module).code, encoding="utf-8")
         try:
             yield
@@ -98,13 +101,14 @@ class Mutation:
 
 
 class _Places(cst.CSTVisitor):
-    """The places of a source text: old node, new node, position."""
+    """The places of a source text: old node, new node, position, whether it is in the body of a function."""
 
     METADATA_DEPENDENCIES = (PositionProvider,)
 
     def __init__(self, source: str) -> None:
         super().__init__()
-        self.places: list[tuple[cst.CSTNode, cst.CSTNode, CodeRange]] = []
+        self.places: list[tuple[cst.CSTNode, cst.CSTNode, CodeRange, bool]] = []
+        self._depth = 0  # functions around the node
         self.module = MetadataWrapper(cst.parse_module(source), unsafe_skip_copy=True).visit(self)
 
     def on_visit(self, node: cst.CSTNode) -> bool:
@@ -115,15 +119,23 @@ class _Places(cst.CSTVisitor):
                 pass
         for kind, operator in mutation_operators:
             for changed in operator(node) if isinstance(node, kind) else ():
-                self.places.append((node, changed, cast("CodeRange", self.get_metadata(PositionProvider, node))))
+                position = cast("CodeRange", self.get_metadata(PositionProvider, node))
+                self.places.append((node, changed, position, self._depth > 0))
         return True
+
+    def on_visit_attribute(self, node: cst.CSTNode, attribute: str) -> None:
+        self._depth += isinstance(node, cst.FunctionDef) and attribute == "body"
+
+    def on_leave_attribute(self, original_node: cst.CSTNode, attribute: str) -> None:
+        self._depth -= isinstance(original_node, cst.FunctionDef) and attribute == "body"
 
 
 def mutations_of(path: Path) -> Iterator[Mutation]:
     code = cst.Module([]).code_for_node
-    for number, (node, changed, position) in enumerate(_Places(path.read_text(encoding="utf-8")).places):
+    places = _Places(path.read_text(encoding="utf-8")).places
+    for number, (node, changed, position, is_in_function) in enumerate(places):
         lines = position.start.line, position.end.line
-        yield Mutation(path.relative_to(ROOT).as_posix(), number, *lines, code(node), code(changed))
+        yield Mutation(path.relative_to(ROOT).as_posix(), number, *lines, code(node), code(changed), is_in_function)
 
 
 def draw_mutations(count: int, seed: int, packages: Sequence[str]) -> list[Mutation]:
@@ -145,7 +157,8 @@ class Covered:
     def tests_of(self, mutation: Mutation) -> list[str]:
         """Return the tests of a place, the quickest first."""
         lines = self._lines(mutation.file)
-        places = {test for line in range(mutation.line, mutation.last_line + 1) for test in lines.get(line, ())}
+        place_lines = range(mutation.line, mutation.last_line + 1) if mutation.is_in_function else ()
+        places = {test for line in place_lines for test in lines.get(line, ())}
         for file in () if places else (mutation.file, *_importers(mutation.file)):
             places |= {test for tests in self._lines(file).values() for test in tests}
         # A shared fixture counts for the first test that uses it.

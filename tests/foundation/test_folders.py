@@ -181,3 +181,14 @@ def test_gives_up_on_a_folder_that_disappears(tmp_path: Path, monkeypatch: pytes
         locked_folder(tmp_path / "x", "busy"),
     ):
         pass
+
+
+@pytest.mark.parametrize(("platform", "below_home"), [("linux", ".cache"), ("darwin", "Library/Caches")])
+def test_cache_is_where_the_system_keeps_caches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, platform: str, below_home: str
+) -> None:
+    # XDG Base Directory Specification; Apple, "File System Programming Guide".
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr("sys.platform", platform)
+    assert folders.cache_folder() == tmp_path / below_home / "croplab"
