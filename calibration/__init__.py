@@ -1,1 +1,1 @@
-"""From a session's raw frames to a look-up table: registration, radiometry, sampling."""
+"""Convert the raw frames of a session to a look-up table (LUT)."""

@@ -1,9 +1,9 @@
-"""The uncertainty budget of a LUT: components and expanded uncertainty of ground truth and patch means.
+"""Uncertainty budget of a LUT: components and expanded uncertainty of its ground truths and patch means.
 
-Errors are relative to bare paper under each illuminant, or to the mean of each patch, by channel. A component is a mean
-square error: a variance, plus the square of an effect that is measured but not corrected. Components are independent
-and are added (JCGM 100:2008, 5.1). The expanded uncertainty has k = 2 (6.2), which covers about 95 %. Sample noise is
-not an error of a patch, but a property of the camera.
+Errors of a ground truth are relative to the counts of bare paper, errors of a patch to its mean, in each channel. A
+component is a mean square error: a variance, plus the square of an effect that is measured but not corrected.
+Components are independent and are added (JCGM 100:2008, 5.1). The expanded uncertainty has k = 2 (6.2), which covers
+about 95 %. Noise of the samples is not included, because it is a property of the camera and no error of the LUT.
 
 K components, L illuminants, C patches in the order of colour indices.
 """
@@ -31,8 +31,8 @@ class Component:
 
     name: str  # Identifier in files
     title: str  # Name in reports
-    assumed: bool  # True if the session cannot show it, so that a usual value is used
-    source: str
+    assumed: bool  # True if the session does not show the effect, so that its usual size is assumed
+    source: str  # How the component was measured, or why it was not
     lights: _Array  # (L, 3, 3) float64, mean square relative error of each illuminant's white in R, G, B
     cells: _Array  # (C, 3) float64, mean square relative error of each patch mean, without the error of bare paper
 
@@ -65,7 +65,7 @@ class Budget:
         return COVERAGE * np.sqrt(np.sum([component.cells for component in self.components], axis=0))
 
     def main_cause(self, light: int) -> Component:
-        """Return the largest component of an illuminant."""
+        """Return the largest component in the uncertainty of an illuminant."""
         return self.components[int(np.argmax(self.lights_deg[:, light]))]
 
     def lights_csv(self) -> str:
@@ -108,7 +108,7 @@ def _csv(columns: list[str], rows: Iterable[list[float]]) -> str:
 
 
 def direction_deg(white: _Array, relative: _Array) -> _Array:
-    """Return the RMS angle (L,) float64, degrees, of the error of vectors `white` (L, 3).
+    """Return the RMS angle (L,) float64, degrees, by which errors turn the vectors `white` (L, 3).
 
     First-order propagation (JCGM 100, 5.1.2): only the error perpendicular to the vector changes its direction.
 
@@ -117,7 +117,7 @@ def direction_deg(white: _Array, relative: _Array) -> _Array:
     length = np.linalg.norm(white, axis=1)
     along = white / np.maximum(length, 1e-9)[:, None]
     across = np.eye(3) - along[:, :, None] * along[:, None, :]
-    # Relative errors, multiplied by the vector and divided by its length.
+    # Maps relative errors of the components to errors perpendicular to the vector, in radians.
     projection = across * along[:, None, :]
     variance = np.einsum("lij,ljk,lik->l", projection, relative, projection)
     return np.degrees(np.sqrt(np.maximum(variance, 0)))

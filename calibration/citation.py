@@ -1,8 +1,9 @@
-"""The origin of a LUT (camera, lens, exposure, dates, projector, authors, licence), and its citation.
+"""Collect the origin of a LUT (camera, lens, exposure, dates, projector, authors, licence), and write its citation.
 
-A published serial number would link a LUT to all photographs of its owner, but readers must see whether two LUTs are
-from one body. A hash is sufficient for this. Serial numbers are short, so the hash is scrypt (RFC 7914): trying all
-numbers of ten digits takes more than twelve years on one core. A lab can also withhold the number.
+The published serial number of a camera would link a LUT to all photographs of its owner. Readers only need to see
+whether two LUTs are from one camera body, so a hash of the number is published. Serial numbers are short and could be
+guessed. The hash is therefore scrypt (RFC 7914), which makes each guess slow: all numbers of ten digits take more than
+twelve years on one core. A lab can also withhold the number.
 
 A citation is a BibTeX entry of type `misc` (O. Patashnik, BibTeXing, 1988, section 3.1). Unknown values are omitted
 from the entry and listed in a comment.
@@ -29,27 +30,27 @@ from foundation.records import Record
 # Form of the published serial number (`experiment.config.CitationSettings.camera_serial`).
 SerialForm = Literal["hash", "plain", "withheld"]
 
-# scrypt's N, r and p for interactive use (RFC 7914, section 2): 16 MiB, about 40 ms. A change would change all hashes,
-# and bodies would no longer be recognised.
+# Parameters N, r and p of scrypt for interactive use (RFC 7914, section 2). Other values would give other hashes, so
+# that older LUTs of a body could not be recognised.
 _COST, _BLOCK, _PARALLEL = 1 << 14, 8, 1
 
 _BYTES = 16  # Length of the hash: 128 bits never coincide by chance
 
 NOT_RECORDED: Final = "not recorded"  # Text for an unknown value
 
-# The devices of the session; see `experiment.config.LabSettings`.
+# Kind of laboratory of the session; see `experiment.config.LabSettings`.
 Rig = Literal["lab", "simulated", "imported"]
 
 Line = Annotated[str, Field(max_length=500)]
 Text = Annotated[str, Field(max_length=20_000)]
 
-_SERIAL = ", serial number "  # Separates name and number of the camera in a journal
+_SERIAL_SEPARATOR = ", serial number "  # Between the name and the number of the camera in a journal
 
-# Digits of the LUT's hash in the key of its entry, enough to distinguish the LUTs of a lab.
+# Digits of the LUT's hash in the key of its BibTeX entry, enough to distinguish the LUTs of a lab.
 KEY_DIGITS: Final = 8
 
 # Special characters of TeX (D. Knuth, The TeXbook, chapter 7), and their replacements.
-_SPECIAL: Final = {
+_TEX_REPLACEMENTS: Final = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
     "}": r"\}",
@@ -90,7 +91,7 @@ class OriginRecord(Record):
 
     rig: Rig | None = None  # None if the session does not record it
     camera_serial: Line | None = None  # Serial number of the body, or its hash, according to `camera_serial_is`
-    # Hash (`serial_hash`), plain, withheld by the lab, or missing in the raw files
+    # Form of `camera_serial`: hash (`serial_hash`), plain, withheld by the lab, or missing in the raw files
     camera_serial_is: Literal["hash", "plain", "withheld", "not stated"] = "not stated"
     lens: Line | None = None  # From the raw files, else from the lab
     iso: int | None = Field(default=None, ge=1)  # ISO speed of most frames
@@ -101,8 +102,8 @@ class OriginRecord(Record):
     first_frame: Line | None = None  # Time of the first frame, ISO 8601, UTC
     last_frame: Line | None = None  # Time of the last frame, ISO 8601, UTC
     frames: int = Field(default=0, ge=0)
-    projector: Line | None = None  # Maker and model from its control port, else from the lab
-    screen: Line | None = None  # Display of the colours, as the session names it
+    projector: Line | None = None  # From the lab, else from the projector's control port
+    screen: Line | None = None  # Display that shows the colours, as the session names it
     taken_by: Line | None = None  # Software that took the session; `Provenance.software` built the LUT
     title: Line | None = None
     authors: list[Line] = Field(default_factory=list[Line])
@@ -146,7 +147,7 @@ def serial_text(origin: OriginRecord | None) -> str:
 
 
 def origin_lines(origin: OriginRecord | None) -> list[tuple[str, str]]:
-    """Return names and values of the origin for people; unknown values are `NOT_RECORDED`."""
+    """Return the rows of a table of the origin: names and values; unknown values are `NOT_RECORDED`."""
     record = origin or OriginRecord()
     rows: list[tuple[str, str | None]] = [
         ("Taken in", _rig_text(record.rig)),
@@ -220,10 +221,13 @@ def origin_record(lab: SessionOrigin, records: Sequence[FrameRecord], origins: S
 
 
 def _serial(lab: SessionOrigin, origins: Sequence[FrameOrigin]) -> tuple[str | None, Any]:
-    """Return the published serial number of most frames, and its form; from the journal if files lack it."""
+    """Return the serial number of most frames as it is published, and its form.
+
+    If the raw files contain no number, it is taken from the journal.
+    """
     camera, serial = _most_frequent([(origin.camera, origin.serial) for origin in origins if origin.serial]) or ("", "")
     if not serial:
-        name, _, serial = lab.devices.get("camera", "").partition(_SERIAL)
+        name, _, serial = lab.devices.get("camera", "").partition(_SERIAL_SEPARATOR)
         camera = _most_frequent([origin.camera for origin in origins if origin.camera]) or name
     if not serial.strip():
         return None, "not stated"
@@ -242,7 +246,7 @@ def _line(text: str) -> str | None:
 
 
 def table_title(camera: str, lights: int | None, origin: OriginRecord | None, computed: bool = False) -> str:
-    """Return the LUT's title from the lab, else from its camera and illuminants."""
+    """Return the title that the lab gave to the LUT, or a title from its camera and illuminants."""
     if origin is not None and origin.title:
         return origin.title
     description = "Computed look-up table" if computed else "Look-up table"
@@ -276,7 +280,7 @@ def bibtex(
 
 def tex_text(text: str) -> str:
     """Return a text that TeX prints unchanged."""
-    return "".join(_SPECIAL.get(character, character) for character in " ".join(text.split()))
+    return "".join(_TEX_REPLACEMENTS.get(character, character) for character in " ".join(text.split()))
 
 
 def _bibtex_name(author: str) -> str:

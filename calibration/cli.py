@@ -1,7 +1,7 @@
 """The command `build-lut`, with its subcommands `check`, `info`, `verify`, `match`, `compare`, `publish` and `fetch`.
 
-One function per command: parse, call, print. Modules that load numpy are imported inside the functions, so that help
-and wrong options are answered immediately (docs/architecture.md).
+Each function reads the options of one command, calls the library and prints the result. Modules that load numpy are
+imported inside the functions, because this import would delay `--help` and error messages (docs/architecture.md).
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ if TYPE_CHECKING:
     from calibration.verdict import BuildResult
 
 app = new_app()
-_others = new_app()
+_subcommands = new_app()
 
 
 class _BuildLut(MainCommand):
-    subcommands = _others
+    subcommands = _subcommands
 
 
 Corners = Annotated[
     tuple[str, str, str, str] | None,
     option(
         "X,Y X,Y X,Y X,Y",
-        "For a chart without tags: corners of its patch area in the frame that is registered first, in pixels of the "
-        "raw file, clockwise from the top left corner of the print.",
+        "For a chart without tags: the four corners of its patch area, clockwise from the top left corner of the "
+        "print, in pixels of the raw file that is registered first, usually the first white frame.",
     ),
 ]
 Linearity = Annotated[
     Path | None,
     option(
         "FOLDER",
-        "Measure the linearity of the sensor with raw files of the chart, not moved, under one illuminant, with "
-        "exposure times from dim to almost saturated.",
+        "Measure the linearity of the sensor with the raw files in FOLDER. They show the chart as in the session and "
+        "differ only in exposure time, from dim to almost saturated.",
     ),
 ]
 SessionFolder = Annotated[Path, typer.Argument(help="Folder of a session from acquire run or acquire import.")]
@@ -66,9 +66,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     "frame. Registers the chart, follows its movements, corrects the flat field, and writes LUT: samples.npy, "
     "illuminations.csv with the ground truth, references.csv, lut.json, frames.csv, report.html and report.json. LUT "
     "appears completely or not at all. Run the same command again to resume an interrupted build.\n\n"
-    "Every figure is compared with its limit: accept, accept with remarks, or refuse. A refused LUT is not written; "
-    "its report is in LUT.refused/, and the exit code is 4.\n\n"
-    "With --append, adds the available frames of a session in progress; LUT appears after the last frame.",
+    "Every figure (measured property) is compared with its limits. The verdict is accept, accept with remarks, or "
+    "refuse. A refused LUT is not written: its report is in LUT.refused/, and the exit code is 4.\n\n"
+    "--append adds the available frames of a session in progress. LUT appears after the last frame.",
     epilog=EXIT_CODES,
 )
 @with_json("build-lut")
@@ -91,15 +91,15 @@ def build_lut(
         typer.Option(
             "--correct-drift",
             help="Correct samples and ground truth for lamp drift between white frames. The gains are recorded, so "
-            "that the correction can be undone. Refused if the white frames do not determine the drift.",
+            "that the correction can be undone. The LUT is refused if the white frames do not determine the drift.",
         ),
     ] = False,
     no_lens_correction: Annotated[
         bool,
         typer.Option(
             "--no-lens-correction",
-            help="Keep the light that the lens spreads between patches and over the frame in the samples; it is still "
-            "measured.",
+            help="Do not correct the samples for light that the lens spreads between patches and over the frame. This "
+            "light is still measured.",
         ),
     ] = False,
     corners: Corners = None,
@@ -125,7 +125,7 @@ def build_lut(
         with Session.open(session) as opened, progress("registering the chart") as show:
             result = build_or_append(opened, lut, show, write_report, options, linearity)
     except QualityError:
-        # Skip the report of an earlier build.
+        # The report may be from an earlier build.
         if output.is_requested and report_path.is_file() and report_path.stat().st_mtime_ns != previous_mtime:
             output.add(**json.loads(report_path.read_text(encoding="utf-8")))
         raise
@@ -144,23 +144,24 @@ def build_lut(
     )
 
 
-@_others.command(epilog=EXIT_CODES)
+@_subcommands.command(epilog=EXIT_CODES)
 @with_json("build-lut check")
 def check(
     session: SessionFolder,
     picture: Annotated[
         Path | None,
-        option("PNG", "Save the frame with the detected chart, or with the expected chart if detection fails."),
+        option("PNG", "Save the frame with the outline of the chart, or with the detected tags if it is not found."),
     ] = None,
     corners: Corners = None,
     linearity: Linearity = None,
     *,
     output: JsonOutput,
 ) -> None:
-    """Register the chart in a session's best frame and judge the frame.
+    """Register the chart in the best frame of a session and judge this frame.
 
-    Reads the best light or white frame of SESSION and a dark frame. Writes only the file of --picture. Figures that
-    need all frames are judged by a build. Exit code 4 if a figure is refused.
+    Reads the first white frame of SESSION and a dark frame. Without white frames, reads the frame of the illuminant
+    that is closest to white. Writes only the file of --picture. Figures that need all frames are judged only by
+    build-lut SESSION LUT. Exit code 4 if a figure is refused.
     """
     from calibration.pipeline.build import check as check_session
     from calibration.pipeline.frames import BuildOptions
@@ -181,7 +182,7 @@ def check(
     )
 
 
-@_others.command(epilog=EXIT_CODES)
+@_subcommands.command(epilog=EXIT_CODES)
 @with_json("build-lut info")
 def info(
     lut: Table,
@@ -215,17 +216,18 @@ def info(
         print(f"{name + ':':17}{printable(value)}")
 
 
-@_others.command(epilog=EXIT_CODES)
+@_subcommands.command(epilog=EXIT_CODES)
 @with_json("build-lut verify")
 def verify(
     lut: Table,
-    session: Annotated[Path | None, typer.Argument(help="Folder of the session, to check the frames, too.")] = None,
+    session: Annotated[Path | None, typer.Argument(help="Folder of the session, to check its frames as well.")] = None,
     *,
     output: JsonOutput,
 ) -> None:
-    """Check the hashes of all files of a LUT, and of the frames if SESSION is given, and list changes.
+    """Check the hashes of all files of a LUT, and list the changed files.
 
-    Reads LUT and SESSION; writes nothing. Exit code 2 if anything has changed.
+    Checks the hashes of the frames as well if SESSION is given. Reads LUT and SESSION; writes nothing. Exit code 2 if
+    anything has changed.
     """
     from calibration.pipeline.frames import frame_faults
     from calibration.table.lut import open_lut
@@ -251,7 +253,7 @@ def verify(
     print(f"{folder}: the hashes of all files{frames} are correct")
 
 
-@_others.command(epilog=EXIT_CODES)
+@_subcommands.command(epilog=EXIT_CODES)
 @with_json("build-lut match")
 def match(
     first_lut: Annotated[Path, typer.Argument(metavar="LUT1", help="Folder of a LUT.")],
@@ -259,9 +261,9 @@ def match(
     *,
     output: JsonOutput,
 ) -> None:
-    """Check that colours and illuminants of two LUTs, also of two cameras, correspond by index.
+    """Check that equal indices in two LUTs mean the same colour and the same illuminant.
 
-    Reads both; writes nothing. Exit code 2 if they do not correspond.
+    The LUTs may belong to different cameras. Reads both; writes nothing. Exit code 2 if the indices differ in meaning.
     """
     from calibration.table.lut import open_lut
     from calibration.table.verification import require_match
@@ -274,7 +276,7 @@ def match(
     print(f"{folders[0]} and {folders[1]} ({cameras}): colours and illuminants correspond by index")
 
 
-@_others.command(epilog=EXIT_CODES)
+@_subcommands.command(epilog=EXIT_CODES)
 @with_json("build-lut compare")
 def compare(
     a_folder: Annotated[Path, typer.Argument(metavar="A", help="Folder of a LUT or a session.")],
@@ -286,9 +288,9 @@ def compare(
     *,
     output: JsonOutput,
 ) -> None:
-    """Compare two LUTs, or sessions, of one chart: differences, and whether noise alone explains them.
+    """Compare two LUTs or sessions of one chart, and report whether noise alone explains their differences.
 
-    Reads A and B. The LUT of a session is built temporarily with default options. Writes FOLDER if given with --out.
+    Reads A and B. The LUT of a session is built temporarily with default options. Writes FOLDER if --out is given.
     Compares colour and brightness of the illuminants, and every patch. Exit code 0 after a comparison, 2 if the charts
     differ or have no common illuminant, 4 if the LUT of a session is refused.
     """
@@ -313,7 +315,7 @@ def compare(
         write_comparison(comparison, out, chart_of(folders))
 
 
-@_others.command(epilog=EXIT_CODES)
+@_subcommands.command(epilog=EXIT_CODES)
 @with_json("build-lut publish")
 def publish(
     lut: Table,
@@ -337,7 +339,7 @@ def publish(
     print(f"build-lut fetch {masked(url)} LUT --expect {table.sha256}")
 
 
-@_others.command(epilog=EXIT_CODES)
+@_subcommands.command(epilog=EXIT_CODES)
 @with_json("build-lut fetch")
 def fetch(
     url: Annotated[str, typer.Argument(help="Folder or URL of a published LUT.")],

@@ -1,4 +1,4 @@
-"""Compiled inner loops of calibration: light spread by the lens, comparison with neighbours, moments.
+"""Compiled inner loops of calibration: light spread by the lens, comparison with neighbours, means and variances.
 
 Sums must not be reordered, so that a LUT has the same bytes on every processor. The module imports nothing of CroP
 except the compiler, because a change in any imported module would recompile all kernels.
@@ -19,22 +19,24 @@ _Count = npt.NDArray[np.uint16]
 _Index = npt.NDArray[np.int64]
 _Slot = npt.NDArray[np.int32]
 
-PARTS = 5  # Parts along a slot; a module of a tag is two parts long, so that no printed edge is inside of a part
+# The print is a grid of equal slots; a patch fills one slot. Each slot has this number of parts along each side. A
+# module of a tag is two parts wide, so that every printed edge lies between two parts.
+PARTS = 5
 
-# Number of slots on each side of a patch with weights of their own. They cover at least 25 px; light from further away
-# does not depend on the sampling position within the slot.
+# On each side of a patch, the light of this number of slots is calculated separately. For light from further away,
+# the position of the sampling window within its slot does not matter.
 REACH = 2
 
-ACROSS = 2 * REACH + 1  # Slots along the neighbourhood of a patch
+ACROSS = 2 * REACH + 1  # Slots along one side of the square around a patch
 
 
 @compiled
 def window_shares(scale: float, pitches: _Array, offsets: _Array, window: int, shares: _Array) -> None:
-    """Fill `shares` (pitches, offsets, 25) with the fractions of a window's light from each part of five slots.
+    """Fill `shares` (pitches, offsets, 25) with the fractions of a window's light from the 25 parts of five slots.
 
-    The kernel is a Gaussian of σ `scale` px along one axis. The window has `window` pixels, and its centre is `offsets`
-    px from the centre of the central slot. Slots are `pitches` px long. Light from further away is added to the
-    outermost parts.
+    The calculation is for one axis. The light is spread by a Gaussian of σ `scale` px. Slots are `pitches` px long. The
+    window has `window` pixels; its centre is `offsets` px from the centre of the middle slot. Light from beyond the
+    five slots is added to the outermost parts.
     """
     parts = shares.shape[2]
     root = scale * math.sqrt(2.0)
@@ -57,7 +59,7 @@ def _interpolated(
     shares: _Array, first_pitch: float, pitch_step: float, first_offset: float, offset_step: float, pitch: float,
     offset: float, out: _Array,
 ) -> None:  # fmt: skip
-    """Fill `out` (25,) with a kernel's shares (pitches, offsets, 25), interpolated bilinearly."""
+    """Interpolate `shares` (pitches, offsets, 25) bilinearly at a pitch and an offset, into `out` (25,)."""
     p = min(max((pitch - first_pitch) / pitch_step, 0.0), shares.shape[0] - 1.000001)
     o = min(max((offset - first_offset) / offset_step, 0.0), shares.shape[1] - 1.000001)
     i, j = int(p), int(o)
@@ -73,13 +75,16 @@ def weights_around(
     row: _Index, column: _Index, neighbours: _Slot, parts: _Slot, offset: _Array, pitch: _Array, shares: _Array,
     grid: _Array, amount: _Array, weights: _Float, background: _Float,
 ) -> None:  # fmt: skip
-    """Fill `weights` (N, 25, 3) and `background` (N, 3 kinds, 3) with the fractions of light from the slots around.
+    """Calculate the fractions of a patch's light that come from the 5 × 5 slots around it.
+
+    Fills `weights` (N, 25, 3) with the fractions from patches, and `background` (N, 3 kinds, 3) with the fractions from
+    paper, black ink and the area beyond the sheet. The last axis is the channel.
 
     `row`, `column`, `neighbours`, `parts`: (N,), (N,) int64, (N, 25) and (5 R, 5 C) int32, as in `PrintedGrid`.
     `offset`: (N, 3, 2) px along the print's axes, from the patch centre to the window centre of each channel. `pitch`:
     (N, 2) px, width and height of a slot at each patch. `shares`: of K kernels, (K, pitches, offsets, 25), by
-    `window_shares`.
-    `grid`: (4,) first pitch and step, first offset and step. `amount`: (N, 3, K), amount of each kernel.
+    `window_shares`. `grid`: (4,) first pitch and step, first offset and step. `amount`: (N, 3, K), fraction of
+    light that each kernel spreads.
     """
     kernels, patch_count = shares.shape[0], len(row)
     x, y = np.empty(ACROSS * PARTS), np.empty(ACROSS * PARTS)
@@ -115,13 +120,13 @@ def weights_around(
 def light_around(
     neighbours: _Slot, weights: _Float, background: _Float, levels: _Array, light: _Array, inks: _Array, out: _Array
 ) -> None:
-    """Fill `out` (N, 3) with the light from around patches.
+    """Fill `out` (N, 3) with the light that each patch receives from its surroundings.
 
-    Sum of weighted `levels` (N, 3), and of `inks` (3 kinds, 3) in the local `light` (N, 3). The last kind, the
-    background behind the print, has its own light.
+    It is the weighted sum of the `levels` (N, 3) of patches and of the `inks` (3 kinds, 3). Paper and black ink are
+    multiplied by the local `light` (N, 3). The last kind, the background behind the print, has its own light.
     """
     for n in range(len(neighbours)):
-        # The three channels together: each sum waits for its previous addition, so one alone would be slower.
+        # Each addition waits for the previous addition to the same sum. Three sums at once use this time.
         red, green, blue = 0.0, 0.0, 0.0
         for slot in range(neighbours.shape[1]):
             source = neighbours[n, slot]
@@ -140,7 +145,10 @@ def light_around(
 
 @compiled
 def blur_rows(image: _Float, taps: _Float, out: _Float) -> None:
-    """Fill `out` (R, N) with a finite `image` (R, N) blurred along axis 0; `taps`: odd number; edges are repeated."""
+    """Fill `out` (R, N) with a finite `image` (R, N), blurred along axis 0 with an odd number of `taps`.
+
+    The first and the last row are repeated beyond the edges.
+    """
     rows, reach = image.shape[0], len(taps) // 2
     padded = np.zeros(len(taps) + 3, dtype=np.float32)
     padded[: len(taps)] = taps
@@ -159,9 +167,10 @@ def blur_rows(image: _Float, taps: _Float, out: _Float) -> None:
 
 @compiled
 def print_slots(shares: _Float, light: _Array, inks: _Array, image: _Float) -> None:
-    """Fill `image` (N, 3) with slots: `shares` (N, 3 kinds) of `inks` (3 kinds, 3) in the local `light` (N, 3).
+    """Fill `image` (N, 3) with the light of each slot, from its `shares` (N, 3 kinds) of the `inks` (3 kinds, 3).
 
-    The last kind, the background behind the print, has its own light.
+    Paper and black ink are multiplied by the local `light` (N, 3). The last kind, the background behind the print, has
+    its own light.
     """
     for slot in range(len(shares)):
         for channel in range(3):
@@ -173,9 +182,10 @@ def print_slots(shares: _Float, light: _Array, inks: _Array, image: _Float) -> N
 
 @compiled
 def add_far(image: _Float, row: _Index, column: _Index, share: _Array, levels: _Array, added: _Array) -> None:
-    """Add to `added` (N, 3) the light of a far `image` (R, K, 3) at `row` and `column`, for patches of `levels` (N, 3).
+    """Add to `added` (N, 3) the light that patches receive from a blurred print, minus the light that they lose.
 
-    `share`: (3,), fraction of the light of each channel.
+    `image`: (R, K, 3) blurred print. `row`, `column`: (N,) slot of each patch. `share`: (3,) fraction of the light that
+    is spread. `levels`: (N, 3) light of each patch.
     """
     for n in range(len(row)):
         for channel in range(3):
@@ -185,10 +195,11 @@ def add_far(image: _Float, row: _Index, column: _Index, share: _Array, levels: _
 
 @compiled
 def colour_differences(columns: _Array, side: int, residual: _Array) -> None:
-    """Fill `residual` (C, M) with values minus the mean of their two neighbours along each axis of the code.
+    """Fill `residual` (C, M) with the difference between each value and its neighbours in the colour cube.
 
-    `columns`: (C, M) float64 values of C = side³ patches in the order of colour indices. Axes with one neighbour are
-    skipped.
+    `columns`: (C, M) float64 values of C = side³ patches in the order of colour indices. Along each axis (code of red,
+    green or blue), the mean of both neighbours is subtracted. The differences are averaged over the axes with two
+    neighbours.
     """
     for red in range(side):
         for green in range(side):
@@ -212,9 +223,10 @@ def colour_differences(columns: _Array, side: int, residual: _Array) -> None:
 
 @compiled
 def clipped_to_neighbours(values: _Array, around: _Index, out: _Array) -> None:
-    """Fill `out` (N,) with values limited to the second lowest and second highest of `around` (N, K).
+    """Fill `out` (N,) with `values`, each limited to the second lowest and second highest value of its neighbourhood.
 
-    NaN stays NaN. With fewer than three values around, including its own, a value cannot be verified and becomes NaN.
+    `around`: (N, K) indices of the value itself and its neighbours. NaN stays NaN. A value becomes NaN if fewer than
+    three values of its neighbourhood are known.
     """
     for n in range(len(values)):
         lowest, low, highest, high = np.inf, np.inf, -np.inf, -np.inf
@@ -223,7 +235,7 @@ def clipped_to_neighbours(values: _Array, around: _Index, out: _Array) -> None:
             value = values[neighbour]
             is_known = value == value
             below, above = value if is_known else np.inf, value if is_known else -np.inf
-            # Without branches, because the processor could not predict them.
+            # Minima and maxima instead of branches, which the processor could not predict.
             low = min(low, max(lowest, below))
             lowest = min(lowest, below)
             high = max(high, min(highest, above))

@@ -1,4 +1,4 @@
-"""Measurements of a build or a check, in named groups of frozen values. Verdict, report and LUT are based on them.
+"""Types for the measurements of a build or a check. Verdict, report and LUT are based on them.
 
 L illuminants, C colours, G printed greys, S samples per patch. Counts are above the black level unless called raw.
 """
@@ -56,7 +56,7 @@ class FrameMeasurements:
     grey_errors: _Levels  # (G, 3) float64 counts, standard errors of `greys`
     dark: FloatArray  # (3,) float64 counts, dark light on bare paper that was subtracted; 0 without subtraction
     share_at_zero: float  # Fraction of the frame's samples in the LUT that are 0
-    blur_px: float  # σ of the frame's blur, half-size px: of the frame registered last, plus the change since then
+    blur_px: float  # σ of the frame's blur, half-size px: from the frame registered last and the change since then
     exposure: float  # Shutter time × ISO speed / f-number² from the raw file, s; 0 if unknown
     origin: FrameOrigin
 
@@ -92,7 +92,7 @@ class LinearityMeasurements:
 
 @dataclass(frozen=True)
 class SessionMeasurements:
-    """The session that was read."""
+    """Properties of the session."""
 
     folder: Path
     camera: str
@@ -120,9 +120,10 @@ class LightMeasurements:
     # (L,) float64, fraction of each illuminant's samples in the LUT that are 0; (0,) after a check
     share_at_zero: _Array
     additivity: Additivity | None  # White against the sum of the primaries; None if a frame is missing
-    # Agreement with the codes; None after a check. In `exchanges` and `seen_as`, indices ≥ L are white frames
+    # Agreement of illuminants and codes; None after a check. In `exchanges` and `seen_as`, indices ≥ L are white frames
     codes: CodeAgreement | None
-    # Agreement of the white frames with the codes, only of the first if the lamp drifted; None without white frames
+    # Agreement of white frames and full white; None without white frames. If they differ by drift alone,
+    # only the first is compared
     white_frames: CodeAgreement | None
     # Drift correction in the LUT; None if not requested. All other values are as measured
     drift: DriftCorrection | None = None
@@ -139,7 +140,7 @@ class LightMeasurements:
     def off_codes_deg(self) -> _Array | None:
         """(L,) float64 degrees, significant angle between each ground truth and its prediction; None after a check.
 
-        For two exchanged illuminants, the angle between them.
+        For exchanged illuminants, it is at least the angle between their predictions.
         """
         if self.codes is None:
             return None
@@ -150,7 +151,7 @@ class LightMeasurements:
         return angle_deg
 
     def lights_off_codes(self, accepted_deg: float) -> list[int]:
-        """Return the illuminants that deviate by more than `accepted_deg`, the largest deviation first."""
+        """Return the illuminants that deviate from their codes by more than `accepted_deg`, the worst first."""
         deg = self.off_codes_deg
         return [] if deg is None else [int(light) for light in np.argsort(-deg) if deg[light] > accepted_deg]
 
@@ -186,7 +187,7 @@ class SensorMeasurements:
     noise: _Array  # (3,) float64, median standard deviation of one sample under white, relative to paper white
     transfer: PhotonTransfer  # Photon-transfer curve of the frame registered first
     linearity: LinearityMeasurements | None
-    superposition: Superposition  # Nonlinearity: several primaries together, compared with each alone
+    superposition: Superposition  # Nonlinearity, from a mixture of primaries compared with each primary alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,10 +195,10 @@ class CellMeasurements:
     """Measurements of the chart's patches."""
 
     window: int  # Side of the sampling window, px; S = window²
-    unfit: tuple[Unfit, ...]
-    stains: Stains  # Patches whose colour does not match their code, in the order of colour indices
+    unfit: tuple[Unfit, ...]  # Patches that must not be used, with the reason
+    stains: Stains  # Areas of the print with colours that do not match their codes
     levels: _Array  # (C, 3) float64, each patch in the frame registered first, relative to bare paper
-    added: AddedLight  # Light added to some patches, whatever their colour
+    added: AddedLight  # Light that is added equally to dark and bright patches of an area, for example by a reflection
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +214,7 @@ class TableMeasurements:
     dark_frames: DarkSummary  # Dark frames; only the first one in a check
     cells: CellMeasurements
     origins: OriginFigures  # Frames with another camera, lens or exposure than most frames
-    # Primaries alone, for the flat field of coloured patches; None if a frame is missing or too dim
+    # Frames of the primaries alone, for the flat field of coloured patches; None if a frame is missing or too dim
     primaries: Primaries | None
     lens: LensFigures  # Light that the lens spreads, and its correction
     point_spread: PointSpread | None  # None if the spread was not measured
@@ -244,7 +245,7 @@ class TableMeasurements:
         return next(candidates, self.frames[0])
 
     def added_bleed(self, frame: FrameMeasurements) -> float:
-        """Return the bleed of the worst sample in a frame, minus the bleed in the registered frame."""
+        """Return the light of neighbouring patches in the worst sample, minus this light in the registered frame."""
         registration, window = self.registration, self.cells.window
         own, first = (bleed(registration.cell_px, px, window) for px in (frame.blur_px, registration.blur_px))
         return own - first
@@ -267,7 +268,7 @@ class TableMeasurements:
 
     @property
     def white_scatter(self) -> float:
-        """Relative standard deviation of a white frame's brightness about its neighbours."""
+        """Relative standard deviation of white frames' brightness about the mean of the frames before and after."""
         whites = np.array([frame.paper.white.sum() for frame in self.white_frames])
         if len(whites) < _SCATTER_FRAMES:
             return _USUAL_SCATTER

@@ -1,7 +1,8 @@
-"""Judge a LUT: compare figures with limits, explain values beyond them, and select frames to take again.
+"""Judge a LUT: compare its figures with their limits, explain values beyond a limit, and select frames to take again.
 
-The verdict depends only on the values. A value that could not be measured is not judged. Single frames are selected if
-they exceed a refusing limit or cause a value beyond a limit. New frames do not correct a fault of all frames.
+A figure is a measured property with limits (`calibration.figures`). The verdict depends only on the values. A value
+that could not be measured is not judged. Single frames are selected if they exceed a refusing limit or cause a value
+beyond a limit. If all frames have the same fault, none is selected, because new frames would have it as well.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from foundation.errors import counted, first_few
 
 COMMAND = "acquire run LAB.toml SESSION --retake bad"  # Repeats the frames listed in the report
 
-_THEN = "if the LUT is still refused, take the session again"
+_IF_REFUSED = "if the LUT is still refused, take the session again"
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class ProbableCause:
     figure: str  # Name of the figure
     decision: Decision  # The cause, and the rule that applied
     evidence: Evidence
-    frames: tuple[FrameRecord, ...]  # Frames that show it, the worst first; empty if all frames show it
+    frames: tuple[FrameRecord, ...]  # Frames that show the cause, the worst first; empty if all frames show it
     positions: tuple[PrintPosition, ...]
 
     @property
@@ -94,7 +95,7 @@ class ProbableCause:
 
     @property
     def is_of_frames(self) -> bool:
-        """True if repeating the listed frames corrects it."""
+        """True if it is sufficient to repeat the listed frames."""
         return self.decision.cause.repeats == "frames" and bool(self.frames)
 
 
@@ -111,7 +112,7 @@ def judge(values: Mapping[str, float], figures: Sequence[Figure] = FIGURES) -> V
 
 
 def explain(figure: Figure, table: TableMeasurements) -> ProbableCause | None:
-    """Return the cause of a figure beyond its limit; None without evidence, or if the figure explains itself."""
+    """Return the cause of a figure beyond its limit; None if there is no evidence, or if the figure explains itself."""
     gathered = None if figure.cause is None else figure.cause.gather(table, figure.accept)
     if figure.cause is None or gathered is None:
         return None
@@ -121,17 +122,20 @@ def explain(figure: Figure, table: TableMeasurements) -> ProbableCause | None:
 
 
 def _shared_cause(unknown: ProbableCause, follows: Sequence[str], table: TableMeasurements) -> ProbableCause:
-    """Return the cause of another figure in the same frames; the unknown cause if there is no such figure."""
+    """Return the known cause of a related figure if it has the same frames; else the unknown cause.
+
+    `follows`: names of the related figures.
+    """
     # For example, an object on the print in a frame also increases the scatter of the frame's patches.
     for name in follows:
-        main = explain(BY_NAME[name], table)
-        if main is None or not main.is_known or not main.frames:
+        related = explain(BY_NAME[name], table)
+        if related is None or not related.is_known or not related.frames:
             continue
-        own_frames, main_frames = ({frame.sha256 for frame in cause.frames} for cause in (unknown, main))
-        if own_frames and own_frames <= main_frames:
-            decision = replace(main.decision, follows=name)
-            positions = unknown.positions or main.positions
-            return replace(unknown, decision=decision, evidence=main.evidence, positions=positions)
+        own_frames, related_frames = ({frame.sha256 for frame in cause.frames} for cause in (unknown, related))
+        if own_frames and own_frames <= related_frames:
+            decision = replace(related.decision, follows=name)
+            positions = unknown.positions or related.positions
+            return replace(unknown, decision=decision, evidence=related.evidence, positions=positions)
     return unknown
 
 
@@ -142,7 +146,7 @@ def findings(verdict: Verdict, table: TableMeasurements) -> dict[str, ProbableCa
 
 
 def retake_command(records: Sequence[FrameRecord]) -> str:
-    """Return the command that repeats frames: by illuminant number, or from the report if there are other frames."""
+    """Return the command that repeats frames: by number if all show illuminants, else from the report."""
     lights = [record.illumination for record in records if record.kind == "light"]
     numbers = [light for light in lights if light is not None]
     return COMMAND if len(numbers) < len(records) else COMMAND.replace("bad", lights_text(numbers))
@@ -155,7 +159,7 @@ def retaken_frames(verdict: Verdict, table: TableMeasurements) -> tuple[FrameRec
     for cause in causes.values():
         if cause.is_of_frames:
             hashes |= {frame.sha256 for frame in cause.frames}
-    # Figures list a dark frame only if its camera or exposure differs.
+    # A dark frame is repeated only if its camera or exposure differs from the other frames.
     foreign = [frame.record for frame in (*table.origins.other_camera, *table.origins.other_exposure)]
     records = [*(frame.record for frame in table.frames), *(record for record in foreign if record.kind == "dark")]
     return tuple(sorted((record for record in records if record.sha256 in hashes), key=lambda record: record.attempt))
@@ -210,7 +214,7 @@ def refusal(verdict: Verdict, table: TableMeasurements, *, reported: bool = Fals
     if frames and (reported or command != COMMAND):
         repeat_text = f"take {counted(len(frames), 'frame')} again"
         is_sufficient = is_mended_by_retaking(verdict, table)
-        action = f"{repeat_text}: {command}" if is_sufficient else f"{repeat_text} first ({command}); {_THEN}"
+        action = f"{repeat_text}: {command}" if is_sufficient else f"{repeat_text} first ({command}); {_IF_REFUSED}"
     return f"{_text_with_position(main_row, table)}{detail}{others_text}; {_cause_text(cause)}{remedy}, and {action}"
 
 
@@ -237,7 +241,7 @@ def _cause_text(cause: ProbableCause | None) -> str:
     decision = cause.decision
     if decision.rule is None:
         return "cause unknown; possible remedy: "
-    # The message of the other figure gives the reason.
+    # If the cause was taken from a related figure, the message of that figure gives the reason.
     why = "" if decision.follows else f" ({decision.rule.why})"
     return f"probably {decision.cause.description}{why}; "
 

@@ -25,8 +25,8 @@ _SOURCE_COLUMNS = ("command", "version", "date", "machine")
 
 _FIGURES_HEAD = """# Figures
 
-`build-lut` judges a LUT by these figures. A figure within the *accepted* limit causes no remark, beyond it a remark,
-and beyond the *refused* limit no LUT is made. `acquire check` judges most figures before a session, from trial frames.
+`build-lut` judges a LUT by these figures. A figure beyond the *accepted* limit causes a remark. If a figure is
+beyond the *refused* limit, no LUT is made. `acquire check` judges most figures before a session, from trial frames.
 `build-lut check` judges those that one frame determines. Figures that more frames can only make worse are judged if
 they are already *beyond* the limit. `report.json` uses the same names.
 
@@ -86,7 +86,7 @@ def _refused(limit: Limit) -> str:
 
 def _limits(figure: Figure) -> str:
     refused, before_session = _refused(figure), "yes" if figure.before_session else "–"
-    remedy = figure.remedy or "see the most frequent cause"
+    remedy = figure.remedy or "depends on the detected fault"
     of_one_frame = _OF_ONE_FRAME[figure.of_one_frame]
     limits = f"{figure.expected} | {refused} | {before_session} | {of_one_frame}"
     return f"| {figure.title} (`{figure.name}`) | {limits} | {figure.why} ({figure.source}) | {remedy} |"

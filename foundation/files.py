@@ -131,12 +131,14 @@ def reading_error(path: Path, error: OSError, remedy: str, description: str = ""
     return error_class(f"cannot read {file}: {error.strerror or error}", remedy=remedy_for_disk or remedy)
 
 
-def read_text(path: Path, remedy: str, description: str = "") -> str:
-    """Return the text of a file in UTF-8, or in UTF-16 with a byte order mark; errors as in `reading_error`."""
+def read_text(path: Path, remedy: str, description: str = "", is_table: bool = False) -> str:
+    """Return the text of a file in UTF-8; errors as in `reading_error`.
+
+    A table may also be in UTF-16 with a byte order mark, since spreadsheet programs save text in it.
+    """
     try:
         data = path.read_bytes()
-        # Excel saves "Unicode text" in UTF-16.
-        is_utf_16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        is_utf_16 = is_table and data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         text = data.decode("utf-16" if is_utf_16 else "utf-8-sig")
     except OSError as error:
         raise reading_error(path, error, remedy, description) from error
@@ -146,20 +148,22 @@ def read_text(path: Path, remedy: str, description: str = "") -> str:
 
 
 def _not_utf_8(path: Path, error: UnicodeDecodeError, remedy: str) -> FormatError:
-    if b"\0" in error.object or error.encoding != "utf-8":
+    start, valid = error.object[:4], error.object[: error.start]
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and error.encoding == "utf-8":
+        problem = "text in UTF-16, expected UTF-8"
+    elif b"\0" in error.object or error.encoding != "utf-8":
         return FormatError("binary data, expected text in UTF-8", about=path, remedy=remedy)
-    line = error.object[: error.start].count(10) + 1
-    return FormatError(
-        f"line {line} has the byte 0x{error.object[error.start]:02x}, expected text in UTF-8; the file may be in "
-        "Latin-1 (Windows-1252)",
-        about=path,
-        remedy="save it as UTF-8 (Save as in most editors)",
-    )
+    else:
+        problem = (
+            f"line {valid.count(10) + 1} has the byte 0x{error.object[error.start]:02x}, expected text in UTF-8; the "
+            "file may be in Latin-1 (Windows-1252)"
+        )
+    return FormatError(problem, about=path, remedy="save it as UTF-8 (Save as in most editors)")
 
 
 def read_csv(path: Path, remedy: str, description: str = "") -> tuple[list[str], list[dict[str, str]]]:
     """Return the column names of a CSV file and its rows; missing cells are empty. Errors as in `read_text`."""
-    table = csv.DictReader(io.StringIO(read_text(path, remedy, description)), restval="")
+    table = csv.DictReader(io.StringIO(read_text(path, remedy, description, is_table=True)), restval="")
     try:
         return list(table.fieldnames or ()), list(table)
     except csv.Error as error:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 app = new_app()
 _explore_app = new_app()
 
-# Threads that read files from an object store; each thread waits for the store most of the time.
+# Number of threads that read files from an object store. It is large, because a thread mostly waits for the store.
 _STORE_READERS: Final = 16
 
 _HELP = f"""Make a data set of raw linear images with exact ground truth.
@@ -58,13 +58,14 @@ Reads the look-up table LUT (made by build-lut) and the source pictures. Writes 
 of a store supported by fsspec. OUT appears when it is complete: images/ (linear camera RGB; other files with
 --layout), previews/, ground_truth.csv, gt.txt, sources.csv, dataset.json and SHA256SUMS.
 
-Each image shows a print of the picture under an illuminant, as the camera would record it. A pixel is the response to
-its colour, interpolated between patches, plus the noise of one sample; with --rendering codes it is one sample of its
-patch. Equal seed, pictures and LUT give equal bytes with any number of workers. A picture that cannot be read is
-skipped and listed. To resume an interrupted run, run the same command again.
+Each image shows a print of the picture under an illuminant, as the camera would record it. By default, a pixel is the
+mean response to the colour of the picture, interpolated between patches of the chart, plus noise. With --rendering
+codes, a pixel is one sample of the patch with the code of the picture. Equal seed, pictures and LUT give equal bytes
+with any number of workers. A picture that cannot be read is skipped and listed. To resume an interrupted run, run the
+same command again.
 
-Examples: a first data set from a computed LUT; training crops under illuminants of any chromaticity; test images with
-two illuminants each, rendered as in the paper.
+The examples make a first data set from a computed LUT; training crops under illuminants of any chromaticity; and test
+images with two illuminants each, rendered as in the paper.
 
 generate demo: first/ --sources photographs/
 
@@ -150,7 +151,7 @@ def explore(
     chromaticity plane with the black-body curve and the gamut of all mixtures: select an illuminant, drag it, or mix
     two. It shows the image of each picture for both renderings, with ground truth, histogram and the noise of single
     pixels. It also shows the command that makes a data set from the picture. A picture dropped onto the page is kept
-    in memory only. With --host the address contains a token, which is new at each start.
+    in memory only. With --host the address of the page contains a secret token, which is new at each start.
     """
     from calibration.table.lut import open_lut
     from generator.explore.explorer import MAX_SIDE, Explorer, ExploreServer, sample_folder
@@ -319,7 +320,7 @@ def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None, is_rer
         raise InputError(f"the contact sheet {contact_sheet} is inside the data set; choose a path outside {out}")
     if contact_sheet.suffix.lower() != ".png":
         raise InputError(f"the contact sheet {contact_sheet} must be a PNG file; choose a name that ends in .png")
-    # An earlier run of the same command may have made both the data set and the sheet.
+    # If an earlier run of the same command completed the data set, it may also have made the sheet.
     if contact_sheet.exists() and not (is_rerun and out and holds_dataset(out)):
         raise InputError(f"the contact sheet {contact_sheet} already exists; choose another name, or remove it first")
 

@@ -29,10 +29,10 @@ from foundation.compiled import compiled
 LITERALS: Final = 286  # Symbols for literals, the end of a block and lengths (RFC 1951, 3.2.5)
 DISTANCES: Final = 30  # Symbols for distances (RFC 1951, 3.2.5)
 END: Final = 256  # Symbol for the end of a block (RFC 1951, 3.2.5)
-# Longest code for literals and distances in bits: three codes and up to seven waiting bits fit into 64 bits.
+# Largest length of a code for literals and distances, in bits. Three codes and seven waiting bits fit into 64 bits.
 LONGEST: Final = 12
 
-# Longest code for code lengths in bits: its length is written in three bits (RFC 1951, 3.2.7).
+# The same for a code of code lengths; the number 7 fits into the three bits of RFC 1951, 3.2.7.
 _LONGEST_OF_LENGTHS: Final = 7
 _LENGTHS: Final = 19  # Symbols of the code for code lengths (RFC 1951, 3.2.7)
 _SYMBOL_BITS: Final = 9  # Bits of a symbol (below 512); frequency and symbol are sorted as one number
@@ -57,7 +57,7 @@ def _sort(keys: Any, used: int) -> None:
 def code_lengths(frequencies: Any, longest: int) -> Any:
     """Return the code length (N,) int64 in bits of each symbol from frequencies (N,) int64; 0 for unused symbols."""
     # Huffman's algorithm on two queues instead of a heap (A. Moffat, J. Katajainen, 1995). Codes longer than `longest`
-    # bits are shortened, and others lengthened until Kraft's sum is 1 again; this costs hardly any bits.
+    # bits are shortened, and other codes are lengthened until Kraft's sum is 1 again.
     lengths = np.zeros(len(frequencies), np.int64)
     keys = np.empty(len(frequencies), np.int64)
     used = 0
@@ -200,7 +200,7 @@ def _run_lengths(sequence: Any, tokens: Any) -> int:
 
 @compiled
 def _used_length(lengths: Any, minimum: int) -> int:
-    # Lengths after the last one that is not 0 are not written.
+    # Zeros at the end of the lengths are not written.
     used = len(lengths)
     while used > minimum and not lengths[used - 1]:
         used -= 1
@@ -235,8 +235,8 @@ def put_head(out: Any, writer: Any, literals: Any, distances: Any, last: int) ->
         put(out, writer, tokens[i, 1], tokens[i, 2])
 
 
-# Largest number of pixels in a row: its byte positions need 31 bits. An entry of the history has 64 bits, of which 33
-# hold the bits of a pixel that are not in the hash.
+# Largest number of pixels in a row. An entry of the history has 64 bits: 31 for a byte position, and 33 for
+# the bits of a pixel that are not in its hash.
 WIDEST: Final = 1 << 28
 
 _WINDOW: Final = 32768  # Largest distance of a match in bytes (RFC 1951, 2)
@@ -248,15 +248,15 @@ _HASHES: Final = 1 << 15
 _MIX: Final = 0x9E3779B97F4B
 # Pixels on which both methods are compared: one window to fill the history, and two that are counted.
 _TRIAL_PIXELS: Final = 3 * _WINDOW_PIXELS
-# Interval of the counted rows in a large band. Counting all rows takes a third of the time of packing, and makes the
-# file only 0.17 % smaller.
+# Interval of the counted rows in a large band. Counting all rows would take much longer and make files only 0.17 %
+# smaller.
 _STEP: Final = 8
 _FEW_ROWS: Final = 4  # Smallest number of counted rows, so that no single row decides
 # Smallest number of counted symbols that represents a band; with fewer, all rows are counted.
 _FEW_SYMBOLS: Final = 1 << 13
-_FLUSH_BITS: Final = 56  # Bits that fit into a flush of 63 bits together with seven waiting bits
-# Bytes for the head and end of a block and for the overrun of a flush. Codes are below 16 bits (`LONGEST`), so a row
-# needs less than twice its bytes.
+_FLUSH_BITS: Final = 56  # Bits that can be added to seven waiting bits before a flush of 63 bits
+# Bytes for the head and end of a block, and for the bytes that a flush writes too many. Codes have less than 16 bits
+# (`LONGEST`), so packed rows have less than twice the bytes of the rows.
 _EXTRA_BYTES: Final = 1024
 
 
@@ -274,7 +274,7 @@ def _length_symbol(length: int) -> tuple[int, int, int]:
     return 257 + 4 * bits + ((length - 3) >> bits), bits, (length - 3) & ((1 << bits) - 1)
 
 
-# Symbols of the distances 1 … 256, then of every 128th (RFC 1951, 3.2.5).
+# Symbols of the distances 1 … 256, then of every 128th distance (RFC 1951, 3.2.5).
 _DISTANCE_SYMBOLS: Final = np.array(
     [_distance_symbol(distance) for distance in (*range(1, 257), *range(1, _WINDOW, 128))], dtype=np.uint8
 )
@@ -319,7 +319,7 @@ def _subtract(rows: Any, filtered: Any) -> None:
 
 @compiled
 def _count_bytes(rows: Any, literals: Any) -> None:
-    # With four counters, an increment does not wait for the previous one of the same byte.
+    # With four counters for each value, an increment rarely waits for the previous increment of the same counter.
     counts = np.zeros((4, 256), np.uint32)
     data = rows.reshape(-1)
     aligned_size = len(data) // 4 * 4
@@ -341,14 +341,15 @@ def find_repeats(image: Any, history: Any, distances: Any) -> None:
 
     The distance is 0 if the window has no equal pixel. `history` (32768,) uint64 is working memory.
     """
-    # An entry of `history` is the byte position of the last pixel with this hash. Its low bits are those bits of the
-    # mixed pixel that are not in the hash. Mixing is one to one, so pixels that agree in both are equal.
+    # An entry of `history` has the byte position of the last pixel with this hash in its high bits. Its low bits are
+    # the bits of the mixed pixel that are not in the hash. Mixing is one to one, so pixels with equal hash and equal
+    # low bits are equal.
     shift, rotation = uint64(48) - uint64(15), uint64(64 - 48 + 15)
     open_bits = (uint64(1) << shift) - uint64(1)
     for slot in range(_HASHES):
         history[slot] = 0
-    samples, backs = image.reshape(-1), distances.reshape(-1)
-    # With this first position, empty entries are outside the window of every pixel. All numbers are unsigned,
+    samples, flat_distances = image.reshape(-1), distances.reshape(-1)
+    # Positions start above the window size, so that empty entries are never in the window. All numbers are unsigned,
     # because numba adds a branch to each index that may be negative.
     position = uint64(_WINDOW + 1)
     index, pixels = uint64(0), uint64(0)
@@ -365,10 +366,10 @@ def find_repeats(image: Any, history: Any, distances: Any) -> None:
             entry = (position << shift) | (mixed & open_bits)
             difference = entry - history[slot]
             history[slot] = entry
-            # The distance to the last pixel with this hash; higher bits are not 0 if that pixel differs. There is no
-            # branch on a repeat, because it cannot be predicted.
-            back = (difference >> shift) | (difference << rotation)
-            backs[pixels] = uint16(back) if back - uint64(1) < uint64(_WINDOW) else uint16(0)
+            # The distance to the last pixel with this hash. If that pixel differs, high bits are not 0. There is no
+            # branch, because the processor cannot predict repeats.
+            distance = (difference >> shift) | (difference << rotation)
+            flat_distances[pixels] = uint16(distance) if distance - uint64(1) < uint64(_WINDOW) else uint16(0)
             index += uint64(3)
             pixels += uint64(1)
             position += uint64(6)
@@ -387,17 +388,17 @@ def _symbol_of(distance: Any) -> Any:
 
 
 @compiled
-def _count(rows: Any, distances: Any, step: int, literals: Any, backs: Any) -> None:
-    # Adds the symbols of one row in `step` to the frequencies of literals and distances. There is no branch on a match,
+def _count(rows: Any, distances: Any, step: int, literals: Any, distance_counts: Any) -> None:
+    # Add the symbols of one row in `step` to the frequencies of literals and distances. There is no branch on a match,
     # because it cannot be predicted. Each byte of a pixel has its own counter, so that increments do not wait.
     counts = np.zeros((6, 256), np.uint32)
     matches = 0
     for y in range(step // 2, rows.shape[0], step):
-        row, back = rows[y], distances[y]
+        row, row_distances = rows[y], distances[y]
         literals[row[0]] += 1
         run, previous = 1, uint32(0)
-        for x in range(len(back)):
-            distance = uint32(back[x])
+        for x in range(len(row_distances)):
+            distance = uint32(row_distances[x])
             if distance == previous and distance != uint32(0) and run < _LONGEST_RUN:
                 literals[_RUNS[run, 0]] -= 1
                 run += 1
@@ -408,7 +409,7 @@ def _count(rows: Any, distances: Any, step: int, literals: Any, backs: Any) -> N
             for i in range(6):
                 counts[i, row[1 + 6 * x + i]] += literal
             match = np.int64(uint32(1) - literal)
-            backs[_symbol_of(distance)] += match
+            distance_counts[_symbol_of(distance)] += match
             matches += match
     literals[_ONE_PIXEL] += matches
     for value in range(256):
@@ -417,20 +418,20 @@ def _count(rows: Any, distances: Any, step: int, literals: Any, backs: Any) -> N
 
 
 @compiled
-def _bits(literals: Any, backs: Any) -> int:
+def _bits(literals: Any, distance_counts: Any) -> int:
     # Total number of bits of symbols with these frequencies.
-    lengths, back_lengths = code_lengths(literals, LONGEST), code_lengths(backs, LONGEST)
+    lengths, distance_lengths = code_lengths(literals, LONGEST), code_lengths(distance_counts, LONGEST)
     total = 0
     for symbol in range(LITERALS):
         total += literals[symbol] * (lengths[symbol] + _LENGTH_BITS[symbol])
     for symbol in range(DISTANCES):
-        total += backs[symbol] * (back_lengths[symbol] + _DISTANCE_BITS[symbol])
+        total += distance_counts[symbol] * (distance_lengths[symbol] + _DISTANCE_BITS[symbol])
     return total
 
 
 @compiled
 def _are_repeats_smaller(image: Any, plain: Any, filtered: Any, distances: Any, history: Any) -> bool:
-    # Compares both methods on rows from the middle of the band.
+    # Compare both methods on rows from the middle of the band.
     height, width = distances.shape
     trial_rows = min(height, 1 + _TRIAL_PIXELS // width)
     top = (height - trial_rows) // 2
@@ -438,39 +439,39 @@ def _are_repeats_smaller(image: Any, plain: Any, filtered: Any, distances: Any, 
     counted = top + min(trial_rows - 1, _WINDOW_PIXELS // width)
     end = top + trial_rows
     find_repeats(image[top:end], history, distances[top:end])
-    literals, backs = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
-    _count(plain[counted:end], distances[counted:end], 1, literals, backs)
+    literals, distance_counts = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
+    _count(plain[counted:end], distances[counted:end], 1, literals, distance_counts)
     _subtract(plain[counted:end], filtered[counted:end])
     differences = np.zeros(LITERALS, np.int64)
     _count_bytes(filtered[counted:end], differences)
-    return _bits(literals, backs) <= _bits(differences, np.zeros(DISTANCES, np.int64))
+    return _bits(literals, distance_counts) <= _bits(differences, np.zeros(DISTANCES, np.int64))
 
 
 @compiled
-def _estimate(plain: Any, distances: Any, literals: Any, backs: Any) -> None:
-    # Estimates the frequencies of literals and distances of a band; every symbol that may occur gets at least 1.
+def _estimate(plain: Any, distances: Any, literals: Any, distance_counts: Any) -> None:
+    # Estimate the frequencies of literals and distances of a band; every symbol that may occur gets at least 1.
     step = max(1, min(_STEP, len(distances) // _FEW_ROWS))
-    _count(plain, distances, step, literals, backs)
+    _count(plain, distances, step, literals, distance_counts)
     if step > 1 and literals.sum() < _FEW_SYMBOLS:
-        literals[:], backs[:], step = 0, 0, 1
+        literals[:], distance_counts[:], step = 0, 0, 1
         literals[END] = 1
-        _count(plain, distances, step, literals, backs)
+        _count(plain, distances, step, literals, distance_counts)
     if step > 1:
         for value in range(256):
             literals[value] = step * literals[value] + 1
         for symbol in range(END + 1, LITERALS):
             literals[symbol] *= step
-        # Runs that share a symbol add more than 1, which is harmless.
+        # If several runs have the same symbol, it gets more than 1, which is harmless.
         for run in range(1, _LONGEST_RUN + 1):
             literals[_RUNS[run, 0]] += 1
         for symbol in range(DISTANCES):
-            backs[symbol] = step * backs[symbol] + 1
+            distance_counts[symbol] = step * distance_counts[symbol] + 1
 
 
 @compiled
 def _join_codes(codes: Any, largest: Any, samples: Any) -> None:
-    # Fill `samples` (65536,) uint32 with the codes of both bytes of each sample value up to `largest`. The length is in
-    # the lowest eight bits: it is the shift of the next code, and a sum of words contains the sum of lengths.
+    # Fill `samples` (65536,) uint32 with the joined codes of both bytes of each sample up to `largest`. The lowest
+    # eight bits have the length, so that a sum of entries contains the sum of lengths.
     mask, length = uint32(0xFFFF), uint32(16)
     for high in range((largest >> 8) + 1):
         first = codes[high]
@@ -545,7 +546,7 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
     # `joined` has the codes of both bytes of each sample value (`_join_codes`).
     offset, waiting, bit_count = writer[0], writer[1], writer[2]
     u0, u1, u2, u3, byte, low = uint64(0), uint64(1), uint64(2), uint64(3), uint64(8), uint64(63)
-    samples, backs = image.reshape(-1), distances.reshape(-1)
+    samples, flat_distances = image.reshape(-1), distances.reshape(-1)
     runs = _run_codes(codes)
     single = runs[1] & low
     matches = _match_codes(runs[1], back_codes)
@@ -557,12 +558,12 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
         offset, waiting, bit_count = flush(out, offset, waiting, bit_count + (row_code >> uint64(16)))
         end = x + width
         while x < end:
-            distance = uint64(backs[x])
-            following = uint64(backs[x + u1]) if x + u1 < end else u0
+            distance = uint64(flat_distances[x])
+            following = uint64(flat_distances[x + u1]) if x + u1 < end else u0
             # A match rarely continues. One sign bit tests it, because LLVM compiles two conditions to two branches.
             if (((following ^ distance) - u1) & (u0 - distance)) >> low:
                 run = u2
-                while run < uint64(_LONGEST_RUN) and x + run < end and uint64(backs[x + run]) == distance:
+                while run < uint64(_LONGEST_RUN) and x + run < end and uint64(flat_distances[x + run]) == distance:
                     run += u1
                 bits, length = _match(matches, distance)
                 bits, length = (bits >> single) << (runs[run] & low), length - single + (runs[run] & low)
@@ -570,7 +571,7 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
                 offset, waiting, bit_count = flush(out, offset, waiting, bit_count + length)
                 x += run
                 continue
-            # Computing both codes is faster than a wrong branch prediction, and a match cannot be predicted.
+            # Both codes are computed, because this is faster than a branch that is often predicted wrongly.
             i = u3 * x
             red, green = uint64(joined[samples[i]]), uint64(joined[samples[i + u1]])
             blue = uint64(joined[samples[i + u2]])
@@ -592,26 +593,25 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
 
 @compiled
 def _pack(image: Any, last: int, plain: Any, filtered: Any, distances: Any, history: Any, joined: Any, out: Any) -> Any:
-    # Fill `out` with a packed band; return its size in bytes, and whether `filtered` (else `plain`) was packed. It
-    # is a single compiled call: taking the interpreter lock between its steps of a millisecond would slow other
-    # threads.
+    # Fill `out` with a packed band; return its size in bytes, and whether `filtered` (else `plain`) was packed. This is
+    # one compiled call, because several short calls would often take the interpreter lock and slow other threads.
     largest = _split(image, plain)
     uses_repeats = _are_repeats_smaller(image, plain, filtered, distances, history)
-    literals, backs = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
+    literals, distance_counts = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
     literals[END] = 1
     if uses_repeats:
         find_repeats(image, history, distances)
-        _estimate(plain, distances, literals, backs)
+        _estimate(plain, distances, literals, distance_counts)
     else:
         _subtract(plain, filtered)
         _count_bytes(filtered, literals)
-    lengths, back_lengths = code_lengths(literals, LONGEST), code_lengths(backs, LONGEST)
+    lengths, distance_lengths = code_lengths(literals, LONGEST), code_lengths(distance_counts, LONGEST)
     codes = codes_of(lengths)
     writer = np.zeros(3, np.uint64)
-    put_head(out, writer, lengths, back_lengths, last)
+    put_head(out, writer, lengths, distance_lengths, last)
     if uses_repeats:
         _join_codes(codes, largest, joined)
-        _put_repeats(out, writer, image, distances, codes, codes_of(back_lengths), joined)
+        _put_repeats(out, writer, image, distances, codes, codes_of(distance_lengths), joined)
     else:
         _put_bytes(out, writer, filtered, codes)
     put(out, writer, codes[END] & 0xFFFF, codes[END] >> 16)
@@ -625,7 +625,7 @@ def _pack(image: Any, last: int, plain: Any, filtered: Any, distances: Any, hist
 
 
 class Packer:
-    """Packs bands one at a time and keeps its working memory, because new memory costs as much time as packing."""
+    """Packs bands one at a time. It keeps its working memory, because allocation would take as long as packing."""
 
     def __init__(self) -> None:
         self._history = np.empty(_HASHES, np.uint64)

@@ -63,11 +63,11 @@ TALLEST: Final = (1 << 31) - 1  # Largest height, px (clause 11.2.2)
 # Largest number of pixels in a band of several rows: 1.5 MiB, so that large images need little memory.
 BAND: Final = 1 << 18
 _ZLIB: Final = bytes([0x78, 0x01])  # zlib header: deflate, window of 32 KiB, fastest level (RFC 1950, 2.2)
-# Compression level of ISA-L (0 to 3) for maps and for OpenEXR after prediction. Both are smooth: with the filter Up,
-# ISA-L makes maps as small as OpenCV does in a fifth of the time.
+# Compression level of ISA-L (0 to 3) for maps, and for OpenEXR after prediction. With the filter Up, ISA-L compresses
+# maps as well as OpenCV in a fifth of the time.
 _LEVEL: Final = 1
-# Bytes packed separately at the start. With more than 16, ISA-L would use its fast loop, whose first hash is undefined
-# (docs/decisions/0051-first-bytes-apart.md).
+# Number of bytes at the start that are compressed separately. ISA-L compresses so few bytes in another loop; the
+# first hash of its usual loop is undefined (docs/decisions/0051-first-bytes-apart.md).
 _APART: Final = 8
 _UP: Final = 2  # Filter type Up (clause 9.2)
 # Colour types (clause 11.2.2).
@@ -115,7 +115,8 @@ def encode_map(values: Image) -> bytes:
 
 def _packed(data: npt.NDArray[np.uint8]) -> bytes:
     packer, plain = isal_zlib.compressobj(_LEVEL), data.reshape(-1).data
-    # In a single call ISA-L hashes bytes 3 to 6 with an undefined register, so that files differ between processes.
+    # In a single call, ISA-L would hash bytes 3 to 6 with an undefined register, and equal maps would give different
+    # files.
     first = packer.compress(plain[:_APART]) + packer.flush(isal_zlib.Z_SYNC_FLUSH)
     return b"".join([first, packer.compress(plain[_APART:]), packer.flush()])
 
@@ -150,10 +151,10 @@ def decode_png(data: bytes) -> npt.NDArray[np.generic]:
     return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB if decoded.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
 
-# OpenEXR, scan lines with ZIP compression. Our own encoder, because the libraries write only to named files. Sources:
+# OpenEXR, scan lines with ZIP compression. The encoder is our own, as libraries write only to named files. Sources:
 # "OpenEXR File Layout", "Technical Introduction to OpenEXR"; prediction as in ImfZip of the reference implementation.
 
-# Largest signed 32-bit integer, the type of window columns and of chunk sizes in bytes.
+# Largest signed 32-bit integer; window coordinates and chunk sizes in bytes have this type.
 LARGEST_SIDE: Final = (1 << 31) - 1
 
 # First bytes of an OpenEXR file of version 2 with scan lines in one part.
@@ -419,7 +420,7 @@ def encode_dng(image: Image, metadata: ImageMetadata) -> bytes:
             f"{SMALLEST_SIDE}x{SMALLEST_SIDE} px or more; choose png or tiff"
         )
     neutral = _neutral(metadata)
-    # Neutral colours are correct with either matrix, other colours only with that of the camera.
+    # Neutral colours are correct with either matrix, other colours only with the matrix of the camera.
     matrix = camera_matrix(metadata.camera) or _SRGB
     model = f"{metadata.camera} generated".strip()
     tags: Tags = {
@@ -430,7 +431,7 @@ def encode_dng(image: Image, metadata: ImageMetadata) -> bytes:
         TiffTag.COMPRESSION: (ValueType.SHORT, [1]),  # none
         TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [CFA]),
         TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
-        # Not the maker of the camera, so that raw developers do not apply its black level or other properties.
+        # With the maker of the camera, raw developers would apply the black level and other properties of this camera.
         TiffTag.MAKE: text("CroP"),
         TiffTag.MODEL: text(model),
         TiffTag.ORIENTATION: (ValueType.SHORT, [1]),  # not rotated
@@ -515,7 +516,7 @@ class FileFormat:
     pieces: Callable[[Image, ImageMetadata], Iterable[bytes | memoryview]]
     # Decodes the bytes of the named file to an array (H, W) or (H, W, channels).
     decode: Callable[[bytes, str], npt.NDArray[np.generic]]
-    # Distributions whose version may change the bytes: encoders, or the source of the colour matrix of a raw file.
+    # Python packages whose version may change the bytes: encoders, or the source of the colour matrix of a raw file.
     libraries: tuple[str, ...] = ()
     smallest_side: int = 1  # px
 
@@ -612,7 +613,7 @@ def require_plausible(data: bytes, name: str) -> None:
 # "Flash and Storm: fast and highly practical tone mapping based on Naka-Rushton equation", VISAPP 2018. The paper on
 # CroP uses it in section 4.2 and in the figure of the generation process.
 
-# Replaces brightness 0, which has no logarithm. Linear values are 0 … 1, so this is far below any signal.
+# Replaces brightness 0, which has no logarithm; far below any signal, because linear values are 0 … 1.
 DARK: Final = 1e-9
 
 _BLACK: Final = np.float32(1e-30)  # Replaces 0 before the logarithm in float32; its code is 0
@@ -623,7 +624,7 @@ class Flash:
     """The tone mapping operator Flash with the parameters of one image."""
 
     k: float  # semi-saturation: a · exp(mean ln V), where V is the brightness of the fitted image
-    scale: float  # code of the brightest pixel (255) over its value before scaling
+    scale: float  # 255 divided by the value of the brightest pixel before scaling
     gamma: float  # display exponent g of y ** (1 / g); 1 for none
 
     def apply(self, linear: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
@@ -769,8 +770,8 @@ def _shrunk(image: npt.NDArray[np.uint16], factor: int) -> npt.NDArray[np.uint16
 @compiled
 def _brightest(samples: Any, logs: Any) -> Any:
     # Return the largest value of `samples` (3 N,) uint16, and the sum over pixels of the logarithm of the largest
-    # channel, from `logs` (65536,) float64. Pixels are counted by value, so that each logarithm is taken once. With
-    # two counters, an increment does not wait for the previous one of the same value.
+    # channel, from `logs` (65536,) float64. Pixels are counted by value, so that each logarithm is used once. With two
+    # counters for each value, an increment rarely waits for the previous increment of the same counter.
     counts = np.zeros((2, 1 << 16), np.uint32)
     top = uint16(0)
     i = uint64(0)
@@ -801,7 +802,8 @@ def _tone_map(samples: Any, roots: Any, shades: Any, out: Any) -> None:
 
 @lru_cache(maxsize=4)
 def _tables(white_level: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.float32]]:
-    # Of each 16-bit value: brightness (value over saturation level, at least `DARK`), its logarithm, its gamma root.
+    # Tables for all 16-bit values: brightness (value over saturation level, at least `DARK`), its logarithm, and the
+    # gamma root of the value.
     linear = np.arange(1 << 16) / white_level
     brightness = np.maximum(linear, DARK)
     return brightness.astype(np.float32), np.log(brightness), (linear ** (1 / _GAMMA)).astype(np.float32)

@@ -152,25 +152,25 @@ class LightOptions:
         str | None,
         _light_option(
             "NAME",
-            "Draw chromaticities from uniform, from gaussian:r=0.3,b=0.25,sd=0.02 (or sd_r, sd_b and corr instead of "
-            "sd), or from the kernel density of a file of ground truths as for --nearest.",
+            "Draw chromaticities of illuminants from a distribution: uniform; gaussian:r=0.3,b=0.25,sd=0.02 (or sd_r, "
+            "sd_b and corr instead of sd); or the kernel density of a file of ground truths as for --nearest.",
         ),
     ] = None
     nearest: Annotated[
         Path | None,
         _light_option(
             "GT.csv",
-            "Use for scene i the illuminant of the LUT nearest in angle to ground truth i of this file (columns "
-            "GT_R,GT_G,GT_B or r,g,b, or lines of three numbers). Scenes are in the order of the pictures; the file "
-            "is repeated if it is shorter.",
+            "For picture or crop i, use the illuminant of the LUT with the smallest angle to ground truth i of this "
+            "file (columns GT_R,GT_G,GT_B or r,g,b, or lines of three numbers). After its last line, the file is used "
+            "again from the start.",
         ),
     ] = None
     match: Annotated[
         Path | None,
         _light_option(
             "GT.csv",
-            "Like --nearest, with a mixture of illuminants that matches the ground truth. If it is outside the gamut "
-            "of the LUT, the nearest mixture is used; a large distance is refused.",
+            "Like --nearest, with a mixture of illuminants that matches the ground truth. If a ground truth is outside "
+            "the gamut of the LUT, the nearest mixture is used; a large distance is refused.",
         ),
     ] = None
     lights_per_image: Annotated[
@@ -180,8 +180,8 @@ class LightOptions:
         str | None,
         _light_option(
             "DATASET",
-            "Repeat the scenes and illuminants of this data set for another camera. LUT must contain the same "
-            "illuminants, and --sources the same pictures; they are prepared in the same way.",
+            "Repeat the pictures and illuminants of this data set for another camera. LUT must contain the same "
+            "illuminants, and --sources the same pictures; pictures are prepared in the same way.",
         ),
     ] = None
     masks: Annotated[
@@ -335,7 +335,7 @@ class RenderingOptions:
 
     def apply_to(self, options: DatasetOptions, table: Lut, existing: Rendering | None) -> DatasetOptions:
         """Return `options` with this rendering."""
-        # `existing` is the rendering of a data set that is complete or in progress; None for a new one.
+        # `existing` is the rendering of a data set that is complete or in progress; None for a new data set.
         from generator.rendering.black_points import parse_black_point
         from generator.rendering.matrices import matrix_for
 
@@ -356,7 +356,7 @@ class VariationOptions:
             "KIND",
             "Change the exposure: a factor such as 0.5; stops:low=-2,high=1 or normal:mean=-1,sd=0.5, drawn for each "
             "image; clip:share=0.01 saturates that share of the pixels; level:share=0.01,low=0.3,high=0.9 exposes "
-            "this share to a random level relative to saturation (most=8 limits the factor). Noise is adapted to it.",
+            "this share to a random level relative to saturation (most=8 limits the factor). Noise follows exposure.",
         ),
     ] = None
     gradient: Annotated[
@@ -408,7 +408,7 @@ class WorkOptions:
     shard_images: Annotated[
         int,
         _work_option(
-            "N", "Images in one shard. In tar and Parquet files and in stores, an unfinished shard is repeated.", min=1
+            "N", "Images in one shard. An unfinished shard of tar or Parquet files or in a store is repeated.", min=1
         ),
     ] = 256
     shard: Annotated[

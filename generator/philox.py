@@ -22,7 +22,7 @@ MULTIPLIERS: Final = (0xD2511F53, 0xCD9E8D57)  # Factors of the two products of 
 KEY_STEPS: Final = (0x9E3779B9, 0xBB67AE85)
 ROUNDS: Final = 10  # The authors' recommendation: 7 rounds pass all statistical tests, 3 more are a margin
 
-# Purposes, one for each random choice. Data sets keep their bytes only if the numbers stay the same.
+# Purposes, one for each random choice. Do not change the numbers, because the bytes of data sets depend on them.
 SAMPLES: Final = 0  # Patch of the chart for a pixel, and one of its samples
 LIGHTS: Final = 1  # Illuminants of a source picture
 SCENES: Final = 2  # Pixels of a random scene

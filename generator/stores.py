@@ -48,7 +48,7 @@ def is_remote(location: str) -> bool:
 
 
 def local_path(location: str | Path) -> Path:
-    """Return the path of a location of this machine, without file:// and with a last component."""
+    """Return the path of a location of this machine, without file:// and with a name as last component."""
     text = str(location)
     for scheme in ("file://", "local://"):
         text = text.removeprefix(scheme)
@@ -77,8 +77,8 @@ def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
 
 Pieces = Iterable[bytes | memoryview]  # The bytes of a file in order; each piece is valid until the next one
 
-# Number of files synchronised in parallel. A file system commits its journal once for all waiting files, so 16 waits
-# take little longer than one wait.
+# Number of files synchronised in parallel. A file system commits its journal once for all waiting files, so 16 files
+# take little longer than one file.
 _SYNC_THREADS: Final = 16
 
 # Buffer size in bytes; larger pieces are written directly. Without a size, Python makes two system calls to choose it,
@@ -92,7 +92,7 @@ _WITH_FOLDERS: Final = frozenset({"ftp", "sftp", "ssh", "smb", "webdav", "webdav
 
 @dataclass(frozen=True)
 class LocalStore:
-    """A folder of this machine. It must exist, so that late writes cannot change a completed data set."""
+    """A folder of this machine, which must exist. Publishing a data set renames it, so that later writes fail."""
 
     root: Path
 
@@ -122,7 +122,7 @@ class LocalStore:
     def create(self, name: str) -> Generator[BinaryIO]:
         """Open a new file for writing; it appears at the end of the block, unless the block raises."""
         path = self.root / name
-        # A random name, because two programs may write the same shard; see `foundation.files.is_partial`.
+        # The temporary name is random, because two programs may write the same shard (`foundation.files.is_partial`).
         unfinished = partial_path(path.with_name(f"{path.name}.{secrets.token_hex(8)}"))
         try:
             try:
@@ -230,7 +230,7 @@ class RemoteStore:
 
     @property
     def _files(self) -> AbstractFileSystem:
-        # Not stored, because workers get this object but cannot get a file system; fsspec caches one for each URL.
+        # The file system is not an attribute, because this object is sent to workers. fsspec caches file systems.
         return filesystem(self.url)[0]
 
     @property

@@ -1,1 +1,1 @@
-"""Look-up tables computed from spectra and a model of the sensor, without a laboratory."""
+"""Compute look-up tables (LUTs) from spectra and a model of the sensor, without a laboratory."""

@@ -1,7 +1,7 @@
 """Command `sim`: the simulated devices of `sim.cli`, and `sim table`, which computes a look-up table (LUT).
 
-A LUT also needs the functions and the format of calibration, so this command is in a higher package than `sim.cli`
-(docs/decisions/0020-a-floor-for-computed-tables.md).
+`sim table` uses functions of `calibration`, and writes its LUT format. Therefore it is not in `sim.cli`, which may not
+import `calibration` (docs/decisions/0020-a-floor-for-computed-tables.md).
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ def table(
     lights: Annotated[
         str | None,
         typer.Option(
-            help="CSV file of spectra (wavelength, then one column each), or published spectra: D65,A,FL2,cie-led,"
+            help="CSV file with columns of wavelengths and spectra, or published spectra: D65,A,FL2,cie-led,"
             "5600K,2000:10000:200K,daylight:4000:10000:500; by default the 707 illuminants of the simulated projector."
         ),
     ] = None,
     settings: Annotated[
-        Path | None, typer.Option(help="TOML file: camera, exposure, room with paper and print, chart, seed, citation.")
+        Path | None, typer.Option(help="TOML file with settings of camera, exposure, room, chart, seed and citation.")
     ] = None,
     *,
     output: JsonOutput,
@@ -64,8 +64,8 @@ def table(
     """Compute a look-up table (LUT) from spectra and the noise model of the sensor, without frames.
 
     Reads the sensitivities, the spectra of the illuminants and the settings. Writes OUT/samples.npy, illuminations.csv,
-    references.csv and lut.json, which records that the LUT was computed. generate can use it like a LUT that build-lut
-    makes from a session in the simulated laboratory. It takes minutes.
+    references.csv and lut.json, which records that the LUT was computed. generate can use this LUT like a LUT of
+    build-lut. The calculation takes minutes.
     """
     from synthesis.lamps import read_lights
     from synthesis.settings import load_settings, table_task

@@ -1,15 +1,15 @@
-"""Illumination of the chart by the simulated projector or by arbitrary spectra, and computed frames of its patches.
+"""Illuminate the chart with the simulated projector or with arbitrary spectra, and compute frames of its patches.
 
-Light is additive: a frame under the projector is the weighted sum of its frames under the three primaries. Under
-spectra, each illuminant has its own frame. Spectra are read from a file, or published spectra are selected by name
-(`sim.spectral`; `--lights` in docs/how-to/table-without-a-lab.md).
+Light is additive: the light on a photosite under the projector is a weighted sum of its light under the three
+primaries. With spectra, the light of each illuminant is computed separately. Spectra are read from a file, or published
+spectra are selected by name (`sim.spectral`; `--lights` in docs/how-to/table-without-a-lab.md).
 
-A computed frame has only the centre of each patch and reference, by default 10 × 10 photosites (25 half-size pixels),
-one below the other. The simulated room provides their light, and the simulated sensor their counts
-(`sim.world.sensors.counts`). The functions of calibration sample them like any frame.
+A computed frame contains only the centres of patches and references, one below the other. By default, each centre has
+10 × 10 photosites (25 half-size pixels). The simulated room provides their light, and the simulated sensor their counts
+(`sim.world.sensors.counts`). The functions of calibration sample a computed frame like any other.
 
-Differences from a photograph: without blur, no light leaks between neighbouring patches. A whole patch has the light
-of its centre. The position of the chart is exact.
+Computed frames differ from photographs in three ways. There is no blur, so no light leaks between neighbouring patches.
+A whole patch has the light of its centre. The position of the chart is exact.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ WAVELENGTH: Final = "wavelength"  # Heading of the first column
 # Range of correlated colour temperatures, K, for which CIE daylight is defined (CIE 15:2018).
 DAYLIGHT_K: Final = (4000.0, 25_000.0)
 
-# Sets of published illuminants, by a pattern of their names.
+# Sets of published illuminants: name of the set, and pattern of the names in it.
 ILLUMINANT_SETS: Final[Mapping[str, str]] = {
     "cie": r"A|B|C|D\d+|E|FL[\d.]+|HP\d|LED-.*|ID\d+",
     "cie-d": r"D\d+|ID\d+",
@@ -78,7 +78,7 @@ class LightSpectrum:
 
 @dataclass(frozen=True, eq=False)
 class LightSpectra:
-    """Spectra of illuminants with different names."""
+    """Spectra of illuminants, each with its own name."""
 
     lights: tuple[LightSpectrum, ...]
     source: dict[str, Any]  # Origin for the record of the LUT: file and hash, or names
@@ -174,7 +174,7 @@ def _light(name: str, power: _Array, cct_k: float | None, where: str) -> LightSp
 
 
 def _published_lights(name: str, text: str) -> Iterable[LightSpectrum]:
-    """Yield the spectra of one item: a published illuminant, a set of them, black bodies, or daylights."""
+    """Yield the spectra of one item of `--lights`: published illuminant, set of them, black bodies, or daylights."""
     if black_bodies := re.fullmatch(r"([\d.:]+)\s*K", name, re.IGNORECASE):
         # Computed at 1 nm and resampled like the other spectra, so that integrals are preserved.
         wavelengths = np.arange(380.0, 781.0)
@@ -223,7 +223,7 @@ def _linear_srgb(power: _Array) -> _Array:
 
 _CHANNELS: Final = "RGB"
 
-# Keys of the random streams, all different; `sim.world.world` uses keys below 10.
+# Keys of independent random streams; `sim.world.world` uses keys below 10.
 _RESPONSE, _NOISE, _BLACK, _HOT = 11, 12, 13, 14
 
 # Columns of a masked area that `drivers.raw.rawfile` does not use for the black level.
@@ -233,7 +233,7 @@ _Float = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class PatchSensor:
-    """The photosites under the patches of a chart. A frame has (N · 2 · window, 2 · window) of them for N patches."""
+    """The photosites that record the patches of a chart: (N · 2 · window, 2 · window) photosites for N patches."""
 
     body: Body
     patches: int  # N
@@ -288,7 +288,7 @@ class PatchSensor:
         light
             (3, rows, columns) float32 from `PatchSensor.light`.
         weights
-            (3,) float64, exposure to each primary.
+            (3,) float64, exposure to each primary, by which its light is multiplied.
         iso
             ISO speed, which sets gain and read noise.
         frame
@@ -352,17 +352,17 @@ class ProjectorLamp:
 
 @dataclass(frozen=True, eq=False)
 class SpectralLamp:
-    """A luminaire at a fixed position that emits one spectrum per illuminant; all have the same flat field.
+    """A luminaire at a fixed position that emits one spectrum per illuminant. All illuminants have one flat field.
 
     Spectra have no absolute brightness. Each exposure is set so that the strongest channel of bare paper reaches
-    `white_level_share` of the room.
+    the fraction `Room.white_level_share` of saturation.
     """
 
     world: World  # Camera, print and room
     powers: _Array  # (L, 81) float64, relative power per nm of each illuminant
     sensor: PatchSensor
     reflectance: _Array  # (N, 81) float64, reflectance of each patch
-    field: _Array  # (N,) float64, illumination of each patch relative to the brightest position, as for green
+    field: _Array  # (N,) float64, illumination of each patch, as by the green primary of the simulated projector
 
     def signals(self, light: int) -> _Array:
         """Return the signal of each patch under an illuminant, (N, 3) float64, DN above black."""

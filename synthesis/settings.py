@@ -26,7 +26,8 @@ from sim.world.world import Room
 from synthesis.lamps import LightSpectra, table_illuminants
 from synthesis.table import TableTask
 
-# Parameters of the simulated room without effect on a computed LUT, which has no neighbouring patches and no time.
+# Parameters of the simulated room that have no effect on a computed LUT: patches have no neighbours, no time passes,
+# and the print has no faults.
 UNUSED_ROOM_FIELDS: Final = (
     "blur_px", "fold_mm", "lamp_drift_per_hour", "shutter_jitter_s", "stain_depth", "stain_mm", "wheel_hz",
 )  # fmt: skip
@@ -104,7 +105,7 @@ def table_room(settings: TableSettings, where: str) -> Room:
 
 
 def table_task(camera: str, settings: TableSettings, where: str, lights: LightSpectra | None = None) -> TableTask:
-    """Return the task for a LUT.
+    """Return the task of computing a LUT, from the values of the command line and the settings.
 
     Parameters
     ----------
@@ -121,11 +122,11 @@ def table_task(camera: str, settings: TableSettings, where: str, lights: LightSp
     curves = read_sensitivities(body.sensitivities)
     record: dict[str, Any] = {
         "by": "sim table",
-        "how": "no frame was taken: counts of the photosites under each cell were computed from spectra and a model of "
-        "the sensor, and sampled as those of a frame",
+        "how": "no frame was taken: counts of the photosites of each patch were computed from spectra and a model of "
+        "the sensor, and sampled like the counts of a frame",
         "sensitivities": describe_sensitivities(curves),
         "lights": {"from": "simulated projector"} if lights is None else lights.source,
-        # The name, not the path of a file of sensitivities, which is no property of the LUT.
+        # Records the name of the sensitivities, because the path of their file is no property of the LUT.
         "body": asdict(replace(body, sensitivities=curves.name)),
         "exposure": settings.exposure.model_dump(mode="json"),
         "room": {name: value for name, value in asdict(room).items() if name not in (*UNUSED_ROOM_FIELDS, "seed")},

@@ -2,8 +2,8 @@
 
 The same camera, illuminants, settings and seed give the same bytes with any number of threads. Computed frames are
 evaluated like photographs in `calibration.pipeline.measuring`: the black level is subtracted, flat field and white are
-measured on the white references, samples are divided by the flat field of their colour. Therefore the ground truth has
-the same kind of error as the ground truth of a photographed LUT.
+measured on the white references, and samples are divided by the flat field for their colour. Therefore the ground truth
+has the same kinds of errors as in a LUT from photographs.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class PatchMeasurement:
         """Measure a white frame and the frames of the primaries."""
         reader = PaperReader(points.whites_mm, points.cells_mm, page_mm)
         first = PatchMeasurement(points, sensor, lamp, iso, reader)
-        # Charts with tags have white references among the patches, other charts only around them.
+        # Charts with tags have white references among the patches. Other charts have them only around the patches.
         order = MAX_ORDER if tagged else MAX_ORDER_AROUND
         base = first._white_frame_paper().field
         uncorrected = replace(first, reader=PaperReader(points.whites_mm, points.cells_mm, page_mm, base, order))
@@ -123,7 +123,7 @@ def _require_unclipped(whites: _Array, frame_name: str) -> None:
     if usable < MIN_REFERENCES:
         raise QualityError(
             f"{frame_name}: {usable} of {len(whites)} references are unclipped, expected {MIN_REFERENCES} or more; "
-            "expose less: reduce room.white_level_share, or with the projector exposure.shutter_s, in the settings"
+            "reduce room.white_level_share in the settings; without --lights, exposure.shutter_s may be reduced instead"
         )
 
 
@@ -226,7 +226,7 @@ def _clipped_cells(frames: Sequence[ComputedFrame], saturation: int) -> list[Unf
     unfit: list[Unfit] = []
     for colour in np.flatnonzero(highest.max(axis=0) >= allowed).tolist():
         light = int(highest[:, colour].argmax())
-        cause = f"clipped: {int(highest[light, colour])} counts under illuminant {light}, below {allowed:.0f} allowed"
+        cause = f"clipped: {int(highest[light, colour])} counts under illuminant {light}, limit {allowed:.0f} counts"
         unfit.append(Unfit(colour=colour, cause=cause))
     return unfit
 

@@ -1,1 +1,1 @@
-"""Causes of figures beyond their limits: the evidence, the rules that decide, and the remedies."""
+"""Probable causes of figures beyond their limits: the evidence, the rules that select a cause, and the remedies."""

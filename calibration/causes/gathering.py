@@ -1,7 +1,8 @@
 """Gather the evidence for the cause of a figure beyond its limit.
 
-Each public function with a name `…_evidence` takes a LUT's measurements and the accepted limit. It returns a
-`CauseEvidence`, or None if there is no evidence. The order is: positions on the print, whole frames, illuminants.
+Each public function with a name `…_evidence` takes the measurements of a LUT and the accepted limit. It returns a
+`CauseEvidence`, or None if there is no evidence. The functions for positions on the print are first, followed by those
+for whole frames and for illuminants.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from calibration.sampling import WINDOW, bleed
 from experiment.measures.stains import Stains, cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
 from experiment.session.records import FrameRecord
 
-# Relative deviation of a block, beyond noise, that shows a fault. Clean simulated frames have smaller deviations.
+# Smallest relative deviation of a block of patches that is a fault. Simulated frames without faults have less.
 MIN_BLOCK = 0.004
 
-# Fraction of the worst frame's deviation from which another frame shows the same fault.
+# Another frame shows the same fault if its deviation is at least this fraction of the worst frame's deviation.
 SAME_FAULT = 0.3
 
 MAX_POSITIONS = 12  # Largest number of positions per figure; more marks would cover the plotted image
@@ -28,8 +29,8 @@ MAX_POSITIONS = 12  # Largest number of positions per figure; more marks would c
 # If at least this fraction of frames differs at a position from the frame registered first, that frame is faulty.
 IN_FIRST = 0.8
 
-# Smallest fraction of a deviation with which another frame shows the same fault, and largest fraction of white frames
-# that are reported as single frames.
+# Another frame shows the same spot if it deviates by at least this fraction of the deviation of the spot. If at most
+# this fraction of the white frames shows the spot, these frames are faulty, and not the print.
 _HALF = 0.5
 
 # Relative residual of references from which an object is reported: ten times their noise under white.
@@ -41,20 +42,21 @@ DARK_RIM = -0.005
 # Smallest number of adjacent patches that proves added light, if all are brighter.
 _MIN_BRIGHT = 4
 
-# Smallest fraction of adjacent patches that a thin shadow darkens (judgement: all, except for noise).
+# A thin shadow darkens at least this fraction of the patches on which it falls (judgement).
 _MOSTLY = 0.8
 
-# Smallest relative deviation of the worst covered patch, unless nearly all are darker (judgement: few printed colours
-# are within 10 % of a hand's reflectance).
+# If fewer patches are darker, one of them must deviate by this fraction. A hand and a printed colour rarely differ less
+# (judgement).
 _COVERED = 0.1
 
-# Fraction of the noisy patches in spots of the print from which the spots explain the noise.
+# If at least this fraction of the noisy patches is in spots of the print, the spots explain the noise.
 _IN_SPOT = 0.5
 
-# Relative deviation of a block above which an object also changes the mean of the references (judgement).
+# An object that changes a block by more than this fraction also changes the mean of the references (judgement).
 _DISTURBED = 0.03
 
-# Largest logarithm of the ratio of equal exposures. Shutter times have steps of 26 %, and files contain rounded times.
+# Exposures are equal if the logarithm of their ratio is smaller. Shutter times have steps of 26 %, and files contain
+# rounded times.
 _SAME_EXPOSURE = 0.03
 
 _Array = npt.NDArray[np.float64]
@@ -107,14 +109,15 @@ def _gather_block(table: TableMeasurements, worst: FrameMeasurements, limit: flo
     frames = [table.registered_frame] if in_first else sorted(beyond, key=lambda frame: -frame.consistency.block)
     x, y = consistency.at_mm
     if in_first and (object_positions := _residual_evidence(table, table.registered_frame)[1]):
-        # Patches under the object were not compared, because they did not match the chart.
+        # The patches under the object were not compared, because they did not match the chart. The white references
+        # show its position.
         x, y = object_positions[0].x_mm, object_positions[0].y_mm
     position = PrintPosition(frames[0].record.file, x, y, size_mm)
     return CauseEvidence(evidence, tuple(frame.record for frame in frames), (position,))
 
 
 def covered_deviation(deviations: npt.NDArray[np.float64]) -> float:
-    """Return the deviation of adjacent patches that an object may cover; NaN if they do not look covered.
+    """Return the deviation of adjacent patches if an object may cover them; else NaN.
 
     `deviations`: (N,) float64, relative, with sign; 0 if unknown.
     """
@@ -123,7 +126,7 @@ def covered_deviation(deviations: npt.NDArray[np.float64]) -> float:
     if not len(darker):
         # A few brighter patches may be dark patches that a hand covers.
         return float(np.median(known_deviations)) if len(known_deviations) >= _MIN_BRIGHT else np.nan
-    # Light of neighbouring patches makes about as many patches brighter as darker, by small amounts.
+    # Blur also mixes neighbouring patches. It changes them slightly, and makes as many brighter as darker.
     is_mixed = len(darker) < _MOSTLY * len(known_deviations) and np.abs(known_deviations).max() < _COVERED
     return np.nan if is_mixed else float(darker.min())
 
@@ -170,7 +173,7 @@ def _gather_disturbed(table: TableMeasurements, softer: float) -> CauseEvidence 
 
 
 def spot_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | None:
-    """Gather evidence on the largest spot of the print; None if the print has no spot."""
+    """Gather evidence on the largest spot (area with wrong colours) of the print; None if there is no spot."""
     stains = table.cells.stains
     spots = spots_of(stains)
     if not spots:
@@ -242,7 +245,7 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
     added, kept = light_of_spot(stains, spot, int(np.argmax(np.abs(colour))))
     size_mm, min_deviation = max(position.size_mm, 1e-9), _HALF * abs(deviation)
     hottest = table.dark_frames.hottest
-    deviating_whites = _whites_off(table, at_mm, position.size_mm, min_deviation)
+    deviating_whites = _faulty_whites(table, at_mm, position.size_mm, min_deviation)
     white_residual = len(deviating_whites) / max(len(table.white_frames), 1)
     evidence = Evidence(
         **_frame_evidence(table, at_mm, size_mm, min_deviation),
@@ -265,14 +268,14 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
     elif 0 < white_residual <= _HALF:
         frames = deviating_whites
     elif evidence.even_showing > 0:
-        frames = _frames_off(table, at_mm, size_mm, min_deviation)
+        frames = _faulty_frames(table, at_mm, size_mm, min_deviation)
         frames = [frame for frame in frames if frame.record.kind == "white"]
     if frames:
         position = replace(position, file=frames[0].record.file)
     return CauseEvidence(evidence, tuple(frame.record for frame in frames), (position,))
 
 
-def _whites_off(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float) -> list[FrameMeasurements]:
+def _faulty_whites(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float) -> list[FrameMeasurements]:
     reach = max(size_mm, 3 * cell_mm(table.cells.stains))
     return [
         frame
@@ -289,7 +292,10 @@ def _dark_rim_fraction(table: TableMeasurements) -> float:
 def _residual_evidence(
     table: TableMeasurements, frame: FrameMeasurements
 ) -> tuple[dict[str, float], tuple[PrintPosition, ...]]:
-    """Return evidence from the largest residual of a white frame's references, and its position; both may be empty."""
+    """Return evidence on the largest residual of the references in a white frame, and its position.
+
+    Both are empty if the residual is small or if there is no other white frame.
+    """
     whites, residuals = table.white_frames, frame.paper.left
     deviation, tint = _largest_deviation(np.array(residuals.deviation))
     if frame not in whites or len(whites) < 2 or abs(deviation) < _MIN_RESIDUAL:
@@ -335,7 +341,7 @@ def reference_evidence(table: TableMeasurements, limit: float) -> CauseEvidence 
         position = PrintPosition(worst.record.file, *residuals.at_mm, 0.0)
         return CauseEvidence(Evidence(**evidence), (), (position,))
     gathered = _gather_spot(table, stains, near_spots[0])
-    # The values of the spot are based on patches of all colours, and are more accurate.
+    # The spot was measured with patches of all colours, which is more accurate than with references alone.
     return replace(gathered, evidence=Evidence(**evidence | gathered.evidence.measured_values()))
 
 
@@ -345,7 +351,7 @@ def _frame_evidence(table: TableMeasurements, at_mm: _Array, size_mm: float, min
     other_frames = [frame for frame in table.frames if frame is not first]
     if not other_frames:
         return {}
-    deviating_frames = _frames_off(table, at_mm, size_mm, min_deviation)
+    deviating_frames = _faulty_frames(table, at_mm, size_mm, min_deviation)
     whites = [frame for frame in other_frames if frame.record.kind == "white"]
     showing = len(deviating_frames) / len(other_frames)
     return {
@@ -356,7 +362,7 @@ def _frame_evidence(table: TableMeasurements, at_mm: _Array, size_mm: float, min
     }
 
 
-def _frames_off(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float) -> list[FrameMeasurements]:
+def _faulty_frames(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float) -> list[FrameMeasurements]:
     """Return the frames that deviate at a position from the frame registered first, worst first."""
     first = table.registered_frame
     frames = [
@@ -421,7 +427,7 @@ def chart_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on the frame in which the chart was registered first."""
     registered = table.registered_frame
     gathered = _gather_frames(table, registered, [registered])
-    # The references show an object on the print only if other white frames do not contain it.
+    # References reveal an object on the print only by comparison with other white frames.
     evidence, positions = _residual_evidence(table, registered)
     return CauseEvidence(Evidence(**gathered.evidence.measured_values() | evidence), gathered.frames, positions)
 
@@ -442,13 +448,13 @@ def _gather_frames(table: TableMeasurements, worst: FrameMeasurements, beyond: _
 
 
 def light_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
-    """Gather the exposures and colour scatter of whites that do not add up, drift, or do not fit their codes."""
+    """Gather evidence on the brightness of frames: recorded exposures, and scatter of white's colour."""
     frames = table.frames
     evidence = Evidence(frames=float(len(frames)), colour_scatter=_colour_scatter(table))
     exposures = np.array([frame.exposure for frame in frames])
     if len(frames) < 2 or not (exposures > 0).all():
         return CauseEvidence(evidence, (), ())
-    # The session's exposure is the median over the frames of illuminants; white frames are few.
+    # The usual exposure is the median over the frames of illuminants, because there are few white frames.
     light_exposures = [frame.exposure for frame in frames if frame.record.kind == "light"]
     ratio = exposures / float(np.median(light_exposures or exposures))
     log_ratio = np.abs(np.log(ratio))
@@ -459,7 +465,7 @@ def light_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
 
 
 def drift_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
-    """Gather evidence on differing white frames: their exposures, or an object on the print in one of them."""
+    """Gather evidence on differences between white frames: other exposures, or an object on the print in one frame."""
     light = light_evidence(table, limit)
     worst = max(table.white_frames, key=lambda frame: frame.consistency.block, default=None)
     if worst is None or light.frames or not worst.consistency.block > _DISTURBED:
@@ -478,12 +484,12 @@ def sum_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     low, middle, high = np.argsort(amounts).tolist()
     lower_step, upper_step = (float(step) for step in (amounts[middle] - amounts[low], amounts[high] - amounts[middle]))
     larger_step, smaller_step = max(lower_step, upper_step), min(lower_step, upper_step)
-    # Frames of primaries may vary as much as white frames.
+    # Smaller differences may be the usual variation between frames.
     if not larger_step > _LONE_RATIO * _colour_range(table):
         return light
     if larger_step > _LONE_RATIO * smaller_step:
         primary, evidence = low if lower_step > upper_step else high, replace(light.evidence, lone_primary=larger_step)
-    elif smaller_step > _EQUALLY * larger_step:
+    elif smaller_step > _MIN_SIMILARITY * larger_step:
         primary, evidence = high, replace(light.evidence, mixed=larger_step)
     else:
         return light
@@ -491,13 +497,14 @@ def sum_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     return CauseEvidence(evidence, frames, ())
 
 
-# One primary is faulty if its difference from the nearest primary is this many times the difference of the other two.
-# Smaller multiples of the white frames' colour range are no fault (judgement).
+# The amounts of the primaries in white differ significantly if they differ by this factor times the colour range of
+# white frames. One primary is faulty if its difference from the next one is this factor times the difference of the
+# other two (judgement).
 _LONE_RATIO = 3.0
 
-# Smallest ratio of deficit and excess of two primaries in white if a primary's frame contains another illuminant
-# (judgement).
-_EQUALLY = 0.7
+# If the frame of one primary contains another illuminant, white has an excess of one primary and a similar deficit of
+# another. This is the smallest ratio of the two (judgement).
+_MIN_SIMILARITY = 0.7
 
 
 def _colour_range(table: TableMeasurements) -> float:
@@ -506,7 +513,7 @@ def _colour_range(table: TableMeasurements) -> float:
 
 
 def _colour_scatter(table: TableMeasurements) -> float:
-    # 0 if the colour of white drifts more than it scatters between frames.
+    # The result is 0 if the colour of white drifts more than it scatters between frames.
     log_white = np.log([frame.paper.white for frame in table.white_frames]).reshape(-1, 3)
     if len(log_white) < 3:
         return 0.0
@@ -535,7 +542,7 @@ def name_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
 
 
 def brightness_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
-    """Gather evidence on illuminants with another brightness than predicted from their codes."""
+    """Gather evidence on illuminants that are brighter or darker than predicted from their codes."""
     gathered, codes = light_evidence(table, limit), table.lights.codes
     if gathered.frames or codes is None:
         return gathered
@@ -566,7 +573,7 @@ def dark_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
 
 
 def stray_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
-    """Gather evidence on light missing in the dark frames."""
+    """Gather evidence on light that is in some frames but not in the dark frames."""
     stray = table.lights.stray
     if stray is None:
         return CauseEvidence(Evidence(), (), ())

@@ -1,5 +1,6 @@
-"""Causes of a figure beyond its limit, the evidence for them, and the table of rules that selects a cause.
+"""Probable causes of a figure beyond its limit, the evidence for them, and the rules that select one of them.
 
+A figure is a measured property of a session or LUT with limits (`calibration.figures`).
 The first rule that applies decides. If no rule applies, the cause is reported as unknown.
 """
 
@@ -10,7 +11,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 from typing import Literal
 
-# Taken again after the remedy: the listed frames, the whole session, or nothing because new frames do not help.
+# What must be taken again after the remedy: the listed frames, the whole session, or nothing.
 Repeats = Literal["frames", "session", "nothing"]
 
 
@@ -21,7 +22,7 @@ class Cause:
     - `name`: identifier, as in `report.json`.
     - `description`: noun phrase that follows "probably" in a message.
     - `remedy`: instruction for the user, in the imperative.
-    - `repeats`: frames or session that must be taken again after the remedy, or nothing.
+    - `repeats`: what must be taken again after the remedy.
     """
 
     name: str
@@ -45,7 +46,7 @@ OBJECT_IN_FRAME = Cause(
 REFLECTION = Cause(
     "reflection in all frames",
     "a reflection on the print in all frames, which adds the same light to every colour",
-    "turn the print or the projector until it mirrors no lamp, window or bright wall, or print on matt paper",
+    "turn the print or the projector until the print mirrors no lamp, window or bright wall; or print on matt paper",
     "session",
 )
 REFLECTION_IN_FRAME = Cause(
@@ -68,19 +69,19 @@ SHADOW = Cause(
 )
 FALL_OFF = Cause(
     "fall-off",
-    "a fall-off towards the corners that the flat field does not describe",
+    "a fall-off of light towards the corners that the flat field does not describe",
     "stop the lens down, use a longer lens or step back, and zoom the projector out",
     "session",
 )
 CURL = Cause(
     "curled print",
-    "a curled or folded print; its shape there could not be measured",
+    "a curled or folded print, so that the positions of patches could not be measured accurately",
     "hang the print flatter, on a board or fastened at all corners",
     "session",
 )
 SPREAD = Cause(
     "soft lens",
-    "a lens that spreads light over several patches, so that neighbouring colours mix at the rims",
+    "a lens that spreads light over several patches, so that their colours mix at the rims",
     "focus on the print, stop down to f/8, clean the lens, move the camera closer, or use a smaller window "
     "(build-lut --window)",
     "session",
@@ -100,7 +101,7 @@ DEFOCUS = Cause(
 ANOTHER_PRINT = Cause(
     "another print",
     "another print: its patches differ from chart.json",
-    "give the chart.json of this print, and keep it in place until the session ends",
+    "use the chart.json of this print, and leave the print in place until the session ends",
     "frames",
 )
 WRONG_NAME = Cause(
@@ -117,13 +118,13 @@ OTHER_CAMERA = Cause(
 )
 OTHER_EXPOSURE = Cause(
     "other exposure",
-    "frames with another recorded exposure than the other frames or the session's settings",
+    "frames with a recorded exposure that differs from the other frames or from the settings of the session",
     "take all frames with one exposure in manual mode: shutter, aperture and ISO speed",
     "frames",
 )
 ROOM_LIGHT = Cause(
     "room light",
-    "light of the room, which is present while the projector shows black",
+    "light of the room in addition to the projected light",
     "darken the room, cover lamps and displays, and keep daylight out",
     "session",
 )
@@ -131,22 +132,21 @@ OTHER_BRIGHTNESS = Cause(
     "one primary's frame",
     "a brightness error in the frame of one primary: a shadow, a hand at the projector, a flickering lamp or another "
     "exposure",
-    "take that frame again, and keep the projector's beam free",
+    "take the frame of this primary again, and keep the projector's beam free",
     "frames",
 )
 COLOUR_WHEEL = Cause(
     "colour wheel",
     "the projector's colour wheel: exposures end within a turn, so that frames contain more of one primary than of "
     "another",
-    "expose whole turns of the wheel, 0.5 s or longer (camera.shutter_s a multiple of 1 / "
-    "lab.projector.colour_wheel_hz; 0.5 s is 30 turns at 60 turns per second), or use a projector without a wheel",
+    "expose for whole turns of the wheel and at least 0.5 s (set camera.shutter_s to a multiple of 1 / "
+    "lab.projector.colour_wheel_hz), or use a projector without a wheel",
     "session",
 )
 MIXED = Cause(
     "another light in one frame",
-    "another light in the frame of one primary, for example because the projected image had not settled: white "
-    "contains more of that primary than its frame, and correspondingly less of another",
-    "take that frame again, and let the projected image settle longer (sequence.settle_s)",
+    "light of another illuminant in the frame of one primary, for example because the projected image had not settled",
+    "take the frame of this primary again, and let the projected image settle longer (sequence.settle_s)",
     "frames",
 )
 UNKNOWN = Cause("unknown", "", "", "nothing")  # No rule applies; the remedy of the limit is reported
@@ -163,46 +163,46 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class Evidence:
-    """Measured properties of a deviation; NaN if not measured.
+    """Measured properties of a deviation; NaN if not measured. A local deviation has one position on the print.
 
     - `frames`: number of compared frames.
-    - `showing`: fraction of these frames with the deviation.
-    - `even_showing`: fraction of the white frames among them with the deviation; 0 without white frames.
-    - `white_residual`: fraction of white frames with references that deviate there by at least half as much.
-    - `some_whites`: 1 if the references deviate there in some white frames and not in others, else 0.
-    - `spot`: fraction of patches there with a wrong colour in the mean of the white frames.
-    - `in_first`: 1 if at least 80 % of the frames differ there from the frame registered first; else 0.
+    - `showing`: fraction of these frames that show the deviation.
+    - `even_showing`: fraction of the white frames among them that show the deviation; 0 without white frames.
+    - `white_residual`: fraction of white frames with white references that have at least half of this deviation.
+    - `some_whites`: 1 if white references deviate at the position in some white frames but not in all; else 0.
+    - `spot`: fraction of the patches at the position with a wrong colour in the mean of the white frames.
+    - `in_first`: 1 if at least 80 % of the frames differ at the position from the frame registered first; else 0.
     - `share`: fraction of the print that deviates.
     - `deviation`: relative deviation in the channel that deviates most; negative is darker.
-    - `tint`: range of the deviation over the channels, divided by its magnitude; 0 if all channels are alike.
-    - `added`: light added to the patches there, independent of their colour, as a fraction of paper white.
-    - `kept`: fraction of their own light that the patches there keep.
-    - `rim`: mean relative residual of the outermost references, with its sign.
+    - `tint`: range of the deviations of the channels, relative to `deviation`; 0 if all channels are alike.
+    - `added`: light added to the patches at the position, equal for all colours, as a fraction of paper white.
+    - `kept`: fraction of their own light that the patches at the position still have.
+    - `rim`: mean relative deviation of the outermost white references from the flat field; negative is darker.
     - `rim_frames`: fraction of white frames in which `rim` is below −0.5 %.
-    - `radial`: fraction of the residuals' variance explained by the distance from the centre.
+    - `radial`: fraction of the variance of all references' deviations that the distance from the centre explains.
     - `hot`: fraction of the affected patches with a photosite that is hot in every dark frame.
-    - `scatter`: relative scatter of all patches of the frame about their codes' colours.
-    - `softer`: light of neighbouring patches that the frame's blur adds to the worst sample, as a fraction.
+    - `scatter`: relative scatter of all patches of the frame about the colours expected from their codes.
+    - `softer`: additional light of neighbouring patches in the worst sample, because of blur, as a fraction.
     - `moved_px`: distance of the chart from its registered position, half-size px.
     - `anew`: fraction of frames in which the chart was registered again.
     - `agreement`: correlation of the patches with the chart at the registered position.
-    - `exposure`: exposure of the frame by its file, relative to the other frames.
+    - `exposure`: recorded exposure of the frame that differs most, divided by the usual exposure.
     - `off_codes_deg`: largest angle between an illuminant's white and the prediction from its codes, degrees.
     - `named_right`: 0 if an illuminant's white fits the codes of another illuminant; else not measured.
-    - `cameras`: number of cameras or lenses among the frames, by their files.
+    - `cameras`: number of cameras or lenses that the raw files name.
     - `room`: light while the projector shows black, as a fraction of white.
     - `room_change`: change of `room` between dark frames, as a fraction of white.
-    - `stray`: light of a primary under a code of 0 that is missing in the dark frames, as a fraction of that primary.
-    - `stray_primaries`: light common to the primaries' frames that exceeds white, as a fraction of white.
-    - `lone_primary`: relative difference of one primary in white from the other two, which agree.
-    - `mixed`: relative excess of one primary in white, if another primary lacks about as much.
+    - `stray`: light of a primary although its code is 0, minus the dark light, as a fraction of that primary.
+    - `stray_primaries`: room light in the frames of primaries, as a fraction of white; it makes their sum exceed white.
+    - `lone_primary`: relative difference between the amount of one primary in white and the amounts of both others.
+    - `mixed`: relative excess of one primary in white, if white lacks about as much of another primary.
     - `colour_scatter`: relative scatter of white's colour between successive white frames, beyond drift.
     - `other_iso`: number of frames with another recorded ISO speed than the settings or most frames.
-    - `lit`: fraction of the unfit patches with too much light on the print for their level.
-    - `misplaced`: fraction of the unfit patches with too large an uncertainty of position.
-    - `uneven`: fraction of the unfit patches with different rim and centre.
-    - `waves_px`: RMS distance of the tags from a flat sheet, half-size px, for patches of 10 px.
-    - `beyond_cell`: fraction of the worst sample's light that the lens brings from outside its patch.
+    - `lit`: fraction of the unfit patches that are too bright because of added light.
+    - `misplaced`: fraction of the unfit patches with an uncertain position.
+    - `uneven`: fraction of the unfit patches with a rim that differs from the centre.
+    - `waves_px`: RMS distance of the tags from a flat sheet, half-size px, scaled to patches of 10 px.
+    - `beyond_cell`: fraction of the worst sample's light that comes from outside its patch.
     """
 
     frames: float = NAN
@@ -285,7 +285,7 @@ class Rule:
         return subject in self.about and all(condition.holds(evidence) for condition in self.conditions)
 
 
-# Subject of a figure. Rules refer to it instead of the figure's name.
+# Subject of a figure. Rules refer to subjects, because several figures may have the same causes.
 Subject = Literal[
     "block", "few cells", "unfit cells", "spot", "references", "frame", "movement", "noisy cells", "chart", "drift",
     "names", "brightness", "sum", "dark", "stray", "camera", "iso",
@@ -296,6 +296,7 @@ def _subjects(*names: Subject) -> frozenset[Subject]:
     return frozenset(names)
 
 
+# Groups of subjects: a position in single frames, whole frames, positions on the print, illuminants and the lamp.
 PLACE = _subjects("block", "few cells")
 WHOLE_FRAME = _subjects("frame", "movement", "noisy cells")
 PRINT = _subjects("spot", "unfit cells", "references")
@@ -306,23 +307,23 @@ DARK = _subjects("dark")
 STRAY = _subjects("stray")
 CHART = _subjects("chart")
 
-# At a position on the print, the white frames agree with the frame registered first.
+# No white frame differs from the frame registered first at the position. All frames therefore deviate there equally.
 _IN_ALL_FRAMES = (
     Condition("in_first", 0, 0), Condition("even_showing", 0, 0), Condition("some_whites", 0, 0),
     Condition("frames", 2, _INFINITY),
 )  # fmt: skip
 
-# The deviation is local, and the frame is as sharp as the frame registered first.
+# The deviation is local, and the frame is not more blurred than the frame registered first.
 _SHARP_PLACE = (Condition("share", 0, 0.5), Condition("scatter", 0, 0.1), Condition("softer", -_INFINITY, 0.003))
 
-# At most 34 % of the frames deviate at a position, and the frame registered first is correct there.
+# At most 34 % of the frames deviate at the position. The frame registered first is correct.
 _IN_FEW_FRAMES = (
     Condition("in_first", 0, 0), Condition("frames", 3, _INFINITY), Condition("showing", 1e-9, 0.34),
 )  # fmt: skip
 
-# Rules in the order of decision: rules based on file data and dark frames precede rules based on appearance.
-# A wrong cause may lead to an unnecessary session; an unknown cause does less harm. Therefore there are gaps between
-# the intervals of different causes.
+# Rules in the order of decision. Rules based on file data and dark frames precede rules based on appearance. A wrong
+# cause may lead to an unnecessary session, and an unknown cause does less harm. Therefore the intervals of different
+# causes leave gaps.
 RULES: tuple[Rule, ...] = (
     Rule(
         OTHER_CAMERA,
@@ -352,13 +353,13 @@ RULES: tuple[Rule, ...] = (
         COLOUR_WHEEL,
         _subjects("drift", "sum", "brightness"),
         (Condition("colour_scatter", 0.002, 0.15),),
-        "white's colour alternates between successive white frames, which lamp drift does not do",
+        "the colour of successive white frames alternates; lamp drift does not have this effect",
     ),
     Rule(
         MIXED,
         _subjects("sum", "brightness", "stray"),
         (Condition("mixed", 0.01, 0.5),),
-        "white contains more of one primary than of the third, and correspondingly less of another",
+        "white contains too much of one primary, and about as much too little of another",
     ),
     Rule(
         OTHER_BRIGHTNESS,
@@ -370,32 +371,32 @@ RULES: tuple[Rule, ...] = (
         WRONG_NAME,
         LIGHT,
         (Condition("named_right", 0, 0), Condition("exposure", 0.97, 1.03)),
-        "its white does not fit its own codes, but the codes of another illuminant",
+        "the white of an illuminant fits the codes of another illuminant, and not its own codes",
     ),
     Rule(
         ROOM_LIGHT,
         DARK,
         (Condition("room_change", 0.002, _INFINITY),),
-        "the light changes between dark frames; the projector's own black is constant",
+        "the light changes between dark frames; a projector's black is constant",
     ),
     Rule(
         ROOM_LIGHT,
         DARK,
         (Condition("room", 0.02, _INFINITY), Condition("frames", 1, _INFINITY)),
-        "no projector's black reaches 2 % of its white",
+        "the light exceeds 2 % of white, which is more than the black of any projector",
     ),
     Rule(
         ROOM_LIGHT,
         STRAY,
         (Condition("stray", 0.004, 0.1),),
-        "illuminants with a code of 0 contain or lack light of that primary which the dark frames do not show",
+        "a primary with code 0 has more or less light in frames of illuminants than in the dark frames",
     ),
     Rule(
         ROOM_LIGHT,
         STRAY,
         (Condition("stray_primaries", 0.004, 0.1),),
-        "red, green and blue alone add up to more than white, by the same amount in each, under a steady lamp; a "
-        "projector that reduces full white has the same effect",
+        "red, green and blue alone add up to more than white by the same fraction of each, and the lamp is steady; "
+        "a projector that reduces full white has the same effect",
     ),
     Rule(
         HOT_PHOTOSITES,
@@ -413,25 +414,25 @@ RULES: tuple[Rule, ...] = (
         DEFOCUS,
         WHOLE_FRAME | PLACE,
         (Condition("softer", 0.003, _INFINITY), Condition("scatter", 0, 0.1)),
-        "the tags are softer than in the frame registered first, and patches contain their neighbours' light",
+        "the tags are more blurred than in the frame registered first, and patches contain light of their neighbours",
     ),
     Rule(
         ANOTHER_PRINT,
         WHOLE_FRAME | PLACE | CHART,
         (Condition("scatter", 0.2, _INFINITY), Condition("softer", -_INFINITY, 0.012)),
-        "no patch has the colour of its code, although the tags are sharp",
+        "the patches do not have the colours of their codes, although the tags are sharp",
     ),
     Rule(
         ANOTHER_PRINT,
         CHART,
         (Condition("agreement", -1, 0.5),),
-        "patches and chart are uncorrelated",
+        "the colours of patches and chart are uncorrelated",
     ),
     Rule(
         BUMP,
         _subjects("movement"),
         (Condition("anew", 1e-9, 1), Condition("moved_px", 0.5, _INFINITY), Condition("softer", -_INFINITY, 0.003)),
-        "the tags are at other positions than before, and as sharp",
+        "the tags are at other positions than before, and equally sharp",
     ),
     Rule(
         OBJECT_IN_FRAME,
@@ -453,7 +454,7 @@ RULES: tuple[Rule, ...] = (
             Condition("showing", 0.8, 1),
             Condition("share", 0, 0.5),
         ),
-        "all frames differ at one position from the frame that they are compared with",
+        "nearly all frames differ at one position from the frame with which they are compared",
     ),
     Rule(
         OBJECT_IN_FRAME,
@@ -488,19 +489,19 @@ RULES: tuple[Rule, ...] = (
             Condition("kept", 0.9, 1.1),
             *_SHARP_PLACE,
         ),
-        "light is added at one position in few frames, and the patches keep their own light",
+        "light is added at one position in few frames, and the patches have lost none of their own light",
     ),
     Rule(
         OBJECT_IN_FRAME,
         _subjects("block"),
         (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("kept", -_INFINITY, 0.85), *_SHARP_PLACE),
-        "patches at one position lose light of their own colours in few frames, all by the same fraction",
+        "in few frames, the patches at one position lose the same fraction of their own light",
     ),
     Rule(
         OBJECT_IN_FRAME,
         PLACE | _subjects("unfit cells"),
         (*_IN_FEW_FRAMES, Condition("spot", 0, 0.1), Condition("deviation", -1, 0), *_SHARP_PLACE),
-        "one position deviates in few frames, and is correct in the others and under white",
+        "one position is darker in few frames, and is correct in the others and under white",
     ),
     Rule(
         REFLECTION,
@@ -511,13 +512,13 @@ RULES: tuple[Rule, ...] = (
             Condition("deviation", 0, _INFINITY),
             Condition("share", 0, 0.7),
         ),
-        "light is added at one position in all frames, and dark colours gain most",
+        "light is added at one position in all frames, and dark colours change most",
     ),
     Rule(
         FALL_OFF,
         _subjects("references"),
         (Condition("radial", 0.5, 1), Condition("rim", -1, -0.005), Condition("rim_frames", 0.9, 1)),
-        "the residual depends only on the distance from the centre, and the rim is darker, in all frames",
+        "in nearly all white frames, the rim is too dark, and deviations depend mainly on the distance from the centre",
     ),
     Rule(
         STAIN,
@@ -530,7 +531,7 @@ RULES: tuple[Rule, ...] = (
             Condition("tint", 0.35, _INFINITY),
             Condition("share", 0, 0.2),
         ),
-        "a position is darker in all frames, in proportion to its light, and more in one colour",
+        "a position is darker in all frames, in proportion to its light, and most in one channel",
     ),
     Rule(
         STAIN,
@@ -541,7 +542,7 @@ RULES: tuple[Rule, ...] = (
             Condition("tint", 0.35, _INFINITY),
             Condition("share", 0, 0.2),
         ),
-        "white references are dark at one position in all white frames, and more in one colour",
+        "white references are dark at one position in nearly all white frames, and most in one channel",
     ),
     Rule(
         SHADOW,
@@ -554,25 +555,25 @@ RULES: tuple[Rule, ...] = (
             Condition("tint", 0, 0.25),
             Condition("share", 0, 0.5),
         ),
-        "a position is darker in all frames, in proportion to its light, equally in all colours",
+        "a position is darker in all frames, in proportion to its light, and equally in all channels",
     ),
     Rule(
         REFLECTION,
         _subjects("unfit cells"),
         (Condition("lit", 0.5, 1),),
-        "most of the affected patches are too bright by the same amount as their neighbours, whatever their colour",
+        "most of the affected patches and their neighbours are too bright by the same amount, whatever their colour",
     ),
     Rule(
         CURL,
         _subjects("unfit cells"),
         (Condition("misplaced", 0.5, 1), Condition("waves_px", 0.3, _INFINITY)),
-        "most of the affected patches have an uncertain position, and the tags do not lie in a plane",
+        "most of the affected patches have an uncertain position, and the tags are not in one plane",
     ),
     Rule(
         SPREAD,
         _subjects("unfit cells", "noisy cells"),
         (Condition("beyond_cell", 0.01, _INFINITY), Condition("uneven", 0.5, 1)),
-        "rim and centre of patches differ, and the print proves that the lens brings light from outside them",
+        "rim and centre of patches differ, and samples contain light from outside their patches",
     ),
 )  # fmt: skip
 
@@ -581,7 +582,7 @@ RULES: tuple[Rule, ...] = (
 class Decision:
     """Probable cause of a figure beyond its limit, with the rule that applied; None if the cause is unknown.
 
-    - `follows`: name of another figure that the rule explains, if this figure has the same cause; else "".
+    - `follows`: name of the related figure from which the cause was taken; else "".
     """
 
     cause: Cause

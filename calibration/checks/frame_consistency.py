@@ -1,18 +1,19 @@
-"""Check that a frame has the camera, exposure and chart of the registered frame.
+"""Compare every frame with the frame registered first (the reference frame): patches, camera, lens and exposure.
 
-A frame under one illuminant may be spoilt although the tags are in place in the white frames before and after it. The
-ratio of a patch's channel to its value in the reference frame is a smooth function of the printed code, for any two
-illuminants and any inks. It is modelled by a polynomial in the code, fitted to the frame itself. The residual consists
-of noise, the error of the polynomial (random over the sheet, as the codes are) and faults of the frame:
+A frame may be faulty although the white frames before and after it are correct. For any two illuminants and any inks,
+the ratio of a patch to its value in the reference frame is a smooth function of the printed code. In each channel, a
+polynomial in the code is fitted to this ratio. The residual consists of noise, errors of the polynomial and faults of
+the frame. The codes are in random order on the print, so errors of the polynomial are random over the print as well.
+Three values describe the faults:
 
-- `scatter` of all patches: large if the frame is blurred, because neighbours mix, or if the patches have another order.
-  The scatter that noise can cause is subtracted.
-- `block`, the mean of neighbouring patches: a hand, a shadow or a reflection covers one area. A patch that differs from
-  all its neighbours, for example by a hot photosite, gets the nearest value of a neighbour.
-- `disturbed`, adjacent patches with large deviations: covered areas that are too small to change the mean of a block
+- `scatter` is the scatter of all patches. It is large if the frame is blurred, because neighbours mix, or if the
+  patches have another order. The scatter that noise can cause is subtracted.
+- `block` is the mean of neighbouring patches. It is large if a hand, a shadow or a reflection covers an area. A patch
+  that differs from all its neighbours, for example by a hot photosite, gets the nearest value of a neighbour.
+- `disturbed` lists adjacent patches with large deviations, in areas too small to change the mean of a block
   (`calibration.checks.small_places`).
 
-Charts of 8 and 64 patches cannot be checked: the polynomial has too many terms for them.
+Charts of 8 and 64 patches cannot be checked, because the polynomial has too many terms for them.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from calibration import kernels
-from calibration.checks.small_places import AROUND, LEAST_MODEL_ERROR, SmallPlaces, cells_without_hot
+from calibration.checks.small_places import AROUND, LEAST_MODEL_ERROR, CoveredPatchFinder, cells_without_hot
 from drivers.raw.rawfile import FrameOrigin
 from experiment.measures.least_squares import (
     code_polynomial,
@@ -44,9 +45,9 @@ _Mask = npt.NDArray[np.bool_]
 
 DEGREE = 4  # Degree of the polynomial in the code: 35 terms
 
-LEAST_COUNTS = 60.0  # Minimum expected mean of the 25 samples of a compared patch, counts; accurate to 3 %
+LEAST_COUNTS = 60.0  # Patches with fewer expected counts are not compared: the mean of 25 samples has an error of 3 %
 
-# Largest number of patches for scatter and blocks: a quarter of a full chart, because every frame is compared.
+# Largest number of patches for scatter and blocks: a quarter of a full chart, to save time in every frame.
 CELLS = 8192
 
 FIT_CELLS = 1500  # Approximate number of patches for fitting the polynomial: forty per term
@@ -64,13 +65,13 @@ _ROUNDS = 3  # Number of reweighted solutions after the unweighted one
 # full chart, noise alone exceeds them in one of sixty frames.
 _CERTAIN = 4.0
 
-# Variance of a standard deviation estimated by the median deviation of N normal values, over σ²/N (P. Rousseeuw and
-# C. Croux, Journal of the American Statistical Association 88, 1993: an efficiency of 37 %).
+# Variance of the standard deviation of N normal values that is estimated from their median deviation, in units of σ²/N
+# (P. Rousseeuw and C. Croux, Journal of the American Statistical Association 88, 1993: an efficiency of 37 %).
 _SPREAD_ERROR2 = 1.36
 
 _SAME_FAULT_RATIO = 0.3  # Deviation relative to the worst block above which a block belongs to the same fault
 
-# Percentile of the expected levels that represents the brightest patch; paper is not among them.
+# Percentile of the expected levels of patches that represents the brightest patch.
 _BRIGHT_PERCENTILE = 99.0
 
 _MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0  # Standard uncertainty of a predicted patch: relative to its level, and counts
@@ -78,9 +79,9 @@ _MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0  # Standard uncertainty of a predicted pa
 
 @dataclass(frozen=True)
 class FrameConsistency:
-    """Differences of a frame from the registered chart under its illuminant; zeros if nothing is comparable."""
+    """Differences between a frame and the reference frame; 0 if no patch can be compared."""
 
-    # relative scatter about the polynomial without noise, beyond 4 standard uncertainties, worst channel
+    # relative scatter about the polynomial, minus noise and 4 standard uncertainties, in the worst channel
     scatter: float = 0.0
     block: float = 0.0  # relative deviation of the worst block, beyond 4 standard uncertainties
     at_mm: tuple[float, float] = (0.0, 0.0)  # centre of the worst block on the print
@@ -92,7 +93,7 @@ class FrameConsistency:
     # covered patches, and the relative deviation of each: worst channel, 0 if too dark
     disturbed: tuple[tuple[int, float], ...] = ()
     seeds: tuple[int, ...] = ()  # disturbed patches with large deviations; the others touch them
-    alone: tuple[int, ...] = ()  # patches with a large deviation, without such neighbours
+    alone: tuple[int, ...] = ()  # isolated patches with a large deviation
 
     def without_hot(self, hot: _Mask, cells_mm: _Array) -> FrameConsistency:
         """Return the same result without patches that deviate because of hot photosites.
@@ -114,22 +115,22 @@ class _Deviations:
 
     solution: _Array  # (K,) coefficients of the polynomial
     measured: _Array  # (N,) counts of the patches compared for blocks; NaN if not comparable
-    expected: _Array  # (N,) the same from the polynomial
-    scatter: float  # estimate from all patches
-    significant_scatter: float  # scatter beyond its uncertainty
+    expected: _Array  # (N,) counts that the polynomial predicts for these patches
+    scatter: float  # relative scatter of all patches, without noise
+    significant_scatter: float  # part of `scatter` that exceeds its uncertainty
     mean: _Array  # (B,) relative deviation of each block
-    excess: _Array  # (B,) part of it beyond noise
+    excess: _Array  # (B,) part of the absolute deviation that exceeds noise
 
 
 @dataclass(frozen=True, eq=False)
 class _Channel:
     """One channel of the reference frame, prepared for comparisons."""
 
-    terms: _Array  # (N, K) of the compared patches
-    level: _Array  # (N,) their counts
+    terms: _Array  # (N, K) terms of the polynomial for each compared patch
+    level: _Array  # (N,) counts of these patches
     bright: npt.NDArray[np.int64]  # indices of patches that are bright enough
-    fitted: npt.NDArray[np.int64]  # indices for the fit
-    design: _Array  # (F, K) of the fit
+    fitted: npt.NDArray[np.int64]  # indices of the F patches to which the polynomial is fitted
+    design: _Array  # (F, K) design matrix of the fit
 
     @staticmethod
     def of(terms: _Array, level: _Array, usable: _Mask) -> _Channel:
@@ -159,7 +160,7 @@ class ConsistencyCheck:
     """
 
     def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, level: _Array, variance: _Array, usable: _Mask) -> None:
-        # Blocks are means over many patches: every fourth patch of a full chart is enough.
+        # Blocks are means over many patches, so every fourth patch of a full chart is sufficient.
         self._selection = slice(None, None, max(1, len(cells_mm) // CELLS))
         all_terms = code_polynomial(np.asarray(rgb), DEGREE)
         terms = np.ascontiguousarray(all_terms[self._selection])
@@ -168,13 +169,12 @@ class ConsistencyCheck:
         self._basis = np.ascontiguousarray(all_terms.T)
         self._level = np.where(usable[:, None] & (level > LEAST_COUNTS), level, np.nan).T.copy()
         self._noise2 = np.ascontiguousarray((variance / np.maximum(level, 1.0) ** 2).T)
-        self._places = SmallPlaces(rgb, cells_mm, usable)
+        self._covered_finder = CoveredPatchFinder(rgb, cells_mm, usable)
         compared_mm = cells_mm[self._selection]
         block, self._block_centres, self._block_mm2 = _blocks(compared_mm)
         self._members = _members(block, len(self._block_centres))
-        # Each deviation is limited to the deviations of its eight neighbours, so that a single patch cannot change a
-        # block. A covered area contains several patches, so it remains. A limit by the scatter of the block would hide
-        # an area that covers less than half of the block.
+        # Each deviation is limited to the deviations of its eight neighbours, so that a single patch cannot change the
+        # mean of a block. A covered area contains several patches, so it is not affected.
         neighbours = cKDTree(compared_mm).query(compared_mm, k=min(AROUND + 1, len(compared_mm)))[1]
         self._around = np.ascontiguousarray(np.atleast_2d(neighbours), dtype=np.int64)
 
@@ -236,7 +236,7 @@ class ConsistencyCheck:
             sigma[row] += self._noise2[channel]
             sigma[row] += max(valid[channel].scatter, LEAST_MODEL_ERROR) ** 2
         np.sqrt(sigma, out=sigma)
-        cells, worst_deviation, seeds, alone = self._places.disturbed(deviation, sigma)
+        cells, worst_deviation, seeds, alone = self._covered_finder.disturbed(deviation, sigma)
         disturbed = tuple(zip(cells.tolist(), worst_deviation.round(6).tolist(), strict=True))
         return disturbed, tuple(seeds.tolist()), tuple(alone.tolist())
 
@@ -244,7 +244,7 @@ class ConsistencyCheck:
         if len(reference.bright) < CELLS_A_TERM * reference.terms.shape[1]:
             return None
         design, level, measured = reference.design, reference.level[reference.fitted], mean[reference.fitted]
-        # Weights follow expected levels; with measured levels, covered patches would have the largest weights.
+        # The weights depend on expected levels. With measured levels, dark covered patches would have large weights.
         sigma = _MODEL_ERROR * float(np.median(measured / level)) * level + _LEAST_ERROR
         if not sigma.min() > 0:
             return None
@@ -284,14 +284,15 @@ class ConsistencyCheck:
 def _fit_added_light(channels: list[_Deviations], members: npt.NDArray[np.int64]) -> tuple[float, float]:
     """Return the added light, relative to the brightest patch, and the remaining fraction of the patches' own light.
 
-    The line is fitted to the patches `members` (B, M; −1 for none) by least absolute deviations, because of outliers.
+    They are intercept and slope of measured against expected levels. The line is fitted by least absolute deviations,
+    because of outliers. `members`: (B, M) patches of the blocks; −1 for none.
     """
     cells = members[members >= 0]
     own: list[_Array] = []
     measured: list[_Array] = []
     for deviations in channels:
         compared = cells[np.isfinite(deviations.expected[cells])]
-        # A channel so dim that its few bright patches are not adjacent has no compared patches.
+        # A dim channel may have no compared patches in these blocks.
         if not len(compared):
             continue
         brightest = float(np.nanpercentile(deviations.expected, _BRIGHT_PERCENTILE))
@@ -349,7 +350,7 @@ class OriginFigures:
         return max((max(frame.ratio, 1 / frame.ratio) - 1 for frame in self.other_exposure), default=0.0)
 
 
-# Exposures within this ratio are equal: shutter speeds are rounded, and differ by a factor of at least 1.26.
+# Exposures with a smaller ratio are equal. Files contain rounded values; shutter times differ by a factor of 1.26.
 _SAME_EXPOSURE = 1.01
 
 
@@ -375,7 +376,7 @@ def _body(origin: FrameOrigin) -> str:
 
 
 def _comparable_bodies(bodies: Sequence[tuple[FrameRecord, str]]) -> Sequence[tuple[FrameRecord, str]]:
-    # Compare by model alone if some frames of the model have no serial number.
+    # If some frames of a model have no serial number, only the model is compared.
     models = {body.split(" no. ")[0] for _, body in bodies if " no. " not in body}
     return [(record, body.split(" no. ")[0] if body.split(" no. ")[0] in models else body) for record, body in bodies]
 

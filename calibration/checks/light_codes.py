@@ -1,15 +1,15 @@
-"""Check that the white reference under each illuminant matches its codes: detects exchanged frames.
+"""Check that the white of each illuminant matches its codes, to detect frames with wrong or exchanged names.
 
-Each white is compared with a prediction from its codes, all other illuminants of the session, and priors for any
-projector (`calibration.checks.projector_model`). Deviations count only beyond the uncertainty of the prediction. The
-checks:
+The white of an illuminant is the camera RGB of bare paper under it. It is predicted from the codes of the illuminant,
+the whites of all other illuminants and priors for any projector (`calibration.checks.projector_model`). Deviations
+count only beyond the uncertainty of the prediction. The two checks:
 
 - Does a white differ from its prediction by more than four standard uncertainties?
 - Would two illuminants fit better with exchanged names? `exchange_deg` is the largest angle between two illuminants
-  whose exchange would not be detected.
+  at which an exchange would not be detected.
 
-With many illuminants, the majority decides. With few, illuminants are left out and names are exchanged until the others
-agree (docs/decisions/0015-lights-are-held-against-their-codes.md).
+If there are many illuminants, a few wrong ones have little weight in the fit. If there are few, illuminants are omitted
+or exchanged on trial until the others agree (docs/decisions/0015-lights-are-held-against-their-codes.md).
 """
 
 from __future__ import annotations
@@ -27,48 +27,49 @@ from foundation.colorimetry import angles_deg
 
 _Array = npt.NDArray[np.float64]
 
-# Standard uncertainties subtracted from an angle or a brightness, so that noise does not appear as a wrong name.
+# Number of standard uncertainties subtracted from an angle or a brightness, so that noise is not reported.
 CERTAIN_SIGMAS = 4.0
 
-# Twice the logarithm of the odds above which two names are reported as exchanged. A session of 707 illuminants has
-# 250 000 pairs, which need 25 of it; the other 5 are odds of ten to one.
+# Two names are reported as exchanged if twice the logarithm of the odds exceeds this value. It is the
+# sum of 25 for the 250 000 pairs of 707 illuminants, and 5 for odds of ten to one.
 EXCHANGE_EVIDENCE = 30.0
 
 # An illuminant is verified if any exchange with an illuminant at a larger angle would be detected. Errors above this
 # angle cause a refusal of the LUT.
 VERIFIED_DEG = 8.0
 
-# Largest standard uncertainty, degrees, of the prediction of a verified illuminant; red and blue are 85° apart.
+# Largest standard uncertainty of the prediction of a verified illuminant, degrees. Red and blue are 85° apart.
 _VERIFIED_SD_DEG = 10.0
 
-_FEW = 24  # Up to this number of illuminants each is left out in turn; with more, the majority decides
+_FEW = 24  # Up to this number of illuminants, each is omitted in turn; with more, robust weights are sufficient
 
 _SUSPECTS = 8  # Number of illuminants tested for exchanges: those whose omission improves the fit most
 
-# An exchange is accepted up to this misfit above the omission of one illuminant, which removes three values with a
-# mean of 1 each.
+# An exchange is preferred to the omission of one illuminant if its misfit is at most this much larger. The omission
+# removes three values, each of which adds 1 to the misfit on average.
 _MISFIT_MARGIN = 9.0
 
-# Relative scatter of a channel against the others: typical of healthy lamps, and largest accepted for this session.
-# Larger values mean a cut colour-wheel period or wrong names, which must be reported.
+# Relative scatter of a channel against the other channels: usual value, and largest value attributed to the lamp. A
+# larger scatter has other causes, for example exposures that end within a turn of the colour wheel.
 _CHROMA_SD, _MOST_CHROMA_SD = 0.003, 0.012
 
-# Relative scatter of brightness: flickering lamps, and sessions without white frames for the drift of the lamp.
-_BRIGHTNESS_SD, _UNTIED_SD = 0.03, 0.06
+# Relative scatter of brightness: of a flickering lamp, and of a lamp with unknown drift because white frames are
+# missing.
+_BRIGHTNESS_SD, _UNKNOWN_DRIFT_SD = 0.03, 0.06
 
-# Largest misfit of few illuminants with correct names: constant, and per illuminant. 360 random healthy rooms were
-# below 6 + 1.7 per illuminant; with an exchange over 6° or more, all were above 12 + 3.3.
+# Largest misfit of few illuminants with correct names: constant part, and part per illuminant. In simulated rooms, it
+# was below 6 + 1.7 per illuminant without faults. With an exchange at 6° or more, it was above 12 + 3.3.
 _MAX_MISFIT, _MAX_MISFIT_EACH = 8.0, 2.5
 
-# Largest squared distance of two whites from the prediction for their exchanged codes. With six dimensions the mean
-# is 6, and 50 is exceeded once in 200 million cases.
+# Largest squared distance (χ² of six values) of two whites from the prediction for their exchanged codes. Noise alone
+# exceeds it once in 200 million cases.
 _MAX_DISTANCE2 = 50.0
 
-# Relative standard deviation of brightness that makes it irrelevant: only the direction counts.
+# Relative standard deviation of brightness that is large enough to make brightness irrelevant.
 _FREE_BRIGHTNESS_SD = 10.0
 
-# Largest squared distance of two predictions, in units of `EXCHANGE_EVIDENCE`, for evaluating their exchange. Both
-# illuminants would deviate, so an exchange gives twice this distance.
+# Two illuminants are not tested for an exchange if the squared distance of their predictions is larger, in units of
+# `EXCHANGE_EVIDENCE`, and both fit their codes. Exchanged illuminants at this distance would not fit.
 _NEAR_PAIRS = 3.0
 
 _BLOCK_PAIRS = 20_000  # Pairs evaluated at a time: about 100 MB
@@ -95,11 +96,11 @@ class CodeAgreement:
     off_deg: _Array  # (L,) angle beyond four standard uncertainties, or 0
     brightness: _Array  # (L,) relative difference of brightness from the prediction; −0.5 is half as bright
     off_brightness: _Array  # (L,) amount of `brightness` beyond four standard uncertainties, ≥ 0
-    seen_as: _Integers  # (L,) illuminant whose codes predict a deviating white; −1: none
+    seen_as: _Integers  # (L,) illuminant whose codes predict the white, if it deviates; −1: none
     exchanges: tuple[ExchangedLights, ...]  # most likely first
     is_verified: npt.NDArray[np.bool_]  # (L,) whether the white is verified by its codes (`VERIFIED_DEG`)
-    exchange_deg: float  # largest angle between two illuminants with an undetected exchange; 0: none
-    misfit: float  # of few illuminants, relative to healthy rooms; 0 with many
+    exchange_deg: float  # largest angle between illuminants at which an exchange is not detectable; 0: none
+    misfit: float  # χ² of the fit to few illuminants, relative to its limit for correct names; 0 with many illuminants
 
     def rows(self, lights: slice) -> CodeAgreement:
         """Return the result for some illuminants; `seen_as` and `exchanges` keep the original indices."""
@@ -140,7 +141,7 @@ def code_agreement(
         for k in detected[np.argsort(-evidence[detected], kind="stable")].tolist()
     ]
     if swap is not None:
-        # Detected by complete refits, which are valid beyond the linearisation of this fit.
+        # This exchange was detected by a complete new fit, which is more accurate than the linearised evidence.
         first, second = swap
         k = int(np.flatnonzero((pairs == swap).all(axis=1))[0])
         swap_evidence = max(float(evidence[k]), EXCHANGE_EVIDENCE)
@@ -162,11 +163,11 @@ def code_agreement(
 def _fit_codes(
     codes: npt.NDArray[np.integer], white: _Array, error: _Array, *, dark_known: bool, drift_known: bool
 ) -> tuple[ProjectorFit, tuple[int, int] | None, float]:
-    """Return the fit to illuminants that agree, a detected exchange, and the misfit relative to healthy rooms.
+    """Return the fit to illuminants that agree, a detected exchange, and the misfit relative to its limit.
 
     The misfit is 0 with many illuminants, because some of them may deviate.
     """
-    brightness_sd = _BRIGHTNESS_SD if drift_known else _UNTIED_SD
+    brightness_sd = _BRIGHTNESS_SD if drift_known else _UNKNOWN_DRIFT_SD
 
     def fit(codes: npt.NDArray[np.integer], chroma_sd: float, used: npt.NDArray[np.bool_] | None) -> ProjectorFit:
         return fit_projector(
@@ -206,7 +207,7 @@ def _fit_codes(
 
 
 def _max_misfit(lights: int) -> float:
-    # Measured on random healthy rooms with 2 to 20 illuminants.
+    # Measured in simulated rooms without faults, with 2 to 20 illuminants.
     return _MAX_MISFIT + _MAX_MISFIT_EACH * lights
 
 
@@ -216,7 +217,10 @@ def _best_exchange(
     misfit: float,
     suspects: Sequence[int],
 ) -> tuple[tuple[int, int] | None, float]:
-    """Return the two suspects whose exchange makes all illuminants agree, or None, and the remaining misfit."""
+    """Return the two suspects that must be exchanged so that all illuminants agree, and the remaining misfit.
+
+    The suspects are None if no exchange is sufficient.
+    """
     best, exchange = _max_misfit(len(codes)), None
     for first, second in combinations(sorted(suspects), 2):
         exchanged = codes.copy()
@@ -228,8 +232,11 @@ def _best_exchange(
 
 
 def _directions(mean: _Array, cov: _Array, white: _Array) -> tuple[_Array, _Array, _Array]:
-    """Return angles (L,) of the whites from their predictions: degrees, in units of σ, and the largest σ, degrees."""
-    # Brightness is ignored: a flickering lamp is no wrong name.
+    """Return the angle (L,) of each white to its prediction in degrees and in units of σ, and the largest σ in degrees.
+
+    σ is the standard uncertainty of the angle. It is largest for one direction of the error.
+    """
+    # Brightness is ignored, so that a flickering lamp does not look like a wrong name.
     direction = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     along = np.asarray(_FREE_BRIGHTNESS_SD**2 * (white**2).sum(axis=1), dtype=np.float64)
     free: _Array = cov + along[:, None, None] * direction[:, :, None] * direction[:, None]
@@ -262,8 +269,8 @@ def _pairs(
     """
     pairs = np.stack(np.triu_indices(len(fit.white), 1), axis=-1)
     if len(fit.white) > _FEW:
-        # With many illuminants, only near pairs and pairs with a deviating illuminant are evaluated: an exchange of
-        # other pairs would cause strong deviations.
+        # With many illuminants, only near pairs and pairs with a deviating illuminant are evaluated. In any other
+        # pair, exchanged illuminants would deviate strongly.
         first, second = pairs.T
         difference = mean[first] - mean[second]
         distance2 = np.einsum("pa,pab,pb->p", difference, np.linalg.inv(cov[first] + cov[second]), difference)
@@ -292,7 +299,7 @@ def _evaluate_pairs(fit: ProjectorFit, pairs: _Integers) -> tuple[_Array, _Array
 
 
 def _seen_as(mean: _Array, cov: _Array, white: _Array, off_deg: _Array) -> _Integers:
-    """Return for each deviating illuminant the one (L,) whose codes predict its white, or −1."""
+    """Return the index (L,) of the illuminant whose codes predict a deviating white; −1 for the other whites."""
     seen_as = np.full(len(white), -1, dtype=np.int64)
     for light in np.flatnonzero(off_deg > 0).tolist():
         own_white = np.broadcast_to(white[light], mean.shape)
@@ -305,11 +312,11 @@ def _seen_as(mean: _Array, cov: _Array, white: _Array, off_deg: _Array) -> _Inte
 
 
 def _without_repeated_lights(exchanges: Sequence[ExchangedLights]) -> tuple[ExchangedLights, ...]:
-    named: set[int] = set()
-    # each illuminant only in its first exchange
+    paired: set[int] = set()
+    # Each illuminant is kept only in its first exchange.
     unique: list[ExchangedLights] = []
     for pair in exchanges:
-        if named.isdisjoint({pair.one, pair.other}):
-            named |= {pair.one, pair.other}
+        if paired.isdisjoint({pair.one, pair.other}):
+            paired |= {pair.one, pair.other}
             unique.append(pair)
     return tuple(unique)

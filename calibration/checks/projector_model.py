@@ -6,15 +6,15 @@ segments):
 
     white(codes) = Σ_p P_p [f_p(code_p) + Σ_S u_Sp(m_S) f_p(m_S) + k_p],   m_S the least code of the primaries in S
 
-P_p is the primary in camera RGB and f_p its tone curve. u_Sp is the light added in the overlap of the primaries S. k_p
-is the remaining light at code 0 after subtraction of dark frames. All parameters have priors: the red channel of a
-camera is mostly sensitive to the red primary, and a tone curve is about a power of 2.2. With few illuminants the priors
-dominate; with many they have almost no effect. The uncertainty of each prediction includes the priors.
+P_p is the camera RGB of primary p, and f_p is its tone curve. u_Sp is the light added where the primaries S overlap.
+k_p is the light that remains at code 0 after subtraction of dark frames. All parameters have priors: the red channel of
+a camera is mostly sensitive to the red primary, and a tone curve is about a power of 2.2. With few illuminants, the
+priors dominate; with many, they have almost no effect. The uncertainty of each prediction includes the priors.
 
 The posterior is approximated by a Gaussian about its mode (Laplace), and Gauss-Newton steps find the mode. Each
-illuminant is compared with its prediction from all others. Outliers in this distance get small weights, by Student's t
-distribution with `_FREEDOM` degrees of freedom. The assumed noise starts large and is reduced to its actual value
-(graduated non-convexity). Therefore a few frames with wrong codes do not attract the first steps.
+illuminant is compared with its prediction from all others. If it is far from this prediction, it gets a small weight,
+by Student's t distribution with `_FREEDOM` degrees of freedom. The assumed noise starts large and is reduced to its
+actual value (graduated non-convexity), so that frames with wrong codes do not mislead the first steps.
 
 Sources: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 2.22 to 2.26, 5.12
 (leaving out); K. L. Lange, R. J. A. Little, J. M. G. Taylor, "Robust statistical modeling using the t distribution",
@@ -54,7 +54,8 @@ _POWER = 2.2  # Mean exponent of tone curves; displays have 1.8 to 2.6
 # bends in log code. sRGB, S-shaped curves and exponents from 1.5 to 2.9 lie within two standard deviations.
 _POWER_SD, _BEND_SD, _BEND_LENGTH = 0.4, 0.2, 0.4
 
-_OWN_WEIGHT = 0.2  # Weight of each primary's own tone curve; curves of a projector are similar
+# Weight of the part of a tone curve that differs between primaries. Most of it is common to the three primaries.
+_OWN_WEIGHT = 0.2
 
 # Nodes of the light added in overlaps, in codes, for linear interpolation.
 _OVERLAP_NODES = np.array([0.0, 64.0, 128.0, 192.0, 255.0])
@@ -70,11 +71,11 @@ _SUBSETS: tuple[tuple[int, ...], ...] = ((0, 1), (0, 2), (1, 2), (0, 1, 2))
 _TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if primary in subset]
 
 
-# Prior standard deviations of the light at code 0, relative to the primary: with dark frames, and without. They cover
-# contrasts of 500 : 1 and more, and room light.
+# Prior standard deviations of the light at code 0, relative to the primary: after subtraction of dark frames, and
+# without dark frames. They cover room light and contrasts of 500 : 1 and more.
 _REST_SD, _REST_SD_WITHOUT_DARK = 5e-4, 0.02
 
-# Constant uncertainty of whites, relative to the brightest white: black level and stray light.
+# Uncertainty of all whites due to black level and stray light, relative to the brightest white.
 _FLOOR = 2e-4
 
 _FREEDOM = 4.0  # Degrees of freedom of Student's t: outliers get small weights, others nearly 1

@@ -1,10 +1,11 @@
-"""Find small covered areas, such as a fingertip: adjacent patches with large deviations.
+"""Find small covered areas of the print, for example by a fingertip, from adjacent patches with large deviations.
 
-Such areas are too small to change the mean of a block. The deviation of a patch is large if it exceeds noise and the
-error of the model, and if it differs as much from patches with similar codes. Errors of the polynomial are distributed
-at random over the print, and hot photosites are isolated; so two adjacent patches are evidence of a cover. The required
-number follows from the number of all large deviations in the frame. Adjacent patches with smaller deviations, or too
-dark to be compared, are included. Charts with colours in order cannot be checked in this way.
+Such an area is too small to change the mean of a block of patches. The deviation of a patch from the polynomial of
+`calibration.checks.frame_consistency` is large if it exceeds noise and model error. It must also differ as much from
+the deviations of patches with similar codes. Model errors are distributed at random over the print, and hot photosites
+are isolated. Two adjacent patches with large deviations are therefore evidence of an object. If a frame has many large
+deviations, more of them must be adjacent. Neighbours of an area are added to it if they deviate less or are too dark to
+be compared. The colours of the chart must be in random order.
 """
 
 from __future__ import annotations
@@ -19,31 +20,32 @@ _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
-_FAR = 5.0  # Standard deviations of a large deviation: noise alone exceeds them once in a million comparisons
+# A deviation is large above this number of standard deviations. Noise alone exceeds it once in a million comparisons.
+_FAR = 5.0
 
-# Standard deviations above which an isolated patch is reported (judgement: 707 frames of a full chart are 70 million
-# comparisons, and no polynomial is exact at the corners of the colour cube).
+# Standard deviations above which an isolated patch is reported (judgement). More are required, because a session has
+# millions of comparisons, and the polynomial is less accurate at the corners of the colour cube.
 _ALONE = 8.0
 
-_LEAST_ALONE = 0.05  # Minimum relative deviation of an isolated patch (judgement)
+_LEAST_ALONE = 0.05  # Smallest relative deviation of an isolated patch that is reported (judgement)
 
-_ALSO = 3.0  # Standard deviations above which a patch belongs to an adjacent area
+_ALSO = 3.0  # Standard deviations above which a patch next to an area is added to it
 
-# Minimum relative standard deviation of a prediction: the response of photosites differs by 0.4 %.
+# Smallest relative standard deviation of a prediction, because the response of photosites differs by 0.4 %.
 LEAST_MODEL_ERROR = 0.004
 
-# Areas of a size are ignored if a frame has more than this number of them by chance (judgement). Healthy frames have
-# hardly any large deviation.
+# An area is significant if chance gives fewer areas of its size in a frame than this number (judgement).
 _BY_CHANCE = 0.1
 
-_NEXT = 1.6  # Largest distance of adjacent patches, in patch distances; diagonal neighbours have 1.41
+# Largest distance of adjacent patches, relative to the distance of patches in a row; diagonal neighbours have 1.41.
+_ADJACENT = 1.6
 
-AROUND = 8  # Largest number of adjacent patches
+AROUND = 8  # Largest number of patches adjacent to a patch
 
-_ALIKE = 6  # Number of similar codes for comparison: both neighbours along each axis of the colour cube
+_ALIKE = 6  # Number of patches with similar codes: both neighbours along each axis of the colour cube
 
 
-class SmallPlaces:
+class CoveredPatchFinder:
     """Finds covered patches in a frame from their deviations.
 
     `rgb`: (C, 3) printed codes. `cells_mm`: (C, 2) positions. `usable`: (C,) bool, patches inside the frame that were
@@ -54,7 +56,7 @@ class SmallPlaces:
         count = len(cells_mm)
         nearest = cKDTree(cells_mm).query(cells_mm, k=min(AROUND + 1, count))
         distance, self._near = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.int64)
-        self._touching: _Mask = distance <= _NEXT * float(np.median(distance[:, 1]))
+        self._touching: _Mask = distance <= _ADJACENT * float(np.median(distance[:, 1]))
         self._touching[:, 0] = False
         codes = np.asarray(rgb, dtype=np.float64)
         self._alike: _Index = np.asarray(cKDTree(codes).query(codes, k=min(_ALIKE + 1, count))[1])[:, 1:]
@@ -63,7 +65,7 @@ class SmallPlaces:
     def disturbed(self, deviation: _Array, sigma: _Array) -> tuple[_Index, _Array, _Index, _Index]:
         """Find covered patches and isolated deviations.
 
-        `deviation`: (K, C) float64, relative deviation from the code's value in each lit channel; NaN if not compared.
+        `deviation`: (K, C) float64, relative deviation from the model in each lit channel; NaN if not compared.
         `sigma`: (K, C) float64, its standard deviation: noise of both frames and error of the model.
 
         Returns covered patches (N,) int64 in ascending order, their relative deviations (N,), the covered patches with
@@ -100,7 +102,7 @@ class SmallPlaces:
         return patches, np.nan_to_num(deviation[worst, patches]), seeds[covered[seeds]], alone[~covered[alone]]
 
     def _significant_areas(self, seeds: _Index) -> _Mask:
-        """Return the patches (C,) of areas too large for chance, from those with large deviations (N,)."""
+        """Return a mask (C,) of the patches with large deviations, `seeds` (N,), in areas too large for chance."""
         count, seed_count = len(self._usable), len(seeds)
         is_significant = np.zeros(count, dtype=np.bool_)
         number = np.full(count, -1)
@@ -114,20 +116,19 @@ class SmallPlaces:
         size = np.bincount(label)[label]
         # Of n randomly distributed patches, n/2 (8 n / C)^(k - 1) areas with at least k patches are expected.
         expected_count = 0.5 * seed_count * (AROUND * seed_count / count) ** (size - 1.0)
-        # If most of the print deviates, the expected count is not valid: an area with most of the patches is
-        # significant.
+        # If most of the print deviates, this formula is not valid. An area with most of the patches is significant.
         is_significant[seeds[(size > 1) & ((expected_count < _BY_CHANCE) | (size > seed_count // 2))]] = True
         return is_significant
 
     def _grown(self, areas: _Mask, joins: _Mask) -> _Mask:
-        # Grow over all connected patches that may join.
+        # Add adjacent patches of `joins` until no more are connected.
         while True:
             added = self._touched(areas) & joins & ~areas
             if not added.any():
                 return areas
             areas = areas | added
 
-    # Patches adjacent to any patch of the areas, both (C,) bool.
+    # Mask (C,) of the patches that are adjacent to a patch of `areas` (C,).
     def _touched(self, areas: _Mask) -> _Mask:
         touched, patches = np.zeros_like(areas), np.flatnonzero(areas)
         touched[self._near[patches][self._touching[patches]]] = True
@@ -135,16 +136,17 @@ class SmallPlaces:
 
 
 def cells_without_hot(cells: _Index, seeds: _Index, hot: _Mask, cells_mm: _Array) -> tuple[_Mask, _Index]:
-    """Remove deviations by hot photosites: return which disturbed patches (N,) remain, and isolated ones (M,) int64.
+    """Remove deviations that hot photosites cause: return a mask (N,) of the remaining disturbed patches.
 
-    An area remains if at least two of its seeds have no hot photosite. Of other areas, a single such seed counts as
-    isolated.
+    An area remains if at least two of its patches with large deviations have no hot photosite. If only one such patch
+    is left, it becomes an isolated patch. The second result is the isolated patches (M,) int64.
 
-    `cells`, `seeds`: (N,) and (K,) int64 in ascending order, from `SmallPlaces.disturbed`. `hot`: (C,) bool, patches
-    with a photosite that is hot in the dark frames. `cells_mm`: (C, 2) positions.
+    `cells`, `seeds`: (N,) and (K,) int64 in ascending order, from `CoveredPatchFinder.disturbed`: disturbed patches,
+    and those of them with large deviations. `hot`: (C,) bool, patches with a photosite that is hot in the dark frames.
+    `cells_mm`: (C, 2) positions.
     """
     nearest = np.asarray(cKDTree(cells_mm).query(cells_mm, k=2)[0])[:, 1]
-    pairs = cKDTree(cells_mm[cells]).query_pairs(_NEXT * float(np.median(nearest)), output_type="ndarray")
+    pairs = cKDTree(cells_mm[cells]).query_pairs(_ADJACENT * float(np.median(nearest)), output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
     label = connected_components(graph, directed=False)[1]
     seed_label, is_valid_seed = label[np.searchsorted(cells, seeds)], ~hot[seeds]

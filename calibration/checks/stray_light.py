@@ -1,7 +1,8 @@
 """Detect room light that is in some frames and not in the dark frames, for example through an open door.
 
-The counts of the white paper under an illuminant are a sum of its counts under red, green and blue at full code. Three
-equations, one for each camera channel, give the amounts of the primaries. Two checks use them:
+The counts of white paper under an illuminant are a weighted sum of its counts under red, green and blue at full code.
+The weights are the amounts of the primaries. They follow from three equations, one for each camera channel, and are
+checked in two ways:
 
 - *Codes of 0.* The amount of a primary with code 0 must be 0. If it is positive, room light is in the frame of this
   illuminant. If it is negative, room light is in the frame of a primary that the illuminant contains.
@@ -18,11 +19,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-CERTAIN = 4.0  # Standard uncertainties subtracted from each amount, so that noise does not appear as light
+CERTAIN = 4.0  # Number of standard uncertainties subtracted from an amount, so that noise does not appear as light
 
-# Tolerance for mixtures of two primaries, relative to the white boost (judgement). A projector that boosts white also
-# boosts mixtures. It adds mostly light of the two primaries, but a part may appear as the third. Faulty primary frames
-# also look like a boost; with this factor they make the check less sensitive, but cannot disable it.
+# A projector that boosts white also boosts mixtures of two primaries, and part of the added light may look like the
+# third primary. This tolerance is relative to the boost of white (judgement). A fault in the frame of a primary also
+# looks like a boost, so a larger tolerance could disable the check.
 BOOST_ELSEWHERE = 0.25
 
 # Largest amount that is reported as room light (judgement). A larger amount means a wrong illuminant or exposure, which
@@ -41,9 +42,10 @@ _Mask = npt.NDArray[np.bool_]
 class StrayLight:
     """Room light in some frames of L illuminants that is not in the dark frames."""
 
-    at_zero: _Array  # (L,) amount of a primary with code 0 (full code: 1) that is furthest from 0; NaN: not checked
-    certain: _Array  # (L,) excess of its size over four standard uncertainties; 0: none, or not checked
-    of_primaries: float  # certain room light in the frames of the primaries, relative to white; 0: none, or not checked
+    # (L,) amount of a primary with code 0, furthest from 0; 1 at full code; NaN: not checked
+    at_zero: _Array
+    certain: _Array  # (L,) absolute amount beyond four standard uncertainties, ≥ 0; 0 if not checked
+    of_primaries: float  # certain room light in the frames of the primaries, relative to white; 0 if not checked
     primaries: tuple[int, int, int]  # indices of red, green and blue
     has_primary: _Mask  # (L, 3) whether the code of a primary is above 0
 
@@ -115,7 +117,7 @@ def stray_light(
         return None
     inverse = np.linalg.inv(primary_whites)
     amounts = white @ inverse
-    # An error in the counts of a primary has the weight of its amount.
+    # Each primary adds the variance of its counts, multiplied by the square of its amount.
     variance = error**2 + amounts**2 @ error[list(primaries)] ** 2
     spread = np.sqrt(variance @ inverse**2)
     has_primary = codes > 0
@@ -133,7 +135,7 @@ def stray_light(
     has_zero = is_checked & ~has_primary.all(axis=1)
     of_primaries = _primary_excess(codes[list(primaries)], full, spread[list(primaries)])
     is_mixture = has_zero & (has_primary.sum(axis=1) > 1)
-    if of_primaries and _are_pure(amounts[is_mixture], has_primary[is_mixture], spread[is_mixture], of_primaries):
+    if of_primaries and _are_clean(amounts[is_mixture], has_primary[is_mixture], spread[is_mixture], of_primaries):
         of_primaries = 0.0
     return StrayLight(
         at_zero=np.where(has_zero, at_zero, np.nan),
@@ -158,8 +160,11 @@ def _primary_excess(codes: npt.NDArray[np.int64], full: _Array, spread: _Array) 
     return share if is_equal and 0 < share <= _MAX_ROOM_LIGHT else 0.0
 
 
-def _are_pure(amounts: _Array, has_primary: _Mask, spread: _Array, share: float) -> bool:
-    """Return whether mixtures of two primaries prove that the frames of the primaries have no room light."""
+def _are_clean(amounts: _Array, has_primary: _Mask, spread: _Array, share: float) -> bool:
+    """Return whether mixtures of two primaries prove that the frames of the primaries contain no room light.
+
+    `share`: supposed room light.
+    """
     contains = np.where(has_primary, amounts, 0.0) >= _MIN_AMOUNT
     if not (contains.sum(axis=0) >= _MIN_MIXTURES).all():
         return False
@@ -167,18 +172,19 @@ def _are_pure(amounts: _Array, has_primary: _Mask, spread: _Array, share: float)
     return bool(missing[contains.any(axis=1)].max() <= _MAX_MISSING * share)
 
 
-# Minimum amount of a primary in a mixture. Room light in the frame of this primary then gives the primary with code 0 a
-# negative amount of at least half of the room light.
+# Smallest amount of a primary with which a mixture shows whether the frame of this primary contains room light. Room
+# light then gives the primary with code 0 a negative amount, at least half as large as the room light.
 _MIN_AMOUNT = 0.5
 
 _MIN_MIXTURES = 3  # Number of mixtures per primary that must agree (judgement: in one, errors may cancel)
 
-# Largest amount of the primary with code 0 in a mixture, including noise, relative to the supposed room light.
+# The frames of the primaries are clean if the amounts of primaries with code 0, including their uncertainty, are below
+# this fraction of the supposed room light.
 _MAX_MISSING = 0.25
 
 _FULL_CODE = 255  # Largest code
 
-# Standard deviation of the lamp relative to the range of two or three white frames; 0.6 is expected for three.
+# Assumed ratio of the lamp's standard deviation to the range of the white frames; 0.6 is expected for three frames.
 _DEVIATION_PER_RANGE = 0.5
 
 # Largest range of the three excesses relative to their mean (judgement). Daylight has less, although its colour differs

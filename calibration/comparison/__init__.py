@@ -1,1 +1,1 @@
-"""How far two sessions of one chart differ, and how far noise alone would let them."""
+"""Compare two LUTs or sessions of one chart: their differences, and whether noise alone explains them."""

@@ -1,7 +1,8 @@
-"""Compare two LUTs by illuminant, and report whether noise alone explains their differences, always B relative to A.
+"""Compare two LUTs, A and B, and report whether noise alone explains their differences.
 
-Noise is taken from the LUTs: the standard error of a patch is the scatter of its samples divided by the square root of
-their number; standard errors of whites are in `references.csv`. Memory use is one illuminant of each LUT per thread.
+All differences are B relative to A. The noise is taken from the LUTs. The standard error of a patch is the scatter of
+its samples, divided by the square root of their number. The standard errors of whites are in `references.csv`. Each
+thread holds one illuminant of both LUTs in memory.
 
 L common illuminants, C colours.
 """
@@ -37,32 +38,32 @@ _Array = npt.NDArray[np.float64]
 _Numbers = npt.NDArray[np.int64]
 _Folders = tuple[Path, Path]
 
-# With 700 illuminants and 32 768 patches, any difference is significant. A difference is therefore reported if noise
-# explains it with a probability below this, for the whole LUT, and if it exceeds a floor without practical effect.
+# A difference is reported if the probability that noise causes it anywhere in the LUT is smaller. It must also exceed
+# one of the limits below: with so many samples, even negligible differences are significant.
 CHANCE = 0.01
 
-# Factor for standard errors of whites, which may be too small: the scatter about a polynomial fitted to the same
-# references, with up to a third as many terms (a factor of 1.22), and references are few.
+# Factor for the standard errors of whites. They are too small, because they are the scatter about a polynomial that was
+# fitted to the same few references.
 ERROR_FACTOR = 1.3
 
 # Negligible angle between whites, degrees: 1/200 of the error of a good method (judgement).
 ANGLE_FLOOR_DEG = 0.005
 
-# Negligible relative difference of brightness: flat fields of different sheets change the whites of a small simulated
-# chart by up to 0.17 %.
+# Negligible relative difference of brightness. Two sheets of a small simulated chart differ by up to 0.17 %, because
+# their flat fields differ.
 BRIGHTNESS_FLOOR = 0.002
 
-# Largest RMS of all patches, and of one illuminant's, in units of noise, that noise explains. Sessions of one simulated
-# room with different noise give 1.00 to 1.05.
+# Largest RMS difference of patches that noise explains, in units of noise: of all patches, and of the patches under one
+# illuminant. Two sessions in the same simulated room give 1.00 to 1.05.
 CELL_SCORE = 1.1
 LIGHT_SCORE = 1.3
 
-# Limits for listing a patch by its mean over all illuminants: standard errors, exceeded by chance for 1 in 5·10⁸
-# patches, and relative difference, as for a stain in `build-lut`.
+# A patch is listed if its mean difference over all illuminants exceeds two limits: in standard errors, and relative, as
+# for a stain in `build-lut`.
 CELL_SIGMAS = 6.0
 CELL_FLOOR = STAINED
 
-# Counts above which a patch is compared: the mean of 25 samples of 300 counts has an error of 1 %.
+# Patches with fewer counts are not compared. The mean of 25 samples of 300 counts has an error of 1 %.
 MIN_COUNTS = 300.0
 
 LightProgress = Callable[[int, int], None]
@@ -84,9 +85,10 @@ class LightDifferences:
 
 @dataclass(frozen=True, eq=False)
 class CellDifferences:
-    """Differences by patch over all illuminants: B divided by A, minus 1, each relative to its own white.
+    """Differences of the patches over all illuminants: B / A − 1, where A and B are relative to their own whites.
 
-    Includes illuminants under which both means exceed `MIN_COUNTS`; NaN without any, and for unfit patches.
+    Only illuminants under which both means exceed `MIN_COUNTS` are included. Unfit patches, and patches without such
+    illuminants, are NaN.
     """
 
     lights: _Numbers  # (C, 3), number of illuminants included
@@ -149,7 +151,7 @@ def compare(
 def table_of(folder: Path, progress: Callable[[int, int, str], None] | None = None) -> Generator[Lut]:
     """Yield the LUT in a folder, or build the LUT of the session in it.
 
-    A LUT of a session is built in a temporary folder next to it: 707 illuminants need 3.5 GB.
+    The LUT of a session is built in a temporary folder next to the session. For 707 illuminants, it needs 3.5 GB.
     """
     if not (folder / JOURNAL_FILE).is_file():
         yield open_lut(folder)
@@ -160,7 +162,7 @@ def table_of(folder: Path, progress: Callable[[int, int, str], None] | None = No
         try:
             build(session, lut, progress)
         finally:
-            # `acquire run --retake bad` expects the report of a refused frame in SESSION.refused.
+            # `acquire run --retake bad` finds the report of a refused LUT next to the session.
             refused_report = refused_folder(lut) / REPORT_JSON
             if refused_report.is_file():
                 write_atomic(refused_folder(folder.resolve()) / REPORT_JSON, refused_report.read_bytes())
@@ -209,7 +211,7 @@ def differing_cells(cells: CellDifferences) -> _Numbers:
 
 
 def _is_significant(chances: _Array) -> npt.NDArray[np.bool_]:
-    # Bonferroni: `CHANCE` holds for all illuminants together.
+    # Bonferroni correction: `CHANCE` is the probability for all illuminants together.
     return chances < CHANCE / len(chances)
 
 
@@ -256,8 +258,8 @@ def _compare_cells(
 ) -> tuple[CellDifferences, _Array]:
     """Return the differences of the patches, and their RMS (L,) float64 by illuminant, in units of noise."""
     unfit = sorted({cell.colour for table in (first, second) for cell in table.provenance.unfit})
-    # A difference divided by its estimated error follows Student's t, with degrees of freedom by Welch-Satterthwaite
-    # for variances of means inversely proportional to the number of samples.
+    # A difference divided by its estimated error follows Student's t distribution, which is wider than the normal one.
+    # The numbers of samples determine its degrees of freedom (Welch-Satterthwaite).
     sizes = np.array([first.samples.shape[2], second.samples.shape[2]], dtype=np.float64)
     widening = stats.t((1 / sizes).sum() ** 2 / (1 / sizes**2 / (sizes - 1)).sum()).std()
 
@@ -303,8 +305,9 @@ def _compare_lights(first: Lut, second: Lut, pairs: Sequence[tuple[int, int]], c
     numbers = np.array(pairs, dtype=np.int64).T
     whites = np.stack([first.white[numbers[0]], second.white[numbers[1]]])
     errors = ERROR_FACTOR * np.stack([white_errors(first)[numbers[0]], white_errors(second)[numbers[1]]])
-    # Log ratios of channels have normal errors. Their weighted mean is the brightness, the deviations from it are the
-    # colour: χ² with two degrees of freedom. A channel below its own error has almost no weight.
+    # The logarithms of the channels' ratios have normal errors. Their weighted mean is the difference of brightness.
+    # The deviations from this mean are the difference of colour, a χ² with two degrees of freedom. A channel below its
+    # own error has almost no weight.
     positive_whites = np.maximum(whites, errors)
     ratio = np.log(positive_whites[1] / positive_whites[0])
     weight = 1 / ((errors / positive_whites) ** 2).sum(axis=0)

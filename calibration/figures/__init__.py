@@ -1,1 +1,1 @@
-"""The judged figures: `figure` defines their type, the other modules the figures, `all_figures` their list."""
+"""Figures: measured properties of a session or LUT, with limits. `figure` has their type, `all_figures` their list."""

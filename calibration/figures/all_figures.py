@@ -1,4 +1,4 @@
-"""All figures in the order of judging and reporting: the order of their definitions, module by module."""
+"""All figures in the order in which they are judged and reported: the order of their definitions, module by module."""
 
 from __future__ import annotations
 

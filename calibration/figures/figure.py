@@ -1,8 +1,8 @@
-"""Types of the judged figures: one object per figure holds its limits, measurement, explanation and report lines.
+"""Type of a figure: a measured property of a session or LUT, with its limits, explanation and report lines.
 
 A value within `accept` is accepted. Between `accept` and `refuse`, the LUT is accepted with a remark. Beyond `refuse`,
-it is not written. A figure without `refuse` only leads to remarks. Limits are defined in this package. Only limits that
-a measurement applies itself are imported from its module, for example from `calibration.registration.register`.
+the LUT is not written. A figure without `refuse` only leads to remarks. Most limits are defined in this package.
+Limits that other modules apply as well are imported from them, for example from `calibration.registration.register`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Sense = Literal["at most", "at least"]
 Outcome = Literal["accept", "accept with remarks", "refuse"]
 OUTCOMES: Final[tuple[Outcome, ...]] = get_args(Outcome)  # From best to worst
 
-# Groups of the report; no figure belongs to devices.
+# Groups of limits in the report. The group "devices" has no figure, only limits for single frames.
 Group = Literal["geometry", "light", "radiometry", "noise", "truth", "devices"]
 
 QUESTIONS: Final[dict[Group, str]] = {
@@ -44,10 +44,10 @@ SIMULATED: Final = "measured on simulated frames"
 
 Range = tuple[float | None, float | None]  # Lowest and highest value; None if unlimited
 
-# Smaller values are rounding errors of sums and count as 0. Limits other than 0 are at least 1000 times higher.
+# Smaller values are rounding errors of sums and are printed as 0. Limits other than 0 are at least 100 times higher.
 _ZERO_BELOW = 1e-7
 
-_INTEGER_FROM = 1000.0  # From this value on, :.3g would print an exponent
+_INTEGER_FROM = 1000.0  # Larger values are printed without decimals, because :.3g would print an exponent
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class SummaryRow:
 
 @dataclass(frozen=True)
 class Line:
-    """A figure's line in the summary: its position among all lines, and its row; None if not applicable."""
+    """A line in the summary: its position among all lines, and a function that returns its row, or None to omit it."""
 
     position: int
     row: Callable[[TableMeasurements], SummaryRow | None]
@@ -148,18 +148,19 @@ class Limit:
 class Figure(Limit):
     """A limit by which a LUT is judged, with the measurement and explanation of its value.
 
-    - `measure`: the value; None if it could not be measured, for example without tags or dark frames.
-    - `before_session`: True if the trial frames of `acquire check` show it as well as a session does.
+    - `measure`: returns the value; None if it could not be measured, for example without tags or dark frames.
+    - `before_session`: True if the trial frames of `acquire check` show the value as well as a session does.
     - `of_one_frame`: use in `build-lut check`, which reads one light or white frame and one dark frame. `known`: the
       value is judged. `bounded`: it is judged only if beyond its limit, because more frames can only make it worse.
       `unknown`: it is not judged.
-    - `where`: text with the frames, illuminants or position beyond the accepted limit; None if its cause provides it.
-    - `retake`: the single frames beyond a limit; None if all are, or if the figure does not concern single frames.
-    - `cause`: evidence and rules for its cause; None if the figure explains itself.
-    - `drawing`: the plot that shows it, if any.
-    - `lines`: its lines in the summary.
-    - `foremost`: True if a refusal reports it first, because others may follow from it.
-    - `detail`: text added to a message, and the remedy, if both depend on the detected fault.
+    - `where`: returns the frames, illuminants or position beyond the accepted limit as text; None if the cause
+      contains them.
+    - `retake`: returns the frames beyond a limit; None if all are, or if the figure does not concern single frames.
+    - `cause`: how the cause is determined; None if the figure explains itself.
+    - `drawing`: the plot that shows the figure, if any.
+    - `lines`: lines of the figure in the summary.
+    - `foremost`: True if a refusal reports this figure first, because other figures may follow from it.
+    - `detail`: returns an addition to messages, and the remedy, if they depend on the detected fault.
     """
 
     _: KW_ONLY

@@ -25,7 +25,7 @@ from experiment.framing.finding import MIN_CELL_PX, MIN_TAG_SHARE
 if TYPE_CHECKING:
     from calibration.measurements import TableMeasurements
 
-_MIN_CELLS_FOR_GLARE = 8**4  # Minimum number of patches that separates veiling glare from other light
+_MIN_CELLS_FOR_GLARE = 8**4  # With fewer patches, veiling glare cannot be distinguished from other light
 
 _HANG_FLATTER = "hang the print flatter"
 _REDUCE_GLARE = (
@@ -64,8 +64,8 @@ def _cell_row(table: TableMeasurements) -> SummaryRow:
 CELL_PX = Figure(
     "cell_px", "Shorter side of a patch", "geometry", "px", "at least", 8.6, MIN_CELL_PX,
     why="the 25 pixels reach 3.25 px from a patch's centre, rounding and registration included",
-    source="geometry: half of 5 px, 0.5 px rounding, 0.25 px registration; at 8.6 px and a blur of 0.7 px the bleed "
-    "is 1.3 %", remedy="move the camera closer or use a longer lens",
+    source="geometry: at 8.6 px and a blur of 0.7 px, 1.3 % of the light of the worst sample comes from outside its "
+    "patch", remedy="move the camera closer or use a longer lens",
     measure=lambda table: table.registration.cell_px, of_one_frame="known",
     drawing="chart", lines=(Line(40, _cell_row),),
 )  # fmt: skip
@@ -91,8 +91,8 @@ def _window_row(table: TableMeasurements) -> SummaryRow:
 BLEED = Figure(
     "bleed", "Light of neighbouring patches in the worst sample", "geometry", "share", "at most", 0.01, 0.03,
     why="the lens's blur mixes neighbouring patches into the outermost pixels of the window",
-    source="normal integral beyond the patch's edge at 0.75 px misplacement: for a sharp lens 0.2 % at 10 px per "
-    "patch and 0.6 % at 8.6 px; a thirtieth of it in a patch mean, included in its uncertainty",
+    source="integral of the blur beyond the patch's edge, for a sample misplaced by 0.75 px: with a sharp lens, 0.2 % "
+    "in patches of 10 px and 0.6 % in patches of 8.6 px; a thirtieth of these values in the mean of a patch",
     remedy="focus on the print, stop down to f/8, move the camera closer, or use a smaller window (build-lut "
     "--window)", measure=_worst_sample_bleed, of_one_frame="known", drawing="chart",
     lines=(
@@ -103,13 +103,13 @@ BLEED = Figure(
 
 
 def _uncorrected_lens_light(table: TableMeasurements) -> float | None:
-    # Few patches cannot show light spread by the lens. It is then part of the uncertainty, without a remedy.
+    # With few patches, light spread by the lens cannot be measured. It is then only part of the uncertainty.
     is_detectable = len(table.registration.mismatched_cells) >= _MIN_CELLS_FOR_GLARE or table.lens.is_uncorrected
     return table.lens.remaining_rms if table.lens.measured and is_detectable else None
 
 
 def _uncorrected_in_worst_cell(table: TableMeasurements) -> float | None:
-    # A remark on all patches includes the worst patch; report only one of the two remarks.
+    # If there is a remark on all patches, a remark on the worst patch would repeat it.
     residual = _uncorrected_lens_light(table)
     return None if residual is None or residual > CORRECTION_RESIDUAL.accept else table.lens.remaining_worst
 
@@ -142,9 +142,9 @@ def _lens_row(table: TableMeasurements) -> SummaryRow:
 CORRECTION_RESIDUAL = Figure(
     "correction_residual", "Light of surroundings that may remain in patch means", "radiometry", "share", "at most",
     0.01, 0.03,
-    why="samples contain light spread by the lens, or veiling glare that an evenly lit print cannot show",
-    source=SIMULATED + ": 0.3 to 0.5 % if light falls off towards the corners, and means twice as accurate; 1.4 % "
-    "in even light or on a chart of 512 colours, which do not show the usual veiling glare of 1 %",
+    why="samples may contain light spread by the lens, or veiling glare, which an evenly lit print cannot show",
+    source=SIMULATED + ": 0.3 to 0.5 % if the light falls off towards the corners; 1.4 % in even light or on a chart "
+    "of 512 colours, because veiling glare cannot be measured there",
     remedy=_REDUCE_GLARE,
     before_session=False, measure=_uncorrected_lens_light, where=_glare_text, lines=(Line(70, _lens_row),),
 )  # fmt: skip
@@ -154,14 +154,14 @@ CORRECTION_WORST = Figure(
     0.03, None,
     why="veiling glare adds as much to dark patches as to bright ones; the relative error of dark ones is several "
     "times the mean",
-    source="geometry: six times the glare's error in a patch of 5 % of paper white; 3 % is three standard deviations "
-    "of a mean of 300 counts; " + SIMULATED + ": 0.3 to 1.9 % if the mean is accepted", remedy=_REDUCE_GLARE,
+    source="3 % is three standard deviations of a mean of 300 counts; " + SIMULATED + ": 0.3 to 1.9 % if "
+    "correction_residual is accepted", remedy=_REDUCE_GLARE,
     before_session=False, measure=_uncorrected_in_worst_cell, where=_glare_text,
 )  # fmt: skip
 
 
 def _marks_text(table: TableMeasurements) -> str:
-    return "corners of the tags" if table.registration.framing.field is None else "outline of the field, across"
+    return "corners of the tags" if table.registration.framing.field is None else "outline of the patch area"
 
 
 def _final_residual_row(table: TableMeasurements) -> SummaryRow:
@@ -169,16 +169,16 @@ def _final_residual_row(table: TableMeasurements) -> SummaryRow:
     name = "Residual of the outline" if has_no_tags else "Residual of tags"
     detector_note = "" if has_no_tags else "; the detector's own error is 0.09"
     value = f"{table.registration.marks_rms_px:.3f} px RMS"
-    return SummaryRow(name, value, f"{_marks_text(table)} against the final map{detector_note}")
+    return SummaryRow(name, value, f"{_marks_text(table)} relative to the final registration{detector_note}")
 
 
 def _plane_residual_row(table: TableMeasurements) -> SummaryRow:
-    note = f"{_marks_text(table)} against a plane imaged by the lens: the waviness of the sheet"
+    note = f"{_marks_text(table)} relative to a plane sheet: the waviness of the print"
     return SummaryRow("Residual of plane and lens", f"{table.registration.lens_residual_px:.2f} px RMS", note)
 
 
 TAG_RESIDUAL_PX = Figure(
-    "tag_residual_px", "Residual of tags, plane and lens", "geometry", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,
+    "tag_residual_px", "Residual of tags, plane sheet", "geometry", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,
     why="on a more wavy sheet, positions are based on the patches alone",
     source=SIMULATED + ": waves of 6 mm with a curl of 10 mm give 2.3", remedy=_HANG_FLATTER,
     measure=lambda table: table.registration.lens_residual_px, of_one_frame="known", drawing="residuals",
@@ -186,7 +186,7 @@ TAG_RESIDUAL_PX = Figure(
 )  # fmt: skip
 
 TAG_FINAL_PX = Figure(
-    "tag_final_px", "Residual of tags, final map", "geometry", "px RMS", "at most", 0.4, 2.0,
+    "tag_final_px", "Residual of tags, final registration", "geometry", "px RMS", "at most", 0.4, 2.0,
     why="patches and tags give different positions of the print; limits are for patches of 10 px and scale with "
     "their size", source=SIMULATED + ": 0.05 to 0.2, the detector's own error 0.09",
     remedy="check that chart.json belongs to this print, and that the print is one flat sheet",
@@ -196,7 +196,7 @@ TAG_FINAL_PX = Figure(
 
 
 def _blocks_row(table: TableMeasurements) -> SummaryRow:
-    value, note = f"{table.registration.block_rms_px:.3f} px RMS", "displacement of patch blocks after the final map"
+    value, note = f"{table.registration.block_rms_px:.3f} px RMS", "displacement that remains after registration"
     return SummaryRow("Residual of patch blocks", value, note, brief=True)
 
 
@@ -218,7 +218,7 @@ BLOCKS_GOOD = Figure(
 
 
 def _agreement_row(table: TableMeasurements) -> SummaryRow:
-    note = "of patch colours and chart colours; about 0 for another chart"
+    note = "correlation of the colours of patches and chart; about 0 for another chart"
     return SummaryRow("Correlation with the chart", f"{table.registration.agreement:.4f}", note, brief=True)
 
 
@@ -226,7 +226,7 @@ AGREEMENT = Figure(
     "agreement", "Correlation of patches and chart", "geometry", "", "at least", 0.97, MIN_AGREEMENT,
     why="the colours differ from the chart",
     source=SIMULATED + ": at least 0.99; about 0 for another order of the patches",
-    remedy="give the chart.json of this print, and print without colour management",
+    remedy="use the chart.json of this print, and print without colour management",
     measure=lambda table: table.registration.agreement, of_one_frame="known",
     cause=Explanation("chart", chart_evidence), drawing="chart", lines=(Line(110, _agreement_row),),
 )  # fmt: skip

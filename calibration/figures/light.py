@@ -118,10 +118,10 @@ def _drift_residual(table: TableMeasurements) -> float | None:
 
 
 DRIFT_LEFT = Figure(
-    "drift_left", "Drift between white frames that the correction leaves", "light", "share", "at most", 0.002, 0.005,
+    "drift_left", "Drift that may remain between white frames", "light", "share", "at most", 0.002, 0.005,
     why="the lamp jumps or flickers between two white frames, so that an illuminant gets a wrong brightness; the "
     "colour of its ground truth is correct",
-    source=SIMULATED + ": 0.1 % of a steady drift on a small chart; 0.5 % for a jump of 1 %",
+    source=SIMULATED + ": 0.1 % for a steady drift on a small chart; 0.5 % for a jump of 1 %",
     remedy="build the LUT without --correct-drift, let the lamp warm up, or take white frames more often "
     "(sequence.reference_every)", before_session=False, measure=_drift_residual, drawing="course",
 )  # fmt: skip
@@ -173,8 +173,9 @@ LEAK_SHARE = Figure(
 DARK_DRIFT = Figure(
     "dark_drift", "Change of the light in dark frames, relative to white", "light", "share", "at most", 0.002,
     0.05,
-    why="the light of the room changes; the subtracted light, or a part of each illuminant, is wrong",
-    source=JUDGEMENT + ": 1 % of a patch with 20 % of white", remedy="darken the room, and keep daylight out",
+    why="the light of the room changes; illuminants contain varying amounts of it, or a wrong amount is subtracted",
+    source=JUDGEMENT + ": 0.2 % of white is 1 % of a patch with 20 % of white",
+    remedy="darken the room, and keep daylight out",
     measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None, of_one_frame="bounded",
     cause=Explanation("dark", dark_evidence),
 )  # fmt: skip
@@ -185,25 +186,25 @@ def _stray_share(table: TableMeasurements) -> float | None:
 
 
 def _stray_row(table: TableMeasurements) -> SummaryRow | None:
-    name, stray = "Light missing in the dark frames", table.lights.stray
+    name, stray = "Light that is not in the dark frames", table.lights.stray
     if table.lights.codes is None:
         return None
     if stray is None:
         return SummaryRow(name, "not measured", "needs frames of red, green and blue alone, and a dark frame")
     note = (
         f"beyond {CERTAIN:g} standard errors; {int(stray.checked.sum())} of {len(stray.certain)} illuminants "
-        "were checked, by a code of 0 or, for primaries, against white; the others were not"
+        "have a code of 0 and were checked; the primaries were compared with white"
     )
     return SummaryRow(name, f"{percent(stray.share)} of white", note)
 
 
 STRAY_SHARE = Figure(
-    "stray_share", "Light in some frames that the dark frames lack, relative to white", "light", "share", "at most",
-    0.004, 0.01,
-    why="an illuminant or a primary contains it, so that saturated colours are paler under some illuminants than "
-    "under others; subtracting dark frames does not help",
-    source=SIMULATED + ": below 0.1 % in healthy rooms; 1 % of white makes the darkest patches 10 % brighter, and "
-    "changes saturated illuminants by 1° to 2°, as much as the error of a good method",
+    "stray_share", "Light in some frames that is not in the dark frames, relative to white", "light", "share",
+    "at most", 0.004, 0.01,
+    why="some illuminants contain this light, so that saturated colours are paler under them than under others; "
+    "subtracting dark frames does not help",
+    source=SIMULATED + ": below 0.1 % in rooms without faults; 1 % of white changes saturated illuminants by 1° to 2°, "
+    "as much as the error of a good method",
     remedy="darken the room, keep doors, lamps and displays unchanged during the session, switch power saving and "
     "dynamic contrast off, and take the frames again",
     measure=_stray_share, cause=Explanation("stray", stray_evidence), lines=(Line(250, _stray_row),),
@@ -237,7 +238,7 @@ def _linearity_row(table: TableMeasurements) -> SummaryRow:
         unmeasured = table.sensor.superposition.unmeasured
         note = "illuminants have wrong names" if unmeasured is None else f"{unmeasured.why}; {unmeasured.remedy}"
         return SummaryRow("Linearity", "not measured", note)
-    note = "beyond two standard errors, over the levels of paper; red, green and blue alone against white, by patch"
+    note = "beyond two standard errors; from all patches under white, compared with red, green and blue alone"
     return SummaryRow("Linearity", f"{percent(deviation)} from proportionality", note)
 
 
@@ -263,7 +264,7 @@ def _linearity_detail(table: TableMeasurements) -> tuple[str, str] | None:
 LINEARITY_KNOWN = Figure(
     "linearity_known", "Linearity measured", "radiometry", "", "at least", 1.0, None,
     why="the proportionality of counts and light is unknown; the uncertainty of the ground truth assumes a typical "
-    "camera", source="uncertainty budget",
+    "camera", source="definition of the uncertainty budget",
     remedy="plan red, green and blue alone (acquire illuminations does) for a chart of at least 512 colours, or give "
     "a series of exposures of the chart with --linearity",
     detail=_linearity_detail, before_session=False, measure=_is_linearity_measured,
@@ -271,7 +272,7 @@ LINEARITY_KNOWN = Figure(
 
 
 def _oversubtracted_share(table: TableMeasurements) -> float | None:
-    # Light subtracted in excess is missing in each primary, so that white exceeds their sum in every channel. The
+    # If too much dark light is subtracted, each primary lacks it, so that white exceeds their sum in every channel. The
     # excess is at most the dark light. A projector that brightens white adds more light, in another colour.
     lights, dark = table.lights, table.dark_frames.light
     if lights.subtracted is None or lights.additivity is None or not _are_names_right(table):
@@ -285,13 +286,13 @@ def _oversubtracted_share(table: TableMeasurements) -> float | None:
     return float(certain.max()) if is_dark_light else 0.0
 
 
-_DARK_MARGIN = 1.25  # Largest excess relative to the dark light; the part above 1 allows for its error
+_DARK_MARGIN = 1.25  # Dark light with its error explains an excess up to this multiple of the dark light
 
 
 TOO_DARK = Figure(
     "too_dark", "Dark light subtracted in excess, relative to white", "light", "share", "at most", 0.0005, 0.002,
-    why="white exceeds the sum of red, green and blue, each of which lacks the excess; saturated and dim illuminants "
-    "have much larger errors", source="0.2 % of white changes an illuminant with 10 % of white by 1°",
+    why="white exceeds the sum of red, green and blue, because each of them lacks the excess; the errors of saturated "
+    "and dim illuminants are much larger", source="0.2 % of white changes an illuminant with 10 % of white by 1°",
     remedy="build the LUT without --subtract-dark; a lamp or a display was on during the dark frames, or the "
     "projector closes an iris for black: take dark frames under the same conditions as the others",
     before_session=False, measure=_oversubtracted_share,
@@ -323,8 +324,8 @@ def _sum_row(table: TableMeasurements) -> SummaryRow | None:
 
 ADDITIVITY = Figure(
     "additivity", "White above the sum of the primaries", "light", "share", "at most", 0.02, None,
-    why="codes do not predict an illuminant: the projector brightens or converts white, or frames have wrong names "
-    "or exposures", source=JUDGEMENT + "; the drift of the lamp is corrected first",
+    why="an illuminant cannot be predicted from its codes: the projector brightens or converts white, or frames have "
+    "wrong names or exposures", source=JUDGEMENT + "; the drift of the lamp is corrected first",
     remedy="switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
     measure=_sum_deviation(-1), cause=Explanation("sum", _sum_evidence), lines=(Line(260, _sum_row),),
 )  # fmt: skip
@@ -381,11 +382,10 @@ def _codes_row(table: TableMeasurements) -> SummaryRow | None:
 
 
 OFF_CODES_DEG = Figure(
-    "off_codes_deg", "White of an illuminant against the prediction from its codes", "light", "°", "at most", 2.0, 8.0,
+    "off_codes_deg", "Angle of an illuminant's white to its prediction from codes", "light", "°", "at most", 2.0, 8.0,
     why="a frame has the name of another illuminant, or was taken before the projected image changed: the codes do "
     "not belong to the whites",
-    source=SIMULATED + ": 0 in random healthy rooms; at least 28° for a list of frames shifted by a row; the angle "
-    "between the two for exchanged illuminants",
+    source=SIMULATED + ": 0 in rooms without faults; at least 28° if a list of frames is shifted by a row",
     remedy="correct the list of imported frames, let the projected image settle longer (sequence.settle_s), or "
     "expose whole turns of the colour wheel",
     foremost=True, measure=_largest_angle, where=_off_codes_text, retake=_frames_off_codes,
@@ -414,10 +414,10 @@ def _frames_off_brightness(table: TableMeasurements, limit: float) -> list[Frame
 
 
 OFF_BRIGHTNESS = Figure(
-    "off_brightness", "Brightness of an illuminant against the prediction from its codes", "light", "share", "at most",
-    0.1, 0.3,
-    why="a frame has another exposure than its file records, or shows another illuminant; brightness differs between "
-    "illuminants that should be equally bright",
+    "off_brightness", "Deviation of an illuminant's brightness from the prediction from its codes", "light", "share",
+    "at most", 0.1, 0.3,
+    why="a frame has another exposure than its file records, or shows another illuminant; illuminants that should be "
+    "equally bright differ",
     source=JUDGEMENT + ": lamps flicker by some per cent; the next shutter time differs by 26 %",
     remedy="keep one exposure for the session, and take the frames again",
     measure=_code_value(lambda codes: float(codes.off_brightness.max())), where=_brightness_text,
@@ -427,9 +427,9 @@ OFF_BRIGHTNESS = Figure(
 
 EXCHANGED_LIGHTS = Figure(
     "exchanged_lights", "Pairs of illuminants with exchanged names", "light", "", "at most", 0, None,
-    why="their whites fit each other's codes; each ground truth is correct, but its codes and colour temperature "
-    "belong to the other",
-    source=SIMULATED + ": none in random healthy rooms; in the others, all pairs with a larger angle than exchange_deg",
+    why="the whites of two illuminants fit each other's codes; each ground truth is correct, but has the codes and "
+    "the colour temperature of the other illuminant",
+    source=SIMULATED + ": none in rooms without faults; all exchanges at a larger angle than exchange_deg are detected",
     remedy="correct the list of imported frames, or take both frames again",
     measure=_code_value(lambda codes: float(len(codes.exchanges))), where=_exchanges_text,
     cause=Explanation("names", name_evidence), drawing="lights",
@@ -438,15 +438,15 @@ EXCHANGED_LIGHTS = Figure(
 CODE_MISFIT = Figure(
     "code_misfit", "Total disagreement of few illuminants with their codes", "light", "", "at most", 1.0, None,
     why="no projector produces these whites from these codes; the wrong illuminant cannot be identified",
-    source=SIMULATED + ": below 1 in random healthy rooms; with more than 24 illuminants each is judged separately",
+    source=SIMULATED + ": below 1 in rooms without faults; with more than 24 illuminants, each is judged separately",
     remedy="check that frames and illuminants belong together, and that the lamp was steady",
     before_session=False, measure=_code_value(lambda codes: codes.misfit), drawing="lights",
 )  # fmt: skip
 
 EXCHANGE_DEG = Figure(
-    "exchange_deg", "Angle above which exchanged names are excluded", "light", "°", "at most", 8.0, None,
+    "exchange_deg", "Angle above which exchanged names are detected", "light", "°", "at most", 8.0, None,
     why="exchanged names of two illuminants at a smaller angle would not be detected",
-    source=SIMULATED + ": 0.3° with 707 illuminants, 0° with eight that are far apart",
+    source=SIMULATED + ": 0.3° with 707 illuminants, 0° with eight very different illuminants",
     remedy="take white and the primaries in the session, and expose longer",
     before_session=False, measure=_code_value(lambda codes: codes.exchange_deg), drawing="lights",
 )  # fmt: skip
@@ -461,16 +461,16 @@ def _checked_row(table: TableMeasurements) -> SummaryRow | None:
     codes = table.lights.codes
     if codes is None:
         return None
-    value = f"{_checked_text(table, 0.0)}; exchanged names excluded down to {format_value(codes.exchange_deg, '°')}"
-    note = "the others are too few or too dim to detect a wrong name"
+    value = f"{_checked_text(table, 0.0)}; exchanged names detectable above {format_value(codes.exchange_deg, '°')}"
+    note = "a wrong name of the other illuminants would not be detected"
     return SummaryRow("Illuminants compared with codes", value, note)
 
 
 CROSS_CHECKED_SHARE = Figure(
     "cross_checked_share", "Illuminants that could be compared with their codes", "light", "share", "at least", 0.9,
     None,
-    why="a wrong name of the others would not be detected",
-    source="angle at which a wrong name is refused, beyond the prediction error of so few illuminants",
+    why="wrong names of the other illuminants would not be detected",
+    source="a wrong name must be detectable from 8° on, the angle at which a LUT is refused",
     remedy="take white, red, green and blue in the session, and expose longer", before_session=False,
     measure=_code_value(lambda codes: float(codes.is_verified.mean())), where=_checked_text,
     lines=(Line(230, _checked_row),),
@@ -499,9 +499,9 @@ _above_angle = _white_frames_above(lambda white: white.off_deg)
 _above_brightness = _white_frames_above(lambda white: white.off_brightness)
 
 WHITE_FRAME_DEG = Figure(
-    "white_frame_deg", "White frame against the prediction from the illuminants", "light", "°", "at most", 2.0, 8.0,
+    "white_frame_deg", "Angle of a white frame to the prediction from illuminants", "light", "°", "at most", 2.0, 8.0,
     why="the frame shows another illuminant than white, or the illuminants have wrong names",
-    source=SIMULATED + ": 0 in random healthy rooms",
+    source=SIMULATED + ": 0 in rooms without faults",
     remedy="correct the list of imported frames, or take the white frame again",
     foremost=True, measure=_white_frame_value(lambda white: white.off_deg),
     where=lambda table, accepted: first_few([frame.file for frame in _above_angle(table, accepted)]),
@@ -509,8 +509,8 @@ WHITE_FRAME_DEG = Figure(
 )  # fmt: skip
 
 WHITE_FRAME_BRIGHTNESS = Figure(
-    "white_frame_brightness", "Brightness of the white frame against the prediction from the illuminants", "light",
-    "share", "at most", 0.1, 0.3,
+    "white_frame_brightness", "Deviation of a white frame's brightness from the prediction from the illuminants",
+    "light", "share", "at most", 0.1, 0.3,
     why="the white frame has another exposure than the illuminants, so that drift and stray light are wrong",
     source=JUDGEMENT + ": lamps flicker by some per cent; the next shutter time differs by 26 %",
     remedy="keep one exposure for the session, and take the white frame again",
@@ -537,8 +537,8 @@ def _primary_fields_row(table: TableMeasurements) -> SummaryRow | None:
 PRIMARIES_LACKING = Figure(
     "primaries_lacking", "Primaries without a frame", "light", "", "at most", 0, None,
     why="the fields of the primaries were not measured; coloured patches are corrected with the field of paper",
-    source="if the primaries' fields differ by 10 %, coloured patches at corners have errors of some tenths of a per "
-    "cent", remedy="take red, green and blue alone in the session",
+    source="if the fields differ by 10 %, coloured patches at the corners have errors of some tenths of a per cent",
+    remedy="take red, green and blue alone in the session",
     before_session=False, measure=_missing_primaries, drawing="field", lines=(Line(240, _primary_fields_row),),
 )  # fmt: skip
 
@@ -561,8 +561,8 @@ def _tint_row(table: TableMeasurements) -> SummaryRow | None:
 
 GREY_TINT_DEG = Figure(
     "grey_tint_deg", "Tint of the print's greys against paper", "radiometry", "°", "at most", 6.0, None,
-    why="greys are not neutral; the ground truth is that of paper, so methods based on grey are judged with a "
-    "different grey on images rendered by codes",
+    why="the colour of paper is the ground truth, and the greys differ from it; on images rendered by codes, methods "
+    "that rely on grey have this error",
     source=JUDGEMENT + "; simulated prints: 1° to 2.5° with the printer's profile; with ink codes, as in the "
     "publication, 4.5° (poster paper) to 8° (glossy)",
     remedy="render by colour (the default), which uses the measured print; or have the chart printed with the "

@@ -76,7 +76,7 @@ def _unfit_row(table: TableMeasurements) -> SummaryRow:
 
 UNFIT_SHARE = Figure(
     "unfit_share", "Unfit patches", "radiometry", "share", "at most", 0.005, 0.1,
-    why="images lack the colours of patches without samples", source=JUDGEMENT, remedy="",
+    why="generated images lack the colours of unfit patches", source=JUDGEMENT, remedy="",
     detail=_unfit_detail, measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1),
     of_one_frame="bounded",
     cause=Explanation("unfit cells", unfit_evidence, follows=("block_deviation",)), drawing="errors",
@@ -98,10 +98,10 @@ DOUBTFUL_SHARE = Figure(
 ADDED_LIGHT = Figure(
     "added_light", "Light added to a large part of the print, relative to paper white", "radiometry", "share",
     "at most", 0.004, 0.01,
-    why="it is equal on dark and bright patches, and extends beyond the patches listed as unfit",
-    source=SIMULATED + ": 0 in healthy rooms; 1 % of paper white makes patches of 10 % of paper white 10 % brighter, "
-    "and patches of 3 % 30 % brighter; a reflection of 3 % causes errors of 57 %",
-    remedy="turn the print or the projector until it shows no reflection, or print on matt paper",
+    why="this light is equal on dark and bright patches, and changes more patches than those listed as unfit",
+    source=SIMULATED + ": 0 in rooms without faults; light of 1 % of paper white makes a patch of 10 % of paper white "
+    "10 % brighter, and a patch of 3 % 30 % brighter",
+    remedy="turn the print or the projector until the print shows no reflection, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.is_known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
@@ -128,8 +128,8 @@ FRAME_BLUR = Figure(
     "frame_blur", "Light of neighbouring patches added in the most blurred frame", "geometry", "share", "at most",
     0.003, 0.012,
     why="a frame is out of focus or shaken; only white frames are checked patch by patch for such light",
-    source=SIMULATED + ": a frame with 0.9 px of blur in a session with 0.5 px has 0.8 % of added light, and errors "
-    "of 1.2 % in patches; a frame with 1.1 px has 2 % and 4 %",
+    source=SIMULATED + ": if the other frames have a blur of 0.5 px, a frame with 0.9 px has 0.8 % of added light, and "
+    "errors of 1.2 % in patches",
     remedy="switch off autofocus and stabilisation, and keep the camera free from vibration",
     measure=lambda table: table.added_bleed(_most_blurred(table)), of_one_frame="bounded",
     where=_most_blurred_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
@@ -149,7 +149,7 @@ FRAME_SCATTER = Figure(
     "frame_scatter", "Scatter of patches about their codes' colours, worst frame", "radiometry", "share", "at most",
     0.012, 0.03,
     why="the frame's samples do not have the colours of their patches",
-    source=SIMULATED + ": up to 0.8 % beyond noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
+    source=SIMULATED + ": up to 0.8 % beyond noise; a blur of 1.5 px gives 5 %, another print 50 %",
     remedy="keep everything unchanged during the session",
     measure=_largest_of_frames(lambda table, frame: frame.consistency.scatter), of_one_frame="bounded",
     where=lambda table, accepted: f"in {max(table.frames, key=lambda frame: frame.consistency.scatter).record.file}",
@@ -161,7 +161,7 @@ FRAME_SCATTER = Figure(
 BLOCK_DEVIATION = Figure(
     "block_deviation", "Deviation of the worst block of patches, worst frame", "radiometry", "share", "at most",
     0.01, 0.03,
-    why="an object or a light was in front of the print in this or in the compared frame, and changed the samples",
+    why="an object or a light changed the samples of an area in this frame, or in the frame registered first",
     source=SIMULATED + ": up to 0.4 % beyond noise",
     remedy="keep people out of the space between lamp, print and camera",
     measure=_largest_of_frames(lambda table, frame: frame.consistency.block), of_one_frame="bounded",
@@ -179,10 +179,10 @@ def _disturbed_count(table: TableMeasurements) -> float | None:
 DISTURBED_CELLS = Figure(
     "disturbed_cells", "Adjacent patches with large deviations in an illuminant's frame", "radiometry", "", "at most",
     0, None,
-    why="their samples under that illuminant do not have the colours of these patches; they are listed as unfit, and "
-    "other patches are not affected",
-    source=SIMULATED + ": none in healthy rooms; two adjacent patches that deviate by five standard deviations are "
-    "sufficient, unless the dark frames show hot photosites there",
+    why="the samples of these patches under the illuminant are wrong; the patches are listed as unfit, and other "
+    "patches are not affected",
+    source=SIMULATED + ": none in rooms without faults; two adjacent patches that deviate by five standard deviations "
+    "are sufficient, unless the dark frames show hot photosites there",
     remedy="keep the space between lamp, print and camera free", measure=_disturbed_count, of_one_frame="bounded",
     cause=Explanation("few cells", disturbed_evidence, follows=("block_deviation",)), drawing="errors",
 )  # fmt: skip
@@ -244,8 +244,8 @@ def _frames_of_other_exposure(table: TableMeasurements, limit: float) -> list[Fr
 
 
 OTHER_EXPOSURE = Figure(
-    "other_exposure", "Exposure of a frame relative to most frames, according to the raw files", "radiometry", "share",
-    "at most", 0.01, 0.1,
+    "other_exposure", "Difference of a frame's exposure from most frames, according to the raw files", "radiometry",
+    "share", "at most", 0.01, 0.1,
     why="illuminants of equal brightness would differ in brightness, and the noise would change with the ISO speed",
     source="shutter times have steps of 26 %, and files contain rounded times", remedy=_KEEP_EXPOSURE,
     foremost=True, measure=lambda table: table.origins.exposure_difference, of_one_frame="bounded",
@@ -255,7 +255,7 @@ OTHER_EXPOSURE = Figure(
 
 OTHER_ISO = Figure(
     "other_iso", "Frames of another ISO speed", "radiometry", "", "at most", 0, None,
-    why="they differ in noise and saturation; their exposure is judged separately",
+    why="these frames differ in noise and saturation; their exposure is judged separately",
     source="by definition", remedy=_KEEP_EXPOSURE,
     measure=lambda table: float(len(table.origins.other_iso)), of_one_frame="bounded",
     where=lambda table, accepted: _foreign_frames_text(table.origins.other_iso), cause=Explanation("iso", iso_evidence),
@@ -263,7 +263,7 @@ OTHER_ISO = Figure(
 
 WHITE_FRAMES = Figure(
     "white_frames", "White frames", "light", "", "at least", 1, None,
-    why="without them, drift of the lamp, stains on the print and the uniformity of patches cannot be measured",
+    why="without white frames, drift of the lamp, stains and the uniformity of patches cannot be measured",
     source="by definition; drift needs two white frames",
     remedy="take white frames during the session (sequence.reference_every)",
     before_session=False, measure=lambda table: float(len(table.white_frames)), drawing="course",
@@ -278,7 +278,7 @@ def _black_row(table: TableMeasurements) -> SummaryRow:
 
 BLACK_DRIFT_COUNTS = Figure(
     "black_drift_counts", "Drift of the black level", "radiometry", "counts", "at most", MAX_BLACK_DRIFT, 16.0,
-    why="the sensor warmed up; each frame's own black level is subtracted, but its error is visible in dark patches "
+    why="the sensor warmed up; the black level of each frame is subtracted, but its error is visible in dark patches "
     "of about 30 counts",
     source=JUDGEMENT, remedy="let the camera run for some minutes before the session, and pause between frames",
     measure=lambda table: table.black_drift, of_one_frame="bounded", drawing="course", lines=(Line(140, _black_row),),

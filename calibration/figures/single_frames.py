@@ -1,4 +1,4 @@
-"""Limits for the laboratory before a session and for single frames during it; no LUT contains these quantities."""
+"""Limits for the laboratory before a session, and for single frames during it. A LUT is not judged by them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ EVENNESS: Final = Limit(
     why="dark corners lack light for dark colours, and the flat field is uncertain there",
     source=SIMULATED + ": fields with 42 to 52 % of the central light at the corners are corrected to 0.2 %",
     remedy="centre the chart in the projected image, stop the lens down, or step back and use a longer lens; turn "
-    "the camera by 180°: a pattern that turns with it comes from the lens",
+    "the camera by 180°: a pattern that turns with the camera comes from the lens",
 )  # fmt: skip
 
 TURN: Final = Limit(
     "turn", "Angle between the rows of the chart and of the frame", "geometry", "°", "at most", 5.0, None,
-    why="sampling windows are aligned with the rows of the frame, and their corners approach the neighbouring patches",
-    source="geometry: 5 px of samples in a patch of 10 px", remedy="turn the camera until the rows are parallel",
+    why="sampling windows are aligned with the rows of the frame, so that their corners approach neighbouring patches",
+    source="geometry: a window of 5 px in a patch of 10 px", remedy="turn the camera until the rows are parallel",
 )  # fmt: skip
 
 KEYSTONE: Final = Limit(
@@ -29,7 +29,7 @@ KEYSTONE: Final = Limit(
 
 NOISE_REDUCTION: Final = Limit(
     "noise_reduction", "Extra time after an exposure, relative to the exposure", "noise", "share", "at most", 0.5, None,
-    why="the body takes its own dark frame after each exposure: the session takes twice as long, and raw data are "
+    why="the camera takes its own dark frame after each exposure: the session takes twice as long, and raw data are "
     "altered", source="without noise reduction, the transfer time of a file is independent of the exposure",
     remedy="switch long exposure noise reduction off in the camera's menu",
 )  # fmt: skip
@@ -55,7 +55,7 @@ BATTERY: Final = Limit(
 
 EMPTY_PHOTOSITES: Final = Limit(
     "data", "Photosites without counts", "devices", "share", "at most", 1e-5, 1e-5,
-    why="part of the file was lost during transfer", source="a body has fewer dead photosites; one lost row is 3e-4",
+    why="part of the file was lost during transfer", source="a sensor has fewer dead photosites; one lost row is 3e-4",
     remedy="check the cable and the memory card",
 )  # fmt: skip
 
@@ -63,7 +63,7 @@ REPEATED: Final = Limit(
     "repeated", "Noise that is independent of earlier frames, relative to all noise", "devices", "",
     "at least", 0.3, 0.3,
     why="the camera delivered an earlier frame again",
-    source="a correlation of 0.95; an identical frame gives 0, an independent one 1",
+    source="0.3 is a correlation of 0.95; an identical frame gives 0, an independent frame 1",
     remedy="check the camera's cable and memory card",
 )  # fmt: skip
 
@@ -81,8 +81,8 @@ ROWS: Final = Limit(
     remedy="check the cable, the memory card and the frame",
 )  # fmt: skip
 
-# Measured by the live judge only, in addition to the limits in LAB.toml.
+# Limits for each frame while a session is taken, in addition to the limits in LAB.toml.
 FRAME_LIMITS: Final = (EMPTY_PHOTOSITES, REPEATED, UNIFORMITY, ROWS)
 
-# Measured by `acquire check` only.
+# Limits that only `acquire check` measures, before a session.
 RIG_LIMITS: Final = (EVENNESS, TURN, KEYSTONE, NOISE_REDUCTION, DISK, CARD, BATTERY)

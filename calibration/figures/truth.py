@@ -35,7 +35,7 @@ def _at_zero_row(table: TableMeasurements) -> SummaryRow | None:
         return None
     worst = int(np.argmax(share))
     value = f"{100 * share.mean():.3f} %, {percent(share[worst])} under illuminant {worst}"
-    note = "no light within the noise; negative values are clipped to 0, which raises the mean of such patches slightly"
+    note = "samples with no light; negative noise is clipped to 0, which raises the mean of such patches slightly"
     return SummaryRow("Samples at 0", value, note)
 
 
@@ -58,8 +58,8 @@ def _transfer_row(table: TableMeasurements) -> SummaryRow:
 
 NOISY_SHARE = Figure(
     "noisy_share", "Patches noisier than expected for their level", "noise", "share", "at most", 0.002, 0.1,
-    why="the patches are not uniform: dirt, a fold, or a neighbour's edge", source="a variance 3.5 times that of the "
-    "model", remedy="clean the print, focus, and hang it flatter",
+    why="the patches are not uniform: dirt, a fold, or a neighbour's edge", source="a variance of more than 3.5 times "
+    "the curve", remedy="clean the print, hang it flatter, and focus",
     measure=lambda table: float(table.sensor.transfer.noisy.mean()), of_one_frame="known",
     cause=Explanation("noisy cells", noisy_evidence), drawing="noise", lines=(Line(180, _transfer_row),),
 )  # fmt: skip
@@ -93,7 +93,7 @@ def _frame_reference_spread(frame: FrameMeasurements) -> float:
 REFERENCE_SPREAD = Figure(
     "reference_spread", "Scatter of white references about the flat field, under white", "truth", "share", "at most",
     0.01, 0.05,
-    why="the flat field cannot describe local changes, or a fall-off untypical of lenses; they remain in the samples",
+    why="the flat field does not describe local changes or an unusual fall-off of light, which remain in the samples",
     source=SIMULATED + ": 0.3 % of noise and photosite response",
     remedy="clean or flatten the print, and look for shadows on it",
     measure=lambda table: max(map(_frame_reference_spread, table.white_frames), default=None), of_one_frame="bounded",
@@ -104,12 +104,12 @@ REFERENCE_SPREAD = Figure(
 def _error_row(table: TableMeasurements) -> SummaryRow:
     error = table.budget.expanded_deg
     value = f"{np.median(error):.2g}° median, {error.max():.2g}° worst illuminant"
-    note = f"k = {COVERAGE:g}; largest component of the worst: {table.budget.main_cause(int(np.argmax(error))).title}"
+    note = f"k = {COVERAGE:g}; largest component in the worst: {table.budget.main_cause(int(np.argmax(error))).title}"
     return SummaryRow("Uncertainty of the ground truth", value, note, brief=True)
 
 
 _REDUCE_COMPONENT = (
-    "reduce its largest component. Noise: expose longer or omit the darkest illuminants; lens: stop it down, clean it "
+    "reduce the largest component. Noise: expose longer or omit the darkest illuminants; lens: stop it down, clean it "
     "and shield it from light outside the print; dark light: darken the room; linearity: expose less"
 )
 
@@ -149,8 +149,8 @@ def _brightest_text(table: TableMeasurements, accepted: float) -> str:
 BRIGHTEST_SHARE = Figure(
     "brightest_share", "Bare paper under the brightest illuminant, relative to saturation", "radiometry", "share",
     "at most", 0.9, CLIPPING_SHARE,
-    why="where the light is strongest, patches saturate",
-    source=JUDGEMENT + ": 0.8 leaves a margin for an uneven light of 20 %", remedy="expose less",
+    why="patches saturate at positions with more light",
+    source=JUDGEMENT + ": leaves a margin of 10 % for uneven light", remedy="expose less",
     measure=lambda table: float(table.lights.white.max()) / table.sensor.white_level,
     of_one_frame="bounded", where=_brightest_text, drawing="lights", lines=(Line(150, _saturation_row),),
 )  # fmt: skip

@@ -1,1 +1,1 @@
-"""The stages from the frames of a session to a LUT."""
+"""Stages of a build, from the frames of a session to a LUT."""

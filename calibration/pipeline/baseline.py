@@ -1,9 +1,10 @@
 """Create the baseline that all frames of a LUT share, from the first frame, the primaries and further white frames.
 
-The flat field of the first frame is the base of all others, and every frame is compared with its patches. Frames of
-the primaries show the field of coloured patches relative to paper, and the light spread by the lens.
+The flat fields of all frames are based on the flat field of the first frame, and their patches are compared with the
+patches of the first frame. The frames of the primaries are used to measure two effects: the flat field of coloured
+patches relative to paper, and the light spread by the lens.
 
-C patches, W white and N grey references; positions on the print in mm, in frames in half-size px.
+C patches, W white and N grey references. Positions are in mm on the print, and in half-size px in frames.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from calibration.pipeline.measuring import (
     ChartPoints,
     DecodedFrame,
     RegisteredFrame,
-    beyond_print,
+    background_counts,
     compared_cells,
     locate,
     register_frame,
@@ -54,19 +55,20 @@ from foundation.robust import huber_weights, robust_sigma
 _Array = npt.NDArray[np.float64]
 _Frames = Iterable[DecodedFrame]
 
-# Degree of the polynomial in the codes, with enough patches. It describes inks with errors below 1 %.
+# Degree of the polynomial in the codes, if there are enough patches. It describes inks with errors below 1 %.
 CODE_DEGREE = 8
 
-LIGHT_ORDER = 4  # Order of the polynomial over the page, with enough patches
+LIGHT_ORDER = 4  # Order of the polynomial over the page, if there are enough patches
 
 _MIN_CELLS_PER_TERM = 5  # Patches per term of the polynomial in the codes; with fewer, its degree is lowered
 
-_MIN_COUNTS = 10.0  # Least counts above black; below, the logarithm is mostly noise
+_MIN_COUNTS = 10.0  # With fewer counts above black, a patch is not used, because its logarithm is mostly noise
 
-# Counts at which the weight of a patch is half of its maximum. Above, errors of the polynomial exceed noise.
+# Counts at which the weight of a patch is half of its maximum. With more counts, errors of the polynomial exceed noise.
 _HALF_WEIGHT_COUNTS = 300.0
 
-_PAPER_WEIGHT = 10.0  # Weight of a white reference, relative to a patch: its colour needs no polynomial
+# Weight of a white reference relative to a patch. It is higher, because the level of paper needs no polynomial.
+_PAPER_WEIGHT = 10.0
 
 _ROUNDS = 5  # Number of reweighted solutions, after which squared Huber weights have converged
 
@@ -104,14 +106,14 @@ def _baseline_of_first(
     variance = cells.var(axis=1, ddof=1)
     if registered.lens is not None:
         means = np.concatenate([cells.mean(axis=1), references.mean(axis=1, dtype=np.float64)])
-        added = registered.lens.added(FrameLevels(means, beyond_print(first, registered.lens.background)))
+        added = registered.lens.added(FrameLevels(means, background_counts(first, registered.lens.background)))
         cells -= added[: len(cells), None]
         references = references - added[len(cells) :, None].astype(np.float32)
     level = cells.mean(axis=1)
     whites = usable_means(references, highest, registered.references, first.saturation)[: len(points.whites_mm)]
     base = PaperReader(points.whites_mm, points.cells_mm, chart.page_mm).read(whites, first.record.file)[0].field
     if not chart.tags:
-        # Without tags, all references are in the margin, and do not show the light in the centre.
+        # On a chart without tags, all references are in the margin, and do not show the light in the centre.
         usable, codes = compared_cells(chart, registered), chart.rgb[chart.cell_of_colour]
         base = field_of_cells(codes, points.cells_mm, level, usable, points.whites_mm, whites, chart.page_mm)
     order = MAX_ORDER if chart.tags else MAX_ORDER_AROUND
@@ -154,7 +156,7 @@ def _measure_superposition(baseline: Baseline, first: DecodedFrame, primaries: S
 def with_lens(
     baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame], more_whites: Iterable[DecodedFrame]
 ) -> Baseline:
-    """Return the baseline with the measured light spread, and corrected for it if the print proves it."""
+    """Return the baseline with the measured light spread, and corrected for this light if it is significant."""
     chart, points = baseline.chart, baseline.points
     if unsuitable(chart):
         return baseline
@@ -195,7 +197,8 @@ def _is_still(baseline: Baseline, decoded: DecodedFrame) -> bool:
 
 
 def _spread_frame(baseline: Baseline, frames: _Frames, view: PrintView, is_mixed: bool) -> SpreadFrame | None:
-    # Mean of the frames of one illuminant in which the chart has not moved. `is_mixed`: it has several primaries.
+    # Mean of the frames of one illuminant in which the chart has not moved. `is_mixed`: the illuminant has several
+    # primaries.
     chart, points = baseline.chart, baseline.points
     usable = ~np.concatenate(
         [
@@ -210,12 +213,12 @@ def _spread_frame(baseline: Baseline, frames: _Frames, view: PrintView, is_mixed
         means, highest = baseline.patches(decoded.mosaic, decoded.black)
         usable &= np.isfinite(means).all(axis=1) & (highest < CLIPPING_SHARE * decoded.saturation)
         total += np.nan_to_num(means)
-        beyond += beyond_print(decoded, view.background)
+        beyond += background_counts(decoded, view.background)
         count, file = count + 1, file or decoded.record.file
     if not count:
         return None
     whites, sensor = points.white_patches, baseline.superposition
-    # Correct for counts lost near black: otherwise they would hide veiling glare.
+    # Correct for counts lost near black, because they would hide veiling glare.
     means, beyond = (values / count for values in (total, beyond))
     usual = np.median(means[whites], axis=0)
     means, beyond = (values * (1 - sensor.difference(np.maximum(values, 0), usual)[0]) for values in (means, beyond))

@@ -14,7 +14,7 @@ Stage, function and result::
     LUT            _write_table                  the folder
 
 Threads decode and measure the next frames in advance with the current `Accumulator`. If the chart is registered again
-in the meantime, they are measured again. Only a few frames are in memory at a time.
+in the meantime, these frames are measured again. Only a few frames are in memory at a time.
 
 The LUT appears completely or not at all. Until it is complete, it is a hidden folder next to its final path. An
 interrupted build resumes from its last checkpoint (`checkpoint`) with an identical result. A checkpoint is used only if
@@ -87,9 +87,9 @@ from foundation.folders import clear_folder
 from foundation.records import to_plain
 from foundation.version import software
 
-CHECKPOINT_EVERY = 16  # Frames between checkpoints; after a kill, at most these are measured again
+CHECKPOINT_EVERY = 16  # Number of frames between checkpoints; after a kill, at most this number is measured again
 
-# Version of the method: increased if samples, ground truth or unfit patches change, so that no LUT mixes methods.
+# Version of the method. It is increased if samples, ground truth or unfit patches change, so that no LUT mixes methods.
 METHOD = 17
 
 MAX_THREADS = 8  # A thread needs 110 MB for a raw file and its counts (6D Mark II); the limit is 2 GB in total
@@ -107,10 +107,10 @@ WriteReport = Callable[[BuildResult, Session, Path], None]
 class TableProgress:
     """Progress of a LUT of a session that is not complete."""
 
-    lights: int
+    lights: int  # Illuminants with a frame
     lights_planned: int
     new_frames: int  # Frames added by this call
-    frames: int
+    frames: int  # All frames added so far
 
 
 def build(
@@ -135,7 +135,7 @@ def build(
     report : WriteReport, optional
         Writes a report into the folder before it gets its final name.
     options : BuildOptions
-        Samples and corrections, by default as in the paper.
+        Samples and corrections.
     linearity : Path, optional
         Folder with a series of exposures, to measure the sensor's linearity.
     judged_by : Sequence[Figure]
@@ -166,7 +166,7 @@ def build(
         figures = table_figures(accumulator, series)
         result = BuildResult(figures, judge(judged_values(figures), judged_by), out)
         if figures.lights.drift is not None and not result.verdict.refused:
-            # If the build is killed here, the samples differ from the checkpoint, and the next build starts again.
+            # If the build is killed here, the samples differ from the checkpoint. The next build measures all frames.
             for light, gain in enumerate(figures.lights.drift.gains):
                 writer.put(light, corrected(writer.get(light), gain))
         # The LUT lists the hashes of its report, so the report is written first.
@@ -217,9 +217,10 @@ def check(
     picture: Path | None = None,
     judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
-    """Register the chart in a session's best frame and judge this frame; only the picture is written.
+    """Register the chart in the first white frame, or in the frame closest to white, and judge this frame.
 
-    `picture`: PNG path for the frame with the detected or expected chart; None for no picture.
+    `picture`: PNG path for the frame with the outline of the chart, or with the detected tags if it is not found; None
+    for no picture. Nothing else is written.
     """
     _require_dark_frames(session, options)
     selected = select_frames(session)
@@ -249,7 +250,7 @@ def judge_trial(
 ) -> BuildResult:
     """Judge a few trial frames like a complete session; nothing is written.
 
-    The lens, and the figures that depend on it, are not measured, because that takes a minute.
+    Light spread by the lens is not measured, because this takes a minute. Figures that depend on it are not judged.
 
     `saturation`: raw count of saturation. `linearity`: folder with a series of exposures.
     """
@@ -300,10 +301,10 @@ def _accumulate_all(
 def _accumulate(
     accumulator: Accumulator, records: Sequence[FrameRecord]
 ) -> Generator[tuple[Accumulator, MeasuredFrame | MeasuredDarkFrame]]:
-    """Yield the accumulator after each frame, with the measured frame; threads measure the next ones."""
+    """Yield the accumulator after each frame, with the measured frame; threads measure the next frames."""
 
     def measure_early(record: FrameRecord) -> EarlyMeasurement:
-        # Runs in a thread, with the accumulator of that moment.
+        # Runs in a thread, with the accumulator at that moment.
         return _measure_frame(accumulator, record, register_again=False)
 
     def others_wait_for(record: FrameRecord) -> bool:
@@ -364,7 +365,10 @@ def prefetched(
     records: Sequence[FrameRecord],
     others_wait_for: Callable[[FrameRecord], bool],
 ) -> Generator[tuple[FrameRecord, _Result]]:
-    """Yield each frame with its result of `work`, in order, while threads process the following frames."""
+    """Yield each frame with its result of `work`, in order, while threads process the following frames.
+
+    `others_wait_for`: True for a frame if the following frames must not be processed before its result is yielded.
+    """
     count = thread_count()
     with ThreadPoolExecutor(count) as pool:
         running: deque[tuple[FrameRecord, Future[_Result]]] = deque()

@@ -1,7 +1,7 @@
 """The hidden folder of an unfinished LUT, and the checkpoint from which a killed build resumes.
 
-A checkpoint is a piece (`foundation.pieces`) in the file `RECORD`, with its arrays in a separate file named after the
-number of frames. The arrays are written before the record refers to them, and the previous arrays are removed last.
+A checkpoint has two files. `RECORD` holds its values and hashes, as a `foundation.pieces.Piece`. The arrays are in a
+file with the number of frames in its name. This file is written first, and the previous arrays are removed last.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Checkpoint:
 class UnfinishedTable:
     """The hidden folder of an unfinished LUT; opened by `unfinished_table`.
 
-    `keep`: whether a later program may resume; False for a refused LUT, which would be refused again.
+    `keep`: whether a later build may resume; False for a refused LUT, which would be refused again.
     """
 
     def __init__(self, folder: Path, out: Path) -> None:
@@ -49,9 +49,9 @@ class UnfinishedTable:
         self.keep = True
 
     def load(self, identity: dict[str, Any], frames: list[str]) -> Checkpoint | None:
-        """Return the checkpoint of an earlier program; None if there is none, or if its inputs differ.
+        """Return the checkpoint of an earlier build; None if there is none, or if its inputs differ.
 
-        Its identity must be equal, and its frames must be the first ones of `frames`, in the same order.
+        Its identity must be `identity`, and its frames must be the first of `frames`, in the same order.
         """
         record = self.folder / RECORD
         if not record.is_file() or not (self.folder / SAMPLES).is_file():

@@ -47,7 +47,7 @@ _Figures = tuple[FrameMeasurements | DarkFrameFigures, ...]
 
 @dataclass(frozen=True, eq=False)
 class Accumulator:
-    """State after the frames added so far; adding a frame returns a new one."""
+    """State after the frames added so far; adding a frame returns a new state."""
 
     session: Session
     selected: SelectedFrames
@@ -56,14 +56,14 @@ class Accumulator:
     saturation: int  # Raw count of saturation, the lowest of all frames
     registered: RegisteredFrame
     dark: DarkLight | None  # Light to subtract from the following frames, if any
-    estimate: DarkLightEstimate  # Of the dark light, only from dark frames that are subtracted
+    estimate: DarkLightEstimate  # Estimate of the dark light; unchanged if dark light is not subtracted
     hot: HotPixels
     highest: npt.NDArray[np.uint16]  # (C,), highest raw count of each patch
-    highest_at: npt.NDArray[np.int64]  # (C,), illuminant of that count; −1 for a white frame
+    highest_at: npt.NDArray[np.int64]  # (C,), illuminant with this count; −1 for a white frame
     outside: npt.NDArray[np.bool_]  # (C,), patch cut off in a frame
     covered: npt.NDArray[np.bool_]  # (C,), patch does not match the chart in a registered frame
-    place_error: _Array  # (C,) px, largest `Registration.expanded_px` of all registered frames
-    even_sum: npt.NDArray[np.float32]  # (C, S, 3) counts above black, sum of the evenly lit frames
+    place_error: _Array  # (C,) px, largest uncertainty of position (`Registration.expanded_px`) in registered frames
+    even_sum: npt.NDArray[np.float32]  # (C, S, 3) counts above black, sum of the evenly lit frames (`is_even`)
     even_noise2: _Array  # (C, 3) counts², sum of the variances of one sample in these frames
     even_frames: int
 
@@ -77,8 +77,8 @@ class Accumulator:
     ) -> Accumulator:
         """Return the state before the first frame.
 
-        `saturation`: raw count of the first registered frame. `first_dark`: dark frame to subtract from the frames
-        before it.
+        `saturation`: raw count of the first registered frame. `first_dark`: first dark frame, to subtract from frames
+        taken earlier.
         """
         count, samples, first = baseline.chart.colour_count, baseline.options.samples, baseline.first
         inside = np.concatenate([first.cells.inside, first.references.inside])
@@ -209,7 +209,7 @@ class Accumulator:
         return np.sqrt(np.median(self.even_noise2 / frames, axis=0)) / np.maximum(level, 1e-6)
 
     def stains(self, field: _Array) -> Stains:
-        """Return the areas of the print that differ in colour from the same codes elsewhere.
+        """Return the areas of the print with colours that differ from patches of similar codes elsewhere.
 
         `field`: (C, 3) float64, flat field of an evenly lit frame for the colour of each patch. The flat field of paper
         would give errors if the primaries have different fields.
@@ -262,7 +262,7 @@ class Accumulator:
             elif colour in disturbed:
                 cause = f"disturbed: {_disturbance(disturbed[colour])}"
             elif colour in light_by_colour:
-                cause = f"unlike: under illuminant {light_by_colour[colour]} the patch alone differs from its code"
+                cause = f"unlike: only this patch differs from its code under illuminant {light_by_colour[colour]}"
             if cause:
                 unfit_cells.append(Unfit(colour=colour, cause=cause))
         return tuple(unfit_cells)

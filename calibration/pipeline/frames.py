@@ -1,4 +1,4 @@
-"""Options of a build, the source frames of a LUT, and the stated origin of their session."""
+"""Options of a build, selection of the frames for a LUT, and the origin that a session states."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _MAX_MORE_WHITES = 3  # Maximum of `SelectedFrames.more_whites`
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """Options of a build; the defaults follow Banić et al. 2019, but subtract spread light."""
+    """Options of a build; the defaults follow Banić et al. 2019, but subtract light that the lens spreads."""
 
     window: int = WINDOW  # Side of a patch's sampling window, px; one of `calibration.sampling.WINDOWS`
     subtract_dark: bool = False  # Subtract dark light from samples and ground truth
     # Corners (x, y) of the patches, half-size px, clockwise from top left; for a chart without tags
     corners: Corners | None = None
     correct_drift: bool = False  # Correct samples and ground truth for lamp drift between white frames
-    lens_correction: bool = True  # Subtract light spread by the lens, if the print proves it
+    lens_correction: bool = True  # Subtract light spread by the lens, if it was measured significantly
 
     def __post_init__(self) -> None:
         if self.window not in WINDOWS:
@@ -66,7 +66,7 @@ class SelectedFrames:
     lights_without: tuple[int, ...]  # Illuminants without a frame
     registered: FrameRecord  # Frame to register first
     primaries: tuple[FrameRecord, ...]  # Frames of red, green and blue alone; () if one is missing
-    more_whites: tuple[FrameRecord, ...]  # Further white frames, against noise of the lens with few patches
+    more_whites: tuple[FrameRecord, ...]  # Further white frames, to measure the lens on charts with few patches
 
     @property
     def newest(self) -> FrameRecord:
@@ -83,9 +83,9 @@ class SelectedFrames:
         return (record for record in self.records if record.kind != "dark")
 
     def is_even(self, record: FrameRecord) -> bool:
-        """Return True for frames that show the uniformity of patches: white frames, and the first light or white frame.
+        """Return True if a frame is evenly lit: a white frame, or the first of all light and white frames.
 
-        A white frame whose file was repeated counts once, because repeated noise does not average out.
+        If several white frames have the same file, only the first counts, because their noise does not average out.
         """
         first = next((white for white in self.records if white.kind == "white" and white.sha256 == record.sha256), None)
         return record == first or record is next(self._lit_frames)
@@ -119,8 +119,8 @@ def select_frames(session: Session) -> SelectedFrames:
 
 def _in_order_taken(session: Session, records: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
     """Return frames in the order taken; their times never decrease."""
-    # White frames are interpolated in time. If a clock was set back between two frames, the second frame is assumed to
-    # follow after the usual interval. For imported frames, only the times in their files are known.
+    # Drift is interpolated in time between white frames. If a clock was set back between two frames, the second frame
+    # is assumed to follow after the usual interval. For imported frames, only the times in their files are known.
     if any(event.what == "import" for event in session.journal.events()):
         return tuple(sorted(records, key=lambda record: (record.taken_at, record.file)))
     ordered = sorted(records, key=lambda record: record.attempt)
@@ -164,7 +164,7 @@ def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> Fra
 
 
 def stated_origin(session: Session) -> SessionOrigin:
-    """Return the stated origin of a session; missing or damaged values count as unknown."""
+    """Return the origin that the settings and the journal of a session state; damaged values count as unknown."""
     try:
         document: dict[str, Any] = tomllib.loads(session.settings_text())
         rig: Rig | None = next((name for name in get_args(Rig) if name == document.get("rig")), None)

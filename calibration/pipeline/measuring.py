@@ -1,10 +1,11 @@
 """Measure one frame in steps: decode, locate, sample, measure. All frames of a LUT share one baseline.
 
-Patches are in the order of colour indices. References follow them, the white references first. A measurement depends
-only on the frame, the baseline, the frame registered last and the dark light. The dark light is from the last dark
-frame before; if there is none, from the first dark frame. Therefore several threads may measure frames in any order.
+Patches are in the order of colour indices. White references follow them, and grey references are last. A measurement
+depends only on the frame, the baseline, the frame registered last and the dark light. The dark light is from the last
+dark frame before this frame; if there is none, from the first dark frame. Therefore several threads may measure frames
+in any order.
 
-C patches of S samples, W white and N grey references; positions on the print in mm, in frames in half-size px.
+C patches of S samples, W white and N grey references. Positions are in mm on the print, and in half-size px in frames.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ _RETAKE_HINT = "or take it again with acquire run LAB.toml SESSION, which detect
 # Distance from the median, in robust standard deviations, above which a grey reference counts as covered or dirty.
 _OUTLIER_SIGMAS = 6.0
 
-_MAX_WITHOUT_OUTLIERS = 4  # Largest number of grey references among which a wrong one cannot be identified
+_MAX_WITHOUT_OUTLIERS = 4  # With at most this number of grey references, a wrong one cannot be identified
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,7 @@ class GreyLevels:
     def read(self, means: _Array, field: _Array) -> tuple[_Array, _Array]:
         """Return value and standard error of each level, (G, 3) float64 counts; NaN without a usable reference.
 
-        `means`: (N, 3) counts above black of each grey reference, NaN if unusable. `field`: (N, 3) flat field there.
+        `means`: (N, 3) counts above black of each grey reference, NaN if unusable. `field`: (N, 3) their flat field.
         """
         flat = means / field
         value, error = np.full((len(self.names), 3), np.nan), np.full((len(self.names), 3), np.nan)
@@ -208,13 +209,16 @@ class RegisteredFrame:
     cells: Sites
     references: Sites
     gauges: dict[Channel, Plane]  # Areas around the tags, or the outline of the patches, to measure movement
-    lens: FrameCorrection | None = None  # Of light spread by the lens, for frames sampled at these positions
+    lens: FrameCorrection | None = None  # Correction of light spread by the lens, at these sampling positions
 
 
 def register_frame(
     decoded: DecodedFrame, chart: Chart, points: ChartPoints, options: BuildOptions, near: Registration | None = None
 ) -> RegisteredFrame:
-    """Return a frame with the chart registered in it."""
+    """Return a frame with the chart registered in it.
+
+    `near`: registration of an earlier frame, which gives the approximate position of a chart without tags.
+    """
     registration = register(decoded.mosaic, chart, decoded.record.file, options.corners, near)
     cells, references = sites_of(registration, points, decoded.shape, options.window)
     gauges: dict[Channel, Plane] = {
@@ -257,16 +261,16 @@ class Baseline:
     first: RegisteredFrame
     whites: _Array  # (W, 3) counts above black of the white references; NaN if unusable
     means: _Array  # (C + W + N, 3) counts above black of patches and references
-    paper: PaperReader  # Reads flat field and white of a frame, based on the shape of the first frame
+    paper: PaperReader  # Measures flat field and white of a frame, based on the flat field of the first frame
     transfer: PhotonTransfer
-    # Linearity, from the first frame and the primaries; a usual value if primaries are missing or the chart moved
+    # Linearity, from the first frame and the primaries; usual values if primaries are missing or the chart moved
     superposition: Superposition
     primaries: Primaries | None = None  # The primaries alone; None if missing or unusable
     lens: LensCorrection | None = None  # Measured light spread; None if not measured
 
     @cached_property
     def consistency_check(self) -> ConsistencyCheck:
-        """Comparison of frames with the first frame, with the flat field for each patch's colour if known."""
+        """Comparison of frames with the first frame. With primaries, the flat field depends on a patch's colour."""
         level = self.means[: len(self.points.cells_mm)]
         if self.primaries is None:
             field = self.paper.base.at(self.points.cells_mm)
@@ -338,7 +342,7 @@ class Baseline:
         return reflectances(self.means, field, paper.white)
 
 
-def beyond_print(decoded: DecodedFrame, beyond: Sites) -> _Array:
+def background_counts(decoded: DecodedFrame, beyond: Sites) -> _Array:
     """Return the mean (3,) float64 counts above black of the background behind the print; 0 if not visible."""
     if not len(beyond.rows):
         return np.zeros(3)
@@ -370,7 +374,7 @@ class LocatedFrame:
     decoded: DecodedFrame
     registered: RegisteredFrame  # The frame registered last; this one, if it was registered again
     moved: RegisteredFrame  # `registered` with its sampling positions moved by `shift`
-    shift: Shift  # Movement since the frame registered before
+    shift: Shift  # Movement since the frame registered before this one
     reregistered: bool
 
 
@@ -464,7 +468,7 @@ def sample(baseline: Baseline, located: LocatedFrame, dark: DarkLight | None, ke
         samples, highest = gather(decoded.mosaic, decoded.black, moved.cells)
         values, noise = table_values(samples, shape, dark_of_cells), sample_noise(samples)
         if dark_of_cells is not None:
-            # Subtract only light spread by the lens: samples with dark light show hot photosites and stains.
+            # These samples are used to find faulty patches. Their dark light is kept; light spread by the lens is not.
             added = dark_of_cells if dark is None else dark_of_cells - dark.patches[: len(dark_of_cells)]
             samples -= added[:, None]
     else:
@@ -484,7 +488,7 @@ def _to_subtract(
     means = np.concatenate([cells, references.mean(axis=1, dtype=np.float64)])
     if dark is not None:
         means -= dark.patches
-    added = moved.lens.added(FrameLevels(means, beyond_print(decoded, moved.lens.background))).astype(np.float32)
+    added = moved.lens.added(FrameLevels(means, background_counts(decoded, moved.lens.background))).astype(np.float32)
     return added if dark is None else added + dark.patches
 
 
@@ -493,7 +497,7 @@ def measure(baseline: Baseline, sampled: SampledFrame) -> MeasuredFrame:
     located, points, values = sampled.located, baseline.points, sampled.values
     decoded, shift, origin = located.decoded, located.shift, located.decoded.mosaic.origin
     greys, grey_errors = points.levels.read(sampled.greys, sampled.paper.field.at(points.greys_mm))
-    # Blur of the registered frame, plus the increase of blur at the gauges.
+    # Blur of the registered frame, plus the increase of blur in the areas that measure movement.
     blur_growth_px2 = 0.0 if located.reregistered else shift.blur_growth_px2
     mean = patch_means(values)
     variance = baseline.transfer.variance(mean) / baseline.options.samples

@@ -1,7 +1,7 @@
-"""Measurements of a whole LUT or of a check, from its accumulated frames, including the uncertainty budget.
+"""Calculate the measurements of a LUT or a check from its accumulated frames, including the uncertainty budget.
 
-An effect that the session does not show is assumed to have its usual size, never 0, and is marked as assumed. The
-linearity series (`read_linearity`) does not affect the samples.
+If a session does not show an effect, the usual size of the effect is assumed, never 0. The linearity measured with a
+series of exposures (`read_linearity`) does not change the samples.
 
 Shapes: L illuminants, C patches in the order of colour indices.
 """
@@ -54,12 +54,12 @@ _Array = npt.NDArray[np.float64]
 # give 0.03).
 _BLACK_COUNTS = 0.05
 
-# Relative standard deviation of photosite response that noise hides (usual for cameras: 0.3 to 1 %).
+# Relative standard deviation of photosite response that noise may hide (cameras have 0.3 to 1 %).
 _RESPONSE = 0.003
 
 _DARK_CHANGE = 0.2  # Relative change of dark light over a session with a single dark frame (judgement)
 
-# Difference between dark light in dark frames and in illuminants' frames, relative, if not measured (judgement).
+# Relative difference between the dark light in dark frames and in other frames, if not measured (judgement).
 _USUAL_OVERSUBTRACTION = 0.2
 
 # Relative error due to lamp flicker or an incomplete turn of the colour wheel in an exposure of 0.5 s (judgement; Heinz
@@ -68,8 +68,8 @@ _FLICKER = 5e-5
 
 _STRAY = 1e-4  # Light from outside the print relative to the illuminant, if not measured (judgement)
 
-# Fraction of the mean square of both errors that is common to all channels (judgement). A lamp flickers in all
-# channels, but a colour wheel stops in one primary, and walls reflect the illuminant in their own colour.
+# Fraction of the mean square errors of flicker and stray light that is common to all channels (judgement). A lamp
+# flickers in all channels, but exposures end within one colour of a wheel, and walls reflect light in their own colour.
 _COMMON = 0.75
 
 
@@ -103,7 +103,7 @@ def _partly_common(size: float, lights: int) -> _Array:
 
 
 def _noise_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    # The flat field contains the variance of white once per term of its polynomial.
+    # Each term of the flat field's polynomial adds the variance of white once.
     square = (table.lights.white_error / white) ** 2
     field = max(len(factor) for frame in table.frames for factor in frame.paper.field.coefficients[0])
     response = (table.sensor.transfer.response**2 + _RESPONSE**2) / table.cells.window**2
@@ -145,8 +145,8 @@ def _darkness_component(table: TableMeasurements, white: _Array, cells: _Array) 
 
 
 def _oversubtracted_counts(table: TableMeasurements, dark: _Array) -> _Array:
-    # If `dark` (3,) counts are too high, white exceeds the primaries' sum by twice the excess, because each primary
-    # lacks it. A projector with a white segment has the same effect.
+    # If `dark` (3,) counts are too high, white lacks the excess once, and the primaries' sum three times. White then
+    # exceeds the sum by twice the excess. A projector with a white segment has the same effect.
     additivity = table.lights.additivity
     if additivity is None:
         return _USUAL_OVERSUBTRACTION * dark
@@ -175,7 +175,7 @@ def _added_light_component(table: TableMeasurements, white: _Array, cells: _Arra
     at_cells = (_STRAY**2 + measured_share**2 + table.cells.added.mean_square) / cells**2
     return Component(
         "added light", "reflections, and light in single frames", table.lights.stray is None,
-        "light added equally to dark and bright patches; paper at codes of 0, and white against the sum of primaries",
+        "light added equally to dark and bright patches; light under codes of 0; white against the sum of primaries",
         lights, at_cells,
     )  # fmt: skip
 
@@ -183,13 +183,13 @@ def _added_light_component(table: TableMeasurements, white: _Array, cells: _Arra
 def _flicker_component(white: _Array, cells: _Array) -> Component:
     return Component(
         "flicker", "flicker within an exposure", True,
-        "usual for lamps and wheels; drift between frames is included in each ground truth",
+        "usual for lamps and colour wheels; drift between frames is part of each ground truth and no error",
         _partly_common(_FLICKER, len(white)), np.broadcast_to(_FLICKER**2, cells.shape),
     )  # fmt: skip
 
 
 def _geometry_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    # On average, a position error has the same effect on a patch as a blur of this σ.
+    # On average, an uncertain position has the same effect on a patch as a blur of this σ.
     registration, window = table.registration, table.cells.window
     blur_px = np.hypot(registration.blur_px, registration.uncertainty_px(table.cells.stains.places_mm))
     of_neighbours = mean_bleed(registration.cell_px, blur_px, window)[:, None]
@@ -197,7 +197,7 @@ def _geometry_component(table: TableMeasurements, white: _Array, cells: _Array) 
     no_error = np.zeros((len(white), 3, 3))
     return Component(
         "geometry", "positions of patches, and blur", False,
-        "registered blur and positions, with average neighbours",
+        "blur and uncertainty of position from the registration, with neighbours of average contrast",
         no_error, (of_neighbours * contrast) ** 2,
     )  # fmt: skip
 
@@ -273,10 +273,10 @@ def _require_in_place(shift: Shift, path: Path) -> None:
         )
 
 
-# Lower limit of the ground truth, counts, so that it has a direction even without light.
+# Lower limit of the ground truth, counts, so that its chromaticity is defined even without light.
 _MIN_WHITE = 1e-3
 
-# Largest drift of white in an accepted LUT, relative and in degrees; larger differences have other causes.
+# Largest differences between white frames that lamp drift explains, relative and in degrees.
 _MAX_DRIFT, _MAX_DRIFT_DEG = 0.15, 2.0
 
 _FULL_CODE = 255  # Code of a primary at full brightness
@@ -394,7 +394,8 @@ def _field_at_cells(baseline: Baseline, even_frame: FrameMeasurements) -> _Array
 def _without_hot(
     frames: tuple[FrameMeasurements, ...], hottest: _Array, cells_mm: _Array
 ) -> tuple[FrameMeasurements, ...]:
-    # A patch with a hot photosite is not regarded as covered. `hottest`: (C,) counts, or (0,) without dark frames.
+    # Patches that deviate because of a hot photosite are not regarded as covered. `hottest`: (C,) counts, or (0,)
+    # without dark frames.
     if not len(hottest):
         return frames
     hot = hottest > 0
@@ -404,14 +405,14 @@ def _without_hot(
 def _light_figures(accumulator: Accumulator, by_light: Sequence[FrameMeasurements]) -> LightMeasurements:
     illuminations, options = accumulator.session.illuminations, accumulator.baseline.options
     error = np.array([frame.paper.error for frame in by_light])
-    # A channel without light may be measured at or below 0; its upper limit is then its standard error.
+    # A channel without light may be measured at or below 0. It then gets its standard error as the value.
     white = np.maximum([frame.paper.white for frame in by_light], np.maximum(error, _MIN_WHITE))
     whites = [frame for frame in accumulator.frames if frame.record.kind == "white"]
     paper = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
     gains = drift_gains(*_times_s(by_light, whites), paper)
     dark = np.zeros(3) if options.subtract_dark else accumulator.dark_summary().light
     full_white = whites[0].paper.white if whites else None
-    compared = whites[:1] if _differ_by_drift(whites) else whites
+    compared = whites[:1] if _differ_only_by_drift(whites) else whites
     agreement = _code_agreement(
         illuminations, by_light, compared, dark, gains if len(compared) < 2 else np.ones_like(gains)
     )
@@ -429,8 +430,8 @@ def _light_figures(accumulator: Accumulator, by_light: Sequence[FrameMeasurement
     )
 
 
-def _differ_by_drift(whites: Sequence[FrameMeasurements]) -> bool:
-    # Frames of other illuminants or exposures differ by more than lamp drift.
+def _differ_only_by_drift(whites: Sequence[FrameMeasurements]) -> bool:
+    # White frames of another illuminant or exposure differ by more than lamp drift.
     levels = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
     if len(levels) < 2:
         return True
@@ -482,7 +483,7 @@ def _stray_light(
     white = (np.array([frame.paper.white for frame in frames]) - dark) * factor
     error = np.array([frame.paper.error for frame in frames]) * factor
     codes = np.array([light.colour for light in illuminations], dtype=np.int64)
-    # Illuminants of full white count as white frames, to measure the lamp's flicker more accurately.
+    # Illuminants of full white count as white frames, so that the flicker of the lamp is measured more accurately.
     full = np.concatenate([white[lights:], white[:lights][(codes == _FULL_CODE).all(axis=1)]])
     return stray_light(codes, white[:lights], error[:lights], full, pure_lights(illuminations))
 

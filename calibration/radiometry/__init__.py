@@ -1,1 +1,1 @@
-"""From counts to linear light: dark frames, primaries, drift, linearity and noise."""
+"""Measure light from raw counts: dark frames, primaries, lamp drift, linearity and noise."""

@@ -1,13 +1,13 @@
 """Evaluate dark frames: light while the projector shows black, read noise, and hot photosites.
 
-Projector leak and ambient light are one value, measured on paper. They are part of every illuminant, and are only
-subtracted on request. A hot photosite is an outlier in every dark frame. The result after a dark frame depends only on
-earlier ones, so a resumed build gives identical bits.
+Projector leak and ambient light are measured together, on paper, and are called dark light. Dark light is part of every
+illuminant, and is only subtracted on request. A hot photosite is an outlier in every dark frame. The result after a
+dark frame depends only on this frame and earlier ones, so a resumed build gives identical bits.
 
-The subtracted dark light is predicted (docs/decisions/0009-dark-light-is-predicted.md), because the noise of a patch in
-one dark frame is as large as its light. The prediction is dark paper × field × reflectance of the patch. The residual
-of a patch is added with weight w = 1 − noise² / variance of all residuals, per channel (empirical Bayes; B. Efron and
-C. Morris, Journal of the American Statistical Association 68, 1973).
+In one dark frame, the noise of a patch is as large as its light. The subtracted light is therefore predicted as light
+of paper × field × reflectance of the patch (docs/decisions/0009-dark-light-is-predicted.md). The mean residual of the
+patch is added with weight w = 1 − noise² / variance of all residuals, per channel (empirical Bayes; B. Efron and C.
+Morris, Journal of the American Statistical Association 68, 1973).
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _LEAST_WHITE = 50.0  # minimum counts of paper in a channel for measuring reflec
 
 _MOST_REFLECTANCE = 1.5  # upper bound relative to paper, against noise in a dim channel
 
-# Largest deviation of a sample from the median of its patch, in σ: read noise exceeds it once in 2.5 million samples,
-# the number in a chart.
+# Largest deviation of a sample from the median of its patch, in σ. Read noise alone exceeds it in less than one of a
+# hundred charts.
 _FAR_SIGMA = 6.0
 
 _Array = npt.NDArray[np.float64]
@@ -39,16 +39,16 @@ HOT_COUNTS = 32.0
 
 HOT_SIGMA = 10.0  # minimum excess of a hot sample, in σ of read noise
 
-_NEVER = 32767  # excess before the first dark frame
+_NEVER = 32767  # initial value of the least excess, before the first dark frame
 
 
 @dataclass(frozen=True, eq=False)
 class DarkLight:
     """Dark light to subtract from frames."""
 
-    paper: _Array  # (3,) counts of paper without field, for the record
-    patches: npt.NDArray[np.float32]  # (P, 3) counts of each patch as seen by the camera, with field
-    share: _Array  # (3,) weight of the residuals, 0 … 1
+    paper: _Array  # (3,) counts of paper, divided by the flat field; only recorded
+    patches: npt.NDArray[np.float32]  # (P, 3) counts of each patch in the frame, not divided by the flat field
+    share: _Array  # (3,) weight of the mean residuals, 0 … 1
 
 
 def winsorised_means(samples: npt.NDArray[np.float32], noise: _Array) -> _Array:
@@ -108,11 +108,11 @@ class DarkLightEstimate:
             noise=self.noise + noise**2 / self.samples,
             frames=self.frames + 1,
         )
-        rest = updated.left / updated.frames
-        spread = MAD_TO_SIGMA * np.median(np.abs(rest[self.inside] - np.median(rest[self.inside], axis=0)), axis=0)
+        mean = updated.left / updated.frames
+        spread = MAD_TO_SIGMA * np.median(np.abs(mean[self.inside] - np.median(mean[self.inside], axis=0)), axis=0)
         noise2 = updated.noise / updated.frames**2
         share = np.clip(1 - noise2 / np.maximum(spread**2, 1e-12), 0, 1)
-        return updated, DarkLight(paper.white, (predicted + share * rest).astype(np.float32), share)
+        return updated, DarkLight(paper.white, (predicted + share * mean).astype(np.float32), share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ class DarkSummary:
     """Summary of all dark frames of a session."""
 
     files: tuple[str, ...] = ()
-    # (3,) leak and ambient light on paper, counts, without field: median of frames; NaN without frames
+    # (3,) dark light on paper, counts, divided by the flat field: median of all frames; NaN without frames
     light: _Array = field(default_factory=lambda: np.full(3, np.nan))
     error: _Array = field(default_factory=lambda: np.full(3, np.nan))  # (3,) its standard uncertainty
     blacks: tuple[_Array, ...] = ()  # (2, 2) counts of each frame
@@ -137,7 +137,7 @@ class DarkFrameFigures:
 
     record: FrameRecord
     black: FloatArray  # (2, 2) counts
-    light: FloatArray  # (3,) counts above black level on paper, without field
+    light: FloatArray  # (3,) counts above black level on paper, divided by the flat field
     error: FloatArray  # (3,) its standard uncertainty
     noise: FloatArray  # (3,) standard deviation of a sample, counts
     origin: FrameOrigin = field(default_factory=FrameOrigin)
@@ -162,7 +162,7 @@ def measure_dark_frame(
     # For normal values, the standard uncertainty of the median is 1.25 times the uncertainty of the mean.
     spread: _Array = MAD_TO_SIGMA * np.median(np.abs(flat - median), axis=0)
     excess: npt.NDArray[np.float32] = cells - np.median(cells, axis=1, keepdims=True)
-    # A seventh of the patches is sufficient. About the median of 25 samples, noise is 2 % too low.
+    # A seventh of the patches is sufficient. Deviations from the median of 25 samples are 2 % too small.
     noise: _Array = (1 + 0.5 / cells.shape[1]) * MAD_TO_SIGMA * np.median(np.abs(excess[::7]), axis=(0, 1))
     figures = DarkFrameFigures(record, black, median, MEDIAN_ERROR * spread / np.sqrt(count), noise)
     return figures, np.clip(np.rint(excess), -32768, 32767).astype(np.int16)
@@ -170,10 +170,10 @@ def measure_dark_frame(
 
 @dataclass(frozen=True, eq=False)
 class HotPixels:
-    """Excess of samples over their patch medians in every dark frame so far; each frame gives a new value."""
+    """Least excess of samples over the medians of their patches in all dark frames so far; immutable."""
 
     least: npt.NDArray[np.int16]  # (C, S, 3) least excess of each sample since the last registration, counts
-    past: _Array  # (C,) excess of each patch before that, counts
+    past: _Array  # (C,) excess of each patch before the last registration, counts
 
     @staticmethod
     def start(cells: int, samples: int) -> HotPixels:

@@ -1,11 +1,9 @@
-"""Remove lamp drift from a LUT, so that all illuminants have the same lamp, and record all corrections of counts.
+"""Correct a LUT for lamp drift, and list all corrections of counts for `lut.json`.
 
-Each illuminant is scaled to the brightest state of the lamp, never to a dimmer one. Samples are multiplied by one or
-more, so different integers stay different, and the measured counts can be recovered exactly (`as_measured`). Samples
-and ground truth are divided by the same numbers in each channel, so the ground truth of every image stays the same
+Each illuminant is scaled to the brightest state of the lamp. Samples are therefore multiplied by factors of at least 1.
+Different integers stay different, so the measured counts can be recovered exactly (`as_measured`). Samples and ground
+truth of an illuminant are divided by the same gain in each channel, so they stay consistent
 (docs/decisions/0030-drift-is-taken-out-on-request.md).
-
-`corrections` describes the processing of counts for `lut.json`.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ _Array = npt.NDArray[np.float64]
 
 SaturationSource = Literal["frames", "raw files", "settings"]
 
-# Decimals of gains in `lut.json`. Samples are divided by the stored values, so the division can be undone.
+# Decimals of gains in `lut.json`. Samples are divided by the rounded gains, so that the division can be undone.
 DIGITS = 6
 
 # Source of the saturation value, for `lut.json`.
@@ -72,14 +70,14 @@ def corrections(
     entries: list[dict[str, Any]] = [
         {
             "name": "black",
-            "how": "subtracted: mean of the frame's masked border for each position of the 2x2 block, "
-            "or the metadata's where no border is masked",
+            "how": "subtracted: mean of the masked border of the frame for each position of the 2x2 block, "
+            "or the value in the metadata if no border is masked",
             "unit": "counts",
             "per_light": np.round(black, 3).tolist(),
         },
         {
             "name": "half size",
-            "how": "R, mean of both G, B of each 2x2 block; nothing interpolated",
+            "how": "each 2x2 block gives R, the mean of both G, and B; nothing is interpolated",
         },
         *([] if subtracted is None else [_dark_correction(subtracted)]),
         {
@@ -91,7 +89,7 @@ def corrections(
         },
         {
             "name": "field",
-            "how": "samples and ground truth divided by F(x, y), at the centre of the patch for its 25 samples; "
+            "how": "samples and ground truth divided by F(x, y), taken at the centre of a patch for all its samples; "
             "F is the product of its factors, each sum c[k] P_i(u) P_j(v) over total orders 0, 1, 2 ..., "
             "(i, j) = (n, 0), (n-1, 1) ... (0, n) within an order n, P Legendre, u = 2x/w - 1, v = 2y/h - 1, "
             "x, y millimetres on a page of w x h; mean of F over the centres of all patches = 1; multiply to undo",
@@ -134,10 +132,10 @@ def applied_drift(gains: _Array) -> dict[str, Any]:
 def _dark_correction(subtracted: _Array) -> dict[str, Any]:
     return {
         "name": "dark",
-        "how": "subtracted from samples, ground truth and references before division by the field: light of the "
-        "previous dark frame (projector leak and room light), predicted for a patch as paper times field of the dark "
-        "frame times reflectance of the patch under white, plus the mean residual of the patch in all dark frames so "
-        "far, weighted against noise; the values are paper without field",
+        "how": "light of the previous dark frame (projector leak and room light), subtracted from samples, ground "
+        "truth and references before division by the field; for a patch, it is paper times field of the dark frame "
+        "times reflectance of the patch under white, plus the mean residual of the patch in all dark frames so far, "
+        "with a weight that is small if noise is large; per_light is this light on paper, without field",
         "unit": "counts",
         "per_light": np.round(subtracted, 4).tolist(),
     }
@@ -145,10 +143,10 @@ def _dark_correction(subtracted: _Array) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class DriftCorrection:
-    """Gains that bring the illuminants of a LUT to one lamp."""
+    """Gains by which the illuminants of a LUT are divided, so that all have the brightest state of the lamp."""
 
     gains: _Array  # (L, 3) lamp relative to the brightest white frame, in (0, 1], rounded to `DIGITS`
-    left: float  # relative uncertainty of the lamp between white frames (`undetermined`)
+    left: float  # relative uncertainty of the lamp between white frames (`drift_uncertainty`)
 
 
 def drift_correction(at_s: _Array, white_at_s: _Array, white: _Array) -> DriftCorrection:
@@ -163,16 +161,17 @@ def drift_correction(at_s: _Array, white_at_s: _Array, white: _Array) -> DriftCo
     gains: _Array = np.ones((len(at_s), 3))
     for channel in range(3):
         gains[:, channel] = np.interp(at_s, white_at_s, relative[:, channel])
-    return DriftCorrection(np.round(gains, DIGITS), undetermined(at_s, white_at_s, white))
+    return DriftCorrection(np.round(gains, DIGITS), drift_uncertainty(at_s, white_at_s, white))
 
 
-def undetermined(at_s: _Array, white_at_s: _Array, white: _Array) -> float:
+def drift_uncertainty(at_s: _Array, white_at_s: _Array, white: _Array) -> float:
     """Return the largest relative deviation of the lamp from linear changes between white frames.
 
-    Each white frame is predicted from its two neighbours; the worst error of a channel counts. With a smooth lamp, the
-    interpolation error is a quarter of it; with a jumping lamp, at most twice as much. With two white frames, the whole
-    change may be a jump. Illuminants before the first or after the last white frame get its value; the change of the
-    lamp in the same time next to it is taken as their error.
+    Each white frame is predicted from the frames before and after it, and the largest error of a channel is returned.
+    The error of interpolated gains is a quarter of this value if the drift is smooth, and at most twice this value if
+    the lamp jumps. With two white frames, their whole difference is returned, because it may be a jump. Illuminants
+    before the first or after the last white frame get the gain of that frame. Their error is estimated
+    from the rate of change next to that frame.
 
     `at_s`, `white_at_s`, `white`: as for `drift_correction`.
     """
@@ -189,7 +188,7 @@ def undetermined(at_s: _Array, white_at_s: _Array, white: _Array) -> float:
 
 
 def corrected(samples: _Samples, gain: _Array) -> _Samples:
-    """Return samples (C, S, 3) uint16 scaled to the brightest lamp, as integers with unrounded means.
+    """Return samples (C, S, 3) uint16 scaled to the brightest state of the lamp, as integers with accurate means.
 
     Sample v, number k of S, becomes ⌊v / g + u⌋ with u = ((11 k mod S) + ½) / S. Rounding to the nearest integer would
     shift all samples of a patch alike, by up to half a count, because they are similar. With distributed thresholds the
@@ -202,10 +201,10 @@ def corrected(samples: _Samples, gain: _Array) -> _Samples:
 
 def as_measured(samples: _Samples, gain: _Array) -> _Samples:
     """Invert `corrected` exactly: return the original samples (C, S, 3) uint16 for `gain` (3,)."""
-    # Different samples stay different by at least one, because g ≤ 1, so each result has one origin only.
+    # Different samples stay different by at least one, because g ≤ 1. Each result therefore has a single origin.
     scaled = samples.astype(np.float64)
     original = np.floor(gain * (scaled - _thresholds(samples.shape[1]) + 1))
-    # Rounding of the product may give a neighbouring integer: test both with the forward rule.
+    # Because of rounding errors, the result may be a neighbouring integer. Both are tested with the forward rule.
     for step in (-1.0, 1.0):
         trial = original + step
         original = np.where((_scaled(original, gain) != scaled) & (_scaled(trial, gain) == scaled), trial, original)
@@ -217,5 +216,5 @@ def _scaled(samples: _Array, gain: _Array) -> _Array:
 
 
 def _thresholds(count: int) -> _Array:
-    # Thresholds are evenly distributed over the samples of a patch: 11 divides no number of samples.
+    # Evenly distributed over the samples of a patch, because 11 and the number of samples have no common divisor.
     return ((np.arange(count) * 11 % count + 0.5) / count)[:, None]

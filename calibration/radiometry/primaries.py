@@ -1,9 +1,10 @@
-"""Use frames of red, green and blue alone: flat field of coloured patches, additivity, and lamp drift.
+"""Measure the flat field of coloured patches and the additivity of light with frames of red, green and blue alone.
 
-The fall-off of red, green and blue towards the corners of the projected image differs. On paper, the field of a mixed
-illuminant is the mean of their fields weighted by the reflected light of each. A coloured patch reflects other
-proportions, so its mean field differs. The frames of the primaries give both
-(`docs/decisions/0014-fields-of-the-primaries.md`). Additivity and drift do not change a LUT.
+In the projected image, red, green and blue fall off differently towards the corners. The flat field of paper under a
+mixture is the mean of their fields, weighted by the light of each primary. A coloured patch reflects other proportions
+of the primaries, so its flat field differs from the field of paper. The frames of the primaries show fields and
+proportions (`docs/decisions/0014-fields-of-the-primaries.md`). Additivity and lamp drift are measured as well, but do
+not change a LUT.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ _Array = npt.NDArray[np.float64]
 # Minimum counts above black level of paper under a primary for a precise field (judgement).
 LEAST_PAPER = 300.0
 
-_LARGEST = 0.2  # largest relative difference of a patch's field from paper; more is noise, and ignored
+# Largest relative difference of a patch's field from the field of paper. A larger difference is noise and is ignored.
+_MAX_FIELD_DIFFERENCE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +50,10 @@ def additivity(
 ) -> Additivity | None:
     """Compare white with the sum of the primaries; None if a primary or white is missing.
 
-    red + green + blue − 2 black = white if light adds, because each of the three includes the black of the projector. A
-    projector with a white segment in its wheel or with colour processing differs. This does not harm a LUT, because the
-    ground truth of each illuminant is measured, but whites cannot be predicted from codes. Measured nonlinearity is
-    corrected first: compression of white would hide that too much dark light was subtracted.
+    If light adds, red + green + blue − 2 black = white, because each of the three contains the black of the projector.
+    With a white segment in the colour wheel, or with colour processing, white differs from this sum. This does not harm
+    a LUT, because the ground truth of each illuminant is measured, but whites cannot be predicted from codes. Measured
+    nonlinearity is corrected first, because compression of white would hide that too much dark light was subtracted.
 
     Parameters
     ----------
@@ -168,7 +170,7 @@ class Primaries:
                 total_light += contribution
                 field_light += at_cells[:, None] * contribution
         ratio = np.where((total_light > 1) & (total > 1), field_light / np.maximum(total_light, 1) / paper_field, 1.0)
-        return np.where(np.abs(ratio - 1) < _LARGEST, ratio, 1.0)
+        return np.where(np.abs(ratio - 1) < _MAX_FIELD_DIFFERENCE, ratio, 1.0)
 
     @property
     def difference(self) -> float:

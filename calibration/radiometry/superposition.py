@@ -1,11 +1,11 @@
 """Measure the linearity of the sensor by flux superposition: compare an illuminant with red, green and blue alone.
 
-Light adds: the light of a patch under several primaries is the sum of its light under each primary, times the amount of
-each. Counts of a linear sensor add in the same way; the counts of a sensor with compression near saturation, loss near
-black or a wrong black level do not. The patches cover all levels from black ink to paper, so four frames show the whole
+The light of a patch under several primaries is the sum of its light under each primary, times the amount of the
+primary. Counts of a linear sensor add in the same way. Counts do not add if there is compression near saturation, loss
+near black or a wrong black level. The patches cover all levels from black ink to paper, so four frames show the whole
 curve. Chart, lens and photosite response do not matter, because the same photosites are compared. Lamp changes between
-frames do not matter, because the amounts of the primaries are fitted too. This is the superposition or flux-addition
-method of detector calibration (C. L. Sanders, Applied Optics 1, 1962).
+frames do not matter, because the amounts of the primaries are fitted as well. This is the superposition or
+flux-addition method of detector calibration (C. L. Sanders, Applied Optics 1, 1962).
 
 A factor common to all counts cannot be measured, and has no effect on chromaticities.
 """
@@ -23,44 +23,46 @@ import numpy.typing as npt
 from experiment.measures.least_squares import code_polynomial
 from foundation.robust import huber_weights, sigma_by_level
 
-# Nodes of the interpolated deviation, relative to saturation; the deviation is 0 at black.
+# Levels, relative to saturation, at which the deviation is fitted. It is interpolated between them, and 0 at black.
 NODES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0)
 
 # Prior standard deviation of the relative deviation at saturation: EMVA 1288 linearity errors of raw files are below
 # 1 %.
 _USUAL_BEND = 0.01
 
-_USUAL_LOSS = 0.0005  # prior loss or gain near black, relative to saturation: some counts of 14 bits
+# Prior standard deviation of the counts lost or gained near black, relative to saturation: some counts of 14 bits.
+_USUAL_LOSS = 0.0005
 
 _LOSS_SCALES = (0.0005, 0.002)  # levels at which this loss reaches 63 %, relative to saturation
 
-_USUAL_REST = 0.0003  # prior of other deviations, relative to the level
+_USUAL_REST = 0.0003  # prior standard deviation of other deviations, relative to the level
 
-_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)  # factors of the usual deviations, with equal odds
+_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)  # candidate factors of these priors, with equal prior odds
 
 _LEAST_PATCHES = 100  # minimum number of patches (judgement)
 
 _CODE_DEGREE = 4  # degree of the polynomial in the codes that predicts patches without noise
 
-_LOOSE = 10.0  # prior standard deviation of the amount of a primary: no information
+_LOOSE = 10.0  # prior standard deviation of the amount of a primary, if nothing is known about it
 
-_OWN_SPECTRUM = 0.001  # prior for differences of the amount between channels: a primary keeps its spectrum
+# Prior standard deviation of the differences between channels in the amount of a primary: its spectrum hardly changes.
+_OWN_SPECTRUM = 0.001
 
 # Models of full white: standard deviation of the amounts of the primaries, of their differences between channels, and
-# prior odds (judgement). First model: the same primaries as in their own frames. Second: exposures that are no whole
-# number of turns of a colour wheel. Third: additional light of another spectrum, from a projector that boosts white.
+# prior odds (judgement). First model: white is the sum of the primaries. Second: the exposures are no whole number of
+# turns of a colour wheel. Third: a projector that boosts white adds light of another spectrum.
 _WHITES = ((0.003, _OWN_SPECTRUM, 0.6), (0.05, _OWN_SPECTRUM, 0.3), (_LOOSE, _LOOSE, 0.1))
 
 _GROUPS = 12  # number of groups of similar levels for measuring the scatter
 
 _ROUNDS = 3  # number of solutions, each weighted and linearised by the previous one
 
-_AMOUNTS = 12  # unknowns before the nodes: amount of each primary, and its difference in each channel
+_AMOUNTS = 12  # number of unknowns before the nodes: amount of each primary, and its difference in each channel
 
 _Array = npt.NDArray[np.float64]
 
 
-_SERIES = "give a series of exposures of the chart with --linearity"
+_GIVE_SERIES = "give a series of exposures of the chart with --linearity"
 
 
 @dataclass(frozen=True)
@@ -73,11 +75,11 @@ class Unmeasured:
 
 NO_PRIMARIES = Unmeasured(
     "the session has no illuminants of each primary alone",
-    f"plan red, green and blue each alone, as acquire illuminations does, or {_SERIES}",
+    f"plan red, green and blue each alone, as acquire illuminations does, or {_GIVE_SERIES}",
 )
 MOVED = Unmeasured(
     "the chart moved between the frames of the primaries and the first registered frame",
-    f"keep chart and camera in place, or {_SERIES}",
+    f"keep chart and camera in place, or {_GIVE_SERIES}",
 )
 
 
@@ -124,7 +126,7 @@ class Superposition:
         return weights @ self.covariance @ np.swapaxes(weights, 1, 2) + chromatic[:, :, None] * chromatic[:, None, :]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of `report.json`, relative to the level of each node."""
+        """Return the values for `report.json`, each divided by the level of its node."""
         level = np.array(NODES) * self.full
         shares = {"deviation": self.deviation / level, "standard_error": np.sqrt(np.diag(self.covariance)) / level}
         rounded = {name: [float(f"{value:.4g}") for value in values.tolist()] for name, values in shares.items()}
@@ -159,12 +161,13 @@ def superposition(
     patches, needed = int(usable.sum()), max(_LEAST_PATCHES, 2 * predictors.shape[1])
     if patches < needed:
         why = f"the chart has {patches} usable patches, {needed} or more expected"
-        return Superposition.usual(full, Unmeasured(why, f"use a chart with more colours, or {_SERIES}"))
+        return Superposition.usual(full, Unmeasured(why, f"use a chart with more colours, or {_GIVE_SERIES}"))
     levels, predictors = np.stack([together, *alone])[:, usable], predictors[usable]
     hats, size = _hats(levels / full), _AMOUNTS + len(NODES)
     whites = _WHITES if white else ((_LOOSE, _LOOSE, 1.0),)
     priors = [(_prior(full, scale, *sigmas), odds) for scale, (*sigmas, odds) in product(_SCALES, whites)]
-    # Unknowns are differences from this start: squares of the full light would hide the differences between priors.
+    # The unknowns are differences from this start. Otherwise, the large squares of counts would hide the differences
+    # between priors.
     start = np.zeros(size)
     start[:3] = 1.0 if white else np.linalg.lstsq(levels[1:].reshape(3, -1).T, levels[0].ravel(), rcond=None)[0]
     solution, covariance = start, np.zeros((size, size))
@@ -194,8 +197,8 @@ def superposition(
 
 def _posterior(matrix: _Array, right: _Array, priors: Sequence[tuple[_Array, float]]) -> tuple[_Array, _Array]:
     """Return mean (U,) and covariance (U, U) of the unknowns, averaged over priors weighted by evidence."""
-    # Bayesian model averaging (J. A. Hoeting and others, Statistical Science 14, 1999): for a small deviation the usual
-    # prior has more information than a chart with few patches, for a large one the patches have more.
+    # Bayesian model averaging (J. A. Hoeting and others, Statistical Science 14, 1999). The usual prior has most weight
+    # if the deviation is small, and wide priors have most weight if the patches show a large deviation.
     covariances: list[_Array] = []
     means: list[_Array] = []
     evidence = np.zeros(len(priors))
@@ -241,7 +244,7 @@ def _usual(full: float) -> _Array:
     level = np.array(NODES)
     bends = [_USUAL_BEND * level**2, _USUAL_BEND * level**3]
     losses = [_USUAL_LOSS * (1 - np.exp(-level / scale)) for scale in _LOSS_SCALES]
-    # A straight line is equivalent to other amounts of the primaries: remove it from each shape.
+    # The straight part of a shape cannot be distinguished from the amounts of the primaries, so it is removed.
     shapes = [shape - level * float((shape / level).mean()) for shape in (*bends, *losses)]
     covariance: _Array = full**2 * (
         np.sum([np.outer(shape, shape) for shape in shapes], axis=0) + np.diag(_USUAL_REST * level) ** 2

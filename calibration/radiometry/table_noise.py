@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from calibration.sampling import PhotonTransfer
     from calibration.table.lut import Lut
 
-_LIGHTS: Final = 6  # illuminants to measure: their 200 000 patches in a full LUT determine each parameter to 1 %
+_LIGHTS: Final = 6  # number of illuminants to measure; in a full LUT, their patches give each parameter to 1 %
 
-# Largest relative RMS difference of variances from the curve: 0.006 in simulated LUTs of two cameras, 0.1 in LUTs with
-# only eight patches per level.
+# Largest RMS of the relative differences between variances and curve. Full simulated LUTs have 0.006, and LUTs with
+# eight patches per level 0.1.
 _MISFIT: Final = 0.25
 
 _FEWEST: Final = 32  # minimum number of patches for a curve of three parameters
@@ -26,8 +26,8 @@ _FEWEST: Final = 32  # minimum number of patches for a curve of three parameters
 def noise_curve(lut: Lut) -> PhotonTransfer | None:
     """Return the photon-transfer curve of the samples of a LUT; None if they have no noise at all.
 
-    Uses the six illuminants whose darkest channel is brightest. Samples of 0 are clipped, so their noise is too small:
-    patches with such samples are excluded, and unfit patches as well. `calibration.sampling` fits the curve.
+    The six illuminants with most counts in their weakest channel are used. Samples of 0 are clipped, so their noise is
+    too small. Patches with such samples and unfit patches are excluded. `calibration.sampling` fits the curve.
 
     Raises
     ------

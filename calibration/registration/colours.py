@@ -1,8 +1,8 @@
 """Predict the camera RGB of printed codes in one frame, and compare patches with the prediction.
 
-The model is fitted to the frame itself, so print and illuminant may be unknown. Patches that differ from the model are
-covered or damaged, or the registration is displaced by a patch. Counts above black level, camera RGB; codes 0 … 255;
-millimetres on the page.
+The colour model is fitted to the frame itself, so print and illuminant may be unknown. Patches that differ from the
+model are covered or damaged, or the registration is displaced by a patch. Camera RGB is in counts above black level;
+codes are 0 … 255; positions are millimetres on the page.
 """
 
 from __future__ import annotations
@@ -17,35 +17,37 @@ from experiment.chart.model import Chart
 from experiment.measures.least_squares import code_powers, least_squares
 from foundation.robust import MAD_TO_SIGMA, huber_weights, robust_sigma
 
-# Minimum number of colours for detecting mismatched patches; with fewer the model is not good enough.
+# Minimum number of colours for detecting mismatched patches; with fewer colours the model is not good enough.
 MIN_COLOURS = 64
 
-# Deviation from the model, in standard deviations, above which a patch is mismatched; model errors are not normal.
+# A patch is mismatched if its deviation from the model exceeds both limits. The first limit, in standard deviations, is
+# high because model errors are not normally distributed.
 _MISMATCH_SIGMA = 10.0
 
-# Minimum deviation of a mismatched patch, relative to paper; errors of the model at the corners of the gamut are less.
+# The second limit, relative to paper. Errors of the model at the corners of the gamut are smaller.
 _MISMATCH_SHARE = 0.08
 
-_NEIGHBOURS = 13  # A patch and the twelve within a distance of two patches
+_NEIGHBOURS = 13  # The patch itself and the twelve patches within a distance of two patches
 
-# Share of mismatched neighbours above which a patch is also treated as covered (judgement).
+# Share of mismatched neighbours above which a patch is also mismatched (judgement).
 _MISMATCH_NEIGHBOURS = 0.35
 
-_SLIP_CELLS = 16  # Largest width, in patches, of an area that is tested for a displacement
+_MAX_AREA_CELLS = 16  # Largest width of an area that is tested for a displacement, in patches
 
-_SLIP = 0.5  # Minimum apparent displacement of an area, in patches: half the way to the neighbour
+_MIN_SHIFT_CELLS = 0.5  # Smallest apparent displacement of a displaced area, in patches
 
-_SLIP_SIGMAS = 6.0  # Minimum apparent displacement in standard uncertainties
+_MIN_SHIFT_SIGMAS = 6.0  # The same in standard uncertainties
 
-# Number of independent measurements in an area: model errors of neighbouring patches are correlated.
+# Number of independent measurements in an area. It is small, because model errors of neighbouring patches are
+# correlated.
 _AREA_MEASUREMENTS = 8
 
-# Relative to paper: error of the colour model, and largest noise that is added to it.
-_COLOUR_MISFIT, _MOST_NOISE = 0.003, 0.01
+# Error of the colour model, and upper limit of the noise; both relative to paper.
+_MODEL_ERROR, _MAX_NOISE = 0.003, 0.01
 
-_MOST_MISFIT = 20.0  # Errors are clipped to this number of standard deviations
+_MAX_ERROR_SIGMAS = 20.0  # Colour errors are clipped to this number of standard deviations
 
-# Standard deviation over median absolute difference of neighbours, for normal noise: 1 / (√2 Φ⁻¹(3/4)).
+# Ratio of the standard deviation of normal noise to the median absolute difference of neighbours: 1 / (√2 Φ⁻¹(3/4)).
 _DIFFERENCE_TO_SIGMA = 1.0484
 
 _Array = npt.NDArray[np.float64]
@@ -53,10 +55,10 @@ _Mask = npt.NDArray[np.bool_]
 
 
 def mismatched(measured: _Array, expected: _Array, paper: _Array, chart: Chart) -> _Mask:
-    """Return the patches (C,) bool, in chart order, with a colour far from the model, and patches surrounded by them.
+    """Return the mismatched patches (C,) bool: their colours are far from the model, or most neighbours are mismatched.
 
-    `measured`, `expected`: (C, 3) colours of the patches, optionally followed by (R, 3) of references; NaN outside the
-    frame. `paper`: (3,) colour of the paper.
+    `measured`, `expected`: (C, 3) colours of the patches in chart order, optionally followed by (R, 3) of references;
+    NaN outside the frame. `paper`: (3,) colour of the paper.
     """
     count = chart.colour_count
     if count < MIN_COLOURS:
@@ -68,14 +70,14 @@ def mismatched(measured: _Array, expected: _Array, paper: _Array, chart: Chart) 
 
 
 def _with_neighbours(is_mismatched: _Mask, centres: _Array) -> _Mask:
-    # A covered patch may match by chance, if the cover has its colour; most of its neighbours do not.
+    # A covered patch may match by chance, if the cover has its colour. Its neighbours show that it is covered.
     neighbours = cKDTree(centres).query(centres, k=min(_NEIGHBOURS, len(centres)))[1]
     mismatched_share = is_mismatched[np.asarray(neighbours).reshape(len(centres), -1)].mean(axis=1)
     return np.asarray(is_mismatched | (mismatched_share > _MISMATCH_NEIGHBOURS))
 
 
 def agreement(measured: _Array, expected: _Array) -> float:
-    """Return the correlation of `measured` and `expected` colours, (N, 3), mean of the brightest channels."""
+    """Return the correlation of `measured` and `expected` colours, (N, 3), mean over the bright channels."""
     light = np.median(measured, axis=0)
     channels = np.flatnonzero(light >= 0.3 * light.max())
     return float(np.mean([np.corrcoef(measured[:, channel], expected[:, channel])[0, 1] for channel in channels]))
@@ -89,14 +91,14 @@ def displaced_areas(
     indices: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]],
     shape: tuple[int, int],
 ) -> tuple[_Array, int]:
-    """Return the areas of a grid of patches with the colours that are expected one patch further.
+    """Find areas of the chart that show the colours of the neighbouring patches.
 
-    The difference of measured and expected colours is fitted, area by area, with the change that a displacement to the
-    next patch causes. Unlike registration, this uses the absolute level of the colours.
+    In each area, the colour error is fitted with the change of colour from patch to patch. The fit gives an apparent
+    displacement in patches. Unlike registration, this test uses the absolute level of the colours.
 
     `measured`, `expected`: (C, 3) colours of the patches. `paper`: (3,) colour of the paper. `ignored`: (C,) bool.
     `indices`: row and column of each patch, (C,) each. `shape`: rows and columns. Returns the centres (B, 2) of the
-    areas, column then row, in patches from the corner of the grid, and the number of areas compared.
+    displaced areas, column then row, in patches from the corner of the grid, and the number of tested areas.
     """
     rows, columns = shape
     row, column = indices
@@ -105,14 +107,14 @@ def displaced_areas(
         image[row + 1, column + 1] = colours
     grid[0, row[ignored] + 1, column[ignored] + 1] = np.nan
     error = (grid[0] - grid[1])[1:-1, 1:-1]
-    # Noise of neighbouring patches plus the error of the colour model; a displacement must not enlarge it.
+    # Noise and error of the colour model. The noise is limited, because a displacement also increases the differences.
     noise = _DIFFERENCE_TO_SIGMA * np.nanmedian(np.abs(np.diff(error, axis=1)), axis=(0, 1))
-    sigma = np.hypot(np.minimum(noise, _MOST_NOISE * paper), _COLOUR_MISFIT * paper) + 1e-9
+    sigma = np.hypot(np.minimum(noise, _MAX_NOISE * paper), _MODEL_ERROR * paper) + 1e-9
     steps = ((grid[1, 1:-1, 2:] - grid[1, 1:-1, :-2]) / 2 / sigma, (grid[1, 2:, 1:-1] - grid[1, :-2, 1:-1]) / 2 / sigma)
-    error = np.clip(error / sigma, -_MOST_MISFIT, _MOST_MISFIT)
-    slipped: list[_Array] = []
+    error = np.clip(error / sigma, -_MAX_ERROR_SIGMAS, _MAX_ERROR_SIGMAS)
+    displaced: list[_Array] = []
     area_count = 0
-    size = int(np.clip(min(rows, columns) // 2, 4, _SLIP_CELLS))
+    size = int(np.clip(min(rows, columns) // 2, 4, _MAX_AREA_CELLS))
     for first_row in range(0, rows, size):
         for first_column in range(0, columns, size):
             area = np.s_[first_row : first_row + size, first_column : first_column + size]
@@ -123,20 +125,20 @@ def displaced_areas(
             area_count += 1
             design = np.stack([slope[is_known] for slope in values[:2]], axis=1)
             gram = design.T @ design
-            slip = np.linalg.solve(gram + 1e-9 * np.eye(2), design.T @ values[2][is_known])
+            shift = np.linalg.solve(gram + 1e-9 * np.eye(2), design.T @ values[2][is_known])
             precision = np.sqrt(np.diag(gram) * _AREA_MEASUREMENTS / is_known.sum())
-            if ((np.abs(slip) > _SLIP) & (np.abs(slip) * precision > _SLIP_SIGMAS)).any():
-                slipped.append(np.array([first_column, first_row]) + size / 2)
-    return np.array(slipped).reshape(-1, 2), area_count
+            if ((np.abs(shift) > _MIN_SHIFT_CELLS) & (np.abs(shift) * precision > _MIN_SHIFT_SIGMAS)).any():
+                displaced.append(np.array([first_column, first_row]) + size / 2)
+    return np.array(displaced).reshape(-1, 2), area_count
 
 
 @dataclass(frozen=True, eq=False)
 class ColourModel:
-    """Camera RGB of printed codes in one frame: a polynomial, times a smooth illumination over the page."""
+    """Camera RGB of printed codes in one frame: a polynomial of the codes, times a smooth illumination of the page."""
 
     degree: int
     coefficients: _Array  # (terms, 3) counts
-    light: _Array  # (6, 3) polynomial of second order in page coordinates −1 … 1, mean about 1
+    light: _Array  # (6, 3) illumination: polynomial of second order in page coordinates −1 … 1, mean about 1
     page_mm: tuple[float, float]
 
     def predict_flat(self, rgb: npt.ArrayLike) -> _Array:
@@ -165,13 +167,13 @@ def _page_terms(points_mm: _Array, page_mm: tuple[float, float]) -> _Array:
 def fit_colours(
     rgb: _Array, points_mm: _Array, measured: _Array, page_mm: tuple[float, float], is_fine: bool = False
 ) -> ColourModel:
-    """Fit the colour model to patches, with low weights for covered or displaced ones.
+    """Fit the colour model to patches; covered or displaced patches get low weights.
 
-    Alternating least squares for polynomial and illumination, reweighted by Huber's weights.
+    Polynomial and illumination are fitted in turn by least squares with Huber's weights.
 
     `rgb`: (N, 3) printed codes, 0 … 255. `points_mm`: (N, 2) centres. `measured`: (N, 3) float64 camera RGB, counts
-    above black level. `is_fine`: use degree 6 or 8 if there are enough patches. Its errors are a third of the errors of
-    degree 3, which matters for the steps between neighbouring codes.
+    above black level. `is_fine`: use degree 6 or 8 in place of 3 if there are enough patches. Charts without tags
+    need this accuracy, because their neighbouring patches are similar.
     """
     degree = (
         (8 if len(rgb) >= 4000 else 6)

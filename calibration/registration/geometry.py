@@ -2,13 +2,14 @@
 
 - `Lens`: homography and Brown's distortion (D. C. Brown, "Close-range camera calibration", 1971).
 - `Displacement`: penalised tensor-product B-splines over the print (P. H. C. Eilers and B. D. Marx, "Flexible smoothing
-  with B-splines and penalties", Statistical Science 1996). If measurements are few, the sheet is modelled by heights
-  over its plane. Heights move points along lines through the foot of the camera's perpendicular. So a measurement
-  across an edge also determines the displacement along it. The sheet hardly stretches within its plane.
-- `LateralColour`: red and blue lie a ρ + b ρ³ further out than green; ρ is 1 at the frame corner. The linear term is
-  the chromatic difference of magnification, the cubic term the chromatic difference of distortion (W. T. Welford,
-  "Aberrations of Optical Systems", 1986, ch. 10).
+  with B-splines and penalties", Statistical Science 1996). For a chart without tags, most of the displacement is
+  modelled as height of the sheet above its plane. Height moves a point along a known line in the frame, so one measured
+  component determines the other.
+- `LateralColour`: red and blue lie a ρ + b ρ³ further out than green, where ρ is the distance from the frame centre, 1
+  at the corner. The linear term is the chromatic difference of magnification, the cubic term the chromatic difference
+  of distortion (W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 10).
 
+A measured displacement d is passed as `information`, its inverse covariance A, and `pull`, the product A d.
 Positions are half-size pixels with pixel centres at integers, x right, y down; points on the print are millimetres.
 """
 
@@ -28,66 +29,65 @@ from experiment.framing.homography import fit_homography, on_one_line, project
 from foundation.errors import RegistrationError
 
 # Minimum number of point pairs for fitting all four distortion coefficients (corners of twelve tags), or only the first
-# (four tags). With fewer pairs the coefficients would fit noise.
+# coefficient (four tags). With fewer pairs the coefficients would fit noise.
 _PAIRS_FOR_ALL, _PAIRS_FOR_ONE = 48, 16
 
-# Assumed focal length in half diagonals of the frame. With real lenses of 1.5 to 0.8 diagonals, a tilt of 2° moves the
-# foot of the camera's perpendicular by 5 to 3 % of the diagonal; with the assumed focal length, by 4 %.
+# Assumed focal length of the camera lens, in half diagonals of the frame. `parallax` depends little on it.
 _FOCAL_RADII = 2.2
 
-# Height of the finite difference in `parallax`, relative to the camera distance.
+# Height difference for the numerical derivative in `parallax`, relative to the camera distance.
 _HEIGHT_STEP = 1e-3
 
-_ON_ONE_LINE = (
+_COLLINEAR_MARKS_MESSAGE = (
     "the detected marks of the chart lie on one line, expected marks all over the sheet; bring the whole chart "
     "into the frame, and uncover it"
 )
 
-# Usual second difference of the displacement between knots, px: waves with an amplitude of 2 px and a period of 20
-# knots, or 0.2 px and 6 knots. Shorter waves are followed if patches show them.
+# Prior standard deviation of the second differences of the spline coefficients. It allows a wave of 2 px amplitude
+# over 20 knots.
 ROUGHNESS_PX = 0.2
 
-# Second difference for waves of 6 mm with a period of 150 mm. Rougher sheets are refused.
+# The same for the roughest accepted sheet: waves of 6 mm with a period of 150 mm.
 MAX_ROUGHNESS_PX = 2.0
 
-# Usual displacement within the plane, between centre and edge of the print: lens distortion beyond Brown's model, or
-# paper expanded by humidity (judgement).
+# Prior standard deviation of the displacement within the plane of the sheet, between its centre and its edge. Causes
+# are lens distortion beyond Brown's model, and paper expanded by humidity (judgement).
 _IN_PLANE_PX = 2.0
 
-# Added to the diagonal, px⁻²: makes the system solvable at knots without measurements; negligible at all others.
+# Added to the diagonal of the normal matrix, px⁻². It makes the matrix regular at knots without measurements.
 _RIDGE = 1e-3
 
-# Draws from the posterior distribution; a standard deviation from 64 values is accurate to 9 %. The seed is fixed.
+# Number of draws from the posterior distribution, and seed. The standard deviation of a position is accurate to 9 %.
 _DRAWS, _SEED = 32, 20
 
 _Array = npt.NDArray[np.float64]
 
-# Prior standard deviation of each term at the frame corner; lenses have 0 to 1 px. It matters only if an illuminant
-# leaves a channel dark.
-_PRIOR_PX = 2.0
+# Prior standard deviation of each term of the lateral colour, at the frame corner; lenses have 0 to 1 px. The prior
+# only matters if a channel receives no light.
+_TERM_PRIOR_PX = 2.0
 
-# Systematic standard uncertainty of each term: errors of the colour model are alike over the frame. Simulated frames
-# without aberration give 0.003 to 0.009 px at the corner, and 0.02 px under a dim illuminant.
-_MODEL_PX = 0.01
+# Systematic standard uncertainty of each term, at the frame corner (simulated frames). It is caused by errors of the
+# colour model, which are the same in all blocks.
+_SYSTEMATIC_PX = 0.01
 
-# Rounds of reweighted least squares: covered blocks, or blocks with colour errors, get a low weight.
-_ROUNDS = 4
+# Rounds of reweighted least squares. Covered blocks and blocks with colour errors get a low weight.
+_REWEIGHTING_ROUNDS = 4
 
 _HUBER = 2.0  # Misfit, in standard deviations, above which the weight of a block decreases
 
-# Ratio of eigenvalues of an information matrix below which the smaller one is a rounding error, and set to zero.
-_MIN_EIGENVALUE_RATIO = 1e-9
+# Smallest ratio of the eigenvalues of an information matrix. A smaller eigenvalue is a rounding error and set to zero.
+_MIN_EIGEN_RATIO = 1e-9
 
 _MEDIAN_CHI2 = 3.357  # Median of χ² with 4 degrees of freedom: two colours, two directions
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A plane seen through a lens: homography, then radial and tangential distortion about the frame centre (Brown)."""
+    """Image of a plane through a lens: homography, then Brown's radial and tangential distortion."""
 
     homography: _Array  # (3, 3) mm to undistorted half-size px
     centre_px: _Array  # (2,) centre of the frame
-    radius_px: float  # half the frame diagonal, unit of length of the coefficients
+    radius_px: float  # half the frame diagonal, the unit of length of `distortion`
     distortion: _Array  # (4,) k1, k2, p1, p2
 
     def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
@@ -108,9 +108,10 @@ class Lens:
         return distorted * self.radius_px + self.centre_px
 
     def parallax(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the apparent movement (N, 2) float64 of points (N, 2) mm per unit of height above the plane.
+        """Return the movement (N, 2) float64 of the images of points (N, 2) mm per unit of height above the plane.
 
-        Its length is 1 at half the frame diagonal from the foot of the camera's perpendicular, and 0 at the foot.
+        Points move away from the foot of the perpendicular from the camera to the plane. The movement is proportional
+        to the distance from the foot; it is 1 at a distance of half the frame diagonal.
         Source: plane and parallax (R. Hartley and A. Zisserman, "Multiple View Geometry", 2nd edition, section 13.3).
         """
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
@@ -118,7 +119,7 @@ class Lens:
         to_camera = np.array([[1, 0, -x], [0, 1, -y], [0, 0, _FOCAL_RADII * self.radius_px]])
         plane = to_camera @ self.homography
         normal = np.cross(plane[:, 0], plane[:, 1])
-        # All points of the plane have the same distance from the camera along the normal of the plane.
+        # Along the normal, all points of the plane have the same distance from the camera.
         step = _HEIGHT_STEP * (normal @ plane[:, 2]) / (normal @ normal) * normal
         plane_points = np.column_stack([points, np.ones(len(points))]) @ plane.T
         raised_px, lowered_px = (
@@ -140,7 +141,7 @@ def fit_lens(
     frame_size : (int, int)
         Width and height in half-size px.
     normals : (N, 2) float64, optional
-        Directions in which the positions are measured, if they are points of edges.
+        Unit vectors across the edges, if the points lie on edges. Only the component along the normal is then used.
 
     Returns
     -------
@@ -152,12 +153,12 @@ def fit_lens(
     radius = float(np.hypot(*frame_size)) / 2
     free_count = 4 if len(points_mm) >= _PAIRS_FOR_ALL else 1 if len(points_mm) >= _PAIRS_FOR_ONE else 0
     if on_one_line(points_mm) or on_one_line(positions_px):
-        raise RegistrationError(_ON_ONE_LINE)
+        raise RegistrationError(_COLLINEAR_MARKS_MESSAGE)
     middle, extent = points_mm.mean(axis=0), points_mm.std(axis=0).max()
     normalise = np.array([[1 / extent, 0, -middle[0] / extent], [0, 1 / extent, -middle[1] / extent], [0, 0, 1]])
     start = fit_homography((points_mm - middle) / extent, (positions_px - centre) / radius)
     if start is None:
-        raise RegistrationError(_ON_ONE_LINE)
+        raise RegistrationError(_COLLINEAR_MARKS_MESSAGE)
     denormalise = np.array([[radius, 0, centre[0]], [0, radius, centre[1]], [0, 0, 1]])
 
     def lens(parameters: _Array) -> Lens:
@@ -186,15 +187,15 @@ class Displacement:
     origin_mm: _Array  # (2,) first knot
     knot_mm: _Array  # (2,) distance of knots in x and y
     coefficients: _Array  # (rows, columns, 2) half-size px (dx, dy)
-    lens: Lens | None = None  # maps heights to the frame; None: displacements without heights
-    # (rows, columns) heights, as their movement of a point at the frame corner, half-size px; None without `lens`
+    lens: Lens | None = None  # maps heights to the frame; None: displacement without heights
+    # (rows, columns) heights, as the movement in half-size px where `Lens.parallax` is 1; None without `lens`
     heights: _Array | None = None
 
     @classmethod
     def over(cls, low_mm: _Array, high_mm: _Array, knot_mm: float, lens: Lens | None = None) -> Displacement:
-        """Return a displacement of zero over a rectangle with corners (2,) mm and knots about `knot_mm` apart.
+        """Return a zero displacement over a rectangle with corners (2,) mm; knots are about `knot_mm` apart.
 
-        With a lens, the displacement is modelled by heights.
+        With `lens`, the displacement includes heights of the sheet.
         """
         spans = np.maximum(np.ceil((high_mm - low_mm) / knot_mm), 1).astype(int)
         shape = spans[1] + 3, spans[0] + 3
@@ -202,7 +203,7 @@ class Displacement:
         return cls(low_mm, (high_mm - low_mm) / spans, np.zeros((*shape, 2)), lens, heights)
 
     def basis(self, points_mm: npt.ArrayLike) -> sparse.csr_array:
-        """Return the splines (N, K) float64 at points (N, 2) mm; outside, the border polynomial continues."""
+        """Return the values (N, K) float64 of the splines at points (N, 2) mm; outside, they are extrapolated."""
         rows, columns = self.coefficients.shape[:2]
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
         knot_position = (points - self.origin_mm) / self.knot_mm
@@ -229,9 +230,8 @@ class Displacement:
 
         Minimises ``Σ ½ dᵀ A d − pullᵀ d + ½ |second differences|² / roughness²``.
 
-        `points_mm`: (N, 2), measured points. `information`: (N, 2, 2) A, inverse covariance of each measurement, px⁻²;
-        0 without a measurement. `pull`: (N, 2) A times the measured displacement, px⁻¹. `roughness_px`: usual second
-        difference between knots.
+        `points_mm`: (N, 2), measured points. `information`: (N, 2, 2) A, px⁻²; 0 without a measurement. `pull`: (N, 2),
+        px⁻¹. `roughness_px`: prior standard deviation of second differences.
         """
         basis = self.basis(points_mm)
         rows, columns = self.coefficients.shape[:2]
@@ -244,13 +244,13 @@ class Displacement:
 
     def errors_px(self, points_mm: _Array, information: _Array, at_mm: _Array) -> _Array:
         """Return the standard uncertainty (M,) float64, px, of the displacement at points `at_mm` (M, 2)."""
-        penalised = self._penalised.reshape(*self.coefficients.shape[:2], -1)
+        penalised = self._shape_coefficients.reshape(*self.coefficients.shape[:2], -1)
         bends = [np.diff(penalised, 2, axis=axis) for axis in (0, 1)]
-        # Parts without measurements are taken to be as rough as the measured parts.
+        # Areas without measurements are assumed to be as rough as the measured areas.
         roughness = max(ROUGHNESS_PX, *(float(np.sqrt((bend**2).mean())) for bend in bends))
-        # Each draw is a fit to data and roughness with simulated scatter; the covariance is the inverse of the normal
-        # matrix (G. Papandreou and A. L. Yuille, "Gaussian sampling by local perturbations", NIPS 2010).
-        drawn = self._drawn(points_mm, information, roughness)
+        # Each draw is a fit to simulated noise of the data and of the prior. The covariance of the draws is the inverse
+        # of the normal matrix (G. Papandreou and A. L. Yuille, "Gaussian sampling by local perturbations", NIPS 2010).
+        drawn = self._draw_deviations(points_mm, information, roughness)
         basis, directions = self.basis(at_mm), self._directions(at_mm)
         moved = np.zeros((len(at_mm), 2, _DRAWS))
         for draws, direction in zip(np.split(drawn, len(directions)), directions, strict=True):
@@ -258,14 +258,14 @@ class Displacement:
         return np.sqrt((moved**2).sum(axis=1).mean(axis=1))
 
     def likely_roughness_px(self, points_mm: _Array, information: _Array, roughness_px: float) -> float:
-        """Return the most likely second difference between knots, px, at least `ROUGHNESS_PX`.
+        """Return the most likely standard deviation of second differences, `ROUGHNESS_PX` to `MAX_ROUGHNESS_PX`.
 
-        The sum of squared bends, divided by the number of determined bends, is one step of a fixed-point iteration
-        (D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992).
+        One step of a fixed-point iteration (D. J. C. MacKay, "Bayesian interpolation", Neural Computation 1992): the
+        sum of squared second differences, divided by the number of second differences that the data determine.
         """
         bending = _differences(*self.coefficients.shape[:2])
-        penalised = self._penalised
-        drawn = self._drawn(points_mm, information, roughness_px)[-penalised.size :]
+        penalised = self._shape_coefficients
+        drawn = self._draw_deviations(points_mm, information, roughness_px)[-penalised.size :]
         groups = np.split(drawn, penalised.shape[1])
         undetermined_px2 = sum(float((np.asarray(bending @ draws) ** 2).sum()) for draws in groups) / _DRAWS
         fitted_px2 = float((np.asarray(bending @ penalised) ** 2).sum())
@@ -273,28 +273,31 @@ class Displacement:
         return float(np.clip(np.sqrt(fitted_px2 / determined), ROUGHNESS_PX, MAX_ROUGHNESS_PX))
 
     @property
-    def _penalised(self) -> _Array:
-        """Coefficients with a roughness penalty: (K, 1) heights, or without a lens (K, 2) displacements, px."""
+    def _shape_coefficients(self) -> _Array:
+        """Coefficients for the shape of the sheet, px: (K, 1) heights, or without a lens (K, 2) displacements."""
         return self.coefficients.reshape(-1, 2) if self.heights is None else self.heights.reshape(-1, 1)
 
     def _directions(self, points_mm: _Array) -> list[_Array]:
         directions = [np.broadcast_to(direction, points_mm.shape) for direction in np.eye(2)]
         return directions if self.lens is None else [*directions, self.lens.parallax(points_mm)]
 
-    def _roughnesses(self, roughness_px: float) -> list[float]:
+    def _roughness_by_group(self, roughness_px: float) -> list[float]:
         if self.lens is None:
             return [roughness_px] * 2
-        # After n knots, independent bends add up to √(n³ / 3) times their size.
+        # Over n knots, independent second differences of 1 px add up to a displacement of √(n³ / 3) px.
         knots = max(self.coefficients.shape[:2]) / 2
         in_plane = min(_IN_PLANE_PX * np.sqrt(3 / knots**3), roughness_px)
         return [in_plane, in_plane, roughness_px]
 
-    def _drawn(self, points_mm: _Array, information: _Array, roughness_px: float) -> _Array:
-        """Draw deviations (G K, draws) from the posterior distribution of the coefficients of all groups."""
+    def _draw_deviations(self, points_mm: _Array, information: _Array, roughness_px: float) -> _Array:
+        """Draw random deviations of all coefficients, (G K, draws), from their posterior distribution.
+
+        The G groups of coefficients are x, y and, with a lens, height.
+        """
         random = np.random.Generator(np.random.SFC64(_SEED))
         rows, columns = self.coefficients.shape[:2]
         matrix = self._normal_matrix(points_mm, information, roughness_px)
-        # Simulated scatter of the measurements: Cholesky factor of the information times normal deviates.
+        # Simulated noise of the measurements: Cholesky factor of the information times normal deviates.
         root = np.linalg.cholesky(information + 1e-9 * np.eye(2))
         scatter = np.einsum("nij,njs->nis", root, random.standard_normal((len(points_mm), 2, _DRAWS)))
         basis = self.basis(points_mm)
@@ -303,7 +306,7 @@ class Displacement:
         bending = _differences(rows, columns)
         roughness_term = [
             bending.T @ random.standard_normal((bending.shape[0], _DRAWS)) / roughness
-            for roughness in self._roughnesses(roughness_px)
+            for roughness in self._roughness_by_group(roughness_px)
         ]
         ridge_term = np.sqrt(_RIDGE) * random.standard_normal((len(directions) * rows * columns, _DRAWS))
         right = data_term + np.concatenate(roughness_term) + ridge_term
@@ -314,27 +317,26 @@ class Displacement:
         directions = self._directions(points_mm)
         weighted = [np.einsum("nij,nj->ni", information, direction) for direction in directions]
         groups = range(len(directions))
-        # Blocks are symmetric, and blocks (i, j) and (j, i) are equal.
+        # Each block is symmetric, and block (i, j) is equal to block (j, i).
         upper = {
             (row, column): basis.T @ sparse.diags_array((directions[row] * weighted[column]).sum(axis=1)) @ basis
             for row, column in combinations_with_replacement(groups, 2)
         }
         bending = _differences(*self.coefficients.shape[:2])
         stiffness, ridge = bending.T @ bending, sparse.identity(bending.shape[1]) * _RIDGE
-        for number, roughness in enumerate(self._roughnesses(roughness_px)):
+        for number, roughness in enumerate(self._roughness_by_group(roughness_px)):
             upper[number, number] += stiffness / roughness**2 + ridge
         blocks = [[upper[min(row, column), max(row, column)] for column in groups] for row in groups]
         return sparse.csc_array(sparse.block_array(blocks))
 
 
 def _cubic_weights(t: _Array) -> _Array:
-    # Uniform cubic B-spline at t in [0, 1] of a span.
+    # Weights of the four uniform cubic B-splines at position t, 0 … 1, between two knots.
     s = 1 - t
     return np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3], axis=-1) / 6
 
 
-# All second differences on the grid: xx, yy, then √2 times xy. One registration needs them dozens of times, hence the
-# cache; do not modify the result.
+# Matrix of all second differences on the grid: xx, yy, then √2 times xy. The result is cached; do not modify it.
 @lru_cache(maxsize=4)
 def _differences(rows: int, columns: int) -> sparse.csr_array:
     def difference(n: int, order: int) -> sparse.csr_array:
@@ -360,9 +362,9 @@ class LateralColour:
 
     @classmethod
     def unmeasured(cls, frame_size: tuple[int, int]) -> LateralColour:
-        """Return zero shifts with the prior uncertainty of a lens; `frame_size` is width and height."""
+        """Return zero shifts with the prior uncertainty; `frame_size` is width and height."""
         size = np.array(frame_size, dtype=np.float64)
-        return cls((size - 1) / 2, float(np.hypot(*size)) / 2, np.zeros((2, 2)), np.eye(4) * _PRIOR_PX**2)
+        return cls((size - 1) / 2, float(np.hypot(*size)) / 2, np.zeros((2, 2)), np.eye(4) * _TERM_PRIOR_PX**2)
 
     def shift_px(self, positions_px: _Array, channel: Channel) -> _Array:
         """Return the outward shift (N, 2) float64 px of a channel at positions (N, 2) px of green."""
@@ -390,23 +392,23 @@ class LateralColour:
     def remeasured(self, positions_px: _Array, information: _Array, pull: _Array) -> LateralColour:
         """Return the most likely shifts after a comparison of blocks in each channel.
 
-        `positions_px`: (B, 2) float64, centres of the blocks. `information`: (3, B, 2, 2) float64 px⁻², inverse
-        covariance of the displacement measured by red, green and blue; 0 without a measurement. `pull`: (3, B, 2)
-        float64 px⁻¹, information times displacement from the present shifts.
+        `positions_px`: (B, 2) float64, centres of the blocks. `information`: (3, B, 2, 2) float64 px⁻², for the
+        distance of each channel from its current position; 0 without a measurement. `pull`: (3, B, 2)
+        float64 px⁻¹.
         """
-        # Displacements common to all channels are no lateral colour: they are eliminated block by block.
+        # A displacement common to all channels is no lateral colour and is eliminated from each block.
         total: _Array = information.sum(axis=0)
-        # A shift between channels needs at least two of them.
-        used = (np.trace(information, axis1=2, axis2=3) > 0).sum(axis=0) > 1
-        if not used.any():
+        # A shift between channels can only be measured if at least two channels are measured.
+        is_used = (np.trace(information, axis1=2, axis2=3) > 0).sum(axis=0) > 1
+        if not is_used.any():
             return self
-        positions, precisions, pulls = positions_px[used], information[:, used], pull[:, used]
-        # Edge points are measured only across the edge: the matrix may be singular.
-        inverse = np.asarray(np.linalg.pinv(total[used], rcond=_MIN_EIGENVALUE_RATIO, hermitian=True), dtype=np.float64)
+        positions, precisions, pulls = positions_px[is_used], information[:, is_used], pull[:, is_used]
+        # The matrix may be singular, because the position of an edge point is only measured across the edge.
+        inverse = np.asarray(np.linalg.pinv(total[is_used], rcond=_MIN_EIGEN_RATIO, hermitian=True), dtype=np.float64)
         offset = (positions - self.centre_px) / self.radius_px
         design = np.stack([offset, offset * (offset**2).sum(axis=1, keepdims=True)], axis=-1)
         colours = [CHANNELS.index("R"), CHANNELS.index("B")]
-        # Information of red and blue after this elimination: a Schur complement.
+        # Information of red and blue after the elimination (Schur complement).
         reduced = np.empty((len(positions), 2, 2, 2, 2))
         for i, row in enumerate(colours):
             for j, column in enumerate(colours):
@@ -416,15 +418,15 @@ class LateralColour:
         reduced_pull = np.stack(
             [pulls[row] - np.einsum("nij,nj->ni", precisions[row], common) for row in colours], axis=1
         )
-        # Misfits are weighted in units of their standard uncertainty.
+        # Inverse covariance of the misfits, for χ².
         misfit_precision = np.linalg.pinv(reduced.transpose(0, 1, 3, 2, 4).reshape(-1, 4, 4), hermitian=True)
         weight, scale = np.ones(len(positions)), 1.0
         terms = start = self.terms_px.ravel()
         covariance = self.covariance_px2
-        for _ in range(_ROUNDS):
+        for _ in range(_REWEIGHTING_ROUNDS):
             normal: _Array = np.einsum("n,nip,nabij,njq->apbq", weight, design, reduced, design).reshape(4, 4) / scale
             gradient: _Array = np.einsum("n,nip,nai->ap", weight, design, reduced_pull).ravel() / scale
-            prior = np.eye(4) / _PRIOR_PX**2
+            prior = np.eye(4) / _TERM_PRIOR_PX**2
             covariance = np.linalg.inv(normal + prior)
             step = covariance @ (gradient - prior @ start)
             terms = start + step
@@ -434,4 +436,4 @@ class LateralColour:
             chi2: _Array = np.einsum("ni,nij,nj->n", misfit, misfit_precision, misfit)
             scale = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
             weight = np.minimum(1.0, _HUBER * np.sqrt(4 * scale / np.maximum(chi2, 1e-9)))
-        return replace(self, terms_px=terms.reshape(2, 2), covariance_px2=covariance + np.eye(4) * _MODEL_PX**2)
+        return replace(self, terms_px=terms.reshape(2, 2), covariance_px2=covariance + np.eye(4) * _SYSTEMATIC_PX**2)

@@ -1,9 +1,12 @@
-"""Move the map from print to frame until both coincide, and estimate the uncertainty of positions.
+"""Correct the map from print to frame by comparing patches, and estimate the uncertainty of positions.
 
-The frame is rectified and compared with the print in camera colours, which a model predicts. The model is fitted to the
-frame itself. A smooth displacement is fitted to the differences. First, blocks of patches are located by correlation
-(`find_blocks`); otherwise the next stage could converge to neighbouring patches. Then all patches move together in
-Gauss-Newton steps (`compare_tiles`). All channels are used, each at its own position; the map is valid for green.
+The frame is rectified and compared with a predicted image of the print. The colour model for the prediction is fitted
+to the frame itself. First, blocks of patches are located by correlation (`find_blocks`), so that the result is not one
+patch off. Then Gauss-Newton steps (`compare_tiles`) fit a smooth displacement to the differences of all patches. All
+channels are used, each at its own position; the map is valid for green.
+
+A chart without tags is in smooth order: the colours of neighbouring patches are similar. Its first steps use blurred
+images in place of blocks. `information` and `pull` are defined in `calibration.registration.tiles`.
 """
 
 from __future__ import annotations
@@ -32,78 +35,77 @@ from experiment.chart.model import PAPER_WHITE, Chart
 from experiment.framing.homography import rms
 from foundation.errors import RegistrationError
 
-# px⁻²: blocks with a standard uncertainty of their position of 0.5 px or more are not used.
-_LEAST_INFORMATION = 4.0
+# Smallest information of a displacement, px⁻²; it corresponds to a standard uncertainty of 0.5 px.
+_MIN_INFORMATION = 4.0
 
 _MEDIAN_CHI2 = 1.386  # Median of χ² with 2 degrees of freedom
 
-# Width in patches of the window for averaging residual movements; a single patch has a noise of 0.05 px.
-_AROUND_CELLS = 3
+# Window width for the mean of residual displacements, in patches. The noise of a single patch is 0.05 px.
+_MEAN_WINDOW_CELLS = 3
 
-# Largest weight of a patch, relative to the median information: patches at a curled rim have less information.
-_MOST_WEIGHT = 0.15
+# Largest weight of a patch in this mean, as a fraction of the median information. Without this limit, patches at a
+# curled rim would hardly count, because they have little information.
+_MAX_WEIGHT = 0.15
 
-# Systematic standard uncertainty of positions: the blur of the predicted print is not exact (simulated frames, small
-# and large charts).
+# Systematic standard uncertainty of positions, because the blur of the predicted print is not exact (simulated frames).
 SYSTEMATIC_PX = 0.01
 
-# Squared position error per squared outline residual: 2 for two axes instead of one, times 2 because the map is fitted
-# to the points of the outline and not to positions inside.
+# Ratio of the squared position error to the squared outline residual: a factor 2 because a position has two axes, and
+# a factor 2 because the map is fitted to the outline only.
 _INSIDE_FACTOR = 4.0
 
-# Number of neighbouring outline points (of 640) in a local mean square, which is then accurate to a third.
-_NEAR_MARKS = 24
+_NEAR_MARKS = 24  # Number of neighbouring outline points in a local mean square
 
-# Multiple of the expected noise that is subtracted from the square of an averaged movement.
+# Multiple of the expected noise variance that is subtracted from a squared mean displacement.
 _NOISE_FACTOR = 2.0
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
-# Width of blocks and search range, both in patches, of the first and second search. Large blocks are never confused;
-# small blocks follow waves (6 mm, period 150 mm) and curled edges to 0.2 … 0.3 px RMS in simulated frames.
+# Block width and search range of the first and the second search, in patches. Large blocks are unambiguous; small
+# blocks follow waves and curled edges.
 _COARSE_BLOCKS = ((10, 1.5), (5, 1.0))
 
-# Width in patches of the window of the fine comparison. With 6, the largest error is 0.40 px instead of 0.38 px.
-_BLOCK_CELLS = 8
+_BLOCK_CELLS = 8  # Window width of the fine comparison, in patches
 
-# Distance of spline knots in patches: smaller than a window, to follow all that the window resolves.
+# Spacing of spline knots, in patches. It is smaller than the window, so the spline follows every shape that the window
+# resolves.
 _KNOT_CELLS = 5
 
-_COARSE_PER_CELL = 5  # Raster elements along a patch in the search of blocks
+_COARSE_PER_CELL = 5  # Raster elements per patch width in the block search
 
-# Fine comparison: raster elements per pixel, and least and largest number along a patch.
-_PER_CELL_PX, _LEAST_PER_CELL, _MOST_PER_CELL = 0.8, 8, 16
+# Fine comparison: raster elements per pixel, and smallest and largest number of elements per patch width.
+_ELEMENTS_PER_PX, _MIN_PER_CELL, _MAX_PER_CELL = 0.8, 8, 16
 
-# Width in patches of the window with constant gain and offset when print and frame are blurred over patches.
-_FOLLOWED_CELLS = 12
+# Window width of the comparison of blurred images, in patches. Gain and offset are constant in a window.
+_BLURRED_WINDOW_CELLS = 12
 
-# Number of independent measurements in such a window: colour errors are correlated over many patches.
+# Number of independent measurements in such a window. It is small, because colour errors are correlated over many
+# patches.
 _WINDOW_MEASUREMENTS = 4
 
-_RIM_SIGMAS = 3.0  # Width of the excluded rim of the field, in σ of the blur
+_RIM_SIGMAS = 3.0  # Width of the excluded rim of the patch area, in standard deviations of the blur
 
-# Number of neighbouring elements with correlated colour errors, for charts of smooth order.
-_COLOURS_REPEAT = 10
+# Number of neighbouring raster elements with the same colour error, for charts in smooth order.
+_CORRELATED_ELEMENTS = 10
 
-# Standard uncertainty of positions, in patches, from colour errors that appear as movements in a smooth order
-# (simulated frames: 0.002 to 0.005 RMS for patches of 8 to 23 px).
-_COLOURS_SHIFT = 0.005
+# Standard uncertainty of positions in a smooth order, in patches (simulated frames). A colour error there has the same
+# effect as a displacement.
+_COLOUR_ERROR_CELLS = 0.005
 
-_BLURRED_CELLS = 0.6  # Blur in patches for the scores of blocks of a smooth order
+_SCORE_BLUR_CELLS = 0.6  # Blur for the scores of blocks in smooth order, in patches
 
-_LEAST_BLOCK_SCORE = 0.3  # Minimum median correlation of located blocks; another chart gives about 0
+_MIN_BLOCK_SCORE = 0.3  # Minimum median correlation of located blocks; another chart gives about 0
 
-# Number of patches for fitting the colour model; more do not improve a polynomial of some dozen terms.
-_COLOUR_PATCHES = 5000
+_COLOUR_PATCHES = 5000  # Approximate number of patches for fitting the colour model; more do not improve it
 
-_LENS_POINTS = 2000  # Number of patches for refitting the lens; more do not improve a dozen parameters
+_LENS_POINTS = 2000  # Approximate number of patches for refitting the lens; more do not improve it
 
-# Assumed standard uncertainty of these positions, px (judgement). The next steps correct the smoothing error, 0.02 px.
+# Assumed standard uncertainty of the positions of these patches, px (judgement).
 _LENS_POINT_SIGMA_PX = 0.1
 
-# Blur σ that cubic interpolation adds: measured on edges of σ 0.4 to 0.7 px, less on softer edges. Without it in the
-# template, position errors are 1.5 times as large.
+# Blur that cubic interpolation adds to the rectified frame, as a standard deviation, measured on sharp edges. The
+# predicted print gets the same blur.
 _INTERPOLATION_PX = 0.28
 
 _Float = npt.NDArray[np.float32]
@@ -111,11 +113,11 @@ _Float = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Quality of the registration, block by block, after the last step."""
+    """Quality of the registration in each block of patches, after the last step."""
 
     centres_mm: _Array  # (B, 2)
     score: _Array  # (B,) correlation of frame and predicted print, −1 … 1; 0 if not comparable
-    residual_px: _Array  # (B, 2) displacement that the block alone would still need
+    residual_px: _Array  # (B, 2) displacement from the final map, measured in the block
 
     @property
     def good(self) -> _Mask:
@@ -126,7 +128,7 @@ class Blocks:
 def fit_blocks(
     comparison: TileComparison, raster: Raster, per_cell: int, chart: Chart, block_cells: int, keep_scores: bool
 ) -> Blocks:
-    """Return score and residual of each block of patches; `keep_scores` keeps scores of low contrast."""
+    """Return score and residual of each block; `keep_scores`: keep the score of a block with little contrast."""
     rows, columns = raster.tiles(per_cell)
     across, down = (max(1, count // block_cells) for count in (columns, rows))
     block_column = np.minimum(np.arange(columns) * across // columns, across - 1)
@@ -136,7 +138,7 @@ def fit_blocks(
     matrix, right = np.zeros((count, 2, 2)), np.zeros((count, 2))
     np.add.at(matrix, block, comparison.information)
     np.add.at(right, block, comparison.pull)
-    # Blank margins have no contrast: only tiles with a patch count.
+    # Only tiles that contain a patch are used, because blank margins have no contrast.
     column, row = np.floor((chart.centres_mm - raster.low_mm) / np.array(chart.cell_mm)).astype(int).T
     occupied = np.zeros((rows, columns))
     occupied[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)] = 1
@@ -147,7 +149,7 @@ def fit_blocks(
     points = comparison.points_mm
     centres = np.stack([np.bincount(block, points[:, axis] * has_patch, count) / divisor for axis in (0, 1)], axis=-1)
     mean = np.bincount(block, comparison.score * has_patch, count) / divisor
-    is_known = np.linalg.eigvalsh(matrix)[:, 0] > _LEAST_INFORMATION
+    is_known = np.linalg.eigvalsh(matrix)[:, 0] > _MIN_INFORMATION
     residual = np.zeros((count, 2))
     residual[is_known] = np.linalg.solve(matrix[is_known], right[is_known, :, None])[..., 0]
     return Blocks(centres[is_used], np.where(is_known | keep_scores, mean, 0.0)[is_used], residual[is_used])
@@ -158,7 +160,7 @@ class PlaceErrors:
     """Standard uncertainty of the positions of a registration."""
 
     raster: Raster  # on the print, one element per patch
-    error_px: _Array  # (rows, columns) at the centre of each element, length over x and y
+    error_px: _Array  # (rows, columns) at the centres of the elements; root of the sum of the variances of x and y
 
     def at(self, points_mm: npt.ArrayLike) -> _Array:
         """Return the standard uncertainty (N,) float64 px at points (N, 2) mm; outside, the value of the rim."""
@@ -166,16 +168,16 @@ class PlaceErrors:
         return np.asarray(ndimage.map_coordinates(self.error_px, [row, column], order=1, mode="nearest"))
 
 
-def unfollowed_px(
+def unfollowed_wave_sigma_px(
     points_mm: _Array, marks_mm: _Array, residual_px: _Array, departure_px: float, reach_mm: float
 ) -> _Array:
-    """Return the standard uncertainty (N,) float64 px from waves of the outline that the map does not follow.
+    """Return the standard uncertainty (N,) float64 px from waves of the sheet that the map does not follow.
 
-    Inside, the waves of a sheet are assumed to be as large as the waves of its outline along both axes. Near the
-    outline, they are assumed to be as large as at the nearest outline points.
+    These waves are visible only at the outline. Inside, they are assumed to be as large as the RMS residual of the
+    outline, and near the outline as large as the residual of the nearest outline points, if this is larger.
 
     `points_mm`: (N, 2) float64. `marks_mm`, `residual_px`: (M, 2) float64, outline points and their distance from the
-    map. `departure_px`: RMS displacement of the outline. `reach_mm`: range of the local mean.
+    map. `departure_px`: RMS displacement of the outline. `reach_mm`: largest distance of points near the outline.
     """
     squared_residual = (residual_px**2).sum(axis=1)
     distance, neighbours = cKDTree(marks_mm).query(points_mm, k=min(_NEAR_MARKS, len(squared_residual)))
@@ -183,13 +185,13 @@ def unfollowed_px(
     local = np.where(distance[:, 0] <= reach_mm, squared_residual[neighbours].mean(axis=1), 0.0)
     squared = _INSIDE_FACTOR * np.maximum(local, squared_residual.mean())
     low, high = marks_mm.min(axis=0), marks_mm.max(axis=0)
-    # Corner points may belong to either side, and each measures only one direction.
+    # Corner points are left out: each measures the position across only one of its two sides.
     on_side = (marks_mm - low < reach_mm / 4) | (high - marks_mm < reach_mm / 4)
     for axis in (0, 1):
         for end in (low[axis], high[axis]):
             side = marks_mm[(np.abs(marks_mm[:, axis] - end) < reach_mm / 4) & ~on_side[:, 1 - axis]]
-            # Near a missing part of the outline, such as a curled corner, the uncertainty is at least the RMS
-            # displacement of the other parts.
+            # If a part of the outline is missing, as at a curled corner, the uncertainty near it is at least the RMS
+            # displacement of the measured parts.
             is_missing = cKDTree(side).query(points_mm)[0] > np.abs(points_mm[:, axis] - end) + reach_mm
             squared = np.where(is_missing, np.maximum(squared, departure_px**2), squared)
     return np.sqrt(squared)
@@ -204,18 +206,16 @@ def place_errors(
     systematic_px: _Array | float = SYSTEMATIC_PX,
     correlated: bool = False,
 ) -> PlaceErrors:
-    """Estimate the standard uncertainty of positions from scatter and from residual movements of patches.
+    """Estimate the standard uncertainty of positions from noise and from residual displacements of patches.
 
-    The scatter part is the posterior uncertainty of the smooth fit; it grows in areas without measurements. The
-    residual part covers shapes that the displacement cannot follow, such as folds and curled edges. In simulated rooms
-    with waves, curl and folded corners, 99 % of the patches of a full chart lie within three standard uncertainties; on
-    charts with 512 colours, 98 %.
+    The first part is the posterior uncertainty of the smooth fit; it grows in areas without measurements. The second
+    part covers shapes that the smooth fit cannot follow, such as folds and curled edges.
 
     `anchors`: (N, 2) mm and (N, 2, 2) px⁻², other points that fix the map, and their information. `systematic_px`:
     additional standard uncertainty, one value or (N,) per tile. `correlated`: neighbouring patches have common errors.
     """
     shape, information = raster.tiles(per_cell), comparison.information
-    is_known = np.linalg.eigvalsh(information)[:, 0] > _LEAST_INFORMATION
+    is_known = np.linalg.eigvalsh(information)[:, 0] > _MIN_INFORMATION
     movement = np.zeros_like(comparison.pull)
     movement[is_known] = np.linalg.solve(information[is_known], comparison.pull[is_known, :, None])[..., 0]
     chi2 = (movement * comparison.pull).sum(axis=1)[is_known]
@@ -224,58 +224,58 @@ def place_errors(
     fit_error = displacement.errors_px(
         np.concatenate([points, anchors[0]]), np.concatenate([information / scatter, anchors[1]]), points
     )
-    # The weight limit keeps strong edges from dominating; patches with weak edges get a low weight against noise.
+    # The weight is proportional to the information up to a limit, so that patches with weak edges get a low weight.
     strength = np.zeros(len(points))
     strength[is_known] = np.linalg.eigvalsh(information[is_known])[:, 0]
-    weight_limit = _MOST_WEIGHT * float(np.median(strength[is_known])) if len(chi2) else 0.0
+    weight_limit = _MAX_WEIGHT * float(np.median(strength[is_known])) if len(chi2) else 0.0
     weight = np.minimum(strength, weight_limit)
 
     def local_mean(values: _Array) -> _Array:
-        return np.asarray(box_mean(values.reshape(shape), _AROUND_CELLS), dtype=np.float64)
+        return np.asarray(box_mean(values.reshape(shape), _MEAN_WINDOW_CELLS), dtype=np.float64)
 
     total = np.maximum(local_mean(weight), 1e-6)
     residual2 = (local_mean(weight * movement[:, 0]) / total) ** 2 + (local_mean(weight * movement[:, 1]) / total) ** 2
     if correlated:
         noise = 2 * scatter * (local_mean(weight / np.sqrt(np.maximum(strength, 1e-6))) / total) ** 2
     else:
-        noise = 2 * scatter * local_mean(weight**2 / np.maximum(strength, 1e-6)) / (_AROUND_CELLS * total) ** 2
+        noise = 2 * scatter * local_mean(weight**2 / np.maximum(strength, 1e-6)) / (_MEAN_WINDOW_CELLS * total) ** 2
     residual2 = np.maximum(residual2 - _NOISE_FACTOR * noise, 0.0)
-    # In the margin and next to tags the mean contains the noise of one patch only, or a rounding error.
+    # In the margin and next to tags, too few patches contribute to the mean.
     residual2[total < 0.5 * weight_limit] = 0.0
-    # Unfollowed shapes oscillate around the map: their residual passes through zero next to its maximum.
-    residual2 = ndimage.maximum_filter(residual2, _AROUND_CELLS)
+    # The residual of a wave passes through zero next to its maximum, so the maximum of the neighbourhood is used.
+    residual2 = ndimage.maximum_filter(residual2, _MEAN_WINDOW_CELLS)
     patch_raster = Raster(raster.low_mm, raster.step_mm * per_cell, shape)
     return PlaceErrors(patch_raster, np.sqrt((fit_error**2 + np.square(systematic_px)).reshape(shape) + residual2))
 
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
-    """Points measured by other means, which fix the map in areas without patches."""
+    """Measured points other than patches: tag corners or outline points. They fix the map in areas without patches."""
 
     points_mm: _Array  # (N, 2)
-    places_px: _Array  # (3, N, 2) positions of red, green and blue; any finite value without a measurement
+    positions_px: _Array  # (3, N, 2) positions of red, green and blue; any finite value without a measurement
     information: _Array  # (3, N, 2, 2) inverse covariance of the positions, px⁻²; 0 without a measurement
 
     def select(self, selection: _Mask) -> Anchors:
         """Return the anchors of a selection (N,) bool."""
-        return Anchors(self.points_mm[selection], self.places_px[:, selection], self.information[:, selection])
+        return Anchors(self.points_mm[selection], self.positions_px[:, selection], self.information[:, selection])
 
     def with_errors_scaled(self, factor: float) -> Anchors:
         """Return anchors with standard uncertainties multiplied by a factor."""
-        return Anchors(self.points_mm, self.places_px, self.information / factor**2)
+        return Anchors(self.points_mm, self.positions_px, self.information / factor**2)
 
     def pull(self, expected_px: _Array) -> _Array:
         """Return information times distance (3, N, 2) float64 px⁻¹ from expected positions (3, N, 2)."""
-        return np.einsum("cnij,cnj->cni", self.information, self.places_px - expected_px)
+        return np.einsum("cnij,cnj->cni", self.information, self.positions_px - expected_px)
 
     def residual_px(self, expected_px: _Array) -> _Array:
-        """Return the distance (N, 2) float64 px from expected positions (3, N, 2), weighted mean of the channels."""
+        """Return the distance (N, 2) float64 px from expected positions (3, N, 2): weighted mean of the channels."""
         inverse = np.asarray(np.linalg.pinv(self.information.sum(axis=0), rcond=1e-9, hermitian=True), dtype=np.float64)
         return np.einsum("nij,cnj->ni", inverse, self.pull(expected_px))
 
 
 class Matcher:
-    """Compares a frame with the print on a raster on the print, and moves the map until both coincide."""
+    """Compares the rectified frame with the predicted print, and corrects the map step by step."""
 
     def __init__(
         self,
@@ -288,7 +288,7 @@ class Matcher:
         cell_px: float,
     ) -> None:
         self._chart = chart
-        # In a smooth order of colours only the steps between neighbouring codes give contrast.
+        # In a smooth order, contrast is low: it consists of the steps between neighbouring codes.
         self._smooth_order = not chart.tags
         self._planes = planes
         self.lens = lens
@@ -307,7 +307,7 @@ class Matcher:
         corners_mm = np.concatenate([corners_mm, *(tag.corners_mm for tag in chart.tags)])
         low = np.maximum(corners_mm.min(axis=0) - cell / 2, 0)
         high = np.minimum(corners_mm.max(axis=0) + cell / 2, chart.page_mm)
-        # The raster is aligned with the first patch: edges of a regular chart fall between elements.
+        # The raster is aligned with the first patch, so that patch edges of a regular chart are element borders.
         low -= (low - chart.centres_mm[0] + cell / 2) % cell
         self._cells_across = np.ceil((high - low) / cell).astype(int)
         self._low, self._cell = low, cell
@@ -320,12 +320,12 @@ class Matcher:
             lens if self._smooth_order else None,
         )
         self._roughness_px = ROUGHNESS_PX
-        self._per_cell = int(np.clip(round(_PER_CELL_PX * cell_px), _LEAST_PER_CELL, _MOST_PER_CELL))
+        self._per_cell = int(np.clip(round(_ELEMENTS_PER_PX * cell_px), _MIN_PER_CELL, _MAX_PER_CELL))
         self._raster = Raster.of(low, cell / self._per_cell, self._cells_across * self._per_cell)
         self._cover = self._raster.coverage(self._centres, self._sizes)
         self._valid = self._raster.outside_tags(chart.tags) & self._raster.near(self._cover, self._per_cell)
         if self._smooth_order:
-            # Blur from the margin into the outermost patches is larger than the steps between patches.
+            # The rim is excluded: light blurred from the margin changes it by more than the steps between patches.
             kernel = 2 * int(np.ceil(_RIM_SIGMAS * blur_px / cell_px * self._per_cell)) + 1
             patch_cover = (self._raster.coverage(chart.centres_mm, self._sizes[: chart.colour_count]) > 0).sum(axis=1)
             covered = np.asarray(patch_cover).reshape(self._raster.shape).astype(np.uint8)
@@ -352,9 +352,9 @@ class Matcher:
         return measured
 
     def patches(self) -> tuple[_Array, _Array, _Array]:
-        """Return measured and predicted camera RGB of all patches, and of the paper, counts.
+        """Return measured and predicted camera RGB of all patches, and predicted camera RGB of the paper, in counts.
 
-        Patches and references: (N, 3) float64, references last; measured is NaN outside the frame. Paper: (3,) float64.
+        Patches, followed by references: (N, 3) float64; measured values are NaN outside the frame. Paper: (3,) float64.
         """
         self.colours = self._fit_colours()
         return self._measured_rgb(), self.colours.predict(self._rgb, self._centres), self._paper_rgb()
@@ -369,7 +369,7 @@ class Matcher:
         return fit_colours(self._rgb[used], self._centres[used], rgb[used], self._chart.page_mm, self._smooth_order)
 
     def _template(self, raster: Raster, cover: sparse.csr_array, sigma: _Array) -> _Float:
-        """Predict the print (H, W, 3) float32 as seen by the camera; `sigma` (2,) is the blur in elements."""
+        """Predict the rectified frame (H, W, 3) float32, counts; `sigma` (2,) is the blur in elements."""
         flat = self.colours.predict_flat(self._rgb)
         paper = self._paper_rgb()
         image = np.asarray(cover @ (flat - paper)) + paper
@@ -379,17 +379,17 @@ class Matcher:
         x, y = np.hypot(sigma, self._elements(raster, _INTERPOLATION_PX)).tolist()
         return np.asarray(cv2.GaussianBlur(image, (0, 0), x, sigmaY=y), dtype=np.float32)
 
-    # Length in elements of a raster along x and y: patches need not be square.
+    # Convert a length from px to raster elements along x and y; elements need not be square.
     def _elements(self, raster: Raster, length_px: float) -> _Array:
         return np.asarray(length_px / self.cell_px * self._cell.min() / raster.step_mm, dtype=np.float64)
 
     def _rectified(self, raster: Raster) -> tuple[_Float, _Mask]:
-        positions = raster.element_places(self.to_pixels)
+        positions = raster.element_positions(self.to_pixels)
         image = np.empty((*raster.shape, 3), dtype=np.float32)
         for channel, plane in enumerate(self._planes):
             channel_positions = positions
             if plane.channel != "G" and self.lateral.terms_px.any():
-                channel_positions = raster.element_places(partial(self.to_pixels, channel=plane.channel))
+                channel_positions = raster.element_positions(partial(self.to_pixels, channel=plane.channel))
             image[..., channel] = cv2.remap(
                 plane.values,
                 channel_positions[..., 0] - np.float32(plane.offset_px[0]),
@@ -402,7 +402,7 @@ class Matcher:
         return image, is_inside
 
     def match_coarsely(self, frame_name: str) -> None:
-        """Locate blocks of patches up to 1.5 patches away, and fit a smooth displacement to them."""
+        """Locate blocks of patches with a search range of 1.5 patches, and fit a smooth displacement to them."""
         elements, smaller_count = _COARSE_PER_CELL, int(self._cells_across.min())
         blocks = [int(np.clip(smaller_count // 3, 2, cells)) for cells, _ in _COARSE_BLOCKS]
         reaches = [round(elements * min(range_cells, 0.25 * blocks[0])) for _, range_cells in _COARSE_BLOCKS]
@@ -414,7 +414,7 @@ class Matcher:
         for block, reach in zip(blocks, reaches, strict=True):
             template = self._template(raster, cover, self._elements(raster, max(self.blur_px, 0.7)))
             image, is_inside = self._rectified(raster)
-            # Print in the margin must not move patches.
+            # The margin is replaced by its prediction, so that print there has no effect.
             is_margin = ~raster.near(cover, elements)
             image[is_margin] = template[is_margin]
             located = find_blocks(raster, template, image, is_inside, block * elements, reach, block**2)
@@ -432,23 +432,22 @@ class Matcher:
                 centre, information, np.einsum("nij,nj->ni", information, total), MAX_ROUGHNESS_PX
             )
             self.colours = self._fit_colours()
-        if best_score < _LEAST_BLOCK_SCORE:
+        if best_score < _MIN_BLOCK_SCORE:
             raise not_this_chart(
-                frame_name, f"the correlation of blocks is {best_score:.2f}, expected at least {_LEAST_BLOCK_SCORE:g}"
+                frame_name, f"the correlation of blocks is {best_score:.2f}, expected at least {_MIN_BLOCK_SCORE:g}"
             )
 
-    def follow(self, sigma_cells: float) -> None:
+    def step_blurred(self, sigma_cells: float) -> None:
         """Make one Gauss-Newton step with print and frame blurred by `sigma_cells` patches."""
-        # The blur removes steps between patches, so the map cannot lock onto neighbouring patches. Folds of a smooth
-        # order and the texture of a random order remain. Areas with an even gradient follow their neighbours smoothly.
-        # Colour errors are correlated over many patches: a window is about one measurement.
-        repeat = (_FOLLOWED_CELLS * _COARSE_PER_CELL) ** 2 / _WINDOW_MEASUREMENTS
+        # The blur removes the steps between patches, so the result cannot be one patch off. Only large structures of
+        # the colour order remain; areas with an even gradient get the displacement of their neighbours.
+        repeat = (_BLURRED_WINDOW_CELLS * _COARSE_PER_CELL) ** 2 / _WINDOW_MEASUREMENTS
         self._move(self._compare_blurred(sigma_cells).weakened(repeat))
         self.colours = self._fit_colours()
 
     def refit_lens(self) -> None:
-        """Refit the lens to the positions of all patches, and the heights to its residual."""
-        # The outline alone cannot separate curl from distortion, and no smooth displacement can correct steep corners.
+        """Refit the lens to the positions of the patches, and the heights to the residual of the new lens."""
+        # The first lens was fitted to the outline alone, which cannot separate curl of the sheet from distortion.
         points = self._chart.centres_mm[:: max(1, self._chart.colour_count // _LENS_POINTS)]
         positions_px = self.to_pixels(points)
         height, width = self._planes[0].values.shape
@@ -470,24 +469,24 @@ class Matcher:
         for channel in range(3):
             image[..., channel] = cv2.GaussianBlur(image[..., channel], (0, 0), x, sigmaY=y)
         weight = (is_inside & is_comparable).astype(np.float32)
-        window = _FOLLOWED_CELLS * elements
+        window = _BLURRED_WINDOW_CELLS * elements
         return compare_tiles(
             raster, elements, template, image, weight, window, self.to_pixels, self.cell_px, without_gradient=True
         )
 
     def blocks(self) -> Blocks:
-        """Return the quality of all blocks; requires a previous step."""
+        """Return the quality of all blocks; call `step` first."""
         assert self._remainder is not None
         comparison = self._remainder
         if self._smooth_order:
-            # Steps between dark patches are below the noise; agreement with the chart shows only over many patches.
-            comparison = replace(comparison, score=self._compare_blurred(_BLURRED_CELLS).score)
+            # Steps between dark patches are below the noise, so the score is calculated from blurred images.
+            comparison = replace(comparison, score=self._compare_blurred(_SCORE_BLUR_CELLS).score)
         return fit_blocks(
             comparison, self._raster, self._per_cell, self._chart, self._block_cells, keep_scores=self._smooth_order
         )
 
     def place_errors(self) -> PlaceErrors:
-        """Return the uncertainty of positions; requires a previous step."""
+        """Return the uncertainty of positions; call `step` first."""
         assert self._remainder is not None
         points, information = self._anchors.points_mm, self._anchors.information.sum(axis=0)
         systematic: _Array | float = SYSTEMATIC_PX
@@ -495,15 +494,15 @@ class Matcher:
             residual = self._anchors.residual_px(self.in_channels(points))
             reach = _KNOT_CELLS * float(self._cell.max())
             departure = rms(self.displacement.at(points))
-            unfollowed = unfollowed_px(self._remainder.points_mm, points, residual, departure, reach)
-            systematic = np.hypot(unfollowed, _COLOURS_SHIFT * self.cell_px)
+            unfollowed = unfollowed_wave_sigma_px(self._remainder.points_mm, points, residual, departure, reach)
+            systematic = np.hypot(unfollowed, _COLOUR_ERROR_CELLS * self.cell_px)
         anchors = points, information
         return place_errors(
             self._remainder, self._raster, self._per_cell, self.displacement, anchors, systematic, self._smooth_order
         )
 
-    def slipped(self, mismatched_cells: _Mask) -> tuple[_Array, int]:
-        """Return the centres (B, 2) mm of areas that are displaced by a patch, and the number of areas.
+    def find_displaced_areas(self, mismatched_cells: _Mask) -> tuple[_Array, int]:
+        """Return the centres (B, 2) mm of areas that are displaced by a patch, and the number of tested areas.
 
         `mismatched_cells`: (C,) bool, patches to ignore.
         """
@@ -517,7 +516,7 @@ class Matcher:
         return self._low + centres * self._cell, area_count
 
     def step(self) -> tuple[float, float]:
-        """Make one Gauss-Newton step of all patches together; return the RMS and the largest movement, px."""
+        """Make one Gauss-Newton step with all patches; return the RMS and the largest movement of the map, px."""
         raster, elements = self._raster, self._per_cell
         template = self._template(raster, self._cover, self._elements(raster, self.blur_px))
         image, is_inside = self._rectified(raster)
@@ -527,7 +526,7 @@ class Matcher:
             raster, elements, template, image, weight, window, self.to_pixels, self.cell_px, self._smooth_order
         )
         if self._smooth_order:
-            compared = compared.weakened(_COLOURS_REPEAT)
+            compared = compared.weakened(_CORRELATED_ELEMENTS)
         points = compared.points_mm
         previous, positions_px = self.displacement, self.to_pixels(points)
         shifted = self.lateral.channels_px(positions_px)
@@ -561,7 +560,7 @@ class Matcher:
         )
 
     def _move(self, compared: TileComparison) -> tuple[float, float]:
-        """Fit the map to tiles and anchors; return the RMS and the largest movement of the tiles, px."""
+        """Fit the displacement to tiles and anchors; return the RMS and the largest movement of the tiles, px."""
         anchors, points = self._anchors, compared.points_mm
         all_points = np.concatenate([points, anchors.points_mm])
         all_information = np.concatenate([compared.information, anchors.information.sum(axis=0)])
@@ -570,7 +569,7 @@ class Matcher:
         total = np.concatenate([compared.pull, anchored]) + np.einsum("nij,nj->ni", all_information, previous)
         self.displacement = self.displacement.fitted(all_points, all_information, total, self._roughness_px)
         if self._smooth_order:
-            # Even gradients do not measure the shape of the sheet, so the result depends on the roughness.
+            # In areas with an even gradient the shape is not measured, so the result depends on the prior roughness.
             self._roughness_px = self.displacement.likely_roughness_px(all_points, all_information, self._roughness_px)
         moved = (self.displacement.at(all_points) - previous)[: len(points)]
         moved = moved[compared.information[:, 0, 0] > 0]
@@ -578,7 +577,7 @@ class Matcher:
 
 
 def not_this_chart(frame_name: str, measurement: str) -> RegistrationError:
-    """Return the error for a frame that shows another chart."""
+    """Return the error for a frame with another chart; `measurement` states the measured and the expected value."""
     return RegistrationError(
         f"{frame_name}: the colours of the patches do not match the chart: {measurement}; "
         "give the chart.json of this print, or uncover it"

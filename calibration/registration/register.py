@@ -1,8 +1,8 @@
-"""Register the chart in a frame: the position of every point of the print.
+"""Register the chart in a frame: calculate the position of every point of the print.
 
-Tags, or the outline of the patch area, give a homography and Brown's distortion. The positions of the patches give the
-remaining deviations, because 35 tags are too few for a wavy sheet. `register` returns a `Registration` or raises
-`RegistrationError`; it never returns a registration of poor quality.
+First, a homography and Brown's lens distortion are fitted to the tags, or to the outline of the patch area. Then a
+smooth displacement is fitted to all patches, because 35 tags cannot describe a wavy sheet. `register` returns a
+`Registration`, or raises `RegistrationError` if the quality is too low.
 
 Positions are half-size pixels with pixel centres at integers; points on the print are millimetres.
 """
@@ -28,56 +28,55 @@ from experiment.framing.sharpness import blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import robust_sigma
 
-# Largest expanded uncertainty of a position, scaled to patches of 10 px (`Registration.expanded_px`). With an error of
-# 0.5 px and a blur of 0.7 px, the outermost of the 25 samples receives 0.1 % of its light from the next patch
-# (`calibration.sampling`).
+# Largest allowed expanded uncertainty of a position, in px, for patches of 10 px (`Registration.expanded_px`). With
+# this error and usual blur, the outermost sample receives 0.1 % of its light from the next patch.
 MAX_PLACE_ERROR_PX = 0.5
 
-# Distance of the outermost sample from the edge of a patch of 10 px; the limits of positions apply to this size.
+# Distance between the outermost sample and the edge of a patch 10 px wide, in px. Position limits apply to this size.
 CLEARANCE_PX = 1.75
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
-# Largest RMS distance of the tags from homography and distortion. Waves of 6 mm and a curl of 10 mm give 2.3 px.
+# Largest RMS residual of the tags or the outline after the lens fit. A sheet with waves of 6 mm and a curl of 10 mm
+# gives 2.3 px.
 MAX_TAG_RESIDUAL_PX = 8.0
 
-# Minimum correlation of patch colours with the prediction; another order of patches gives about 0.
+# Minimum correlation of measured and predicted patch colours. A chart with another order of patches gives about 0.
 MIN_AGREEMENT = 0.8
 
-# Minimum for a chart without tags. Its colours are in smooth order, so the colour model can partly fit even an object
-# that covers it. 0.99 is usual.
+# The same for a chart without tags; 0.99 is usual. Neighbouring patches of such a chart have similar colours, so the
+# colour model can partly fit even an object in front of the chart.
 MIN_PLAIN_AGREEMENT = 0.95
 
 MIN_GOOD_BLOCKS = 0.75  # Minimum share of blocks of patches that match the chart (judgement)
 
-# Largest RMS residual of the blocks for patches of 10 px: twice the tolerance of the samples, and more than ten times
-# the residual of simulated sheets with waves of 3 mm.
+# Largest RMS residual of the blocks, for patches of 10 px. Waves of 3 mm give less than a tenth of it in simulation.
 MAX_BLOCK_RESIDUAL_PX = 0.5
 
-# Maximum number of steps; each compares all patches. A flat print takes two or three, a curled one five.
+# Maximum number of Gauss-Newton steps. A flat print needs two or three steps, a curled print five.
 _GAUSS_NEWTON_STEPS = 8
 
-# The iteration ends when the RMS and the largest movement of a step are below these. The remaining error is at most
-# half as large, like the error of the map itself. A curled rim converges last, and the RMS does not show it.
-_SETTLED_PX, _SETTLED_CELL_PX = 0.015, 0.15
+# The iteration ends if the RMS and the largest movement of a step are both below these limits. The second limit is
+# for a curled rim: it converges last and hardly changes the RMS.
+_CONVERGED_RMS_PX, _CONVERGED_MAX_PX = 0.015, 0.15
 
-# Standard uncertainty of a tag corner: measured 0.085 px under white, 0.20 px under a dim illuminant.
+# Standard uncertainty of a tag corner. Measured: 0.085 px under white, 0.20 px under a dim illuminant.
 _TAG_SIGMA_PX = 0.15
 
-_LEAST_TAG_SIGMA_PX = 0.03  # Lower bound of `_TAG_SIGMA_PX`: error of the detector in the sharpest frames
+_MIN_TAG_SIGMA_PX = 0.03  # Standard uncertainty of a tag corner in the sharpest frames
 
 _OUTLINE_SIGMA_PX = 0.1  # Standard uncertainty of an outline point, across the outline (judgement)
 
-# An outline point is an outlier if its distance from the curve of its side exceeds 5 standard deviations and 1 px.
+# An outline point is an outlier if it is further from the curve of its side than both limits.
 _OUTLIER_SIGMAS, _OUTLIER_PX = 5.0, 1.0
 
-# Blur, in patches, of the first steps for a chart without tags, from coarse to fine.
+# Blur of the first steps for a chart without tags, in patch widths, from coarse to fine.
 _COARSE_BLURS = (1.0, 1.0, 0.6)
 
-# The chart is refused if at least this number and this share of the tested areas appear to be displaced by one patch.
-# In correct registrations of simulated rooms there is none.
-_FEW_SLIPPED, _SLIPPED_SHARE = 2, 0.015
+# The frame is refused if at least this number and at least this share of the tested areas appear to be displaced by
+# one patch.
+_MIN_DISPLACED_AREAS, _MIN_DISPLACED_SHARE = 2, 0.015
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,18 +87,18 @@ class Registration:
     lens: Lens  # homography and lens distortion of the green channel
     displacement: Displacement  # smooth correction of `lens` for a sheet that is not flat
     lateral: LateralColour  # shifts of red and blue against green
-    # (N, 2) distance of the tag corners from the final map; without tags, distance across the outline
+    # (N, 2) distance of the tag corners from the final map; without tags, distance of the outline points
     marks_residual_px: _Array
-    lens_residual_px: float  # RMS distance of the same marks from `lens` alone
-    blocks: Blocks  # quality, block by block
+    lens_residual_px: float  # RMS distance of the tag corners or outline points from `lens` alone
+    blocks: Blocks  # match and residual of each block of patches
     place_errors: PlaceErrors  # standard uncertainty of positions
     colours: ColourModel  # camera RGB of the printed codes in this frame
-    # (N,) patches, in chart order, with a colour far from `colours`: covered, damaged or misprinted
+    # (N,) patches with a colour far from `colours`, in chart order: covered, damaged or misprinted
     mismatched_cells: _Mask
     agreement: float  # correlation of patch colours with `colours`, −1 … 1; mean of the channels that receive light
-    blur_px: float  # σ of the edges of the tags or of the patch area
+    blur_px: float  # standard deviation of the blur at the edges of the tags or of the patch area
     cell_px: float  # shorter side of the smallest patch, half-size px
-    shift_px: tuple[float, float] = (0.0, 0.0)  # movement (dx, dy) since the registered frame
+    shift_px: tuple[float, float] = (0.0, 0.0)  # movement (dx, dy) of the chart since the registered frame
 
     def to_pixels(self, points_mm: npt.ArrayLike, channel: Channel = "G") -> _Array:
         """Map points on the print to the frame.
@@ -108,7 +107,7 @@ class Registration:
         ----------
         points_mm : (N, 2) float
         channel : {"R", "G", "B"}
-            The lens shifts red and blue against green. Samples are taken at the positions of green.
+            Lateral colour of the lens shifts red and blue against green. Samples are taken at the positions of green.
 
         Returns
         -------
@@ -119,20 +118,21 @@ class Registration:
         return positions_px + self.lateral.shift_px(positions_px, channel)
 
     def uncertainty_px(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the standard uncertainty (N,) float64, px, of positions of points (N, 2) mm, in green."""
+        """Return the standard uncertainty (N,) float64, px, of the green positions of points (N, 2) mm."""
         return self.place_errors.at(points_mm)
 
     def expanded_px(self, points_mm: npt.ArrayLike) -> _Array:
         """Return the expanded uncertainty (N,) float64, px, of points (N, 2) mm, scaled to patches of 10 px.
 
-        The coverage factor is 2; it is 3 for a chart without tags, because its outline alone shows short waves.
+        The coverage factor is 2 with tags. It is 3 without tags, because only the outline shows short waves of the
+        sheet.
         """
         coverage_factor = 2 if self.framing.field is None else 3
         return coverage_factor * self.uncertainty_px(points_mm) / self.clearance
 
     @property
     def position_uncertainty_px(self) -> tuple[float, float]:
-        """Standard uncertainty of positions, px: median of the chart, and 99th percentile of the outermost patches."""
+        """Standard uncertainty of positions, px: median of all, 99th percentile of the outermost patches."""
         error = self.place_errors.error_px
         rim = np.concatenate([error[1], error[-2], error[:, 1], error[:, -2]])
         return float(np.median(error)), float(np.percentile(rim, 99))
@@ -148,14 +148,14 @@ class Registration:
 
     @property
     def block_rms_px(self) -> float:
-        """RMS displacement, px, that the good blocks would still need: an estimate of the registration error."""
+        """RMS residual, px, of the good blocks: an estimate of the registration error."""
         return rms(self.blocks.residual_px[self.blocks.good])
 
     @property
     def clearance(self) -> float:
-        """Distance of the samples from the patch edges relative to patches of 10 px, ≥ 1.
+        """Distance of the samples from the patch edges, divided by this distance in a patch of 10 px; at least 1.
 
-        Limits for positions are multiplied by it: an error of one pixel has no effect in a patch of 100 px.
+        Limits for positions are multiplied by it, because large patches tolerate larger position errors.
         """
         return max(1.0, (self.cell_px / 2 - SAMPLE_REACH_PX) / CLEARANCE_PX)
 
@@ -169,7 +169,7 @@ def register(
 ) -> Registration:
     """Register the chart in a frame.
 
-    Takes about 5 s on one processor for 32 768 patches and 18 megapixels, three times as long without tags.
+    A full chart with tags takes about 5 s on one processor. A chart without tags takes three times as long.
 
     Parameters
     ----------
@@ -182,7 +182,8 @@ def register(
         For a chart without tags: corners of the patch area in half-size px, clockwise from the printed top left,
         accurate to 20 px.
     neighbour : Registration, optional
-        Another frame of the session. A chart without tags is searched near its position there and needs no corners.
+        Registration of another frame of the session. A chart without tags is searched near its position in that
+        frame; corners are then not needed.
 
     Raises
     ------
@@ -197,14 +198,15 @@ def register(
     lateral = LateralColour.unmeasured((width, height))
     if framing.field is None:
         marks = _tag_corners(framing, chart)
-        lens, residual = fit_lens(marks.points_mm, marks.places_px.sum(axis=0), (width, height))
+        lens, residual = fit_lens(marks.points_mm, marks.positions_px.sum(axis=0), (width, height))
     else:
-        field, _, lateral = _clear_edges(framing.field, planes, blur, lateral)
-        # One pixel away from its position, an edge appears softer than it is, and a soft edge is located further out.
+        field, _, lateral = _refine_outline(framing.field, planes, blur, lateral)
+        # The blur is measured again at the refined edges. A blur measured one pixel beside an edge is too large, and
+        # would shift the edges outwards.
         refined_blur = blur_px(replace(framing, field=field))
-        field, _, lens, _ = _field_through_lens(field, (width, height))
-        field, marks, lateral = _clear_edges(_completed(field, lens, chart), planes, refined_blur, lateral)
-        field, is_inlier, lens, residual = _field_through_lens(field, (width, height))
+        field, _, lens, _ = _fit_outline(field, (width, height))
+        field, marks, lateral = _refine_outline(_add_missing_outline(field, lens, chart), planes, refined_blur, lateral)
+        field, is_inlier, lens, residual = _fit_outline(field, (width, height))
         framing, marks = replace(framing, field=field), marks.select(is_inlier)
     lens_rms = rms(residual)
     if lens_rms > MAX_TAG_RESIDUAL_PX:
@@ -214,25 +216,23 @@ def register(
             "chart.json matches it"
         )
     if chart.tags:
-        # A small residual shows that the corners are more precise than usual. Waves of the sheet would hide it.
-        marks = marks.with_errors_scaled(
-            float(np.clip(2 * lens_rms, _LEAST_TAG_SIGMA_PX, _TAG_SIGMA_PX)) / _TAG_SIGMA_PX
-        )
-    cell_px = _cell_px(lens, chart)
+        # A small residual shows that the tag corners are more precise than usual.
+        marks = marks.with_errors_scaled(float(np.clip(2 * lens_rms, _MIN_TAG_SIGMA_PX, _TAG_SIGMA_PX)) / _TAG_SIGMA_PX)
+    cell_px = _shortest_cell_side_px(lens, chart)
     _require_size_and_focus(cell_px, blur, frame_name)
     matcher = Matcher(chart, planes, lens, marks, lateral, blur, cell_px)
     if chart.tags:
         matcher.match_coarsely(frame_name)
     else:
         for blur_cells in _COARSE_BLURS:
-            matcher.follow(blur_cells)
+            matcher.step_blurred(blur_cells)
             matcher.refit_lens()
     for _ in range(_GAUSS_NEWTON_STEPS):
         rms_step_px, largest_step_px = matcher.step()
-        if rms_step_px < _SETTLED_PX and largest_step_px < _SETTLED_CELL_PX:
+        if rms_step_px < _CONVERGED_RMS_PX and largest_step_px < _CONVERGED_MAX_PX:
             break
-    registration = _registered(chart, framing, matcher, marks, lens_rms)
-    _judge(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, frame_name)
+    registration = _registration(chart, framing, matcher, marks, lens_rms)
+    _require_match(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, frame_name)
     if not chart.tags:
         _refuse_displaced_areas(matcher, registration.mismatched_cells, frame_name)
     return registration
@@ -247,15 +247,16 @@ def _tag_corners(framing: ChartPose, chart: Chart) -> Anchors:
     return Anchors(corners_mm, in_channel[:, None, None] * corners_px, in_channel[:, None, None, None] * information)
 
 
-def _clear_edges(
+def _refine_outline(
     field: DetectedField, planes: list[Plane], blur: float, lateral: LateralColour
 ) -> tuple[DetectedField, Anchors, LateralColour]:
-    """Return the refined field, its edge points channel by channel, and the lateral colour shifts."""
+    """Return the patch area with a refined outline, the outline points in each channel, and the lateral colour."""
     edges_px, heights = refine_edges(planes, field.outline_px, field.normals, blur)
     # Points without a clear edge in any channel are dropped.
     is_clear = np.asarray(heights.any(axis=0))
     edges_px, heights, normals = edges_px[:, is_clear], heights[:, is_clear], field.normals[is_clear]
-    # Half the step height doubles the error. The weights of the channels add up to 1, as all contain the same edge.
+    # The error of an edge is inversely proportional to its step height. The weights add up to 1, because the channels
+    # show the same edge and are not independent.
     weight = heights**2 / (heights**2).sum(axis=0)
     information_across = np.einsum("ni,nj->nij", normals, normals) / _OUTLINE_SIGMA_PX**2
     marks = Anchors(field.outline_mm[is_clear], edges_px, weight[..., None, None] * information_across)
@@ -265,9 +266,10 @@ def _clear_edges(
     return replace(field, outline_mm=marks.points_mm, outline_px=green, normals=normals), marks, lateral
 
 
-def _completed(field: DetectedField, lens: Lens, chart: Chart) -> DetectedField:
-    """Return the field with the missing points of its outline, at the positions that the lens predicts."""
-    # Next to pale patches the outline is traced one patch too far inside or not at all; one channel may show it.
+def _add_missing_outline(field: DetectedField, lens: Lens, chart: Chart) -> DetectedField:
+    """Add the missing points of the outline, at the positions that the lens predicts."""
+    # Next to pale patches, the outline is not detected or is one patch too far inside. The refinement may still find
+    # the edge there in one channel.
     corners = field_mm(chart)
     share = (np.arange(SIDE_POINTS) + 0.5)[:, None] / SIDE_POINTS
     sides: list[tuple[_Array, _Array, _Array]] = []
@@ -289,12 +291,12 @@ def _completed(field: DetectedField, lens: Lens, chart: Chart) -> DetectedField:
     return replace(field, outline_mm=points, outline_px=places, normals=normals)
 
 
-def _field_through_lens(field: DetectedField, frame_size: tuple[int, int]) -> tuple[DetectedField, _Mask, Lens, _Array]:
-    # Outliers are marks in the margin.
+def _fit_outline(field: DetectedField, frame_size: tuple[int, int]) -> tuple[DetectedField, _Mask, Lens, _Array]:
+    # Outliers are pins, text or lines in the margin of the sheet.
     is_kept = np.ones(len(field.outline_mm), dtype=np.bool_)
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
     for _ in range(2):
-        # Curled corners and their neighbours deviate by pixels: compare points with the curve of their side.
+        # Curled corners deviate from the lens by several px, so points are compared with the curve of their side.
         distance_px = field.curve_residual_px(residual)
         is_inlier = distance_px <= max(_OUTLIER_SIGMAS * robust_sigma(distance_px), _OUTLIER_PX)
         is_kept[is_kept] = is_inlier
@@ -309,17 +311,17 @@ def _field_through_lens(field: DetectedField, frame_size: tuple[int, int]) -> tu
 
 
 def _refuse_displaced_areas(matcher: Matcher, mismatched_cells: _Mask, frame_name: str) -> None:
-    slipped_mm, area_count = matcher.slipped(mismatched_cells)
-    if len(slipped_mm) >= max(_FEW_SLIPPED, _SLIPPED_SHARE * area_count):
-        x, y = slipped_mm[0]
+    displaced_mm, area_count = matcher.find_displaced_areas(mismatched_cells)
+    if len(displaced_mm) >= max(_MIN_DISPLACED_AREAS, _MIN_DISPLACED_SHARE * area_count):
+        x, y = displaced_mm[0]
         raise RegistrationError(
-            f"{frame_name}: {len(slipped_mm)} of {area_count} areas of the chart match the neighbouring patches, "
+            f"{frame_name}: {len(displaced_mm)} of {area_count} areas of the chart match the neighbouring patches, "
             f"the first near ({x:.0f}, {y:.0f}) mm from the top-left corner of the sheet; uncover the print, hang it "
             "flatter, and check that chart.json describes the printed positions"
         )
 
 
-def _cell_px(lens: Lens, chart: Chart) -> float:
+def _shortest_cell_side_px(lens: Lens, chart: Chart) -> float:
     half = np.array(chart.cell_mm) / 2
     across = [lens.to_pixels(chart.centres_mm + half * sign) for sign in ((-1, 0), (1, 0), (0, -1), (0, 1))]
     sides = [np.linalg.norm(across[1] - across[0], axis=1), np.linalg.norm(across[3] - across[2], axis=1)]
@@ -341,7 +343,7 @@ def _require_size_and_focus(cell_px: float, blur: float, frame_name: str) -> Non
         )
 
 
-def _registered(chart: Chart, framing: ChartPose, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
+def _registration(chart: Chart, framing: ChartPose, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
     measured, expected, paper = matcher.patches()
     is_inside = np.asarray(np.isfinite(measured).all(axis=1))
     residual = marks.residual_px(matcher.in_channels(marks.points_mm))
@@ -349,7 +351,7 @@ def _registered(chart: Chart, framing: ChartPose, matcher: Matcher, marks: Ancho
     blocks = matcher.blocks()
     if not chart.tags:
         is_inside[: chart.colour_count] &= ~mismatched_cells
-        blocks = _without_mismatched_cells(blocks, mismatched_cells, chart)
+        blocks = _reduce_scores_of_mismatched(blocks, mismatched_cells, chart)
     return Registration(
         framing=framing,
         lens=matcher.lens,
@@ -367,15 +369,16 @@ def _registered(chart: Chart, framing: ChartPose, matcher: Matcher, marks: Ancho
     )
 
 
-def _without_mismatched_cells(blocks: Blocks, mismatched_cells: _Mask, chart: Chart) -> Blocks:
-    # If colours are in smooth order, neighbouring patches look alike in a wide window, also if they are covered.
+def _reduce_scores_of_mismatched(blocks: Blocks, mismatched_cells: _Mask, chart: Chart) -> Blocks:
+    # On a chart without tags, neighbouring patches have similar colours. The score of a wide window therefore stays
+    # high if patches are covered.
     block_of_cell = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm)[1])
     cell_count = np.maximum(np.bincount(block_of_cell, minlength=len(blocks.score)), 1)
     mismatched_share = np.bincount(block_of_cell, mismatched_cells, minlength=len(blocks.score)) / cell_count
     return replace(blocks, score=blocks.score * (1 - mismatched_share))
 
 
-def _judge(registration: Registration, minimum_agreement: float, frame_name: str) -> None:
+def _require_match(registration: Registration, minimum_agreement: float, frame_name: str) -> None:
     blocks = registration.blocks
     if registration.agreement < minimum_agreement:
         raise not_this_chart(

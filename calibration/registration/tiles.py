@@ -1,9 +1,9 @@
-"""Compare a rectified frame with the predicted print on a raster on the print: first by blocks, then by tiles.
+"""Compare a rectified frame with the predicted print, in blocks or in tiles of a raster on the print.
 
-`find_blocks` locates blocks of patches by correlation, up to 1.5 patches away. `compare_tiles` estimates the movement
-of each tile with one step of the method of Lucas and Kanade, with local gain and offset, and Huber weights (B. D. Lucas
-and T. Kanade, "An iterative image registration technique", IJCAI 1981). Units: raster elements, mm on the print, and
-half-size pixels.
+`find_blocks` locates blocks of patches by correlation. `compare_tiles` estimates the displacement of each tile with one
+step of the method of Lucas and Kanade, with local gain and offset, and Huber weights (B. D. Lucas and T. Kanade, "An
+iterative image registration technique", IJCAI 1981). Lengths are in raster elements, mm on the print, or half-size
+pixels. `information` is the inverse covariance of a displacement; `pull` is information times displacement.
 """
 
 from __future__ import annotations
@@ -23,30 +23,29 @@ _Array = npt.NDArray[np.float64]
 
 ToPixels = Callable[[_Array], _Array]  # from points (N, 2) mm to positions (N, 2) px
 
-# Distance of the nodes on which maps are computed, in elements. Bilinear interpolation errors are below 0.001 px.
+# Spacing of the nodes where the map is calculated exactly, in elements. Positions between nodes are interpolated.
 _LATTICE_STRIDE = 8
 
-# Minimum correlation of frame and predicted print for a tile to move the map (judgement).
+# Minimum correlation of frame and predicted print around a tile; other tiles are not used (judgement).
 MIN_SCORE = 0.5
 
-# Minimum valid share of the window of a tile for a valid score (judgement).
-_LEAST_SHARE = 0.25
+# Minimum share of comparable elements in the window of a tile; otherwise its score is 0 (judgement).
+_MIN_SHARE = 0.25
 
 _Float = npt.NDArray[np.float32]
 
-# Minimum correlation of a located block, and of a block with few patches. Other charts give about 0; blocks of few
-# patches may reach 0.4 by chance.
-_LEAST_SCORE, _LEAST_SCORE_OF_FEW = 0.3, 0.5
+# Minimum correlation of a located block, and of a block with few patches. Another chart gives about 0, but blocks with
+# few patches may reach 0.4 by chance.
+_MIN_BLOCK_SCORE, _MIN_SMALL_BLOCK_SCORE = 0.3, 0.5
 
 _FEW_CELLS = 64  # Blocks with fewer patches need the higher correlation
 
-_NEIGHBOUR_BLOCKS = 1.6  # Maximum distance of neighbours, in block spacings: the eight blocks around
+_NEIGHBOUR_BLOCKS = 1.6  # Distance limit of neighbours, in block spacings: it includes the eight surrounding blocks
 
-# Largest difference of movement between a block and its neighbours, in patches; more is a wrong match.
-_MOST_DISAGREEMENT = 0.6
+# Largest difference between the displacements of a block and its neighbours, in patches; above it, the match is wrong.
+_MAX_DISAGREEMENT_CELLS = 0.6
 
-# Standard uncertainty of the position of a block, in patches: 0.1 elements of the coarse raster, or 0.2 px of patches
-# of 10 px (simulated frames).
+# Standard uncertainty of the position of a block, in patches (simulated frames).
 _MOVE_SIGMA_CELLS = 0.02
 
 _Mask = npt.NDArray[np.bool_]
@@ -54,7 +53,7 @@ _Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """A raster on the print: element (row, column) has its centre at low + (column + ½, row + ½) · step."""
+    """Raster on the print. The centre of element (row, column) is `low_mm` + (column + ½, row + ½) · `step_mm`."""
 
     low_mm: _Array  # (2,) corner of the first element, x then y
     step_mm: _Array  # (2,) width and height of an element
@@ -62,11 +61,11 @@ class Raster:
 
     @classmethod
     def of(cls, low_mm: _Array, step_mm: _Array, size: _Array) -> Raster:
-        """Return the raster that begins at `low_mm` (2,) and has `size` (columns, rows) elements of `step_mm` (2,)."""
+        """Return the raster with corner `low_mm` (2,) and `size` (columns, rows) elements of `step_mm` (2,)."""
         return cls(low_mm, step_mm, (int(size[1]), int(size[0])))
 
     def point(self, column: float, row: float) -> _Array:
-        """Return the position (2,) float64 mm of a border between elements."""
+        """Return the position (2,) float64 mm of raster coordinates; integers are borders between elements."""
         return self.low_mm + np.array([column, row]) * self.step_mm
 
     def tiles(self, size: int) -> tuple[int, int]:
@@ -86,8 +85,8 @@ class Raster:
         points = self.low_mm + np.stack([x.ravel(), y.ravel()], axis=-1) * self.step_mm
         return to_pixels(points).reshape(rows, columns, 2), stride
 
-    def element_places(self, to_pixels: ToPixels) -> _Float:
-        """Return positions (H, W, 2) float32 px of all elements, x then y: bilinear between exact nodes."""
+    def element_positions(self, to_pixels: ToPixels) -> _Float:
+        """Return positions (H, W, 2) float32 px of all elements, x then y, interpolated between exact nodes."""
         lattice, stride = self._lattice(to_pixels)
         rows, columns = ((np.arange(length) + 0.5) / stride for length in self.shape)
         i, j = rows.astype(int), columns.astype(int)
@@ -96,7 +95,7 @@ class Raster:
         return (along[i] * (1 - v) + along[i + 1] * v).astype(np.float32)
 
     def smooth(self, function: ToPixels) -> _Float:
-        """Evaluate a slowly varying function of points (N, 2) mm, values (N, K), on the raster (H, W, K) float32."""
+        """Evaluate a smooth function of points (N, 2) mm, with values (N, K), on the raster: (H, W, K) float32."""
         rows, columns = (max(2, length // 32) for length in self.shape)
         y, x = np.mgrid[:rows, :columns]
         low, high = self.low_mm + self.step_mm / 2, self.low_mm + (np.array(self.shape[::-1]) - 0.5) * self.step_mm
@@ -115,7 +114,7 @@ class Raster:
         height, width = self.shape
         low = (centres_mm - sizes_mm / 2 - self.low_mm) / self.step_mm
         high = (centres_mm + sizes_mm / 2 - self.low_mm) / self.step_mm
-        # Edges that differ from a border by rounding are put on the border.
+        # Edges that differ from an element border only by rounding are moved to the border.
         low, high = (np.where(np.abs(v - np.rint(v)) < 1e-3, np.rint(v), v) for v in (low, high))
         first = np.floor(low).astype(int)
         reach = int((np.ceil(high) - first).max())
@@ -139,14 +138,14 @@ class Raster:
         )
 
     def near(self, cover: sparse.csr_array, per_cell: int) -> _Mask:
-        """Return elements (H, W) bool covered by a patch or within a fifth of a patch of one."""
-        # The margin beyond may contain rulers, text or pins.
+        """Return the elements (H, W) bool on a patch, or at most a fifth of a patch width away from it."""
+        # The margin outside these elements may contain rulers, text or pins.
         covered = (np.diff(cover.indptr) > 0).reshape(self.shape).astype(np.uint8)
         reach = 2 * max(1, round(0.2 * per_cell)) + 1
         return np.asarray(cv2.dilate(covered, np.ones((reach, reach), dtype=np.uint8))).astype(np.bool_)
 
     def outside_tags(self, tags: tuple[Tag, ...]) -> _Mask:
-        """Return elements (H, W) bool outside of all tags and their white rims."""
+        """Return the elements (H, W) bool outside of all tags and their white rims."""
         is_outside = np.ones(self.shape, dtype=bool)
         for tag in tags:
             rim = np.ptp(tag.corners_mm, axis=0).max() / TAG_MODULES * 1.5
@@ -170,16 +169,17 @@ def tiles(shape: tuple[int, int], size: int, margin: int) -> Generator[tuple[sli
 
 
 def jacobians(to_pixels: ToPixels, points_mm: _Array, step_mm: _Array) -> _Array:
-    """Return ∂(x, y) px / ∂(column, row), (N, 2, 2), at points (N, 2) mm; elements of `step_mm` (2,)."""
+    """Return ∂(x, y) px / ∂(column, row), (N, 2, 2), at points (N, 2) mm; `step_mm`: (2,) size of an element."""
     reach = np.diag(step_mm)
     slopes = [(to_pixels(points_mm + reach[axis]) - to_pixels(points_mm - reach[axis])) / 2 for axis in (0, 1)]
     return np.stack(slopes, axis=-1)
 
 
 def to_pixel_units(sums: _Array, jacobians: _Array) -> tuple[_Array, _Array]:
-    """Return information (N, 2, 2) px⁻² and pull (N, 2) px⁻¹ of sums (N, 5) in raster elements.
+    """Convert sums (N, 5) in raster elements to information (N, 2, 2) px⁻² and pull (N, 2) px⁻¹.
 
-    The sums are xx, xy, yy, xe, ye of the image slopes x, y and the error e; `jacobians` (N, 2, 2) belong to the map.
+    The sums are xx, xy, yy, xe, ye of the image slopes x, y and the error e. `jacobians`: (N, 2, 2) of the map, px per
+    element.
     """
     inverse = np.linalg.inv(jacobians)
     matrix = sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
@@ -227,7 +227,7 @@ class TileComparison:
         return self.of(self.points_mm, information, pull - np.einsum("cnij,cnj->cni", information, shift), self.score)
 
     def weakened(self, times: float) -> TileComparison:
-        """Return the comparison with the weight of fewer measurements, if `times` of them repeat each other."""
+        """Return the comparison with information divided by `times`, if `times` measurements have the same error."""
         information, pull = self.of_channels
         return self.of(self.points_mm, information / times, pull / times, self.score)
 
@@ -243,11 +243,11 @@ def compare_tiles(
     cell_px: float,
     without_gradient: bool = False,
 ) -> TileComparison:
-    """Estimate the displacement of the map in tiles of size × size elements.
+    """Estimate the displacement of the frame from the map in tiles of size × size elements.
 
-    `expected`, `measured`: (H, W, 3) float32 counts, the predicted print and the frame. `weight`: (H, W) float32, 1 for
-    comparable elements, else 0. `window`: width of the window for gain and offset. `to_pixels`: the map, from points
-    (N, 2) mm to positions (N, 2) px. `without_gradient`: ignore even gradients.
+    `expected`, `measured`: (H, W, 3) float32 counts, the predicted print and the rectified frame. `weight`: (H, W)
+    float32, 1 for comparable elements, else 0. `window`: width of the window for gain and offset, in elements.
+    `to_pixels`: the map, from points (N, 2) mm to positions (N, 2) px. `without_gradient`: ignore even gradients.
     """
     mean = _LocalMean(weight, window, without_gradient)
     agreeing = np.zeros(raster.shape, dtype=np.float32)
@@ -277,12 +277,12 @@ def compare_tiles(
         for term, (first, second) in enumerate(((gx, gx), (gx, gy), (gy, gy), (gx, error), (gy, error))):
             sums[channel, ..., term] = sums_of(huber * first * second, size)
     score = agreeing / np.sqrt(np.maximum(expected_power * measured_power, np.float32(1e-6)))
-    score *= mean.share > _LEAST_SHARE
+    score *= mean.share > _MIN_SHARE
     points = raster.points_of_tiles(size)
     slopes = jacobians(to_pixels, points, raster.step_mm)
     units = [to_pixel_units(channel_sums.reshape(-1, 5), slopes) for channel_sums in sums]
     information, pull = (np.stack(values) for values in zip(*units, strict=True))
-    # If raster elements are finer than photosites, the noise of neighbouring elements is correlated.
+    # If raster elements are smaller than pixels, the noise of neighbouring elements is correlated.
     repeat = max(1.0, (size / cell_px) ** 2)
     score = tile_middles(score, size).ravel().astype(np.float64)
     good = (score >= MIN_SCORE) / repeat
@@ -292,17 +292,17 @@ def compare_tiles(
 class _LocalMean:
     """Weighted mean over a window around each element."""
 
-    def __init__(self, weight: _Float, window: int, keep_gradient: bool) -> None:
+    def __init__(self, weight: _Float, window: int, includes_gradient: bool) -> None:
         self._weight, self._window = weight, window
         # (H, W) valid share of each window
         self.share = np.maximum(box_mean(weight, window), np.float32(1e-3))
         rows, columns = (np.flatnonzero(weight.any(axis=axis)) for axis in (1, 0))
         self._inner: tuple[slice, slice] | None = None
-        if keep_gradient and min(len(rows), len(columns)) > window:
+        if includes_gradient and min(len(rows), len(columns)) > window:
             self._inner = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
     def __call__(self, image: _Float) -> _Float:
-        """Return the mean (H, W). With `keep_gradient`, an even gradient is its own mean up to the border."""
+        """Return the mean (H, W). With `includes_gradient`, it contains even gradients, also at the border."""
         if self._inner is None:
             return np.asarray(box_mean(image * self._weight, self._window) / self.share, dtype=np.float32)
         margin = self._window // 2 + 1
@@ -316,15 +316,15 @@ class _LocalMean:
 class LocatedBlocks:
     """Positions of blocks of patches, located by correlation."""
 
-    centres_mm: _Array  # (B, 2) expected position on the print
-    moves_mm: _Array  # (B, 2) distance of the located position from it
-    score: _Array  # (B,) correlation with the print, −1 … 1
-    least_score: float = _LEAST_SCORE  # blocks with a lower score are not used
+    centres_mm: _Array  # (B, 2) expected positions on the print
+    moves_mm: _Array  # (B, 2) located minus expected positions
+    score: _Array  # (B,) correlation of frame and predicted print, −1 … 1
+    least_score: float = _MIN_BLOCK_SCORE  # blocks with a lower score are not used
 
     def information(self, moves_px: _Array, spacing_mm: _Array, cell_px: float) -> _Array:
         """Return the inverse covariance (B, 2, 2) float64 px⁻² of the positions of the blocks.
 
-        `moves_px`: (B, 2) moves in the frame. `spacing_mm`: (2,) distance of blocks in x and y.
+        `moves_px`: (B, 2) `moves_mm` converted to the frame. `spacing_mm`: (2,) distance of blocks in x and y.
         """
         score = np.where(self.score > self.least_score, self.score, 0.0)
         weight = _weights(self.centres_mm, moves_px, score, spacing_mm, cell_px)
@@ -336,11 +336,11 @@ def find_blocks(
 ) -> LocatedBlocks:
     """Locate square blocks of the print in a rectified frame by normalised correlation.
 
-    `expected`, `measured`: (H, W, 3) float32 counts, the predicted print and the frame. `is_inside`: (H, W) bool,
-    elements inside the frame; other blocks are dropped. `size`, `reach`: block size and search range in elements.
-    `cells`: number of patches in a block.
+    `expected`, `measured`: (H, W, 3) float32 counts, the predicted print and the rectified frame. `is_inside`: (H, W)
+    bool, elements inside the frame; blocks with other elements are dropped. `size`, `reach`: block size and search
+    range in elements. `cells`: number of patches in a block.
     """
-    # The square root makes noise uniform (Anscombe 1948) and reduces the effect of illumination gradients.
+    # The square root makes the noise uniform (Anscombe 1948) and reduces the effect of illumination gradients.
     expected, measured = (np.sqrt(np.maximum(image, 0)) for image in (expected, measured))
     centres: list[_Array] = []
     moves: list[_Array] = []
@@ -358,7 +358,7 @@ def find_blocks(
         np.array(centres).reshape(-1, 2),
         np.array(moves).reshape(-1, 2) * raster.step_mm,
         np.array(scores),
-        _LEAST_SCORE if cells >= _FEW_CELLS else _LEAST_SCORE_OF_FEW,
+        _MIN_BLOCK_SCORE if cells >= _FEW_CELLS else _MIN_SMALL_BLOCK_SCORE,
     )
 
 
@@ -368,7 +368,7 @@ def _peak(match: _Array) -> tuple[float, _Array]:
     for axis, (index, length) in enumerate(((int(column), match.shape[1]), (int(row), match.shape[0]))):
         if 0 < index < length - 1:
             line = match[row, index - 1 : index + 2] if axis == 0 else match[index - 1 : index + 2, column]
-            # vertex of the parabola through three values
+            # Vertex of the parabola through three values.
             bend = line[0] - 2 * line[1] + line[2]
             if bend < 0:
                 position[axis] += 0.5 * (line[0] - line[2]) / bend
@@ -378,11 +378,11 @@ def _peak(match: _Array) -> tuple[float, _Array]:
 def _weights(centres_mm: _Array, moves_px: _Array, score: _Array, spacing_mm: _Array, cell_px: float) -> _Array:
     distance = np.abs(centres_mm[:, None] - centres_mm[None]) / spacing_mm
     is_near = np.asarray((distance < _NEIGHBOUR_BLOCKS).all(axis=-1))
-    # squared score, or 0 if the neighbours of a block disagree
+    # The weight is the squared score, or 0 if the displacement of a block differs from the median of its neighbours.
     weight = score**2
     for index in range(len(score)):
         neighbours = is_near[index] & (score > 0)
         median_move = np.median(moves_px[neighbours], axis=0) if neighbours.sum() >= 3 else moves_px[index]
-        if np.linalg.norm(moves_px[index] - median_move) > _MOST_DISAGREEMENT * cell_px:
+        if np.linalg.norm(moves_px[index] - median_move) > _MAX_DISAGREEMENT_CELLS * cell_px:
             weight[index] = 0.0
     return weight

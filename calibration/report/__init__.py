@@ -1,1 +1,1 @@
-"""The page that shows how a table was measured."""
+"""The report on the measurement of a look-up table (LUT)."""

@@ -1,7 +1,7 @@
 """Plots of the report, each on its own Matplotlib figure (`foundation.plots.draw_png`).
 
-A frame is drawn at half size, in linear camera RGB: one pixel per 2×2 block, without interpolation (paper, section 3.3:
-"simple subsampling and debayering").
+Frames are drawn at half size, one pixel per 2×2 block, without interpolation (paper, section 3.3: "simple subsampling
+and debayering").
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from foundation.plots import CHANNEL_INK, FAINT, INK, MARK, draw_squares
 
 _PAPER_PERCENTILE = 99.5  # Percentile used as paper white; brighter pixels are highlights or hot photosites
 
-_GAMMA = 2.2  # Approximates the sRGB curve for display
+_GAMMA = 2.2  # Exponent that approximates the sRGB curve for display
 _Mask = npt.NDArray[np.bool_]
 
 
 def viewable(picture: _Image) -> _Image:
-    """Return an image (H, W, 3) float32 for display, 0 … 1: each channel relative to paper white, roughly sRGB."""
+    """Return an image (H, W, 3) float32 for display, 0 … 1: each channel relative to paper white, gamma-encoded."""
     white = np.maximum(np.percentile(picture[::4, ::4].reshape(-1, 3), _PAPER_PERCENTILE, axis=0), 1)
     return np.clip(picture / white, 0, 1).astype(np.float32) ** np.float32(1 / _GAMMA)
 
@@ -124,11 +124,11 @@ def _draw_magnified(
 
 
 def draw_residuals(figure: Any, chart: Chart, registration: Registration) -> None:
-    """Draw the displacement beyond the lens, and its residual in each block of patches."""
+    """Draw the displacement of the sheet, and the residual of each block of patches."""
     figure.set_size_inches(10, 3.9)
     left_axes, right_axes = figure.subplots(1, 2)
     page_w, page_h = chart.page_mm
-    # The displacement is measured at patches and tags only; the bare margin would be extrapolated.
+    # The margin is not drawn, because the displacement is only measured at patches and tags.
     half = np.array(chart.cell_mm) / 2
     left_mm, top_mm = (float(value) for value in chart.centres_mm.min(axis=0) - half)
     right_mm, bottom_mm = (float(value) for value in chart.centres_mm.max(axis=0) + half)
@@ -142,7 +142,7 @@ def draw_residuals(figure: Any, chart: Chart, registration: Registration) -> Non
     grid = np.s_[4::8, 4::8]
     arrows = moved.reshape(*x.shape, 2)[grid]
     left_axes.quiver(x[grid], y[grid], arrows[..., 0], -arrows[..., 1], color="white", alpha=0.85, width=0.0028)
-    left_axes.set(title="displacement beyond the lens", xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0))
+    left_axes.set(title="displacement of the sheet", xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0))
     blocks = registration.blocks
     good = blocks.good
     residual = blocks.residual_px[good]
@@ -204,7 +204,7 @@ def draw_chromaticities(
     for axes, linear, title, coloured in (
         (panels[0], projected, "as projected", False),
         (panels[1], white, source, False),
-        (panels[2], white, "the same, in colour", True),
+        (panels[2], white, "ground truth in colour", True),
     ):
         lit = linear.sum(axis=1) > 0
         r, _, b = (linear[lit] / linear[lit].sum(axis=1, keepdims=True)).T
@@ -272,7 +272,7 @@ def draw_budget(figure: Any, budget: Budget, levels: _Array) -> None:
     cells.legend(frameon=False, fontsize=8)
 
 
-_MAX_LABELLED_BARS = 40  # Largest number of illuminants with separate, numbered bars
+_MAX_LABELLED_BARS = 40  # Largest number of illuminants for which bars are separate and numbered
 
 
 def _ring(axes: Any, x: float, y: float, text: str) -> None:
@@ -290,7 +290,7 @@ def _ring(axes: Any, x: float, y: float, text: str) -> None:
     )
 
 
-_INWARD_FROM = 0.7  # Fraction of the plot beyond which labels are placed inwards
+_INWARD_FROM = 0.7  # Fraction of the axis above which labels are placed on the inner side of their point
 
 
 def _ring_largest(axes: Any, values: Any, table: TableMeasurements, smallest: bool = False) -> None:
@@ -303,7 +303,7 @@ def _ring_largest(axes: Any, values: Any, table: TableMeasurements, smallest: bo
 
 
 def draw_course(figure: Any, table: TableMeasurements) -> None:
-    """Draw black level, movement, blur, white, deviation of patches and number of references, frame by frame.
+    """Draw black level, movement, blur, white, deviation of patches and number of references of each frame.
 
     Rings mark the worst frames.
     """
@@ -344,12 +344,12 @@ def draw_course(figure: Any, table: TableMeasurements) -> None:
             )
         white.legend(frameon=False, fontsize=8)
     white.axhline(0, color="0.8", linewidth=0.8, zorder=0)
-    white.set(title="bare paper under white", ylabel="change since the first, %", xlabel="frame")
+    white.set(title="bare paper under white", ylabel="change since the first white frame, %", xlabel="frame")
     _draw_consistency(consistency, count, table)
 
 
 def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], table: TableMeasurements) -> None:
-    axes.set(title="deviation of patches from their codes", ylabel="%", xlabel="frame")
+    axes.set(title="deviation from similar patches", ylabel="%", xlabel="frame")
     if not has_enough_cells(len(table.registration.mismatched_cells)):
         axes.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=axes.transAxes)
         return
@@ -365,7 +365,7 @@ def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], table: TableMea
 
 _MIN_LEVEL = 1.0  # Lowest level drawn on the logarithmic axes, counts
 
-# Percentile of position errors at which the scale ends; the outermost patches have much larger errors.
+# Percentile of the position errors where the colour scale ends; the outermost patches have much larger errors.
 _SCALE_PERCENTILE = 99.0
 
 _Image = npt.NDArray[np.float32]
@@ -373,9 +373,9 @@ _Array = npt.NDArray[np.float64]
 
 
 def draw_errors(figure: Any, table: TableMeasurements, chart: Chart) -> None:
-    """Draw the deviation of patches from their codes' colours, and the uncertainty of their positions, over the print.
+    """Draw the deviation from patches with similar codes, and the uncertainty of their positions, over the print.
 
-    Rings mark the worst patches. On charts with too few colours the first plot is empty, with a note.
+    Rings mark the worst patches. On charts with too few colours the first plot contains only a note.
     """
     page_w, page_h = chart.page_mm
     figure.set_size_inches(10, 0.2 + 4.6 * page_h / page_w)
@@ -396,7 +396,7 @@ def draw_errors(figure: Any, table: TableMeasurements, chart: Chart) -> None:
     image = draw_squares(right, chart.page_mm, chart.centres_mm, side_mm, error, 4.1, cmap="cividis", vmin=0, vmax=top)
     figure.colorbar(image, ax=right, label="half-size px", shrink=0.8, extend="max")
     _mark(right, chart.centres_mm[int(np.argmax(error))])
-    left.set(title="deviation of patches from their codes", ylabel="mm")
+    left.set(title="deviation from similar patches", ylabel="mm")
     right.set(title="standard uncertainty of positions")
     for axes in (left, right):
         axes.set(xlabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal", facecolor="#f2f3f5")
@@ -454,7 +454,7 @@ def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransf
         right.semilogx(levels, levels / np.sqrt(variances), ".", color=CHANNEL_INK[channel], markersize=4)
         right.semilogx(grid, grid / np.sqrt(model), "-", color=CHANNEL_INK[channel], linewidth=0.9)
     left.set(title="variance of one sample", xlabel="counts above black", ylabel="counts²")
-    right.set(title="signal to noise of one sample", xlabel="counts above black")
+    right.set(title="signal-to-noise ratio of one sample", xlabel="counts above black")
     left.legend(frameon=False, fontsize=8, labelcolor=INK)
     for axes in (left, right):
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -463,12 +463,12 @@ def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransf
         axes.grid(color=FAINT, alpha=0.25, linewidth=0.5)
 
 
-_MIN_LEVELS = 6  # Levels needed to report the curve's three parameters (judgement: twice as many)
+_MIN_LEVELS = 6  # Minimum number of levels for reporting the three parameters of the curve (judgement)
 
-# Smallest radius of a circle, relative to the page width: a circle around one patch is invisible in a thumbnail.
+# Smallest radius of a circle, relative to the page width. A circle around a single patch would be too small to see.
 _MIN_RADIUS = 0.012
 
-LabelledPosition = tuple[str, PrintPosition]  # Short label, and position
+LabelledPosition = tuple[str, PrintPosition]
 
 
 def draw_positions(figure: Any, picture: _Image, chart: Chart, registration: Registration, positions: Any) -> None:
@@ -489,7 +489,7 @@ def draw_positions(figure: Any, picture: _Image, chart: Chart, registration: Reg
     )
     angles = np.linspace(0, 2 * np.pi, 90)
     unit_circle = np.column_stack([np.cos(angles), np.sin(angles)])
-    # Figures with the same position share its circle.
+    # Deviations at the same position share a circle.
     numbers_by_circle: dict[tuple[float, float, float], list[int]] = {}
     for label, position in positions:
         numbers_by_circle.setdefault((position.x_mm, position.y_mm, position.size_mm), []).append(numbers[label])
@@ -502,7 +502,7 @@ def draw_positions(figure: Any, picture: _Image, chart: Chart, registration: Reg
         axes.plot(ring[:, 0], ring[:, 1], color=MARK, linewidth=1.8)
         if tuple(shown_numbers) not in labelled:
             labelled.add(tuple(shown_numbers))
-            # If a circle extends beyond the frame, the number is placed at its visible part.
+            # If part of a circle is outside the frame, the number is placed at the visible part.
             visible = ring[((ring > (0.02 * width, 0.03 * height)) & (ring < (width, height))).all(axis=1)]
             corners = visible if len(visible) else ring
             x, y = corners[np.argmin(corners.sum(axis=1))]

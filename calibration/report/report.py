@@ -1,7 +1,7 @@
 """The report of a LUT: `report.html` for people and `report.json` for programs (docs/formats.md).
 
-`report.html` is one file. It starts with the verdict, the remedies and the most important plots. All figures follow in
-groups, each with its plots (`Figure.drawing`).
+`report.html` is one file. It starts with the verdict, the remedies and the most important plots. Then all figures
+follow in groups; each group has its own plots (`Figure.drawing`).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from foundation.files import write_atomic
 from foundation.pages import render
 from foundation.plots import draw_png
 
-# Points across and down the page reported in `chart_places`: enough for its pose and approximate curl.
+# Number of points across and down the page in `chart_places`. They describe the pose of the sheet and most of its curl.
 GRID_POINTS = (7, 5)
 
 _Array = npt.NDArray[np.float64]
@@ -123,7 +123,7 @@ def _causes_json(result: BuildResult) -> list[dict[str, Any]]:
 
 
 def _grid_json(table: TableMeasurements) -> dict[str, Any]:
-    """Return the pixel positions of grid points of the page in the frame registered first, half-size px."""
+    """Return the positions of a grid of points of the page in the registered frame, half-size px."""
     registration = table.registration
     width, height = registration.colours.page_mm
     across, down = GRID_POINTS
@@ -199,7 +199,7 @@ def _channels_json(table: TableMeasurements) -> dict[str, Any]:
 
 
 def _finite_values(values: _Array) -> list[float | None]:
-    """Return values (N,) with six significant digits; None for values that JSON cannot hold."""
+    """Return values (N,) with six significant digits; None for NaN and infinity, which JSON cannot contain."""
     return [_rounded(value) if np.isfinite(value) else None for value in values.tolist()]
 
 
@@ -207,7 +207,7 @@ def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-MAX_FRAMES = 4  # Frames drawn with their positions; each is read again
+MAX_FRAMES = 4  # Largest number of frames drawn with marked positions; each frame is read again
 
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
@@ -218,22 +218,22 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
 
 
 def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
-    """Return the plots: the main ones first, then those of the groups."""
+    """Return all plots: first the main plots, then the plots of the groups."""
     table = result.figures
     chart, registration = session.chart, table.registration
     frame = half_size(read_raw(session.folder / table.session.registered_file))
-    primaries = "Fields of the primaries were not measured: frames of red, green and blue alone are missing."
+    primaries = "Flat fields of the primaries were not measured, because frames of red, green or blue are missing."
     if table.primaries is not None:
         primaries = (
-            f"The fields of red, green and blue differ by up to {100 * table.primaries.difference:.1f} %; each patch "
-            "is corrected for the field of its colour."
+            f"The flat fields of red, green and blue light differ by up to {100 * table.primaries.difference:.1f} %; "
+            "the correction of each patch depends on its colour."
         )
     return [
         *_main_pictures(result, session, frame),
         _Picture(
             "Residuals of the registration",
-            "Left: displacement of the patches from a plane imaged by the lens, which is the waviness of the paper. "
-            "Right: residual of each block of patches, magnified; short arrows in random directions are noise.",
+            "Left: distance of the patches from their positions on a flat sheet, caused by waves of the paper. "
+            "Right: residual of each block of patches, magnified. Short arrows in random directions are noise.",
             draw_png(draw_residuals, chart, registration),
             "geometry",
             "residuals",
@@ -241,24 +241,24 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
         _Picture(
             "Light on the print",
             "Flat field of the registered frame, from its white references. Samples and ground truth are divided by "
-            f"it. Contours are 2 % apart. {primaries}",
+            f"the flat field. Contour lines are 2 % apart. {primaries}",
             draw_png(draw_field, chart, table.registered_frame.paper.field),
             "light",
             "field",
         ),
         _Picture(
             "Course of the session",
-            "Black level, movement and blur of the chart, bare paper under white, deviation of patches from their "
-            "codes' colours, and number of white references, frame by frame; rings mark the worst frames. A loss of "
-            "focus affects all patches; a hand or a shadow on the print affects a block of patches.",
+            "Black level, movement and blur of the chart, level of bare paper under white, deviation from patches "
+            "with similar codes, and number of white references in each frame. Rings mark the worst frames. A loss of "
+            "focus affects all patches; a hand or a shadow affects a block of patches.",
             draw_png(draw_course, table),
             "radiometry",
             "course",
         ),
         _Picture(
             "Uncertainty of the ground truth",
-            f"Left: expanded uncertainty (k = {COVERAGE:g}) of each illuminant, divided among its components by their "
-            "squares; the worst illuminant first. Right: expanded uncertainty of each patch mean against its level, "
+            f"Left: expanded uncertainty (k = {COVERAGE:g}) of each ground truth, the largest first. Each bar is "
+            "divided in proportion to the squares of its components. Right: expanded uncertainty of each patch mean, "
             "without noise. " + "; ".join(f"{item.title}: {item.source}" for item in table.budget.components) + ".",
             draw_png(draw_budget, table.budget, table.cells.levels),
             "truth",
@@ -275,33 +275,33 @@ def _main_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np.
     source = f"recorded by the {table.session.camera}"
     expanded = table.budget.expanded_deg
     worst = int(np.argmax(expanded)) if len(expanded) > 1 else None
-    ring_text = "" if worst is None else f" A circle marks illuminant {worst}, with the most uncertain ground truth."
+    ring_text = "" if worst is None else f" A circle marks illuminant {worst}, with the largest uncertainty."
     return [
         _Picture(
             "The registered chart",
-            f"{table.session.registered_file}, contrast stretched, with the detected tags. Below, magnified: outlines "
-            f"of patches and pixels of their {window**2} samples, in the corners and in the centre.",
+            f"{table.session.registered_file} with the detected tags and increased contrast. Below, magnified: "
+            f"outlines of patches and windows of their {window**2} samples, in the corners and in the centre.",
             draw_png(draw_registration, frame, chart, registration, window),
             name="chart",
         ),
         _Picture(
             "The illuminants",
-            "rb-chromaticities of the illuminants as projected, as recorded on bare paper (the ground truth), and the "
-            f"latter in their colours. Rings are black bodies.{ring_text}",
+            "rb-chromaticities of the illuminants. Left: as projected. Centre: as recorded on bare paper, which is the "
+            f"ground truth. Right: the ground truth, in colour. Rings are black bodies.{ring_text}",
             draw_png(draw_chromaticities, codes, black_body, table.lights.white, source, worst),
             name="lights",
         ),
         _Picture(
             "Errors of patches",
-            "Left: deviation of patches and their neighbours from the same codes elsewhere on the sheet. Right: "
-            "uncertainty of the position of each patch. Rings mark the worst patches.",
+            "Left: deviation of the neighbourhood of each patch from patches with similar codes elsewhere. "
+            "Right: uncertainty of the position of each patch. Rings mark the worst patches.",
             draw_png(draw_errors, table, chart),
             name="errors",
         ),
         _Picture(
             "Noise",
-            "Left: variance of one sample against its level, as medians of patches of similar levels, and the fitted "
-            "curve (read noise, photons, photosite response). Right: the resulting signal-to-noise ratio.",
+            "Left: variance of one sample against its level, and fitted curve (read noise, photon noise and response "
+            "of photosites). Points are medians of patches with similar levels. Right: signal-to-noise ratio.",
             draw_png(draw_noise, cell_noise(frame, chart, registration, window), table.sensor.transfer, window**2),
             name="noise",
         ),
@@ -319,16 +319,16 @@ def _position_pictures(result: BuildResult, session: Session) -> list[_Picture]:
         picture = half_size(read_raw(session.folder / file))
         png = draw_png(draw_positions, picture, session.chart, result.figures.registration, positions)
         caption = (
-            f"{file}, contrast stretched. Circles mark deviations beyond their limits, at their positions in the frame "
-            "registered first."
+            f"{file} with increased contrast. Circles mark deviations beyond their limits, at their positions in the "
+            "frame registered first."
         )
         pictures.append(_Picture(f"Position: {Path(file).stem}", caption, png))
     return pictures
 
 
-MAX_UNFIT = 200  # Unfit patches listed on the page; lut.json lists all
+MAX_UNFIT = 200  # Largest number of unfit patches listed on the page; lut.json lists all
 
-# Outcomes as on the page, the worst first.
+# Words for the outcomes on the page, the worst outcome first.
 _OUTCOME_WORDS: dict[Outcome, str] = {"refuse": "refuse", "accept with remarks": "remark", "accept": "accept"}
 
 _OUTCOME_ORDER: tuple[Outcome, ...] = tuple(_OUTCOME_WORDS)
@@ -341,13 +341,13 @@ class _Picture:
     heading: str
     caption: str
     png: bytes
-    group: Group | None = None  # The group in which it is folded; None for pictures at the top
+    group: Group | None = None  # Group that contains the plot; None for plots at the top
     name: Drawing | None = None  # As in `Figure.drawing`
 
 
 @dataclass(frozen=True)
 class _Row:
-    """A judged value; beyond its limit with remedy and position."""
+    """A judged value. Remedy and position are empty if it is within its limit."""
 
     judged: JudgedValue
     remedy: str
@@ -359,10 +359,7 @@ def page(
     pictures: Sequence[_Picture],
     position_pictures: Sequence[_Picture] = (),
 ) -> str:
-    """Return the text of `report.html`: verdict, remedies, main plots, then all figures in groups.
-
-    `position_pictures`: frames with marked deviations.
-    """
+    """Return the text of `report.html`; `position_pictures` are frames with marked deviations."""
     table, verdict = result.figures, result.verdict
     causes, beyond_count = findings(verdict, table), len(verdict.refused) + len(verdict.remarks)
     rows = [
@@ -384,7 +381,7 @@ def page(
         sentence={
             "accept": "Accepted: every figure is within its limit.",
             "accept with remarks": f"Accepted with remarks on {len(verdict.remarks)} of {len(verdict.rows)} figures.",
-            "refuse": f"Refused for {len(verdict.refused)} of {len(verdict.rows)} figures.",
+            "refuse": f"Refused because of {len(verdict.refused)} of {len(verdict.rows)} figures.",
         }[verdict.outcome],
         usable=not verdict.refused,
         todo=rows[:beyond_count],
@@ -400,7 +397,7 @@ def page(
 
 
 def summary(table: TableMeasurements, group: Group | None = None) -> list[SummaryRow]:
-    """Return the summary lines of all figures, or of a group; for a check, only of figures that one frame shows."""
+    """Return the summary rows of all figures or of a group; for one frame, only rows of figures that it can show."""
     session = table.session
     figures = [figure for figure in FIGURES if not table.is_of_one_frame or figure.of_one_frame != "unknown"]
     lines = (line for figure in figures if group in (None, figure.group) for line in figure.lines)
@@ -433,7 +430,7 @@ def _group_content(
 
 
 def _retake(result: BuildResult) -> dict[str, Any] | None:
-    """Return the frames to take again, and the command; None if this does not help."""
+    """Return the frames to take again, and the command; None if there are no such frames."""
     records = retaken_frames(result.verdict, result.figures)
     if not records:
         return None

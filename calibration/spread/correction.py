@@ -2,9 +2,9 @@
 
 The correction subtracts one number per patch and channel from the samples: the light that the lens added, minus the
 light that it removed. The noise of samples is unchanged. The light is calculated from the levels of the uncorrected
-frame, as in the fit of the point spread, so it includes light that is scattered twice.
+frame. `calibration.spread.fitting` defines near and far kernels, their shares, and the T unknowns of a channel.
 
-Conventions: P patches as in `PrintedGrid`; counts above black level; half-size pixels.
+Levels are counts above black level; lengths are half-size pixels; P is the number of patches in `PrintedGrid`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from calibration.registration.register import Registration
 from calibration.sampling import Sites, sites_at
 from calibration.spread.fitting import (
     FAR_PX,
+    FRAME_TERMS,
     NEAR_PX,
-    PLACES,
     TERMS,
     USUAL_VEIL,
     PointSpread,
@@ -34,8 +34,8 @@ from calibration.spread.fitting import (
     channels_alike,
     far_groups,
     fit_spread,
+    frame_terms,
     kernel_of_terms,
-    place_terms,
 )
 from calibration.spread.predicting import VARYING_BITS, LevelModel
 from calibration.spread.surroundings import (
@@ -53,20 +53,21 @@ _MARGIN_PX = 12.0  # minimum distance of background samples from the edge of the
 
 _LATTICE_PX = 24  # distance between neighbouring background samples
 
-# Minimum number of references of one colour per term of the smooth component over the page.
-_LEAST_REFERENCES = 3
+# Minimum number of references of one colour, per coefficient of the polynomial that is removed from their levels.
+_MIN_REFERENCES = 3
 
-# Highest order over the page of a smooth change of the white references, to which the flat field is fitted.
+# Highest order of the polynomial over the page for white references. The flat field is fitted to these references, so
+# smooth changes of their levels are part of the flat field.
 _FIELD_ORDER = 6
 
-_LEAST_LEVEL = 1e-3  # lower bound of levels in relative errors
+_MIN_LEVEL = 1e-3  # lower bound of levels as divisors of relative errors
 
 _Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class PrintView:
-    """Properties common to all frames of a session: grid of the print, usual light, and background samples."""
+    """Properties common to all frames of a session: grid of the print, first flat field, background samples."""
 
     grid: PrintedGrid
     whites: slice  # indices of the white references
@@ -85,7 +86,7 @@ class PrintView:
         shape: tuple[int, int],
         window: int,
     ) -> PrintView:
-        """Return the view of a session; `photosites_px` (3, 2): offset of photosites from the centre of a block."""
+        """Return the view of a session; `field`: flat field of its first frame."""
         low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
         light = UsualLight.of(grid, field.at(grid.points_mm), field.at(np.clip(grid.slots_mm, low, high)))
         background = _background_sites(grid, registration, shape, window)
@@ -111,7 +112,7 @@ class PrintView:
             offset_px=np.ascontiguousarray(offset),
             pitch_px=pitch,
             frame_slots=float(np.prod(self.frame_px) / pitch.prod(axis=1).mean()),
-            places=place_terms(window_px.astype(np.float64), self.frame_px),
+            places=frame_terms(window_px.astype(np.float64), self.frame_px),
             whites=self.whites,
             light=self.light,
         )
@@ -135,7 +136,7 @@ class FrameCorrection:
         return FrameCorrection(around, around.near(amounts[:, :, :near]), far, veil, view.background)
 
     def added(self, levels: FrameLevels) -> _Array:
-        """Return the light that the lens added to each patch, (P, 3) float64 counts; negative if it removed more."""
+        """Return the light that the lens added to each patch minus the light that it removed, (P, 3) float64 counts."""
         around, inks = self.around, self.around.inks(levels)
         added = self.near.at(levels, inks) - self.near.total * levels.patches
         if self.far.any():
@@ -169,14 +170,14 @@ class LensFigures:
     """Effect of the lens and its correction under the illuminants of the measurement, for patches above 300 counts."""
 
     rms: float  # RMS change of patch means relative to paper; 0 without correction
-    worst: float  # largest change
+    worst: float  # largest change of a patch mean
     # RMS error of patch means after correction: uncertainty of the shares and uncorrected veiling glare
     residual: float
     residual_worst: float  # the same for the worst patch
     worst_level: float  # level of the worst patch relative to paper
     veil: float  # most likely veiling glare relative to the mean light of the frame, worst channel
     veil_error: float  # its standard uncertainty
-    beyond_cell: float  # largest share of light from outside of the patch, in the worst sample
+    beyond_cell: float  # share of light from outside of the patch, in the worst sample
     left_in_worst: float  # excess of this share over the mean of the window; it is not corrected
     # (3, 3) covariance of the relative errors of white (ground truth), with usual veiling glare if not measured
     white_covariance: _Array
@@ -195,7 +196,7 @@ class LensFigures:
         mean = np.nanmean(levels, axis=0)
         levels = np.where(np.isfinite(levels), levels, mean)
         white = USUAL_VEIL**2 * channels_alike() * np.outer(1 - mean, 1 - mean)
-        cells = USUAL_VEIL * mean * np.abs(1 / np.maximum(levels, _LEAST_LEVEL) - 1)
+        cells = USUAL_VEIL * mean * np.abs(1 / np.maximum(levels, _MIN_LEVEL) - 1)
         return LensFigures(
             *(0.0,) * 9,
             white_covariance=white,
@@ -207,7 +208,7 @@ class LensFigures:
 
     @property
     def uncorrected_in_worst(self) -> float:
-        """Uncorrected share of light from outside of the patch, in the worst sample, without the sharp core."""
+        """Share of light from outside of the patch that is not corrected, in the worst sample."""
         return max(self.left_in_worst, 0.0) if self.corrected else self.beyond_cell
 
     @property
@@ -222,7 +223,7 @@ class LensFigures:
 
     @property
     def remaining_worst(self) -> float:
-        """The same for the worst patch."""
+        """Error of the worst patch that the lens still causes, relative to paper."""
         return self._remaining(self.worst, self.residual_worst)
 
     def _remaining(self, size: float, residual: float) -> float:
@@ -282,7 +283,7 @@ def measure_spread(
     """Measure the point spread on frames; None if no frame is bright enough.
 
     `least_counts`: minimum counts of paper in a used channel, and of patches in the figures. `reason_uncorrected`:
-    reason for not correcting frames with a proven spread, or "".
+    reason why a proven spread is not corrected, or "".
     """
     if not frames:
         return None
@@ -291,11 +292,11 @@ def measure_spread(
     scales: list[_Array] = []
     paper_changes: dict[int, _Array] = {}
     references: list[ReferenceData] = []
-    # for each near kernel: its share is 1 in the whole frame, and the others are 0
-    unit_shares = np.zeros((len(NEAR_PX), PLACES, 3, len(NEAR_PX)))
+    # One set of shares for each near kernel: its share is 1 in the whole frame, and all other shares are 0.
+    unit_shares = np.zeros((len(NEAR_PX), FRAME_TERMS, 3, len(NEAR_PX)))
     unit_shares[:, 0] = np.eye(len(NEAR_PX))[:, None]
     near = [around.near(amounts) for amounts in unit_shares]
-    # brightest frame of each channel, with the number of averaged frames as factor
+    # Each channel is measured in its brightest frame; an average of n frames counts as n times as bright.
     brightest = np.argmax([frame.white * frame.frames for frame in frames], axis=0)
     for index, frame in enumerate(frames):
         channels = np.flatnonzero((brightest == index) & (frame.white >= least_counts))
@@ -335,7 +336,7 @@ def _reference_data(frame: SpreadFrame, around: Surroundings, channel: int, chan
     for colour in range(int(frame.printed.max()) + 1):
         selected = np.flatnonzero((frame.printed == colour) & frame.usable)
         order = _white_order(len(selected)) if whites[selected].any() else 1
-        if len(selected) >= _LEAST_REFERENCES * len(page_powers(order)):
+        if len(selected) >= _MIN_REFERENCES * len(page_powers(order)):
             positions_mm = around.grid.points_mm[selected]
             field = frame.field[selected, channel]
             references.append(ReferenceData(channel, level[selected], changes[selected], field, positions_mm, order))
@@ -354,11 +355,11 @@ def _changes(
     bits: int,
     channel: int,
 ) -> tuple[_Array, _Array, _Array]:
-    """Return the changes of a channel if the share of an unknown is 1, for each of T unknowns.
+    """Return the effects on a channel of T unknowns, each with the share 1.
 
-    1. (T, P), change of levels: added light minus the change of the white references, to which the field is fitted.
-    2. (T,), mean change of the white references, by which all levels change.
-    3. (T,), relative change of white: this mean minus the light that a patch loses.
+    1. (T, P), change of levels: added light minus the change of the flat field, which is fitted to white references.
+    2. (T,), mean change of the white references.
+    3. (T,), relative change of the counts of paper: the second value minus the light that a patch loses.
     """
     count, points = 8**bits, around.grid.points_mm
     levels = frame.levels.patches[:, channel]
@@ -394,7 +395,7 @@ def _changes(
 
 
 def _kernel_light(frame: SpreadFrame, around: Surroundings, near: list[NearLight]) -> list[tuple[_Array, _Array]]:
-    """Return for each kernel the light at the patches (P, 3), counts, and the share (P, 3) of a patch's own light."""
+    """Return for each kernel its light at the patches (P, 3), counts, and the weight (P, 3) of the patch itself."""
     levels = frame.levels
     inks = around.inks(levels)
     image = around.image(levels, inks)
@@ -424,13 +425,13 @@ def _figures(
     for item, scale in zip(data, scales, strict=True):
         expected = LevelModel.of(item.level, item.usable, bits).predicted
         is_bright = item.usable & (item.level * scale[-1] > least_counts)
-        # Levels are relative to paper, so the mean change of white is a part of each change.
+        # Levels are relative to paper, so the mean change of the white references is subtracted.
         change = (item.changes[is_bright] - np.outer(expected[is_bright], scale[:-1])) / item.level[is_bright, None]
         terms = channel_terms(item.channel)
         corrected.append(change @ spread.shares[terms])
         error2.append(((change @ mean_square[np.ix_(terms, terms)]) * change).sum(axis=1))
         levels.append(item.level[is_bright])
-        change = item.changes / np.maximum(item.level, _LEAST_LEVEL)[:, None] - scale[:-1]
+        change = item.changes / np.maximum(item.level, _MIN_LEVEL)[:, None] - scale[:-1]
         cells[item.channel] = np.sqrt(((change @ total_error[np.ix_(terms, terms)]) * change).sum(axis=1))
     correction, error, level = np.concatenate(corrected), np.concatenate(error2), np.concatenate(levels)
     worst, mean = _beyond_cell(around)
@@ -461,16 +462,16 @@ def _figures(
 
 
 def _white_covariance(shares_error: _Array, paper_changes: list[_Array]) -> _Array:
-    """Return the covariance (3, 3) of relative errors of paper, from its changes (T,) per channel."""
+    """Return the covariance (3, 3) of the relative errors of paper, from its changes (T,) in each channel."""
     change = np.zeros((3, TERMS))
     for channel in range(3):
         change[channel, channel_terms(channel)] = paper_changes[channel]
-    # Light that leaves the frame is no error: it makes all patches of a channel darker by the same factor.
+    # Light that leaves the frame causes no error, because it makes all patches of a channel darker by the same factor.
     return change @ shares_error @ change.T
 
 
 def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:
-    """Return the share (N,) of each near kernel from outside of a patch: in the worst sample, and window mean."""
+    """Return the fraction (N,) of each near kernel outside of the patch: in the worst sample, and on average."""
     cell, reach = float(around.pitch_px.min()), around.window // 2
     worst, mean = np.empty(len(NEAR_PX)), np.empty(len(NEAR_PX))
     # The worst sample is a corner pixel, with 0.5 px of rounding towards the corner.
@@ -485,7 +486,7 @@ def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:
 def _background_sites(grid: PrintedGrid, registration: Registration, shape: tuple[int, int], window: int) -> Sites:
     rows, columns = shape
     width, height = grid.pitch_mm
-    # Area of the sheet: from the outermost patches, straight lines to its edge, and a margin.
+    # Background samples must be outside of the sheet and of a margin around it.
     low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
     sheet = grid.slots_mm[grid.blank_shares[..., 2].ravel() < 0.5]
     low, high = np.minimum(low, sheet.min(axis=0)), np.maximum(high, sheet.max(axis=0))

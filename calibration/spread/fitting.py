@@ -1,19 +1,19 @@
-"""Fit the point spread of the lens outside of its sharp core by regression on the light around each patch.
+"""Fit the point spread of the lens outside of its sharp core, by regression on the light around each patch.
 
-A share is the part of a point's light that the lens spreads over a Gaussian with a given σ. Sums of Gaussians describe
-any spread that decreases with distance. Light that the lens spreads uniformly over the frame is veiling glare (ISO
-9358).
+The point spread is modelled as a sum of Gaussian kernels with fixed σ. Such a sum describes any spread that decreases
+with distance. Light that the lens spreads uniformly over the frame is veiling glare (ISO 9358); it is treated as the
+last kernel. The share of a kernel is the fraction of the light of a point that it spreads.
 
 The colours of a chart are in random order, so the neighbours of a patch are unrelated to its code. The level of a patch
-is predicted from similar codes; the difference is regressed on the light that each kernel would add.
+is predicted from similar codes. The residual is regressed on the light that each kernel would add.
 
-- No regressor contains the noise of the patch itself: predicted levels are used for it.
-- Errors of the field and unevenness of the print are smooth factors of levels; they are fitted too, with a prior near
-  0. Veiling glare differs from them, because it adds equally to dark and bright patches.
-- The share of a far kernel is not negative. A kernel that gains less than `LEAST_GAIN` is dropped. If any kernel is
-  proven, far kernels and veiling glare have their most likely shares, with usual lenses as prior.
+- The regressors are calculated from predicted levels, so they do not contain the noise of the patch itself.
+- Errors of the flat field and unevenness of the print multiply levels by smooth factors, which are fitted as well.
+  Veiling glare differs from them, because it adds equally to dark and bright patches.
+- A kernel is proven if its χ² gain is at least `LEAST_GAIN`; other kernels are dropped. If any kernel is proven, far
+  kernels and veiling glare get their most likely shares, with usual lenses as prior. These shares are not negative.
 
-C patches in the order of colour indices; T unknowns of a channel.
+Arrays have C patches in the order of colour indices, or T unknowns of a channel.
 """
 
 from __future__ import annotations
@@ -31,161 +31,160 @@ from calibration.spread.predicting import VARYING_BITS, LevelModel
 from experiment.measures.least_squares import page_polynomial, page_powers
 from foundation.robust import sigma_by_level
 
-# σ of the near kernels, half-size px: from the first effect of neighbours on the 25 samples to the width of a slot (the
-# place of a patch). With factors of two, their sum fits a smooth spread within the measurement uncertainty.
+# σ of the near kernels, half-size px. The smallest brings the first light of neighbours to the samples of a patch; the
+# largest spreads light over a slot, which is the area of one patch.
 NEAR_PX = (1.5, 3.0, 6.0)
 
-# σ of the far kernels, half-size px: one slot, two, a tenth of the height of a full chart, and the widest that can be
-# separated from veiling glare. Power laws are mixtures of them.
+# σ of the far kernels, half-size px: one slot, two slots, a tenth of the height of a full chart, and the widest kernel
+# that can be separated from veiling glare.
 FAR_PX = (12.0, 24.0, 96.0, 384.0)
 
-# Terms of the share of a near kernel over the frame: a polynomial, quadratic along both axes (`place_terms`), because
-# aberrations grow with the field angle and lenses may be decentred. Wider kernels come from scatter, which is uniform.
-PLACES = 9
+# Number of terms that describe a near share over the frame: a polynomial, quadratic along both axes (`frame_terms`),
+# because aberrations grow with the field angle. The shares of far kernels are constant over the frame.
+FRAME_TERMS = 9
 
-_NEAR_TERMS = PLACES * len(NEAR_PX)
+_NEAR_TERMS = FRAME_TERMS * len(NEAR_PX)
 
 _CHANNEL_TERMS = _NEAR_TERMS + len(FAR_PX) + 1
 
-# Number of unknowns: for each channel near kernels (all terms), far kernels, and veiling glare.
+# Number of unknown shares: for each channel, all terms of near kernels, then far kernels, then veiling glare.
 TERMS = 3 * _CHANNEL_TERMS
 
-# Minimum χ² gain of a kernel: four standard uncertainties of its share. All kernels together must gain as much in
-# cross-validation.
+# Minimum χ² gain of a proven kernel: its share is then four standard uncertainties. In cross-validation, all kernels
+# together must gain as much.
 LEAST_GAIN = 16.0
 
 _Array = npt.NDArray[np.float64]
 
-# Largest misfit for separating veiling glare from other light; simulated rooms with veiling glare have 1.5 to 3.3.
+# Largest misfit (`PointSpread.misfit`) with which veiling glare can be separated from other light. Simulations with
+# veiling glare have at most 3.3.
 MOST_MISFIT = 5.0
 
 LEAST_COUNTS = 300.0  # minimum counts of paper above black level in a used channel
 
-# Prior standard deviation of the coefficients of a smooth factor of levels: errors of the field and unevenness of the
+# Prior standard deviation of the coefficients of the smooth factors: errors of the flat field and unevenness of the
 # print (judgement).
 USUAL_UNEVENNESS = 0.003
 
-LOOSE_UNEVENNESS = 0.03  # the same for several primaries with different fields (judgement)
+LOOSE_UNEVENNESS = 0.03  # the same for light of several primaries with different flat fields (judgement)
 
 FOLDS = 4  # folds of cross-validation over parts of the print
 
-# Number of tiles along the longer page side; each tile belongs to one fold, and each fold covers the whole print.
+# Number of tiles along the longer page side. Each tile belongs to one fold, and each fold covers the whole print.
 _PATCHWORK = 10
 
-# Orders of polynomials over the page: of light outside of all kernels, of smooth factors of levels (as of a field), and
-# of ink density (level times its logarithm).
+# Orders of polynomials over the page: of light that no kernel explains, of smooth factors of levels, and of changes of
+# ink density (level times its logarithm).
 _SHAPE_ORDER, _FACTOR_ORDER, _INK_ORDER = 4, 6, 2
 
-DARK_LEVEL = 0.1  # level of dark patches, relative to paper, for comparing the sensor's nonlinearity
+DARK_LEVEL = 0.1  # level relative to paper where nonlinearity of the sensor may hide veiling glare
 
-_LEAST_BEND = 1e-4  # lower bound of the standard deviation of the sensor's nonlinearity
+_MIN_BEND = 1e-4  # lower bound of the standard deviation of the sensor's nonlinearity
 
-# Largest prior standard deviation of a share: the equations can then be solved for kernels with little effect, too.
+# Prior standard deviation of shares without other prior. It is wide, and makes the equations solvable for kernels with
+# little effect.
 _PRIOR_SHARE = 0.1
 
-# Prior standard deviation of veiling glare: 0.3 to 1.5 % by ISO 9358 and ISO 18844. It is used unchanged if the chart
-# cannot show veiling glare.
+# Prior standard deviation of veiling glare; lenses have 0.3 to 1.5 % (ISO 9358, ISO 18844). It is reported unchanged if
+# the chart cannot show veiling glare.
 USUAL_VEIL = 0.01
 
-_WIDE_KERNELS = 2  # number of far kernels that resemble smooth light on the print, like veiling glare
+_WIDE_KERNELS = 2  # number of far kernels that are so wide that they resemble other smooth light
 
-# Prior standard deviation of the share of each far kernel, in addition to its expectation from the previous kernel.
+# Prior standard deviation of the share of each far kernel, about its expectation from the previous kernel.
 _FAR_STEPS = (0.01, 0.01, 0.004, 0.003)
 
-# Factors of `_FAR_STEPS` for lenses with scatter, with equal prior odds.
+# Factors of `_FAR_STEPS` for lenses with little, usual and much scatter; their prior probabilities are equal.
 _FAR_SIZES = (0.3, 1.0, 3.0)
 
-# Factor of the usual near and far kernels for a lens without scatter, and of the usual veiling glare for a lens without
-# veiling glare: coated glass without dust.
+# Factor of the usual shares for a lens without scatter, and of the usual veiling glare for a lens without veiling
+# glare.
 _CLEAN = 0.001
 
-# Prior probability of a lens without scatter, for all charts and for charts with few colours (judgement). Otherwise
-# charts with few colours would report several times the actual error.
+# Prior probability of a lens without scatter, for charts with many and with few colours (judgement). The first value
+# would give charts with few colours an uncertainty of several times the actual error.
 _CLEAN_ODDS, _CLEAN_ODDS_OF_FEW = 0.3, 0.7
 
-# Prior probability of a lens with scatter but without veiling glare, on charts with few colours (judgement).
+# Prior probability that a lens with scatter has no veiling glare, on charts with few colours (judgement).
 _CLEAR_ODDS_OF_FEW = 0.3
 
-# Exponents of the decrease of scattered light with distance, and factor of the far kernels: polish, scratches and dust
-# (J. E. Harvey, "Light-scattering characteristics of optical surfaces", 1976; I. R. King, "The profile of a star
-# image", 1971), and aberrations, which end within a slot.
+# Assumed laws of scattered light: exponent of its decrease with distance, and factor of the far kernels. Two laws are
+# for polish, scratches and dust (J. E. Harvey, "Light-scattering characteristics of optical surfaces", 1976; I. R.
+# King, "The profile of a star image", 1971). The third is for aberrations, which end within a slot.
 _LAWS = ((2.0, 1.0), (3.0, 1.0), (3.0, _CLEAN))
 
 _POWER_ODDS = 0.5  # prior probability that scattered light follows one of these laws (judgement)
 
 _SCATTERED = 0.04  # prior standard deviation of all scattered light of a lens that follows a law (judgement)
 
-# Prior standard deviation of a kernel's share from the law, relative to it, per channel (judgement): scattered light
-# near a patch predicts scattered light over the whole frame.
+# Prior standard deviation of the difference between a share and the law, relative to the law (judgement).
 _OFF_LAW = 0.35
 
-# As `CHANNELS_APART`, for deviations from a law (judgement): the lens determines the shape, the channel the amount.
-_LAW_APART = 0.7
+# Standard deviation of the difference between a channel's far share and the common share of R, G and B, relative to the
+# share (judgement). Scatter and coatings vary over the visible spectrum.
+CHANNELS_APART = 1 / 3
+
+_LAW_APART = 0.7  # as `CHANNELS_APART`, for these differences (judgement)
 
 _SCATTER_APART = 0.5  # as `CHANNELS_APART`, for a lens that follows a law
 
-# Expected share of a far kernel relative to the previous one: 1 for r⁻², 0.25 for r⁻³, 0 for an exponential. Charts
-# with few colours cannot show 384 px, but 24 px.
+# Expected share of a far kernel relative to the previous kernel. It would be 1 for a decrease with r⁻², 0.25 for r⁻³.
 _FAR_FALL = 0.5
 
-# Standard deviation of the far share of a channel, relative to the common part of R, G and B: variation of scatter and
-# coatings over the visible spectrum (judgement).
-CHANNELS_APART = 1 / 3
-
-# The same for lenses with similar channels, with different channels, and with coatings for one channel.
+# `CHANNELS_APART` for three kinds of lenses: similar channels, different channels, and coatings for one channel.
 _APART = (0.03, CHANNELS_APART, 0.7)
 
-# Prior probabilities of `_APART` (judgement). Without a visible difference, similar channels dominate.
-_APART_ODDS = (0.4, 0.4, 0.2)
+_APART_ODDS = (0.4, 0.4, 0.2)  # prior probabilities of `_APART` (judgement)
 
-# Largest veiling glare with shares that are constant over the frame: the worst lens by ISO 9358 plus half a standard
-# uncertainty. Kernels that grew threefold to the corners were once mistaken for 4.6 % veiling glare.
+# Largest credible veiling glare on charts with few colours. Above it, the light may come from near kernels that grow
+# towards the corners, which such charts cannot show.
 MOST_VEIL = 0.02
 
-# Lower bound of the misfit for charts with few colours, because patch errors are correlated over channels. In 46 rooms
-# of `benchmarks.troubles` without veiling glare, the result was 1.6 standard uncertainties RMS without this bound.
-_LEAST_MISFIT = 3.0
+# Lower bound of the misfit for charts with few colours, because the errors of a patch are correlated over channels.
+_MIN_MISFIT = 3.0
 
 _LEVELS = 40  # number of groups of similar levels for measuring the scatter
 
-_HUBER = 3.0  # standard deviations above which the weight of a patch decreases
+_HUBER = 3.0  # residual in standard deviations above which the weight of a patch decreases
 
-_ROUNDS = 2  # number of solutions, each weighted by the residuals of the previous one
+_ROUNDS = 2  # number of solutions; each solution gets its weights from the residuals of the previous solution
 
-# Rounding of stored shares: far below their uncertainty and far above rounding differences of linear algebra, so that
-# the bytes of a LUT do not depend on the machine.
+# Stored shares are multiples of this step, so that the bytes of a LUT do not depend on rounding in linear algebra.
 _ROUNDING = 1e-7
 
-# Prior standard deviation of the change of a share over the frame if there are too few patches to measure it: half of
-# the change of a mild near spread of 1 % (judgement).
+# Prior standard deviation of the change of a share over the frame, if there are too few patches to measure the change
+# (judgement).
 _SMALL_SHARE = 0.002
 
-_EVEN_TERMS = 3  # number of unknowns of a kernel that is constant over the frame: one per channel
+_EVEN_TERMS = 3  # number of unknowns of a share that is constant over the frame: one per channel
 
 
-def place_terms(places_px: npt.NDArray[np.floating], frame_px: tuple[int, int]) -> _Array:
-    """Return the terms (N, 9) float64 of a near kernel's share: products of Legendre polynomials, 1 first.
+def frame_terms(positions_px: npt.NDArray[np.floating], frame_px: tuple[int, int]) -> _Array:
+    """Return the terms (N, 9) float64 of a near share over the frame: products of Legendre polynomials, constant first.
 
-    `places_px`: (N, 2) half-size px, x then y.
+    `positions_px`: (N, 2) half-size px, x then y.
     """
-    unit = 2 * np.clip(places_px / (np.array(frame_px[::-1]) - 1.0), 0, 1) - 1
+    unit = 2 * np.clip(positions_px / (np.array(frame_px[::-1]) - 1.0), 0, 1) - 1
     x, y = (np.stack([np.ones_like(t), t, 1.5 * t**2 - 0.5], axis=-1) for t in unit.T)
-    return (y[:, :, None] * x[:, None, :]).reshape(-1, PLACES)
+    return (y[:, :, None] * x[:, None, :]).reshape(-1, FRAME_TERMS)
 
 
 def channel_terms(channel: int) -> npt.NDArray[np.int64]:
-    """Return the unknowns (T,) int64 of a channel: by kernel, by term, veiling glare last."""
+    """Return the indices (T,) int64 of the unknowns of a channel, ordered by kernel and term; veiling glare is last."""
     return np.arange(_CHANNEL_TERMS, dtype=np.int64) + channel * _CHANNEL_TERMS
 
 
 def kernel_of_terms() -> list[tuple[int, int | None]]:
-    """Return kernel and frame term of each unknown of a channel; term None: constant over the frame."""
-    near: list[tuple[int, int | None]] = [(kernel, place) for kernel in range(len(NEAR_PX)) for place in range(PLACES)]
+    """Return kernel and frame term of each unknown of a channel; the term is None for far kernels and veiling glare."""
+    near: list[tuple[int, int | None]] = [(k, term) for k in range(len(NEAR_PX)) for term in range(FRAME_TERMS)]
     return near + [(kernel, None) for kernel in range(len(NEAR_PX), len(NEAR_PX) + len(FAR_PX) + 1)]
 
 
 def groups_of_terms() -> list[npt.NDArray[np.int64]]:
-    """Return the unknowns (n,) int64 that are kept or dropped together: constant and varying part of each kernel."""
+    """Return groups of unknowns (n,) int64 that are kept or dropped together.
+
+    Each kernel has a group for its constant share; a near kernel has another for the change over the frame.
+    """
     terms = np.array([(kernel, 0 if place is None else min(place, 1)) for kernel, place in kernel_of_terms()])
     groups: list[npt.NDArray[np.int64]] = []
     for kernel, varying in sorted({(int(kernel), int(varying)) for kernel, varying in terms}):
@@ -195,17 +194,17 @@ def groups_of_terms() -> list[npt.NDArray[np.int64]]:
 
 
 def far_groups() -> list[npt.NDArray[np.int64]]:
-    """Return the unknowns (3,) int64 in R, G and B of each far kernel, and of veiling glare last."""
+    """Return the unknowns (3,) int64 in R, G and B of each far kernel and, last, of veiling glare."""
     return groups_of_terms()[-len(FAR_PX) - 1 :]
 
 
 def _bend_of(channel: int) -> int:
-    # after the unknowns of light outside of all kernels
+    # The unknown of nonlinearity follows the unknowns of light that no kernel explains.
     return TERMS + len(page_powers(_SHAPE_ORDER)) - 1 + channel
 
 
 def free_terms() -> npt.NDArray[np.bool_]:
-    """Return the unknowns, (n,) bool, of either sign: near kernels, which are clearly measurable."""
+    """Return the unknowns, (n,) bool, that may be negative: near kernels."""
     return np.arange(TERMS) % _CHANNEL_TERMS < _NEAR_TERMS
 
 
@@ -213,21 +212,21 @@ def free_terms() -> npt.NDArray[np.bool_]:
 class PointSpread:
     """Spread of the lens outside of its sharp core, measured on the chart."""
 
-    # (TERMS,) corrected shares: 0 for unproven kernels; the most likely ones for far light if any is proven
+    # (TERMS,) shares for the correction: 0 for near kernels that are not proven; all 0 if no kernel is proven
     shares: _Array
     covariance: _Array  # (TERMS, TERMS) of all unknowns, proven or not
-    gain: float  # χ² gain of the proven kernels; chance gives 1 per unknown
+    gain: float  # χ² gain of the proven kernels; by chance, each unknown gains 1
     held_out: float  # χ² gain in cross-validation
-    misfit: float  # smooth light outside of all kernels relative to chance, ≥ 1; factor of the covariance
-    likeliest: _Array  # (TERMS,) most likely shares, proven or not
+    misfit: float  # χ² gain from smooth light that no kernel explains, per unknown, ≥ 1; factor of the covariance
+    likeliest: _Array  # (TERMS,) most likely shares, also if no kernel is proven
 
     @property
     def unexplained(self) -> _Array:
-        """(T, T) float64, mean square error of the shares: variance plus likely but uncorrected shares."""
+        """(TERMS, TERMS) float64, mean square error of the shares: covariance plus squares of uncorrected shares."""
         return self.mean_square_error(self.shares)
 
     def mean_square_error(self, subtracted: _Array) -> _Array:
-        """Return the mean square error (T, T) float64 if the shares (T,) are subtracted."""
+        """Return the mean square error (TERMS, TERMS) float64 if the shares (TERMS,) are corrected."""
         uncorrected = self.likeliest - subtracted
         return self.covariance + np.outer(uncorrected, uncorrected)
 
@@ -237,7 +236,7 @@ class PointSpread:
         return bool(self.shares.any()) and self.held_out > LEAST_GAIN * self.misfit
 
     def amounts(self) -> _Array:
-        """Return the shares (9, 3, K) float64: terms over the frame, channels, kernels, veiling glare last."""
+        """Return the shares (9, 3, K) float64: terms over the frame, channels, kernels with veiling glare last."""
         return self._by_kernel(self.shares)
 
     def errors(self) -> _Array:
@@ -245,7 +244,7 @@ class PointSpread:
         return self._by_kernel(np.sqrt(np.diag(self.covariance)))
 
     def _by_kernel(self, values: _Array) -> _Array:
-        array = np.zeros((PLACES, 3, len(NEAR_PX) + len(FAR_PX) + 1))
+        array = np.zeros((FRAME_TERMS, 3, len(NEAR_PX) + len(FAR_PX) + 1))
         for channel in range(3):
             for (kernel, term), value in zip(kernel_of_terms(), values[channel_terms(channel)], strict=True):
                 array[term or 0, channel, kernel] = value
@@ -268,25 +267,25 @@ class SpreadData:
     """One channel of a frame: levels of patches, and their changes by the kernels."""
 
     channel: int
-    level: _Array  # (C,) relative to paper, without field
-    changes: _Array  # (C, T) change of `level` per share of each unknown, by the light that arrives
-    even: _Array  # (C,) change of `level` by uniform light over the frame
-    field: _Array  # (C,) illumination field, about 1
+    level: _Array  # (C,) relative to paper, divided by the flat field
+    changes: _Array  # (C, T) change of `level` if the share of an unknown is 1
+    even: _Array  # (C,) change of `level` by uniform light with the mean level of the frame
+    field: _Array  # (C,) flat field, about 1
     usable: npt.NDArray[np.bool_]
     unevenness: float  # prior standard deviation of smooth factors
-    bend: float  # relative standard deviation of paper counts against dark patches
+    bend: float  # standard deviation of the sensor's nonlinearity between dark patches and paper, relative
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceData:
-    """One channel of a frame at references of one colour, which need no colour model."""
+    """One channel of a frame at references of one colour. Their levels are equal, so no prediction is needed."""
 
     channel: int
-    level: _Array  # (N,) relative to paper, without field
+    level: _Array  # (N,) as in `SpreadData`
     changes: _Array  # (N, T) as in `SpreadData`
     field: _Array  # (N,) as in `SpreadData`
     places_mm: _Array  # (N, 2)
-    order: int  # order over the page of components that the field fit removes
+    order: int  # order of the polynomial over the page that is removed, because the flat field contains it
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,7 +296,7 @@ class _Rows:
     design: _Array  # (N, T + M)
     level: _Array  # (N,)
     folds: tuple[slice, ...]  # rows of each fold
-    unknowns: npt.NDArray[np.int64]  # of the columns
+    unknowns: npt.NDArray[np.int64]  # (T + M,) index of the unknown of each column
     freedom: float = 1.0  # ratio of residual variance to noise variance
 
 
@@ -308,7 +307,7 @@ def fit_spread(
     bits: int,
     references: Sequence[ReferenceData] = (),
 ) -> PointSpread | None:
-    """Fit the point spread to the differences of patches from their prediction; None without data.
+    """Fit the point spread to the residuals of patches; None if there are no data.
 
     `cells_mm`: (C, 2) float64, centres of the patches.
     """
@@ -320,10 +319,10 @@ def fit_spread(
     factors = np.full(size, 1 / _PRIOR_SHARE**2)
     for item, row in zip(data, rows, strict=True):
         factors[row.unknowns[len(channel_terms(0)) + shapes :]] = 1 / item.unevenness**2
-        factors[_bend_of(item.channel)] = 1 / max(item.bend, _LEAST_BEND) ** 2
+        factors[_bend_of(item.channel)] = 1 / max(item.bend, _MIN_BEND) ** 2
         factors[row.unknowns[-(len(page_powers(_INK_ORDER)) - 1) :]] = 1 / USUAL_UNEVENNESS**2
     prior = np.diag(factors)
-    usual = np.asarray(np.linalg.inv(_usual_shares(bits, _Lens())), dtype=np.float64)
+    usual = np.asarray(np.linalg.inv(_prior_covariance(bits, _Lens())), dtype=np.float64)
     prior[:TERMS, :TERMS] = usual
     shape = np.arange(TERMS, TERMS + shapes)
     others = np.delete(np.arange(size), shape)
@@ -341,8 +340,8 @@ def fit_spread(
     normal, right = normal[:, others][:, :, others], right[:, others]
     prior = prior[np.ix_(others, others)]
     matrix, vector = _without_factors(normal.sum(axis=0), right.sum(axis=0), prior)
-    # The misfit inflates the uncertainty of the data, but not the prior.
-    variance = max(misfit, _LEAST_MISFIT) if is_few else misfit
+    # The misfit increases the variance of the data, but not of the prior.
+    variance = max(misfit, _MIN_MISFIT) if is_few else misfit
     inflated = _without_factors(normal.sum(axis=0), right.sum(axis=0), variance * prior)
     weakened = inflated[0] / variance - usual, inflated[1] / variance
     lenses = _Lenses.of((matrix - usual, vector), weakened, bits)
@@ -354,14 +353,15 @@ def fit_spread(
     veil = far[-1]
     extra = np.zeros((TERMS, TERMS))
     for item in data:
-        # Counts lost near black by nonlinearity hide veiling glare of the same size.
+        # If nonlinearity of the sensor reduces the counts of dark patches, it hides veiling glare of the same size.
         hidden = DARK_LEVEL * item.bend / float(np.median(item.even * item.field))
         extra[veil[item.channel], veil[item.channel]] += hidden**2
     apparent_veil = _positive(matrix, vector, _terms(candidates))[0][veil]
-    # There is other smooth light, or shares grow to the corners, which charts with few patches cannot show.
+    # Apparent veiling glare may be other smooth light. On charts with few colours it may be near spread that grows
+    # towards the corners.
     is_ambiguous = misfit > MOST_MISFIT or (is_few and apparent_veil.mean() > MOST_VEIL)
     if is_ambiguous:
-        # The source of the apparent veiling glare is unknown.
+        # It is then not corrected, and counted as uncertainty.
         extra[np.ix_(veil, veil)] += np.outer(apparent_veil, apparent_veil)
         candidates.pop()
         far.pop()
@@ -369,7 +369,7 @@ def fit_spread(
     if is_ambiguous:
         extra += _usual_wide_light(bits, scatters=len(proven) > 0)
     _, gain = _positive(matrix, vector, proven)
-    # Every lens has far light: dropping an uncertain share would be an error of its full size.
+    # Far shares are corrected even if they are not proven, because every lens has some far spread.
     shares, covariance = lenses.shares(np.union1d(proven, _terms(far)))
     covariance += extra
     held_out = 0.0
@@ -383,25 +383,25 @@ def fit_spread(
 
 @dataclass(frozen=True, eq=False)
 class _Lenses:
-    """Equations for each assumed lens: amount of scatter, and similarity of channels."""
+    """Equations and probability of each assumed lens; the assumptions are the priors of the shares."""
 
     matrices: _Array  # (L, TERMS, TERMS)
-    vector: _Array  # (TERMS,) of all lenses
+    vector: _Array  # (TERMS,) right-hand side, the same for all lenses
     covariances: _Array  # (L, TERMS, TERMS) of all shares
     weights: _Array  # (L,) posterior probability, sum 1
     likeliest_prior: _Array  # (TERMS, TERMS) inverse prior covariance of the most likely lens
 
     @staticmethod
     def of(equations: tuple[_Array, _Array], weakened: tuple[_Array, _Array], bits: int) -> _Lenses:
-        """Return all assumed lenses with equations (TERMS, TERMS), (TERMS,) of the print.
+        """Combine the equations of the print, (TERMS, TERMS) and (TERMS,), with the prior of each assumed lens.
 
-        `weakened`: the same equations with less weight, because of the misfit.
+        `weakened`: the same equations, divided by the misfit.
         """
         matrix, vector = weakened
         lenses = _assumed_lenses(bits < VARYING_BITS)
-        priors = np.array([np.linalg.inv(_usual_shares(bits, lens)) for lens in lenses])
-        # Log evidence (D. MacKay, Bayesian interpolation, 1992) at the most likely shares that are not negative: a
-        # negative fit is no evidence for a lens with veiling glare.
+        priors = np.array([np.linalg.inv(_prior_covariance(bits, lens)) for lens in lenses])
+        # Twice the logarithm of the evidence (D. MacKay, Bayesian interpolation, 1992). Veiling glare is restricted to
+        # values ≥ 0, because a negative value is no evidence of veiling glare.
         gains = np.array([_positive(matrix + prior, vector, np.arange(TERMS))[1] for prior in priors])
         evidence = gains + np.linalg.slogdet(priors)[1] - np.linalg.slogdet(matrix + priors)[1]
         odds = np.array([lens.odds for lens in lenses])
@@ -415,7 +415,7 @@ class _Lenses:
         )
 
     def shares(self, terms: npt.NDArray[np.int64]) -> tuple[_Array, _Array]:
-        """Return the mean shares (TERMS,), 0 except for the kept ones, and their covariance."""
+        """Return the mean shares (TERMS,) over all lenses, 0 except for `terms`, and their covariance."""
         lens_shares = np.array([_positive(matrix, self.vector, terms)[0] for matrix in self.matrices])
         mean = np.round(self.weights @ lens_shares / _ROUNDING) * _ROUNDING
         difference = (lens_shares - mean) * np.sqrt(self.weights)[:, None]
@@ -424,10 +424,10 @@ class _Lenses:
 
 @dataclass(frozen=True)
 class _Lens:
-    """Assumptions about a lens; scatter and reflections are independent."""
+    """Assumptions about a lens; near and far spread is independent of veiling glare."""
 
     near: float = 1.0  # factor of the usual shares of near kernels
-    far: float = 1.0  # factor for far kernels
+    far: float = 1.0  # factor of the usual shares of far kernels
     far_apart: float = CHANNELS_APART  # as `CHANNELS_APART`
     power: float = 0.0  # exponent of the scatter law; 0: independent shares
     veil: float = 1.0  # factor of the usual veiling glare
@@ -454,17 +454,20 @@ def _assumed_lenses(few: bool) -> list[_Lens]:
 
 
 def _usual_wide_light(bits: int, scatters: bool) -> _Array:
-    """Return the prior mean squares (TERMS, TERMS) of wide shares; `scatters`: the lens is known to scatter."""
+    """Return the prior mean squares (TERMS, TERMS) of wide kernels and veiling glare.
+
+    `scatters`: only for lenses with scatter.
+    """
     wide = _terms(far_groups()[-_WIDE_KERNELS - 1 :])
     lenses = [lens for lens in _assumed_lenses(bits < VARYING_BITS) if lens.near == 1 or not scatters]
     mean_squares = np.zeros((TERMS, TERMS))
     for lens in lenses:
         probability = lens.odds / sum(lens.odds for lens in lenses)
-        mean_squares[np.ix_(wide, wide)] += probability * _usual_shares(bits, lens)[np.ix_(wide, wide)]
+        mean_squares[np.ix_(wide, wide)] += probability * _prior_covariance(bits, lens)[np.ix_(wide, wide)]
     return mean_squares
 
 
-def _usual_shares(bits: int, lens: _Lens) -> _Array:
+def _prior_covariance(bits: int, lens: _Lens) -> _Array:
     usual = np.diag(np.full(TERMS, (lens.near * _PRIOR_SHARE) ** 2))
     if bits < VARYING_BITS:
         varying = np.concatenate([group for group in groups_of_terms() if len(group) > _EVEN_TERMS])
@@ -478,7 +481,7 @@ def _usual_shares(bits: int, lens: _Lens) -> _Array:
     else:
         kernels = kernels[len(NEAR_PX) :]
         transfer = np.eye(len(FAR_PX))
-        # The first far kernel is also near, so the second does not depend on it.
+        # The second share does not depend on the first, because the first far kernel also describes near spread.
         for kernel in range(2, len(FAR_PX)):
             transfer[kernel] += _FAR_FALL * transfer[kernel - 1]
         sizes = (transfer * (lens.far * np.array(_FAR_STEPS)) ** 2) @ transfer.T
@@ -491,8 +494,8 @@ def _usual_shares(bits: int, lens: _Lens) -> _Array:
 
 
 def _law(power: float) -> _Array:
-    """Return the share (K,) of each kernel, near and far, in light that decreases by a power of the distance."""
-    # The law is a mixture of Gaussians with weights σ^(1 − power) dσ; each kernel stands for the nearest ratios of σ.
+    """Return the fraction (K,) of each near and far kernel in light that decreases with a power of the distance."""
+    # The law is a mixture of Gaussians with weights σ^(1 − power) dσ. Each kernel represents the nearest range of σ.
     scale = np.array(NEAR_PX + FAR_PX)
     between = np.sqrt(scale[1:] * scale[:-1])
     edges = np.array([scale[0] ** 2 / between[0], *between, scale[-1] ** 2 / between[-1]])
@@ -511,8 +514,8 @@ def _take(normal: _Array, right: _Array, prior: _Array, terms: npt.NDArray[np.in
 
 
 def _misfit(normal: _Array, right: _Array, prior: _Array, shapes: int) -> float:
-    """Return the χ² gain per unknown of smooth light outside of all kernels, at least 1 as by chance."""
-    # These unknowns add equally to dark and bright patches. Without such light, each gains about 1.
+    """Return the χ² gain from smooth light that no kernel explains, per unknown; at least 1, the value by chance."""
+    # This light adds equally to dark and bright patches.
     with_shape = _without_factors(normal, right, prior, TERMS + shapes)
     others = np.delete(np.arange(len(prior)), np.arange(TERMS, TERMS + shapes))
     plain = _without_factors(*_take(normal, right, prior, others))
@@ -525,10 +528,10 @@ def _rows(
 ) -> _Rows:
     """Return the rows of one channel of a frame; `number` identifies its smooth factors.
 
-    `lens`: (T,), shares that correct levels before they predict others.
+    `lens`: (T,), shares for correcting the levels from which other levels are predicted.
     """
     level = np.where(data.usable, data.level, np.nan)
-    # An unusable patch gets the value of a neighbour, which is at most one outlier.
+    # An unusable patch gets the level of the usable patch with the next code.
     usable = np.flatnonzero(data.usable)
     nearest = usable[np.clip(np.searchsorted(usable, np.arange(len(level))), 0, len(usable) - 1)]
     level = np.where(data.usable, level, data.level[nearest])
@@ -564,7 +567,7 @@ def _rows(
 
 
 def nonlinearity_change(level: _Array, field: _Array) -> _Array:
-    """Return the change of levels (N,) by a nonlinear sensor, with the field fitted to white references."""
+    """Return the change of levels (N,) by nonlinearity of the sensor; 0 at white, to which the flat field is fitted."""
     return level * (1 - level) * field
 
 
@@ -579,7 +582,7 @@ def _by_fold(
 
 
 def _reference_rows(data: ReferenceData, page_mm: tuple[float, float]) -> _Rows:
-    # Smooth components belong to the field: remove them from values and changes.
+    # Smooth components are removed from values and changes, because they are part of the flat field.
     smooth = page_polynomial(data.places_mm, page_mm, data.order)
     columns = np.column_stack([data.level, data.changes, nonlinearity_change(data.level, data.field)])
     rough = columns - smooth @ np.linalg.lstsq(smooth, columns, rcond=None)[0]
@@ -615,14 +618,14 @@ def _normal_equations(rows: Sequence[_Rows], solution: _Array) -> tuple[_Array, 
 
 def _without_factors(normal: _Array, right: _Array, prior: _Array, count: int = TERMS) -> tuple[_Array, _Array]:
     full = normal + prior
-    # Schur complement: eliminates all unknowns after the first `count`.
+    # The Schur complement eliminates all unknowns after the first `count`.
     elimination = np.linalg.solve(full[count:, count:], full[count:, :count]).T
     matrix = full[:count, :count] - elimination @ full[count:, :count]
     return 0.5 * (matrix + matrix.T), right[:count] - elimination @ right[count:]
 
 
 def _solved(normal: _Array, right: _Array, prior: _Array, terms: npt.NDArray[np.int64]) -> _Array:
-    # all unknowns; shares are 0 except for `terms`
+    # Solve for all unknowns; shares are 0 except for `terms`.
     shares, _ = _positive(*_without_factors(normal, right, prior), terms)
     full = normal + prior
     solution = np.empty(len(right))
@@ -655,7 +658,7 @@ def _positive(matrix: _Array, vector: _Array, terms: npt.NDArray[np.int64]) -> t
 def _selected(
     matrix: _Array, vector: _Array, misfit: float, candidates: list[npt.NDArray[np.int64]]
 ) -> npt.NDArray[np.int64]:
-    """Return the unknowns of significant kernels: the weakest is dropped until each kernel gains enough."""
+    """Return the unknowns of the proven kernels: the weakest kernel is dropped until all others gain enough."""
     kernels = list(candidates)
     _, gain = _positive(matrix, vector, _terms(kernels))
     while kernels:
@@ -663,7 +666,7 @@ def _selected(
             np.concatenate([*kernels[:k], *kernels[k + 1 :], np.zeros(0, dtype=np.int64)]) for k in range(len(kernels))
         ]
         gains = [_positive(matrix, vector, np.sort(remaining))[1] for remaining in without]
-        # By chance, each unknown gains one.
+        # By chance, each unknown gains 1 times the misfit.
         excess = [gain - less - misfit * (LEAST_GAIN + len(own) - 1) for less, own in zip(gains, kernels, strict=True)]
         weakest = int(np.argmin(excess))
         if excess[weakest] > 0:

@@ -1,14 +1,14 @@
 """Model the print around each patch, and the light that the kernels of the point spread bring to the patch.
 
-- The print is a grid of slots of one size, as made by `experiment.chart.layout`: every patch and reference fills a
-  slot, a tag has 4 × 4 slots, and a module of a tag is 0.4 slots wide. In this module, "patches" include the white and
-  the grey references, after the patches in the order of colour indices.
-- Near kernels are integrated over each slot and each photosite of a window, per channel. Tags and margins are divided
-  into fifths of a slot. Far kernels blur the print slot by slot.
-- Paper and black ink each have one level, multiplied by the local flat field. The background has the mean of positions
-  next to the sheet.
+- The print is a grid of slots of one size, as made by `experiment.chart.layout`. A patch or a reference fills one slot,
+  a tag fills 4 × 4 slots, and a module of a tag is 0.4 slots wide. In this module, "patches" are the patches in the
+  order of colour indices, followed by the white and the grey references.
+- Near kernels are integrated over each slot and over each photosite of a window, in each channel. Tags and margins are
+  divided into fifths of a slot. For far kernels, the print is blurred slot by slot.
+- Paper and black ink have one level each, multiplied by the local flat field. The background has the mean level that is
+  measured next to the sheet.
 
-Half-size pixels; P patches as in `PrintedGrid`; counts above black level.
+Lengths are half-size pixels; levels are counts above black level; P is the number of patches in `PrintedGrid`.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from drivers.raw.rawfile import CHANNELS, Mosaic, channel_offset_px, phases
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 
-PAD = 6  # slots around the outermost patches: margins and background within the range of wide kernels
+PAD = 6  # number of slots around the outermost patches, for margins and background
 
-_OFF_GRID = 0.02  # tolerance of positions on the grid, in slots, for rounding in files
+_OFF_GRID = 0.02  # tolerance of positions on the grid, in slots, because positions in files are rounded
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int32]
 
-# Minimum bits per channel: with fewer, the curvature between codes cannot be separated from noise.
+# Minimum bits per channel: with fewer bits, the curvature between codes cannot be separated from noise.
 LEAST_BITS = 3
 
-# Tabulated offsets of windows: first, px; step, px; number. Offsets by rounding, colour filters, registration and
-# lateral chromatic aberration stay within 2 px. Cubic terms of a step are below 10⁻⁴ of a share.
+# Window offsets in a table: first offset and step in px, and number. Rounding, colour filters, registration and lateral
+# chromatic aberration together cause at most 2 px.
 _OFFSETS_PX = (-2.0, 1 / 16, 65)
 
-_PITCHES = 9  # number of tabulated slot sizes, over the range in the frame
+_PITCHES = 9  # number of slot sizes in this table, over the range of sizes in the frame
 
-_FAR_REACH = 3.0  # half width of a far kernel in σ; scaling compensates the truncated 0.3 %
+_FAR_REACH = 3.0  # half width of a far kernel, in σ; the truncated kernel is scaled to a sum of 1
 
 _Float = npt.NDArray[np.float32]
 
@@ -58,8 +58,8 @@ class PrintedGrid:
     row: npt.NDArray[np.int64]  # (P,) slot of each patch
     column: npt.NDArray[np.int64]  # (P,)
     source: _Index  # (R, K) patch in each slot; −1: none
-    parts: _Index  # (5 R, 5 K) patch in each part of a slot; P: paper, P + 1: black ink, P + 2: beyond the sheet
-    blank_shares: npt.NDArray[np.float32]  # (R, K, 3) share of paper, black ink, and beyond the sheet in each slot
+    parts: _Index  # (5 R, 5 K) patch in each part of a slot; P: paper, P + 1: black ink, P + 2: background
+    blank_shares: npt.NDArray[np.float32]  # (R, K, 3) area fractions of paper, black ink and background in each slot
     slots_mm: _Array  # (R K, 2) centres of the slots
 
     @cached_property
@@ -76,7 +76,7 @@ class PrintedGrid:
 
 
 def unsuitable(chart: Chart) -> str:
-    """Return the reason why the lens cannot be measured with a chart, as a clause; "" if it can."""
+    """Return the reason why the lens cannot be measured with a chart, as a clause; "" if it can be measured."""
     if not chart.tags:
         return "the chart has no tags, so its colours are in a smooth order, and neighbours are too similar"
     if chart.bits < LEAST_BITS:
@@ -93,7 +93,7 @@ def _points(chart: Chart) -> _Array:
 
 def _slots(chart: Chart) -> tuple[_Array, _Array]:
     points = _points(chart)
-    # Centre of the first slot in mm, and slots (P, 2) of the patches: column, row
+    # Return the centre of the first slot in mm, and the column and row (P, 2) of each patch in slots.
     low = points.min(axis=0)
     return low, (points - low) / np.array(chart.cell_mm)
 
@@ -152,11 +152,11 @@ class FrameLevels:
 
 @dataclass(frozen=True, eq=False)
 class UsualLight:
-    """Flat field of the session's first frame, used for unmeasured areas in all frames."""
+    """Flat field of the first frame of the session, used in all frames for areas that are not measured."""
 
     patches: _Array  # (P, 3)
-    slots: _Array  # (R K, 3); beyond the outermost patches, the value at these patches
-    elsewhere: _Array  # (2, 3) sum over the areas of paper and of black ink, in slots
+    slots: _Array  # (R K, 3); outside of the outermost patches, the value at these patches
+    elsewhere: _Array  # (2, 3) sum of the flat field over all paper and over all black ink, in slots
 
     @staticmethod
     def of(grid: PrintedGrid, patches: _Array, slots: _Array) -> UsualLight:
@@ -171,11 +171,11 @@ class Surroundings:
 
     grid: PrintedGrid
     window: int  # width in pixels of a patch's window
-    # (P, 3, 2) from the patch centre to the centre of its window, along the axes of the print, by channel
+    # (P, 3, 2) vector from the patch centre to the centre of its window in each channel, along the axes of the print
     offset_px: _Array
     pitch_px: _Array  # (P, 2) width and height of a slot
     frame_slots: float  # area of the frame in slots
-    places: _Array  # (P, 9) terms of a share at each patch (`place_terms`)
+    places: _Array  # (P, 9) terms of a near share at each patch (`frame_terms`)
     whites: slice  # indices of the white references
     light: UsualLight
 
@@ -200,7 +200,7 @@ class Surroundings:
         return NearLight(grid.neighbours, weights, blank_weights, local.sum(axis=2), self.light.patches)
 
     def inks(self, levels: FrameLevels) -> _Array:
-        """Return paper, black ink and background, (3, 3) float64 counts at flat field 1."""
+        """Return the levels of paper, black ink and background, (3, 3) float64 counts, for a flat field of 1."""
         whites = levels.patches[self.whites] / self.light.patches[self.whites]
         # The first colour is the code (0, 0, 0), the black of tags.
         return np.stack([np.median(whites, axis=0), levels.patches[0] / self.light.patches[0], levels.beyond])
@@ -222,7 +222,7 @@ class Surroundings:
     def blurred(self, image: _Float, scale_px: float) -> _Float:
         """Return the print blurred by a far kernel, (K, R, 3) float32 counts: columns first."""
         width, height = self._mean_pitch_px
-        # Columns and channels are one axis, because the innermost loop of `blur_rows` runs over it.
+        # Columns and channels are merged into one axis, over which the innermost loop of `blur_rows` runs.
         rows = image.reshape(image.shape[0], -1)
         down = np.empty_like(rows)
         kernels.blur_rows(rows, far_taps(scale_px / height), down)
@@ -233,7 +233,7 @@ class Surroundings:
         return across.reshape(turned.shape)
 
     def far(self, image: _Float, scale_px: float) -> _Array:
-        """Return the light of a far kernel at the patches, (P, 3) float64 counts, including their own slots."""
+        """Return the light of a far kernel at the patches, (P, 3) float64 counts, with light of the patch itself."""
         return self.blurred(image, scale_px)[self.grid.column, self.grid.row].astype(np.float64)
 
     @cached_property
@@ -242,7 +242,7 @@ class Surroundings:
         return width, height
 
     def own_share(self, scale_px: float) -> float:
-        """Return the share of a far kernel's light at a patch that comes from its own slot."""
+        """Return the fraction of the light of a far kernel that comes from the patch itself."""
         width, height = self._mean_pitch_px
         taps = far_taps(scale_px / width), far_taps(scale_px / height)
         return float(taps[0][len(taps[0]) // 2] * taps[1][len(taps[1]) // 2])
@@ -253,14 +253,14 @@ class NearLight:
     """Weights of the light that near kernels bring to patches."""
 
     neighbours: npt.NDArray[np.int32]  # (P, 25) patches around each patch, as in `PrintedGrid`
-    weights: _Float  # (P, 25, 3) of each neighbour
-    blank_weights: _Float  # (P, 3, 3) of paper, black ink and background
+    weights: _Float  # (P, 25, 3) weight of each neighbour
+    blank_weights: _Float  # (P, 3, 3) weights of paper, black ink and background
     total: _Array  # (P, 3) sum of the weights of a patch
     light: _Array  # (P, 3) flat field at the patches, as in `UsualLight`
 
     @property
     def own(self) -> _Array:
-        """(P, 3) float64, weight of each patch's own slot."""
+        """(P, 3) float64, weight of the patch itself."""
         return self.weights[:, self.weights.shape[1] // 2].astype(np.float64)
 
     def at(self, levels: FrameLevels, inks: _Array) -> _Array:
@@ -271,7 +271,7 @@ class NearLight:
 
 
 def far_taps(scale: float) -> _Float:
-    """Return the shares (n,) float32 of slots on a line in a Gaussian of σ `scale` slots; n is odd, the sum 1."""
+    """Return the weights (n,) float32 of slots along a line for a Gaussian with σ = `scale` slots; n is odd, sum 1."""
     reach = max(1, math.ceil(_FAR_REACH * scale))
     edges = np.arange(-reach, reach + 2) - 0.5
     taps = np.diff(ndtr(edges / scale))

@@ -1,4 +1,4 @@
-"""Make and cache the demonstration LUT: commands accept `demo:` instead of a LUT folder."""
+"""Make and cache the demonstration LUT. Commands accept `demo:` in place of a LUT folder."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from foundation.files import sha256_of
 from foundation.folders import cache_folder
 from foundation.version import software
 
-DEMO: Final = "demo:"  # given instead of a LUT folder
+DEMO: Final = "demo:"  # name of the demonstration LUT, in place of a LUT folder
 
 CAMERA: Final = "Canon_EOS_600D"
 # From incandescent lamp to blue sky, with a fluorescent lamp and an LED.
 LIGHTS: Final = "2856K,4000K,D55,D65,FL2,LED-B3,7500K,10000K"
 
-BITS: Final = 4  # bits per channel: 4096 colours, 5 MB
+BITS: Final = 4  # bits per channel: 4096 colours; the LUT has 5 MB
 
 _SETTINGS: Final = f"""\
 [room]
@@ -49,7 +49,7 @@ def table_folder(folder_or_demo: Path) -> Path:
 
 
 def _make(folder: Path) -> None:
-    # `sim table` runs as a command, because its package is above this one.
+    # `sim table` runs as a command, because this package must not import `synthesis`.
     options = ["--camera", CAMERA, "--lights", LIGHTS]
     with TemporaryDirectory() as temporary:
         settings = Path(temporary) / "settings.toml"

@@ -1,9 +1,9 @@
 """The look-up table (LUT) on disk: its files (docs/formats.md), and how to open it.
 
-This module is the interface of the generator to LUTs; `calibration.table.writing` writes them. Every released version
-of the format stays readable. `SHA256SUMS` has the form of `sha256sum`, so a LUT can be verified without this software;
-the hash of that file identifies the LUT. Opening a LUT verifies small files; samples are verified at the first use of
-an illuminant.
+The generator reads LUTs through this module; `calibration.table.writing` writes them. Every released version of the
+format stays readable. `SHA256SUMS` has the format of `sha256sum`, so a LUT can be verified without this software. The
+hash of this file identifies the LUT. Opening a LUT verifies all files except the samples; samples are verified at the
+first use of an illuminant.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ FRAME_FIELDS: Final = ("kind", "illumination", "file", "sha256")  # columns of `
 
 MOST_SAMPLES: Final = 1024  # largest number of samples per patch; the largest window has 9×9
 
-# Origin and processing of the LUT; written last: a folder without it is incomplete.
+# Origin and processing of the LUT. This file is written last; a folder without it is incomplete.
 PROVENANCE: Final = "lut.json"
 
 SAMPLES: Final = "samples.npy"  # uint16 little-endian, C order, [illuminant, colour, sample, RGB]
@@ -68,7 +68,7 @@ REPORT_FORMAT: Final = "crop.report"
 
 REPORT_VERSION: Final = 1  # `format` and `version` of `report.json` (docs/formats.md)
 
-# Largest sizes of files except samples, bytes: forty times the sizes for 707 illuminants and 32 768 colours.
+# Largest accepted sizes of files, in bytes: about forty times the sizes of a full LUT.
 MOST_BYTES: Final = {
     PROVENANCE: 64 << 20,
     ILLUMINATIONS: 16 << 20,
@@ -81,10 +81,10 @@ MOST_BYTES: Final = {
     SUMS: 64 << 10,
 }
 
-# Files that may be missing: no data are read from them, and fetched LUTs do not have them.
+# Files that may be missing, because no data are read from them. Fetched LUTs do not have them.
 OPTIONAL: Final = frozenset({REPORT_PAGE})
 
-_LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")
+_LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")  # line of `SHA256SUMS`: hash and file name
 _TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, REPORT_PAGE)
 RESTORE: Final = "restore it from a copy, fetch the LUT again, or build it again"
 
@@ -95,8 +95,8 @@ EXPANDED: Final = "expanded_deg"  # column of `uncertainty.csv`
 
 CELL_COLUMNS: Final = ("expanded_r", "expanded_g", "expanded_b")  # columns of `cells.csv` after the colour index
 
-# Upper bound of ground truths, in units of 16-bit samples: larger values are not measurements, and their chromaticity
-# may overflow.
+# Upper bound of ground truths, in the units of the samples. A larger value is no measurement, and its chromaticity
+# could overflow.
 MOST_WHITE: Final = 1_000_000
 
 
@@ -121,9 +121,9 @@ class Provenance(Record):
     version: Literal[1] = VERSION
     camera: str  # maker and model from the raw files
     bits: int = Field(ge=1, le=5)  # bits per channel of the codes; the LUT has 8**bits colours
-    # sample value of sensor saturation: linear camera RGB after black subtraction
+    # sample value at sensor saturation, after black subtraction
     white_level: int = Field(ge=1, le=65535)
-    # applied corrections with parameters, in order
+    # corrections with their parameters, in the order of application
     corrections: list[dict[str, Any]] = Field(default_factory=list[dict[str, Any]])
     session_sha256: str  # hash over the hashes of all frames (`frames_sha256`)
     chart_sha256: str
@@ -131,12 +131,12 @@ class Provenance(Record):
     unfit: list[Unfit] = Field(default_factory=list[Unfit])
     samples_sha256: Sha256 | None = None  # None until the LUT is written
     illuminations_sha256: Sha256 | None = None
-    # hash of the samples of each illuminant, as bytes of the file; locates damage
+    # hash of the bytes of each illuminant in `samples.npy`, to locate damage
     lights_sha256: list[Sha256] = Field(default_factory=list[Sha256])
     # hashes of further files: `references.csv`
     files_sha256: dict[FileName, Sha256] = Field(default_factory=dict[FileName, Sha256])
     has_sums: bool = False  # `SHA256SUMS` lists all files; false until it is written
-    # program and settings, if the LUT was computed from spectra and a sensor model; None for frames
+    # program and settings, if the LUT was computed from spectra and a sensor model; None if it was built from frames
     computed: dict[str, Any] | None = None
     # equipment, date, author and licence; None in computed LUTs without this information
     origin: OriginRecord | None = None
@@ -213,7 +213,7 @@ def load_frames(path: Path) -> tuple[SourceFrame, ...]:
 
 
 def light_sha256(samples: npt.NDArray[np.uint16]) -> str:
-    """Return the SHA-256 of the samples (8**bits, S, 3) uint16 of one illuminant, as bytes of the file."""
+    """Return the SHA-256 of the samples (8**bits, S, 3) uint16 of one illuminant, as stored in `samples.npy`."""
     return sha256_of(np.ascontiguousarray(samples, dtype="<u2").data)
 
 
@@ -248,7 +248,7 @@ def map_samples(path: Path, lights: int, bits: int) -> npt.NDArray[np.uint16]:
 def samples_sha256(
     path: Path, samples: npt.NDArray[np.uint16], progress: Callable[[int, int], None] | None = None
 ) -> tuple[str, list[str]]:
-    """Return the hash of the file and of the part of each illuminant, in one pass.
+    """Return the hash of `samples.npy` and the hash of the samples of each illuminant; reads the file once.
 
     `samples`: (L, 8**bits, S, 3) uint16, the same file, memory-mapped; only its shape is used.
     """
@@ -269,7 +269,7 @@ def samples_sha256(
 
 
 def sums_text(folder: Path, samples_sha256: str, provenance: str) -> str:
-    """Return the text of `SHA256SUMS` for a LUT that is complete except for `lut.json`."""
+    """Return the text of `SHA256SUMS` for a LUT that is complete except for `lut.json`; `provenance` is its hash."""
     hashes = {name: file_sha256(folder / name) for name in _TEXTS if (folder / name).is_file()}
     hashes |= {SAMPLES: samples_sha256, PROVENANCE: provenance}
     return "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes))
@@ -311,7 +311,7 @@ def changed_files(folder: Path, recorded: Mapping[str, str]) -> Iterator[str]:
             yield f"{name} is missing"
         elif file_sha256(path) != expected_hash:
             yield f"{name} has changed since the build" + ": codes or ground truth" * (name == ILLUMINATIONS)
-    # Only listed files are read, so other unlisted names do no harm.
+    # Files with other names are ignored, because nothing reads them.
     yield from (
         f"{name} was added after the build" for name in _TEXTS if name not in recorded and (folder / name).exists()
     )
@@ -430,13 +430,13 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
     ----------
     folder : Path
     check : bool
-        Verify the hashes of all files except samples; `calibration.table.verification` does this itself to list all
-        changes. Samples are verified at the first use of an illuminant.
+        Whether to verify the hashes of all files except samples. Samples are verified at the first use of an
+        illuminant.
 
     Raises
     ------
     FormatError
-        If the folder is not a LUT, its version is unknown, its files disagree, or a file has changed since the build.
+        If the folder is not a LUT, its version is unknown, or a file is damaged or has changed since the build.
     """
     path = folder / PROVENANCE
     require_plain_table(folder)

@@ -1,4 +1,4 @@
-"""Describe a LUT for people, verify every byte of it, and compare two LUTs."""
+"""Describe a LUT as text, verify all its bytes, and compare two LUTs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _uncertainty(lut: Lut) -> str:
 
 
 def describe(lut: Lut) -> list[tuple[str, str]]:
-    """Return names and values that describe a LUT and its origin, for people to read."""
+    """Return a readable description of a LUT and its origin, as pairs of name and value."""
     source, lights = lut.provenance, lut.illuminations
     black_bodies = [light.cct_k for light in lights if light.cct_k is not None]
     spectra = sum(light.kind == "spectrum" for light in lights)
@@ -83,7 +83,7 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
         ("Session", session),
         ("Chart", source.chart_sha256),
         ("Samples", source.samples_sha256 or ""),
-        ("Hashes", f"of every file, in {SUMS}; its own hash identifies the LUT"),
+        ("Hashes", f"of all files in {SUMS}; the hash of this list identifies the LUT"),
         ("LUT", lut.sha256),
     ]
 
@@ -101,7 +101,7 @@ def _name(correction: Mapping[str, Any]) -> str:
 
 
 def find_faults(lut: Lut, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """Return a message for each difference from the time of the build; reads every byte."""
+    """Return a message for each file that has changed since the build; reads every byte."""
     sums = recorded_sums(lut.folder)
     faults = list(changed_files(lut.folder, sums))
     file_hash, lights = samples_sha256(lut.folder / SAMPLES, lut.samples, progress)
@@ -128,10 +128,7 @@ def chart_difference(first: Lut, second: Lut) -> str:
 
 
 def require_match(first: Lut, second: Lut) -> None:
-    """Raise `FormatError` if colours or illuminants of two LUTs do not correspond by index.
-
-    LUTs of the same chart and list of illuminants pass, whatever the camera and the day.
-    """
+    """Raise `FormatError` if two LUTs differ in chart or illuminants; camera and date may differ."""
     chart_text = chart_difference(first, second)
     differences = [chart_text] if chart_text else []
     if len(first.illuminations) != len(second.illuminations):

@@ -1,4 +1,4 @@
-"""Write a look-up table (LUT): samples by illuminant, ground truth, and provenance last (docs/formats.md)."""
+"""Write the files of a look-up table (LUT), `lut.json` last (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def frames_csv(frames: Sequence[SourceFrame]) -> str:
 class LutWriter:
     """Writes a new LUT folder, one illuminant at a time; the caller renames the folder when it is complete.
 
-    The full size of the samples is allocated first, so that a full disk is detected before the work.
+    Disk space for all samples is allocated first, so that a full disk is detected at the start.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class LutWriter:
             raise storage_error(self._path, error) from error
 
     def damaged(self) -> list[int]:
-        """Return the illuminants with samples on disk that differ from the written ones."""
+        """Return the illuminants with damaged samples: their hash on disk differs from the hash when written."""
         samples = np.load(self._path, mmap_mode="r", allow_pickle=False)
         return [light for light, written_hash in self.sha256.items() if light_sha256(samples[light]) != written_hash]
 
@@ -106,9 +106,9 @@ class LutWriter:
     ) -> None:
         """Write frames, ground truth, hashes and provenance; after this the folder is a LUT.
 
-        The report must be in the folder already, because its hash is written.
+        The report must already be in the folder, because its hash is recorded.
 
-        `white`: (L, 3) float64, ground truth.
+        `white`: (L, 3) float64, ground truth. `files`: text of further files by name.
         """
         self.flush()
         file_hash, lights = samples_sha256(self._path, np.load(self._path, mmap_mode="r", allow_pickle=False))
@@ -116,7 +116,7 @@ class LutWriter:
         if damaged:
             raise StorageError(
                 f"{self._path}: the samples of illuminants {', '.join(map(str, damaged[:10]))} on disk differ from the "
-                "written ones; check the disk, then build the LUT on another"
+                "written samples; check the disk, then build the LUT on another disk"
             )
         truth = _ground_truth_csv(illuminations, white)
         write_atomic(self._folder / ILLUMINATIONS, truth)
@@ -153,9 +153,10 @@ def _ground_truth_csv(illuminations: Sequence[Illuminant], white: npt.NDArray[np
 
 
 def references_csv(names: Sequence[str], white: _Array, white_error: _Array, greys: _Array, errors: _Array) -> str:
-    """Return the text of `references.csv`: for each illuminant the white, then the greys.
+    """Return the text of `references.csv`: for each illuminant the white reference, then the grey references.
 
-    `white`, `white_error`: (L, 3), units of the samples. `greys`, `errors`: (L, G, 3), same units; NaN becomes empty.
+    `white`, `white_error`: (L, 3), values and uncertainties in the units of the samples. `greys`, `errors`: (L, G, 3),
+    same units; NaN is written as an empty field.
     """
     values = np.concatenate([white[:, None], greys], axis=1)
     all_errors = np.concatenate([white_error[:, None], errors], axis=1)

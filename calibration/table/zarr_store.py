@@ -1,12 +1,12 @@
 """Publish a LUT as a sharded Zarr array on any fsspec store, and fetch it back to a folder.
 
 Zarr specification version 3 with the codec `sharding_indexed`: one chunk per illuminant, 32 illuminants per object,
-compressed by Blosc (Zstandard after bit shuffle). The other files of the LUT are attributes, unchanged. The attribute
-`whole` is set last; only an array without it is overwritten.
+compressed by Blosc (Zstandard after bit shuffle). The other files of the LUT are stored unchanged as attributes. The
+attribute `whole` is set to true at the end; only an array without it may be overwritten.
 
-Data from a store are not trusted: texts, shape and chunks of the array and the header of `samples.npy` must agree.
-Sizes are limited; names and codecs must be those of published LUTs. A fetched LUT appears in its folder complete and
-verified, or not at all. Needs zarr, the extra `cluster`.
+Data from a store are not trusted. Files, shape and chunks of the array and the header of `samples.npy` must agree.
+Sizes are limited, and only the file names and codecs of published LUTs are accepted. A fetched LUT appears in its
+folder complete and verified, or not at all. Needs zarr, the extra `cluster`.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ VERSION: Final = 1  # the only version so far
 # Text files that are published if they exist; `lut.json` last, because it completes a LUT.
 TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, SUMS, PROVENANCE)
 
-MOST_LIGHTS: Final = 65_536  # largest number of illuminants in a fetched LUT: a hundred times the paper's
+MOST_LIGHTS: Final = 65_536  # largest number of illuminants in a fetched LUT; the paper's LUT has about 700
 
 _METADATA: Final = "zarr.json"
 
-# Largest metadata, bytes: all files except samples and report page; see `calibration.table.lut.MOST_BYTES`.
+# Largest size of the metadata, in bytes. They contain all files except samples and report page.
 _MOST_METADATA: Final = 256 << 20
 
 _MOST_HEAD: Final = 10_000  # longest header of an array file that NumPy reads, bytes
@@ -68,21 +68,20 @@ _MOST_HEAD: Final = 10_000  # longest header of an array file that NumPy reads, 
 # Codecs of published LUTs; others are not run, because a store could name any installed codec.
 _CODECS: Final = frozenset({"sharding_indexed", "bytes", "blosc", "crc32c"})
 
-HASH: Final = re.compile("[0-9a-f]{64}")  # a SHA-256 as printed
+HASH: Final = re.compile("[0-9a-f]{64}")  # SHA-256 in hexadecimal digits
 
-# Illuminants per object of the store: 100 MB compressed for a full LUT, a good size for stores and networks.
-SHARD_LIGHTS: Final = 32
+SHARD_LIGHTS: Final = 32  # number of illuminants per object of the store; 100 MB in a full LUT
 
-ReportLights = Callable[[int, int], None]  # called with the number of illuminants copied, and of all
+ReportLights = Callable[[int, int], None]  # called with the number of copied illuminants and the total number
 
 
 def error_text(error: Exception) -> str:
-    """Return the message of a store's error on one line."""
+    """Return kind and message of an error on one line."""
     return " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
 
 
 def table_texts(attributes: dict[str, Any], url: str) -> dict[str, str]:
-    """Return the text files of a LUT by name; raise `FormatError` for any other file."""
+    """Return the text files of a published LUT by name; raise `FormatError` if there are other files."""
     files = attributes.get("files")
     if not isinstance(files, dict):
         raise FormatError(f"{url} has no files attribute, which every LUT has; publish the LUT again")
@@ -90,7 +89,7 @@ def table_texts(attributes: dict[str, Any], url: str) -> dict[str, str]:
     for name, text in cast("dict[str, Any]", files).items():
         if name not in TEXTS or not isinstance(text, str) or len(text) > MOST_BYTES[name]:
             raise FormatError(
-                f"{url} contains {name!r}, which is not a file of a LUT or too large; publish the LUT again"
+                f"{url} contains {name!r}, which is not a file of a LUT or is too large; publish the LUT again"
             )
         texts[name] = text
     missing = {PROVENANCE, ILLUMINATIONS, SUMS} - texts.keys()
@@ -100,7 +99,7 @@ def table_texts(attributes: dict[str, Any], url: str) -> dict[str, str]:
 
 
 def require_expected(folder: Path, expect: str | None, url: str) -> None:
-    """Raise `FormatError` if the hash of a LUT differs from `expect`; None accepts any."""
+    """Raise `FormatError` if the hash of a LUT differs from `expect`; None accepts any hash."""
     table_hash = file_sha256(folder / SUMS)
     if expect is not None and table_hash != expect:
         raise FormatError(
@@ -109,7 +108,10 @@ def require_expected(folder: Path, expect: str | None, url: str) -> None:
 
 
 def require_shape(metadata: dict[str, Any], expected: tuple[int, int], url: str) -> tuple[int, int, int, int]:
-    """Return the shape of the samples; raise `FormatError` if the array is not stored like a published LUT."""
+    """Return the shape of the samples; raise `FormatError` if shape, chunks, type or codecs are not of a LUT.
+
+    `expected`: numbers of illuminants and colours.
+    """
     shape = metadata.get("shape")
     chunks: Any = {}
     codecs: set[Any] = set()
@@ -164,7 +166,7 @@ def require_space(folder: Path, size: int, url: str) -> None:
 
 
 def read_metadata(url: str) -> dict[str, Any] | None:
-    """Return the metadata of an array, `zarr.json` (Zarr 3, "Array metadata"); None if there is none."""
+    """Return the metadata of an array, `zarr.json` (Zarr 3, "Array metadata"); None if it does not exist."""
     from fsspec.core import url_to_fs
 
     if "://" not in url or url.startswith("file://"):
@@ -176,7 +178,7 @@ def read_metadata(url: str) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except Exception as error:
-        # Each kind of store has its own errors.
+        # Each kind of store raises different errors.
         raise InputError(f"cannot read {url}: {error_text(error)}; check the address") from error
     if len(data) > _MOST_METADATA:
         raise FormatError(f"{url}: {_METADATA} has more than {_MOST_METADATA} bytes, expected fewer; check the address")
@@ -184,7 +186,7 @@ def read_metadata(url: str) -> dict[str, Any] | None:
 
 
 def table_attributes(metadata: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Return the attributes of a published LUT, complete or not; None if there is none."""
+    """Return the attributes of a published LUT, complete or not; None if the array is no LUT."""
     attributes = (metadata or {}).get("attributes")
     if not isinstance(attributes, dict):
         return None
@@ -221,7 +223,7 @@ def publish(lut: Lut, url: str, progress: ReportLights | None = None) -> None:
     except CropError:
         raise
     except Exception as error:
-        # Each kind of store has its own errors.
+        # Each kind of store raises different errors.
         raise StorageError(
             f"cannot write {url}: {error_text(error)}; check the address and your permissions"
         ) from error
@@ -230,16 +232,17 @@ def publish(lut: Lut, url: str, progress: ReportLights | None = None) -> None:
 def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: str | None = None) -> Lut:
     """Copy a published LUT to a folder, and open it.
 
-    Texts are read first; they give the size of the samples. The samples of each illuminant are verified on arrival.
+    Text files are copied first; they determine the size of the samples. The samples of each illuminant are verified
+    when they arrive.
 
     Parameters
     ----------
     url : str
     folder : Path
     progress : callable, optional
-        Called with the numbers of illuminants copied and in total.
+        Called with the number of copied illuminants and the total number.
     expect : str, optional
-        Hash of the LUT (`Lut.sha256`) from a trusted person; None accepts any.
+        Hash of the LUT (`Lut.sha256`) from a trusted person; None accepts any LUT.
     """
     zarr = _zarr()
     if expect is not None and not HASH.fullmatch(expect):
@@ -266,7 +269,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
         try:
             array: Any = zarr.open_array(url, mode="r")
         except Exception as error:
-            # Each kind of store has its own errors.
+            # Each kind of store raises different errors.
             raise FormatError(f"cannot read {url}: {error_text(error)}; publish the LUT again") from error
         path = partial / SAMPLES
         try:
@@ -295,7 +298,7 @@ def _light(array: Any, light: int, shape: tuple[int, int, int, int], url: str) -
         if samples.shape != shape[1:]:
             raise ValueError(f"its shape is {samples.shape}, expected {shape[1:]}")
     except Exception as error:
-        # Each kind of store has its own errors, and damaged chunks raise errors of the codec.
+        # Each kind of store raises different errors, and damaged chunks raise errors of the codec.
         raise FormatError(
             f"cannot read illuminant {light} of {url}: {error_text(error)}; publish the LUT again"
         ) from error

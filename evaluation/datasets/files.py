@@ -193,7 +193,7 @@ def split_header(line: str) -> tuple[list[str], str]:
 
 def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, Mapping[str, str]]]:
     """Yield the fields of each row of a table by column, after its file and line number for messages."""
-    lines = files.read_text(path, "restore it").splitlines()
+    lines = files.read_text(path, "restore it", is_table=True).splitlines()
     header, separator = split_header(lines[0] if lines else "")
     missing = [name for name in columns if name not in header]
     if missing:

@@ -213,7 +213,7 @@ class GivenEstimates:
 
 def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -> GivenEstimates:
     """Return the estimates of a file for the images of a data set; every image needs exactly one line."""
-    text = read_text(path, f"give a CSV file of estimates, {_ESTIMATES_TEXT}")
+    text = read_text(path, f"give a CSV file of estimates, {_ESTIMATES_TEXT}", is_table=True)
     by_stem = _by_stem(images)
     image_names = {comparable(image): image for image in images}
     lights: dict[str, npt.NDArray[np.float64]] = {}

@@ -29,7 +29,7 @@ def uncertainty_of(description: Description) -> str:
         return "The LUT does not report the uncertainty of its ground truths."
     return (
         "The LUT reports the expanded uncertainty (k = 2, about 95 %) of its ground truths: "
-        f"{median(uncertainties):.2g}° in the median and {max(uncertainties):.2g}° at most (`uncertainty_deg` in "
+        f"the median is {median(uncertainties):.2g}°, the largest {max(uncertainties):.2g}° (`uncertainty_deg` in "
         "`dataset.json`). Smaller differences between methods are not significant."
     )
 
@@ -43,13 +43,13 @@ def kind_of(description: Description) -> str:
     """Return a sentence on the origin of the colours: photographed, simulated or computed."""
     table = description.table
     if table.computed is not None:
-        return "Their LUT was computed from spectra and a model of the sensor; nothing was photographed."
+        return "The LUT was computed from spectra and a model of the sensor; nothing was photographed."
     rig = None if table.origin is None else table.origin.rig
     if rig == "simulated":
-        return "Their LUT was made in a simulated laboratory; nothing was photographed."
+        return "The LUT was made in a simulated laboratory; nothing was photographed."
     if rig is None:
-        return "Their LUT does not record whether its frames were photographed or simulated."
-    return "Their LUT was made from raw frames of a printed chart under illuminants from a projector."
+        return "The LUT does not record whether its frames were photographed or simulated."
+    return "The LUT was made from raw frames of a printed chart under illuminants from a projector."
 
 
 def summary_of(description: Description) -> str:
@@ -98,13 +98,13 @@ def pixels_of(description: Description) -> str:
     samples = description.table.samples
     if option(description, "rendering") is None:
         return (
-            f"Each pixel is one of the {samples} samples of its colour in the LUT, drawn with the seed; for mixed "
-            "illuminants, one sample for each illuminant is drawn, and they are mixed."
+            f"Each pixel is one of the {samples} samples of its colour in the LUT, drawn with the seed. For mixed "
+            "illuminants, one sample for each illuminant is drawn, and these samples are mixed."
         )
     return (
         "Each pixel is the mean of its colour, interpolated between patches of the LUT, plus noise. The noise is the "
         f"deviation of one of the {samples} samples of the nearest patch from their mean, drawn with the seed and "
-        "scaled to the noise at that level; for mixed illuminants, the deviations of all illuminants are combined."
+        "scaled to the level of the pixel. For mixed illuminants, the deviations of all illuminants are combined."
     )
 
 
@@ -122,7 +122,7 @@ def noise_of(description: Description) -> str:
     return (
         f"In the model of the sensor, one count is {gain * 100 / iso:.4g} electrons at its ISO {iso:g}. "
         f"At ISO 100 one count is {gain:.4g} electrons, and the read noise of a photosite is {read:.4g} counts, of "
-        f"which {early:.4g} electrons arise before the amplifier. {green}"
+        f"which {early:.4g} electrons are noise before the amplifier. {green}"
     )
 
 
@@ -192,7 +192,7 @@ def datasheet(description: Description) -> str:
         "uncertainty": uncertainty_of(description),
         "white_level": table.white_level,
     }
-    # One more than in the template, because `authors` always has an open question on the data set.
+    # The number of marks in the template, plus the mark that `authors` always contains.
     return template.substitute(answers, count=template.template.count("${open}") + 1)
 
 
@@ -216,7 +216,7 @@ def size_category(images: int) -> str:
 
 
 def card(description: Description) -> str:
-    """Return the text of README.md; the licence is open, because it depends on the licences of the pictures."""
+    """Return the text of README.md; its licence is `unknown`, because it depends on the licences of the pictures."""
     lights = "".join(f"| {light.illumination} | {light.cell} |\n" for light in description.lights[:20])
     rest = f"\nand {len(description.lights) - 20} more in `dataset.json`.\n" if len(description.lights) > 20 else ""
     origin = "".join(f"| {name} | {table_cell(value)} |\n" for name, value in origin_table(description))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 MAX_ROWS: Final = 12  # Largest number of sources on a sheet; more images would be too small on a full screen
 MAX_COLUMNS: Final = 8  # Largest number of illuminants on a sheet, for the same reason
-# Number of grid images that replace one row: a grid of 6×4 images fills a screen like 12 rows of 8 images.
+# The grid has this number of images for each allowed row: 24 large images fill a screen like 12 rows of small images.
 _GRID_IMAGES: Final = 2
 # Ratio of columns to rows of the grid, about that of screens and of most pictures.
 _GRID_ASPECT: Final = 1.5
@@ -76,7 +76,7 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     from matplotlib.patches import Circle
 
     record = dataset.description
-    # Compared with the number of sources, not of names: a source that was drawn several times has one name.
+    # Sources are counted, not names, because a picture that is used several times has one name.
     is_grid = record.images == record.sources
     grid = _grid(dataset.entries, max_rows, max_columns) if is_grid else _rows(dataset.entries, max_rows, max_columns)
     pictures = [[_load(dataset, entry) for entry in line] for line in grid]
@@ -183,7 +183,7 @@ def _label(light_names: Mapping[str, str], light: str, truth: Triple) -> str:
 
 
 def _colour(light: str, lights: Mapping[int, Light]) -> Triple:
-    # The colour that the projector would show; codes of a mixture are added in linear light.
+    # Approximate colour for a display, from the codes of the projector; codes of a mixture are added in linear light.
     mixture = parse_mixture(light)
     codes = np.array([lights[number].codes for number in mixture.lights]) / 255
     red, green, blue = (float(channel) for channel in (np.asarray(mixture.weights) @ codes**2.2) ** (1 / 2.2))

@@ -41,7 +41,7 @@ def metadata_of(sample: Sample) -> dict[str, Any]:
         "truth": list(record.truth),
         "lights": [{"illumination": light.illumination, "truth": list(light.truth)} for light in record.lights],
     }
-    # Unused options add no key, so that such data sets keep their bytes between versions.
+    # Unused options add no key, so that data sets without them keep their bytes between versions.
     return plain | {"details": record.details} if record.details else plain
 
 

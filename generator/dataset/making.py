@@ -6,8 +6,8 @@ workplace, the folder or store location in which a data set is made (`shards.Wor
 - A workplace belongs to one plan. Another plan is refused, and the message lists the differences. Records have the
   identifier of their plan, because a worker of a removed plan may still be running.
 - A program that makes the complete data set locks the folder exclusively; programs that make shares share the lock.
-- When the work fails, a workplace without a finished image is removed. If the command is at fault and must change, a
-  workplace without a finished shard is removed too.
+- If the work fails before an image is finished, the workplace is removed. After an `InputError`, the command must be
+  changed; the workplace is then removed unless a shard is complete.
 """
 
 from __future__ import annotations
@@ -125,8 +125,8 @@ def parse_share(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-# Largest number of submissions of a shard. Dask gives up a task after four workers have died with it. After 5 × 4 dead
-# workers, the shard itself is the probable cause.
+# Largest number of submissions of a shard. Dask gives up a task when four workers have died during it. After five
+# submissions, the shard itself is the probable cause.
 ATTEMPTS: Final = 5
 
 # Timeout for the scheduler in s; a running scheduler answers in milliseconds, even on a busy network.
@@ -136,7 +136,7 @@ _Event = Callable[[], None]
 
 
 def _by_threads(plan: Plan, shards: Sequence[int], workplace: Workplace, workers: int, callbacks: Callbacks) -> None:
-    # Two shards are made at once, so that all threads have work while one of the shards is being completed.
+    # Two shards are made at the same time, so that no thread is idle while one of them is being completed.
     events: SimpleQueue[_Event | None] = SimpleQueue()
     cancelled = threading.Event()
     waiting = iter(shards)
@@ -543,7 +543,8 @@ def _open_remote_workplace(out: str, identity: PlanIdentity) -> Generator[Workpl
 
 
 def _require_still_free(path: Path, folder: Path) -> None:
-    # Another program may have completed the data set while this one waited for the lock; `folder` is then new.
+    # Another program may have completed the data set while this program waited for the lock, which then created
+    # `folder` again.
     try:
         require_free(path, "the data set")
     except InputError:

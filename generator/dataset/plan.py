@@ -39,10 +39,7 @@ if TYPE_CHECKING:
 # Default number of images in a shard. A kill loses at most this number for each shard in progress.
 SHARD_IMAGES: Final = 256
 
-# Version of colorimetric rendering, increased when equal options give other pixels. In version 1 the black of the print
-# was the grey of the black patch; since version 2 it is the grey to which black is mapped. Version 3 tries more patches
-# for greys with an error of 0.2° or more. Version 4 has one map of the chart, interpolated between patches; before,
-# each illuminant had one.
+# Version of colorimetric rendering. It is increased when equal options give other pixels.
 RENDERING_VERSION: Final = 4
 
 
@@ -269,7 +266,7 @@ class Plan:
         )
 
     def identity(self) -> dict[str, Any]:
-        """Return plain values; they are equal for two plans if and only if both plans make the same bytes."""
+        """Return plain values that are equal for two plans if and only if both plans make the same bytes."""
         return {
             "format": "crop.plan",
             "version": 1,
@@ -297,7 +294,7 @@ class Plan:
             "split": dict(zip(SPLITS, options.split, strict=True)) if options.split else None,
             "shard_images": options.shard_images,
         }
-        # Unused options add no key, so that such data sets keep their bytes between versions.
+        # Unused options add no key, so that data sets without them keep their bytes between versions.
         if options.variation is not None:
             recorded["variation"] = options.variation.describe()
         if options.crops > 1:

@@ -55,12 +55,12 @@ _NAME: Final = re.compile(r"([0-9]{1,10})(\.[A-Za-z0-9.]*)?")
 _VALID: Final = "with r + g + b = 1 and no negative number"
 # Tolerance for sums and means of chromaticities: above the rounding of six digits, below 0.001 degrees.
 _ROUNDING: Final = 2e-6
-_KEPT: Final = 4096  # Cached illuminants, because many images share one; several times the number in a LUT
+_KEPT: Final = 4096  # Number of cached illuminants, several times the number in a LUT; many images share an illuminant
 
 
 def read_entries(store: Store, description: Description) -> Iterator[Entry]:
     """Yield the entries of a data set in the order of their numbers, without reading images."""
-    # Both lists are in this order, and rows of an image are consecutive, so one line of each list is in memory.
+    # Only one line of `gt.txt` and of `ground_truth.csv` is in memory, because both are in this order.
     name = f"{store.location}/{GROUND_TRUTH}"
     split_of_image: dict[int, Split] = {}
     for split in SPLITS:
@@ -136,7 +136,7 @@ def _truth(store: Store, text: str, line: int, image: str, lights: tuple[Triple,
 
 @lru_cache(maxsize=_KEPT)
 def _may_be_mean(mean: Triple, lights: tuple[Triple, ...]) -> bool:
-    # The weights are not in the lists, so only the range of each channel is checked.
+    # The weights of the illuminants are not in the lists, so only the range of each channel is checked.
     return all(
         min(light_components) - _ROUNDING <= component <= max(light_components) + _ROUNDING
         for component, *light_components in zip(mean, *lights, strict=True)
@@ -219,7 +219,7 @@ def _listed_files(lines: Iterator[bytes], listed_names: set[str]) -> Iterator[tu
                 f"{SUMS}, line {number} is damaged, expected a hash, two spaces and a name inside the data set",
             )
         elif name in listed_names:
-            # Each file is read once only, even if a malicious list repeats it a million times.
+            # Each file is read only once, even if a malicious list repeats it a million times.
             yield "", "", f"{SUMS}, line {number}: {name} is listed twice"
         else:
             listed_names.add(name)

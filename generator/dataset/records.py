@@ -193,7 +193,7 @@ class Description(SparseRecord):
     table: TableRecord
     seed: int
     options: dict[str, Any]
-    planned: int = Field(ge=0, le=1 << 32)  # number of planned images; numbers of missing ones are not used
+    planned: int = Field(ge=0, le=1 << 32)  # number of planned images; missing images leave gaps in the numbers
     images: int = Field(ge=0, le=1 << 32)  # number of generated images
     sources: int = Field(ge=0, le=1 << 32)  # number of sources that were used
     pixels: int = Field(ge=0)  # of all sources

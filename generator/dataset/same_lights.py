@@ -109,7 +109,7 @@ def preparation_of(description: Description) -> Preparation:
         crop=None if crop is None else (crop[0], crop[1]),
         cover=bool(description.options.get("cover", False)),
         crop_at=description.options.get("crop_at"),
-        # A repeated data set was itself cropped with the seed of the first one.
+        # If this data set repeats another one, it was cropped with the seed of that one.
         seed=description.options.get("lights_of", {}).get("pictures_seed", description.seed),
         crops=int(description.options.get("crops", 1)),
     )

@@ -14,8 +14,8 @@ OUT. An object store has no rename: files are written to their final location, p
 - Each worker keeps about three pictures in memory.
 
 An image with one illuminant has the ground truth of this illuminant, also with a fall-off of brightness. With a
-coloured fall-off (`generator.variation.variation`), the illuminant is listed twice, for the near and the far end.
-Masks and ground truth maps then have the weights of both in each pixel.
+coloured fall-off (`generator.variation.variation`), the illuminant is listed twice, for both ends of the fall-off.
+Masks then have the weights of both ends in each pixel.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ PLAN: Final = "plan.json"
 RECORDS: Final = "shards"  # Folder of the records of shards
 NOTES: Final = ".plan"  # Folder of plan and records in an object store
 _SHARD_PIECE: Final = "shard"  # Name of the piece of a complete shard; pieces of images have their numbers as names
-_HEAD_BYTES: Final = 80  # Bytes of a record file that contain the name of its first piece, after a SHA-256
-_READERS: Final = 16  # Record files that are read in parallel, because most of the time is waiting for the store
+_HEAD_BYTES: Final = 80  # Number of bytes at the start of a record file that contain the name of its first piece
+_READERS: Final = 16  # Number of record files read in parallel, because a read mostly waits for the store
 
 PlanIdentity = Mapping[str, Any]
 
@@ -112,17 +112,17 @@ _threads: Final = threading.local()
 # Shorter side in px below which a picture gets a note: probably an icon or a failed download, not a photograph.
 TINY_PX: Final = 16
 
-_WORD: Final = 1 << 64  # Number of values of the eight bytes of a hash that select the split of a source
+_HASH_VALUES: Final = 1 << 64  # Number of values of eight bytes; eight bytes of a hash select the split
 
 
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
     """Return the split of a source; `shares` of train, validation and test have the sum 1."""
-    # It depends on the seed and the content (the name, if there is no file), but on no other source. Copies of one file
-    # are therefore in the same split, and the shares are exact only on average.
+    # The split depends only on the seed and on the content of the source (the name, if there is no file). Copies of a
+    # file are therefore in the same split, and the shares are exact only on average.
     if shares is None:
         return None
     digest = hashlib.sha256(f"split {seed} {sha256 or name}".encode()).digest()[:8]
-    position = int.from_bytes(digest, "big") / _WORD
+    position = int.from_bytes(digest, "big") / _HASH_VALUES
     bound = 0.0
     for split, share in zip(SPLITS, shares, strict=True):
         bound += share
@@ -181,9 +181,10 @@ def photograph(
 ) -> RawImage:
     """Return the raw image of a print of `picture` (H, W, 3) uint8, sRGB codes.
 
-    For rendering by codes, all colours must have samples in the LUT. `number` is the number of the image.
+    For rendering by codes, all colours must have samples in the LUT. `number` is the number of the image;
+    `white_level` limits the counts of images with masks.
     """
-    # The data set records only the hash of the LUT, so samples must match their hashes.
+    # The data set records the hash of the LUT, so the samples must still match the hashes in the LUT.
     for mixture in lighting.mixtures:
         for light in mixture.lights:
             lut.require_unchanged(light)
@@ -310,12 +311,12 @@ SILENT: Final = Callbacks()  # Callbacks that do nothing
 class _ReadSource:
     """A source picture that was read."""
 
-    cuts: tuple[Cut, ...]  # its crops, or one of the full picture; empty if all its images are finished
+    cuts: tuple[Cut, ...]  # its crops, or the full picture as one crop; empty if all its images are finished
     record: SourceRecord
 
 
 class ShardCancelled(Exception):
-    """A shard was cancelled because of an error elsewhere, which is handled there."""
+    """A shard was cancelled because of an error in another shard, which is reported there."""
 
 
 def make_shard(
@@ -526,7 +527,7 @@ def _unchanged_source(job: ShardJob, position: int, finished: Mapping[int, Finis
     first = records[0] if records else None
     if first is None or any(source != first for source in records):
         return None
-    # For a file in a store the hash is unknown before reading it.
+    # The hash of a file in a store is unknown until the file is read.
     return first if changed_sha256(job.sources[position - job.position], -math.inf) == first.sha256 else None
 
 
@@ -647,14 +648,14 @@ def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
         has_uncertainty = bool(options.get("uncertainty"))
         table.write(csv_text([[*GROUND_TRUTH_COLUMNS, *([UNCERTAINTY_COLUMN] if has_uncertainty else [])]]))
         sources_file.write(csv_text([SOURCE_COLUMNS]))
-        for record, fresh, left_out in _records(workplace, int(identity["shards"])):
+        for record, new_sources, new_skipped in _records(workplace, int(identity["shards"])):
             names = {source.position: source for source in record.sources}
-            for source in fresh:
+            for source in new_sources:
                 sources_file.write(_source_row(source))
                 counts["sources"] += 1
                 counts["pixels"] += source.width * source.height * int(options.get("crops", 1))
                 counts["replaced"] += source.replaced_pixels
-            skipped += left_out
+            skipped += new_skipped
             used.update((light.illumination, light) for light in record.lights)
             for image in record.images:
                 source = names[image.position]
@@ -727,15 +728,15 @@ def _records(workplace: Workplace, shards: int) -> Iterator[tuple[ShardRecord, l
                     f"the picture {last.name} differs between two shards, expected no change while the data set is "
                     f"made; remove {workplace.notes.location} and the files next to it, then start again"
                 )
-            fresh = ordered[1:]
+            new = ordered[1:]
         else:
-            fresh = ordered
+            new = ordered
         if ordered:
             last = ordered[-1]
         yield (
             record,
-            [source for source in fresh if isinstance(source, SourceRecord)],
-            [source for source in fresh if isinstance(source, Skipped)],
+            [source for source in new if isinstance(source, SourceRecord)],
+            [source for source in new if isinstance(source, Skipped)],
         )
 
 
@@ -765,7 +766,7 @@ def _image_rows(name: str, source: str, image: ImageRecord, used_lights: Mapping
 
 def _uncertainty(label: str, lights: Mapping[int, Light]) -> str:
     # Expanded uncertainty in degrees; empty if the LUT does not report it. A mixture gets the largest value of its
-    # illuminants, because their errors have common causes and do not cancel.
+    # illuminants, because their errors have common causes and do not average out.
     uncertainties = [lights[int(term.partition(":")[0])].uncertainty_deg for term in label.split("+")]
     reported = [uncertainty for uncertainty in uncertainties if uncertainty is not None]
     return f"{max(reported):.4g}" if len(reported) == len(uncertainties) else ""
@@ -837,7 +838,7 @@ class Workplace:
         return _record_in(piece, FinishedImage) if piece.is_complete(self.files.open) else None
 
     def has_finished(self, shard: bool = False) -> bool:
-        """Return whether an image (or a complete shard, if `shard`) of any plan is finished."""
+        """Return whether any plan has a finished image, or with `shard` a complete shard."""
         names = self.notes.names(RECORDS)
         return any(not shard or _SHARD_PIECE in read_pieces(self.notes.get(name)) for name in names)
 

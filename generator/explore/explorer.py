@@ -46,14 +46,14 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
-MAX_SIDE: Final = 1000  # Longest side of a picture on the page, px: fits a window and renders in milliseconds
+MAX_SIDE: Final = 1000  # Longest side of a picture on the page, px; it fits a window and renders in milliseconds
 
-MOST_UPLOADS: Final = 8  # Number of uploaded pictures that are kept, and of decoded pictures in the cache
+MOST_UPLOADS: Final = 8  # Largest number of uploaded pictures that are kept, and of decoded pictures in the cache
 
-# Largest number of pixels of an uploaded picture: as many as the largest cameras have; decoding needs 200 MB.
+# Largest number of pixels of an uploaded picture. Decoding of such a picture needs 200 MB.
 MOST_UPLOADED_PIXELS: Final = 1 << 26
 
-# Side of a uniform area for measuring noise, px: its 256 pixels give the standard deviation within 5 %.
+# Side of a uniform area for measuring noise, px. Its 256 pixels give the standard deviation to 5 %.
 _DRAWS: Final = 16
 
 _STEPS: Final = 33  # Points of the black-body curve
@@ -233,7 +233,7 @@ class Explorer:
 
 
 def _as_argument(name: str) -> str:
-    # Without ./, such a path would be parsed as an option or as the subcommand.
+    # Without ./, such a path would be parsed as an option or as the command `explore`.
     return f"./{name}" if name.startswith("-") or name == "explore" else name
 
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from calibration import kernels, sampling
 from calibration.causes.rules import RULES, Evidence, Subject, decide, evidence_names
 from calibration.checks import light_codes
-from calibration.checks.small_places import SmallPlaces, cells_without_hot
+from calibration.checks.small_places import CoveredPatchFinder, cells_without_hot
 from calibration.figures.all_figures import FIGURES
 from calibration.radiometry import drift, primaries, table_noise
 from calibration.radiometry.dark_frames import HotPixels
@@ -109,7 +109,7 @@ def test_small_places(pinned: Pinned) -> None:
             deviation[:, tree.query(sheet.places[random.integers(len(sheet.places))], k=cells)[1]] += mismatched
         deviation[1, ::17] = np.nan
         usable = random.random(len(sheet.places)) < 0.95
-        one = SmallPlaces(sheet.rgb, sheet.places, usable).disturbed(deviation, np.full_like(deviation, 0.01))
+        one = CoveredPatchFinder(sheet.rgb, sheet.places, usable).disturbed(deviation, np.full_like(deviation, 0.01))
         hot = random.random(len(sheet.places)) < 0.2
         result.append([*one, *cells_without_hot(one[0], one[2], hot, sheet.places)])
     pinned("small places that something covers", result)
@@ -145,7 +145,7 @@ def test_the_lamp_s_drift(pinned: Pinned) -> None:
         "drift of a lamp",
         [
             [drift.drift_correction(at, every[:n], white[:n]) for n in (2, 3, 6)],
-            [drift.undetermined(at[:n], every, white) for n in (5, 30, 60)],
+            [drift.drift_uncertainty(at[:n], every, white) for n in (5, 30, 60)],
             primaries.drift_gains(at, every, white),
             [drift.corrected(samples, np.array([0.93, 0.99, 1.0])), drift.applied_drift(lamp / lamp.max())],
         ],
@@ -222,7 +222,7 @@ def test_places_of_cells(pinned: Pinned) -> None:
         ]
         result.append([*map(brief, blocks), *(brief(one.error_px) for one in errors)])
     marks = random.uniform(0, 100, (300, 2))
-    unfollowed = matching.unfollowed_px(marks[:40] + 0.5, marks, random.normal(0, 0.2, (300, 2)), 0.7, 20.0)
+    unfollowed = matching.unfollowed_wave_sigma_px(marks[:40] + 0.5, marks, random.normal(0, 0.2, (300, 2)), 0.7, 20.0)
     pinned("places of cells", [result, brief(unfollowed)], **LOOSE)
 
 
@@ -352,7 +352,7 @@ def test_shares_of_a_lens(pinned: Pinned) -> None:
     random = np.random.default_rng(16)
     spots = random.uniform(-5, 60, (30, 2))
     laws = [fitting._law(power) for power in (0.5, 1.0, 1.5, 3.0, 6.0)]
-    pinned("shares of a lens", [result, brief(fitting.place_terms(spots, (40, 50))), laws], **LOOSE)
+    pinned("shares of a lens", [result, brief(fitting.frame_terms(spots, (40, 50))), laws], **LOOSE)
 
 
 def brighter(means: _Array) -> _Array:

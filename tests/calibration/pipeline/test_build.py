@@ -938,7 +938,7 @@ def test_light_that_is_always_there_is_not_remarked_on_here(
     stray = result.figures.lights.stray
     assert stray is not None
     assert stray.share < 0.002
-    (row,) = [row for row in summary(result.figures) if row.name == "Light missing in the dark frames"]
+    (row,) = [row for row in summary(result.figures) if row.name == "Light that is not in the dark frames"]
     assert "1 of 6 illuminants" in row.note
 
 
@@ -1176,7 +1176,8 @@ def test_a_white_frame_that_is_red_is_refused_as_such(small_lab: Lab, tmp_path: 
 
     message, _ = refused(small_lab, tmp_path, frame)
     assert (
-        "White frame against the prediction" in message or "exchanged names: illuminant 1 and white frame 0" in message
+        "Angle of a white frame to the prediction" in message
+        or "exchanged names: illuminant 1 and white frame 0" in message
     )
     assert "warm up" not in message
 
@@ -1217,7 +1218,7 @@ def test_lights_whose_files_state_another_exposure_are_refused(small_lab: Lab, t
         return small_lab.dng(step.colour, step.number, stated=replace(SETTINGS, iso=200) if deviation else SETTINGS)
 
     message, report = refused(small_lab, tmp_path, frame)
-    assert "Exposure of a frame" in message
+    assert "exposure from most frames" in message
     assert "instead of 0.5 s, ISO 100, f/8" in message
     assert report["retake"] == "4-5"
 
@@ -1229,7 +1230,7 @@ def test_white_frames_at_half_exposure_are_no_brilliant_colour(small_lab: Lab, t
         tmp_path,
         lambda step: small_lab.dng(step.colour, step.number, HALF if step.kind == "white" else SETTINGS),
     )
-    assert "Exposure of a frame" in message
+    assert "exposure from most frames" in message
     assert "additivity" not in report["figures"]  # pyrefly: ignore[not-iterable]
 
 

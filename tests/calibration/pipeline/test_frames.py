@@ -16,7 +16,7 @@ import pytest
 
 from calibration.pipeline import measuring
 from calibration.pipeline.frames import select_frames, stated_origin
-from calibration.pipeline.measuring import beyond_print, usable_means
+from calibration.pipeline.measuring import background_counts, usable_means
 from calibration.sampling import sites_at
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -119,5 +119,5 @@ def test_background_is_mean_beside_print(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(measuring, "gather_means", gathered)
     decoded: Any = SimpleNamespace(mosaic=None, black=None)
     places = np.array([[10.0, 10], [20, 20]])
-    assert beyond_print(decoded, sites_at(places, (40, 40))).tolist() == [1.5, 2.5, 3.5]
-    assert beyond_print(decoded, sites_at(places[:0], (40, 40))).tolist() == [0, 0, 0]
+    assert background_counts(decoded, sites_at(places, (40, 40))).tolist() == [1.5, 2.5, 3.5]
+    assert background_counts(decoded, sites_at(places[:0], (40, 40))).tolist() == [0, 0, 0]

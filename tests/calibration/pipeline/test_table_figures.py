@@ -93,8 +93,8 @@ def test_scales_frames_to_median_exposure() -> None:
 def test_drift_has_limits_of_brightness_and_colour(white: tuple[float, float, float], is_drift: bool) -> None:
     # The median of three is what two of them have.
     frames = [frame(), frame(white), frame()]
-    assert table_figures._differ_by_drift(frames) is is_drift
-    assert table_figures._differ_by_drift([frame(white)])
+    assert table_figures._differ_only_by_drift(frames) is is_drift
+    assert table_figures._differ_only_by_drift([frame(white)])
 
 
 def test_times_start_at_first_white_frame() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.radiometry.drift import as_measured, corrected, drift_correction, undetermined
+from calibration.radiometry.drift import as_measured, corrected, drift_correction, drift_uncertainty
 
 WHITE = np.array([3000.0, 7000.0, 4000.0])
 EVERY_S = np.arange(0.0, 3601.0, 600.0)
@@ -30,12 +30,12 @@ def test_scales_to_brightest_lamp() -> None:
 @pytest.mark.parametrize("jump", [0.004, 0.01, 0.02])
 def test_jump_leaves_half_undetermined(jump: float) -> None:
     lamp = np.where(EVERY_S < 1500, 1.0, 1 - jump)
-    assert undetermined(LIGHTS_S, EVERY_S, WHITE * lamp[:, None]) == pytest.approx(jump / 2, rel=0.02)
+    assert drift_uncertainty(LIGHTS_S, EVERY_S, WHITE * lamp[:, None]) == pytest.approx(jump / 2, rel=0.02)
 
 
 def test_smooth_warm_up_leaves_little_undetermined() -> None:
     lamp = 1 - 0.02 * np.exp(-EVERY_S / 1800)
-    uncertainty = undetermined(LIGHTS_S, EVERY_S, WHITE * lamp[:, None])
+    uncertainty = drift_uncertainty(LIGHTS_S, EVERY_S, WHITE * lamp[:, None])
     gains = drift_correction(LIGHTS_S, EVERY_S, WHITE * lamp[:, None]).gains
     true = (1 - 0.02 * np.exp(-LIGHTS_S / 1800)) / lamp.max()
     error = float(np.abs(gains[:, 0] / true - 1).max())
@@ -44,14 +44,14 @@ def test_smooth_warm_up_leaves_little_undetermined() -> None:
 
 def test_two_white_frames_may_hide_full_jump() -> None:
     both = np.array([0.0, 3600.0])
-    assert undetermined(LIGHTS_S, both, WHITE * np.array([[1.0], [0.98]])) == pytest.approx(0.02)
+    assert drift_uncertainty(LIGHTS_S, both, WHITE * np.array([[1.0], [0.98]])) == pytest.approx(0.02)
 
 
 def test_extrapolation_adds_uncertainty() -> None:
     white = WHITE * (1 - 0.02 * EVERY_S / 3600)[:, None]
     late = np.append(LIGHTS_S, 3600.0 + 1800.0)
-    assert undetermined(late, EVERY_S, white) == pytest.approx(0.01, rel=0.03)
-    assert undetermined(np.append(LIGHTS_S, -600.0), EVERY_S, white) == pytest.approx(0.02 / 6, rel=0.03)
+    assert drift_uncertainty(late, EVERY_S, white) == pytest.approx(0.01, rel=0.03)
+    assert drift_uncertainty(np.append(LIGHTS_S, -600.0), EVERY_S, white) == pytest.approx(0.02 / 6, rel=0.03)
 
 
 def test_refuses_one_white_frame() -> None:

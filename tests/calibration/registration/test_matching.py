@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from calibration.registration.matching import (
-    unfollowed_px,
+    unfollowed_wave_sigma_px,
 )
 from calibration.registration.tiles import Raster, TileComparison
 from experiment.chart.layout import paper_chart
@@ -26,7 +26,9 @@ def test_uncertainty_follows_outline_and_rises_near_waves() -> None:
     residual = np.full_like(marks, 0.01 / np.sqrt(2))
     is_wave = (marks[:, 1] == 0) & (np.abs(marks[:, 0] - 100) < 20)
     residual[is_wave] = 0.3 / np.sqrt(2)
-    inside, wavy, elsewhere = unfollowed_px(np.array([(100, 50), (100, 5), (30, 95.0)]), marks, residual, 5.0, REACH)
+    inside, wavy, elsewhere = unfollowed_wave_sigma_px(
+        np.array([(100, 50), (100, 5), (30, 95.0)]), marks, residual, 5.0, REACH
+    )
     outline_rms = np.sqrt((residual**2).sum(axis=1).mean())
     assert inside == elsewhere == pytest.approx(2 * outline_rms)
     assert wavy == pytest.approx(0.6)
@@ -37,7 +39,7 @@ def test_missing_corner_has_departure_from_plane() -> None:
     is_missing = (marks[:, 1] == 0) & (marks[:, 0] < 60)
     marks = marks[~is_missing]
     points = np.array([(5, 5), (30, 5), (55, 5), (30, 95), (150, 5), (100, 50.0)])
-    uncertainty = unfollowed_px(points, marks, np.full_like(marks, 0.01), 0.8, REACH)
+    uncertainty = unfollowed_wave_sigma_px(points, marks, np.full_like(marks, 0.01), 0.8, REACH)
     assert uncertainty == pytest.approx([0.8, 0.8, 0.02 * np.sqrt(2), 0.02 * np.sqrt(2), *[0.02 * np.sqrt(2)] * 2])
 
 

@@ -277,7 +277,7 @@ def expect_refusal(text: str) -> AbstractContextManager[object]:
 )
 def test_refuses_registration_beyond_limits(values: dict[str, Any], minimum_agreement: float, message: str) -> None:
     with expect_refusal(message):
-        registering._judge(registration(**values), minimum_agreement, "it")
+        registering._require_match(registration(**values), minimum_agreement, "it")
 
 
 @pytest.mark.parametrize(
@@ -296,7 +296,7 @@ def test_refuses_blur_and_size_beyond_limits(cell_px: float, blur: float, messag
     ("slipped", "area_count", "is_refused"), [(1, 10, False), (2, 133, True), (2, 134, False), (3, 200, True)]
 )
 def test_refuses_several_displaced_areas(slipped: int, area_count: int, is_refused: bool) -> None:
-    matcher: Any = SimpleNamespace(slipped=lambda cells: (np.full((slipped, 2), 7.0), area_count))  # pyrefly: ignore[implicit-any-lambda]
+    matcher: Any = SimpleNamespace(find_displaced_areas=lambda cells: (np.full((slipped, 2), 7.0), area_count))  # pyrefly: ignore[implicit-any-lambda]
     with expect_refusal("match the neighbouring patches" if is_refused else ""):
         registering._refuse_displaced_areas(matcher, np.zeros(9, np.bool_), "it")
 
@@ -328,7 +328,7 @@ def test_mismatched_patches_reduce_score_of_block() -> None:
     mismatched = np.flatnonzero(in_first_block)[::4]
     is_mismatched = np.zeros(CHART.colour_count, np.bool_)
     is_mismatched[mismatched] = True
-    reduced = registering._without_mismatched_cells(blocks, is_mismatched, CHART)
+    reduced = registering._reduce_scores_of_mismatched(blocks, is_mismatched, CHART)
     assert reduced.score == pytest.approx([0.8 * (1 - len(mismatched) / in_first_block.sum()), 0.9])
 
 
@@ -341,7 +341,7 @@ def test_completes_outline_with_outward_normals() -> None:
     # The second side (right) and half of the third (bottom) are missing.
     traced = np.concatenate([sides[0], sides[2][: SIDE_POINTS // 2], sides[3]])
     field = DetectedField(np.zeros((4, 2)), np.eye(3), traced, np.zeros_like(traced), np.zeros_like(traced), 1.0)
-    completed = registering._completed(field, lens, chart)
+    completed = registering._add_missing_outline(field, lens, chart)
     added, normals = completed.outline_mm[len(traced) :], completed.normals[len(traced) :]
     np.testing.assert_array_equal(completed.outline_mm[: len(traced)], traced)
     np.testing.assert_allclose(completed.outline_px[len(traced) :], lens.to_pixels(added))

@@ -83,7 +83,7 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
 
 @pytest.mark.parametrize(
     ("unseen", "message"),
-    [((), "They were kept, as in the paper"), (("--unseen",), "Generated: made, 4 images")],
+    [((), "They were kept, because generated images of the paper"), (("--unseen",), "Generated: made, 4 images")],
 )
 def test_table2_excludes_test_pictures_only_with_unseen(
     make_table: TableMaker,
