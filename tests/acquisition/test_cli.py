@@ -151,7 +151,10 @@ def test_init_fills_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.slow
 def test_init_makes_a_chart_of_the_given_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(layout, "design_chart", lambda bits, page: design_chart(1, page))
+    def small(bits: int, page: str | None) -> Chart:
+        return design_chart(1, page)
+
+    monkeypatch.setattr(layout, "design_chart", small)
     assert main(["init", str(tmp_path / "lab"), "--page", "A5"]) == 0
     # ISO 216: A5 is 148 mm × 210 mm.
     assert load_chart(load_lab(tmp_path / "lab" / "LAB.toml").chart).page_mm == (210, 148)
