@@ -182,6 +182,14 @@ def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
         if error.code == EXIT_INTERRUPTED:
             return _report_interruption(is_resumable)
         return error.code if isinstance(error.code, int) else int(error.code is not None)
+    except Exception as error:
+        # Python 3.11 wraps an interruption of an import in RuntimeError, if it comes while a class is made.
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
+            raise
+        return _report_interruption(is_resumable)
     return 0
 
 
