@@ -17,8 +17,8 @@ def camera_name(maker: str, model: str) -> str:
 
     Examples
     --------
-    >>> camera_name("Canon.Inc", "Canon EOS 6D Mark II"), camera_name("FUJIFILM", "X-T5")
-    ('Canon EOS 6D Mark II', 'FUJIFILM X-T5')
+    >>> camera_name("NIKON CORPORATION", "NIKON D850"), camera_name("FUJIFILM", "X-T5")
+    ('NIKON D850', 'FUJIFILM X-T5')
     """
     maker_word, model_word = (re.split(r"\W+", words.casefold().strip())[0] for words in (maker, model))
     return model if maker_word == model_word else f"{maker} {model}".strip()
@@ -41,8 +41,8 @@ class CameraIdentity:
 
     @property
     def name(self) -> str:
-        """Maker and model as in `camera_name`."""
-        return camera_name(self.maker, self.model)
+        """Maker and model as in raw files, whose maker has no "Inc."."""
+        return camera_name(re.sub(r"[ .,]*Inc\.?$", "", self.maker), self.model)
 
 
 @dataclass(frozen=True)

@@ -414,8 +414,8 @@ EOS_BODIES: Mapping[str, EosModel] = MappingProxyType(
 def eos_with(sensor: Body, name: str) -> EosModel:
     """Return the body with a name, by default an EOS 550D, that reports the camera of a sensor as raw files do."""
     body = EOS_BODIES.get(name, EOS_550D)
-    maker, model = sensor.maker, sensor.model
-    if "canon" not in maker.lower():
+    maker, model = body.info.manufacturer, sensor.model
+    if "canon" not in sensor.maker.lower():
         # The driver requires the word Canon; names of cameras contain only the first word of the maker.
         maker, model = f"{sensor.camera.split(' ')[0]} (simulated Canon EOS)", sensor.camera
     return replace(body, info=replace(body.info, manufacturer=maker, model=model))

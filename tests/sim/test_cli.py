@@ -55,8 +55,13 @@ def test_missing_screen_or_projector_exits_with_3(capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["Canon_EOS_5DS", "mine.json"])
+@pytest.mark.parametrize("model", ["Canon_EOS_5DS", "mine.json", "Test", "EOS 6D Mark II"])
 def test_camera_takes_sensitivities(model: str, tmp_path: Path) -> None:
+    names = {
+        "Canon_EOS_5DS": "Canon EOS 5DS",
+        "Test": "Canon CroP Test",
+        "EOS 6D Mark II": "Canon EOS 6D Mark II",
+    }
     if model == "mine.json":
         source = Path(sim.__file__).parent / "data" / f"Canon_EOS_5DS{SUFFIX}"
         text = source.read_text().replace('"Canon"', '"Nikon"').replace('"EOS 5DS"', '"D810"')
@@ -69,7 +74,7 @@ def test_camera_takes_sensitivities(model: str, tmp_path: Path) -> None:
         name = camera.identity().name
         camera.close()
     assert name == find_body(model).camera
-    assert name == ("Nikon D810" if model.endswith(".json") else "Canon EOS 5DS")
+    assert name == names.get(model, "Nikon D810")
 
 
 def test_unknown_camera_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
