@@ -15,7 +15,7 @@ from pydantic import Field
 from calibration.citation import OriginRecord
 from calibration.sampling import WINDOW, WINDOWS
 from experiment.chart.layout import design_chart
-from experiment.config import CameraSettings, CitationSettings, Settings, validate_settings
+from experiment.config import CameraSettings, CitationSettings, Settings, file_in, validate_settings
 from experiment.lights import plan_illuminants
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
@@ -77,7 +77,11 @@ def load_settings(path: Path | None) -> TableSettings:
     if path is None:
         return TableSettings()
     text = read_text(path, "give a TOML file", "settings")
-    return parse_settings(parse_toml(text, str(path)), str(path))
+    settings = parse_settings(parse_toml(text, str(path)), str(path))
+    if isinstance(sensitivities := settings.camera.get("sensitivities"), str):
+        camera = {**settings.camera, "sensitivities": file_in(path.resolve().parent, sensitivities)}
+        return settings.model_copy(update={"camera": camera})
+    return settings
 
 
 def parse_settings(document: dict[str, Any], where: str) -> TableSettings:

@@ -25,7 +25,7 @@ from experiment.session.records import last_frame_time
 from foundation.clock import SIM_START, SimulatedClock
 from foundation.errors import ConfigurationError
 from sim.buses.usb import MemoryTransport
-from sim.camera.bodies import EOS_BODIES
+from sim.camera.bodies import eos_with
 from sim.camera.eos import SimulatedEos
 from sim.camera.film import WorldFilm
 from sim.projectors.pjlink import PjLinkPeer
@@ -51,8 +51,7 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     world = World(sheet(chart), sensor, simulated_room(settings))
     events = read_disturbances(settings.simulated.events, settings.file)
     film = WorldFilm(world, lambda: screen.colour, simulated_projector.light, SERIAL, colour_counts, events, exposures)
-    # A body that is defined only by its sensitivities uses the protocol of an EOS 550D.
-    protocol = EOS_BODIES.get(settings.simulated.body, EOS_BODIES["EOS 550D"])
+    protocol = eos_with(sensor, settings.simulated.body)
     apertures = () if settings.camera.exposure.aperture is None else protocol.aperture_codes
     # The battery never runs empty, because cameras run on mains power in a long session.
     body = replace(protocol, shots_per_charge=10**9, aperture_codes=apertures)
