@@ -11,7 +11,7 @@ matrix reports the residual.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -63,7 +63,7 @@ class ColourMatrix:
     """
 
     name: str
-    rows: npt.NDArray[np.float64]
+    rows: npt.NDArray[np.float64] = field(repr=False)
     source: str
 
 
