@@ -14,6 +14,7 @@ import time
 from importlib import import_module
 from math import inf
 from types import FrameType, ModuleType
+from typing import Any
 
 # Module of each command.
 COMMANDS = {
@@ -28,7 +29,7 @@ COMMANDS = {
 _API_MODULES = "generator", "generator.training", "evaluation.metrics"
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     modules: list[ModuleType] = []
     # Python itself looks up names such as __path__, which must not load the packages.
     if name == "__all__" or not name.startswith("__"):
@@ -43,7 +44,7 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *__getattr__("__all__")]
+    return list(__getattr__("__all__"))
 
 
 def _require_own_packages() -> None:

@@ -9,6 +9,8 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from foundation.errors import counted
+
 # (H, W, 3), linear camera RGB ≥ 0, black level subtracted, in any unit.
 Image = npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
@@ -108,3 +110,7 @@ class SceneSet:
     treatment: Mapping[str, str] = field(default_factory=dict[str, str])
     folds: tuple[int, ...] | None = None
     truth_uncertainty_deg: float | None = None
+
+    def __repr__(self) -> str:
+        """Return one line, because the list of images may be very long."""
+        return f"SceneSet({self.name!r}, {counted(len(self.scenes), 'image')}, layout {self.layout})"

@@ -320,8 +320,8 @@ class RenderingOptions:
         _image_option(
             "NAME",
             "Matrix from linear sRGB to camera RGB, for colorimetric rendering: name of a camera, file with 3 x 3 "
-            "numbers, table for a matrix fitted to the LUT, or none. \\[default: matrix of the camera of the LUT, else "
-            "table]",
+            "numbers, table for a matrix fitted to the LUT, or none. \\[default: matrix of the camera of the LUT, "
+            "else of the sensitivities of a computed LUT, else table]",
         ),
     ] = None
     black_point: Annotated[

@@ -20,7 +20,7 @@ from experiment.lights import plan_illuminants
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
 from foundation.records import from_settings, parse_toml
-from sim.spectral import describe_sensitivities, read_sensitivities
+from sim.spectral import describe_sensitivities, matrix_record, read_sensitivities
 from sim.world.sensors import find_body
 from sim.world.world import Room
 from synthesis.lamps import LightSpectra, table_illuminants
@@ -125,6 +125,7 @@ def table_task(camera: str, settings: TableSettings, where: str, lights: LightSp
         "how": "no frame was taken: counts of the photosites of each patch were computed from spectra and a model of "
         "the sensor, and sampled like the counts of a frame",
         "sensitivities": describe_sensitivities(curves),
+        "matrix": matrix_record(curves),
         "lights": {"from": "simulated projector"} if lights is None else lights.source,
         # Records the name of the sensitivities, because the path of their file is no property of the LUT.
         "body": asdict(replace(body, sensitivities=curves.name)),

@@ -141,6 +141,10 @@ class Provenance(Record):
     # equipment, date, author and licence; None in computed LUTs without this information
     origin: OriginRecord | None = None
 
+    def __repr__(self) -> str:
+        """Return one line; the hashes alone have 70 bytes for each illuminant."""
+        return f"Provenance({self.camera}, {self.bits} bits, saturation {self.white_level}, {self.software})"
+
     @model_validator(mode="after")
     def _require_colours(self) -> Self:
         invalid = [cell.colour for cell in self.unfit if cell.colour >= 8**self.bits]

@@ -28,6 +28,7 @@ import numpy.typing as npt
 from llvmlite import ir
 from numpy import uint32, uint64
 
+from foundation.arrays import native
 from foundation.compiled import inlined
 from foundation.errors import InputError, value_text
 from generator.kernels.vector import (
@@ -293,7 +294,7 @@ def check_samples(samples: Samples) -> int:
 
 def check_tables(tables: Samples | Sequence[Samples]) -> list[Samples]:
     """Check the samples of several illuminants, all uint16 (8**bits, S, 3) of one shape; return them as a list."""
-    checked = list(tables)
+    checked = [native(table) for table in tables]
     if not checked:
         raise InputError("0 illuminants were given to mix, expected 1 or more")
     for table in checked:

@@ -23,14 +23,14 @@ from experiment.config import LabSettings
 from experiment.session.folder import Session
 from experiment.session.records import last_frame_time
 from foundation.clock import SIM_START, SimulatedClock
-from foundation.errors import ConfigurationError
+from foundation.errors import ConfigurationError, nearest_names
 from sim.buses.usb import MemoryTransport
 from sim.camera.bodies import eos_with
 from sim.camera.eos import SimulatedEos
 from sim.camera.film import WorldFilm
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
-from sim.spectral import known_sensitivities
+from sim.spectral import OTHER_CAMERA, known_sensitivities
 from sim.world.disturbances import read_disturbances
 from sim.world.rendering import Print
 from sim.world.sensors import BODIES, Body, find_body
@@ -76,8 +76,8 @@ def simulated_body(settings: LabSettings) -> Body:
     """Return the simulated camera of the settings."""
     name, changes = settings.simulated.body, settings.simulated.camera or {}
     if name not in BODIES and name not in known_sensitivities() and not Path(name).is_file():
-        names = ", ".join([*sorted(BODIES), *known_sensitivities()])
-        problem = f"simulated.body is {name!r}, expected a file of sensitivities or one of {names}"
+        near = f"{nearest_names(name, [*BODIES, *known_sensitivities()], 3)} ".lstrip()
+        problem = f"simulated.body is {name!r}, expected a camera or a file of sensitivities; {near}{OTHER_CAMERA}"
         raise ConfigurationError(problem, about=settings.file, value=name)
     return find_body(name, changes, settings.file, "simulated.camera")
 
