@@ -35,6 +35,7 @@ from calibration.report.plots import (
     draw_registration,
     draw_residuals,
     half_size,
+    numbered_labels,
 )
 from calibration.sampling import largest_window
 from calibration.table.lut import REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION
@@ -58,7 +59,7 @@ from experiment.session.folder import Session
 from foundation.errors import counted, first_few
 from foundation.files import write_atomic
 from foundation.pages import render
-from foundation.plots import draw_png
+from foundation.plots import PANEL, draw_panels
 
 # Points across and down the page reported in `chart_places`: enough for its pose and approximate curl.
 GRID_POINTS = (7, 5)
@@ -232,9 +233,9 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
         *_main_pictures(result, session, frame),
         _Picture(
             "Residuals of the registration",
-            "Left: displacement of the patches from a plane imaged by the lens, which is the waviness of the paper. "
-            "Right: residual of each block of patches, magnified; short arrows in random directions are noise.",
-            draw_png(draw_residuals, chart, registration),
+            "First: displacement of the patches from a plane imaged by the lens, which is the waviness of the paper. "
+            "Second: residual of each block of patches, magnified; short arrows in random directions are noise.",
+            draw_panels(draw_residuals, chart, registration, inches=[PANEL] * 2),
             "geometry",
             "residuals",
         ),
@@ -242,7 +243,7 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
             "Light on the print",
             "Flat field of the registered frame, from its white references. Samples and ground truth are divided by "
             f"it. Contours are 2 % apart. {primaries}",
-            draw_png(draw_field, chart, table.registered_frame.paper.field),
+            draw_panels(draw_field, chart, table.registered_frame.paper.field, inches=[PANEL] * 3),
             "light",
             "field",
         ),
@@ -251,16 +252,16 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
             "Black level, movement and blur of the chart, bare paper under white, deviation of patches from their "
             "codes' colours, and number of white references, frame by frame; rings mark the worst frames. A loss of "
             "focus affects all patches; a hand or a shadow on the print affects a block of patches.",
-            draw_png(draw_course, table),
+            draw_panels(draw_course, table, inches=[(3.3, 2.4)] * 6),
             "radiometry",
             "course",
         ),
         _Picture(
             "Uncertainty of the ground truth",
-            f"Left: expanded uncertainty (k = {COVERAGE:g}) of each illuminant, divided among its components by their "
-            "squares; the worst illuminant first. Right: expanded uncertainty of each patch mean against its level, "
+            f"First: expanded uncertainty (k = {COVERAGE:g}) of each illuminant, divided among its components by their "
+            "squares; the worst illuminant first. Second: expanded uncertainty of each patch mean against its level, "
             "without noise. " + "; ".join(f"{item.title}: {item.source}" for item in table.budget.components) + ".",
-            draw_png(draw_budget, table.budget, table.cells.levels),
+            draw_panels(draw_budget, table.budget, table.cells.levels, inches=[PANEL] * 2),
             "truth",
             "budget",
         ),
@@ -271,8 +272,7 @@ def _main_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np.
     table, chart = result.figures, session.chart
     registration, window = table.registration, table.cells.window
     codes = np.array([light.colour for light in session.illuminations])
-    black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
-    source = f"recorded by the {table.session.camera}"
+    kelvins = np.array([light.cct_k or np.nan for light in session.illuminations], dtype=np.float64)
     expanded = table.budget.expanded_deg
     worst = int(np.argmax(expanded)) if len(expanded) > 1 else None
     ring_text = "" if worst is None else f" A circle marks illuminant {worst}, with the most uncertain ground truth."
@@ -281,28 +281,35 @@ def _main_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np.
             "The registered chart",
             f"{table.session.registered_file}, contrast stretched, with the detected tags. Below, magnified: outlines "
             f"of patches and pixels of their {window**2} samples, in the corners and in the centre.",
-            draw_png(draw_registration, frame, chart, registration, window),
+            draw_panels(draw_registration, frame, chart, registration, window, inches=[PANEL, *[(1.75, 2.0)] * 5]),
             name="chart",
+            is_photograph=True,
         ),
         _Picture(
             "The illuminants",
-            "rb-chromaticities of the illuminants as projected, as recorded on bare paper (the ground truth), and the "
-            f"latter in their colours. Rings are black bodies.{ring_text}",
-            draw_png(draw_chromaticities, codes, black_body, table.lights.white, source, worst),
+            f"Chromaticities of the illuminants as projected, and as recorded by the {table.session.camera} on bare "
+            f"paper, which are the ground truths. The line joins the black bodies.{ring_text}",
+            draw_panels(draw_chromaticities, codes, kelvins, table.lights.white, worst, inches=[(4.4, 4.5)] * 2),
             name="lights",
         ),
         _Picture(
             "Errors of patches",
-            "Left: deviation of patches and their neighbours from the same codes elsewhere on the sheet. Right: "
+            "First: deviation of patches and their neighbours from the same codes elsewhere on the sheet. Second: "
             "uncertainty of the position of each patch. Rings mark the worst patches.",
-            draw_png(draw_errors, table, chart),
+            draw_panels(draw_errors, table, chart, inches=[PANEL] * 2),
             name="errors",
         ),
         _Picture(
             "Noise",
-            "Left: variance of one sample against its level, as medians of patches of similar levels, and the fitted "
-            "curve (read noise, photons, photosite response). Right: the resulting signal-to-noise ratio.",
-            draw_png(draw_noise, cell_noise(frame, chart, registration, window), table.sensor.transfer, window**2),
+            "First: variance of one sample against its level, as medians of patches of similar levels, and the fitted "
+            "curve (read noise, photons, photosite response). Second: the resulting signal-to-noise ratio.",
+            draw_panels(
+                draw_noise,
+                cell_noise(frame, chart, registration, window),
+                table.sensor.transfer,
+                window**2,
+                inches=[PANEL] * 2,
+            ),
             name="noise",
         ),
     ]
@@ -317,12 +324,14 @@ def _position_pictures(result: BuildResult, session: Session) -> list[_Picture]:
     pictures: list[_Picture] = []
     for file, positions in list(by_file.items())[:MAX_FRAMES]:
         picture = half_size(read_raw(session.folder / file))
-        png = draw_png(draw_positions, picture, session.chart, result.figures.registration, positions)
+        drawings = draw_panels(
+            draw_positions, picture, session.chart, result.figures.registration, positions, inches=[PANEL]
+        )
         caption = (
             f"{file}, contrast stretched. Circles mark deviations beyond their limits, at their positions in the frame "
-            "registered first."
-        )
-        pictures.append(_Picture(f"Position: {Path(file).stem}", caption, png))
+            "registered first. "
+        ) + "; ".join(f"{number}: {label}" for label, number in numbered_labels(positions).items())
+        pictures.append(_Picture(f"Position: {Path(file).stem}", caption, drawings, is_photograph=True))
     return pictures
 
 
@@ -336,13 +345,14 @@ _OUTCOME_ORDER: tuple[Outcome, ...] = tuple(_OUTCOME_WORDS)
 
 @dataclass(frozen=True)
 class _Picture:
-    """A plot of the report, PNG, with heading and caption."""
+    """A plot of the report, one SVG for each panel, with heading and caption."""
 
     heading: str
     caption: str
-    png: bytes
+    drawings: tuple[bytes, ...]
     group: Group | None = None  # The group in which it is folded; None for pictures at the top
     name: Drawing | None = None  # As in `Figure.drawing`
+    is_photograph: bool = False  # As in `pages.figure`
 
 
 @dataclass(frozen=True)
