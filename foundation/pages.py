@@ -29,7 +29,8 @@ _MIN_SVG_SCALE: Final = 0.75
 # Command options, intervals such as "1 – 2", and "p = 1e-05". Browsers would break lines in them.
 _NUMBER = r"[-−+]?\d[\d.]*(?:e[-+]\d+)?"
 _UNBREAKABLE = re.compile(
-    rf"(?<![\w-])--[a-z][\w-]*|{_NUMBER} (?:–|…|±) {_NUMBER}|\bp [=<≤] {_NUMBER}|\beffect {_NUMBER}|\d[\d.]*e[-+]\d+"
+    rf"(?<![\w-])--[a-z][\w-]*|{_NUMBER} (?:–|…|±|to) {_NUMBER}(?: %| px)?|\bp [=<≤] {_NUMBER}|\beffect {_NUMBER}"
+    r"|\d[\d.]*e[-+]\d+"
 )
 
 

@@ -153,7 +153,7 @@ def draw_residuals(panels: Any, chart: Chart, registration: Registration) -> Non
     good = blocks.good
     residual = blocks.residual_px[good]
     largest = float(np.linalg.norm(residual, axis=1).max(initial=1e-3))
-    arrows = right_axes.quiver(
+    right_axes.quiver(
         blocks.centres_mm[good, 0],
         blocks.centres_mm[good, 1],
         residual[:, 0],
@@ -163,11 +163,16 @@ def draw_residuals(panels: Any, chart: Chart, registration: Registration) -> Non
         scale=20 * largest,
         width=0.0028,
     )
-    right_axes.quiverkey(arrows, 0.9, 1.08, largest, f"{largest:.3f} px", labelpos="W")
     right_axes.plot(*blocks.centres_mm[~good].T, "x", color=MARK, label="does not match the chart")
     if (~good).any():
         right_axes.legend(fontsize=8)
-    right_axes.set(title="residual of patch blocks", xlabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")
+    right_axes.set(
+        title=f"residual of patch blocks, longest {largest:.3f} px",
+        xlabel="mm",
+        xlim=(0, page_w),
+        ylim=(page_h, 0),
+        aspect="equal",
+    )
 
 
 def draw_field(panels: Any, chart: Chart, shape: FlatField) -> None:
@@ -258,7 +263,8 @@ def draw_budget(panels: Any, budget: Budget, levels: _Array) -> None:
         base += height
     lights.set(title="ground truth", xlabel="illuminants, the worst first", ylabel="degrees, k = 2")
     lights.set_xlim(-0.6, len(at) - 0.4)
-    lights.legend(fontsize=8)
+    lights.set_ylim(0, 1.45 * lights.get_ylim()[1])  # Space for the legend
+    lights.legend(fontsize=8, loc="upper right", ncols=2)
     if len(at) <= _MAX_LABELLED_BARS:
         lights.set_xticks(at, [str(light) for light in order])
     else:

@@ -126,6 +126,8 @@ def test_photograph_is_shown_as_a_whole_and_drawing_stays_readable() -> None:
     assert [f"aria-label='two, {number} of 2'" in panels for number in (1, 2)] == [True, True]
 
 
-@pytest.mark.parametrize("text", ["-0.3 – 0.12", "p = 2.1e-05", "effect +0.45", "1.2e-07", "--max-side", "1.5 ± 0.2"])
+@pytest.mark.parametrize(
+    "text", ["-0.3 – 0.12", "p = 2.1e-05", "effect +0.45", "1.2e-07", "--max-side", "1.5 ± 0.2", "+0.1 to +0.2 %"]
+)
 def test_numbers_and_options_stay_on_one_line(text: str) -> None:
     assert f"<span class='unbroken'>{text}</span>" in pages.paragraph(f"It is {text}, as expected.")
