@@ -10,17 +10,19 @@ A location is a path or a URL as the user writes it. A name is a path below it, 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
+import re
 import secrets
 import shutil
 import tempfile
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, cast
 
 from foundation.errors import CropError, FormatError, InputError, StorageError
 from foundation.files import (
@@ -32,6 +34,7 @@ from foundation.files import (
     storage_error,
     sync_folder,
 )
+from foundation.remote import filesystem, is_remote, remote_error
 from foundation.secret_texts import masked
 
 if TYPE_CHECKING:
@@ -41,10 +44,7 @@ if TYPE_CHECKING:
 DESCRIPTION: Final = "dataset.json"  # Marks a complete data set, so it is written last
 
 
-def is_remote(location: str) -> bool:
-    """Return whether `location` is the URL of a store; file:// is a path of this machine."""
-    scheme, separator, _ = location.partition("://")
-    return bool(separator) and scheme not in ("file", "local")
+_URL_AS_PATH: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
 def local_path(location: str | Path) -> Path:
@@ -52,27 +52,14 @@ def local_path(location: str | Path) -> Path:
     text = str(location)
     for scheme in ("file://", "local://"):
         text = text.removeprefix(scheme)
+    if isinstance(location, Path) and _URL_AS_PATH.match(text):
+        raise InputError(f"{text} is a Path, which removes a slash of a URL; give the URL as text (str)")
     path = Path(text)
     if text and path.name in ("", ".."):
         path = path.resolve()
     if not path.name:
         raise InputError(f"{str(location)!r} is not a folder name, expected a name such as images; give one")
     return path
-
-
-def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
-    """Return the fsspec file system of a URL, and the path in it."""
-    from fsspec.core import url_to_fs
-
-    try:
-        return url_to_fs(url)
-    except Exception as error:
-        # A store may connect here and raise its own errors; errors of ftplib are not OSError.
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(
-            f"cannot open the store {url}: {reason}; use a store that fsspec supports, and install its library (s3://: "
-            "s3fs, gs://: gcsfs, az://: adlfs)"
-        ) from error
 
 
 Pieces = Iterable[bytes | memoryview]  # The bytes of a file in order; each piece is valid until the next one
@@ -214,6 +201,35 @@ def _sync_file(path: Path) -> None:
         raise storage_error(path, error) from error
 
 
+class _RemoteFile(io.RawIOBase):
+    """An open object for `io.BufferedReader`, because streams of fsspec take no size in `readline`."""
+
+    def __init__(self, stream: Any, translated_errors: Callable[[], AbstractContextManager[None]]) -> None:
+        self._stream, self._translated_errors = stream, translated_errors
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        with self._translated_errors():
+            data = self._stream.read(len(buffer))
+        buffer[: len(data)] = data
+        return len(data)
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        return int(self._stream.seek(offset, whence))
+
+    def tell(self) -> int:
+        return int(self._stream.tell())
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
 @dataclass(frozen=True)
 class RemoteStore:
     """A location in an object store."""
@@ -260,26 +276,26 @@ class RemoteStore:
     def get(self, name: str) -> bytes:
         """Return the bytes of an object; raises FormatError."""
         _require_inside(self.location, name)
-        with self._translated_errors(name, reading=True):
+        with self._translated_errors(name, "read"):
             return self._files.cat_file(self._path(name))
 
     @contextmanager
     def open(self, name: str) -> Generator[BinaryIO]:
         """Open an object for reading; raises FormatError."""
         _require_inside(self.location, name)
-        with self._translated_errors(name, reading=True):
+        with self._translated_errors(name, "read"):
             stream = self._files.open(self._path(name), "rb")
-        with stream:
-            yield stream
+        with io.BufferedReader(_RemoteFile(stream, lambda: self._translated_errors(name, "read")), _BUFFER) as file:
+            yield file
 
     def has(self, name: str) -> bool:
         """Return whether the object exists."""
-        with self._translated_errors(name, reading=True):
+        with self._translated_errors(name, "read"):
             return self._files.exists(self._path(name))
 
     def names(self, folder: str = "") -> Iterator[str]:
         """Return the names of all objects below `folder`."""
-        with self._translated_errors(folder, reading=True):
+        with self._translated_errors(folder, "read"):
             paths = self._files.find(self._path(folder))
         return (path[len(self._root) :].lstrip("/") for path in paths)
 
@@ -304,21 +320,13 @@ class RemoteStore:
         return f"{self._root}/{name}" if name else self._root
 
     @contextmanager
-    def _translated_errors(self, name: str, reading: bool = False) -> Generator[None]:
+    def _translated_errors(self, name: str, action: str = "write") -> Generator[None]:
         try:
             yield
         except (CropError, MemoryError):
             raise
         except Exception as error:
-            reason = masked(" ".join(f"{type(error).__name__}: {error}".split()))
-            if reading:
-                raise FormatError(
-                    f"cannot read {self.location}/{name}: {reason}; check the address and your permission to read"
-                ) from error
-            raise StorageError(
-                f"cannot write {self.location}/{name}: {reason}; check the address and your permission to write, then "
-                "run the same command again"
-            ) from error
+            raise remote_error(error, action, f"{self.location}/{name}".rstrip("/")) from error
 
 
 def _require_inside(location: str, name: str) -> None:
