@@ -16,6 +16,7 @@ import re
 import secrets
 import shutil
 import tempfile
+import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
@@ -145,8 +146,9 @@ class LocalStore:
             return stream.read()
 
     @contextmanager
-    def open(self, name: str) -> Generator[BinaryIO]:
-        """Open a file for sequential reading; raises FormatError."""
+    def open(self, name: str, scattered: bool = False) -> Generator[BinaryIO]:
+        """Open a file for reading; raises FormatError. `scattered`: only some parts are read."""
+        del scattered
         try:
             # Lists of a foreign data set may contain any name, so names outside the folder are refused.
             with open_inside(self.root, name) as stream:
@@ -199,6 +201,50 @@ def _sync_file(path: Path) -> None:
             os.close(handle)
     except OSError as error:
         raise storage_error(path, error) from error
+
+
+# Parts of remote objects in memory: 256 MB. By default s3fs reads 50 MB ahead, so that each image of a tar file would
+# cost the whole file.
+_BLOCK: Final = 1 << 18
+_MOST_BLOCKS: Final = 1 << 10
+_KEPT_READ: Final = 1 << 23  # larger reads are not kept; a group of a Parquet file is smaller
+_blocks: Final[dict[tuple[str, int], bytes]] = {}
+_blocks_lock: Final = threading.Lock()
+
+
+@lru_cache(maxsize=1)
+def _shared_blocks() -> str:
+    """Register a cache of fsspec that all open objects share, and return its name."""
+    from fsspec.caching import BaseCache, register_cache
+
+    class SharedBlocks(BaseCache):
+        name = "crop-blocks"
+
+        def __init__(self, blocksize: int, fetcher: Callable[[int, int], bytes], size: int, key: str) -> None:
+            super().__init__(blocksize, fetcher, size)
+            self._key = key
+
+        def _fetch(self, start: int | None, stop: int | None) -> bytes:
+            first, last = start or 0, self.size if stop is None else min(stop, self.size)
+            if last - first > _KEPT_READ:
+                return self.fetcher(first, last)
+            keys = [(self._key, number) for number in range(first // _BLOCK, -(-last // _BLOCK))]
+            with _blocks_lock:
+                found = {key: _blocks.pop(key) for key in keys if key in _blocks}
+            missing = [key for key in keys if key not in found]
+            if missing:
+                begin, end = missing[0][1] * _BLOCK, (missing[-1][1] + 1) * _BLOCK
+                data = self.fetcher(begin, min(end, self.size))
+                for number in range(missing[0][1], missing[-1][1] + 1):
+                    found[self._key, number] = data[number * _BLOCK - begin :][:_BLOCK]
+            with _blocks_lock:
+                _blocks.update(found)
+                while len(_blocks) > _MOST_BLOCKS:
+                    del _blocks[next(iter(_blocks))]
+            return b"".join(found[key] for key in keys)[first % _BLOCK :][: max(0, last - first)]
+
+    register_cache(SharedBlocks, clobber=True)
+    return SharedBlocks.name
 
 
 class _RemoteFile(io.RawIOBase):
@@ -280,11 +326,17 @@ class RemoteStore:
             return self._files.cat_file(self._path(name))
 
     @contextmanager
-    def open(self, name: str) -> Generator[BinaryIO]:
-        """Open an object for reading; raises FormatError."""
+    def open(self, name: str, scattered: bool = False) -> Generator[BinaryIO]:
+        """Open an object for reading; raises FormatError. `scattered`: only some parts are read, perhaps repeatedly."""
         _require_inside(self.location, name)
         with self._translated_errors(name, "read"):
-            stream = self._files.open(self._path(name), "rb")
+            files, path = self._files, self._path(name)
+            options: dict[str, Any] = {}
+            if scattered:
+                # The answer of the store names the version, so that parts of a replaced object are not used.
+                key = f"{self.url} {name} {files.info(path)}"
+                options = {"block_size": _BLOCK, "cache_type": _shared_blocks(), "cache_options": {"key": key}}
+            stream = files.open(path, "rb", **options)
         with io.BufferedReader(_RemoteFile(stream, lambda: self._translated_errors(name, "read")), _BUFFER) as file:
             yield file
 

@@ -21,9 +21,10 @@ from calibration.table.zarr_store import fetch, publish
 from foundation.errors import InputError, StorageError
 from generator.dataset.making import Workers, generate_dataset, make_dataset, make_share
 from generator.dataset.plan import DatasetOptions, Plan
-from generator.dataset.reader import open_dataset
+from generator.dataset.reader import file_faults, open_dataset
 from generator.dataset.records import Layout
 from generator.lights.lighting import ListedLights
+from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import find_pictures
 from generator.stores import open_store
 from generator.training.crops import Crops
@@ -207,3 +208,41 @@ def test_unusable_store_is_reported_with_remedy(
             (error,) = [text for text in capsys.readouterr().err.splitlines() if text.startswith("error: ")]
             assert remedy in error, error
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("layout", ["webdataset", "parquet"])
+def test_images_of_a_shard_are_read_once(
+    bucket: str, lut: Lut, layout: Layout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By default, s3fs reads 50 MB ahead for each image."""
+    options = DatasetOptions(layout=layout, previews=False)
+    dataset = generate_dataset(lut, f"{bucket}/out", random_scenes(24, 200, 200), [0], options=options)
+    files: Any = import_module("s3fs").core.S3File
+    read, original = list[int](), files._fetch_range
+
+    def fetch_range(file: object, start: int, end: int) -> bytes:
+        read.append(end - start)
+        return bytes(original(file, start, end))
+
+    monkeypatch.setattr(files, "_fetch_range", fetch_range)
+    for entry in dataset.entries:
+        dataset.read_image(entry)
+    size = len(open_store(f"{bucket}/out").get(f"data/000000.{'tar' if layout == 'webdataset' else 'parquet'}"))
+    assert size / 2 < sum(read) < 1.3 * size
+    # Another data set of the same name: no bytes of the first one are used.
+    open_store(f"{bucket}/out").remove("")
+    other = generate_dataset(lut, f"{bucket}/out", random_scenes(24, 200, 200, 5), [0], options=options)
+    assert dataset.read_image(other.entries[0]).tobytes() == other.read_image(other.entries[0]).tobytes()
+    assert list(file_faults(f"{bucket}/out")) == []
+
+
+def test_server_that_fails_while_a_list_is_read(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = open_store(bucket)
+    store.put("list", b"line\n" * 10)
+
+    def hang_up(*_: object) -> bytes:
+        raise ConnectionResetError("the server hung up")
+
+    monkeypatch.setattr(import_module("s3fs").core.S3File, "_fetch_range", hang_up)
+    with store.open("list") as stream, pytest.raises(StorageError, match="AWS_ENDPOINT_URL"):
+        stream.readline()
