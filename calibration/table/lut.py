@@ -449,9 +449,9 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
     except OSError as error:
         if (partial_path(folder) / SAMPLES).is_file():
             raise FormatError(f"{folder} is not complete; complete it with build-lut SESSION {folder}") from error
-        raise FormatError(
-            f"{folder} is not a LUT: cannot read {PROVENANCE} ({error.strerror}); make one with build-lut"
-        ) from error
+        # A Path has one slash less than its URL.
+        remedy = "copy it with build-lut fetch URL FOLDER" if ":/" in str(folder) else "make one with build-lut"
+        raise FormatError(f"{folder} is not a LUT: cannot read {PROVENANCE} ({error.strerror}); {remedy}") from error
     provenance = parse_provenance(text, path)
     lights = load_illuminants(folder / ILLUMINATIONS, computed=True)
     white = _load_white(folder / ILLUMINATIONS)
