@@ -302,7 +302,7 @@ def _ring_largest(axes: Any, values: Any, table: TableMeasurements, smallest: bo
     _ring(axes, index, float(array[index]), Path(table.frames[index].record.file).stem)
 
 
-def draw_course(figure: Any, table: TableMeasurements) -> None:
+def draw_frame_values(figure: Any, table: TableMeasurements) -> None:
     """Draw black level, movement, blur, white, deviation of patches and number of references of each frame.
 
     Rings mark the worst frames.
