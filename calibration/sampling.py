@@ -21,7 +21,8 @@ from drivers.raw.rawfile import CHANNELS, Mosaic, phases
 from experiment.framing.sharpness import MAX_BLUR_PX
 from foundation.compiled import compiled, inlined
 
-# A smaller difference between the rim and the centre of a patch, relative to its mean, is negligible (judgement).
+# A smaller difference between the rim and the centre of a patch, relative to its mean, is negligible. Chosen by
+# judgement.
 UNEVEN_SHARE = 0.01
 
 # The difference is significant from this number of standard deviations. Noise alone exceeds 5 σ once in 1.7 million

@@ -45,20 +45,21 @@ _FEW = 24  # Up to this number of illuminants, each is omitted in turn; with mor
 
 _SUSPECTS = 8  # Number of illuminants tested for exchanges: those whose omission improves the fit most
 
-# An exchange is preferred to the omission of one illuminant if its misfit is at most this much larger. The omission
-# removes three values, each of which adds 1 to the misfit on average.
+# An exchange is preferred to the omission of one illuminant if the misfit of the exchange is at most this much larger.
+# The omission removes three values, each of which adds 1 to the misfit on average.
 _MISFIT_MARGIN = 9.0
 
 # Relative scatter of a channel against the other channels: usual value, and largest value attributed to the lamp. A
 # larger scatter has other causes, for example exposures that end within a turn of the colour wheel.
 _CHROMA_SD, _MOST_CHROMA_SD = 0.003, 0.012
 
-# Relative scatter of brightness: of a flickering lamp, and of a lamp with unknown drift because white frames are
-# missing.
+# Relative scatter of brightness: of a flickering lamp with known drift, and of a lamp without white frames, whose drift
+# is unknown.
 _BRIGHTNESS_SD, _UNKNOWN_DRIFT_SD = 0.03, 0.06
 
-# Largest misfit of few illuminants with correct names: constant part, and part per illuminant. In simulated rooms, it
-# was below 6 + 1.7 per illuminant without faults. With an exchange at 6° or more, it was above 12 + 3.3.
+# Largest misfit of few illuminants with correct names: constant part, and part per illuminant. In simulated rooms
+# without faults, the misfit was below 6 + 1.7 per illuminant. With an exchange at 6° or more, it was above 12 + 3.3 per
+# illuminant.
 _MAX_MISFIT, _MAX_MISFIT_EACH = 8.0, 2.5
 
 # Largest squared distance (χ² of six values) of two whites from the prediction for their exchanged codes. Noise alone
@@ -68,8 +69,9 @@ _MAX_DISTANCE2 = 50.0
 # Relative standard deviation of brightness that is large enough to make brightness irrelevant.
 _FREE_BRIGHTNESS_SD = 10.0
 
-# Two illuminants are not tested for an exchange if the squared distance of their predictions is larger, in units of
-# `EXCHANGE_EVIDENCE`, and both fit their codes. Exchanged illuminants at this distance would not fit.
+# Largest squared distance between the predictions of two illuminants that are tested for an exchange, in units of
+# `EXCHANGE_EVIDENCE`. At a larger distance, exchanged illuminants would not fit their codes. Illuminants that do not
+# fit their codes are tested at any distance.
 _NEAR_PAIRS = 3.0
 
 _BLOCK_PAIRS = 20_000  # Pairs evaluated at a time: about 100 MB

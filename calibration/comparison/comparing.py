@@ -46,7 +46,7 @@ CHANCE = 0.01
 # fitted to the same few references.
 ERROR_FACTOR = 1.3
 
-# Negligible angle between whites, degrees: 1/200 of the error of a good method (judgement).
+# Negligible angle between whites, degrees: 1/200 of the error of a good method. Chosen by judgement.
 ANGLE_FLOOR_DEG = 0.005
 
 # Negligible relative difference of brightness. Two sheets of a small simulated chart differ by up to 0.17 %, because

@@ -24,7 +24,7 @@ from experiment.measures.paper import FlatField, Paper
 
 _Array = npt.NDArray[np.float64]
 
-# Minimum counts above black level of paper under a primary for a precise field (judgement).
+# Minimum counts above black level of paper under a primary for a precise field. Chosen by judgement.
 LEAST_PAPER = 300.0
 
 # Largest relative difference of a patch's field from the field of paper. A larger difference is noise and is ignored.

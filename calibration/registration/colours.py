@@ -29,7 +29,7 @@ _MISMATCH_SHARE = 0.08
 
 _NEIGHBOURS = 13  # The patch itself and the twelve patches within a distance of two patches
 
-# Share of mismatched neighbours above which a patch is also mismatched (judgement).
+# Share of mismatched neighbours above which a patch is also mismatched. Chosen by judgement.
 _MISMATCH_NEIGHBOURS = 0.35
 
 _MAX_AREA_CELLS = 16  # Largest width of an area that is tested for a displacement, in patches

@@ -101,7 +101,7 @@ _COLOUR_PATCHES = 5000  # Approximate number of patches for fitting the colour m
 
 _LENS_POINTS = 2000  # Approximate number of patches for refitting the lens; more do not improve it
 
-# Assumed standard uncertainty of the positions of these patches, px (judgement).
+# Assumed standard uncertainty of the positions of these patches, px. Chosen by judgement.
 _LENS_POINT_SIGMA_PX = 0.1
 
 # Blur that cubic interpolation adds to the rectified frame, as a standard deviation, measured on sharp edges. The

@@ -49,7 +49,7 @@ MIN_AGREEMENT = 0.8
 # colour model can partly fit even an object in front of the chart.
 MIN_PLAIN_AGREEMENT = 0.95
 
-MIN_GOOD_BLOCKS = 0.75  # Minimum share of blocks of patches that match the chart (judgement)
+MIN_GOOD_BLOCKS = 0.75  # Minimum share of blocks of patches that match the chart; chosen by judgement
 
 # Largest RMS residual of the blocks, for patches of 10 px. Waves of 3 mm give less than a tenth of it in simulation.
 MAX_BLOCK_RESIDUAL_PX = 0.5
@@ -66,7 +66,7 @@ _TAG_SIGMA_PX = 0.15
 
 _MIN_TAG_SIGMA_PX = 0.03  # Standard uncertainty of a tag corner in the sharpest frames
 
-_OUTLINE_SIGMA_PX = 0.1  # Standard uncertainty of an outline point, across the outline (judgement)
+_OUTLINE_SIGMA_PX = 0.1  # Standard uncertainty of an outline point, across the outline; chosen by judgement
 
 # An outline point is an outlier if it is further from the curve of its side than both limits.
 _OUTLIER_SIGMAS, _OUTLIER_PX = 5.0, 1.0

@@ -463,7 +463,7 @@ def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransf
         axes.grid(color=FAINT, alpha=0.25, linewidth=0.5)
 
 
-_MIN_LEVELS = 6  # Minimum number of levels for reporting the three parameters of the curve (judgement)
+_MIN_LEVELS = 6  # Minimum number of levels for reporting the three parameters of the curve; chosen by judgement
 
 # Smallest radius of a circle, relative to the page width. A circle around a single patch would be too small to see.
 _MIN_RADIUS = 0.012

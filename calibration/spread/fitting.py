@@ -63,10 +63,10 @@ MOST_MISFIT = 5.0
 LEAST_COUNTS = 300.0  # minimum counts of paper above black level in a used channel
 
 # Prior standard deviation of the coefficients of the smooth factors: errors of the flat field and unevenness of the
-# print (judgement).
+# print. Chosen by judgement.
 USUAL_UNEVENNESS = 0.003
 
-LOOSE_UNEVENNESS = 0.03  # the same for light of several primaries with different flat fields (judgement)
+LOOSE_UNEVENNESS = 0.03  # the same for light of several primaries with different flat fields; chosen by judgement
 
 FOLDS = 4  # folds of cross-validation over parts of the print
 
@@ -101,11 +101,11 @@ _FAR_SIZES = (0.3, 1.0, 3.0)
 # glare.
 _CLEAN = 0.001
 
-# Prior probability of a lens without scatter, for charts with many and with few colours (judgement). The first value
-# would give charts with few colours an uncertainty of several times the actual error.
+# Prior probability of a lens without scatter, for charts with many and with few colours. The first value would give
+# charts with few colours an uncertainty of several times the actual error. Chosen by judgement.
 _CLEAN_ODDS, _CLEAN_ODDS_OF_FEW = 0.3, 0.7
 
-# Prior probability that a lens with scatter has no veiling glare, on charts with few colours (judgement).
+# Prior probability that a lens with scatter has no veiling glare, on charts with few colours. Chosen by judgement.
 _CLEAR_ODDS_OF_FEW = 0.3
 
 # Assumed laws of scattered light: exponent of its decrease with distance, and factor of the far kernels. Two laws are
@@ -113,18 +113,18 @@ _CLEAR_ODDS_OF_FEW = 0.3
 # King, "The profile of a star image", 1971). The third is for aberrations, which end within a slot.
 _LAWS = ((2.0, 1.0), (3.0, 1.0), (3.0, _CLEAN))
 
-_POWER_ODDS = 0.5  # prior probability that scattered light follows one of these laws (judgement)
+_POWER_ODDS = 0.5  # prior probability that scattered light follows one of these laws; chosen by judgement
 
-_SCATTERED = 0.04  # prior standard deviation of all scattered light of a lens that follows a law (judgement)
+_SCATTERED = 0.04  # prior standard deviation of all scattered light of a lens that follows a law; chosen by judgement
 
-# Prior standard deviation of the difference between a share and the law, relative to the law (judgement).
+# Prior standard deviation of the difference between a share and the law, relative to the law. Chosen by judgement.
 _OFF_LAW = 0.35
 
 # Standard deviation of the difference between a channel's far share and the common share of R, G and B, relative to the
-# share (judgement). Scatter and coatings vary over the visible spectrum.
+# share. Scatter and coatings vary over the visible spectrum. Chosen by judgement.
 CHANNELS_APART = 1 / 3
 
-_LAW_APART = 0.7  # as `CHANNELS_APART`, for these differences (judgement)
+_LAW_APART = 0.7  # as `CHANNELS_APART`, for these differences; chosen by judgement
 
 _SCATTER_APART = 0.5  # as `CHANNELS_APART`, for a lens that follows a law
 
@@ -134,7 +134,7 @@ _FAR_FALL = 0.5
 # `CHANNELS_APART` for three kinds of lenses: similar channels, different channels, and coatings for one channel.
 _APART = (0.03, CHANNELS_APART, 0.7)
 
-_APART_ODDS = (0.4, 0.4, 0.2)  # prior probabilities of `_APART` (judgement)
+_APART_ODDS = (0.4, 0.4, 0.2)  # prior probabilities of `_APART`; chosen by judgement
 
 # Largest credible veiling glare on charts with few colours. Above it, the light may come from near kernels that grow
 # towards the corners, which such charts cannot show.
@@ -152,8 +152,8 @@ _ROUNDS = 2  # number of solutions; each solution gets its weights from the resi
 # Stored shares are multiples of this step, so that the bytes of a LUT do not depend on rounding in linear algebra.
 _ROUNDING = 1e-7
 
-# Prior standard deviation of the change of a share over the frame, if there are too few patches to measure the change
-# (judgement).
+# Prior standard deviation of the change of a share over the frame, if there are too few patches to measure the change.
+# Chosen by judgement.
 _SMALL_SHARE = 0.002
 
 _EVEN_TERMS = 3  # number of unknowns of a share that is constant over the frame: one per channel

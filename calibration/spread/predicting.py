@@ -39,7 +39,7 @@ _LENGTH_SCALE = 16.0
 
 _NOISES = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)  # candidates for the ratio of noise to function
 
-_EQUAL_NOISE_LEVEL = 0.02  # level at which read noise and photon noise are equal (judgement)
+_EQUAL_NOISE_LEVEL = 0.02  # level at which read noise and photon noise are equal; chosen by judgement
 
 _MIN_LEVEL = 1e-3  # lower bound of levels before the square root is taken
 
