@@ -25,18 +25,19 @@ from foundation.compiled import compiled, inlined
 # judgement.
 UNEVEN_SHARE = 0.01
 
-# The difference is significant from this number of standard deviations. Noise alone exceeds 5 σ once in 1.7 million
-# comparisons, and a full chart has 98 304.
+# Number of standard deviations from which this difference is significant. Noise alone exceeds 5 σ once in 1.7 million
+# comparisons, and a full chart has 98 304 comparisons.
 UNEVEN_SIGMA = 5.0
 
-# A photosite with less than this fraction of the light of its patch is dead. Next to a dark patch, the rim keeps more.
+# A photosite with less than this fraction of the light of its patch is dead. Blur from a dark neighbour reduces the
+# light at the rim of a patch less than this.
 DEAD_SHARE = 0.5
 
 # Patches with fewer counts are not searched for dead photosites, so that noise is not mistaken for them.
 DEAD_LEVEL = 300.0
 
-# Probability that noise alone makes a normal patch count as noisy. With 25 samples, the limit is 3.5 times the variance
-# of the model.
+# Probability that noise alone makes a normal patch count as noisy. With 25 samples, a patch is then noisy from 3.5
+# times the variance of the model.
 NOISY = 1e-8
 
 # Number of groups of patches with similar levels, from which noise is estimated; 1000 patches of a full chart in each.
@@ -47,7 +48,8 @@ _CURVE_BINS = 48  # Largest number of such groups for the photon-transfer curve
 # Possible sides of a sampling window, half-size px. They are odd, so that a window has a central pixel.
 WINDOWS = (3, 5, 7, 9)
 
-# Negligible fraction of a sample's light that comes from outside its patch. The accepted limit is 5 times higher.
+# Negligible fraction of the light of a sample that comes from outside its patch. The limit of the figure `bleed` is 5
+# times higher.
 SAFE_BLEED = 0.002
 
 MISPLACEMENT_PX = 0.75  # Largest error of a sample's position: rounding 0.5 px, registration 0.25 px
@@ -265,7 +267,7 @@ def has_dead_photosite(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.bool
 def sample_noise(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Return the standard deviation of one sample of each patch, (N, 3) float64 counts.
 
-    It is estimated from all patches of a similar level, because a single patch gives it only to 25 %. `samples`:
+    It is estimated from all patches of a similar level, because a single patch has an error of 25 %. `samples`:
     (N, S, 3) counts above black.
     """
     inner = _inner(samples.shape[1])

@@ -107,9 +107,8 @@ class FrameConsistency:
         is_disturbed, single = cells_without_hot(cells, np.array(self.seeds, dtype=np.int64), hot, cells_mm)
         disturbed = tuple(patch for patch, valid in zip(self.disturbed, is_disturbed.tolist(), strict=True) if valid)
         seeds = tuple(cell for cell in self.seeds if is_disturbed[np.searchsorted(cells, cell)])
-        return replace(
-            self, disturbed=disturbed, seeds=seeds, isolated=tuple(sorted({*self.isolated, *isolated.tolist()}))
-        )
+        isolated = tuple(sorted({*self.isolated, *single.tolist()}))
+        return replace(self, disturbed=disturbed, seeds=seeds, isolated=isolated)
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,12 +38,12 @@ _Array = npt.NDArray[np.float64]
 _Numbers = npt.NDArray[np.int64]
 _Folders = tuple[Path, Path]
 
-# A difference is reported if the probability that noise causes it anywhere in the LUT is smaller. It must also exceed
-# one of the limits below: with so many samples, even negligible differences are significant.
+# Largest probability with which noise alone causes a reported difference anywhere in the LUT. A reported difference
+# must also exceed one of the limits below, because with so many samples even negligible differences are significant.
 CHANCE = 0.01
 
 # Factor for the standard errors of whites. They are too small, because they are the scatter about a polynomial that was
-# fitted to the same few references.
+# fitted to the same few white references.
 ERROR_FACTOR = 1.3
 
 # Negligible angle between whites, degrees: 1/200 of the error of a good method. Chosen by judgement.
@@ -53,15 +53,15 @@ ANGLE_FLOOR_DEG = 0.005
 # their flat fields differ.
 BRIGHTNESS_FLOOR = 0.002
 
-# Largest RMS difference of patches that noise explains, in units of noise: of all patches, and of the patches under one
-# illuminant. Two sessions in the same simulated room give 1.00 to 1.05.
-CELL_SCORE = 1.1
-LIGHT_SCORE = 1.3
+# Largest RMS difference of patches that noise explains, in units of noise. Two sessions in the same simulated room give
+# 1.00 to 1.05.
+CELL_SCORE = 1.1  # of all patches
+LIGHT_SCORE = 1.3  # of the patches under one illuminant
 
-# A patch is listed if its mean difference over all illuminants exceeds two limits: in standard errors, and relative, as
-# for a stain in `build-lut`.
+# A patch is listed if its mean difference over all illuminants exceeds both limits. The first is in standard errors;
+# the second is the limit of a stain in `build-lut`.
 CELL_SIGMAS = 6.0
-CELL_FLOOR = STAINED
+CELL_FLOOR = STAINED  # relative
 
 # Patches with fewer counts are not compared. The mean of 25 samples of 300 counts has an error of 1 %.
 MIN_COUNTS = 300.0

@@ -114,7 +114,7 @@ WHITE_DRIFT = Figure(
 
 def _drift_residual(table: TableMeasurements) -> float | None:
     drift = table.lights.drift
-    return drift.left if drift is not None and len(table.white_frames) > 1 else None
+    return drift.uncertainty if drift is not None and len(table.white_frames) > 1 else None
 
 
 DRIFT_LEFT = Figure(

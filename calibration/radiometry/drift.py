@@ -1,8 +1,8 @@
 """Correct a LUT for lamp drift, and list all corrections of counts for `lut.json`.
 
 Each illuminant is scaled to the brightest state of the lamp. Samples are therefore multiplied by factors of at least 1.
-Different integers stay different, so the measured counts can be recovered exactly (`as_measured`). Samples and ground
-truth of an illuminant are divided by the same gain in each channel, so they stay consistent
+Different integers stay different, so that the measured counts can be recovered exactly (`as_measured`). Samples and
+ground truth of an illuminant are divided by the same gain in each channel, so they stay consistent
 (docs/decisions/0030-drift-is-taken-out-on-request.md).
 """
 
@@ -146,7 +146,7 @@ class DriftCorrection:
     """Gains by which the illuminants of a LUT are divided, so that all have the brightest state of the lamp."""
 
     gains: _Array  # (L, 3) lamp relative to the brightest white frame, in (0, 1], rounded to `DIGITS`
-    left: float  # relative uncertainty of the lamp between white frames (`drift_uncertainty`)
+    uncertainty: float  # relative, of the lamp between white frames (`drift_uncertainty`)
 
 
 def drift_correction(at_s: _Array, white_at_s: _Array, white: _Array) -> DriftCorrection:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from calibration.sampling import PhotonTransfer
     from calibration.table.lut import Lut
 
-_LIGHTS: Final = 6  # number of illuminants to measure; in a full LUT, their patches give each parameter to 1 %
+_LIGHTS: Final = 6  # number of illuminants to measure; in a full LUT, each parameter of the curve is accurate to 1 %
 
 # Largest RMS of the relative differences between variances and curve. Full simulated LUTs have 0.006, and LUTs with
 # eight patches per level 0.1.

@@ -24,7 +24,7 @@ MIN_COLOURS = 64
 # high because model errors are not normally distributed.
 _MISMATCH_SIGMA = 10.0
 
-# The second limit, relative to paper. Errors of the model at the corners of the gamut are smaller.
+# The second limit, relative to paper. At the corners of the gamut, the model has smaller errors.
 _MISMATCH_SHARE = 0.08
 
 _NEIGHBOURS = 13  # The patch itself and the twelve patches within a distance of two patches
@@ -36,7 +36,7 @@ _MAX_AREA_CELLS = 16  # Largest width of an area that is tested for a displaceme
 
 _MIN_SHIFT_CELLS = 0.5  # Smallest apparent displacement of a displaced area, in patches
 
-_MIN_SHIFT_SIGMAS = 6.0  # The same in standard uncertainties
+_MIN_SHIFT_SIGMAS = 6.0  # Smallest apparent displacement of a displaced area, in standard uncertainties
 
 # Number of independent measurements in an area. It is small, because model errors of neighbouring patches are
 # correlated.
@@ -57,8 +57,8 @@ _Mask = npt.NDArray[np.bool_]
 def mismatched(measured: _Array, expected: _Array, paper: _Array, chart: Chart) -> _Mask:
     """Return the mismatched patches (C,) bool: their colours are far from the model, or most neighbours are mismatched.
 
-    `measured`, `expected`: (C, 3) colours of the patches in chart order, optionally followed by (R, 3) of references;
-    NaN outside the frame. `paper`: (3,) colour of the paper.
+    `measured`, `expected`: (C, 3) colours of the patches in chart order, or (C + R, 3) with the references last; NaN
+    outside the frame. `paper`: (3,) colour of the paper.
     """
     count = chart.colour_count
     if count < MIN_COLOURS:

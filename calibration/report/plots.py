@@ -290,7 +290,7 @@ def _ring(axes: Any, x: float, y: float, text: str) -> None:
     )
 
 
-_INWARD_FROM = 0.7  # Fraction of the axis above which labels are placed on the inner side of their point
+_INWARD_FROM = 0.7  # Beyond this fraction of an axis, labels are placed on the inner side of their point
 
 
 def _ring_largest(axes: Any, values: Any, table: TableMeasurements, smallest: bool = False) -> None:

@@ -45,7 +45,7 @@ _Array = npt.NDArray[np.float64]
 class AddedLight:
     """Added light on each patch."""
 
-    share: _Array  # (C, 3) relative to paper; the fifth percentile of patches is set to 0
+    share: _Array  # (C, 3) relative to paper; shifted so that the fifth percentile of the patches is 0
     error: _Array  # (C, 3) standard uncertainty of `share`
 
     @staticmethod

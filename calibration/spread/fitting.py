@@ -50,8 +50,8 @@ _CHANNEL_TERMS = _NEAR_TERMS + len(FAR_PX) + 1
 # Number of unknown shares: for each channel, all terms of near kernels, then far kernels, then veiling glare.
 TERMS = 3 * _CHANNEL_TERMS
 
-# Minimum χ² gain of a proven kernel: its share is then four standard uncertainties. In cross-validation, all kernels
-# together must gain as much.
+# Minimum χ² gain of a proven kernel: its share is then four standard uncertainties. In cross-validation, this is the
+# minimum gain of all kernels together.
 LEAST_GAIN = 16.0
 
 _Array = npt.NDArray[np.float64]
@@ -62,11 +62,12 @@ MOST_MISFIT = 5.0
 
 LEAST_COUNTS = 300.0  # minimum counts of paper above black level in a used channel
 
-# Prior standard deviation of the coefficients of the smooth factors: errors of the flat field and unevenness of the
-# print. Chosen by judgement.
+# Prior standard deviation of the coefficients of the smooth factors, which describe errors of the flat field and
+# unevenness of the print. Chosen by judgement.
 USUAL_UNEVENNESS = 0.003
 
-LOOSE_UNEVENNESS = 0.03  # the same for light of several primaries with different flat fields; chosen by judgement
+# `USUAL_UNEVENNESS` for light of several primaries with different flat fields. Chosen by judgement.
+LOOSE_UNEVENNESS = 0.03
 
 FOLDS = 4  # folds of cross-validation over parts of the print
 
@@ -97,12 +98,12 @@ _FAR_STEPS = (0.01, 0.01, 0.004, 0.003)
 # Factors of `_FAR_STEPS` for lenses with little, usual and much scatter; their prior probabilities are equal.
 _FAR_SIZES = (0.3, 1.0, 3.0)
 
-# Factor of the usual shares for a lens without scatter, and of the usual veiling glare for a lens without veiling
-# glare.
+# Factor of the usual shares for a lens without scatter. It is also the factor of the usual veiling glare for a lens
+# without veiling glare.
 _CLEAN = 0.001
 
-# Prior probability of a lens without scatter, for charts with many and with few colours. The first value would give
-# charts with few colours an uncertainty of several times the actual error. Chosen by judgement.
+# Prior probability of a lens without scatter, for charts with many and with few colours. With few colours, the first
+# value would give several times the actual error as uncertainty. Chosen by judgement.
 _CLEAN_ODDS, _CLEAN_ODDS_OF_FEW = 0.3, 0.7
 
 # Prior probability that a lens with scatter has no veiling glare, on charts with few colours. Chosen by judgement.
@@ -124,11 +125,12 @@ _OFF_LAW = 0.35
 # share. Scatter and coatings vary over the visible spectrum. Chosen by judgement.
 CHANNELS_APART = 1 / 3
 
-_LAW_APART = 0.7  # as `CHANNELS_APART`, for these differences; chosen by judgement
+_LAW_APART = 0.7  # as `CHANNELS_APART`, for differences between shares and the law; chosen by judgement
 
 _SCATTER_APART = 0.5  # as `CHANNELS_APART`, for a lens that follows a law
 
-# Expected share of a far kernel relative to the previous kernel. It would be 1 for a decrease with r⁻², 0.25 for r⁻³.
+# Expected share of a far kernel relative to the previous kernel. A decrease of light with r⁻² would give 1, and r⁻³
+# would give 0.25.
 _FAR_FALL = 0.5
 
 # `CHANNELS_APART` for three kinds of lenses: similar channels, different channels, and coatings for one channel.
@@ -212,11 +214,11 @@ def free_terms() -> npt.NDArray[np.bool_]:
 class PointSpread:
     """Spread of the lens outside of its sharp core, measured on the chart."""
 
-    # (TERMS,) shares for the correction: 0 for near kernels that are not proven; all 0 if no kernel is proven
+    # (TERMS,) shares to correct: 0 for near kernels that are not proven; all 0 if no kernel is proven
     shares: _Array
     covariance: _Array  # (TERMS, TERMS) of all unknowns, proven or not
     gain: float  # χ² gain of the proven kernels; by chance, each unknown gains 1
-    held_out: float  # χ² gain in cross-validation
+    held_out: float  # χ² gain of the proven kernels in cross-validation
     misfit: float  # χ² gain from smooth light that no kernel explains, per unknown, ≥ 1; factor of the covariance
     likeliest: _Array  # (TERMS,) most likely shares, also if no kernel is proven
 

@@ -34,7 +34,8 @@ VARYING_BITS = 4  # minimum bits per channel for prediction by neighbours; other
 # Side of a square of codes perpendicular to an axis. The curvature along the axis is averaged over this square.
 _SIDE = 5
 
-# Length scale of the random function, in code steps of a chart with three bits (judgement; fitted values are 7 to 20).
+# Length scale of the random function, in code steps of a chart with three bits. Chosen by judgement: fitted values are
+# 7 to 20.
 _LENGTH_SCALE = 16.0
 
 _NOISES = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)  # candidates for the ratio of noise to function
@@ -43,7 +44,7 @@ _EQUAL_NOISE_LEVEL = 0.02  # level at which read noise and photon noise are equa
 
 _MIN_LEVEL = 1e-3  # lower bound of levels before the square root is taken
 
-# Variance of unknown values: prior of the linear part of the function, and noise of unusable patches.
+# Variance that stands for an unknown value: prior of the linear part of the function, and noise of unusable patches.
 _UNKNOWN_VARIANCE = 1e4
 
 _OUTLIER_SIGMAS = 4.0  # a patch with a larger residual, in standard deviations, is not used for predicting others

@@ -361,7 +361,7 @@ def test_mean_light_is_mean_of_slots(sharp: Photograph) -> None:
     as_large = replace(around, frame_slots=float(len(slots)))
     assert as_large.mean(levels, inks) == pytest.approx(slots.mean(axis=0), rel=1e-6)
     # The background fills the rest of the frame.
-    expected = (slots.sum(axis=0) + 1000 * levels.beyond) / (len(slots) + 1000)
+    expected = (slots.sum(axis=0) + 1000 * levels.background) / (len(slots) + 1000)
     larger = replace(around, frame_slots=float(len(slots) + 1000))
     assert larger.mean(levels, inks) == pytest.approx(expected, rel=1e-6)
     assert around.frame_slots > len(slots)
