@@ -35,9 +35,11 @@ beyond the *refused* limit, no LUT is made. `report.json` uses the same names. T
 
 Terms in the tables:
 
-- *White*: camera RGB of bare paper under an illuminant. *Paper white*: bare paper under full white.
+- *White*: camera RGB of bare paper under an illuminant. It is predicted from its codes and from the whites of the
+  other illuminants. *Paper white* is bare paper under full white.
 - *Block*: group of adjacent patches that are compared together.
 - *Worst sample*: sample in the corner of a window, nearest to the neighbouring patches.
+- *Frame registered first*: usually the first white frame. The other frames are compared with it.
 - *Unfit patch*: patch that must not be used; `lut.json` lists unfit patches with the reason.
 
 *Written by `python -m docs.reference_pages` from `calibration/figures`.*

@@ -139,7 +139,7 @@ def _lens_row(table: TableMeasurements) -> SummaryRow:
 
 
 CORRECTION_RESIDUAL = Figure(
-    "correction_residual", "Lens-spread light that may remain in patch means after correction", "radiometry", "share",
+    "correction_residual", "Light spread by the lens that may remain in patch means", "radiometry", "share",
     "at most", 0.01, 0.03,
     why="patch means may contain light that the lens spreads from other parts of the print (veiling glare)",
     source=SIMULATED + ": 0.3 to 0.5 %. In even light or on a chart of 512 colours, veiling glare cannot be measured, "
@@ -149,7 +149,7 @@ CORRECTION_RESIDUAL = Figure(
 )  # fmt: skip
 
 CORRECTION_WORST = Figure(
-    "correction_worst", "Lens-spread light that may remain in the worst patch after correction", "radiometry", "share",
+    "correction_worst", "Light spread by the lens that may remain in the worst patch", "radiometry", "share",
     "at most", 0.03, None,
     why="dark patches get as much veiling glare as bright patches, so that their relative error is larger",
     source=SIMULATED + ": 0.3 to 1.9 %. The noise of 25 samples of 300 counts is 1 %", remedy=_REDUCE_GLARE,

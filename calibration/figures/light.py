@@ -133,7 +133,7 @@ def _white_drift_deg(table: TableMeasurements) -> float | None:
 
 
 WHITE_DRIFT_DEG = Figure(
-    "white_drift_deg", "Drift of white's colour", "light", "°", "at most", 0.2, 2.0,
+    "white_drift_deg", "Drift of the colour of paper white", "light", "°", "at most", 0.2, 2.0,
     why="the lamp's spectrum changes, and not only its brightness",
     source=JUDGEMENT + ": a tenth of the angular error of a good method", remedy=_WARM_UP,
     measure=_white_drift_deg, cause=Explanation("drift", drift_evidence), drawing="frames",
@@ -433,7 +433,7 @@ EXCHANGED_LIGHTS = Figure(
 )  # fmt: skip
 
 CODE_MISFIT = Figure(
-    "code_misfit", "Disagreement of all illuminants with their codes (up to 24 illuminants)", "light", "", "at most",
+    "code_misfit", "Disagreement of all illuminants with their codes, for up to 24 illuminants", "light", "", "at most",
     1.0, None,
     why="at least one illuminant has wrong codes, but it cannot be identified",
     source=SIMULATED + ": below 1 without faults. With more than 24 illuminants, each illuminant is judged separately",
@@ -460,14 +460,14 @@ def _checked_row(table: TableMeasurements) -> SummaryRow | None:
     if codes is None:
         return None
     value = f"{_checked_text(table, 0.0)}; exchanged names detectable above {format_value(codes.exchange_deg, '°')}"
-    note = "a wrong name of the remaining illuminants would not be detected"
+    note = "wrong names of illuminants that were not compared would not be detected"
     return SummaryRow("Illuminants compared with codes", value, note)
 
 
 CROSS_CHECKED_SHARE = Figure(
     "cross_checked_share", "Illuminants that could be compared with their codes", "light", "share", "at least", 0.9,
     None,
-    why="wrong names of the remaining illuminants would not be detected",
+    why="wrong names of illuminants that were not compared would not be detected",
     source=JUDGEMENT + ". An illuminant counts if a wrong name would be detected at angles of 8° and more",
     remedy="take white, red, green and blue in the session, and expose longer", before_session=False,
     measure=_code_value(lambda codes: float(codes.is_verified.mean())), where=_checked_text,
@@ -507,7 +507,7 @@ WHITE_FRAME_DEG = Figure(
 )  # fmt: skip
 
 WHITE_FRAME_BRIGHTNESS = Figure(
-    "white_frame_brightness", "Deviation of a white frame's brightness from the prediction from the illuminants",
+    "white_frame_brightness", "Deviation of a white frame's brightness from its prediction",
     "light", "share", "at most", 0.1, 0.3,
     why="the white frame has another exposure than the illuminants, so that drift and stray light are wrong",
     source=JUDGEMENT + ": more than the flicker of a lamp, and less than one step of the shutter time (26 %)",

@@ -99,7 +99,8 @@ ADDED_LIGHT = Figure(
     "added_light", "Light added to a large part of the print, relative to paper white", "radiometry", "share",
     "at most", 0.004, 0.01,
     why="a reflection adds the same light to dark and bright patches, also to patches that are not listed as unfit",
-    source=SIMULATED + ": 0 without faults. Light of 1 % of paper white makes a patch with 10 % of it 10 % brighter",
+    source=SIMULATED + ": 0 without faults. Light of 1 % of paper white makes a patch with a reflectance of "
+    "10 % brighter by a tenth",
     remedy="turn the print or the projector until the print shows no reflection, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.is_known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",

@@ -315,9 +315,9 @@ def _refuse_displaced_areas(matcher: Matcher, mismatched_cells: _Mask, frame_nam
     if len(displaced_mm) >= max(_MIN_DISPLACED_AREAS, _MIN_DISPLACED_SHARE * area_count):
         x, y = displaced_mm[0]
         raise RegistrationError(
-            f"{frame_name}: {len(displaced_mm)} of {area_count} areas of the chart have the colours of the neighbouring "
-            f"patches, the first near ({x:.0f}, {y:.0f}) mm from the top-left corner of the sheet; uncover the print, "
-            "hang it flatter, and check that chart.json describes the printed positions"
+            f"{frame_name}: {len(displaced_mm)} of {area_count} areas of the chart have the colours of the "
+            f"neighbouring patches, the first near ({x:.0f}, {y:.0f}) mm from the top-left corner of the sheet; "
+            "uncover the print, hang it flatter, and check that chart.json describes the printed positions"
         )
 
 
