@@ -38,7 +38,7 @@ DEAD_LEVEL = 300.0
 
 # Probability that noise alone makes a normal patch count as noisy. With 25 samples, a patch is then noisy from 3.5
 # times the variance of the model.
-NOISY = 1e-8
+NOISY_PROBABILITY = 1e-8
 
 # Number of groups of patches with similar levels, from which noise is estimated; 1000 patches of a full chart in each.
 _NOISE_BINS = 32
@@ -350,7 +350,7 @@ def photon_transfer(level: _Array, variance: _Array, samples: int = 25) -> Photo
         lit_level = np.maximum(level[:, channel], 0)
         model = terms[0, channel] + terms[1, channel] * lit_level + terms[2, channel] * lit_level**2
         ratio = np.maximum(ratio, variance[:, channel] / np.maximum(model, 1e-9))
-    allowed = float(chi2.isf(NOISY, samples - 1)) / (samples - 1)
+    allowed = float(chi2.isf(NOISY_PROBABILITY, samples - 1)) / (samples - 1)
     with np.errstate(divide="ignore"):
         gain = np.where(terms[1] > 0, 1 / terms[1], np.inf)
     return PhotonTransfer(gain, np.sqrt(terms[0]), np.sqrt(terms[2]), misfit, ratio, allowed)

@@ -31,7 +31,7 @@ IN_FIRST = 0.8
 
 # Another frame shows the same spot if it deviates by at least this fraction of the deviation of the spot. If at most
 # this fraction of the white frames shows the spot, these frames are faulty, and not the print.
-_HALF = 0.5
+_SAME_SPOT = 0.5
 
 # Smallest relative residual of references for which an object is reported: ten times their noise under white.
 _MIN_RESIDUAL = 0.02
@@ -246,7 +246,7 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
     colour = spot_colour(stains, spot)
     deviation, tint = _largest_deviation(colour)
     added, kept = light_of_spot(stains, spot, int(np.argmax(np.abs(colour))))
-    size_mm, min_deviation = max(position.size_mm, 1e-9), _HALF * abs(deviation)
+    size_mm, min_deviation = max(position.size_mm, 1e-9), _SAME_SPOT * abs(deviation)
     hottest = table.dark_frames.hottest
     deviating_whites = _faulty_whites(table, at_mm, position.size_mm, min_deviation)
     white_residual = len(deviating_whites) / max(len(table.white_frames), 1)
@@ -268,7 +268,7 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
     frames: list[FrameMeasurements] = []
     if evidence.in_first == 1:
         frames = [table.registered_frame]
-    elif 0 < white_residual <= _HALF:
+    elif 0 < white_residual <= _SAME_SPOT:
         frames = deviating_whites
     elif evidence.even_showing > 0:
         frames = _faulty_frames(table, at_mm, size_mm, min_deviation)
@@ -309,7 +309,7 @@ def _residual_evidence(
         other = frame.paper.left
         distance_mm = float(np.linalg.norm(np.array(other.at_mm) - at_mm))
         largest, _ = _largest_deviation(np.array(other.deviation))
-        return abs(largest) >= _HALF * abs(deviation) and distance_mm < near_mm
+        return abs(largest) >= _SAME_SPOT * abs(deviation) and distance_mm < near_mm
 
     evidence = {
         "white_residual": float(np.mean([deviates_too(white) for white in whites])),
@@ -336,7 +336,7 @@ def reference_evidence(table: TableMeasurements, limit: float) -> CauseEvidence 
         "radial": residuals.radial,
         "rim_frames": _dark_rim_fraction(table),
     }
-    if 0 < evidence.get("white_residual", 0.0) <= _HALF:
+    if 0 < evidence.get("white_residual", 0.0) <= _SAME_SPOT:
         return CauseEvidence(Evidence(**evidence), (worst.record,), positions)
     distance_mm = np.linalg.norm(stains.places_mm - residuals.at_mm, axis=1)
     near_spots = [spot for spot in spots_of(stains) if distance_mm[spot].min() < 4 * cell_mm(stains)]

@@ -48,7 +48,7 @@ DEGREE = 4  # Degree of the polynomial in the code: 35 terms
 LEAST_COUNTS = 60.0  # Patches with fewer expected counts are not compared: the mean of 25 samples has an error of 3 %
 
 # Largest number of patches for scatter and blocks: a quarter of a full chart, to save time in every frame.
-CELLS = 8192
+MAX_CELLS = 8192
 
 FIT_CELLS = 1500  # Approximate number of patches for fitting the polynomial: forty per term
 
@@ -57,13 +57,13 @@ BLOCK_CELLS = 32
 
 LEAST_CELLS = 12  # Minimum number of compared patches in a block
 
-CELLS_A_TERM = 2  # Minimum number of patches per term; with fewer, the polynomial would fit faults
+CELLS_PER_TERM = 2  # Minimum number of patches per term; with fewer, the polynomial would fit faults
 
 _ROUNDS = 3  # Number of reweighted solutions after the unweighted one
 
 # Number of standard uncertainties subtracted from the mean of a block and from the scatter. With the 256 blocks of a
 # full chart, noise alone exceeds them in one of sixty frames.
-_CERTAIN = 4.0
+_CERTAIN_SIGMAS = 4.0
 
 # Variance of the standard deviation of N normal values that is estimated from their median deviation, in units of σ²/N
 # (P. Rousseeuw and C. Croux, Journal of the American Statistical Association 88, 1993: an efficiency of 37 %).
@@ -143,7 +143,7 @@ class _Channel:
 
 def has_enough_cells(cells: int) -> bool:
     """Return whether a chart with this number of patches can be checked."""
-    return cells >= CELLS_A_TERM * len(code_powers(DEGREE))
+    return cells >= CELLS_PER_TERM * len(code_powers(DEGREE))
 
 
 class ConsistencyCheck:
@@ -163,7 +163,7 @@ class ConsistencyCheck:
 
     def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, level: _Array, variance: _Array, usable: _Mask) -> None:
         # Blocks are means over many patches, so every fourth patch of a full chart is sufficient.
-        self._selection = slice(None, None, max(1, len(cells_mm) // CELLS))
+        self._selection = slice(None, None, max(1, len(cells_mm) // MAX_CELLS))
         all_terms = code_polynomial(np.asarray(rgb), DEGREE)
         terms = np.ascontiguousarray(all_terms[self._selection])
         self._usable = usable[self._selection]
@@ -243,7 +243,7 @@ class ConsistencyCheck:
         return disturbed, tuple(seeds.tolist()), tuple(isolated.tolist())
 
     def _channel_deviations(self, reference: _Channel, mean: _Array, variance: _Array) -> _Deviations | None:
-        if len(reference.bright) < CELLS_A_TERM * reference.terms.shape[1]:
+        if len(reference.bright) < CELLS_PER_TERM * reference.terms.shape[1]:
             return None
         design, level, measured = reference.design, reference.level[reference.fitted], mean[reference.fitted]
         # The weights depend on expected levels. With measured levels, dark covered patches would have large weights.
@@ -265,12 +265,12 @@ class ConsistencyCheck:
         scatter2 = robust_sigma(deviation[bright] - np.median(deviation[bright])) ** 2
         noise2 = float(np.median(variance[bright] / expected[bright] ** 2))
         # The relative uncertainty of a square is twice the uncertainty of its root.
-        error = _CERTAIN * 2 * float(np.sqrt(_SPREAD_ERROR2 / len(bright)))
+        error = _CERTAIN_SIGMAS * 2 * float(np.sqrt(_SPREAD_ERROR2 / len(bright)))
         kernels.clipped_to_neighbours(deviation[:-1].copy(), self._around, deviation[:-1])
         block_deviations = deviation[self._members]
         count = np.isfinite(block_deviations).sum(axis=1)
         average = np.nansum(block_deviations, axis=1) / np.maximum(count, 1)
-        excess = np.abs(average) - _CERTAIN * np.sqrt(scatter2 / np.maximum(count, 1))
+        excess = np.abs(average) - _CERTAIN_SIGMAS * np.sqrt(scatter2 / np.maximum(count, 1))
         compared = np.isfinite(deviation[:-1])
         return _Deviations(
             solution=solution,

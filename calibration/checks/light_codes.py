@@ -41,9 +41,9 @@ VERIFIED_DEG = 8.0
 # Largest standard uncertainty of the prediction of a verified illuminant, degrees. Red and blue are 85° apart.
 _VERIFIED_SD_DEG = 10.0
 
-_FEW = 24  # Up to this number of illuminants, each is omitted in turn; with more, robust weights are sufficient
+_FEW_LIGHTS = 24  # Up to this number of illuminants, each is omitted in turn; with more, robust weights are sufficient
 
-_SUSPECTS = 8  # Number of illuminants tested for exchanges: those whose omission improves the fit most
+_SUSPECT_COUNT = 8  # Number of illuminants tested for exchanges: those whose omission improves the fit most
 
 # An exchange is preferred to the omission of one illuminant if the misfit of the exchange is at most this much larger.
 # The omission removes three values, each of which adds 1 to the misfit on average.
@@ -72,7 +72,7 @@ _FREE_BRIGHTNESS_SD = 10.0
 # Largest squared distance between the predictions of two illuminants that are tested for an exchange, in units of
 # `EXCHANGE_EVIDENCE`. At a larger distance, exchanged illuminants would not fit their codes. Illuminants that do not
 # fit their codes are tested at any distance.
-_NEAR_PAIRS = 3.0
+_MAX_PAIR_DISTANCE2 = 3.0
 
 _BLOCK_PAIRS = 20_000  # Pairs evaluated at a time: about 100 MB
 
@@ -177,7 +177,7 @@ def _fit_codes(
         )
 
     count = len(white)
-    if count > _FEW:
+    if count > _FEW_LIGHTS:
         fitted = fit(codes, _CHROMA_SD, None)
         _, deviation, _ = _directions(*fitted.predicted(np.arange(count)[:, None]), white)
         # 1.39 is the median of χ² with two degrees of freedom.
@@ -198,7 +198,7 @@ def _fit_codes(
         best = fits[ranked[0]]
         is_healthy = best.misfit < _max_misfit(int(used.sum()) - 1)
         if used.all():
-            exchange, misfit_left = _best_exchange(fit, codes, fitted.misfit, ranked[:_SUSPECTS])
+            exchange, misfit_left = _best_exchange(fit, codes, fitted.misfit, ranked[:_SUSPECT_COUNT])
             if exchange is not None and misfit_left < best.misfit + _MISFIT_MARGIN:
                 remaining = ~np.isin(np.arange(count), exchange)
                 return fit(codes, _CHROMA_SD, remaining), exchange, misfit
@@ -270,13 +270,13 @@ def _pairs(
     `mean` (L, 3) and `cov` (L, 3, 3) are predictions. `is_off` (L,): illuminants that deviate from their codes.
     """
     pairs = np.stack(np.triu_indices(len(fit.white), 1), axis=-1)
-    if len(fit.white) > _FEW:
+    if len(fit.white) > _FEW_LIGHTS:
         # With many illuminants, only near pairs and pairs with a deviating illuminant are evaluated. In any other
         # pair, exchanged illuminants would deviate strongly.
         first, second = pairs.T
         difference = mean[first] - mean[second]
         distance2 = np.einsum("pa,pab,pb->p", difference, np.linalg.inv(cov[first] + cov[second]), difference)
-        pairs = pairs[(distance2 < _NEAR_PAIRS * EXCHANGE_EVIDENCE) | is_off[first] | is_off[second]]
+        pairs = pairs[(distance2 < _MAX_PAIR_DISTANCE2 * EXCHANGE_EVIDENCE) | is_off[first] | is_off[second]]
     blocks = [pairs[start : start + _BLOCK_PAIRS] for start in range(0, len(pairs), _BLOCK_PAIRS)]
     results = [_evaluate_pairs(fit, block) for block in blocks]
     empty = (np.zeros(0),) * 3

@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-CERTAIN = 4.0  # Number of standard uncertainties subtracted from an amount, so that noise does not appear as light
+# Number of standard uncertainties subtracted from an amount, so that noise does not appear as light.
+CERTAIN_SIGMAS = 4.0
 
 # A projector that boosts white also boosts mixtures of two primaries, and part of the added light may look like the
 # third primary. This tolerance is relative to the boost of white. A fault in the frame of a primary also looks like a
 # boost, so a larger tolerance could disable the check. Chosen by judgement.
-BOOST_ELSEWHERE = 0.25
+BOOST_TOLERANCE = 0.25
 
 # Largest amount that is reported as room light. A larger amount means a wrong illuminant or exposure, which other
 # figures detect. Chosen by judgement.
@@ -125,7 +126,7 @@ def stray_light(
     is_checked = np.ones(len(codes), dtype=np.bool_)
     is_checked[list(primaries)] = False
     boost = max(float(full.max()) - 1, 0.0) if len(full) else 0.0
-    tolerance = CERTAIN * spread + np.where(has_primary.sum(axis=1) > 1, BOOST_ELSEWHERE * boost, 0.0)[:, None]
+    tolerance = CERTAIN_SIGMAS * spread + np.where(has_primary.sum(axis=1) > 1, BOOST_TOLERANCE * boost, 0.0)[:, None]
     beyond = np.where(~has_primary & is_checked[:, None], np.maximum(np.abs(amounts) - tolerance, 0), 0.0)
     # A wrong illuminant or exposure changes all amounts, and by more than room light.
     beyond[(beyond > _MAX_ROOM_LIGHT).any(axis=1)] = 0
@@ -155,8 +156,8 @@ def _primary_excess(codes: npt.NDArray[np.int64], full: _Array, spread: _Array) 
     flicker = float(np.ptp(full.mean(axis=1)))
     # The frames of the primaries have the same flicker and slow changes as the white frames.
     error = float(np.sqrt((spread**2).max() + (_DEVIATION_PER_RANGE * flicker) ** 2))
-    share = float(excess.min()) - CERTAIN * error
-    is_equal = float(np.ptp(excess)) <= _MAX_DIFFERENCE * float(excess.mean())
+    share = float(excess.min()) - CERTAIN_SIGMAS * error
+    is_equal = float(np.ptp(excess)) <= _MAX_EXCESS_RANGE * float(excess.mean())
     return share if is_equal and 0 < share <= _MAX_ROOM_LIGHT else 0.0
 
 
@@ -168,8 +169,8 @@ def _are_clean(amounts: _Array, has_primary: _Mask, spread: _Array, share: float
     contains = np.where(has_primary, amounts, 0.0) >= _MIN_AMOUNT
     if not (contains.sum(axis=0) >= _MIN_MIXTURES).all():
         return False
-    missing = np.where(has_primary, 0.0, np.abs(amounts) + CERTAIN * spread).max(axis=1)
-    return bool(missing[contains.any(axis=1)].max() <= _MAX_MISSING * share)
+    missing = np.where(has_primary, 0.0, np.abs(amounts) + CERTAIN_SIGMAS * spread).max(axis=1)
+    return bool(missing[contains.any(axis=1)].max() <= _MAX_CLEAN_AMOUNT * share)
 
 
 # Smallest amount of a primary with which a mixture shows whether the frame of this primary contains room light. If it
@@ -180,7 +181,7 @@ _MIN_MIXTURES = 3  # Number of mixtures per primary that must agree, because err
 
 # The frames of the primaries are clean if the amounts of primaries with code 0, including their uncertainty, are below
 # this fraction of the supposed room light.
-_MAX_MISSING = 0.25
+_MAX_CLEAN_AMOUNT = 0.25
 
 _FULL_CODE = 255  # Largest code
 
@@ -189,4 +190,4 @@ _DEVIATION_PER_RANGE = 0.5
 
 # Largest range of the three excesses relative to their mean. Daylight has a smaller range, although its colour differs
 # from the lamp. Flicker in the frames of the primaries has a larger range. Chosen by judgement.
-_MAX_DIFFERENCE = 0.6
+_MAX_EXCESS_RANGE = 0.6

@@ -40,7 +40,7 @@ _Folders = tuple[Path, Path]
 
 # Largest probability with which noise alone causes a reported difference anywhere in the LUT. A reported difference
 # must also exceed one of the limits below, because with so many samples even negligible differences are significant.
-CHANCE = 0.01
+MAX_CHANCE = 0.01
 
 # Factor for the standard errors of whites. They are too small, because they are the scatter about a polynomial that was
 # fitted to the same few white references.
@@ -211,8 +211,8 @@ def differing_cells(cells: CellDifferences) -> _Numbers:
 
 
 def _is_significant(chances: _Array) -> npt.NDArray[np.bool_]:
-    # Bonferroni correction: `CHANCE` is the probability for all illuminants together.
-    return chances < CHANCE / len(chances)
+    # Bonferroni correction: `MAX_CHANCE` is the probability for all illuminants together.
+    return chances < MAX_CHANCE / len(chances)
 
 
 def _answer(name: str, text: str, *faults: str) -> NoiseAnswer:

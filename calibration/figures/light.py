@@ -18,7 +18,7 @@ from calibration.causes.gathering import (
     stray_evidence,
     sum_evidence,
 )
-from calibration.checks.stray_light import CERTAIN
+from calibration.checks.stray_light import CERTAIN_SIGMAS
 from calibration.figures.figure import (
     JUDGEMENT,
     SIMULATED,
@@ -192,7 +192,7 @@ def _stray_row(table: TableMeasurements) -> SummaryRow | None:
     if stray is None:
         return SummaryRow(name, "not measured", "needs frames of red, green and blue alone, and a dark frame")
     note = (
-        f"minus {CERTAIN:g} standard errors, in {int(stray.checked.sum())} of {len(stray.certain)} illuminants "
+        f"minus {CERTAIN_SIGMAS:g} standard errors, in {int(stray.checked.sum())} of {len(stray.certain)} illuminants "
         "(those with a code of 0) and in the primaries"
     )
     return SummaryRow(name, f"{percent(stray.share)} of white", note)

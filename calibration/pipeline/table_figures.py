@@ -55,7 +55,7 @@ _Array = npt.NDArray[np.float64]
 _BLACK_COUNTS = 0.05
 
 # Relative standard deviation of photosite response that is always assumed, because noise may hide it.
-_RESPONSE = 0.003
+_RESPONSE_SD = 0.003
 
 _DARK_CHANGE = 0.2  # Relative change of dark light over a session with a single dark frame; chosen by judgement
 
@@ -64,14 +64,14 @@ _USUAL_OVERSUBTRACTION = 0.2
 
 # Relative error due to lamp flicker or an incomplete turn of the colour wheel in an exposure of 0.5 s (Heinz et al.
 # 2018). Chosen by judgement.
-_FLICKER = 5e-5
+_FLICKER_ERROR = 5e-5
 
-_STRAY = 1e-4  # Light from outside the print relative to the illuminant, if not measured; chosen by judgement
+_STRAY_ERROR = 1e-4  # Light from outside the print relative to the illuminant, if not measured; chosen by judgement
 
 # Fraction of the mean square errors of flicker and of stray light that all channels have in common. Chosen by
 # judgement: most flicker changes all channels alike. Channels differ if an exposure ends within one colour of the
 # wheel, or if walls reflect light in their own colour.
-_COMMON = 0.75
+_COMMON_FRACTION = 0.75
 
 
 def budget_of(table: TableMeasurements) -> Budget:
@@ -98,8 +98,8 @@ def _diagonal(squares: _Array) -> _Array:
 
 
 def _partly_common(size: float, lights: int) -> _Array:
-    """Return covariances (L, 3, 3) of a relative error, of which the fraction `_COMMON` is common to all channels."""
-    square = size**2 * (_COMMON * np.ones((3, 3)) + (1 - _COMMON) * np.eye(3))
+    """Return covariances (L, 3, 3) of a relative error; `_COMMON_FRACTION` of it is common to all channels."""
+    square = size**2 * (_COMMON_FRACTION * np.ones((3, 3)) + (1 - _COMMON_FRACTION) * np.eye(3))
     return np.broadcast_to(square, (lights, 3, 3))
 
 
@@ -107,7 +107,7 @@ def _noise_component(table: TableMeasurements, white: _Array, cells: _Array) -> 
     # The variance of the flat field at a patch is the variance of white times the number of its coefficients.
     square = (table.lights.white_error / white) ** 2
     coefficients = max(len(factor) for frame in table.frames for factor in frame.paper.field.coefficients[0])
-    response = (table.sensor.transfer.response**2 + _RESPONSE**2) / table.cells.window**2
+    response = (table.sensor.transfer.response**2 + _RESPONSE_SD**2) / table.cells.window**2
     return Component(
         "noise", "noise of the white references", False,
         "scatter of the white references about each frame's flat field, and photosite response within a patch; noise "
@@ -172,8 +172,8 @@ def _linearity_component(table: TableMeasurements, white: _Array, cells: _Array)
 
 def _added_light_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
     measured_share = 0.0 if table.lights.stray is None else table.lights.stray.share
-    lights = _partly_common(_STRAY, len(white)) + measured_share**2 * np.eye(3)
-    at_cells = (_STRAY**2 + measured_share**2 + table.cells.added.mean_square) / cells**2
+    lights = _partly_common(_STRAY_ERROR, len(white)) + measured_share**2 * np.eye(3)
+    at_cells = (_STRAY_ERROR**2 + measured_share**2 + table.cells.added.mean_square) / cells**2
     return Component(
         "added light", "reflections, and light in single frames", table.lights.stray is None,
         "light added equally to dark and bright patches; light of primaries with code 0; white minus all primaries",
@@ -185,7 +185,7 @@ def _flicker_component(white: _Array, cells: _Array) -> Component:
     return Component(
         "flicker", "flicker within an exposure", True,
         "usual for lamps and colour wheels; drift between frames is part of the ground truths and no error",
-        _partly_common(_FLICKER, len(white)), np.broadcast_to(_FLICKER**2, cells.shape),
+        _partly_common(_FLICKER_ERROR, len(white)), np.broadcast_to(_FLICKER_ERROR**2, cells.shape),
     )  # fmt: skip
 
 

@@ -40,7 +40,7 @@ HOT_COUNTS = 32.0
 
 HOT_SIGMA = 10.0  # minimum excess of a hot sample, in σ of read noise
 
-_NEVER = 32767  # value of `HotPixels.least` before the first dark frame
+_NO_FRAME_YET = 32767  # value of `HotPixels.least` before the first dark frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ class HotPixels:
     @staticmethod
     def start(cells: int, samples: int) -> HotPixels:
         """Return the state before the first dark frame."""
-        return HotPixels(np.full((cells, samples, 3), _NEVER, dtype=np.int16), np.zeros(cells))
+        return HotPixels(np.full((cells, samples, 3), _NO_FRAME_YET, dtype=np.int16), np.zeros(cells))
 
     def with_frame(self, excess: npt.NDArray[np.int16]) -> HotPixels:
         """Return the state after a frame with `excess` (C, S, 3) from `measure_dark_frame`."""
@@ -190,7 +190,7 @@ class HotPixels:
 
         `noise`: (3,) counts, standard deviation of a sample.
         """
-        return HotPixels(np.full_like(self.least, _NEVER), self.hottest(noise))
+        return HotPixels(np.full_like(self.least, _NO_FRAME_YET), self.hottest(noise))
 
     def hottest(self, noise: _Array) -> _Array:
         """Return the excess (C,) float64 of the hottest sample of each patch in every frame, counts; 0 if none.
@@ -198,7 +198,7 @@ class HotPixels:
         `noise`: (3,) counts, standard deviation of a sample.
         """
         limit = np.maximum(HOT_COUNTS, HOT_SIGMA * noise)
-        is_hot = (self.least > limit) & (self.least < _NEVER)
+        is_hot = (self.least > limit) & (self.least < _NO_FRAME_YET)
         return np.maximum(np.where(is_hot, self.least, 0).max(axis=(1, 2)).astype(np.float64), self.past)
 
 

@@ -23,7 +23,7 @@ _Array = npt.NDArray[np.float64]
 SaturationSource = Literal["frames", "raw files", "settings"]
 
 # Decimals of gains in `lut.json`. Samples are divided by the rounded gains, so that the division can be undone.
-DIGITS = 6
+GAIN_DIGITS = 6
 
 # Source of the saturation value, for `lut.json`.
 _SATURATION_FROM: dict[SaturationSource, str] = {
@@ -145,7 +145,7 @@ def _dark_correction(subtracted: _Array) -> dict[str, Any]:
 class DriftCorrection:
     """Gains by which the illuminants of a LUT are divided, so that all have the brightest state of the lamp."""
 
-    gains: _Array  # (L, 3) lamp relative to the brightest white frame, in (0, 1], rounded to `DIGITS`
+    gains: _Array  # (L, 3) lamp relative to the brightest white frame, in (0, 1], rounded to `GAIN_DIGITS`
     uncertainty: float  # relative, of the lamp between white frames (`drift_uncertainty`)
 
 
@@ -161,7 +161,7 @@ def drift_correction(at_s: _Array, white_at_s: _Array, white: _Array) -> DriftCo
     gains: _Array = np.ones((len(at_s), 3))
     for channel in range(3):
         gains[:, channel] = np.interp(at_s, white_at_s, relative[:, channel])
-    return DriftCorrection(np.round(gains, DIGITS), drift_uncertainty(at_s, white_at_s, white))
+    return DriftCorrection(np.round(gains, GAIN_DIGITS), drift_uncertainty(at_s, white_at_s, white))
 
 
 def drift_uncertainty(at_s: _Array, white_at_s: _Array, white: _Array) -> float:

@@ -37,7 +37,7 @@ _LOSS_SCALES = (0.0005, 0.002)  # levels at which this loss reaches 63 %, relati
 
 _USUAL_REST = 0.0003  # prior standard deviation of deviations of any other shape, relative to the level
 
-_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)  # candidate factors of these priors, with equal prior odds
+_PRIOR_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)  # candidate factors of these priors, with equal prior odds
 
 _LEAST_PATCHES = 100  # minimum number of patches; chosen by judgement
 
@@ -61,7 +61,7 @@ _GROUPS = 12  # number of groups of similar levels for measuring the scatter
 
 _ROUNDS = 3  # number of solutions, each weighted and linearised by the previous one
 
-_AMOUNTS = 12  # number of unknowns before the nodes: amount of each primary, and its difference in each channel
+_AMOUNT_COUNT = 12  # number of unknowns before the nodes: amount of each primary, and its difference in each channel
 
 _Array = npt.NDArray[np.float64]
 
@@ -99,7 +99,7 @@ class Superposition:
     @staticmethod
     def usual(full: float, unmeasured: Unmeasured = NO_PRIMARIES) -> Superposition:
         """Return usual deviations of cameras, for a session without a measurement."""
-        return Superposition(full, np.zeros(len(NODES)), _usual(full), unmeasured)
+        return Superposition(full, np.zeros(len(NODES)), _usual_covariance(full), unmeasured)
 
     @property
     def measured(self) -> bool:
@@ -167,9 +167,9 @@ def superposition(
         why = f"the chart has {patches} usable patches, {needed} or more expected"
         return Superposition.usual(full, Unmeasured(why, f"use a chart with more colours, or {_GIVE_SERIES}"))
     levels, predictors = np.stack([together, *alone])[:, usable], predictors[usable]
-    hats, size = _hats(levels / full), _AMOUNTS + len(NODES)
+    hats, size = _hats(levels / full), _AMOUNT_COUNT + len(NODES)
     whites = _WHITE_MODELS if white else ((_FREE_SD, _FREE_SD, 1.0),)
-    priors = [(_prior(full, scale, *sigmas), odds) for scale, (*sigmas, odds) in product(_SCALES, whites)]
+    priors = [(_prior(full, scale, *sigmas), odds) for scale, (*sigmas, odds) in product(_PRIOR_SCALES, whites)]
     # The unknowns are small differences from this start. With the full amounts, rounding errors would hide the
     # differences of the evidence between priors.
     start = np.zeros(size)
@@ -184,7 +184,7 @@ def superposition(
             # Corrected counts are proportional: value - m(value) = sum of amount (primary - m(primary)).
             bend = hats[0, :, channel] - np.einsum("k,kpn->pn", amounts, hats[1:, :, channel])
             design = np.zeros((len(value), size))
-            design[:, :3], design[:, own], design[:, _AMOUNTS:] = primaries, primaries, bend
+            design[:, :3], design[:, own], design[:, _AMOUNT_COUNT:] = primaries, primaries, bend
             residual = value - design @ solution
             sigma = sigma_by_level(residual, value, _GROUPS) + 1e-9
             root = huber_weights(np.abs(residual) / sigma, 1.0) / sigma
@@ -196,7 +196,7 @@ def superposition(
             misfit = max(misfit, _misfit(rows, root * residual))
         difference, covariance = _posterior(matrix / misfit, right / misfit, priors)
         solution = start + difference
-    return Superposition(full, solution[_AMOUNTS:], covariance[_AMOUNTS:, _AMOUNTS:], None)
+    return Superposition(full, solution[_AMOUNT_COUNT:], covariance[_AMOUNT_COUNT:, _AMOUNT_COUNT:], None)
 
 
 def _posterior(matrix: _Array, right: _Array, priors: Sequence[tuple[_Array, float]]) -> tuple[_Array, _Array]:
@@ -236,14 +236,14 @@ def printed_predictors(codes: npt.ArrayLike, references: npt.NDArray[np.integer]
 
 def _prior(full: float, scale: float, amount_sd: float, channel_sd: float) -> _Array:
     # Inverse of the prior covariance of all unknowns; arguments as in `_WHITE_MODELS`.
-    prior = np.zeros((_AMOUNTS + len(NODES), _AMOUNTS + len(NODES)))
+    prior = np.zeros((_AMOUNT_COUNT + len(NODES), _AMOUNT_COUNT + len(NODES)))
     prior[:3, :3] = np.linalg.inv(_FREE_SD**2 * np.ones((3, 3)) + amount_sd**2 * np.eye(3))
-    prior[3:_AMOUNTS, 3:_AMOUNTS] = np.eye(_AMOUNTS - 3) / channel_sd**2
-    prior[_AMOUNTS:, _AMOUNTS:] = np.linalg.inv(scale**2 * _usual(full))
+    prior[3:_AMOUNT_COUNT, 3:_AMOUNT_COUNT] = np.eye(_AMOUNT_COUNT - 3) / channel_sd**2
+    prior[_AMOUNT_COUNT:, _AMOUNT_COUNT:] = np.linalg.inv(scale**2 * _usual_covariance(full))
     return prior
 
 
-def _usual(full: float) -> _Array:
+def _usual_covariance(full: float) -> _Array:
     """Return the prior covariance (K, K) float64 counts²: curvature of all counts, and loss near black."""
     level = np.array(NODES)
     bends = [_USUAL_BEND * level**2, _USUAL_BEND * level**3]

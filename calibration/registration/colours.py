@@ -27,7 +27,7 @@ _MISMATCH_SIGMA = 10.0
 # The second limit, relative to paper. At the corners of the gamut, the model has smaller errors.
 _MISMATCH_SHARE = 0.08
 
-_NEIGHBOURS = 13  # The patch itself and the twelve patches within a distance of two patches
+_NEIGHBOUR_COUNT = 13  # The patch itself and the twelve patches within a distance of two patches
 
 # Share of mismatched neighbours above which a patch is also mismatched. Chosen by judgement.
 _MISMATCH_NEIGHBOURS = 0.35
@@ -71,7 +71,7 @@ def mismatched(measured: _Array, expected: _Array, paper: _Array, chart: Chart) 
 
 def _with_neighbours(is_mismatched: _Mask, centres: _Array) -> _Mask:
     # A covered patch may match by chance, if the cover has its colour. Its neighbours show that it is covered.
-    neighbours = cKDTree(centres).query(centres, k=min(_NEIGHBOURS, len(centres)))[1]
+    neighbours = cKDTree(centres).query(centres, k=min(_NEIGHBOUR_COUNT, len(centres)))[1]
     mismatched_share = is_mismatched[np.asarray(neighbours).reshape(len(centres), -1)].mean(axis=1)
     return np.asarray(is_mismatched | (mismatched_share > _MISMATCH_NEIGHBOURS))
 

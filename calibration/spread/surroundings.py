@@ -28,7 +28,7 @@ from drivers.raw.rawfile import CHANNELS, Mosaic, channel_offset_px, phases
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 
-PAD = 6  # number of slots around the outermost patches, for margins and background
+PAD_SLOTS = 6  # number of slots around the outermost patches, for margins and background
 
 _OFF_GRID = 0.02  # tolerance of positions on the grid, in slots, because positions in files are rounded
 
@@ -109,14 +109,14 @@ def _fits_grid(chart: Chart) -> bool:
 def printed_grid(chart: Chart) -> PrintedGrid:
     """Return the grid of a chart that is not `unsuitable`."""
     low, slots = _slots(chart)
-    column, row = np.rint(slots).astype(np.int64).T + PAD
+    column, row = np.rint(slots).astype(np.int64).T + PAD_SLOTS
     count = len(row)
-    rows, columns = int(row.max()) + 1 + PAD, int(column.max()) + 1 + PAD
+    rows, columns = int(row.max()) + 1 + PAD_SLOTS, int(column.max()) + 1 + PAD_SLOTS
     source = np.full((rows, columns), -1, dtype=np.int32)
     source[row, column] = np.arange(count)
     width, height = chart.cell_mm
-    x = low[0] + ((np.arange(columns * PARTS) + 0.5) / PARTS - 0.5 - PAD) * width
-    y = low[1] + ((np.arange(rows * PARTS) + 0.5) / PARTS - 0.5 - PAD) * height
+    x = low[0] + ((np.arange(columns * PARTS) + 0.5) / PARTS - 0.5 - PAD_SLOTS) * width
+    y = low[1] + ((np.arange(rows * PARTS) + 0.5) / PARTS - 0.5 - PAD_SLOTS) * height
     sheet = ((y > 0) & (y < chart.page_mm[1]))[:, None] & ((x > 0) & (x < chart.page_mm[0]))
     parts = np.where(sheet, count, count + 2).astype(np.int32)
     drawn = drawing(chart)

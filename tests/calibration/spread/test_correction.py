@@ -30,7 +30,7 @@ from calibration.spread.fitting import (
     far_groups,
 )
 from calibration.spread.surroundings import (
-    PAD,
+    PAD_SLOTS,
     FrameLevels,
     Surroundings,
     UsualLight,
@@ -458,7 +458,7 @@ def test_grid_has_every_patch_once() -> None:
     grid = printed_grid(CHART)
     patches = grid.source[grid.source >= 0]
     assert sorted(patches.tolist()) == list(range(len(grid.points_mm)))
-    assert (grid.source[:PAD] < 0).all()
+    assert (grid.source[:PAD_SLOTS] < 0).all()
     # tags have 64 modules of 2 × 2 parts, and a rim of one module
     black = (grid.parts == len(grid.points_mm) + 1).sum()
     assert black > 0
