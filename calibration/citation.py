@@ -2,8 +2,7 @@
 
 The published serial number of a camera would link a LUT to all photographs of its owner. Readers only need to see
 whether two LUTs are from one camera body, so a hash of the number is published. Serial numbers are short and could be
-guessed. The hash is therefore scrypt (RFC 7914), which makes each guess slow: all numbers of ten digits take more than
-twelve years on one core. A lab can also withhold the number.
+guessed. The hash is therefore scrypt (RFC 7914), which makes each guess slow. A lab can also withhold the number.
 
 A citation is a BibTeX entry of type `misc` (O. Patashnik, BibTeXing, 1988, section 3.1). Unknown values are omitted
 from the entry and listed in a comment.

@@ -70,7 +70,7 @@ _Mask = npt.NDArray[np.bool_]
 
 
 def patch_means(values: npt.NDArray[np.uint16]) -> npt.NDArray[np.float64]:
-    """Return the means (N, 3) float64 of values (N, S, 3) uint16, eight times faster than NumPy."""
+    """Return the means (N, 3) float64 of values (N, S, 3) uint16."""
     means = np.empty((values.shape[0], 3))
     _patch_means(values, means)
     return means
@@ -241,8 +241,7 @@ def rim_difference(
 def unevenness(samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Return the relative difference of rim and centre of each patch in its worst channel, (N,) float64.
 
-    The result is 0 if no channel differs by more than 5 standard deviations and 1 % of the patch. In a window of 3×3,
-    the centre is a single pixel, so the difference is 2.5 times as noisy as with 5×5.
+    The result is 0 if no channel differs by more than 5 standard deviations and 1 % of the patch.
 
     `samples`: (N, S, 3) counts above black, the mean of evenly lit frames. `noise`: (N, 3) counts, standard deviation
     of one of these values.
@@ -497,7 +496,7 @@ def gather_values(
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
     """Return `table_values` of the samples of `gather`, (N, S, 3) uint16, and the highest raw counts (N,) uint16.
 
-    This is three times faster than `gather` and `table_values`. `black`: (2, 2). `field`, `dark`: (N, 3).
+    `black`: (2, 2). `field`, `dark`: (N, 3).
     """
     dark = np.zeros(field.shape, dtype=np.float32) if dark is None else dark
     values = np.empty((len(sites.rows), sites.window**2, 3), dtype=np.uint16)

@@ -1,8 +1,8 @@
 """Judge a LUT: compare its figures with their limits, explain values beyond a limit, and select frames to take again.
 
-A figure is a measured property with limits (`calibration.figures`). The verdict depends only on the values. A value
-that could not be measured is not judged. A frame is selected if its value exceeds the limit of refusal, or if it
-causes a value beyond a limit. If all frames have the same fault, none is selected, because new frames would have it.
+The verdict depends only on the values. A value that could not be measured is not judged. A frame is selected if its
+value exceeds the limit of refusal, or if it causes a value beyond a limit. If all frames have the same fault, none is
+selected, because new frames would have it.
 """
 
 from __future__ import annotations

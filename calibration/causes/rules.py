@@ -1,6 +1,5 @@
 """Probable causes of a figure beyond its limit, the evidence for them, and the rules that select one of them.
 
-A figure is a measured property of a session or LUT with limits (`calibration.figures`).
 The first rule that applies decides. If no rule applies, the cause is reported as unknown.
 """
 

@@ -126,7 +126,7 @@ def code_agreement(
     dark_known, drift_known : bool
         Whether dark light and lamp drift were measured.
     """
-    # The matrices are small: threads of the linear algebra library would mostly wait for each other.
+    # The matrices are small, so that several threads would be slower.
     with threadpool_limits(limits=1, user_api="blas"):
         fit, swap, misfit = _fit_codes(np.asarray(codes), white, error, dark_known=dark_known, drift_known=drift_known)
     count = len(white)
@@ -209,7 +209,6 @@ def _fit_codes(
 
 
 def _max_misfit(lights: int) -> float:
-    # Measured in simulated rooms without faults, with 2 to 20 illuminants.
     return _MAX_MISFIT + _MAX_MISFIT_EACH * lights
 
 

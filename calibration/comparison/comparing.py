@@ -1,8 +1,7 @@
 """Compare two LUTs, A and B, and report whether noise alone explains their differences.
 
 All differences are B relative to A. The noise is taken from the LUTs. The standard error of a patch is the scatter of
-its samples, divided by the square root of their number. The standard errors of whites are in `references.csv`. Each
-thread holds one illuminant of both LUTs in memory.
+its samples, divided by the square root of their number. The standard errors of whites are in `references.csv`.
 
 L common illuminants, C colours.
 """

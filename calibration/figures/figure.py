@@ -44,7 +44,7 @@ SIMULATED: Final = "measured on simulated frames"
 
 Range = tuple[float | None, float | None]  # Lowest and highest value; None if unlimited
 
-# Smaller values are rounding errors of sums and are printed as 0. Limits other than 0 are at least 100 times higher.
+# Smaller values are rounding errors of sums and are printed as 0.
 _ZERO_BELOW = 1e-7
 
 _INTEGER_FROM = 1000.0  # Larger values are printed without decimals, because :.3g would print an exponent

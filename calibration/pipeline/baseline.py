@@ -177,7 +177,7 @@ def with_lens(
         candidates.append(_spread_frame(baseline, chain([first], more_whites), view, is_mixed=True))
     frames = [frame for frame in candidates if frame is not None]
     reason = "" if baseline.options.lens_correction else "disabled by --no-lens-correction"
-    # On a busy machine, several threads of linear algebra wait for each other longer than they compute.
+    # On a busy machine, several threads would be slower.
     with threadpool_limits(limits=1, user_api="blas"):
         measurement = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS, reason)
     if measurement is None:

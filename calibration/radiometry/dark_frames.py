@@ -1,8 +1,7 @@
 """Evaluate dark frames: light while the projector shows black, read noise, and hot photosites.
 
 Projector leak and ambient light are measured together, on paper, and are called dark light. Dark light is part of every
-illuminant, and is only subtracted on request. A hot photosite is an outlier in every dark frame. The result after a
-dark frame depends only on this frame and earlier ones, so a resumed build gives identical bits.
+illuminant, and is only subtracted on request. A hot photosite is an outlier in every dark frame.
 
 In one dark frame, the noise of a patch is as large as its light. The subtracted light is therefore predicted as light
 of paper × field × reflectance of the patch (docs/decisions/0009-dark-light-is-predicted.md). The mean residual of the

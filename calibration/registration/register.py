@@ -169,8 +169,6 @@ def register(
 ) -> Registration:
     """Register the chart in a frame.
 
-    A full chart with tags takes about 5 s on one processor. A chart without tags takes three times as long.
-
     Parameters
     ----------
     mosaic : Mosaic

@@ -211,7 +211,7 @@ MAX_FRAMES = 4  # Largest number of frames drawn with marked positions; each fra
 
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
-    """Write `report.html` and `report.json` into a LUT's folder; takes some seconds."""
+    """Write `report.html` and `report.json` into a LUT's folder."""
     pictures = _pictures(result, session)
     write_atomic(folder / REPORT_PAGE, page(result, pictures, _position_pictures(result, session)))
     write_atomic(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")

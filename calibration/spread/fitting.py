@@ -524,7 +524,6 @@ def _at_terms(
 
 def _misfit(normal: _Array, right: _Array, prior: _Array, shapes: int) -> float:
     """Return the χ² gain from smooth light that no kernel explains, per unknown; at least 1, the value by chance."""
-    # This light adds equally to dark and bright patches.
     with_shape = _eliminate_factors(normal, right, prior, TERMS + shapes)
     others = np.delete(np.arange(len(prior)), np.arange(TERMS, TERMS + shapes))
     plain = _eliminate_factors(*_at_terms(normal, right, prior, others))

@@ -157,7 +157,7 @@ def _residual_matrix_of(root: _Array, usable: _Mask, bits: int) -> tuple[_Array,
     return _cached_residual_matrix(root.tobytes(), usable.tobytes(), bits)
 
 
-# The results are cached, because they are needed several times for each channel. Do not modify them.
+# The results are cached; do not modify them.
 @lru_cache(maxsize=6)
 def _cached_residual_matrix(root_bytes: bytes, usable_bytes: bytes, bits: int) -> tuple[_Array, _Array]:
     root, usable = np.frombuffer(root_bytes), np.frombuffer(usable_bytes, dtype=np.bool_)
@@ -188,7 +188,7 @@ def _invert_likeliest(prior: _Array, noise: _Array, root: _Array, *shares: float
         scale = float(inner @ inner) / len(root)
         candidates.append((0.5 * len(root) * np.log(scale) + float(np.log(np.diag(factor)).sum()), share, factor))
     _, share, factor = min(candidates, key=lambda candidate: candidate[:2])
-    # LAPACK's inversion of a factored matrix is four times as fast as a general solution. It fills one triangle only.
+    # LAPACK's inversion of a factored matrix fills one triangle only.
     inverse: _Array = lapack.dpotri(factor, lower=1)[0]
     inverse += np.tril(inverse, -1).T
     return inverse, share

@@ -425,7 +425,7 @@ class Lut:
 
 
 def open_lut(folder: Path, *, check: bool = True) -> Lut:
-    """Open a LUT folder; takes milliseconds for any size.
+    """Open a LUT folder.
 
     Parameters
     ----------
