@@ -305,7 +305,7 @@ def _ring(axes: Any, x: float, y: float, text: str) -> None:
     )
 
 
-_INWARD_FROM = 0.7  # Fraction of the axis above which labels are placed on the inner side of their point
+_INWARD_FROM = 0.7  # Beyond this fraction of an axis, labels are placed on the inner side of their point
 
 
 def _ring_largest(axes: Any, values: Any, table: TableMeasurements, smallest: bool = False) -> None:
@@ -317,8 +317,8 @@ def _ring_largest(axes: Any, values: Any, table: TableMeasurements, smallest: bo
     _ring(axes, index, float(array[index]), Path(table.frames[index].record.file).stem)
 
 
-def draw_course(panels: Any, table: TableMeasurements) -> None:
-    """Draw black level, movement, blur, white, deviation of patches and number of references, frame by frame.
+def draw_frame_values(panels: Any, table: TableMeasurements) -> None:
+    """Draw black level, movement, blur, white, deviation of patches and number of references of each frame.
 
     Rings mark the worst frames.
     """
@@ -474,7 +474,7 @@ def draw_noise(panels: Any, noise: tuple[_Array, _Array], transfer: PhotonTransf
         axes.minorticks_off()
 
 
-_MIN_LEVELS = 6  # Minimum number of levels for reporting the three parameters of the curve (judgement)
+_MIN_LEVELS = 6  # Minimum number of levels for reporting the three parameters of the curve; chosen by judgement
 
 # Smallest radius of a circle, relative to the page width. A circle around a single patch would be too small to see.
 _MIN_RADIUS = 0.012

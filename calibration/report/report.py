@@ -27,9 +27,9 @@ from calibration.report.plots import (
     cell_noise,
     draw_budget,
     draw_chromaticities,
-    draw_course,
     draw_errors,
     draw_field,
+    draw_frame_values,
     draw_noise,
     draw_positions,
     draw_registration,
@@ -208,11 +208,11 @@ def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-MAX_FRAMES = 4  # Largest number of frames drawn with marked positions; each frame is read again
+MAX_FRAMES = 4  # Largest number of frames drawn with marked positions; each frame must be read from disk again
 
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
-    """Write `report.html` and `report.json` into a LUT's folder; takes some seconds."""
+    """Write `report.html` and `report.json` into a LUT's folder."""
     pictures = _pictures(result, session)
     write_atomic(folder / REPORT_PAGE, page(result, pictures, _position_pictures(result, session)))
     write_atomic(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
@@ -248,13 +248,13 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
             "field",
         ),
         _Picture(
-            "Course of the session",
-            "Black level, movement and blur of the chart, level of bare paper under white, deviation from patches "
-            "with similar codes, and number of white references in each frame. Rings mark the worst frames. A loss of "
+            "Values of each frame",
+            "Black level, movement and blur of the chart, counts of bare paper under white, deviation of patches from "
+            "patches with similar codes, and number of used white references. Circles mark the worst frames. A loss of "
             "focus affects all patches; a hand or a shadow affects a block of patches.",
-            draw_panels(draw_course, table, inches=[(3.3, 2.4)] * 6),
+            draw_panels(draw_frame_values, table, inches=[(3.3, 2.4)] * 6),
             "radiometry",
-            "course",
+            "frames",
         ),
         _Picture(
             "Uncertainty of the ground truth",
