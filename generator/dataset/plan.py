@@ -42,8 +42,8 @@ SHARD_IMAGES: Final = 256
 # Version of colorimetric rendering, increased when equal options give other pixels. In version 1 the black of the print
 # was the grey of the black patch; since version 2 it is the grey to which black is mapped. Version 3 tries more patches
 # for greys with an error of 0.2° or more. Version 4 has one map of the chart, interpolated between patches; before,
-# each illuminant had one.
-RENDERING_VERSION: Final = 4
+# each illuminant had one. Version 5 searches the whole chart for positions, and rounds at random.
+RENDERING_VERSION: Final = 5
 
 
 @dataclass(frozen=True)
