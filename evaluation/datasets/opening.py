@@ -21,6 +21,7 @@ from evaluation.datasets.published.cube import (
 )
 from evaluation.datasets.published.gehler_shi import is_gehler_shi, open_gehler_shi
 from evaluation.datasets.published.intel_tau import is_intel_tau, open_intel_tau
+from evaluation.datasets.published.levi import is_levi, open_levi
 from evaluation.datasets.published.lsmi import is_lsmi, open_lsmi
 from evaluation.datasets.published.nus8 import is_nus8, open_nus8
 from evaluation.datasets.thumbnails import open_thumbnails
@@ -130,6 +131,14 @@ LAYOUTS: Mapping[str, Layout] = {
         is_lsmi,
         open_lsmi,
         ("camera", "subset", *_LEVELS, "partial"),
+        is_unverified=True,
+    ),
+    "levi": Layout(
+        "LEVI, night images",
+        "gt.mat and folders img and msk",
+        is_levi,
+        open_levi,
+        (*_LEVELS, "partial"),
         is_unverified=True,
     ),
     "ffcc": Layout(
