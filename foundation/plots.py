@@ -1,4 +1,4 @@
-"""Draw Matplotlib figures as SVG in the colours of the page, or as PNG on white. Equal data give equal bytes.
+"""Draw Matplotlib figures as SVG for a page, as PDF or SVG for a paper, or as PNG. Equal data give equal bytes.
 
 Matplotlib is imported when a figure is drawn. Only its object interface is used, so there are no windows and no global
 state.
@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from importlib import resources
 from io import BytesIO
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -71,6 +71,9 @@ _SVG_STYLE = _STYLE | {
     "svg.hashsalt": "crop",
 }
 
+# TrueType fonts in a PDF, because many journals refuse Matplotlib's default, Type 3. Outlines in an SVG.
+_PAPER_STYLE = {"figure.facecolor": "white", "pdf.fonttype": 42, "svg.fonttype": "path"}
+
 
 def series_style(number: int) -> dict[str, str]:
     """Return the Matplotlib keywords `color` and `linestyle` of a series, numbered from 0.
@@ -113,24 +116,35 @@ def draw_png(draw: Callable[..., None], *arguments: Any) -> bytes:
     return cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGR), _PNG_SETTINGS)[1].tobytes()
 
 
-def draw_svg(draw: Callable[..., None], *arguments: Any, inches: tuple[float, float] = (7.2, 4.0)) -> bytes:
-    """Return the SVG of a figure that `draw(figure, *arguments)` draws, for use in a page (`foundation.pages.figure`).
+# Use of a vector figure: SVG in a page, or a file for a paper.
+FigureForm = Literal["page", "pdf", "svg"]
 
-    The colours `INK`, `FAINT`, `GRID` and `PAPER` become CSS variables, which the page defines. Text is not converted
-    to outlines.
+
+def draw_svg(
+    draw: Callable[..., None],
+    *arguments: Any,
+    inches: tuple[float, float] = (7.2, 4.0),
+    form: FigureForm = "page",
+) -> bytes:
+    """Return a vector figure that `draw(figure, *arguments)` draws.
+
+    For a page (`foundation.pages.figure`), the colours `INK`, `FAINT`, `GRID` and `PAPER` become CSS variables, which
+    the page defines, and text is not converted to outlines. A file for a paper has a white background and contains its
+    fonts.
     """
     import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     library: Any = matplotlib
-    with library.rc_context(_SVG_STYLE):
+    with library.rc_context(_SVG_STYLE if form == "page" else _SVG_STYLE | _PAPER_STYLE):
         figure: Any = Figure(figsize=inches, layout="constrained")
-        FigureCanvasSVG(figure)
         draw(figure, *arguments)
         _write_plain_numbers(figure)
         stream = BytesIO()
-        figure.savefig(stream, format="svg", dpi=_RASTER_DPI, metadata={"Date": None})
+        date = {"CreationDate": None} if form == "pdf" else {"Date": None}
+        figure.savefig(stream, format="pdf" if form == "pdf" else "svg", dpi=_RASTER_DPI, metadata=date)
+    if form != "page":
+        return stream.getvalue()
     text = stream.getvalue().decode()
     for colour, name in _CSS_VARIABLES.items():
         text = re.sub(re.escape(colour), f"var(--{name})", text, flags=re.IGNORECASE)

@@ -24,7 +24,7 @@ from evaluation.scene import MixedScene, Scene
 from foundation import pages
 from foundation.colorimetry import srgb_codes
 from foundation.errors import counted
-from foundation.plots import FAINT, draw_svg, legend_label, series_style
+from foundation.plots import FAINT, FigureForm, draw_svg, legend_label, series_style
 
 # The axis of errors ends at this percentile of all methods' errors, because a few outliers would compress the curves.
 _AXIS_PERCENTILE = 98
@@ -42,10 +42,10 @@ _MAX_VECTOR_POINTS = 3000
 _SCALE_PERCENTILE = 95  # The colour scale ends at this percentile of all methods' errors
 
 
-def error_curves(results: Sequence[Result], metric: ErrorKind) -> bytes:
-    """Return the cumulative error curves of methods as SVG: fraction of images up to each error."""
+def error_curves(results: Sequence[Result], metric: ErrorKind, form: FigureForm = "page") -> bytes:
+    """Return the cumulative error curves of methods: fraction of images up to each error."""
     rows = math.ceil(len(results) / 2)
-    return draw_svg(_draw_curves, results, metric, inches=(8.6, 3.9 + 0.19 * rows))
+    return draw_svg(_draw_curves, results, metric, inches=(8.6, 3.9 + 0.19 * rows), form=form)
 
 
 def _draw_curves(figure: Any, results: Sequence[Result], metric: ErrorKind) -> None:
@@ -63,15 +63,17 @@ def _draw_curves(figure: Any, results: Sequence[Result], metric: ErrorKind) -> N
     figure.legend(loc="outside lower left", ncols=2, handlelength=3)
 
 
-def error_planes(results: Sequence[Result], truths: npt.NDArray[np.float64], metric: ErrorKind) -> bytes:
-    """Return the errors over the chromaticity plane as SVG, one panel for each of the first twelve methods.
+def error_planes(
+    results: Sequence[Result], truths: npt.NDArray[np.float64], metric: ErrorKind, form: FigureForm = "page"
+) -> bytes:
+    """Return the errors over the chromaticity plane, one panel for each of the first twelve methods.
 
     `truths`: (N, 3) float64, ground truths, camera RGB of any length.
     """
     drawn = results[:_PANELS]
     columns = _column_count(len(drawn))
     width, height = (4.6, 3.6) if len(drawn) == 1 else (8.6, 0.7 + (7.8 / columns) * math.ceil(len(drawn) / columns))
-    return draw_svg(_draw_planes, drawn, truths, metric, inches=(width, height))
+    return draw_svg(_draw_planes, drawn, truths, metric, inches=(width, height), form=form)
 
 
 def _column_count(panels: int) -> int:
@@ -200,8 +202,8 @@ MAX_METHODS = 12  # Largest number of methods with images; more would make the p
 _DEFINITIONS = (
     "Recovery error: angle between estimated and true illuminant. Reproduction error: angle between white and a white "
     "surface after correction. Tri.: (Q1 + 2 Q2 + Q3) / 4. Best and worst 25%: mean of the errors up to the 25th and "
-    "from the 75th percentile. Avg.: geometric mean of mean, median, trimean, best and worst 25%. Percentiles as in "
-    "MATLAB's prctile (Hazen)."
+    "from the 75th percentile. Avg.: geometric mean of mean, median, trimean, best and worst 25%. Worst 5%: mean of "
+    "the errors from the 95th percentile. Percentiles as in MATLAB's prctile (Hazen)."
 )
 
 
