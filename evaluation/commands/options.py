@@ -75,7 +75,8 @@ Read = Annotated[
         "How DATA is read; repeat the option for several keys. layout=NAME: generated, thumbnails, cube-plus, cube++, "
         "simple-cube++, nus8, gehler-shi, intel-tau, lsmi, levi, ffcc or folder. camera=NAME: one of several. "
         "subset=NAME: a part, such as train or test. truth=NAME: one of several ground truths. black=LEVEL, "
-        "saturation=LEVEL: in the units of the files. partial: skip images missing in a copy. docs/reference/datasets.md lists the names. "
+        "saturation=LEVEL: in the units of the files. partial: skip images missing in a copy. "
+        "docs/reference/datasets.md lists the names. "
         "\\[default: detected layout, with its own values]",
     ),
 ]

@@ -49,7 +49,7 @@ Triple = tuple[float, float, float]
 # Details of one image, by column of `images.csv`; all images of a data set have the same columns.
 Details = dict[str, int | float | str]
 
-Layout = Literal["folder", "webdataset", "parquet"]
+Layout = Literal["folder", "c5", "webdataset", "parquet"]
 Split = Literal["train", "validation", "test"]
 SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
 
