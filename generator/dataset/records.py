@@ -38,6 +38,7 @@ IMAGES: Final = "images.csv"
 SOURCES: Final = "sources.csv"
 SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile", "note")
 TRUTHS: Final = "gt.txt"
+NAMED_TRUTHS: Final = "named_gt.txt"  # As `TRUTHS`, with the name of the image before the numbers; for other programs
 SUMS: Final = "SHA256SUMS"
 DATASHEET: Final = "DATASHEET.md"
 CARD: Final = "README.md"

@@ -56,6 +56,7 @@ from generator.dataset.records import (
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,
     IMAGES,
+    NAMED_TRUTHS,
     SOURCE_COLUMNS,
     SOURCES,
     SPLITS,
@@ -641,6 +642,7 @@ def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
     rendered = _RenderingSums()
     with ExitStack() as stack:
         truths = _ListedFile(stack, workplace.files, TRUTHS)
+        named_truths = _ListedFile(stack, workplace.files, NAMED_TRUTHS)
         table = _ListedFile(stack, workplace.files, GROUND_TRUTH)
         sources_file = _ListedFile(stack, workplace.files, SOURCES)
         split_files = {
@@ -665,7 +667,9 @@ def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
                 source = names[image.position]
                 name = f"{image_key(image.number)}{suffix}"
                 table.write(_image_rows(name, source.name, image, used if has_uncertainty else None))
-                truths.write("{:.9f} {:.9f} {:.9f}\n".format(*image.truth))
+                truth_text = "{:.9f} {:.9f} {:.9f}\n".format(*image.truth)
+                truths.write(truth_text)
+                named_truths.write(f"{name} {truth_text}")
                 labels.update(light.illumination for light in image.lights)
                 if image.details:
                     rendered.add(image.details, source.width * source.height)
@@ -701,7 +705,7 @@ def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
             rendering=rendered.summary() if {"rendering", "black_point"} & options.keys() else None,
         )
         text = (description.model_dump_json(indent=2) + "\n").encode()
-        written = [table, truths, sources_file, *split_files.values()]
+        written = [table, truths, named_truths, sources_file, *split_files.values()]
         if details is not None:
             written.append(details)
         for file in written:
