@@ -296,5 +296,6 @@ def write_comparisons(
     with atomic_folder(folder, "the comparison") as partial_folder:
         for name, text in texts.items():
             (partial_folder / name).write_text(text, encoding="utf-8")
-        for number, comparison in enumerate(comparisons, start=1) if figures else ():
-            (partial_folder / f"scatter_{number}.{figures}").write_bytes(error_scatter(comparison.matched, figures))
+        if figures is not None:
+            for number, comparison in enumerate(comparisons, start=1):
+                (partial_folder / f"scatter_{number}.{figures}").write_bytes(error_scatter(comparison.matched, figures))

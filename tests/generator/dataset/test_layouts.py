@@ -115,7 +115,7 @@ def test_c5_and_ccmnet_read_images(make: Make) -> None:
         make("c5", form="tiff")
     data_set = make("c5", split=(0.6, 0.0, 0.4))
     splits = {split: folder_of(data_set) / split for split in ("train", "test")}
-    entries = {(entry.split, entry.image[:6]): entry for entry in data_set.entries}
+    entries = {(str(entry.split), entry.image[:6]): entry for entry in data_set.entries}
     for split, folder in splits.items():
         for file in [file for file in folder.iterdir() if file.name.endswith((".png", ".PNG"))]:
             entry = entries.pop((split, file.name[:6]))
