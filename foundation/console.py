@@ -90,7 +90,8 @@ def _make_printable() -> None:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
-            # The descriptor was closed when the interpreter started. The new one stays open until the process ends.
+            # The descriptor was closed when the interpreter started. The new descriptor stays open until the process
+            # ends.
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
         elif isinstance(stream, TextIOWrapper):
             if stream.errors == "strict":
@@ -136,7 +137,7 @@ def _make_tolerant(stream: Any) -> TextIOWrapper:
 
 
 def resume_gc() -> None:
-    """Enable garbage collection after the imports of a command; it then skips the imported objects."""
+    """Enable garbage collection after the imports of a command; the collection skips the imported objects."""
     if not gc.isenabled():
         _freeze_once()
     gc.enable()
@@ -144,7 +145,7 @@ def resume_gc() -> None:
 
 @functools.cache
 def _freeze_once() -> None:
-    # gc.freeze exempts all present objects from collection. A second call would exempt garbage as well.
+    # gc.freeze exempts all existing objects from garbage collection. A second call would also exempt garbage.
     gc.freeze()
 
 
@@ -358,7 +359,7 @@ def _set_log_level(level: int) -> None:
     root, handler = logging.getLogger(), logging.StreamHandler(sys.stderr)
     handler.set_name(_HANDLER)
     handler.setFormatter(logging.Formatter(_FORMAT))
-    # A group of commands and its command may both have the option. Each record is printed once even then.
+    # A group and its command may both have the option. Replace the handler, so that each record is printed once.
     root.handlers[:] = [present for present in root.handlers if present.name != _HANDLER] + [handler]
     root.setLevel(level)
 
@@ -458,7 +459,7 @@ class StyledCommand(_Styled, TyperCommand):
         try:
             return super().make_context(*arguments, **keywords)
         except typer.BadParameter as error:
-            # Remove the prefix that pydantic adds.
+            # Remove the prefix that pydantic adds to messages.
             error.message = error.message.removeprefix("Value error, ")
             raise
 
@@ -618,7 +619,7 @@ def option(metavar: str | None, text: str, *names: str, panel: str | None = None
 
 
 def with_option_groups(function: Callable[..., None]) -> Callable[..., None]:
-    """Replace each group of options among the parameters of a command by its options.
+    """Replace each parameter of a command that is a group of options by the options of this group.
 
     A group is a frozen dataclass. Its fields are ``Annotated`` with ``Option`` or ``Argument`` of typer, and have
     defaults. A field name must occur only once in a command.

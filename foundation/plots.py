@@ -39,7 +39,7 @@ _PNG_DPI = 110  # A picture of 10 inches fills the page width of 1100 pixels
 # Compression level 4 makes PNG files as small as Matplotlib's level 6, in a third of the time.
 _PNG_SETTINGS: Final = (cv2.IMWRITE_PNG_COMPRESSION, 4)
 
-# Resolution of the images in an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
+# Resolution of raster images in an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
 _RASTER_DPI = 180
 
 _STYLE = {
