@@ -69,8 +69,8 @@ def deviations(levels: _Array, exposure_s: _Array) -> tuple[_Array, _Array]:
     for channel in range(3):
         both_times = (exposure_s, _exact_times(exposure_s))
         fits = [_deviation(levels[..., channel], np.log(times), nodes) for times in both_times]
-        # A camera that records 0.3 s may have exposed for 0.3 s, or for 0.315 s, which is a third of a stop from 0.25
-        # s. The times with the better fit are used.
+        # Cameras round times: 0.3 s may be exact, or may be 0.315 s, a time on the scale of thirds of a stop. The times
+        # with the better fit are used.
         deviation[channel] = min(fits, key=lambda fit: fit[1])[0]
     return nodes, deviation
 
