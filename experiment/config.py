@@ -1,7 +1,7 @@
 """Read the settings in `LAB.toml` and check every value.
 
 An unknown key is an error, and its message suggests the closest known key. Relative paths are resolved against the
-folder of the file. No device is opened here.
+folder of the file.
 """
 
 from __future__ import annotations
@@ -203,8 +203,8 @@ class JudgeSettings(Settings):
     white frame. If the chart is displaced slightly and then rests, its new position becomes the reference. The default
     is ten times the measurement error in a dark image."""
     blur_px: NotNegative = 0.3
-    """Largest growth of the blur since the first white frame, px: √(σ² − σ₀²) for the blur σ₀ of that frame and the
-    blur σ of a later one. The blur of a good lens is about 0.5 px."""
+    """Largest growth of the blur since the first white frame, px: √(σ² − σ₀²), with the blur σ₀ of this white frame and
+    the blur σ of a later frame. The blur of a good lens is about 0.5 px."""
     drift_percent: NotNegative = 1.0
     """Deviation of the lamp from its expected level that is always allowed, per cent. A warm lamp usually stays within
     it. If the levels of the lamp scatter, a larger deviation is allowed. `build-lut` warns from the same value."""

@@ -1,7 +1,6 @@
 """Clocks, real and simulated.
 
-Code that waits or records a time takes a `Clock` as a parameter. `SystemClock` is the clock of the machine. The date of
-a `SteadyClock` never goes back. `SimulatedClock` is the clock of the simulated laboratory.
+Code that waits or records a time takes a `Clock` as a parameter.
 """
 
 from __future__ import annotations

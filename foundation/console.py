@@ -107,7 +107,7 @@ _OUTPUTS = {1: "standard output", 2: "standard error"}
 
 
 class _Output(FileIO):
-    """Output stream that discards all text after its reader has ended, such as `head` or a closed pager.
+    """Output stream that discards all text after its reader, such as `head` or a pager, has ended.
 
     Other write errors are raised with the name of the stream.
     """
@@ -477,13 +477,13 @@ class _StyledTyper(typer.Typer):
         register = super().command(name, **keywords)
 
         def decorate(function: Callable[..., None]) -> Callable[..., None]:
-            register(_with_common(function))
+            register(_with_common_options(function))
             return function
 
         return decorate
 
 
-def _with_common(function: Callable[..., None]) -> Callable[..., None]:
+def _with_common_options(function: Callable[..., None]) -> Callable[..., None]:
     hints = get_type_hints(function, include_extras=True)
     own = [
         parameter.replace(annotation=hints[name]) for name, parameter in inspect.signature(function).parameters.items()
@@ -517,7 +517,7 @@ def new_app(help_text: str | None = None, **options: Any) -> typer.Typer:
         **options,
     )
     if help_text is not None:
-        app.callback()(_with_common(_no_action))
+        app.callback()(_with_common_options(_no_action))
     return app
 
 

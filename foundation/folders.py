@@ -1,8 +1,7 @@
 """Create folders atomically, lock them, detect unmounted disks, and find the user's cache folder.
 
-A folder is filled under a hidden name next to its final path, then renamed. `foundation.files` does the same for files.
-The operating system holds the locks, so a lock ends with its program. If a file system cannot lock folders, a file in
-the folder is locked.
+A folder is filled under a hidden name next to its final path, then renamed. The operating system holds the locks, so a
+lock ends with its program. If a file system cannot lock folders, a file in the folder is locked.
 """
 
 from __future__ import annotations

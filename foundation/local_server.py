@@ -117,8 +117,8 @@ class Connections:
             self._open.pop(id(link), None)
 
     def _replaceable(self) -> _Connection | None:
-        # Choose a connection of the address with most connections: first one that has sent no request, then an idle
-        # one, then one that has been busy for longer than `ANSWER_S`.
+        # Replace a connection of the address with most connections: preferably a new connection, or an idle connection,
+        # or else a connection that is busy for longer than `ANSWER_S`.
         latest_start = self._now() - ANSWER_S
         ranks = {"new": 0, "idle": 1, "busy": 2}
         connections = [c for c in self._open.values() if c.state != "busy" or c.since < latest_start]

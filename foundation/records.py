@@ -54,7 +54,7 @@ FloatArray = Annotated[npt.NDArray[np.float64], PlainValidator(_as_floats), Plai
 
 
 class Record(BaseModel):
-    """Frozen record. Unknown keys in a file are ignored, because later versions may add keys."""
+    """Frozen record; unknown keys in a file are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True, use_attribute_docstrings=True)
 

@@ -19,12 +19,13 @@ Each camera channel becomes (1 − v) · light + v · mean light, where the mean
 
 **Lateral chromatic aberration.** The lens magnifies red and blue differently from green. Let ρ be the distance from the
 axis relative to the corner, and d the shift in the corner. Then red or blue is shifted outwards by d · ρ · (1 + ρ²) / 2
-relative to green. The linear term is the chromatic difference of magnification, the cubic term that of distortion (W.
-T. Welford, "Aberrations of Optical Systems", 1986, ch. 10). Equal weights of both terms are an assumption.
+relative to green. The linear term is the chromatic difference of magnification, the cubic term the chromatic difference
+of distortion (W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 10). Equal weights of both terms are an
+assumption.
 
-**Fall-off.** The lens transmits 1 / (1 + c r²)² at the distance r from the axis, which is cos⁴ of the angle to the
-axis. A primary of the projector has the light g / (1 + c d²) at the distance d from its brightest point, with the gain
-g. `sim.world.rendering.light` applies both.
+**Fall-off.** The lens transmits 1 / (1 + c r²)² at the distance r from the axis. This is cos⁴ of the angle to the axis.
+A primary of the projector has the light g / (1 + c d²) at the distance d from its brightest point, with the gain g.
+`sim.world.rendering.light` applies both.
 
 Positions are half-size pixels, centres at integers, x right, y down.
 """

@@ -37,9 +37,9 @@ of equal inks. ``managed`` converts like an ICC profile of a print shop, in thre
 3. XYZ to ink codes of the paper.
 
 Colours out of gamut become the nearest printable colour in CIELAB relative to paper. Differences of hue count twice,
-because profiles preserve hue rather than chroma. The conversion table has 33 nodes per channel, like an ICC profile,
-and is the numerical inverse of the print model. Interpolation in tetrahedra keeps greys neutral, because grey codes
-depend on grey nodes only (Kasson and others, J. Electronic Imaging 4 (1995) 226).
+because profiles preserve hue rather than chroma. The conversion table is the numerical inverse of the print model.
+Interpolation in tetrahedra keeps greys neutral, because grey codes depend on grey nodes only (Kasson and others, J.
+Electronic Imaging 4 (1995) 226).
 """
 
 from __future__ import annotations
@@ -190,8 +190,8 @@ def _read(name: str) -> dict[str, PublishedSpectrum]:
 # End of the file names in `sim.data`: first and last wavelength and step, as in rawtoaces-data.
 SUFFIX: Final = "_380_780_5.json"
 
-# Highest allowed response at the first and last wavelength of a file, relative to the peak. At this limit,
-# the missing light is below 1 %.
+# Highest allowed response at the first and last wavelength of a file, relative to the peak. At this limit, the missing
+# light is below 1 %.
 EDGE_SHARE: Final = 0.05
 
 _CHANNELS: Final = ("R", "G", "B")

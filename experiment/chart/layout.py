@@ -10,8 +10,8 @@
 - All other slots are achromatic references. They are spread evenly but irregularly, because a regular grid would cause
   streaks in the fitted flat field.
 
-The same bits, page and seed give the same chart. On A0, 221 × 155 slots hold 32 768 colours, 35 tags and 927
-references. For existing sheets, `paper_chart` makes the plain grid of Banić et al. (2019) with 256 × 128 patches.
+The same bits, page and seed give the same chart. For existing sheets, `paper_chart` makes the plain grid of Banić et
+al. (2019) with 256 × 128 patches.
 """
 
 from __future__ import annotations
@@ -155,8 +155,7 @@ def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, s
 
     Returns
     -------
-        The chart. The side of its patches is 5.292 mm. On a page that is too small for this, it is the largest multiple
-        of 5 pixels at 600 dpi that fits.
+        The chart, with the sizes that the module docstring gives.
     """
     if not 1 <= bits <= 5:
         raise InputError(f"{bits} bits per channel are given, expected 1 to 5; give another number")
@@ -328,8 +327,7 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
     """Choose `count` of the allowed slots (rows, columns), spread evenly but irregularly over the grid.
 
     Source: R. Ulichney, "The void-and-cluster method for dither array generation", 1993. The first choice is random.
-    Then each chosen slot in turn moves to the emptiest position in its quarter of the grid. One pass is enough: on A0,
-    no two references are closer than 4 slots, and no slot is farther than 6 slots from a reference.
+    Then each chosen slot in turn moves to the emptiest position in its quarter of the grid. One pass is enough.
     """
     rows, columns = allowed.shape
     middle_row, middle_column = (rows + 1) // 2, (columns + 1) // 2
@@ -356,7 +354,6 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
         density -= np.multiply(down[:, row, None], across[:, column], out=contribution)
         penalty[row, column] = 0.0
         quarter = quarters[2 * int(row >= middle_row) + int(column >= middle_column)]
-        # Slots that must not be chosen have an infinite score.
         score = density[quarter] + penalty[quarter]
         row, column = divmod(int(slot_numbers[quarter].flat[score.argmin()]), columns)
         density += np.multiply(down[:, row, None], across[:, column], out=contribution)

@@ -57,8 +57,7 @@ BARS_PX = (30, 20, 15, 12, 10, 8, 6, 5, 4, 3, 2, 1)
 
 BAR_LENGTH_PX = 75  # Length of the bars, 3.2 mm: several half-size pixels, which can be averaged
 
-# Diameter and number of spokes of the Siemens star. At its edge it has 0.75 line pairs per millimetre, which a
-# half-size image of the EOS 550D resolves.
+# Diameter and number of spokes of the Siemens star. At its edge it has 0.75 line pairs per millimetre.
 STAR_PX, STAR_CYCLES = 120, 12
 
 # Slanted edge of ISO 12233 with 4.8 degrees: number of steps, length of a step, and smallest depth of the black area.

@@ -136,7 +136,7 @@ class Chart:
         return tuple(reference for reference in self.references if reference.is_white)
 
     def to_json(self) -> str:
-        """Return the text of `chart.json`. Equal charts have the same text, also after they are saved and read."""
+        """Return the text of `chart.json`, which is the same for equal charts."""
         document = {
             "format": FORMAT,
             "version": VERSION,

@@ -10,7 +10,7 @@ PDF/X-4 has these requirements. The numbers are clauses of ISO 32000-1 (PDF 1.7)
 
 The codes on the page have no profile (they are untagged), so they are not changed if colour management is off. For
 printing with colour management, the output intent of a PDF needs the ICC profile of an output device, and a TIFF needs
-that of an input device or display. Both profiles declare sRGB (IEC 61966-2-1). Neither describes a printer.
+the profile of an input device or display. Both profiles declare sRGB (IEC 61966-2-1). Neither describes a printer.
 
 Source of the profiles: ICC.1:2001-04 (version 2.4), header 6.1, required tags 6.3, lut16Type 6.5.8,
 textDescriptionType 6.5.17. The primaries of sRGB are adapted to D50 by the Bradford transform, as in the sRGB profiles
@@ -86,7 +86,7 @@ def row_of_pixels(codes: Sequence[Code], box: Box) -> bytes:
 
 
 def save_page(path: Path, size_pt: tuple[float, float], content: bytes, title: str, subject: str) -> None:
-    """Write a page as PDF/X-4; the same content gives the same bytes."""
+    """Write a page as PDF/X-4."""
     packed, profile = zlib.compress(content, 6), zlib.compress(srgb_output_profile(), 9)
     name = hashlib.sha256(content + title.encode() + subject.encode()).hexdigest()
     metadata = _metadata(title, subject, name).encode()

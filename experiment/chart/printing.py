@@ -2,9 +2,9 @@
 
 - The files have true size: print them at 100 %, never with "fit to page". In the TIFF, each patch has the same whole
   number of pixels, and each tag module, too. Unequal modules would shift the detected corners of a tag.
-- The codes are amounts of ink, not colours. The colours are measured later. Therefore the codes have no profile (they
-  are untagged) on the page of the PDF and in the normal TIFF. For printing with colour management, the output intent of
-  the PDF and the tagged TIFF declare sRGB.
+- The codes are amounts of ink, not colours. Therefore the codes have no profile (they are untagged) on the page of the
+  PDF and in the normal TIFF. For printing with colour management, the output intent of the PDF and the tagged TIFF
+  declare sRGB.
 - An A0 sheet at 600 dpi has 1.7 GB of pixels, so it is compressed strip by strip and never completely in memory.
 """
 
@@ -241,10 +241,7 @@ def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI, tagged: bool = Fa
 
 
 def save_pdf(chart: Chart, path: Path) -> None:
-    """Write the sheet as PDF/X-4: one page of filled rectangles in DeviceRGB.
-
-    The same chart gives the same bytes.
-    """
+    """Write the sheet as PDF/X-4: one page of filled rectangles in DeviceRGB."""
     save_drawing(drawing(chart), path, label(chart), f"chart.json has SHA-256 {chart.sha256}")
 
 
@@ -289,7 +286,6 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     band_tops, band_bottoms = np.array([[top, bottom] for top, bottom, _ in bands]).T
     tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
     shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)
-    # The matrix is sparse, because each row overlaps few bands.
     weights = sparse.csr_array(np.maximum(shared, 0) / _SUPERSAMPLING)
     picture = np.asarray(weights @ means.reshape(len(bands), -1), dtype=np.float64)
     return np.rint(picture).reshape(height_px, width_px, 3).astype(np.uint8)

@@ -4,8 +4,8 @@ The corners come from the user or from another frame of the session. Their order
 chart. The image is compared with the printed codes, so a wrong order and a mirrored image are detected.
 
 Users give corners in pixels of the raw file before any rotation: x to the right, y down, (0, 0) is the first visible
-pixel. The first corner is the one that is printed top-left, and the others follow clockwise. All other positions are
-in half-size pixels. The traced outline includes lens distortion; `homography` does not.
+pixel. The first corner is printed top-left, and the other three follow clockwise. Positions in the code are in
+half-size pixels. The traced outline includes lens distortion; `homography` does not.
 """
 
 from __future__ import annotations
@@ -294,8 +294,9 @@ class _PlacedChart:
 def _colour_misfit(picture: PreparedImage, placed: _PlacedChart, chart: Chart) -> tuple[float, float]:
     """Return two misfits between the image and the printed codes, each 0 … 1.
 
-    For each channel, the scatter of the patches around a fit of light and codes is divided by the scatter around a fit
-    of light alone. The first misfit is the product of these ratios, the second is the mean of their squares.
+    Two models are fitted to each channel: light and codes, and light alone. The scatter of the patches around the first
+    fit is divided by the scatter around the second. The first misfit is the product of these ratios, the second is the
+    mean of their squares.
     """
     sampled_patches = np.random.default_rng(1).permutation(chart.colour_count)[:_COMPARED_CELLS]
     points = chart.centres_mm[sampled_patches]

@@ -265,7 +265,7 @@ def annotated_png(mosaic: Mosaic, chart: Chart, pose: ChartPose | None) -> bytes
     """Draw the pose of the chart onto a frame of half size, and return the drawing as PNG bytes.
 
     The drawing shows the page and the tags, or the outline of the patch area. Without `pose`, it shows all detected
-    tags and the expected ids, or, for a chart without tags, an instruction to give the corners of its patch area.
+    tags and the expected ids. If the chart has no tags, it shows how to give the corners of the patch area.
     """
     black = frame_black(mosaic)
     plane = pose.plane if pose is not None else strongest_plane(mosaic, black)

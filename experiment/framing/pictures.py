@@ -22,14 +22,14 @@ from experiment.framing.field import DetectedField
 from experiment.framing.finding import AMBER, FONT, GREEN, RED, ChartPose, DetectedTag
 from foundation.robust import huber_weights, robust_sigma
 
-# Largest movement that can be measured, half-size px. After a larger one, the edge is outside the crop around its
+# Largest movement that can be measured, half-size px. After a larger movement, the edge is outside the crop around its
 # gauge.
 MAX_SHIFT_PX = 3.0
 
 # Largest movement after which the sampling grid stays where it is, half-size px.
 STILL_PX = 0.1
 
-# Largest movement after which the grid is only shifted, half-size px. After a larger one, the chart is registered
+# Largest movement after which the grid is only shifted, half-size px. After a larger movement, the chart is registered
 # again, because it may also have rotated.
 REREGISTER_PX = 0.5
 
@@ -51,7 +51,8 @@ _STRIP_REACH_PX = 6
 
 _MIN_STRIPS = 8  # Smallest number of strips: twice the number of parameters of the movement
 
-# Smallest correlation of a gauge between the two frames. Chosen by judgement: a covered gauge has a smaller one.
+# Smallest correlation of a gauge between the two frames. Chosen by judgement: a covered gauge has a smaller
+# correlation.
 _LEAST_CORRELATION = 0.5
 
 # Smallest eigenvalue of the scaled normal matrix of a tag. Below it, the image of the tag has too little structure.
@@ -136,7 +137,6 @@ def shift_between(reference: Plane, pose: ChartPose, plane: Plane) -> Shift:
 
 
 def _gauge_tags(pose: ChartPose) -> list[DetectedTag]:
-    # Select a few tags with evenly spaced ids.
     tags = sorted(pose.tags, key=lambda tag: tag.id)
     last = len(tags) - 1
     return [tags[index] for index in sorted({round(last * step / (_GAUGE_TAGS - 1)) for step in range(_GAUGE_TAGS)})]

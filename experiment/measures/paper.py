@@ -330,7 +330,6 @@ def _field_residual(residuals: _Array, places_mm: _Array, page_mm: tuple[float, 
     worst = int(np.argmax(np.abs(channel_residuals)))
     squared_distances = ((places_mm - places_mm[worst]) ** 2).sum(axis=1)
     nearest = np.argsort(squared_distances)[:_AVERAGED_REFERENCES]
-    # Average over the neighbours whose residuals have the same sign.
     same_sign = nearest[np.sign(channel_residuals[nearest]) == np.sign(channel_residuals[worst])]
     red, green, blue = residuals[same_sign].mean(axis=0).tolist()
     x, y = places_mm[worst].tolist()

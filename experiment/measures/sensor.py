@@ -2,8 +2,8 @@
 
 EMVA 1288 (release 4.0, linearity error) plots the mean counts of a sensor against exposure, and measures the deviation
 from a straight line between 5 and 95 % of saturation. Here every patch of the chart gives such a curve. If a sensor is
-linear, the counts of all patches rise by the same factor from one frame to the next. This factor need not be known. If
-it depends on the level, the sensor is not linear.
+linear, the counts of all patches rise by the same factor from one frame to the next. If this factor depends on the
+level, the sensor is not linear.
 
 One nonlinearity is not visible in this way: counts that follow a power of the light. Its exponent is determined from
 the exposure times of all frames together, because cameras round the single times (0.3 s for 0.315 s).

@@ -85,7 +85,7 @@ class Stains:
 
     deviation: _Array  # (C, 3), measured / predicted light − 1, mean over the neighbourhood of a patch; NaN if unknown
     error: _Array  # (C, 3), standard error of `deviation`
-    patch_deviation: _Array  # (C, 3), the same for each single patch, with noise and prediction error; NaN if unknown
+    patch_deviation: _Array  # (C, 3), measured / predicted light − 1 of each patch alone; NaN if unknown
     stained: _Mask  # (C,), whether each patch is listed as unfit
     level: _Array  # (C, 3), mean counts above black
     places_mm: _Array  # (C, 2), positions of the patches on the sheet
@@ -124,8 +124,8 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     Parameters
     ----------
     level
-        (8**bits, 3) float64, mean counts above black by colour index, divided by the flat field; best averaged over
-        all white frames.
+        (8**bits, 3) float64, mean counts above black by colour index, divided by the flat field; if possible averaged
+        over all white frames.
     centres_mm
         (8**bits, 2) float64, position of each colour on the sheet.
     bits
@@ -142,8 +142,8 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     clean = usable.copy()
     deviation, error, log_ratios = (np.full(level.shape, np.nan) for _ in range(3))
     stained = np.zeros(len(level), dtype=np.bool_)
-    # A patch is predicted from patches with neighbouring codes, which are elsewhere on the sheet. This needs no model
-    # of ink or paper. The prediction is repeated without the stained patches.
+    # A patch is predicted from patches with neighbouring codes, which are elsewhere on the sheet. The prediction is
+    # repeated without the stained patches.
     for _ in range(_ROUNDS):
         log_ratios = _log_ratios(np.where(clean[:, None], level, np.nan), level, usable, bits)
         deviation, error = _neighbourhood_means(log_ratios, neighbours)

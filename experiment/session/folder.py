@@ -1,4 +1,4 @@
-"""Create, open and check the folder of a session. No device is used here.
+"""Create, open and check the folder of a session.
 
 A frame is recorded in two steps: first its raw file is written, flushed and renamed, then its row in the journal is
 committed. If a crash happens between the steps, the next run appends `.stray` to the file name and ignores the

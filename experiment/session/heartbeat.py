@@ -23,8 +23,8 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Literal
 
-# State of a run: it takes frames, a step takes longer than expected, it waits for something that happens automatically,
-# it is paused until somebody acts, or it has ended.
+# State of a run. "running": it takes frames. "late": a step takes longer than expected. "waiting": it waits for
+# something that happens automatically. "paused": it waits until somebody acts.
 RunState = Literal["running", "late", "waiting", "paused", "ended"]
 
 # Delay after which a sign of life counts as missing, seconds. Chosen by judgement, because a disk may block for

@@ -3,8 +3,7 @@
 - Every write is a transaction that is on disk when the call returns. A frame without a committed row is not accepted.
   Rows are never deleted, but an accepted frame can be voided.
 - During a run the journal is in SQLite's write-ahead mode, if the disk allows it. Readers then see the last commit and
-  block no writer. After a normal end the journal is a single file again. A reader creates and changes no file.
-- A session may come from an unknown source, so `experiment.session.opening` refuses invalid rows.
+  block no writer. After a normal end the journal is a single file again.
 - Another program may delete, replace or truncate the file. SQLite would not notice this, because it caches pages. So a
   run checks that the journal on disk is the open journal and is complete (`_JournalGuard`).
 - All rows except signs of life and the place of the session are called facts. They are also written to the ledger,
@@ -627,8 +626,6 @@ def _verdict_text(verdict: str, reason: str) -> str:
 
 @dataclass(frozen=True)
 class _FileState:
-    """Properties of a file, from which changes are detected."""
-
     numbers: tuple[int, int]  # device and inode
     size: int
     written: int  # time of the last write, ns
@@ -707,8 +704,6 @@ class LostJournalError(StorageError):
 
 
 class _LockRetry:
-    """Waits while another program holds the journal."""
-
     def __init__(self, path: Path, seconds: float, announce: Callable[[str], object]) -> None:
         self._path = path
         self._seconds = seconds

@@ -242,7 +242,6 @@ def time_left(attempts: Iterable[TimedAttempt], remaining_frames: int) -> float 
     accepted_count = sum(attempt.is_accepted for attempt in recent)
     if not intervals or not accepted_count:
         return None
-    # A single long interval does not change the median.
     return statistics.median(intervals) * len(recent) / accepted_count * remaining_frames
 
 

@@ -183,8 +183,6 @@ class _Refusal(Enum):
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame in progress."""
-
     number: int
     taken_at: datetime
     raw: Future[bytes | None]  # Raw file; None if the film failed
@@ -347,7 +345,6 @@ class SimulatedEos:
     # The values of properties.
 
     def _value(self, code: int) -> bytes:
-        """Return the value of a property; some values are computed from the state."""
         match code:
             case Property.EOS_AVAILABLE_SHOTS:
                 return number_value(self._available_shots())
@@ -946,7 +943,7 @@ class SimulatedEos:
         """Answer OK."""
 
     def _handlers(self) -> dict[int, Callable[[Arguments], OperationResult | None]]:
-        # In the order of the 60D. Real bodies support more operations, such as uploads and live view.
+        # In the order of the 60D.
         return {
             Operation.GET_DEVICE_PROP_DESC: self._get_device_prop_desc,
             Operation.GET_DEVICE_PROP_VALUE: self._get_device_prop_value,

@@ -154,8 +154,8 @@ class WatchedFilm:
     """Frames of a `World` under measured light, in real time.
 
     `gather(number, seconds)` measures the light of an exposure with a number, from 0, and a duration. It waits until
-    the exposure has ended, and returns the mean projected picture (h, w, 3) float32, 0 to 1 of the full light of each
-    primary, and the relative lamp brightness. `opened`: time from which lamp drift counts.
+    the exposure has ended, and returns two values: the mean projected picture (h, w, 3) float32, 0 to 1 of the full
+    light of each primary, and the relative lamp brightness. `opened`: time from which lamp drift counts.
     """
 
     suffix = ".dng"

@@ -6,7 +6,7 @@ roll, then tilt, then pan. A pinhole camera with Brown's lens distortion project
 calibration", 1971; coordinates and coefficients as in OpenCV).
 
 **Rendering.** `light` is compiled by numba and runs without the interpreter lock, so `sim.world.world` calls it from
-several threads for blocks of rows. Blocks do not change the result, because a row depends only on its arguments.
+several threads for blocks of rows.
 
 Pixels are half-size, centres at integers, x right, y down. Millimetres are on the print, from its top left corner.
 Photosites are counted in the visible frame.

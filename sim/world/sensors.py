@@ -94,10 +94,11 @@ class HotPattern:
     The excess is their dark signal. It is proportional to exposure time and ISO speed, and has the shot noise of its
     electrons.
 
-    The number of hot photosites increases with age. It is proportional to size⁻³ of the photosites and to √ISO, by
-    G. Chapman and others (DFT 2022, doi 10.1109/DFT56152.2022.9962368; size⁻²·⁵ in Proc. SPIE 7875 (2011)). At ISO 100
-    this gives about 3 per million on an EOS 550D (4.3 µm) after ten years, and 0.4 on an EOS 6D Mark II (5.7 µm) after
-    three. Hot photosites of new bodies are not included. The exponential distribution is an assumption.
+    The number of hot photosites increases with age. It is proportional to size⁻³ of the photosites and to √ISO, by G.
+    Chapman and others (DFT 2022, doi 10.1109/DFT56152.2022.9962368; size⁻²·⁵ in Proc. SPIE 7875 (2011)). At ISO 100,
+    about 3 per million are hot on an EOS 550D (4.3 µm) after ten years. On an EOS 6D Mark II (5.7 µm), 0.4 per million
+    are hot after three years. Hot photosites of new bodies are not included. The exponential distribution is an
+    assumption.
     """
 
     rows: NDArray[np.int64]  # (H,) int64, ascending rows of the sensor
@@ -227,7 +228,7 @@ def _canon(
     )
 
 
-# Cameras by the name of their sensitivities. The EOS 600D has a sensor of the same generation as the EOS 550D.
+# The EOS 600D has a sensor of the same generation as the EOS 550D.
 SENSITIVITY_BODIES: Final[Mapping[str, Body]] = MappingProxyType(
     {
         "Canon_EOS_600D": replace(BODIES["EOS 550D"], model="Canon EOS 600D"),

@@ -8,9 +8,9 @@ primary (`_render`). A frame is the weighted sum of these three images, plus noi
 - `project`, `white`, `reflected`, `camera_rgb_at` and `field` return exact values, without point spread and veiling
   glare. An ideal look-up table would contain these values; tests compare with them.
 
-The signal is ∫ primary × reflectance × sensitivity dλ. Its scale is given by bare paper under full white at 0.5 s, f/8
-and ISO 100: the strongest channel has the share `Room.white_level_share` of the range from black to saturation.
-Positions are millimetres on the print or half-size pixels; DN are counts above the black level.
+The signal is ∫ primary × reflectance × sensitivity dλ. Bare paper under full white at 0.5 s, f/8 and ISO 100 gives the
+scale: its strongest channel is `Room.white_level_share` times the range from black to saturation. Positions are
+millimetres on the print or half-size pixels; DN are counts above the black level.
 
 A `Room` describes light, lens and print. A `Situation` describes the differences of one frame from the undisturbed
 room. Positions in a situation are relative to the page: (0, 0) is the top left corner, (1, 1) the bottom right corner,
@@ -104,8 +104,8 @@ class Room:
     projector_falloff
         Share of the projector's light that is lost half a page diagonal from its brightest point.
     primary_difference
-        Relative difference of `projector_falloff` between primaries. The brightest points of the primaries differ by
-        up to this number of half page diagonals.
+        Relative difference of `projector_falloff` between primaries. The brightest points of the primaries differ by up
+        to this number of half page diagonals.
     lamp_spectrum
         ``uhp`` (mercury lamp and colour wheel) or ``led``.
     transfer
@@ -676,7 +676,6 @@ class World:
         return passed[..., None] * self._falloff[:, 3] / (1 + self._falloff[:, 2] * from_spot)
 
     def _balance(self) -> NDArray[np.float64]:
-        # Gains that scale the mean of each primary over the sheet to the mean of green.
         width, height = self.sheet.page_mm
         x, y = np.meshgrid((np.arange(60) + 0.5) * width / 60, (np.arange(40) + 0.5) * height / 40)
         means = self.field(np.stack([x, y], axis=-1)).mean(axis=(0, 1))
@@ -740,7 +739,6 @@ class World:
         return out, self.lens.add_veil(out, self.body.pattern)
 
     def _response(self, first: int, last: int) -> NDArray[np.float32]:
-        # Response (rows, columns) float32 of the photosites of a block of rows.
         response = self._random(3, first).standard_normal((last - first, self.body.visible.width), dtype=np.float32)
         response *= np.float32(self.room.response_spread)
         response += np.float32(1)
@@ -783,7 +781,7 @@ class World:
 
 
 def _run_in_blocks(rows: int, work: Callable[[int, int], None]) -> None:
-    # Calls `work(first, last + 1)` for each block of rows.
+    # Calls `work(first, end)` for each block of rows.
     firsts = range(0, rows, _BLOCK_ROWS)
     with ThreadPoolExecutor(processor_count()) as threads:
         for future in [threads.submit(work, first, min(first + _BLOCK_ROWS, rows)) for first in firsts]:
