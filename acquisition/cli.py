@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
 from collections import Counter
@@ -62,20 +63,43 @@ def init(
     rig: Annotated[
         Rig, typer.Option(help="lab: real devices, which you enter in LAB.toml; simulated: no hardware.")
     ] = Rig.LAB,
+    page: Annotated[str | None, typer.Option(help="Sheet of the new chart, as in acquire chart.")] = None,
+    existing_chart: Annotated[
+        Path | None,
+        option("CHART", "Use this chart, a folder of acquire chart or its chart.json; none is made.", "--chart"),
+    ] = None,
 ) -> None:
     """Create a lab: a commented LAB.toml, the chart to print and the 707 illuminants.
 
-    Reads no file. Writes LAB/LAB.toml, chart/ (like acquire chart, without the TIFF) and illuminations.csv (like
-    acquire illuminations). An existing chart or existing illuminants stay unchanged; an existing LAB.toml is an error.
+    Reads the chart of --chart. Writes LAB/LAB.toml, chart/ (like acquire chart, without the TIFF) and illuminations.csv
+    (like acquire illuminations). A chart or illuminants in LAB stay unchanged; an existing LAB.toml is an error.
     """
     settings, print_folder, lights = lab / "LAB.toml", lab / "chart", lab / "illuminations.csv"
     require_free(settings, "the settings")
+    chart_file = print_folder / "chart.json"
+    if page is not None and (existing_chart is not None or chart_file.exists()):
+        raise InputError(
+            f"--page {page} is for a new chart, but {existing_chart or chart_file} exists; omit --page, or use another "
+            "folder"
+        )
+    if existing_chart is not None:
+        from experiment.chart.model import load_chart
+
+        chart_file = existing_chart / "chart.json" if existing_chart.is_dir() else existing_chart
+        load_chart(chart_file)
     make_folder(lab, lab)
-    if not (print_folder / "chart.json").exists():
-        chart(print_folder, tiff=False)
+    if not chart_file.exists():
+        chart(print_folder, tiff=False, page=page)
     if not lights.exists():
         illuminations(lights)
-    write_atomic(settings, files("acquisition").joinpath("data", f"{rig.value}.toml").read_text("utf-8"))
+    text = files("acquisition").joinpath("data", f"{rig.value}.toml").read_text("utf-8")
+    location = chart_file.resolve()
+    inside = location.is_relative_to(lab.resolve())
+    # JSON writes a text like TOML.
+    chart_text = json.dumps(
+        (location.relative_to(lab.resolve()) if inside else location).as_posix(), ensure_ascii=False
+    )
+    write_atomic(settings, text.replace('"chart/chart.json"', chart_text, 1))
     edit = "enter your devices" if rig is Rig.LAB else "change it if necessary"
     print(f"{settings}: {edit}, then run: acquire check {shlex.quote(str(settings))}")
 

@@ -6,9 +6,22 @@ are two calls, so that the projector can show the next illuminant while the fram
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from datetime import datetime
 from typing import BinaryIO, Protocol, runtime_checkable
+
+
+def camera_name(maker: str, model: str) -> str:
+    """Return maker and model, only the model if it begins with the maker.
+
+    Examples
+    --------
+    >>> camera_name("NIKON CORPORATION", "NIKON D850"), camera_name("FUJIFILM", "X-T5")
+    ('NIKON D850', 'FUJIFILM X-T5')
+    """
+    maker_word, model_word = (re.split(r"\W+", words.casefold().strip())[0] for words in (maker, model))
+    return model if maker_word == model_word else f"{maker} {model}".strip()
 
 
 @dataclass(frozen=True)
@@ -28,9 +41,8 @@ class CameraIdentity:
 
     @property
     def name(self) -> str:
-        """Maker and model; only the model if it begins with the maker."""
-        maker_word, model_word = (words.casefold().split()[:1] for words in (self.maker, self.model))
-        return self.model if maker_word == model_word else f"{self.maker} {self.model}".strip()
+        """Maker and model as in raw files, whose maker has no "Inc."."""
+        return camera_name(re.sub(r"[ .,]*Inc\.?$", "", self.maker), self.model)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,10 @@
 """PJLink over TCP: messages, a projector driver, and the search for projectors in the network.
 
-The driver sends only lines that the standard defines. It accepts these deviations: lower case, lines that end with LF
-or CR LF, empty lines, and NUL between lines (some projectors fill their packets with NUL). Datagrams may come from
-any sender, so a datagram without a valid reply is ignored.
+The driver sends only lines that the standard defines. In replies it accepts these deviations: lower case, blanks, lines
+that end with LF, CR LF or NUL, empty lines, and the values that real projectors send instead of those of the standard
+(each in a test with its source). A value that only informs never ends a run: if it cannot be read, it counts as not
+reported. Power, faults and the reply to a command must be clear. Datagrams may come from any sender, so a datagram
+without a valid reply is ignored.
 
 Source: JBMIA, PJLink Specifications 1.04 (class 1) and 2.00 (class 2, whose lines have the digit 2; 3.2 search, 3.3
 status notification).
@@ -17,6 +19,7 @@ import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import chain, repeat
 from typing import TypeVar
 
 from drivers.links.link import Exchange, Link, quoted
@@ -78,19 +81,24 @@ class PjLinkReply:
     def error(self) -> ErrorCode | None:
         """Error code; None if the value is not an error code."""
         try:
-            return ErrorCode(self.value.upper())
+            return ErrorCode(_without_blanks(self.value))
         except ValueError:
             return None
+
+
+def _without_blanks(text: str) -> str:
+    """Return a text in capitals without blanks, as in ``ERR 1`` and ``ERR1``."""
+    return "".join(text.split()).upper()
 
 
 def split_line(data: bytes, limit: int = MAX_LINE) -> tuple[bytes, int] | None:
     """Return the first line without its end, and the number of bytes up to its end; None if no line is complete.
 
-    Empty lines and NUL are skipped.
+    Empty lines are skipped. NUL ends a line, as CR and LF do.
     """
     start = len(data) - len(data.lstrip(b"\r\n\0"))
-    line_end = re.compile(rb"[\r\n]").search(data, start)
-    line = data[start : None if line_end is None else line_end.start()].replace(b"\0", b"")
+    line_end = re.compile(rb"[\r\n\0]").search(data, start)
+    line = data[start : None if line_end is None else line_end.start()]
     if len(line) >= limit:
         raise ProtocolError(
             f"a PJLink line starts with {quoted(line)} and has {len(line)} bytes, expected fewer than {limit}; "
@@ -116,9 +124,9 @@ def parse_greeting(line: bytes) -> str | Refused | None:
     match [words[0].upper(), *words[1:]] if words else []:
         case ["PJLINK", "0"]:
             return None
-        case ["PJLINK", "1", seed] if len(seed) == 8:
+        case ["PJLINK", "1", seed]:
             return seed
-        case ["PJLINK", word] if word.upper() == "ERRA":
+        case ["PJLINK", *rest] if _without_blanks("".join(rest)) == "ERRA":
             return Refused.WRONG_PASSWORD
         case [word, *_] if word.startswith("HTTP/"):
             raise ProtocolError(
@@ -127,7 +135,7 @@ def parse_greeting(line: bytes) -> str | Refused | None:
             )
         case _:
             raise ProtocolError(
-                f"the projector greets with {quoted(line)}, expected PJLINK 0, or PJLINK 1 and a seed of 8 characters; "
+                f"the projector greets with {quoted(line)}, expected PJLINK 0, or PJLINK 1 and a seed; "
                 f"check that PJLink is enabled on it and that the port is {PORT}"
             )
 
@@ -167,9 +175,10 @@ def encode_reply(reply: PjLinkReply | Refused) -> bytes:
 
 def parse_reply(line: bytes) -> PjLinkReply | Refused:
     """Return the reply in a line without its end; upper and lower case of the value are unchanged."""
-    if line.strip().upper() == b"PJLINK ERRA":
+    match = re.fullmatch(rb"\s*%([0-9])([0-9A-Za-z]{4})\s*=(.{0,128})", line, re.DOTALL)
+    # Some servers put ERRA into the reply to the command.
+    if _without_blanks((line if match is None else match[3]).decode("ascii", "replace")) in ("PJLINKERRA", "ERRA"):
         return Refused.WRONG_PASSWORD
-    match = re.fullmatch(rb"%([0-9])([0-9A-Za-z]{4})=(.{0,128})", line, re.DOTALL)
     if match is None:
         raise ProtocolError(f"the projector answers {quoted(line)}, expected %1 or %2, four letters, = and a value")
     level, command, value = match.groups()
@@ -189,9 +198,10 @@ def format_power(power: Power) -> str:
 
 def parse_power(value: str) -> Power:
     """Return the power state in a POWR reply."""
-    if value not in _POWERS:
+    digit = value.lstrip("0") or value[:1]
+    if digit not in _POWERS:
         raise _unexpected("POWR", value, "0 standby, 1 on, 2 cooling or 3 warm-up")
-    return _POWERS[value]
+    return _POWERS[digit]
 
 
 def format_mute(muted: bool) -> str:
@@ -199,11 +209,9 @@ def format_mute(muted: bool) -> str:
     return MUTE_ON if muted else MUTE_OFF
 
 
-def parse_mute(value: str) -> bool:
-    """Return whether an AVMT code mutes the image; code 21 mutes only the sound."""
-    if not re.fullmatch("[123][01]", value):
-        raise _unexpected("AVMT", value, "11, 21, 31 or 30")
-    return value in ("11", "31")
+def parse_mute(value: str) -> bool | None:
+    """Return whether an AVMT code mutes the image, None if it is no code; code 21 mutes only the sound."""
+    return value in ("11", "31") if re.fullmatch("[123][01]", value) else None
 
 
 def format_faults(faults: Iterable[Fault]) -> str:
@@ -213,25 +221,28 @@ def format_faults(faults: Iterable[Fault]) -> str:
 
 
 def parse_faults(value: str) -> tuple[Fault, ...]:
-    """Return the faults in the six digits of ERST."""
-    if not re.fullmatch("[012]{6}", value):
+    """Return the faults in the digits of ERST.
+
+    Fewer digits are the first components; digits after the sixth belong to other components.
+    """
+    digits = _without_blanks(value)
+    if not re.fullmatch("[012]*", digits):
         raise _unexpected("ERST", value, "six digits of 0, 1 or 2")
-    return tuple(
-        Fault(name, _SEVERITIES[digit]) for name, digit in zip(FAULT_PARTS, value, strict=True) if digit != "0"
-    )
+    parts = chain(FAULT_PARTS, repeat("other"))
+    pairs = zip(parts, digits, strict=False)
+    return tuple(dict.fromkeys(Fault(part, _SEVERITIES[digit]) for part, digit in pairs if digit != "0"))
 
 
 def format_lamps(lamps: Sequence[Lamp]) -> str:
     """Return the LAMP value: the hours of each lamp, then 1 if it is lit, else 0."""
-    return " ".join(f"{lamp.hours} {int(lamp.lit)}" for lamp in lamps)
+    return " ".join(f"{lamp.hours} {int(bool(lamp.lit))}" for lamp in lamps)
 
 
 def parse_lamps(value: str) -> tuple[Lamp, ...]:
-    """Return the lamps in a LAMP reply."""
-    if not re.fullmatch(r"[0-9]+ +[01]( +[0-9]+ +[01])*", value, re.ASCII):
-        raise _unexpected("LAMP", value, "pairs of hours and 0 or 1")
-    words = value.split()
-    return tuple(Lamp(int(hours), lit == "1") for hours, lit in zip(words[::2], words[1::2], strict=True))
+    """Return the lamps in a LAMP reply, () if it has no hours; the state of a lamp may be missing."""
+    pairs = re.findall(r"([0-9]+)(?:[ ,]+([01])(?![0-9]))?", value, re.ASCII)
+    is_readable = re.fullmatch(r"[0-9 ,]*", value, re.ASCII)
+    return tuple(Lamp(int(hours), lit == "1" if lit else None) for hours, lit in pairs) if is_readable else ()
 
 
 def is_class_1_input(code: str) -> bool:
@@ -240,9 +251,7 @@ def is_class_1_input(code: str) -> bool:
 
 
 def parse_input(value: str) -> str:
-    """Return an input code in capitals."""
-    if not re.fullmatch("[1-6][1-9A-Z]", value.upper()):
-        raise _unexpected("INPT", value, "a digit 1 to 6 and one of 1 to 9 or A to Z")
+    """Return an input code, or the name that some projectors send, in capitals."""
     return value.upper()
 
 
@@ -270,11 +279,9 @@ def format_resolution(resolution: Resolution | NoResolution) -> str:
 
 def parse_input_resolution(value: str) -> Resolution | NoResolution:
     """Return the resolution in an IRES reply, such as ``1920x1080``, or the reason if it is missing."""
-    if value in ("-", "*"):
-        return NoResolution(value)
-    match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", value, re.ASCII)
+    match = re.match(r"([0-9]{1,5})\s*[x*\u00d7]\s*([0-9]{1,5})", value, re.ASCII | re.IGNORECASE)
     if match is None:
-        raise _unexpected("IRES", value, "width, x and height in pixels, - or *")
+        return NoResolution.NO_SIGNAL if re.fullmatch("-+", value) else NoResolution.UNKNOWN_SIGNAL
     return Resolution(int(match[1]), int(match[2]))
 
 
@@ -283,18 +290,15 @@ def format_freeze(frozen: bool) -> str:
     return "1" if frozen else "0"
 
 
-def parse_freeze(value: str) -> bool:
-    """Return whether a FREZ reply reports a frozen image."""
-    if value not in ("0", "1"):
-        raise _unexpected("FREZ", value, "0 moving or 1 frozen")
-    return value == "1"
+def parse_freeze(value: str) -> bool | None:
+    """Return whether a FREZ reply reports a frozen image, None if it is no digit of the standard."""
+    return value == "1" if value in ("0", "1") else None
 
 
 def parse_class(value: str) -> int:
-    """Return the class in a CLSS reply."""
-    if not re.fullmatch("[1-9]", value, re.ASCII):
-        raise _unexpected("CLSS", value, "1 or 2")
-    return int(value)
+    """Return the class in a CLSS reply, its first digit, as in ``Class 1`` and ``Version1``; without a digit, 1."""
+    match = re.search("[1-9]", value)
+    return 1 if match is None else int(match[0])
 
 
 def _unexpected(command: str, value: str, expected: str) -> ProtocolError:

@@ -57,11 +57,11 @@ class Lamp:
     hours
         Accumulated hours of operation.
     lit
-        True if the lamp is on.
+        True if the lamp is on; None if the projector does not report it.
     """
 
     hours: int
-    lit: bool
+    lit: bool | None
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,8 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from foundation.errors import counted
+
 # (H, W, 3), linear camera RGB ≥ 0, black level subtracted, in any unit.
 Image = npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
@@ -99,6 +101,8 @@ class SceneSet:
         Fold of each scene, from 0, as the authors of the data set define it; None if they define no folds.
     truth_uncertainty_deg
         Largest uncertainty (k = 2) of a ground truth, degrees; None if the data set does not report it.
+    black_bodies
+        Camera RGB of the black bodies among the illuminants, by their temperature in K; empty if unknown.
     """
 
     name: str
@@ -108,3 +112,10 @@ class SceneSet:
     treatment: Mapping[str, str] = field(default_factory=dict[str, str])
     folds: tuple[int, ...] | None = None
     truth_uncertainty_deg: float | None = None
+    black_bodies: Mapping[float, tuple[float, float, float]] = field(
+        default_factory=dict[float, tuple[float, float, float]]
+    )
+
+    def __repr__(self) -> str:
+        """Return one line, because the list of images may be very long."""
+        return f"SceneSet({self.name!r}, {counted(len(self.scenes), 'image')}, layout {self.layout})"

@@ -245,8 +245,8 @@ class SimulatedSettings(Settings):
     """The simulated laboratory."""
 
     body: str = "EOS 550D"
-    """EOS 550D, EOS 6D Mark II or Test (small frames); or spectral sensitivities by name or file, as in `sim table
-    --camera`."""
+    """EOS 550D, EOS 6D Mark II or Test (small frames); or spectral sensitivities, as in `sim table --camera`, by name or
+    as a file relative to the settings file."""
     camera: dict[str, Any] | None = None
     """Properties in which the camera differs from this body, with the field names of sim.world.sensors.Body."""
     seed: Annotated[int, Field(ge=0)] = 1
@@ -375,7 +375,17 @@ def load_lab(path: Path) -> LabSettings:
     if language is not None and language.lower().endswith(".toml"):
         projector = settings.lab.projector.model_copy(update={"language": str(folder / language)})
         changes["lab"] = settings.lab.model_copy(update={"projector": projector})
+    simulated = settings.simulated
+    body, camera = file_in(folder, simulated.body), dict(simulated.camera or {})
+    if isinstance(sensitivities := camera.get("sensitivities"), str):
+        camera["sensitivities"] = file_in(folder, sensitivities)
+    changes["simulated"] = simulated.model_copy(update={"body": body, "camera": camera or simulated.camera})
     return settings.model_copy(update=changes)
+
+
+def file_in(folder: Path, name: str) -> str:
+    """Return the path of a file of sensitivities that a settings file in `folder` names; other names are unchanged."""
+    return str(folder / name) if name.lower().endswith(".json") or (folder / name).is_file() else name
 
 
 def parse_lab(text: str, source_name: str, folder: Path | None = None) -> LabSettings:

@@ -75,6 +75,16 @@ def srgb_codes(linear: npt.ArrayLike) -> npt.NDArray[np.uint8]:
     return np.rint(255 * encode_srgb(np.clip(linear, 0.0, 1.0))).astype(np.uint8)
 
 
+def fit_white_matrix(linear: _Array, responses: _Array) -> _Array:
+    """Return the matrix (3, 3) with rows of sum 1 from linear sRGB (N, 3) to responses (N, 3), 1 for white.
+
+    For a response a, least squares fit a - G = c_r (R - G) + c_b (B - G), which makes the sums of rows 1.
+    """
+    differences, green = linear[:, [0, 2]] - linear[:, [1]], linear[:, [1]]
+    coefficients = np.asarray(np.linalg.lstsq(differences, responses - green, rcond=None)[0], np.float64).T
+    return np.stack([coefficients[:, 0], 1 - coefficients.sum(axis=1), coefficients[:, 1]], axis=1)
+
+
 def angles_deg(first: npt.ArrayLike, second: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return the angles (...) float64 between pairs of colours, 0 to 180 degrees.
 

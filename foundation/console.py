@@ -183,6 +183,14 @@ def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
         if error.code == EXIT_INTERRUPTED:
             return _report_interruption(is_resumable)
         return error.code if isinstance(error.code, int) else int(error.code is not None)
+    except Exception as error:
+        # Python 3.11 wraps an interruption of an import in RuntimeError, if it comes while a class is made.
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
+            raise
+        return _report_interruption(is_resumable)
     return 0
 
 
@@ -209,6 +217,10 @@ def _print_in_handler(message: str) -> None:
         os.write(2, f"\n{message}\n".encode())
 
 
+def _interrupt() -> None:
+    raise KeyboardInterrupt
+
+
 class EndRequest:
     """Request to end the process, usually sent by a signal.
 
@@ -216,17 +228,20 @@ class EndRequest:
     and prints a message, and the block ends when it can. A second request raises KeyboardInterrupt.
     """
 
-    def __init__(self, report: Callable[[str], object] = _print_in_handler) -> None:
-        self._report = report
+    def __init__(
+        self, report: Callable[[str], object] = _print_in_handler, interrupt: Callable[[], object] = _interrupt
+    ) -> None:
+        self._report, self._interrupt = report, interrupt
         self._message = ""
         self.is_requested = False
 
     def request(self) -> None:
         """Request the end, as a signal does."""
         is_first, self.is_requested = not self.is_requested, True
-        if not (is_first and self._message):
-            raise KeyboardInterrupt
-        self._report(self._message)
+        if is_first and self._message:
+            self._report(self._message)
+        else:
+            self._interrupt()
 
     @contextmanager
     def postponed(self, message: str) -> Generator[None]:
@@ -255,7 +270,9 @@ class EndRequest:
 @contextmanager
 def orderly_end() -> Generator[EndRequest]:
     """Treat `kill` and a closed terminal like Ctrl-C, so that devices are closed; ignored signals stay ignored."""
-    ending = EndRequest()
+    outer = signal.getsignal(signal.SIGINT)
+    # The outer handler knows whether a signal repeats another one.
+    ending = EndRequest(interrupt=(lambda: outer(signal.SIGINT, None)) if callable(outer) else _interrupt)
     if threading.current_thread() is not threading.main_thread():
         yield ending
         return
@@ -451,6 +468,36 @@ class _Styled:
         return option
 
 
+# Names of options and arguments, and names that other programs use for them.
+_OTHER_NAMES = {
+    "workers": "j jobs n-jobs threads n-threads num-threads num-workers processes cores cpus parallel nproc",
+    "out": "o output output-dir outdir output-folder dest destination save",
+    "sources": "i input inputs images pictures source src",
+    "seed": "s random-seed random-state",
+    "crop": "size patch-size crop-size image-size resolution",
+    "crops": "n count num number images-per-picture repeat",
+    "folds": "k kfold k-fold n-splits n-folds splits",
+    "read": "layout camera subset partial black saturation",
+    "light": "lights illuminant illuminants illumination illuminations",
+    "dry-run": "n dryrun simulate no-act",
+    "verbose": "debug log-level d",
+    "quiet": "silent s",
+    "page": "paper paper-size size format",
+    "method": "m methods model algorithm",
+    "error": "metric",
+    "host": "bind address ip",
+    "pjlink": "port p tcp",
+    "port": "p",
+    "model": "camera body",
+    "camera": "model body",
+    "settings": "c config config-file conf",
+    "format": "f type extension file-format",
+    "matrix": "ccm colour-matrix color-matrix",
+    "lab": "c config settings",
+    "data": "dataset data-set d",
+}
+
+
 class StyledCommand(_Styled, TyperCommand):
     """Command with our style of help."""
 
@@ -462,6 +509,24 @@ class StyledCommand(_Styled, TyperCommand):
             # Remove the prefix that pydantic adds to messages.
             error.message = error.message.removeprefix("Value error, ")
             raise
+        except Exception as error:
+            # The class of this error depends on the version of typer.
+            if hasattr(error, "possibilities"):
+                self._suggest(cast("Any", error))
+            raise
+
+    def _suggest(self, error: Any) -> None:
+        """Add our name of an unknown option that other programs have."""
+        word = error.option_name.lstrip("-").lower().replace("_", "-")
+        ours = [name for name, others in _OTHER_NAMES.items() if word in (name, *others.split())]
+        options = [f"--{name}" for name in ours if any(f"--{name}" in each.opts for each in self.params)]
+        parameters = [each for each in self.params if each.param_type_name == "argument"]
+        named = [str(each.metavar) for each in parameters if each.name in (word, *ours)]
+        if options:
+            error.possibilities = options
+        elif named:
+            error.message += f"; {named[0]} is an argument, give it without the name of an option"
+            error.possibilities = []
 
 
 class _StyledGroup(_Styled, TyperGroup):

@@ -320,8 +320,8 @@ class RenderingOptions:
         _image_option(
             "NAME",
             "Matrix from linear sRGB to camera RGB, for colorimetric rendering: name of a camera, file with 3 x 3 "
-            "numbers, table for a matrix fitted to the LUT, or none. \\[default: matrix of the camera of the LUT, else "
-            "table]",
+            "numbers, table for a matrix fitted to the LUT, or none. \\[default: matrix of the camera of the LUT, "
+            "else of the sensitivities of a computed LUT, else table]",
         ),
     ] = None
     black_point: Annotated[
@@ -418,6 +418,15 @@ class WorkOptions:
             "Make only share I of N, with I from 0 to N - 1. After all shares, run the command without this option.",
         ),
     ] = None
+    dry_run: Annotated[
+        bool,
+        _work_option(
+            None,
+            "Print the number of images, the disk space, the time and the share of pixels outside of the gamut of the "
+            "print, from a sample of the images; write only to the cache.",
+            "--dry-run",
+        ),
+    ] = False
     verify: Annotated[
         str | None,
         _work_option(

@@ -102,7 +102,13 @@ def _serve_serial(device: SimulatedProjector, language_name: str) -> None:
 def camera(
     context: typer.Context,
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port for PTP/IP; 0 for a free one.")] = 15740,
-    model: Annotated[str, typer.Option(help="EOS 550D, EOS 6D Mark II, or Test, which has small frames.")] = "EOS 550D",
+    model: Annotated[
+        str,
+        typer.Option(
+            help="EOS 550D, EOS 6D Mark II, or Test, which has small frames; or spectral sensitivities by name or "
+            "file, as in sim table --camera."
+        ),
+    ] = "EOS 550D",
     chart: Annotated[Path | None, typer.Option(help="chart.json of the print; by default grey squares.")] = None,
     room: Annotated[
         list[str] | None, option("NAME=VALUE", "Parameter of the simulated room, as in LAB.toml; can be repeated.")
@@ -122,7 +128,7 @@ def camera(
     that projector also change the light. These options allow rehearsals of `acquire` (docs/how-to/rehearsal.md).
 
     The command prints its address and serves until Ctrl-C. With --watch-screen, it also prints the progress of each
-    exposure. It reads the file of --chart, and writes no file.
+    exposure. It reads the files of --chart and --model, and writes no file.
 
     Exit code 0 after Ctrl-C. Exit code 2 if the model, chart, room or screen is wrong. Exit code 3 if the port is in
     use or the screen cannot be read.
@@ -134,27 +140,26 @@ def camera(
     from drivers.canon import SHUTTER
     from drivers.ptp.codes import Property
     from sim.buses.ptp import serve_ptpip
-    from sim.camera.bodies import EOS_BODIES
+    from sim.camera.bodies import eos_with
     from sim.camera.eos import SimulatedEos
-    from sim.world.sensors import BODIES
+    from sim.world.sensors import find_body
     from sim.world.world import REFERENCE_EXPOSURE, World, read_room
 
-    if model not in EOS_BODIES:
-        raise ConfigurationError(f"--model is {model!r}, expected one of {', '.join(sorted(EOS_BODIES))}; correct it")
+    sensor = find_body(model)
     if watch_screen is None and watch_projector is not None:
         raise ConfigurationError("--watch-projector is given without --watch-screen; give both")
     changes = dict(_setting("--room", text) for text in room or ())
     # Lamp drift is off by default. It would count from `SIM_START`, so long ago that the lamp would now be dark.
     world = World(
         _grey_squares() if chart is None else _print(context, chart),
-        BODIES[model],
+        sensor,
         read_room(_SEED, {"lamp_drift_per_hour": 0.0} | changes, "the command line", "--room"),
     )
     with ExitStack() as resources:
         film = resources.enter_context(_film(world, watch_screen, watch_projector))
         # A frame may be exposed while earlier frames are still calculated.
         executor = resources.enter_context(ThreadPoolExecutor(3, "developing"))
-        eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, executor=executor)
+        eos = SimulatedEos(eos_with(sensor, model), film, SystemClock(), auto_power_off_s=0, executor=executor)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
         with serve_ptpip(eos, port, name=eos.body.model) as server:
             _until_interrupted("PTP/IP camera {} at {}:{}".format(eos.body.model, *server.address))

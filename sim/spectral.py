@@ -59,7 +59,7 @@ import numpy.typing as npt
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
-from foundation.colorimetry import decode_srgb, observer_cie_1931
+from foundation.colorimetry import angles_deg, decode_srgb, fit_white_matrix, linear_srgb, observer_cie_1931
 from foundation.errors import FormatError, InputError, nearest_names
 from foundation.files import sha256_of
 from foundation.records import Record
@@ -151,6 +151,12 @@ class PublishedSpectrum:
 def published_spectra() -> Mapping[str, PublishedSpectrum]:
     """Return all published illuminants by name, such as ``D65``, ``FL2``, ``LED-B3``, ``Kinoton 75P``."""
     return MappingProxyType(_read("published_lights.csv"))
+
+
+@cache
+def published_reflectances() -> Mapping[str, PublishedSpectrum]:
+    """Return the reflectances of the 24 patches of a ColorChecker by name, 0 to 1, as `power`."""
+    return MappingProxyType(_read("colour_checker.csv"))
 
 
 def daylight(cct_k: float) -> PublishedSpectrum:
@@ -246,8 +252,15 @@ def known_sensitivities() -> tuple[str, ...]:
     return tuple(sorted(name.removesuffix(SUFFIX) for name in files if name.endswith(SUFFIX)))
 
 
+# Remedy for an unknown camera
+OTHER_CAMERA: Final = (
+    "sim table --camera list shows all names. For another camera, give the path of a JSON file of sensitivities; "
+    "https://github.com/AcademySoftwareFoundation/rawtoaces-data has more, in data/camera"
+)
+
+
 def read_sensitivities(name: str, other_names: Sequence[str] = ()) -> Sensitivities:
-    """Return the sensitivities of an included camera or of a file; error messages also list `other_names`."""
+    """Return the sensitivities of an included camera or of a file; error messages also suggest `other_names`."""
     if name in known_sensitivities():
         data = resources.files("sim").joinpath("data", name + SUFFIX).read_bytes()
         return parse_sensitivities(data, name, name)
@@ -255,12 +268,8 @@ def read_sensitivities(name: str, other_names: Sequence[str] = ()) -> Sensitivit
     try:
         data = path.read_bytes()
     except OSError as error:
-        names = [*known_sensitivities(), *other_names]
-        near = f"{nearest_names(name, names)} ".lstrip()
-        raise InputError(
-            f"no camera {name!r}: {_reading_problem(error)}; {near}choose one of "
-            f"{', '.join(names)}, or a file of spectral sensitivities"
-        ) from error
+        near = f"{nearest_names(name, [*known_sensitivities(), *other_names], 3)} ".lstrip()
+        raise InputError(f"no camera {name!r}: {_reading_problem(error)}; {near}{OTHER_CAMERA}") from error
     return parse_sensitivities(data, path.name.removesuffix(SUFFIX).removesuffix(".json"), str(path))
 
 
@@ -359,6 +368,25 @@ def describe_sensitivities(source: Sensitivities) -> dict[str, Any]:
 
 # Wavelengths of all spectra of the models, (81,) float64.
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 5.0)
+
+
+def matrix_record(camera: Sensitivities) -> dict[str, Any]:
+    """Return the colour matrix of a camera under D65 for a record: rows, linear sRGB to camera RGB, and source.
+
+    Least squares over the 24 reflectances of a ColorChecker. It keeps white, and is rounded to four decimals.
+    """
+    grid, functions = observer_cie_1931()
+    d65, patches = published_spectra()["D65"], published_reflectances().values()
+    power = resampled(d65.wavelengths_nm, d65.power[:, None], WAVELENGTHS_NM)
+    reflectances = np.stack([patch.power for patch in patches])
+    observer, sensor = power * resampled(grid, functions, WAVELENGTHS_NM), power * camera.at(WAVELENGTHS_NM)
+    linear = linear_srgb(reflectances @ observer) / linear_srgb(observer.sum(axis=0))
+    responses = reflectances @ sensor / sensor.sum(axis=0)
+    rows = fit_white_matrix(linear, responses)
+    residual = float(np.median(angles_deg(linear @ rows.T, responses)))
+    source = "least squares over the sensitivities and 24 reflectances under D65"
+    return {"rows": rows.round(4).tolist(), "source": f"{source}; median residual {residual:.1f} degrees"}
+
 
 LampSpectrum = Literal["uhp", "led"]
 

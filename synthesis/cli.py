@@ -14,7 +14,7 @@ import typer
 
 from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, orderly_end, progress, with_json
-from foundation.errors import counted
+from foundation.errors import ConfigurationError, counted
 from sim import cli as devices
 from sim.cli import app
 
@@ -40,12 +40,14 @@ def read_print(chart: Path) -> Print:
 @app.command(epilog=EXIT_CODES)
 @with_json("sim table")
 def table(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the LUT.")],
+    out: Annotated[
+        Path | None, typer.Argument(metavar="OUT", help="New folder for the LUT; omitted for --camera list.")
+    ] = None,
     camera: Annotated[
         str,
         typer.Option(
             help="Spectral sensitivities: a name (Canon_EOS_5DS), a JSON file in the format of rawtoaces, or a camera "
-            "of the simulated laboratory (EOS 550D)."
+            "of the simulated laboratory (EOS 550D); list prints all names and ends."
         ),
     ] = "Canon_EOS_600D",
     lights: Annotated[
@@ -67,6 +69,11 @@ def table(
     references.csv and lut.json, which records that the LUT was computed. generate can use this LUT like a LUT of
     build-lut. The calculation takes minutes.
     """
+    if camera == "list":
+        _list_cameras(output)
+        return
+    if out is None:
+        raise ConfigurationError("OUT is missing, expected a new folder for the LUT; run sim table OUT --camera NAME")
     from synthesis.lamps import read_lights
     from synthesis.settings import load_settings, table_task
     from synthesis.table import compute_table
@@ -80,6 +87,20 @@ def table(
         f"{out}: computed, {result.lights} illuminants, {result.cells} colours, {task.window**2} samples each; "
         f"{counted(result.unfit, 'unfit patch', 'unfit patches')}"
     )
+
+
+def _list_cameras(output: JsonOutput) -> None:
+    from sim.spectral import known_sensitivities, read_sensitivities
+    from sim.world.sensors import BODIES
+
+    measured = [(name, read_sensitivities(name).camera, "measured, rawtoaces-data") for name in known_sensitivities()]
+    simulated = [(name, body.camera, f"simulated with {body.sensitivities}") for name, body in BODIES.items()]
+    rows = [("name", "camera", "source"), *measured, *simulated]
+    output.add(cameras=[dict(zip(rows[0], row, strict=True)) for row in rows[1:]])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip())
+    print("A JSON file of spectral sensitivities can be given instead of a name.")
 
 
 if __name__ == "__main__":

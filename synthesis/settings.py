@@ -15,12 +15,12 @@ from pydantic import Field
 from calibration.citation import OriginRecord
 from calibration.sampling import WINDOW, WINDOWS
 from experiment.chart.layout import design_chart
-from experiment.config import CameraSettings, CitationSettings, Settings, validate_settings
+from experiment.config import CameraSettings, CitationSettings, Settings, file_in, validate_settings
 from experiment.lights import plan_illuminants
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
 from foundation.records import from_settings, parse_toml
-from sim.spectral import describe_sensitivities, read_sensitivities
+from sim.spectral import describe_sensitivities, matrix_record, read_sensitivities
 from sim.world.sensors import find_body
 from sim.world.world import Room
 from synthesis.lamps import LightSpectra, table_illuminants
@@ -77,7 +77,11 @@ def load_settings(path: Path | None) -> TableSettings:
     if path is None:
         return TableSettings()
     text = read_text(path, "give a TOML file", "settings")
-    return parse_settings(parse_toml(text, str(path)), str(path))
+    settings = parse_settings(parse_toml(text, str(path)), str(path))
+    if isinstance(sensitivities := settings.camera.get("sensitivities"), str):
+        camera = {**settings.camera, "sensitivities": file_in(path.resolve().parent, sensitivities)}
+        return settings.model_copy(update={"camera": camera})
+    return settings
 
 
 def parse_settings(document: dict[str, Any], where: str) -> TableSettings:
@@ -121,6 +125,7 @@ def table_task(camera: str, settings: TableSettings, where: str, lights: LightSp
         "how": "no frame was taken: counts of the photosites of each patch were computed from spectra and a model of "
         "the sensor, and sampled like the counts of a frame",
         "sensitivities": describe_sensitivities(curves),
+        "matrix": matrix_record(curves),
         "lights": {"from": "simulated projector"} if lights is None else lights.source,
         # Records the name of the sensitivities, because the path of their file is no property of the LUT.
         "body": asdict(replace(body, sensitivities=curves.name)),

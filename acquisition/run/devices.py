@@ -234,7 +234,7 @@ def _is_lit(projector: Projector) -> bool:
         return False
     with suppress(DeviceError):
         lamps = projector.lamps()
-        return not lamps or any(lamp.lit for lamp in lamps)
+        return not lamps or any(lamp.lit is not False for lamp in lamps)
     return True
 
 

@@ -65,6 +65,11 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illuminant, ..
     if not rows or not set(columns).issuperset(FRAME_COLUMNS[:3]):
         problem = f"{len(rows)} frames with the columns {','.join(columns)}, expected 1 or more frames with at least "
         raise FormatError(f"{problem}{','.join(FRAME_COLUMNS[:3])}; correct the list", about=path)
+    timeless = [number for number, row in enumerate(rows, 2) if not (row.get("taken_at") or "").strip()]
+    # The modification time of a copy is later than the time of exposure in another row.
+    if 0 < len(timeless) < len(rows):
+        problem = f"{len(timeless)} of {len(rows)} frames have no taken_at, the first in line {timeless[0]}"
+        raise FormatError(f"{problem}, expected all frames or none; complete the list", about=path)
     lights = load_illuminants(path.parent / "illuminations.csv")
     frames = [
         _parse_row(row, f"{path}, line {number}", path.parent, len(lights))
@@ -91,8 +96,15 @@ def _parse_row(row: Mapping[str, str | None], where: str, folder: Path, lights: 
         exposure_s = float(cell("exposure_s") or 0)
         time = cell("taken_at")
         taken_at = datetime.fromisoformat(time) if time else datetime.fromtimestamp(file.stat().st_mtime, UTC)
-    except ValueError as error:
-        remedy = "give illumination as an integer, exposure_s in s, and taken_at in ISO 8601"
+        # Local time occurs twice when the clock goes back, and then frames would be in the wrong order.
+        if taken_at.tzinfo is None:
+            raise ValueError(f"taken_at is {time!r}, expected a time with its offset from UTC, such as {time}+02:00")
+        taken_at = taken_at.astimezone(UTC)
+        # Range of the journal; a camera whose clock was never set reports year 0.
+        if not 1970 <= taken_at.year < 9999:
+            raise ValueError(f"taken_at is {time or taken_at}, expected a time after 1970")
+    except (ValueError, OverflowError) as error:
+        remedy = "give illumination as an integer, exposure_s in s, and taken_at in ISO 8601 with an offset"
         raise FormatError(str(error), about=where, remedy=remedy) from error
     if illumination is not None and not 0 <= illumination < lights:
         problem = f"illumination is {illumination}, expected 0 … {lights - 1} as in illuminations.csv; correct it"
@@ -104,8 +116,6 @@ def _parse_row(row: Mapping[str, str | None], where: str, folder: Path, lights: 
     if verdict not in ("", ACCEPTED, REFUSED) and not verdict.startswith(f"{REFUSED}: "):
         problem = f"verdict is {verdict!r}, expected {ACCEPTED}, {REFUSED}: REASON, or nothing; correct it"
         raise FormatError(problem, about=where, value=verdict)
-    if not taken_at.tzinfo:
-        taken_at = taken_at.replace(tzinfo=UTC)
     return ListedFrame(kind, illumination, file, cell("sha256").lower(), taken_at, exposure_s, verdict)
 
 

@@ -522,7 +522,7 @@ def require_same_devices(session: Session, devices: Devices, settings: LabSettin
     recorded = session.journal.records()
     body = devices.camera.identity()
     # Firmware versions and the user's name of a projector are not compared, because they may change.
-    names = {"camera": f"{body.maker} {body.model}, serial number {body.serial}"}
+    names = {"camera": f"{body.name}, serial number {body.serial}"}
     if devices.projector is not None:
         projector = devices.projector.identity()
         names["projector"] = f"{projector.maker} {projector.model}".strip() or "of an unknown maker"

@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.camera import camera_name
 from drivers.raw.lossless_jpeg import jpeg_size, lossless_fault
 from drivers.raw.storage import (
     LEAST_BITS,
@@ -646,7 +647,7 @@ def _assemble_mosaic(
 ) -> Mosaic:
     """Return the mosaic of a sensor; `exposure`: ISO speed, f-number and shutter time in seconds, 0 if not stated."""
     directories, cr3 = contents.directories, contents.cr3
-    camera = _camera_name(data, directories) if cr3 is None else _join_names(cr3.maker, cr3.model)
+    camera = _camera_name(data, directories) if cr3 is None else camera_name(cr3.maker, cr3.model)
     serial, lens = read_serial_and_lens(data, directories if cr3 is None else cr3.exif)
     iso, aperture, shutter_s = exposure
     # If a file states no exposure, LibRaw returns 1 s at f/1, but no ISO speed.
@@ -712,18 +713,11 @@ def _camera_name(data: bytes | memoryview, directories: list[Directory]) -> str:
     for directory in directories:
         maker, model = directory.text(TiffTag.MAKE), directory.text(TiffTag.MODEL)
         if model:
-            return _join_names(maker, model)
+            return camera_name(maker, model)
     for directory in directories:
         if directory.text(TiffTag.UNIQUE_CAMERA_MODEL):
             return directory.text(TiffTag.UNIQUE_CAMERA_MODEL)
-    return _join_names(*_read_ciff_camera(data))
-
-
-def _join_names(maker: str, model: str) -> str:
-    """Return maker and model; only the model if it starts with the maker, as in ``Canon EOS 550D``."""
-    if not maker or model.split(" ")[0].casefold() == maker.split(" ")[0].casefold():
-        return model
-    return f"{maker} {model}"
+    return camera_name(*_read_ciff_camera(data))
 
 
 def _dcraw_frame(sensor: tuple[int, int], libraw_area: Area) -> Area:

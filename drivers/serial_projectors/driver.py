@@ -17,6 +17,7 @@ from drivers.serial_projectors.language import (
     handshake_parser,
     match_value,
     refusal_kind,
+    state_of,
 )
 from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import RUN_AGAIN, DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
@@ -89,11 +90,10 @@ class LineProjector(Projector):
             value = self._query(words).upper()
         except _Busy as error:
             return self._transition_state(error)
-        if value in words.stopped:
-            raise DeviceFault(f"{self.label} answers {value} to {words.ask}: {words.stopped[value]}")
-        if value not in words.states:
+        if stopped := state_of(words.stopped, value):
+            raise DeviceFault(f"{self.label} answers {value} to {words.ask}: {stopped}")
+        if (power := state_of(words.states, value)) is None:
             raise self._unexpected(words.ask, value, f"one of {', '.join((*words.states, *words.stopped))}")
-        power = words.states[value]
         if power is Power.ON and self._announced_power is not Power.COOLING:
             self._announced_power = None
         power = self._announced_power or power
@@ -132,9 +132,9 @@ class LineProjector(Projector):
         value = self._query_if_supported(Question(ask=words.ask, answer=words.answer))
         if value is None:
             return None
-        if value.upper() not in words.states:
+        if (is_muted := state_of(words.states, value)) is None:
             raise self._unexpected(words.ask, value, f"one of {', '.join(words.states)}")
-        return words.states[value.upper()]
+        return is_muted
 
     def set_muted(self, muted: bool) -> None:
         """Mute the image or show it; refused unless the projector is on."""
@@ -178,8 +178,9 @@ class LineProjector(Projector):
         if query is None or value is None:
             return ()
         hours = value.split()
-        if not hours or not all(number.isascii() and number.isdecimal() for number in hours):
-            raise self._unexpected(query.ask, value, "hours")
+        # The hours only inform, so a value that is no number must not end a run.
+        if not all(number.isascii() and number.isdecimal() for number in hours):
+            return ()
         is_lit = self.power() in (Power.ON, Power.WARMING)
         return tuple(Lamp(int(number), is_lit) for number in hours)
 
@@ -256,11 +257,20 @@ class LineProjector(Projector):
             # `Exchange.query` discards the input that has arrived. It may announce power or faults, so read it first.
             self._discard_messages(0.0)
         line = self._language.line
+        # Some projectors confirm a query before they answer it (grapefrukt/esphome-optoma 3).
+        confirmed = {done.upper() for done in (self._language.power.done, self._language.mute.done) if done}
         reply = self._exchange.query(
-            encode_command(line, text), answer_parser(self._language, text), self._handle_unasked
+            encode_command(line, text),
+            answer_parser(self._language, text),
+            lambda message: (
+                self._handle_unasked(message)
+                or (message.upper() in confirmed and match_value(answers, message) is None)
+            ),
         )
         self._require_accepted(text, reply)
         value = match_value(answers, reply)
+        # Some projectors put a refusal in place of the value (arendst/Tasmota 15841).
+        self._require_accepted(text, value or "")
         if value is None:
             self._exchange.close()
             raise self._unexpected(text, reply, f"{' or '.join(map(repr, answers))}; {CHECK_SPEED}")

@@ -1,16 +1,16 @@
 """The text commands of a projector as data: commands, replies, and the meaning of the replies.
 
 A language is one TOML file, in ``drivers/data/languages`` or at a path that the user gives. In its texts, `{}` means a
-value. Replies are compared without regard to upper and lower case.
+value. Replies are compared without regard to upper and lower case, to blanks, and to zeros before a value.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, cast, get_args
+from typing import Annotated, Any, Final, Literal, TypeVar, cast, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -432,7 +432,9 @@ def answer_parser(language: Language, sent: str = "") -> MessageParser[str]:
                 if text.startswith(word) and language.match_unasked(rest):
                     return word, data.index(word.encode("ascii"), start) + len(word)
             start = min(end_positions) + 1
-            if not line.echo or text != sent or has_echo:
+            # An echo in other capitals than the command is only recognized for queries: to pow=on, POW=ON is the reply.
+            is_echo = text == sent or ("?" in sent and text.upper() == sent.upper())
+            if not line.echo or not is_echo or has_echo:
                 return text, start
             has_echo = True
 
@@ -469,9 +471,19 @@ def match_value(templates: Iterable[str], text: str) -> str | None:
     return None
 
 
+_State = TypeVar("_State")
+
+
+def state_of(states: Mapping[str, _State], value: str) -> _State | None:
+    """Return the meaning of a value, also if it has more or fewer zeros before it than in the language."""
+    values = {key.lstrip("0") or key[:1]: state for key, state in states.items()}
+    return values.get(value.upper().lstrip("0") or value[:1])
+
+
 @cache
 def _pattern(template: str) -> re.Pattern[str]:
-    return re.compile(re.escape(template).replace(re.escape(_VALUE), "(.*)"), re.IGNORECASE)
+    pattern = re.escape(template).replace(re.escape(_VALUE), "(.*)").replace(r"\ ", r"\s*").replace("=", r"\s*=\s*")
+    return re.compile(pattern, re.IGNORECASE)
 
 
 Refusal = Literal["unknown", "busy", "unclear"]  # Fields of `Refusals`

@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from evaluation.commands.options import Data, Read, argument, choose_learners, image_steps, open_data, thread_option
+from evaluation.commands.options import (
+    Data,
+    Read,
+    argument,
+    choose_learners,
+    choose_without_constant,
+    image_steps,
+    open_data,
+    split_names,
+    thread_option,
+)
 from foundation.clock import SystemClock
 from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, option, with_json
 from foundation.errors import InputError
-from foundation.folders import require_free_file
+from foundation.folders import atomic_folder, require_free, require_free_file
 
 # Names of the learners of this suite, for help texts.
 LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, kernel-ridge, convnet or constant-light"
 
-HELP = f"""Train a method on every image of a data set and write a model file.
+HELP = f"""Train methods on every image of a data set and write model files.
 
-METHOD is {LEARNERS_HELP}.
+METHOD is {LEARNERS_HELP}, or all. Separate several methods by commas; --out is then a new folder for METHOD.npz of each
+method.
 
 Reads DATA in any layout of evaluate run. Writes MODEL.npz, a new file of plain arrays with a record of the training:
 data set, number of images, hash of their names and ground truths, treatment of the images, settings, seed, software
@@ -31,10 +43,13 @@ DATA, for example few images of your camera.
 
 @with_json("evaluate train")
 def train(
-    method: Annotated[str, argument("METHOD", f"One of {LEARNERS_HELP}.")],
+    method: Annotated[str, argument("METHOD", f"{LEARNERS_HELP} or all; several separated by commas.")],
     data: Data,
     *,
-    out: Annotated[Path, option("MODEL.npz", "New model file; a missing folder is created.")],
+    out: Annotated[
+        Path,
+        option("MODEL.npz|FOLDER", "New model file; a missing folder is created. For several methods, a new folder."),
+    ],
     adapt: Annotated[
         Path | None, option("MODEL.npz", "Adapt this model of the same method to DATA instead of training a new one.")
     ] = None,
@@ -49,45 +64,69 @@ def train(
     from evaluation.learning.model_files import load_model, provenance_of, save_model
     from evaluation.reports.table_output import show_notes
 
-    learners = choose_learners([method])
-    if len(learners) != 1:
-        raise InputError(f"METHOD is {method}, {len(learners)} methods, expected one for a model file; give one")
-    (learner,) = learners
-    if not isinstance(learner, FeatureLearner):
+    # Learners of `all` that are not installed are omitted, as in evaluate cv.
+    names = split_names([method])
+    chosen, notes = choose_learners(names), list[str]()
+    if "all" in map(str.lower, names):
+        chosen, notes = choose_without_constant(names)
+    if not chosen:
+        raise InputError(f"METHOD is {method!r}, 0 methods, expected at least 1; name one")
+    learners = [learner for learner in chosen if isinstance(learner, FeatureLearner)]
+    if len(learners) < len(chosen):
         raise InputError(
-            f"{method} is your own class, expected a method of this suite for a model file; use evaluate cv {method} "
+            f"{method} has your own class, expected methods of this suite for model files; use evaluate cv {method} "
             f"{data} to train and test it, and let its fit write its own file to keep it"
         )
-    if out.suffix != ".npz":
-        raise InputError(f"--out is {out}, expected a name that ends in .npz, as evaluate run requires; rename it")
-    require_free_file(out, "the model")
-    require_installed(learner)
+    is_single = len(learners) == 1
+    if is_single != (out.suffix == ".npz"):
+        expected = "a name that ends in .npz, as evaluate run requires" if is_single else "a folder for several models"
+        raise InputError(f"--out is {out}, expected {expected}; rename it")
+    if is_single:
+        require_free_file(out, "the model")
+    else:
+        require_free(out, "the models")
+    for learner in learners:
+        require_installed(learner)
     base_model = None if adapt is None else load_model(adapt)
     if base_model is not None:
-        if base_model.learner.key != learner.key:
+        if [base_model.learner.key] != [learner.key for learner in learners]:
             raise InputError(
                 f"{adapt} is a model of {base_model.learner.key}, expected {method}; give a model of {method}"
             )
         # The settings of the base model apply, which may differ from the present defaults.
-        learner = base_model.learner
+        learners = [base_model.learner]
     data_set = open_data(data, read)
     truths = truths_of(data_set.scenes)
     count = len(data_set.scenes)
-    with image_steps(count) as step:
-        (features,) = extract(data_set.scenes, [learner], workers or processor_count(), step)
-        if base_model is None:
-            fitted = fit_extracted(learner, features, truths, seed)
-        else:
-            fitted = adapting.adapt(base_model, adapting.fit_local(learner, features, truths, seed))
-        base_record = base_model.provenance if base_model else None
+    base_record = base_model.provenance if base_model else None
+    with image_steps(count) as step, nullcontext(out) if is_single else atomic_folder(out, "the models") as folder:
+        extracted = extract(data_set.scenes, learners, workers or processor_count(), step)
         record = provenance_of(data_set, seed, SystemClock(), adapted_from=base_record)
-        save_model(out, fitted, record)
-    unused = sum(image_features is None for image_features in features)
-    notes = [f"{unused} of {count} images have no usable pixel and were excluded from the training"] if unused else []
-    output.add(model=out, method=learner.name, data_set=data_set.name, images=count, unused=unused, seed=seed)
-    if isinstance(fitted.model, adapting.BlendedModel):
-        share = float(fitted.model.share)
-        output.add(adapted_from=adapt, share=share)
-        notes.append(f"weights of the blend: {adapt} {share:.2f}, training on these images alone {1 - share:.2f}")
-    print(f"{out}: {learner.name}, {record.description()}")
-    show_notes(output, notes, data_set.treatment)
+        shares: dict[str, float] = {}
+        for learner, features in zip(learners, extracted, strict=True):
+            if base_model is None:
+                fitted = fit_extracted(learner, features, truths, seed)
+            else:
+                fitted = adapting.adapt(base_model, adapting.fit_local(learner, features, truths, seed))
+            save_model(out if is_single else folder / f"{learner.key}.npz", fitted, record)
+            if isinstance(fitted.model, adapting.BlendedModel):
+                shares[learner.key] = float(fitted.model.share)
+    for learner, features in zip(learners, extracted, strict=True):
+        path = out if is_single else out / f"{learner.key}.npz"
+        unused = sum(image_features is None for image_features in features)
+        if unused:
+            notes.append(f"{unused} of {count} images have no usable pixel and were excluded from the training")
+        values: dict[str, Any] = {
+            "model": path, "method": learner.name, "data_set": data_set.name, "images": count, "unused": unused,
+            "seed": seed,
+        }  # fmt: skip
+        if learner.key in shares:
+            share = shares[learner.key]
+            values |= {"adapted_from": adapt, "share": share}
+            notes.append(f"weights of the blend: {adapt} {share:.2f}, training on these images alone {1 - share:.2f}")
+        if is_single:
+            output.add(**values)
+        else:
+            output.append("models", values)
+        print(f"{path}: {learner.name}, {record.description()}")
+    show_notes(output, list(dict.fromkeys(notes)), data_set.treatment)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY
 from evaluation.metrics import ErrorKind, MapError, Summary, recovery_error, reproduction_error, summarise
-from foundation.errors import first_few
+from foundation.errors import counted, first_few
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +37,10 @@ class Result:
     guessed: npt.NDArray[np.bool_]
     causes: Mapping[int, str] | None = None
     maps: Mapping[int, MapError] | None = None
+
+    def __repr__(self) -> str:
+        """Return one line, because there may be thousands of images."""
+        return f"Result({self.method!r}, {counted(len(self.estimates), 'image')})"
 
     def at(self, indices: npt.NDArray[np.int64]) -> Result:
         """Return the results of the scenes with these indices (P,) int64, in this order, without `maps`.
@@ -179,6 +183,9 @@ class Run:
     notes: tuple[str, ...] = ()  # Sentences printed with the results
     software: str = ""  # Name and version of the software
     truth_uncertainty_deg: float | None = None
+    black_bodies: Mapping[float, tuple[float, float, float]] = field(
+        default_factory=dict[float, tuple[float, float, float]]
+    )
 
 
 def indistinct_methods(results: Sequence[Result], uncertainty_deg: float | None) -> tuple[str, ...]:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 SHARD_IMAGES: Final = 256
 
 # Version of colorimetric rendering. It is increased when equal options give other pixels.
-RENDERING_VERSION: Final = 4
+RENDERING_VERSION: Final = 5
 
 
 @dataclass(frozen=True)

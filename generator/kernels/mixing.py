@@ -28,8 +28,9 @@ import numpy as np
 import numpy.typing as npt
 from numpy import uint32
 
+from foundation.arrays import native
 from foundation.compiled import compiled, inlined
-from foundation.errors import InputError
+from foundation.errors import InputError, value_text
 from generator import philox
 from generator.kernels import vector as streaming
 from generator.kernels.choice import (
@@ -484,11 +485,12 @@ def mix_samples(
     target = check_out(out, picture.shape, np.uint16)
     key = check_seed(seed, image)
     shape = (*picture.shape[:2], len(lights))
-    pixel_weights = np.asarray(weights)
-    if pixel_weights.dtype != np.float32:
-        pixel_weights = check_weights(pixel_weights, len(lights)).astype(np.float32)
-    if pixel_weights.shape not in (shape, shape[2:]):
-        raise InputError(f"the weights are {pixel_weights.shape}, expected {shape} or {shape[2:]}")
+    pixel_weights = native(weights)
+    if pixel_weights.ndim == 1:
+        pixel_weights = check_weights(pixel_weights, len(lights))
+    if pixel_weights.shape not in (shape, shape[2:]) or pixel_weights.dtype.kind not in "fiub":
+        raise InputError(f"the weights are {value_text(pixel_weights)}, expected numbers {shape} or {shape[2:]}")
+    pixel_weights = pixel_weights.astype(np.float32, copy=False)
     source, pixel_weights = packed_rows(picture), np.broadcast_to(pixel_weights, shape)
     if picture.shape[1] < BLOCK:
         source = np.pad(source, ((0, 0), (0, BLOCK), (0, 0)))

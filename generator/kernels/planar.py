@@ -22,6 +22,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from foundation.arrays import native
 from foundation.compiled import compiled
 from foundation.errors import InputError
 from generator.kernels.choice import (
@@ -182,6 +183,7 @@ def draw_batch(
     >>> crops.shape, crops.dtype
     ((2, 3, 4, 4), dtype('float32'))
     """
+    tables = native(tables)
     if tables.ndim != 4 or not len(tables):
         raise InputError(f"the samples have shape {tables.shape}, expected (illuminants, 8**bits, samples, 3)")
     bits = check_samples(tables[0])
@@ -202,8 +204,6 @@ def draw_batch(
     seed_ids, image_ids = _whole_numbers(seeds, count, 64, "seed"), _whole_numbers(images, count, 32, "image number")
     target = check_out(out, (count, 3, height, width), np.float32)
     work = target if target.strides[3] == 4 or width == 1 else np.empty(target.shape, np.float32)
-    if not tables[0].flags.c_contiguous:
-        tables = np.ascontiguousarray(tables)
     last_samples = readable(tables[-1])
     # A batch often contains a picture several times; it is checked once.
     distinct = {id(picture): picture for picture in pictures}

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy import uint32
 
+from foundation.arrays import native
 from foundation.compiled import compiled, inlined
 from foundation.errors import InputError
 from generator.kernels import vector as streaming
@@ -225,6 +226,7 @@ def draw_samples(
             [42, 43, 44],
             [45, 46, 47]]], dtype=uint16)
     """
+    samples = native(samples)
     bits = check_samples(samples)
     check_picture(picture)
     target = check_out(out, picture.shape, np.uint16)

@@ -29,8 +29,9 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
+from foundation.arrays import native
 from foundation.compiled import compiled, inlined
-from foundation.errors import FormatError, InputError, first_few
+from foundation.errors import FormatError, InputError, first_few, value_text
 from foundation.names import in_natural_order
 from generator import philox
 from generator.files import read_native, require_plausible, upright
@@ -385,6 +386,32 @@ def quantise_shares(shares: npt.NDArray[np.floating[Any]], out: Weights) -> None
         _quantise_shares_of_two(shares[0], shares[1], out.reshape(len(out), -1))
     else:
         _quantise_shares(shares, out)
+
+
+def checked_weights(weights: npt.ArrayLike, shape: tuple[int, int, int]) -> Weights:
+    """Check weights (H, W, K) ≥ 0 from outside; return them normalised, in multiples of 1/65535."""
+    try:
+        given = native(weights)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"the weights are no array: {error}; expected numbers of shape {shape}") from error
+    if given.shape != shape or given.dtype.kind not in "fiub":
+        raise InputError(
+            f"the weights are {value_text(given)}, expected numbers of shape {shape}: height and width of the picture, "
+            "and number of illuminants; correct them"
+        )
+    values = given.astype(np.float64)
+    largest = values.max(axis=2, keepdims=True, initial=0)
+    is_invalid = ~(np.isfinite(values) & (values >= 0)).all(axis=2) | (largest[..., 0] == 0)
+    if is_invalid.any():
+        row, column = np.argwhere(is_invalid)[0].tolist()
+        raise InputError(
+            f"the weights in row {row}, column {column} are {given[row, column].tolist()}, expected finite numbers ≥ 0 "
+            f"with a sum above 0; correct {np.count_nonzero(is_invalid)} of {is_invalid.size} pixels"
+        )
+    normalised = np.empty(shape, np.float32)
+    # Division by the largest weight first, because the sum of very large weights is infinite.
+    quantise_shares(np.ascontiguousarray((values / largest).transpose(2, 0, 1), np.float32), normalised)
+    return normalised
 
 
 def decode_values(file: bytes, name: Path | str) -> npt.NDArray[Any]:

@@ -3,7 +3,10 @@
 A listed matrix converts XYZ to camera RGB under D65. It is multiplied by the matrix from sRGB to XYZ (IEC 61966-2-1),
 which is for D65, too. Rows are scaled to sum 1: white becomes (1, 1, 1), which is then multiplied by the illuminant.
 
-For other cameras the matrix is fitted to the look-up table (LUT). The patches were printed from sRGB codes. If the
+A computed look-up table (LUT) records a matrix that `sim table` calculated from the sensitivities of its camera. It is
+used if the camera has no listed matrix.
+
+For other cameras the matrix is fitted to the LUT. The patches were printed from sRGB codes. If the
 print shop reproduces sRGB, the camera RGB of the patches is C · linear sRGB, and least squares give C. If the print was
 not colour-managed, C also contains the errors of the print, mostly colours that are too pale. The `source` of the
 matrix reports the residual.
@@ -11,15 +14,15 @@ matrix reports the residual.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from foundation.colorimetry import angles_deg, decode_srgb
-from foundation.errors import InputError
+from foundation.colorimetry import angles_deg, decode_srgb, fit_white_matrix
+from foundation.errors import FormatError, InputError
 from generator.kernels.choice import channels_of
 from generator.rendering.print_profiles import PrintProfile, profile_of
 
@@ -63,7 +66,7 @@ class ColourMatrix:
     """
 
     name: str
-    rows: npt.NDArray[np.float64]
+    rows: npt.NDArray[np.float64] = field(repr=False)
     source: str
 
 
@@ -143,13 +146,30 @@ def matrix_for(lut: Lut, text: str | None = None) -> ColourMatrix:
     """Return the colour matrix for a LUT.
 
     `text`: name of a camera, a file, `table` for the matrix fitted to the LUT, or `none` for the identity. None: the
-    matrix of the LUT's camera, or the fitted one if it is not listed.
+    listed matrix of the LUT's camera, else the one that a computed LUT records, else the fitted one.
     """
     if text is None:
-        return camera_matrix(lut.provenance.camera) or fitted_matrix(lut)
+        return camera_matrix(lut.provenance.camera) or recorded_matrix(lut) or fitted_matrix(lut)
     if text.strip().lower() == TABLE:
         return fitted_matrix(lut)
     return choose_matrix(text) or ColourMatrix("none", np.eye(3), "no matrix: linear sRGB is used as camera RGB")
+
+
+def recorded_matrix(lut: Lut) -> ColourMatrix | None:
+    """Return the matrix of the sensitivities of a computed LUT, or None if the LUT records none."""
+    record = (lut.provenance.computed or {}).get("matrix")
+    if record is None:
+        return None
+    try:
+        rows, source = np.array(record["rows"], np.float64), str(record["source"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"{lut.folder}: computed.matrix of lut.json is {record!r}; {_RECORDED}") from error
+    if rows.shape != (3, 3) or not np.abs(rows).max() <= _LARGEST:
+        raise FormatError(f"{lut.folder}: computed.matrix of lut.json is {record!r}; {_RECORDED}")
+    return ColourMatrix(lut.provenance.camera, _normalised(rows, str(lut.folder)), source)
+
+
+_RECORDED: Final = "expected 3 x 3 numbers as rows, and their source; compute the LUT again"
 
 
 def fitted_matrix(lut: Lut) -> ColourMatrix:
@@ -167,9 +187,8 @@ def fitted_matrix(lut: Lut) -> ColourMatrix:
 def fit_matrix(profile: PrintProfile) -> tuple[npt.NDArray[np.float64], float]:
     """Return the matrix (3, 3) float64 with rows of sum 1 from linear sRGB codes to colours, and its residual, degrees.
 
-    Colours are scaled between the print's black and paper, channel by channel. For a scaled channel a, least squares
-    fit a - G = c_r (R - G) + c_b (B - G), which makes the sums of rows 1. R, G and B are linear sRGB.
-    The residual is the median angle between predicted and recorded colours.
+    Colours are scaled between the print's black and paper, channel by channel, for `fit_white_matrix`. The residual is
+    the median angle between predicted and recorded colours.
     """
     bits = profile.bits
     codes = channels_of(np.flatnonzero(profile.usable), bits) / (2.0**bits - 1)
@@ -179,8 +198,6 @@ def fit_matrix(profile: PrintProfile) -> tuple[npt.NDArray[np.float64], float]:
     paper = profile.colours[-1] if profile.usable[-1] else np.full(3, profile.white)
     span = np.maximum(paper - black, 1e-6)
     reflectances = (colours - black) / span
-    differences = linear[:, [0, 2]] - linear[:, [1]]
-    coefficients = np.asarray(np.linalg.lstsq(differences, reflectances - linear[:, [1]], rcond=None)[0], np.float64).T
-    rows = np.stack([coefficients[:, 0], 1 - coefficients.sum(axis=1), coefficients[:, 1]], axis=1)
+    rows = fit_white_matrix(linear, reflectances)
     predicted = black + span * np.clip(linear @ rows.T, 0, 1)
     return rows, float(np.median(angles_deg(predicted, colours)))

@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.table.lut import open_lut, require_lut
-from foundation.errors import InputError, value_text
+from foundation.errors import InputError, counted, value_text
 from generator import philox
 from generator.kernels.planar import draw_batch, scales_of
 from generator.kernels.printed_crops import draw_printed_crops
@@ -127,6 +127,11 @@ class Batch:
     lights: npt.NDArray[np.int64]
     pictures: npt.NDArray[np.int64]
     black_taken: npt.NDArray[np.float64]
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        count, _, height, width = self.images.shape
+        return f"Batch({counted(count, 'crop')} of {height}x{width} px)"
 
 
 class Crops:
@@ -287,6 +292,12 @@ class Crops:
             If the epoch is out of range.
         """
         self.epoch = self._checked_epoch(epoch)
+
+    def __repr__(self) -> str:
+        """Return one line; the list of illuminants may be very long."""
+        height, width = self.size
+        lights = counted(len(self.lights), "illuminant")
+        return f"Crops({counted(self.length, 'crop')} of {height}x{width} px, {lights}, {self.gallery!r}, {self.lut!r})"
 
     def __len__(self) -> int:
         """Return the number of crops per epoch."""

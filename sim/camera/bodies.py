@@ -30,6 +30,7 @@ from drivers.ptp.codes import (
     WhiteBalance,
 )
 from drivers.ptp.protocol import DeviceInfo
+from sim.world.sensors import Body
 
 # Kinds of the record that lists the allowed values of a property.
 NO_LIST = 1  # Without list; the property can usually not be set.
@@ -408,3 +409,13 @@ TEST_BODY = replace(
 EOS_BODIES: Mapping[str, EosModel] = MappingProxyType(
     {"EOS 550D": EOS_550D, "EOS 6D Mark II": EOS_6D_MARK_II, "Test": TEST_BODY}
 )
+
+
+def eos_with(sensor: Body, name: str) -> EosModel:
+    """Return the body with a name, by default an EOS 550D, that reports the camera of a sensor as raw files do."""
+    body = EOS_BODIES.get(name, EOS_550D)
+    maker, model = body.info.manufacturer, sensor.model
+    if "canon" not in sensor.maker.lower():
+        # The driver requires the word Canon; names of cameras contain only the first word of the maker.
+        maker, model = f"{sensor.camera.split(' ')[0]} (simulated Canon EOS)", sensor.camera
+    return replace(body, info=replace(body.info, manufacturer=maker, model=model))

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from drivers.camera import camera_name
 from foundation.compiled import compiled
 from foundation.errors import ConfigurationError
 from foundation.records import from_settings
@@ -67,10 +68,8 @@ class Body:
 
     @property
     def camera(self) -> str:
-        """Maker and model without repetition, as `drivers.raw.rawfile` reads them from raw files."""
-        words = self.model.split(" ")
-        has_maker = not self.maker or words[0].casefold() == self.maker.split(" ")[0].casefold()
-        return self.model if has_maker else f"{self.maker} {self.model}"
+        """Maker and model as in all messages."""
+        return camera_name(self.maker, self.model)
 
     @property
     def half_size(self) -> tuple[int, int]:

@@ -147,3 +147,34 @@ def test_init_fills_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert len(load_illuminants(lab / "illuminations.csv")) == 707
     names = {path.name for path in (lab / "chart").iterdir()}
     assert names == {"chart.json", "chart.pdf", "preview.png", "proof.pdf", "PRINTING.txt"}
+
+
+@pytest.mark.slow
+def test_init_makes_a_chart_of_the_given_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def small(bits: int, page: str | None) -> Chart:
+        return design_chart(1, page)
+
+    monkeypatch.setattr(layout, "design_chart", small)
+    assert main(["init", str(tmp_path / "lab"), "--page", "A5"]) == 0
+    # ISO 216: A5 is 148 mm × 210 mm.
+    assert load_chart(load_lab(tmp_path / "lab" / "LAB.toml").chart).page_mm == (210, 148)
+
+
+@pytest.mark.parametrize("name", ["", "chart.json"])
+@pytest.mark.parametrize("folder", ["print", "lab/my print"])
+def test_init_takes_an_existing_chart(name: str, folder: str, tmp_path: Path) -> None:
+    lab, drawn = begun(tmp_path / "lab"), design_chart(2)
+    (tmp_path / folder).mkdir()
+    drawn.save(tmp_path / folder / "chart.json")
+    assert main(["init", str(lab), "--chart", str(tmp_path / folder / name)]) == 0
+    settings = load_lab(lab / "LAB.toml")
+    assert load_chart(settings.chart).sha256 == load_chart(tmp_path / folder / "chart.json").sha256
+    is_inside = folder.startswith("lab/")
+    assert ('chart = "my print/chart.json"' in (lab / "LAB.toml").read_text()) is is_inside
+
+
+@pytest.mark.parametrize("options", [("--chart", "missing"), ("--page", "A3"), ("--page", "A3", "--chart", "missing")])
+def test_init_refuses_a_chart_that_it_cannot_use(options: tuple[str, ...], tmp_path: Path) -> None:
+    lab = begun(tmp_path / "lab")
+    assert main(["init", str(lab), *options]) == 2
+    assert not (lab / "LAB.toml").exists()

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acquisition.run.devices import health_fault
 from drivers import pjlink as wire
 from drivers.links.link import Link, PeerLink
 from drivers.links.network import Address, TcpLink, UdpSocket
@@ -432,7 +433,9 @@ def test_digest_matches_the_standards_example() -> None:
         (b"PJLINK 0", None),
         (b"PJLINK 1 498e4a67", "498e4a67"),
         (b"pjlink 1 498E4a67", "498E4a67"),
+        (b"PJLINK  1  42 ", "42"),
         (b"PJLINK ERRA", Refused.WRONG_PASSWORD),
+        (b"Pjlink err a", Refused.WRONG_PASSWORD),
     ],
 )
 def test_parses_greetings(line: bytes, greeting: str | Refused | None) -> None:
@@ -440,7 +443,7 @@ def test_parses_greetings(line: bytes, greeting: str | Refused | None) -> None:
 
 
 @pytest.mark.parametrize(
-    "line", [b"", b"PJLINK", b"PJLINK 1", b"PJLINK 1 short", b"PJLINK 0 x", b"SSH-2.0-x", b"\xff\xfe"]
+    "line", [b"", b"PJLINK", b"PJLINK 1", b"PJLINK 1 a b", b"PJLINK 0 x", b"SSH-2.0-x", b"\xff\xfe"]
 )
 def test_refuses_invalid_greetings(line: bytes) -> None:
     with pytest.raises(ProtocolError, match="PJLink is enabled"):
@@ -480,6 +483,9 @@ def test_commands_match_the_standards_bytes() -> None:
         (b"%2IRES=*", PjLinkReply("IRES", "*", level=2)),
         (b"PJLINK ERRA", Refused.WRONG_PASSWORD),
         (b"pjlink erra", Refused.WRONG_PASSWORD),
+        (b"PJLINK ERR A ", Refused.WRONG_PASSWORD),
+        (b"%1POWR=ERRA", Refused.WRONG_PASSWORD),
+        (b" %1POWR = 1 ", PjLinkReply("POWR", "1")),
     ],
 )
 def test_parses_replies(line: bytes, reply: PjLinkReply | Refused) -> None:
@@ -522,32 +528,68 @@ def test_parses_values_of_class_2() -> None:
 @pytest.mark.parametrize(
     ("parse", "value"),
     [
-        (wire.parse_input, "71"),
-        (wire.parse_input, "30"),
-        (wire.parse_input, "3"),
-        (wire.parse_input_resolution, "1920"),
-        (wire.parse_input_resolution, ""),
-        (wire.parse_input_resolution, "1920x1080p"),
-        (wire.parse_input_resolution, "٣x٣"),
-        (wire.parse_freeze, "2"),
-        (wire.parse_class, "0"),
-        (wire.parse_class, "²"),
         (wire.parse_power, "4"),
         (wire.parse_power, ""),
-        (wire.parse_mute, "12"),
-        (wire.parse_mute, "on"),
-        (wire.parse_faults, "00000"),
+        (wire.parse_power, "on"),
         (wire.parse_faults, "300000"),
-        (wire.parse_lamps, "120"),
-        (wire.parse_lamps, "120 2"),
-        (wire.parse_lamps, "-1 0"),
-        (wire.parse_lamps, "١ 1"),
+        (wire.parse_faults, "ok"),
     ],
 )
 def test_refuses_values_outside_the_standard(parse: object, value: str) -> None:
     assert callable(parse)
     with pytest.raises(ProtocolError):
         parse(value)
+
+
+@pytest.mark.parametrize(
+    ("parse", "value", "meaning"),
+    [
+        (wire.parse_class, "Class 1", 1),  # Optoma X351, gaetano-guerriero/pypjlink 1
+        (wire.parse_class, "Version1", 1),  # BenQ, OpenLP bug 1550891
+        (wire.parse_class, "CLASS2", 2),
+        (wire.parse_class, "", 1),
+        (wire.parse_class, "²", 1),
+        # Extron drivers of several makers read LAMP without a state, others with a state for each of two lamps.
+        (wire.parse_lamps, "120", (Lamp(120, None),)),
+        (wire.parse_lamps, "120 3000", (Lamp(120, None), Lamp(3000, None))),
+        (wire.parse_lamps, "120 1 3000", (Lamp(120, True), Lamp(3000, None))),
+        (wire.parse_lamps, "0 1 10 0", (Lamp(0, True), Lamp(10, False))),
+        (wire.parse_lamps, "-1 0", ()),
+        (wire.parse_lamps, "١ 1", ()),
+        (wire.parse_lamps, "unknown", ()),
+        (wire.parse_faults, "000", ()),
+        (wire.parse_faults, "", ()),
+        (wire.parse_faults, "00 00 01", (Fault("other", Severity.WARNING),)),
+        (wire.parse_faults, "020", (Fault("lamp", Severity.ERROR),)),
+        (wire.parse_faults, "00000022", (Fault("other", Severity.ERROR),)),
+        (wire.parse_power, "01", Power.ON),
+        (wire.parse_power, "00", Power.STANDBY),
+        (wire.parse_mute, "12", None),
+        (wire.parse_freeze, "2", None),
+        # Three characters, home-assistant/core 55507: a client that expected two stopped there.
+        (wire.parse_input, "31a", "31A"),
+        (wire.parse_input_resolution, "1920 x 1080", Resolution(1920, 1080)),
+        (wire.parse_input_resolution, "1920x1080p", Resolution(1920, 1080)),
+        (wire.parse_input_resolution, "1080i", NoResolution.UNKNOWN_SIGNAL),
+        (wire.parse_input_resolution, "", NoResolution.UNKNOWN_SIGNAL),
+        (wire.parse_input_resolution, "--", NoResolution.NO_SIGNAL),
+    ],
+)
+def test_reads_values_that_real_projectors_send(parse: Callable[[str], object], value: str, meaning: object) -> None:
+    assert parse(value) == meaning
+
+
+def test_optoma_with_class_in_words_passes_all_queries_of_a_run() -> None:
+    # gaetano-guerriero/pypjlink 1; lower case: openhab/openhab-addons 6725.
+    script = Script(
+        b"PJLINK 0\r\n",
+        b"%1ERST ?\r", b"%1erst=000 \r\n",
+        b"%1POWR ?\r", b"%1powr=1\0",
+        b"%1AVMT ?\r", b"%1AVMT = err 1\n",
+        b"%1CLSS ?\r", b"%1CLSS=Class 1\r",
+    )  # fmt: skip
+    assert health_fault(driver(script)) is None
+    assert script.ended()
 
 
 @pytest.mark.slow

@@ -29,6 +29,21 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     assert settings.illuminations == tmp_path.resolve() / "lights.csv"
 
 
+def test_sensitivities_are_relative_to_the_file(tmp_path: Path) -> None:
+    lab = tmp_path / "LAB.toml"
+    text = '[simulated]\nbody = "mine.json"\ncamera = { sensitivities = "other.JSON", iso = 100 }\n'
+    lab.write_text(MINIMAL + text)
+    simulated = load_lab(lab).simulated
+    assert simulated.body == str(tmp_path.resolve() / "mine.json")
+    assert simulated.camera == {"sensitivities": str(tmp_path.resolve() / "other.JSON"), "iso": 100}
+    for name in ("EOS 6D Mark II", "Canon_EOS-1Ds_Mark_III"):
+        lab.write_text(MINIMAL + f'[simulated]\nbody = "{name}"\n')
+        assert load_lab(lab).simulated.body == name
+    (tmp_path / "curves").touch()
+    lab.write_text(MINIMAL + '[simulated]\nbody = "curves"\n')
+    assert load_lab(lab).simulated.body == str(tmp_path.resolve() / "curves")
+
+
 def test_defaults_match_the_documentation() -> None:
     text = (Path(__file__).parents[2] / "docs/lab.md").read_text(encoding="utf-8").split("```")[1].removeprefix("toml")
     top, *sections = text.split("\n[")

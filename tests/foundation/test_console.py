@@ -86,6 +86,15 @@ def test_interruption_exits_with_130(capsys: pytest.CaptureFixture[str]) -> None
 
     assert run(interrupt) == 130
     assert capsys.readouterr().err == "error: interrupted; run the same command again\n"
+
+    def interrupt_wrapped() -> None:
+        try:
+            interrupt()
+        except KeyboardInterrupt as error:
+            raise RuntimeError("Error calling __set_name__") from error
+
+    assert run(interrupt_wrapped) == 130
+    assert capsys.readouterr().err == "error: interrupted; run the same command again\n"
     assert run(interrupt, is_resumable=False) == 130
     assert capsys.readouterr().err == "error: interrupted; no results were kept\n"
 

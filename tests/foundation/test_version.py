@@ -38,6 +38,7 @@ assert not {"numpy", "typer", "generator"} & sys.modules.keys()
 assert croplab.open_lut is __import__("generator").open_lut
 for name in croplab.__all__:
     assert callable(getattr(croplab, name)), name
+assert dir(croplab) == sorted(croplab.__all__)
 try:
     croplab.nothing
 except AttributeError:

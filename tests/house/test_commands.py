@@ -127,3 +127,56 @@ def test_reads_settings_with_byte_order_mark(tmp_path: Path) -> None:
         (tmp_path / "LAB.toml").write_bytes(mark + text.encode())
         read.append(load_lab(tmp_path / "LAB.toml"))
     assert read[0] == read[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("evaluation.cli", "cv", "kernel-ridge", "data", "--jobs", "3"), "--workers"),
+        (("generator.cli", "demo:", "out", "-j", "3"), "--workers"),
+        (("generator.cli", "demo:", "--output", "out"), "OUT is an argument"),
+        (("evaluation.cli", "data", "--output", "out"), "--out"),
+        (("evaluation.cli", "data", "--metric", "recovery"), "--error"),
+        (("sim.cli", "camera", "--body", "Test"), "--model"),
+        (("acquisition.cli", "init", "lab", "--paper", "A3"), "--page"),
+    ],
+)
+def test_option_of_other_programs_suggests_ours(
+    words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module, *arguments = words
+    assert import_module(module).main(arguments) == 2
+    assert expected in " ".join(re.sub("[│╭╮╰╯─]", "", capsys.readouterr().err).split())
+
+
+# Both signals of a quick double Ctrl-C, while modules are imported, and while the command handles the first.
+INTERRUPTED = {
+    "import": "import signal\nsignal.raise_signal(signal.SIGINT)\nsignal.raise_signal(signal.SIGINT)\n",
+    "run": """
+import signal
+from contextlib import suppress
+from foundation.console import orderly_end, run
+
+def command():
+    with orderly_end():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.raise_signal(signal.SIGINT)
+
+def main():
+    code = run(command)
+    signal.raise_signal(signal.SIGINT)
+    return code
+""",
+}
+
+
+@pytest.mark.parametrize("phase", INTERRUPTED)
+def test_two_interrupts_end_in_one_line(phase: str, tmp_path: Path) -> None:
+    (tmp_path / "interrupted.py").write_text(INTERRUPTED[phase])
+    code = "import signal, sys, croplab; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    code += "; croplab.COMMANDS['sim'] = 'interrupted'; sys.exit(croplab.sim())"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(Path.cwd()), str(tmp_path)))}
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (130, "error: interrupted; run the same command again\n")

@@ -6,10 +6,16 @@ from pathlib import Path
 
 import pytest
 
+import sim
+from drivers.canon import CanonEos
 from drivers.links.network import TcpLink, TcpServer
 from drivers.pjlink import PjLinkProjector
 from drivers.projector import Power
+from drivers.ptp.ip import IpTransport
+from foundation.clock import SystemClock
 from sim.cli import main
+from sim.spectral import SUFFIX
+from sim.world.sensors import find_body
 from tests.drivers.display.x_servers import virtual_screen
 from tests.sim.conftest import sim_serving
 
@@ -46,6 +52,34 @@ def test_missing_screen_or_projector_exits_with_3(capsys: pytest.CaptureFixture[
     with virtual_screen(tmp_path, "64x48") as screen:
         assert main([*arguments, screen.display, "--watch-projector", f"127.0.0.1:{port}"]) == 3
     assert f"nothing listens at 127.0.0.1:{port}" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["Canon_EOS_5DS", "mine.json", "Test", "EOS 6D Mark II"])
+def test_camera_takes_sensitivities(model: str, tmp_path: Path) -> None:
+    names = {
+        "Canon_EOS_5DS": "Canon EOS 5DS",
+        "Test": "Canon CroP Test",
+        "EOS 6D Mark II": "Canon EOS 6D Mark II",
+    }
+    if model == "mine.json":
+        source = Path(sim.__file__).parent / "data" / f"Canon_EOS_5DS{SUFFIX}"
+        text = source.read_text().replace('"Canon"', '"Nikon"').replace('"EOS 5DS"', '"D810"')
+        (tmp_path / model).write_text(text)
+        model = str(tmp_path / model)
+    with sim_serving("camera", "--port", "0", "--model", model) as (line,):
+        host, port = line.split()[-1].split(":")
+        clock = SystemClock()
+        camera = CanonEos(lambda: IpTransport.connect(host, int(port), guid=bytes(16), name="test", clock=clock), clock)
+        name = camera.identity().name
+        camera.close()
+    assert name == find_body(model).camera
+    assert name == names.get(model, "Nikon D810")
+
+
+def test_unknown_camera_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["camera", "--port", "0", "--model", "Canon_EOS_600"]) == 2
+    assert "did you mean 'Canon_EOS_600D'?" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import pytest
 
 from calibration.cli import main as build_lut
 from calibration.table.lut import open_lut
+from sim.spectral import known_sensitivities, matrix_record, read_sensitivities
+from sim.world.sensors import BODIES
 from synthesis.cli import main
 
 SMALL = "[chart]\nbits = 1\n"
@@ -31,6 +35,7 @@ def test_computes_a_lut(settings: str, tmp_path: Path, capsys: pytest.CaptureFix
     assert computed is not None
     assert (computed["seed"], computed["room"]["paper"], computed["room"]["hot_per_million"]) == (4, "matt", 5)
     assert computed["room"]["profile"] == "unmanaged"
+    assert computed["matrix"] == matrix_record(read_sensitivities("Canon_EOS-1Ds_Mark_III"))
 
 
 @pytest.mark.slow
@@ -57,6 +62,7 @@ def test_records_and_prints_the_citation(settings: str, tmp_path: Path, capsys: 
     ("arguments", "message"),
     [
         (["--camera", "Canon_EOS_1"], "no camera 'Canon_EOS_1'"),
+        (["--camera", "Nikon_D810"], "sim table --camera list"),
         (["--settings", "nowhere.toml"], "nowhere.toml"),
     ],
 )
@@ -66,6 +72,21 @@ def test_refuses_bad_arguments(
     assert main(["table", str(tmp_path / "lut"), *arguments]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "lut").exists()
+
+
+def test_lists_cameras_with_sources(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["table", "--camera", "list"]) == 0
+    rows = [re.split(r"  +", line) for line in capsys.readouterr().out.splitlines()]
+    assert ["Canon_EOS-1Ds_Mark_III", "Canon EOS-1Ds Mark III", "measured, rawtoaces-data"] in rows
+    assert ["EOS 550D", "Canon EOS 550D", "simulated with Canon_EOS_600D"] in rows
+    assert main(["table", "--camera", "list", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)["cameras"]
+    assert {*known_sensitivities(), *BODIES} == {camera["name"] for camera in listed}
+
+
+def test_requires_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["table"]) == 2
+    assert "OUT is missing" in capsys.readouterr().err
 
 
 def test_also_has_the_device_commands(capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,14 +23,14 @@ from experiment.config import LabSettings
 from experiment.session.folder import Session
 from experiment.session.records import last_frame_time
 from foundation.clock import SIM_START, SimulatedClock
-from foundation.errors import ConfigurationError
+from foundation.errors import ConfigurationError, nearest_names
 from sim.buses.usb import MemoryTransport
-from sim.camera.bodies import EOS_BODIES
+from sim.camera.bodies import eos_with
 from sim.camera.eos import SimulatedEos
 from sim.camera.film import WorldFilm
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
-from sim.spectral import known_sensitivities
+from sim.spectral import OTHER_CAMERA, known_sensitivities
 from sim.world.disturbances import read_disturbances
 from sim.world.rendering import Print
 from sim.world.sensors import BODIES, Body, find_body
@@ -51,8 +51,7 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     world = World(sheet(chart), sensor, simulated_room(settings))
     events = read_disturbances(settings.simulated.events, settings.file)
     film = WorldFilm(world, lambda: screen.colour, simulated_projector.light, SERIAL, colour_counts, events, exposures)
-    # A body that is defined only by its sensitivities uses the protocol of an EOS 550D.
-    protocol = EOS_BODIES.get(settings.simulated.body, EOS_BODIES["EOS 550D"])
+    protocol = eos_with(sensor, settings.simulated.body)
     apertures = () if settings.camera.exposure.aperture is None else protocol.aperture_codes
     # The battery never runs empty, because cameras run on mains power in a long session.
     body = replace(protocol, shots_per_charge=10**9, aperture_codes=apertures)
@@ -77,8 +76,8 @@ def simulated_body(settings: LabSettings) -> Body:
     """Return the simulated camera of the settings."""
     name, changes = settings.simulated.body, settings.simulated.camera or {}
     if name not in BODIES and name not in known_sensitivities() and not Path(name).is_file():
-        names = ", ".join([*sorted(BODIES), *known_sensitivities()])
-        problem = f"simulated.body is {name!r}, expected a file of sensitivities or one of {names}"
+        near = f"{nearest_names(name, [*BODIES, *known_sensitivities()], 3)} ".lstrip()
+        problem = f"simulated.body is {name!r}, expected a camera or a file of sensitivities; {near}{OTHER_CAMERA}"
         raise ConfigurationError(problem, about=settings.file, value=name)
     return find_body(name, changes, settings.file, "simulated.camera")
 

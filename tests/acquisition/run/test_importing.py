@@ -136,3 +136,42 @@ def test_exit_code_reports_missing_illuminant(
     shutil.rmtree(folder / "session")
     assert main(list(map(str, arguments))) == code
     assert ("accepted frames: illuminant 1;" in capsys.readouterr().err) == (code == 4)
+
+
+def test_clock_that_goes_back_keeps_the_order(folder: Path) -> None:
+    # In Zagreb, 2026-10-25 02:00 to 03:00 occurred twice.
+    times = ("2026-10-25T02:50:00+02:00", "2026-10-25T02:10:00+01:00", "2026-10-25T01:30:00Z")
+    import_rows(folder, [light(number, taken_at=time) for number, time in enumerate(times)])
+    with Session.open(folder / "session") as session:
+        taken = [frame.taken_at.isoformat() for frame in session.frames()]
+    assert taken == ["2026-10-25T00:50:00+00:00", "2026-10-25T01:10:00+00:00", "2026-10-25T01:30:00+00:00"]
+
+
+@pytest.mark.parametrize(
+    "time",
+    [
+        "2026-10-25T02:50:00",
+        "2026-10-25 02:50",
+        "2026-10-25",
+        "0000:00:00 00:00:00",
+        "0001-01-01T00:00:00+14:00",
+        "9999-12-31T23:59:59-12:00",
+        "1969-12-31T23:59:59Z",
+    ],
+)
+def test_refuses_times_that_cannot_be_ordered(folder: Path, time: str) -> None:
+    with pytest.raises(FormatError, match=r"line 2.* offset"):
+        import_rows(folder, [light(0, taken_at=time)])
+    assert not (folder / "session").exists()
+
+
+def test_offset_with_seconds_can_be_read_again(folder: Path) -> None:
+    # Local mean time; a journal has no place for seconds of an offset.
+    import_rows(folder, [light(0, taken_at="2026-10-25T02:50:00+01:03:50")])
+    with Session.open(folder / "session") as session:
+        assert [frame.taken_at.isoformat() for frame in session.frames()] == ["2026-10-25T01:46:10+00:00"]
+
+
+def test_refuses_a_list_with_some_times(folder: Path) -> None:
+    with pytest.raises(FormatError, match=r"1 of 2 frames have no taken_at, the first in line 3"):
+        import_rows(folder, [light(0, taken_at="2026-10-25T02:50:00+02:00"), light(1)])

@@ -324,6 +324,8 @@ ON, OFF = Power.ON, Power.STANDBY
         (b"*POW=ON#", ON),
         (b"*pow=off#\r\n", OFF),
         (b"\0\0>*pow=?#\r\nPOW=ON\r\n", ON),
+        (b">*POW=?#\r\n*POW=ON#\r\n>", ON),  # echo in capitals, rrooggiieerr/homeassistant-benqprojector 8
+        (b">*pow=?#\r\r\n*POW = off #\r\n", OFF),
     ],
 )
 def test_benq_power_with_and_without_echo_and_prompt(reply: bytes, power: Power) -> None:
@@ -385,6 +387,36 @@ def test_benq_names_lamps_and_refusals() -> None:
     projector.set_muted(True)
     with pytest.raises(DeviceRefused):
         projector.muted()
+
+
+def test_benq_refusal_in_place_of_the_value() -> None:
+    # A TK700STi that is cooling down, arendst/Tasmota 15841.
+    off = bytes.fromhex("3E2A706F773D3F230D0D0A2A504F573D4F4646230D0A")
+    cooling = bytes.fromhex("3E2A706F773D3F230D0D0A2A504F573D426C6F636B206974656D230D0A")
+    projector, script = scripted("benq", (b"\r*pow=?#\r", off), (b"\r*pow=?#\r", cooling))
+    assert projector.power() is Power.STANDBY
+    assert projector.power() is Power.WARMING
+    assert script.ended()
+
+
+def test_benq_lamp_hours_with_a_blank() -> None:
+    # A W1100, rrooggiieerr/benqprojector.py 5.
+    projector, _ = scripted(
+        "benq",
+        (b"\r*ltim=?#\r", b"*ltim=?#\r\n*ltim= 1383\r\n"),
+        (b"\r*pow=?#\r", b"*POW=ON#\r\n"),
+        (b"\r*ltim=?#\r", b"*LTIM=unknown#\r\n"),
+    )
+    assert projector.lamps() == (Lamp(1383, lit=True),)
+    assert projector.lamps() == ()
+
+
+def test_optoma_confirms_a_query_before_its_answer() -> None:
+    # grapefrukt/esphome-optoma 3.
+    projector, script = scripted("optoma", (OPTOMA_STATE, b"P\rOk1\r"), (OPTOMA_STATE, b"OK01\r"))
+    assert projector.power() is Power.ON
+    assert projector.power() is Power.ON
+    assert script.ended()
 
 
 @pytest.mark.parametrize("answer", [b"Illegal format", b"Unsupported item"])

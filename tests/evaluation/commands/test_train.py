@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,37 @@ def test_trains_saves_and_uses_model(data: Path, tmp_path: Path, capsys: pytest.
     assert main(["train", "smart-color-cat", str(data), "--out", str(model)]) == 2
     assert "already exists" in capsys.readouterr().err
     assert model.read_bytes() == before
+
+
+def test_trains_several_methods_as_cv_does(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, alone = tmp_path / "models", tmp_path / "alone.npz"
+    methods = "smart-color-cat, kernel-ridge"
+    assert main(["train", methods, str(data), "--out", str(folder), "--json"]) == 0
+    reported = json.loads(capsys.readouterr().out)["models"]
+    assert [Path(model["model"]).name for model in reported] == ["smart-color-cat.npz", "kernel-ridge.npz"]
+    assert main(["train", "kernel-ridge", str(data), "--out", str(alone)]) == 0
+    with np.load(alone) as expected, np.load(folder / "kernel-ridge.npz") as trained:
+        arrays = [name for name in expected.files if expected[name].dtype.kind == "f"]
+        assert all(np.array_equal(expected[name], trained[name]) for name in arrays)
+    assert main(["train", methods, str(data), "--out", str(folder)]) == 2
+    assert "already exists" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("method", "out", "reason"),
+    [
+        ("kernel-ridge,smart-color-cat", "both.npz", "expected a folder"),
+        ("kernel-ridge", "model", "ends in .npz"),
+        ("kernel-ridge,kernel-ridge", "models", "given twice"),
+        (",", "models", "0 methods"),
+    ],
+)
+def test_refuses_methods_and_names_that_do_not_fit(
+    method: str, out: str, reason: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", method, str(data), "--out", str(tmp_path / out)]) == 2
+    assert reason in capsys.readouterr().err
+    assert not (tmp_path / out).exists()
 
 
 def test_adapts_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,7 +112,7 @@ def test_trains_user_class(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["cv", class_file, str(data)]) == 0
     assert "My mean" in capsys.readouterr().out
     assert main(["train", class_file, str(data), "--out", str(tmp_path / "model.npz")]) == 2
-    assert "is your own class" in capsys.readouterr().err
+    assert "your own class" in capsys.readouterr().err
 
 
 def test_all_omits_learners_that_are_not_installed(
@@ -101,7 +133,7 @@ def test_all_omits_learners_that_are_not_installed(
     ("arguments", "message"),
     [
         (["cv", "smart-color-cat", "DATA", "--folds", "none.csv"], "none.csv"),
-        (["train", "all", "DATA", "--out", "x.npz"], "expected one for a model file"),
+        (["train", "all", "DATA", "--out", "x.npz"], "expected a folder for several models"),
         (["train", "smart-color-cat", "DATA", "--out", "model.txt"], "ends in .npz"),
     ],
 )

@@ -54,7 +54,7 @@ def test_refuses_other_files(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         read_errors(tmp_path)
     (tmp_path / "errors.csv").write_bytes(b"\xff\xfe\x80")
-    with pytest.raises(FormatError, match="expected.* UTF-8"):
+    with pytest.raises(FormatError, match=r"expected.* UTF-8"):
         read_errors(tmp_path)
 
 

@@ -223,7 +223,7 @@ def test_mixed_pixels_have_noise_of_one_exposure(noisy_lights: npt.NDArray[np.ui
 def test_mix_samples_refuses_invalid_weights(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
     tables = make_lut().samples[:2]
     weights = weight_maps(37, 1053, 2)
-    with pytest.raises(InputError, match=r"weights are \(37, 1053, 1\).*\(37, 1053, 2\) or \(2,\)"):
+    with pytest.raises(InputError, match=r"weights are an array float32 \(37, 1053, 1\).*\(37, 1053, 2\) or \(2,\)"):
         mix_samples(tables, picture, weights[..., :1])
     for invalid in (-0.1, float("nan"), float("inf")):
         faulty = weights.copy()

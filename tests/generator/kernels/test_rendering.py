@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import re
 from collections.abc import Callable
 from inspect import signature
 from typing import Any
@@ -207,9 +208,9 @@ def test_refuses_unknown_light(make_lut: MakeLut, picture: npt.NDArray[np.uint8]
     for light in (-1, 4):
         with pytest.raises(InputError, match=rf"illuminant {light};.*0 to 3"):
             render(lut, picture, light)
-    invalid: list[Any] = [1.5, None]
+    invalid: list[Any] = [1.5, [0, 1]]
     for light in invalid:
-        with pytest.raises(InputError, match=rf"{light!r}"):
+        with pytest.raises(InputError, match=re.escape(repr(light))):
             render(lut, picture, light)
     np.testing.assert_array_equal(render(lut, picture, np.arange(4)[2]), render(lut, picture, 2))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +32,7 @@ def make_table(tmp_path: Path) -> MakeTable:
         camera: str = "Canon EOS 550D",
         white_level: int = 11536,
         name: str = "lut",
+        computed: dict[str, Any] | None = None,
     ) -> Lut:
         folder = tmp_path / name
         folder.mkdir()
@@ -59,6 +61,7 @@ def make_table(tmp_path: Path) -> MakeTable:
                 session_sha256="1" * 64,
                 chart_sha256="2" * 64,
                 software="test 1",
+                computed=computed,
             ),
         )
         return open_lut(folder)

@@ -8,10 +8,19 @@ import numpy as np
 import pytest
 
 from drivers.raw.rawfile import camera_matrix as libraw_matrix
-from foundation.errors import InputError
-from generator.rendering.matrices import camera_matrix, cameras, choose_matrix, fit_matrix
+from foundation.errors import FormatError, InputError
+from generator.rendering.matrices import (
+    SOURCE,
+    TABLE,
+    camera_matrix,
+    cameras,
+    choose_matrix,
+    fit_matrix,
+    matrix_for,
+)
 from generator.rendering.print_profiles import PrintProfile
 from sim.world.sensors import BODIES, SENSITIVITY_BODIES, Body
+from tests.generator.rendering.conftest import MakeTable
 
 
 def test_matrices_keep_white() -> None:
@@ -28,6 +37,22 @@ def test_matrices_keep_white() -> None:
 @pytest.mark.parametrize("name", ["", "Canon", "EOS", "5D", "Nikon 550D", "50D"])
 def test_unlisted_cameras_have_no_matrix(name: str) -> None:
     assert camera_matrix(name) is None
+
+
+def test_reads_matrix_that_a_computed_lut_records(make_table: MakeTable) -> None:
+    rows = [[0.5, 0.25, 0.25], [0.25, 0.5, 0.25], [0, 0.5, 1.5]]
+    recorded = make_table(camera="Maker M1", computed={"by": "sim table", "matrix": {"rows": rows, "source": "fit"}})
+    matrix = matrix_for(recorded)
+    assert (matrix.name, matrix.source) == ("Maker M1", "fit")
+    np.testing.assert_array_equal(matrix.rows, [*rows[:2], [0, 0.25, 0.75]])
+    # The maker's matrix comes first, and a LUT without a record gets the fitted matrix.
+    listed = make_table(name="listed", computed={"matrix": {"rows": rows, "source": "fit"}})
+    assert matrix_for(listed).source == SOURCE
+    assert matrix_for(make_table(name="plain", camera="Maker M1")).name == TABLE
+    for number, wrong in enumerate(({"rows": rows[:2], "source": ""}, {"rows": [[1e9] * 3] * 3, "source": ""}, 3, {})):
+        damaged = make_table(name=f"damaged{number}", camera="Maker M1", computed={"matrix": wrong})
+        with pytest.raises(FormatError, match="expected 3 x 3 numbers"):
+            matrix_for(damaged)
 
 
 @pytest.mark.parametrize("body", [*SENSITIVITY_BODIES.values(), BODIES["EOS 550D"], BODIES["EOS 6D Mark II"]])

@@ -66,7 +66,7 @@ def test_refuses_wrong_parameter(tmp_path: Path, text: str, expected: str) -> No
 
 
 def test_refuses_unknown_body() -> None:
-    with pytest.raises(ConfigurationError, match="EOS 550D, EOS 6D Mark II"):
+    with pytest.raises(ConfigurationError, match=r"did you mean .*sim table --camera list"):
         simulated_body(settings('[simulated]\nbody = "EOS 7D"\n'))
 
 
