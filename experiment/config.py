@@ -245,8 +245,8 @@ class SimulatedSettings(Settings):
     """The simulated laboratory."""
 
     body: str = "EOS 550D"
-    """EOS 550D, EOS 6D Mark II or Test (small frames); or spectral sensitivities, as in `sim table --camera`, by name or
-    as a file relative to the settings file."""
+    """EOS 550D, EOS 6D Mark II or Test (small frames). Or spectral sensitivities as in `sim table --camera`: a name, or
+    a file relative to the settings file."""
     camera: dict[str, Any] | None = None
     """Properties in which the camera differs from this body, with the field names of sim.world.sensors.Body."""
     seed: Annotated[int, Field(ge=0)] = 1

@@ -184,7 +184,7 @@ def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
             return _report_interruption(is_resumable)
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     except Exception as error:
-        # Python 3.11 wraps an interruption of an import in RuntimeError, if it comes while a class is made.
+        # If a class is being made when an import is interrupted, Python 3.11 raises a RuntimeError instead.
         cause: BaseException | None = error
         while cause is not None and not isinstance(cause, KeyboardInterrupt):
             cause = cause.__cause__ or cause.__context__
@@ -271,7 +271,7 @@ class EndRequest:
 def orderly_end() -> Generator[EndRequest]:
     """Treat `kill` and a closed terminal like Ctrl-C, so that devices are closed; ignored signals stay ignored."""
     outer = signal.getsignal(signal.SIGINT)
-    # The outer handler knows whether a signal repeats another one.
+    # The outer handler counts the signals, so it decides whether this request is a repetition.
     ending = EndRequest(interrupt=(lambda: outer(signal.SIGINT, None)) if callable(outer) else _interrupt)
     if threading.current_thread() is not threading.main_thread():
         yield ending
@@ -468,7 +468,7 @@ class _Styled:
         return option
 
 
-# Names of options and arguments, and names that other programs use for them.
+# Our names of options and arguments, with the names that other programs use.
 _OTHER_NAMES = {
     "workers": "j jobs n-jobs threads n-threads num-threads num-workers processes cores cpus parallel nproc",
     "out": "o output output-dir outdir output-folder dest destination save",
@@ -516,7 +516,7 @@ class StyledCommand(_Styled, TyperCommand):
             raise
 
     def _suggest(self, error: Any) -> None:
-        """Add our name of an unknown option that other programs have."""
+        """If an unknown option is one of `_OTHER_NAMES`, add our name to its error."""
         word = error.option_name.lstrip("-").lower().replace("_", "-")
         ours = [name for name, others in _OTHER_NAMES.items() if word in (name, *others.split())]
         options = [f"--{name}" for name in ours if any(f"--{name}" in each.opts for each in self.params)]

@@ -99,10 +99,10 @@ def draw_svg(draw: Callable[..., None], *arguments: Any, inches: tuple[float, fl
 
 
 def draw_panels(draw: Callable[..., None], *arguments: Any, inches: Sequence[tuple[float, float]]) -> tuple[bytes, ...]:
-    """Return an SVG for each panel that `draw(panels, *arguments)` draws; a phone shows them below each other.
+    """Return one SVG for each panel that `draw(panels, *arguments)` draws. A phone shows the panels below each other.
 
-    `panels` are axes, each on its own figure of the size in `inches`. `PANEL` fits two times into a page, and once into
-    the width of a phone.
+    `panels` are axes, each on its own figure of the size in `inches`. Two panels of size `PANEL` fit next to each other
+    on a page, one on a phone.
     """
     return _draw_figures(lambda figures: draw([figure.add_subplot() for figure in figures], *arguments), inches)
 

@@ -412,10 +412,10 @@ EOS_BODIES: Mapping[str, EosModel] = MappingProxyType(
 
 
 def eos_with(sensor: Body, name: str) -> EosModel:
-    """Return the body with a name, by default an EOS 550D, that reports the camera of a sensor as raw files do."""
+    """Return the EOS body `name`, by default an EOS 550D, which reports maker and model of the camera of `sensor`."""
     body = EOS_BODIES.get(name, EOS_550D)
     maker, model = body.info.manufacturer, sensor.model
     if "canon" not in sensor.maker.lower():
-        # The driver requires the word Canon; names of cameras contain only the first word of the maker.
+        # The driver requires the word Canon in the maker. The first word of the maker starts the name of the camera.
         maker, model = f"{sensor.camera.split(' ')[0]} (simulated Canon EOS)", sensor.camera
     return replace(body, info=replace(body.info, manufacturer=maker, model=model))
