@@ -35,10 +35,10 @@ DASHES = ("-", "--", ":", "-.")  # Line styles; the style changes after every se
 # Variables of `templates/colours.css` that replace the colours of an SVG.
 _CSS_VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
 
-# Resolution of the images in an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
+# Resolution of raster images in an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
 _RASTER_DPI = 180
 
-_MAX_RASTER_PX = 1300  # Largest width of such an image, so that a page with photographs stays below a few megabytes
+_MAX_RASTER_PX = 1300  # Largest width of a raster image, so that a page with photographs stays below a few megabytes
 
 _STYLE = {
     "font.size": 9,
@@ -112,10 +112,10 @@ def draw_svg(
 
 
 def draw_panels(draw: Callable[..., None], *arguments: Any, inches: Sequence[tuple[float, float]]) -> tuple[bytes, ...]:
-    """Return an SVG for each panel that `draw(panels, *arguments)` draws; a phone shows them below each other.
+    """Return one SVG for each panel that `draw(panels, *arguments)` draws. A phone shows the panels below each other.
 
-    `panels` are axes, each on its own figure of the size in `inches`. `PANEL` fits two times into a page, and once into
-    the width of a phone.
+    `panels` are axes, each on its own figure of the size in `inches`. Two panels of size `PANEL` fit next to each other
+    on a page, one on a phone.
     """
     return _draw_figures(lambda figures: draw([figure.add_subplot() for figure in figures], *arguments), inches)
 

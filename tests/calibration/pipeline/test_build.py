@@ -833,10 +833,10 @@ def test_uneven_primaries_are_no_dirt_on_the_print(tmp_path: Path) -> None:
     expected = np.log(own / of_paper)
     assert expected.std(axis=0).min() > 0.003
     for channel in range(3):
-        is_measured = np.isfinite(stains.alone[:, channel])
+        is_measured = np.isfinite(stains.patch_deviation[:, channel])
         # 1 where cells are evened by the field of paper.
         differs = expected[is_measured, channel] - expected[is_measured, channel].mean()
-        assert abs(differs @ stains.alone[is_measured, channel] / (differs @ differs)) < 0.3
+        assert abs(differs @ stains.patch_deviation[is_measured, channel] / (differs @ differs)) < 0.3
 
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
