@@ -119,7 +119,7 @@ def run(*words: object) -> int:
 def unplotted() -> Iterator[None]:
     """Skip drawing the plots of results, which other tests check."""
 
-    def blank(draw: Callable[..., None], *arguments: object, inches: tuple[float, float]) -> bytes:
+    def blank(draw: Callable[..., None], *arguments: object, inches: tuple[float, float], form: str = "page") -> bytes:
         return b"<svg></svg>"
 
     with pytest.MonkeyPatch.context() as patched:
