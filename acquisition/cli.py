@@ -190,7 +190,7 @@ def illuminations(
 ) -> None:
     """Plan the illuminants: uniformly spread chromaticities and black bodies; 707 by default.
 
-    Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb chromaticities next to it.
+    Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the chromaticities (r, b) next to it.
     """
     from experiment.lights import parse_ccts, plan_illuminants, plot_illuminants, save_illuminants
 
@@ -244,7 +244,7 @@ def check(
         tuple[str, str, str, str] | None,
         option(
             "X,Y X,Y X,Y X,Y",
-            "Corners of the field of a chart without tags, as in build-lut.",
+            "Corners of the patch area of a chart without tags, as in build-lut.",
         ),
     ] = None,
     linearity: Annotated[
@@ -300,8 +300,8 @@ def run(
         str | None,
         option(
             "LIGHTS",
-            "Repeat illuminants, such as 12,40-44; bad: the frames that build-lut refused in the newest report "
-            "next to SESSION. Their earlier frames are kept, but not used.",
+            "Illuminants to repeat, such as 12,40-44, or the word bad for the frames that build-lut refused in the "
+            "newest report next to SESSION. The earlier frames are kept, but not used.",
         ),
     ] = None,
     dry_run: Annotated[

@@ -13,23 +13,23 @@ from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, Check, doubts_of, duration_text
 from foundation.errors import CropError, counted
 
-LAST = 5  # Number of verdicts and events to show (chosen).
+LAST = 5  # Number of the newest verdicts, and of the newest events, that are shown.
 
 
-# Added to a value beyond its limits for which the frame was not refused.
+# Text after a value that is beyond its limits, if the check did not refuse the frame.
 BEYOND = " (beyond its limit, but accepted, or explained by another cause)"
 
-# Meanings of the checks, as in docs/how-to/night-run.md.
+# Meanings of the checks of docs/reference/judge.md.
 MEANINGS = {
     "data": "share of photosites without counts",
     "clipping": "share of clipped photosites",
-    "exposure": "brightest photosites, share of saturation",
-    "chart": "detected tags, or white references of a chart without tags",
-    "repeated": "noise of the difference to earlier frames, relative to independent frames",
+    "exposure": "level of the brightest photosites, share of saturation",
+    "chart": "number of detected tags, or of white references if the chart has no tags",
+    "repeated": "share of the noise that is not in an earlier frame; 0 if the camera sent a frame twice",
     "movement": "distance of the chart from its rest position",
     "blur": "blur compared with the first white frame",
-    "rows": "strips of rows with unexpected content",
-    "uniformity": "largest deviation of a tile from the light of the frame",
+    "rows": "number of strips (quarters of a row) with unexpected content",
+    "uniformity": "largest deviation of a region of the frame from the rest",
     "off_codes_deg": "angle between ordered and measured illuminant",
     "off_brightness": "brightness relative to the prediction from earlier frames",
     "stray_share": "light that is not from the projector, share of white",

@@ -122,7 +122,7 @@ class Camera(Protocol):
         """
 
     def expose(self) -> datetime:
-        """Release the shutter without autofocus; return as soon as the illuminant may change.
+        """Release the shutter without autofocus; return as soon as the exposure no longer needs the illuminant.
 
         An earlier frame that was not downloaded is dropped.
 

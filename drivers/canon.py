@@ -1141,7 +1141,7 @@ class EosBody:
             nonlocal received
             if received + len(piece) > pending.size:
                 raise ProtocolError(
-                    f"{self.label} announced {pending.size} bytes for {pending.name!r} and sends more; repeat it"
+                    f"{self.label} sends more than {pending.size} bytes for {pending.name!r}; download it again"
                 )
             into.write(piece[max(offset - received, 0) :])
             received += len(piece)
@@ -1162,7 +1162,7 @@ class EosBody:
             else:
                 if len(data) > limit:
                     raise ProtocolError(
-                        f"{self.label} sent {len(data)} bytes at {offset}, expected at most {limit}; repeat it"
+                        f"{self.label} sent {len(data)} bytes at {offset}, at most {limit} expected; download again"
                     )
                 # The standard operation reports the number of sent bytes. Canon's own operation has other parameters.
                 count = parameters[0] if parameters and operation == Operation.GET_PARTIAL_OBJECT else len(data)
@@ -1173,12 +1173,12 @@ class EosBody:
 
     def _truncated_error(self, pending: PendingObject, received: int) -> DeviceError:
         return DeviceError(
-            f"{self.label} announced {pending.size} bytes for {pending.name!r}, sent only {received}; repeat it"
+            f"{self.label} sent only {received} of {pending.size} bytes for {pending.name!r}; download it again"
         )
 
     def _send_frames_to_host(self) -> None:
         host = host_destination(self.state)
-        # If an earlier program was killed, the body is still set to the host. At the end it is then set to the card.
+        # If an earlier program was killed, the body still sends to the host. The card is then set at the end.
         self._user_destination = number_value(CaptureDestination.CARD)
         if not self.state.has_value(Property.EOS_CAPTURE_DESTINATION, host):
             self._user_destination = self.state.values.get(Property.EOS_CAPTURE_DESTINATION, self._user_destination)
@@ -1202,7 +1202,6 @@ class EosBody:
         )
 
     def _retry_while_busy(self, action: Callable[[], None]) -> None:
-        """Repeat `action` while the body is busy, for at most `BUSY_LIMIT_S`."""
         # A new session would not help, because the body would start its work again.
         end = self._clock.monotonic() + BUSY_LIMIT_S
         while True:
@@ -1517,7 +1516,7 @@ class CanonEos:
                 raise  # the announcement may be lost; on a new connection the body repeats it
             self._last_release = None
             remedy = "switch it off and on, and expose again"
-            raise DeviceError(f"{error.without_remedy()}, and its memory has none", remedy=remedy) from error
+            raise DeviceError(f"{error.without_remedy()}, and its memory contains no frame", remedy=remedy) from error
         return release.announced
 
     def _receive_frame(self, body: EosBody, release: _Release, into: BinaryIO, start: int) -> PendingObject:

@@ -142,7 +142,7 @@ def plan_settings(body: Body, settings: ExposureSettings) -> dict[str, str]:
         setting = first_setting(body, names)
         if value is None:
             if setting is not None and parse_number(setting.value) is not None:
-                faults.append(f"the lens has apertures, it is set to {setting.value}: set one as f-number")
+                faults.append(f"the lens offers apertures and is set to {setting.value}: set one as f-number")
             continue
         if names is APERTURE and setting is not None and setting.has_no_number:
             faults.append(f'aperture {value:g} cannot be set, because the lens reports none: set aperture = "none"')
@@ -334,7 +334,6 @@ class Gphoto2Camera:
         self._close_connection()
 
     def _fetch_file(self, camera: gphoto2.Camera, path: gphoto2.CameraFilePath) -> gphoto2.CameraFile:
-        """Return a file from the camera; repeat the request while it is busy."""
         gp = load_library()
         for _ in range(BUSY_TRIES - 1):
             try:
@@ -361,7 +360,6 @@ class Gphoto2Camera:
 
     @contextmanager
     def _connection(self) -> Generator[gphoto2.Camera]:
-        """Yield the open camera, and convert errors of libgphoto2 to ours."""
         if self._closed:
             raise DeviceError("the camera has been closed; open the rig again")
         gp = load_library()

@@ -6,8 +6,8 @@ that end with LF, CR LF or NUL, empty lines, and the values that real projectors
 reported. Power, faults and the reply to a command must be clear. Datagrams may come from any sender, so a datagram
 without a valid reply is ignored.
 
-Source: JBMIA, PJLink Specifications 1.04 (class 1) and 2.00 (class 2, whose lines have the digit 2; 3.2 search, 3.3
-status notification).
+Sources: JBMIA, PJLink Specifications 1.04 for class 1. PJLink Specifications 2.00 for class 2, with clause 3.2 for the
+search and clause 3.3 for status notices. Lines of class 2 have the digit 2.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MUTE_OFF = "30"
 
 
 class ErrorCode(Enum):
-    """Error replies (1.04, 2.3)."""
+    """Error replies (PJLink 1.04, clause 2.3)."""
 
     UNDEFINED = "ERR1"
     OUT_OF_PARAMETER = "ERR2"
@@ -108,7 +108,7 @@ def split_line(data: bytes, limit: int = MAX_LINE) -> tuple[bytes, int] | None:
 
 
 def authentication_digest(seed: str, password: str) -> str:
-    """Return MD5 of seed and password as 32 lowercase hex digits (1.04, 5.1)."""
+    """Return MD5 of seed and password as 32 lowercase hex digits (PJLink 1.04, clause 5.1)."""
     return hashlib.md5((seed + password).encode(), usedforsecurity=False).hexdigest()
 
 
@@ -306,7 +306,7 @@ def _unexpected(command: str, value: str, expected: str) -> ProtocolError:
 
 
 SEARCH = b"%2SRCH\r"
-# Time in which replies to a search are collected, seconds. Projectors wait up to 10 s before a reply (2.00, 3.2).
+# Time in which replies to a search are collected, seconds. Projectors wait up to 10 s (PJLink 2.00, clause 3.2).
 COLLECT_S = 30.0
 
 
@@ -459,7 +459,7 @@ class PjLinkProjector:
     def _query_class_2(self, command: str) -> str | None:
         if self.pjlink_class() < 2:
             raise DeviceRefused(
-                f"{self._label} has PJLink class 1, {command} requires class 2; set this with its remote control"
+                f"{self._label} has PJLink class 1, but {command} requires class 2; see the menu of the projector"
             )
         return self._query_if_supported(command, level=2)
 
@@ -523,7 +523,7 @@ class PjLinkProjector:
             is_later_request = self._exchange.request_count > 1
             self._exchange.close()
             if is_later_request:
-                # Some servers require the digest before every command; a new connection starts with one.
+                # Some servers require the digest before every command; a new connection starts with a digest.
                 return self._exchange_request(request)
             raise
         except ProtocolError:
@@ -532,7 +532,6 @@ class PjLinkProjector:
         return reply
 
     def _greet(self, exchange: Exchange) -> bytes:
-        """Return the digest that precedes the first command."""
         try:
             line = exchange.listen(split_line, is_startup_notice)
         except LinkTimeout as error:

@@ -6,7 +6,7 @@ spectra are selected by name (`sim.spectral`; `--lights` in docs/how-to/table-wi
 
 A computed frame contains only the centres of patches and references, one below the other. By default, each centre has
 10 × 10 photosites (25 half-size pixels). The simulated room provides their light, and the simulated sensor their counts
-(`sim.world.sensors.counts`). The functions of calibration sample a computed frame like any other.
+(`sim.world.sensors.counts`).
 
 Computed frames differ from photographs in three ways. There is no blur, so no light leaks between neighbouring patches.
 A whole patch has the light of its centre. The position of the chart is exact.

@@ -155,7 +155,7 @@ class TableTask:
 
 @dataclass(frozen=True, eq=False)
 class ComputedTable:
-    """Folder of a computed LUT, and the numbers of illuminants, patches and unfit patches."""
+    """Folder of a computed LUT, and the numbers of illuminants, patches and unfit (clipped) patches."""
 
     folder: Path
     lights: int

@@ -65,8 +65,8 @@ from foundation.errors import RegistrationError, StorageError, counted
 from foundation.files import write_atomic
 from foundation.folders import bytes_text, free_bytes_at
 
-# If white is in this range of saturation, trial frames have the shutter time of the settings. Otherwise they have the
-# best tried shutter time.
+# If the level of white, as a share of saturation, is in this range, trial frames have the shutter time of the settings.
+# If not, they have the best tried shutter time.
 USABLE = (0.3, 0.9)
 
 _Array = npt.NDArray[np.float64]
@@ -105,8 +105,8 @@ def check_lab(
 ) -> CheckReport:
     """Check the devices and the chart of the settings; record nothing.
 
-    `picture`: PNG file to draw. `corners`: corners of the field of a chart without tags, half-size px. `linearity`:
-    also take an exposure series that measures the linearity of the sensor.
+    `picture`: PNG file to draw. `corners`: corners of the patch area of a chart without tags, half-size px.
+    `linearity`: also take an exposure series that measures the linearity of the sensor.
     """
     chart = load_chart(settings.chart)
     lights = load_illuminants(settings.illuminations)
@@ -168,7 +168,7 @@ def _require_space(folder: Path, needed_bytes: int) -> None:
     if (free_bytes := free_bytes_at(folder)) < needed_bytes:
         raise StorageError(
             f"{bytes_text(free_bytes)} free at {folder}, expected {bytes_text(needed_bytes, up=True)} for the frames "
-            "of a check; free space, or give settings on another disk"
+            "of a check; free space, or move the folder of LAB.toml to another disk"
         )
 
 
@@ -183,20 +183,20 @@ def _try_exposures(
     if settings.rig == "replay":
         stated_counts, counts = float(first.mosaic.white_level), float(first.mosaic.saturation())
         saturation = Saturation(counts, counts < stated_counts, stated_counts)
-        return TriedExposures(first, (measure_level(first, saturation, _paper(first, chart)),), (), saturation)
+        return TriedExposures(first, (measure_level(first, saturation, _paper_level(first, chart)),), (), saturation)
     # The camera may accept a time of the settings that it does not list.
     times = fitting_times(sorted({*offered_s, settings.camera.shutter_s}) if offered_s else (), period_s(settings))
     announce("measuring the saturation level with white frames of increasing shutter time")
     saturation = measure_saturation(first, lambda seconds: camera.take(WHITE, seconds), times)
 
     def level(shot: Shot) -> TriedTime:
-        return measure_level(shot, saturation, _paper(shot, chart))
+        return measure_level(shot, saturation, _paper_level(shot, chart))
 
     trials = search(level(first), lambda seconds: level(camera.take(WHITE, seconds)), times)
     return TriedExposures(first, trials, tuple(times), saturation)
 
 
-def _paper(shot: Shot, chart: Chart) -> _Array | None:
+def _paper_level(shot: Shot, chart: Chart) -> _Array | None:
     """Return (3,) counts of white paper above black, as measured by `acquire run`; None if no chart is detected."""
     if not chart.tags:
         return None
@@ -238,7 +238,8 @@ def _figure_findings(trial: Trial, settings: LabSettings) -> list[Finding]:
     fault = Finding(
         LEAK_SHARE.name,
         "fault",
-        f"the dark frame has {value:.1f} % of the level of white (mean, or brightest 6 % of the frame)",
+        f"the dark frame has {value:.1f} % of the level of white (in the mean or in "
+        "the brightest 6 % of the frame, whichever is more)",
         value / 100,
         LEAK_SHARE.unit,
         tolerable=(None, allowed / 100),

@@ -53,7 +53,7 @@ class Photographer:
         self._settings = settings
         self._file = scratch / "frame"
         self._shutter_s = settings.camera.shutter_s
-        # Shutter time, and time from release to the end of the download, s, of every frame.
+        # For every frame, the shutter time, s, and the time from release to the end of the download, s.
         self.timings: list[tuple[float, float]] = []
 
     def capture(self, colour: Colour, shutter_s: float, into: BinaryIO) -> CapturedFrame:
@@ -92,11 +92,11 @@ class Photographer:
 
 TARGET = 0.7  # Best level of white, as a share of saturation.
 
-# Levels of white, as shares of saturation, at which no other time is proposed (chosen). Brighter white clips after a
-# drift of the lamp. Darker white makes dark patches noisier.
+# Levels of white, as shares of saturation, at which no other time is proposed. Chosen by judgement, because brighter
+# white clips after a drift of the lamp, and darker white makes dark patches noisier.
 SUITABLE = (0.6, 0.8)
 
-TRIALS = 8  # Maximum number of tried times. Six are enough, because each step may be a factor of 16.
+TRIALS = 8  # Maximum number of tried times. A step may be a factor of 16, so six usually suffice.
 
 # Factor by which the exposure is increased to saturate the sensor. The weakest channel of white is at about a quarter
 # of saturation in a good exposure.
@@ -104,12 +104,12 @@ LONGER = 8.0
 
 LONGEST_S = 30.0  # Longest shutter time to try, s. Longer exposures have more hot photosites.
 
-# A photosite is saturated if it has less than this share of the expected counts. Expected counts may be wrong by 8 %,
-# because cameras report nominal shutter times (0.3 s for 0.315 s).
+# A photosite is saturated if it has less than this share of the counts that a shorter exposure predicts. The prediction
+# may be wrong by 8 %, because cameras report nominal shutter times (0.3 s for 0.315 s).
 PROPORTIONAL = 0.9
 
-# Counts below this share of the stated range cannot be saturation. They may be noise, and noise does not
-# follow the exposure.
+# Counts above black below this share of the saturation level in the file cannot be saturation. They may be noise, and
+# noise does not follow the exposure.
 LEAST_RANGE = 0.25
 
 _Array = npt.NDArray[np.float64]
@@ -282,7 +282,7 @@ def judge_exposure(
         remedy = f"set camera.shutter_s = {best.shutter_s:.4g} (measured: {format_value(best.highest, 'share')})"
         details["proposed_shutter_s"] = best.shutter_s
     else:
-        remedy = _remedy_without_time(best, period_s)
+        remedy = _remedy_if_no_time_fits(best, period_s)
     finding = judge_value(BRIGHTEST_SHARE, 1.0 if first.clipped else first.highest, measurement, remedy, details)
     if finding.grade != "good":
         return finding
@@ -301,7 +301,7 @@ def _is_suitable(trial: TriedTime) -> bool:
     return SUITABLE[0] <= trial.highest <= SUITABLE[1] and not trial.clipped
 
 
-def _remedy_without_time(best: TriedTime, period_s: float | None) -> str:
+def _remedy_if_no_time_fits(best: TriedTime, period_s: float | None) -> str:
     turns = f" and that is a multiple of {format_value(period_s, 's')}" if period_s else ""
     nearest = (
         f"even the shortest, {best.shutter_s:.4g} s, saturates"

@@ -27,7 +27,7 @@ class Finding:
     - `said`: the measured value in words, or the reason why it could not be measured.
     - `value`: the judged value; None without a value.
     - `unit`: unit of the value and the limits, as in `Limit`.
-    - `good`, `tolerable`: ranges that are accepted, and accepted with remarks.
+    - `good`, `tolerable`: range of accepted values, and range of values that are accepted at least with remarks.
     - `reason`: the expected value, and the harm of other values; empty if the value is good.
     - `remedy`: action of the user; empty if nothing needs to be done.
     - `details`: further values by name, for programs.
@@ -92,7 +92,7 @@ class CheckReport:
         names = ", ".join(name.replace("_", " ") for name in self.not_known)
         forecast = f"build-lut would return {self.forecast!r} on the {len(self.figures)} figures of this check"
         if self.shutter_s is not None:
-            forecast = f"no forecast: frames were exposed {self.shutter_s:.4g} s; set camera.shutter_s to this value"
+            forecast = f"no forecast for the shutter time of the settings; set camera.shutter_s = {self.shutter_s:.4g}"
         return [
             f"LUT         {forecast}",
             f"            figures that only a session can measure: {names}",

@@ -15,7 +15,7 @@ from drivers.camera import Camera, ReportsSupplies, Supplies
 from foundation.errors import DeviceError, StorageError
 from foundation.folders import bytes_text, free_bytes_at
 
-CHARGE = 440  # Number of frames for one battery charge; source: see `BATTERY`.
+FRAMES_PER_CHARGE = 440  # Number of frames for one battery charge; source: see `BATTERY`.
 
 
 def judge_disk(folder: Path, frames: int, frame_bytes: int) -> Finding:
@@ -53,7 +53,7 @@ def _battery(supplies: Supplies, frames: int) -> Finding:
         reason = "the camera does not report the charge of its battery"
         return not_checked("battery", reason, f"use a mains adapter: the plan has {frames} frames")
     charge = f"{format_value(supplies.battery, 'share')} charged, and the plan has {frames} frames"
-    frames_share = supplies.battery * CHARGE / max(frames, 1)
+    frames_share = supplies.battery * FRAMES_PER_CHARGE / max(frames, 1)
     if supplies.mains is None and supplies.battery >= 1 and BATTERY.outcome(frames_share) != "accept":
         reason = f"{charge}: this camera reports a full battery and a mains adapter in the same way"
         return not_checked("battery", reason, "make sure that a mains adapter is connected")
@@ -77,7 +77,7 @@ def _card(supplies: Supplies, needed: int) -> Finding:
 def judge_noise_reduction(timings: Sequence[tuple[float, float]]) -> Finding:
     """Judge whether the camera takes its own dark frame after a long exposure (noise reduction).
 
-    `timings`: shutter time, and time from the release until the file was received, s, of every frame.
+    `timings`: for every frame, shutter time, s, and time from the release until the file was received, s.
     """
     times = sorted(timings)
     if not times or times[-1][0] < 1.0 or times[-1][0] < 4 * times[0][0]:

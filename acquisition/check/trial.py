@@ -83,7 +83,7 @@ def trial_lights(plan: Sequence[Illuminant], primaries: npt.NDArray[np.float64])
 
 
 def trial_steps(lights: Sequence[Illuminant]) -> tuple[SessionStep, ...]:
-    """Return the plan of a trial: references, illuminants, references."""
+    """Return the plan of a trial: white and dark frames, then illuminants, then white and dark frames again."""
     references: list[tuple[FrameKind, int | None, Colour]] = [("white", None, WHITE)] * WHITES
     references.append(("dark", None, BLACK))
     lit: list[tuple[FrameKind, int | None, Colour]] = [("light", light.index, light.colour) for light in lights]

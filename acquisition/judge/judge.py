@@ -6,8 +6,8 @@ frame fails several checks, only the cause has a message (`CAUSES`), not its con
 The amounts of the three primaries in a frame (`acquisition.judge.state`) are compared with a prediction from the
 ordered codes, which the projector should show. Colour is compared independently of lamp brightness, which has its own
 check. If the colour is wrong, the frame is compared with the previous illuminant, with other illuminants of the plan,
-and with the ordered illuminant plus other light. Tiles and rows that deviate from the rest of the frame are covered,
-show another picture, or are damaged.
+and with the ordered illuminant plus other light. Tiles (regions of a grid on the
+frame) and rows that deviate from the rest of the frame are covered, show another picture, or are damaged.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class LiveJudge:
         elif conflict is not None:
             voids, lasting = True, self._state.restarts > MOST_RESTARTS
         else:
-            voids = step.kind in REFERENCES and _voids_others(state, cause.name)
+            voids = step.kind in REFERENCES and _voids_earlier_frames(state, cause.name)
             lasting = _is_lasting(self._state, step, cause.name)
         return Judgement(
             checks=checks,
@@ -174,7 +174,8 @@ class LiveJudge:
             return _FrameChecks(frame, (*checks, Check(OFF_CODES_DEG.name, reason=_UNPREDICTABLE)))
         anchor = state.anchor
         if step.kind != "dark" and (anchor is None or (state.resumed and _has_moved(state, mosaic, black, measured))):
-            # The first lit frame, which is white, becomes the anchor. A resumed run replaces it if the chart was moved.
+            # The first lit frame, which is white, gives the anchor (position of the chart). A resumed run replaces the
+            # anchor if the chart was moved.
             try:
                 anchor = Anchor.from_white(mosaic, black, self._chart)
             except RegistrationError as error:
@@ -213,7 +214,7 @@ class LiveJudge:
             return _FrameChecks(frame, tuple(checks))
         light = state.basis.light(measured)
         if not state.has_primaries and step.kind == "response":
-            # A basis from the white frame alone cannot describe a frame of one primary.
+            # A basis without primaries consists of white, so it cannot describe a frame of one primary.
             return _FrameChecks(frame, tuple(checks), light)
         moved = frame.moved_px if not np.isnan(frame.moved_px).any() else state.moved_px
         previous = state.recent[-1] if state.recent else None
@@ -256,7 +257,7 @@ def _paper_rgb(paper: npt.NDArray[np.float64]) -> tuple[float, float, float] | N
 
 
 def _judge_basis(state: JudgeState, following: JudgeState) -> Check | None:
-    # A frame of one primary cannot show that the chart is partly covered, but would falsify all later comparisons.
+    # A frame of one primary cannot show whether the chart is partly covered. If it is, all later comparisons are wrong.
     if state.has_primaries or not following.has_primaries or state.white_or_grey is None or following.basis is None:
         return None
     moved = np.zeros(2) if following.moved_px is None else following.moved_px
@@ -342,7 +343,7 @@ def _judge_exposure(
 
 UNKNOWN_POSITION: npt.NDArray[np.float64] = np.full(2, np.nan)  # Position of a chart that could not be measured
 
-_UNRECOGNISED = (
+_CHART_NOT_DETECTED = (
     "the chart was not detected at its last position: it is covered, out of focus, or has moved by more than its tags "
     "can show; check the frame, and restore the positions of camera and chart"
 )
@@ -387,7 +388,7 @@ def _judge_movement(
     if shift.gauges == 0:
         large_shift_px = anchor.displacement(mosaic, black, channel)
         if large_shift_px is None:
-            return [Check("movement", None, None, judge.moved_px, "px", _UNRECOGNISED)], UNKNOWN_POSITION
+            return [Check("movement", None, None, judge.moved_px, "px", _CHART_NOT_DETECTED)], UNKNOWN_POSITION
         reason, distance = _movement_reason(large_shift_px, judge.moved_px), round(float(np.hypot(*large_shift_px)), 3)
         return [Check("movement", distance, None, judge.moved_px, "px", reason)], np.array(large_shift_px)
     position = np.array([shift.dx, shift.dy])
@@ -597,16 +598,17 @@ def _inconsistent_white(state: JudgeState, judge: JudgeSettings) -> Check | None
 class _FrameCause:
     """Properties of a check that refuses a frame.
 
-    - `explains`: checks that fail as a consequence.
-    - `lasts`: whether every repeated frame fails, too.
-    - `is_hidden`: whether only references can show the cause. Frames since the last good reference are then voided.
-    - `in_each_light`: whether every illuminant shows the cause, provided that the illuminant can be predicted.
+    - `consequences`: checks that fail as a consequence.
+    - `is_lasting`: whether every repeated frame fails, too.
+    - `is_hidden`: whether only white and dark frames (references) can show the cause. Frames since the last good
+      reference are then voided.
+    - `is_in_all_lights`: whether every illuminant that can be predicted shows the cause.
     """
 
-    explains: frozenset[str] = frozenset()
-    lasts: bool = False
+    consequences: frozenset[str] = frozenset()
+    is_lasting: bool = False
     is_hidden: bool = False
-    in_each_light: bool = False
+    is_in_all_lights: bool = False
 
 
 # Checks for added light: in an illuminant, and in a dark frame compared with the first one.
@@ -620,25 +622,25 @@ _LIGHT_CHECKS = frozenset({"uniformity", "blur", OFF_CODES_DEG.name, OFF_BRIGHTN
 CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
     {
         "file": _FrameCause(),
-        OTHER_CAMERA.name: _FrameCause(lasts=True),
+        OTHER_CAMERA.name: _FrameCause(is_lasting=True),
         "settings": _FrameCause(),
         "data": _FrameCause(),
         "repeated": _FrameCause(),
         "clipping": _FrameCause(),
         "exposure": _FrameCause(),
-        "chart": _FrameCause(lasts=True),
+        "chart": _FrameCause(is_lasting=True),
         "movement": _FrameCause(_LIGHT_CHECKS | {"rows"}),
         "blur": _FrameCause(frozenset({"rows", "uniformity"})),
-        "rows": _FrameCause(_LIGHT_CHECKS | _ADDED_LIGHT | {"movement"}, in_each_light=True),
+        "rows": _FrameCause(_LIGHT_CHECKS | _ADDED_LIGHT | {"movement"}, is_in_all_lights=True),
         "uniformity": _FrameCause(
-            _LIGHT_CHECKS - {"uniformity"} | _ADDED_LIGHT | {"rows", "movement"}, in_each_light=True
+            _LIGHT_CHECKS - {"uniformity"} | _ADDED_LIGHT | {"rows", "movement"}, is_in_all_lights=True
         ),
-        OFF_CODES_DEG.name: _FrameCause(_ADDED_LIGHT | {OFF_BRIGHTNESS.name, WHITE_DRIFT.name}, in_each_light=True),
+        OFF_CODES_DEG.name: _FrameCause(_ADDED_LIGHT | {OFF_BRIGHTNESS.name, WHITE_DRIFT.name}, is_in_all_lights=True),
         STRAY_SHARE.name: _AMBIENT,
         DARK_DRIFT.name: _AMBIENT,
-        OFF_BRIGHTNESS.name: _FrameCause(in_each_light=True),
+        OFF_BRIGHTNESS.name: _FrameCause(is_in_all_lights=True),
         LEAK_SHARE.name: _FrameCause(is_hidden=True),
-        WHITE_DRIFT.name: _FrameCause(in_each_light=True),
+        WHITE_DRIFT.name: _FrameCause(is_in_all_lights=True),
         ADDITIVITY.name: _FrameCause(),
     }
 )
@@ -647,7 +649,8 @@ CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
 # alone rarely makes a tile exceed its limit (simulated).
 _CLEARLY_UNEVEN = 2.0
 
-# Blur, px, below which rows still match (simulated). If rows deviate with less blur, wrong rows explain the blur.
+# Blur, px, below which rows keep the expected content (simulated). If rows deviate at less blur, wrong rows cause the
+# measured blur.
 _ROWS_MATCH_PX = 0.7
 
 
@@ -677,22 +680,22 @@ def _without_consequences(checks: Sequence[Check]) -> tuple[Check, ...]:
                 reasons.remove(name)
                 by_name[name] = replace(check, reason="")
         order = [by_name[check.name] for check in order]
-    consequences = CAUSES[reasons[0]].explains if reasons else frozenset[str]()
+    consequences = CAUSES[reasons[0]].consequences if reasons else frozenset[str]()
     return tuple(replace(check, reason="") if check.name in consequences else check for check in order)
 
 
-def _voids_others(state: JudgeState, cause: str) -> bool:
-    hidden = CAUSES[cause].is_hidden or (CAUSES[cause].in_each_light and not state.has_primaries)
+def _voids_earlier_frames(state: JudgeState, cause: str) -> bool:
+    hidden = CAUSES[cause].is_hidden or (CAUSES[cause].is_in_all_lights and not state.has_primaries)
     return hidden or cause in state.unmeasured
 
 
 def _is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
-    # A change of the lamp before the start of a run is lasting. Otherwise all illuminants before the next white
-    # frame would be lost.
+    # A change of the lamp before the start of a run counts as lasting. If it did not, all illuminants before the next
+    # white frame would be voided.
     is_changed_lamp = cause == WHITE_DRIFT.name and is_brightest_grey(step)
     # If the first frame of a session is overexposed, so is its repetition.
     is_overexposed = cause == "clipping" and state.white is None
-    return is_changed_lamp or is_overexposed or CAUSES[cause].lasts or state.refusals[1] >= limits.LASTING_FRAMES
+    return is_changed_lamp or is_overexposed or CAUSES[cause].is_lasting or state.refusals[1] >= limits.LASTING_FRAMES
 
 
 _MIN_SCATTER = 0.0015  # Least relative scatter of amounts between two frames of one illuminant.
@@ -705,7 +708,7 @@ _PRIMARIES = ("red", "green", "blue")
 
 _MIN_ORDERED_LIGHT = 0.005  # Least ordered light of a primary, share of its full light, that is reported as missing.
 
-# Share of its ordered light below which a primary is missing. The leak of a projector at black is less.
+# A primary with less than this share of its ordered light is missing. A projector that shows black leaks less light.
 _MISSING_SHARE = 0.05
 
 _Array = npt.NDArray[np.float64]
@@ -736,7 +739,7 @@ def _judge_light(
     lamp = ""
     if not reason and abs(fit.brightness) > margin:
         level = state.to_confirm[0]
-        # A small step that two frames show is accepted, because each illuminant has its own ground truth.
+        # A small step of the lamp that two frames show is accepted, because each illuminant has its own ground truth.
         stepped = abs(fit.brightness) <= limits.LAMP_STEP_ACCEPTED and abs(fit.brightness - level) <= margin / 2
         lamp = "" if stepped else _brightness_reason(fit.brightness, margin)
     deviations = Deviations(((fit.brightness, fit.brightness_sd),), (comparison.neutral_light(),))
@@ -755,7 +758,7 @@ def _judge_light(
 def lamp_check(brightness: float, margin: float, reason: str) -> Check:
     """Return the check of `brightness`, the logarithm of measured over predicted brightness, with limit `margin`.
 
-    A limit above `MAX_WHITE_DRIFT` is not stated. It only means that the scatter of the lamp is still unknown.
+    If `margin` exceeds `MAX_WHITE_DRIFT`, the scatter of the lamp is unknown, and the check has no limit.
     """
     allowed = round(100 * margin, 2) if 100 * margin < limits.MAX_WHITE_DRIFT else None
     low = None if allowed is None else -allowed
@@ -1016,24 +1019,25 @@ _WHOLE_FRAME = 0.5  # Share of deviating tiles above which the whole frame devia
 # Blurs σ, half-size px, that are tried if rows deviate.
 _TRIED_BLURS_PX = (0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 
-_REMAINING = 0.4  # Share of the median deviation of rows that may remain if a blur is the cause.
+# If a blur is the cause, at most this share of the median deviation remains after blurring the expected rows.
+_REMAINING_DEVIATION = 0.4
 
-# Median relative deviation of rows above which blurs are tried. With less, only some rows deviate.
-_MIN_BLURRED = 0.02
+# Median relative deviation of rows above which blurs are tried. If it is smaller, only some rows deviate.
+_MIN_DEVIATION = 0.02
 
 _EDGE_CONTRAST = 2.0  # Relative contrast of the chart (tags, paper, patches) at the edges of a tile.
 
 # If rows are from other places, at least this share of the deviating rows is brighter, and at least this share darker.
 _RARER_SIGN_SHARE = 0.1
 
-# Ratio of the median step between neighbouring rows to the median deviation, above which rows are from several places.
+# Rows are from several places if their deviation changes from row to row by more than this share of its median.
 # Shadows, windows and parts of a picture have at most 0.03, scrambled rows at least 0.2 (simulated).
 _RAGGED_STEP = 0.1
 
-# Movement or blur, px, that rows at the edges of the chart tolerate, because less cannot always be measured.
+# Movement or blur, px, that is allowed for rows at the edges of the chart, because it cannot always be measured.
 _UNMEASURED_PX = 1.0
 
-# Relative change of a strip per px of sideways movement, which brings other patches to the ends of the strip.
+# Relative change of a strip per px of sideways movement. The movement brings other patches to the ends of the strip.
 _ROW_EDGE_CHANGE = 0.15
 
 
@@ -1042,8 +1046,8 @@ def _judge_evenness(
 ) -> tuple[list[Check], npt.NDArray[np.bool_]]:
     """Check that a lit frame shows one illuminant everywhere; return also which tiles (T,) bool deviate.
 
-    `moved_px`: (2,) displacement of the chart relative to the basis. `previous`: the previous frame or None; a part of
-    the current frame may still show its illuminant.
+    `moved_px`: (2,) displacement of the chart since the frames of the basis. `previous`: the previous frame or None; a
+    part of the current frame may still show its illuminant.
     """
     residuals = light.tiles
     systematic = UNIFORMITY.accept if basis.shows_primaries else limits.UNEVEN_WITHOUT_PRIMARIES
@@ -1107,13 +1111,17 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
         return checks
     for sigma in _TRIED_BLURS_PX:
         soft = basis.strips(frame, light.amounts, down, sigma)
-        if soft is not None and _deviation(soft) < _REMAINING * _deviation(sharp) and _deviation(sharp) > _MIN_BLURRED:
+        if (
+            soft is not None
+            and _deviation(soft) < _REMAINING_DEVIATION * _deviation(sharp)
+            and _deviation(sharp) > _MIN_DEVIATION
+        ):
             reason = (
                 f"the frame is out of focus or shaken: its rows match with an additional blur of {sigma:g} px; check "
                 "the focus, switch off autofocus, and check for vibrations"
             )
             return [*checks, Check("blur", sigma, None, None, "px", reason)]
-    # Rows from other places are partly brighter and partly darker. A shadow, or other light, has one sign.
+    # Rows from other places are partly brighter and partly darker. A shadow or other light has one sign everywhere.
     signed = sharp.signed[is_wrong]
     brighter = float((signed > 0).mean())
     ragged = _is_ragged(sharp, is_wrong)
@@ -1121,11 +1129,11 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
         return checks
     cause = "the file was damaged during transfer: check the cable and the memory card"
     if uneven and not ragged:
-        # A drawing on the screen also has both signs, but changes little from row to row.
+        # A drawing also makes some rows brighter and some darker, but changes little from row to row.
         cause = f"check the frame: a screen saver or a window covers the projected image, or {cause}"
     rows = np.flatnonzero(is_wrong.reshape(-1, SEGMENTS).any(axis=1))
     reason = (
-        f"{counted(len(rows), 'row')} of blocks, from row {2 * int(rows[0])} of the frame to {2 * int(rows[-1]) + 1}, "
+        f"{counted(len(rows), 'row')} of 2×2 blocks, frame rows {2 * int(rows[0])} to {2 * int(rows[-1]) + 1}, "
         f"do not have the expected content; {cause}"
     )
     return [Check(ROWS.name, float(count), None, float(ROWS.accept), "", reason)]

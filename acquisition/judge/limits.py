@@ -19,7 +19,7 @@ LIGHT_SIGMAS: Final = 5.5
 BRIGHTNESS_SIGMAS: Final = 6.0
 
 # Least light added to two or three frames together, in standard deviations, that is reported. In undisturbed sessions,
-# light above `MIN_ADDED_LIGHT` has less than 0.9 standard deviations (`benchmarks.detection`).
+# light above `MIN_ADDED_LIGHT` was less than 0.9 standard deviations (`benchmarks.detection`).
 ADDED_SIGMAS: Final = 4.5
 
 # Deviation of colour, in standard deviations, from which a frame is compared with the previous illuminant. About one
@@ -30,7 +30,7 @@ STALE_SIGMAS: Final = 3.5
 # of squared standard deviations. This is a factor of 1000 in likelihood.
 STALE_ADVANTAGE: Final = 13.8
 
-# The same for any other illuminant of the plan. The factor is 22 000, because the plan has hundreds of illuminants.
+# The same number for any other illuminant. The factor is 22 000, because the plan has hundreds of illuminants.
 OTHER_ADVANTAGE: Final = 20.0
 
 # Light in dark frames, percent of white, above which a run warns, because `build-lut` would add a remark.
@@ -83,7 +83,8 @@ SAME_POSITION_PX: Final = 0.1  # Largest distance of two measured positions, hal
 # Least counts of paper above black at which movement is measured. The error is 0.02 px at 66 counts.
 MIN_PAPER_DN: Final = 40.0
 
-# The same for blur. Blur depends on the second derivative of the image, which hot photosites disturb in dim frames.
+# Least counts of paper for blur. Blur depends on the second derivative of the image. In dim frames, hot photosites
+# disturb it.
 MIN_PAPER_FOR_BLUR_DN: Final = 500.0
 
 # Blur may decrease by this multiple of its allowed increase, because less blur is harmless.

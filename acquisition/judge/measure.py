@@ -60,11 +60,11 @@ _PAPER_SEARCH_PX = 4
 # Smallest level of paper, relative to the brightest references. The flat field falls off to about this level.
 _PAPER_LEVEL = 0.7
 
-# Side of the brightest square in a reference of 10 px, half-size px. A smaller square would be bright by chance, and
-# later frames would seem darker.
+# Side of the square that is measured in a reference of 10 px, half-size px. The brightest is selected. A smaller one
+# would be bright by chance in this frame, and later frames would seem darker.
 _PAPER_PX = 7
 
-_MAX_REFERENCES = 300  # Number of measured white references. If each is accurate to 2 %, the mean is to 0.1 %.
+_MAX_REFERENCES = 300  # Number of measured white references. If each has an error of 2 %, their mean has 0.1 %.
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +87,12 @@ class Anchor:
         """Return the anchor of a white frame; `black` (2, 2) float64 counts, `chart` None to use textured areas."""
         if chart is None:
             plane = strongest_plane(mosaic, black)
-            framing = _textures(plane)
-            paper = _brightest(plane.values)
+            framing = _textured_areas(plane)
+            paper = _brightest_centres(plane.values)
         else:
             framing = find_chart(mosaic, chart, "the white frame")
             whites = np.array([reference.centre_mm for reference in chart.white_references]).reshape(-1, 2)
-            paper = _paper(framing.plane.values, project(framing.homography, whites[:_MAX_REFERENCES]))
+            paper = _paper_centres(framing.plane.values, project(framing.homography, whites[:_MAX_REFERENCES]))
         gauges: dict[Channel, Plane] = {c: gauges_of(mosaic, c, black, framing) for c in CHANNELS}
         # The full plane is dropped to save memory. Later frames are only compared around the gauges.
         small_framing = replace(framing, plane=gauges[framing.plane.channel])
@@ -103,7 +103,7 @@ class Anchor:
         return shift_between(self.gauges[channel], self.framing, gauges_of(mosaic, channel, black, self.framing))
 
     def displacement(self, mosaic: Mosaic, black: _Array, channel: Channel) -> tuple[float, float] | None:
-        """Return a movement of any size, half-size px right and down; None if too few tags are detected.
+        """Return a small or large movement, half-size px right and down; None if too few tags are detected.
 
         `black` (2, 2) float64 counts of the frame.
         """
@@ -150,7 +150,7 @@ class Anchor:
         return [(x0, y0, min(x1, width), min(y1, height)) for x0, y0, x1, y1 in gauge_boxes(self.framing)]
 
 
-def _paper(values: npt.NDArray[np.float32], places: _Array) -> npt.NDArray[np.int64]:
+def _paper_centres(values: npt.NDArray[np.float32], places: _Array) -> npt.NDArray[np.int64]:
     """Return (N, 2) centres of the brightest squares near `places` (N, 2) px that are as bright as paper."""
     height, width = values.shape
     reach, half = _PAPER_SEARCH_PX, _PAPER_PX // 2
@@ -166,12 +166,12 @@ def _paper(values: npt.NDArray[np.float32], places: _Array) -> npt.NDArray[np.in
         centres.append((x - reach + column, y - reach + row))
         levels.append(float(crop[row, column]))
     if not centres:
-        return _brightest(values)
+        return _brightest_centres(values)
     bright = np.array(levels) > _PAPER_LEVEL * np.percentile(levels, 90)
     return np.array(centres, dtype=np.int64)[bright]
 
 
-def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
+def _brightest_centres(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
     """Return (N, 2) centres of the brightest 3×3 neighbourhoods in a grid of regions.
 
     They are partly bright by chance, so white seems to drift by some tenths of a percent in later frames.
@@ -190,7 +190,7 @@ def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
     return np.array(centres, dtype=np.int64)[bright]
 
 
-def _textures(plane: Plane) -> ChartPose:
+def _textured_areas(plane: Plane) -> ChartPose:
     values = plane.values
     height, width = values.shape
     energy = cv2.boxFilter(cv2.Laplacian(values, cv2.CV_32F) ** 2, -1, (_TEXTURE_PX, _TEXTURE_PX))

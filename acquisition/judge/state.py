@@ -44,8 +44,8 @@ _NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 18
 
 _POWER = 2.2  # Exponent of the mean power law; displays have 1.8 to 2.6
 
-# Prior standard deviations of the exponent and of the bends of a tone curve (log), and correlation length of the bends
-# in log code. sRGB, S-shaped curves and exponents from 1.4 to 3 are within two standard deviations.
+# Prior standard deviations of the exponent, and of the bend (deviation of a log amount from the power law). The bend
+# has a correlation length in log code. sRGB, S-shaped curves and exponents from 1.4 to 3 are within two deviations.
 _EXPONENT_SIGMA, _BEND_SIGMA, _BEND_LENGTH = 0.4, 0.12, 0.7
 
 # Share of these standard deviations that is independent for each primary. The three curves are similar, except for
@@ -60,7 +60,7 @@ _OVERLAP_SIGMA = 0.25  # Prior standard deviation of overlaps, relative. White s
 # Relative error of the assumed form of an overlap, because the added light need not follow the least code.
 _OVERLAP_SHAPE = 0.15
 
-# Standard deviation of the change of log lamp brightness from frame to frame. In a thousand frames this is 1 %.
+# Standard deviation of the change of log lamp brightness from frame to frame; 1 % in a thousand frames.
 LAMP_SIGMA = 3e-4
 
 # Standard deviation of log lamp brightness after a pause. The lamp may be cold, aged or replaced.
@@ -102,8 +102,8 @@ _Array = npt.NDArray[np.float64]
 Codes = tuple[int, int, int]
 
 
-def _x(codes: npt.ArrayLike) -> _Array:
-    # Logarithm of codes relative to `TOP`: the abscissa of the tone curves.
+def _log_codes(codes: npt.ArrayLike) -> _Array:
+    # Relative to `TOP`; the abscissa of the tone curves.
     return np.log(np.maximum(np.asarray(codes, dtype=np.float64), 0.5) / TOP)
 
 
@@ -117,7 +117,7 @@ def _kernel(a: _Array, b: _Array, slope: float, bend: float) -> _Array:
 @cache
 def _node_prior() -> tuple[_Array, _Array]:
     # (N, N) prior covariance of a curve at the nodes, and its inverse.
-    x = _x(_NODES)
+    x = _log_codes(_NODES)
     prior = _kernel(x, x, _EXPONENT_SIGMA, _BEND_SIGMA) + 1e-8 * np.eye(_NODE_COUNT)
     return prior, np.asarray(np.linalg.inv(prior), dtype=np.float64)
 
@@ -126,7 +126,7 @@ def _node_prior() -> tuple[_Array, _Array]:
 def _curve_weights() -> _Array:
     # (256, N) weights of the nodes in the value of a curve at each code.
     _, inverse = _node_prior()
-    return _kernel(_x(np.arange(256)), _x(_NODES), _EXPONENT_SIGMA, _BEND_SIGMA) @ inverse
+    return _kernel(_log_codes(np.arange(256)), _log_codes(_NODES), _EXPONENT_SIGMA, _BEND_SIGMA) @ inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +219,7 @@ class ProjectorModel:
         """Return (3, 256) float64: amount of each primary alone at each code, at the current lamp brightness."""
         curves = self.state[:_CURVE_ENTRIES].reshape(3, _NODE_COUNT) @ _curve_weights().T
         levels = self.state[_CURVE_ENTRIES : _CURVE_ENTRIES + 3, None] + self.state[_LAMP]
-        amounts = np.exp(np.minimum(_POWER * _x(np.arange(256)) + curves + levels, 5))
+        amounts = np.exp(np.minimum(_POWER * _log_codes(np.arange(256)) + curves + levels, 5))
         amounts[:, 0] = 0
         return np.asarray(amounts, dtype=np.float64)
 
@@ -306,7 +306,9 @@ class ProjectorModel:
         """Return log amounts (3,), their derivatives (3, K) by the state, and the error of the overlaps (3,)."""
         curves = self.state[:_CURVE_ENTRIES].reshape(3, _NODE_COUNT)
         table = _curve_weights()
-        base = np.array([_POWER * float(_x(code)) + float(table[code] @ curves[p]) for p, code in enumerate(codes)])
+        base = np.array(
+            [_POWER * float(_log_codes(code)) + float(table[code] @ curves[p]) for p, code in enumerate(codes)]
+        )
         slopes = np.zeros((3, _STATE_SIZE))
         shares = np.zeros((3, len(_TERMS)))
         for p, code in enumerate(codes):
@@ -315,7 +317,7 @@ class ProjectorModel:
         for k, (p, subset) in enumerate(_TERMS):
             least_code = min(codes[index] for index in subset)
             if least_code > 0:
-                own = _POWER * float(_x(least_code)) + float(table[least_code] @ curves[p]) - base[p]
+                own = _POWER * float(_log_codes(least_code)) + float(table[least_code] @ curves[p]) - base[p]
                 shares[p, k] = np.exp(min(own, 0.0))
         terms = self.state[_OVERLAPS]
         total = np.maximum(1 + shares @ terms, 0.2)
@@ -335,8 +337,7 @@ _SYSTEMATIC = 0.003  # Relative error of the counts of a tile, which is added to
 # the mean of optical black by some tenths of a count, which matters in dim frames.
 BLACK_DN = 0.3
 
-# Deviations of dark tiles are divided by this share of the median signal, because a glint on a dark backdrop is
-# harmless.
+# Least signal, as a share of the median, by which deviations are divided. A glint on a dark backdrop is harmless.
 _MIN_REFERENCE_SHARE = 0.1
 
 # Smaller movements, half-size px, are ignored for strips. This is the error of a measured movement in a dim frame.
@@ -513,7 +514,7 @@ _MIN_MIXED_FRAMES = 4
 
 @dataclass(frozen=True, eq=False)
 class RecentFrame:
-    """A frame of this run: its codes, its measurements, and its amounts; None without a basis."""
+    """A frame of this run: its codes, its measurements, and its amounts (None without a basis)."""
 
     codes: Codes
     measured: Measured
@@ -577,12 +578,12 @@ class ExaminedFrame:
 class JudgeState:
     """State of a session.
 
-    The judge learns from the first frames of a session or run. One of them may be wrong, which only later frames can
-    show. Then all first frames are repeated (a restart).
+    The judge learns from the first frames of a session or run. Only later frames can show that
+    one of them is wrong. Then all first frames are repeated (a restart).
 
     - `anchor`: position of the chart.
     - `first`: first accepted frame of the session, for camera, size and serial number.
-    - `first_white`, `white`, `first_dark`, `dark`: first and newest accepted references.
+    - `first_white`, `white`, `first_dark`, `dark`: first and newest accepted white and dark frames (references).
     - `first_grey`: first frame of the brightest grey, with which the same grey of a resumed run is compared.
     - `primaries`: frames of the three primaries at `experiment.session.records.TOP`.
     - `basis`, `model`: decomposition of a frame into primaries, and prediction of their amounts from codes.

@@ -74,8 +74,8 @@ LEAST_FREE_BYTES = 1 << 20
 
 LOOK = "check the camera, its cable and the computer"  # Remedy if a run reports nothing.
 
-# The expected end is shown as a time of day only if the newest attempt and the last sign of life are nearer, s. In a
-# simulated lab, time passes at another rate.
+# Longest time, s, between the newest attempt and the last sign of life at which the expected end is shown as a time of
+# day. In a simulated lab, time passes at another rate.
 LAB_CLOCK_S = 600.0
 
 
@@ -229,11 +229,11 @@ def read_session(folder: Path, earlier: SessionView | None = None) -> SessionVie
         SessionPlace.of(path),
         max((frame.size for frame in accepted), default=0),
         {frame.step: frame.file for frame in lost_files(folder, accepted)} if is_complete else {},
-        _without_own_files(folder) if is_complete else "",
+        _missing_files_text(folder) if is_complete else "",
     )
 
 
-def _without_own_files(folder: Path) -> str:
+def _missing_files_text(folder: Path) -> str:
     missing = [str(folder / name) for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
     return f"{' and '.join(missing)}: missing; restore it from a copy of the session" if missing else ""
 
@@ -369,8 +369,8 @@ def _state_of(
 Json = dict[str, Any]  # A JSON object
 
 
-# A journal that changed less than this time ago, s, is read again. A second change within the resolution of its time
-# stamp would not be detected otherwise.
+# A journal is read again if its last change is more recent than this, s. A further change may have the same time stamp,
+# and would not be detected.
 FRESH_S = 0.25
 
 # Interval, s, after which an unchanged session is read again, because files of frames may have been deleted.

@@ -58,7 +58,7 @@ RELIGHT_S: Final = 15.0
 
 QUERIES_SHARE: Final = 0.01  # If all queries take less than this fraction of a frame's time, all are made at each frame
 
-_NAME: Final = "the projector"
+_PROJECTOR: Final = "the projector"
 
 # Longest time between the answer to a switch-off command and its execution, s.
 SWITCH_OFF_LIMIT_S: Final = 5.0
@@ -77,8 +77,8 @@ def make_ready(projector: Projector, sequence: SequenceSettings, retry: RetryPol
     """
     # A lamp that is lit at the first query is assumed to be warm.
     was_lit = _light(projector, retry)
-    retry.attempt(lambda: _unmute(projector), _NAME)
-    pause = retry.pause(_NAME)
+    retry.attempt(lambda: _unmute(projector), _PROJECTOR)
+    pause = retry.pause(_PROJECTOR)
     went_out = _wait_until_healthy(projector, retry, pause, sequence.relight)
     pause.over()
     if not was_lit or went_out:
@@ -87,7 +87,7 @@ def make_ready(projector: Projector, sequence: SequenceSettings, retry: RetryPol
 
 def await_health(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> None:
     """Pause while the projector is unhealthy; return when it is healthy and warm."""
-    pause = retry.pause(_NAME)
+    pause = retry.pause(_PROJECTOR)
     if _wait_until_healthy(projector, retry, pause, sequence.relight):
         _warm_up(projector, sequence, retry)
     pause.over()
@@ -174,7 +174,7 @@ def _wait_until_healthy(projector: Projector, retry: RetryPolicy, pause: Pause, 
         if not isinstance(fault, LinkError):
             answered = retry.clock.monotonic()
             went_out = went_out or not _is_lit(projector)
-        # This is done only with `relight`, because somebody may have switched the projector off on purpose. It is done
+        # The lamp is switched on only with `relight`, because somebody may have switched it off on purpose. It is lit
         # once per pause, because repeated ignition wears out a lamp.
         if relight and _power(projector) is Power.STANDBY:
             relight = False
@@ -187,14 +187,14 @@ def _wait_until_healthy(projector: Projector, retry: RetryPolicy, pause: Pause, 
 
 def _light(projector: Projector, retry: RetryPolicy) -> bool:
     """Switch the lamp on if necessary, and wait until it is lit; return whether it was lit at the first query."""
-    power: Power | None = retry.attempt(projector.power, _NAME)
+    power: Power | None = retry.attempt(projector.power, _PROJECTOR)
     if power is Power.ON:
         return True
     clock = retry.clock
     started_s, switched = clock.monotonic(), False
     while power is not Power.ON:
         if power is Power.STANDBY and not switched:
-            retry.attempt(projector.switch_on, _NAME)
+            retry.attempt(projector.switch_on, _PROJECTOR)
             started_s, switched = clock.monotonic(), True
         if clock.monotonic() - started_s > POWER_LIMIT_S:
             state = "does not answer" if power is None else f"is still in {power.value}"
@@ -254,7 +254,7 @@ def _stayed_lit(projector: Projector, sequence: SequenceSettings, retry: RetryPo
     while (left_s := until - retry.clock.monotonic()) >= INSTANT_S:
         retry.wait(min(left_s, PAUSE_S), "waiting", countdown)
         if health_fault(projector) is not None:
-            pause = retry.pause(_NAME)
+            pause = retry.pause(_PROJECTOR)
             went_out = _wait_until_healthy(projector, retry, pause, sequence.relight)
             pause.over()
             if went_out:
@@ -367,14 +367,14 @@ def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
         return
     if len(faults) == 1:
         ((name, fault),) = faults.items()
-        raise fault_of(name, fault)
+        raise with_device_name(name, fault)
     is_input_error = all(isinstance(fault, InputError) for fault in faults.values())
     cls = ConfigurationError if is_input_error else DeviceError
     lines = "".join(f"\n  {name}: {fault}" for name, fault in faults.items())
     raise cls(f"{len(faults)} of {len(questions)} devices cannot be used:{lines}") from next(iter(faults.values()))
 
 
-def fault_of(device: str, fault: CropError) -> CropError:
+def with_device_name(device: str, fault: CropError) -> CropError:
     """Add the name of the device to a fault, because an address alone does not identify the device."""
     if str(fault).startswith((device, f"the {device}")):
         return fault
@@ -407,7 +407,7 @@ def wheel_of(settings: LabSettings) -> float:
 
 
 def period_s(settings: LabSettings) -> float:
-    """Return the period of the light, s: a turn of the colour wheel, or without a wheel the duration of an image."""
+    """Return the period of the light, s: a turn of the colour wheel, or without a wheel a refresh of the display."""
     wheel_hz = wheel_of(settings)
     return 1 / wheel_hz if wheel_hz else _light_period_s(settings.lab.projector)
 
@@ -420,7 +420,7 @@ def holds_whole_turns(shutter_s: float, period_s: float) -> bool:
 
 
 def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> None:
-    """Require that an exposure is a whole number of turns of the colour wheel, or of images if there is no wheel."""
+    """Require that an exposure is a whole number of turns of the colour wheel, or of display refreshes without one."""
     period = _light_period_s(projector)
     shutter = camera.shutter_s
     if holds_whole_turns(shutter, period):
@@ -431,7 +431,7 @@ def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> No
     nearest = " or ".join(f"{time:.4g}" for time in (shorter, longer) if time is not None)
     unit, source, key = "turns", "the colour wheel", "colour_wheel_hz"
     if not projector.colour_wheel_hz:
-        unit, source, key = "images", "the projector", "refresh_hz"
+        unit, source, key = "refreshes", "the display", "refresh_hz"
     raise ConfigurationError(
         f"camera.shutter_s = {shutter:g} s is {shutter / period:.2f} {unit} of {source} ({1 / period:g} per second), "
         f"expected whole {unit}",

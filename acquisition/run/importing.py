@@ -66,7 +66,7 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illuminant, ..
         problem = f"{len(rows)} frames with the columns {','.join(columns)}, expected 1 or more frames with at least "
         raise FormatError(f"{problem}{','.join(FRAME_COLUMNS[:3])}; correct the list", about=path)
     timeless = [number for number, row in enumerate(rows, 2) if not (row.get("taken_at") or "").strip()]
-    # The modification time of a copy is later than the time of exposure in another row.
+    # A row without taken_at would get the time of its file. If the file is a copy, this is later than other exposures.
     if 0 < len(timeless) < len(rows):
         problem = f"{len(timeless)} of {len(rows)} frames have no taken_at, the first in line {timeless[0]}"
         raise FormatError(f"{problem}, expected all frames or none; complete the list", about=path)

@@ -2,7 +2,8 @@
 
 While a frame is downloaded, the next illuminant settles on the screen. While a frame is judged, the next frame is
 exposed (docs/explanation/steps.md). `StepQueue` selects the next frame, and `Pipeline` operates the devices. `Verdicts`
-records verdicts and their consequences for other frames. `LastingCause` waits if every frame would be refused. A second
+records verdicts and their consequences for other frames. A refused reference (white or dark frame) may void other
+frames. `LastingCause` waits if every frame would be refused. A second
 thread saves and judges files. It uses neither the devices nor the journal, so rows are committed in the order of
 exposure.
 """
@@ -62,8 +63,7 @@ AHEAD = 1
 # Number of tries to download a frame before it is exposed again.
 DOWNLOADS = 2
 
-# Expected durations of steps that have not been measured yet, s: writing to the journal; showing or reading back a
-# colour; exposing, in addition to twice the shutter time; judging; downloading.
+# Expected durations of steps before they are measured, s. An exposure lasts `RELEASE_S` and twice the shutter time.
 COMMIT_S, SHOW_S, RELEASE_S, JUDGE_S, DOWNLOAD_S = 1.0, 2.0, 3.0, 5.0, 10.0
 
 PROMISE = "ending after this frame; press Ctrl-C again to end at once"  # Answer to a request to end the run
@@ -183,7 +183,7 @@ class Pipeline:
     def _next_light(self) -> ShownLight | None:
         """Show the next illuminant; None if no frame is left. If necessary, wait for verdicts first."""
         while not self._ending.is_requested:
-            if self._verdicts.is_spent:
+            if self._verdicts.is_budget_spent:
                 self._collect(0)
                 self._verdicts.require_budget()
             if self._lasting.must_wait:
@@ -390,7 +390,6 @@ def _is_disk_fault(fault: CropError) -> bool:
 
 
 def _download(job: Job, frame: Exposed) -> Callable[[], ReceivedFile]:
-    """Download the last frame into `frames/` under a hidden name; return the function that completes the file."""
     incoming = IncomingFile(job.session.frames_folder / frame.stem)
     try:
         with job.watch.step(_CAMERA, f"sends {step_name(frame.step)} to the disk", DOWNLOAD_S, "download"):
@@ -436,13 +435,13 @@ class Verdicts:
         self._budget_gb = job.settings.sequence.refused_gb
 
     @property
-    def is_spent(self) -> bool:
+    def is_budget_spent(self) -> bool:
         """Whether refused and voided frames of this run take more space than allowed."""
         return self._unused_bytes > self._budget_gb * 1e9
 
     def require_budget(self) -> None:
-        """Raise an error if `is_spent`, because so many refused frames have a systematic cause."""
-        if self.is_spent:
+        """Raise an error if `is_budget_spent`, because so many refused frames have a systematic cause."""
+        if self.is_budget_spent:
             raise QualityError(
                 f"refused and voided frames of this run take {self._unused_bytes / 1e9:.3g} GB of the disk, at most "
                 f"{self._budget_gb:g} GB allowed (sequence.refused_gb); remove the causes, which acquire status lists, "
@@ -560,7 +559,7 @@ class Verdicts:
 
 
 class LastingCause:
-    """A cause for which every frame would be refused. The run waits, and tests at growing intervals if it is removed.
+    """A cause for which every frame would be refused. The run waits, and tests at growing intervals if it still exists.
 
     A late picture has the right colour if the same colour is shown twice in a row. A test therefore needs an accepted
     frame with a changed colour. After this frame, the test ends when an illuminant or all test frames are accepted.
@@ -601,12 +600,12 @@ class LastingCause:
         if self._step is not None:
             self._test_steps.add(self._step.number)
             if self._step.kind != "dark":
-                self._link()
+                self._add_linking_frames()
 
     def accepted(self, step: SessionStep, changed: bool) -> None:
         """Note an accepted frame, which may show that the cause has been removed; `changed`: see `Exposed`.
 
-        A dark frame does not show it, because it is also accepted if no light reaches the chart.
+        A dark frame does not show this, because it is also accepted if no light reaches the chart.
         """
         self._test_steps.discard(step.number)
         self._has_changed |= changed and step.kind != "dark"
@@ -619,8 +618,8 @@ class LastingCause:
             self._testing.over()
             self._testing = None
 
-    def _link(self) -> None:
-        # Chart, camera or lamp may have changed during the wait, so the frames that link runs are taken again.
+    def _add_linking_frames(self) -> None:
+        # Chart, camera or lamp may have changed during the wait, so frames that compare before and after are taken.
         job = self._job
         attempts = job.on_disk(job.session.journal.attempts)
         if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
@@ -648,7 +647,8 @@ def _accepted_changes(
         )
         events.append(("moved", sentence))
     percent = values.get(OFF_BRIGHTNESS.name, 0.0)
-    # A step of the lamp can be accepted although it is beyond its limit. Frames that connect runs have wide limits.
+    # A step of the lamp may be accepted beyond its limit. Frames that connect runs have wide limits, so their value is
+    # compared with the usual limit.
     stepped = any(check.name == OFF_BRIGHTNESS.name and check.is_beyond for check in judgement.checks)
     connects_runs = step.kind == "response" and any(lit.kind == "light" and lit.number < step.number for lit in steps)
     if stepped or (connects_runs and abs(percent) > judge.drift_percent):
@@ -662,7 +662,7 @@ def _accepted_changes(
     if room_percent > ROOM_LIGHT_PERCENT and step.number == min(row.number for row in steps if row.kind == step.kind):
         sentence = (
             f"{step_name(step)}: black has {room_percent:.1f} % of white, at most {ROOM_LIGHT_PERCENT:g} % allowed; "
-            "switch off other lamps. Otherwise build-lut adds a remark, and --subtract-dark subtracts this light"
+            "switch off other lamps. If it stays, build-lut adds a remark; its option --subtract-dark subtracts it"
         )
         events.append((DOUBT, sentence))
     return events
@@ -821,7 +821,7 @@ class StepQueue:
         return None
 
     def _light_or_reference(self, light: int) -> int:
-        """Return the illuminant, or a reference if too many illuminants were taken since the last reference.
+        """Return the step of an illuminant, or of a reference if too many illuminants were taken since the last one.
 
         If no references follow the illuminant in the plan, they are added first. So a killed run never looks complete.
         """
@@ -841,8 +841,8 @@ class StepQueue:
         return step.number
 
 
-def unclosed_kinds(kinds: Iterable[str]) -> frozenset[str]:
-    """Return the kinds of references missing after the last illuminant; `kinds`: kinds of the accepted frames."""
+def missing_references(kinds: Iterable[str]) -> frozenset[str]:
+    """Return the kinds of references (white, dark) not accepted after the last illuminant; `kinds`: accepted frames."""
     unclosed: set[str] = set()
     for name in kinds:
         if name == "light":

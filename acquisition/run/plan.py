@@ -21,11 +21,11 @@ from typing import Any, Final, TypeVar
 
 from acquisition.run.devices import (
     Devices,
-    fault_of,
     holds_whole_turns,
     period_s,
     reported_error,
     wheel_of,
+    with_device_name,
 )
 from acquisition.run.rig.opening import known_frame_bytes, open_rig
 from drivers.camera import CameraIdentity, ReportsSupplies, Supplies
@@ -183,7 +183,7 @@ def order_of(steps: Sequence[SessionStep], settings: LabSettings) -> str:
     return "shuffled by another seed, kept from the start of the session"
 
 
-# Fraction of the frames that may have to be repeated, for which space is required (judgement).
+# Space is required for this fraction of the frames to be repeated. Chosen by judgement.
 RETAKEN_SHARE: Final = 0.1
 EXTRA_BYTES: Final = 150_000  # Space for the preview of a frame and its rows in the journal, bytes
 # Space that remains free, bytes, because other programs need it and full disks are slow.
@@ -240,7 +240,7 @@ def frame_bytes(largest: int | None, model: str, simulated: int | None = None) -
     megapixels = MEGAPIXELS.get(model.removeprefix("Canon ").removeprefix("NIKON "))
     if megapixels is None:
         cause = f"the size of a frame of {model} is unknown" if model else "the camera did not answer"
-        return Estimate(UNKNOWN_BYTES, f"assumed: {cause}; acquire check measures it", False)
+        return Estimate(UNKNOWN_BYTES, f"assumed, because {cause}; acquire check measures it", False)
     density = PADDED_BYTES_PER_PIXEL if model.startswith(("ILCE", "CroP ")) else BYTES_PER_PIXEL
     return Estimate(megapixels * 1e6 * density, f"{megapixels:.1f} million photosites, {density:g} bytes each", True)
 
@@ -286,7 +286,7 @@ def ask(devices: Devices) -> Answers:
         try:
             return question()
         except DeviceError as fault:
-            faults.append(fault_of(device, fault))
+            faults.append(with_device_name(device, fault))
             return default
 
     camera, projector, presenter = devices.camera, devices.projector, devices.presenter
@@ -411,9 +411,9 @@ def make_plan(
     )
 
 
-# Longest plausible settling time, s (judgement). A longer one was probably given in milliseconds.
+# Longest plausible settling time, s. Chosen by judgement: a longer one was probably given in milliseconds.
 LONG_SETTLE_S: Final = 10.0
-# Shortest warm-up after which a lamp is steady, s (judgement). Makers recommend 10 to 30 minutes.
+# Shortest warm-up without a warning, s. It is half of the shortest time that makers recommend (10 to 30 minutes).
 SHORT_WARM_UP_S: Final = 300.0
 
 
@@ -616,13 +616,13 @@ def _frames_text(work: Work) -> str:
 
 
 def _turns_text(settings: LabSettings) -> str:
-    """Return the number of turns of the colour wheel, or of images, in an exposure; "" for a steady light."""
+    """Return the turns of the colour wheel, or the display refreshes, in an exposure; "" for a steady light."""
     wheel = wheel_of(settings)
     if settings.rig != "lab" and not wheel:
         return ""
-    period, unit = period_s(settings), "turn of the colour wheel" if wheel else "picture"
+    period, unit = period_s(settings), "turn of the colour wheel" if wheel else "refresh of the display"
     turns = settings.camera.shutter_s / period
-    plural = unit.replace("turn ", "turns ").replace("picture", "pictures")
+    plural = unit.replace("turn ", "turns ").replace("refresh ", "refreshes ")
     if holds_whole_turns(settings.camera.shutter_s, period):
         return f" = {counted(round(turns), unit, plural)}"
     return f" = {turns:.2f} {plural}, which is not a whole number"

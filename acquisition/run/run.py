@@ -1,7 +1,7 @@
 """Take a session as set in LAB.toml: create or resume it, open the rig, take all missing frames, and send notices.
 
-Notices go to the terminal, a command, a URL, systemd and a monitoring service (docs/how-to/night-run.md). A separate
-thread delivers them, so that frames do not wait. A notice that cannot be delivered is reported once.
+Notices go to the terminal, a command, a URL, systemd and a monitoring service (docs/how-to/notifications.md). A
+separate thread delivers them, so that frames do not wait. A notice that cannot be delivered is reported once.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from acquisition.judge.judge import LiveJudge
 from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.view import write_session_report
 from acquisition.run.devices import TRY_S, Devices, RetryPolicy, RunEnd, RunWatch, leave_lab, make_ready, pause_cause
-from acquisition.run.pipeline import Job, Pipeline, StepQueue, Taken, link_runs, step_name, unclosed_kinds
+from acquisition.run.pipeline import Job, Pipeline, StepQueue, Taken, link_runs, missing_references, step_name
 from acquisition.run.plan import nothing_to_retake, planned_steps, require_plan, require_same
 from acquisition.run.rig.opening import open_rig
 from calibration.figures.light import DARK_DRIFT, LEAK_SHARE, OFF_CODES_DEG, STRAY_SHARE, WHITE_DRIFT
@@ -114,7 +114,7 @@ class Notices:
         self.report_failures()
 
     def close(self) -> None:
-        """Wait until all notices are delivered, at most for `LIMIT_S` and `ENDING_S`; a second call does nothing."""
+        """Wait until all notices are delivered, at most for `LIMIT_S` plus `ENDING_S`; a second call does nothing."""
         if self._thread.is_alive() and not self._closed:
             until = time.monotonic() + LIMIT_S + ENDING_S
             with suppress(queue.Full):
@@ -213,7 +213,7 @@ class PauseNotices:
         self._is_reported = False
 
     def paused(self, sentence: str) -> None:
-        """Report a pause. This is called repeatedly during a pause, so that a delayed notice is sent later."""
+        """Report a pause. This is called repeatedly, so a notice that comes too early for `QUIET_S` is sent later."""
         if self._is_reported:
             return
         cause, now_s = pause_cause(sentence), self._clock.monotonic()
@@ -400,7 +400,6 @@ class Life:
 
 
 def _watchdog_s(environment: Mapping[str, str]) -> float:
-    """Return the watchdog time of the service manager, s; 0 without a watchdog."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return 0.0
     try:
@@ -456,7 +455,7 @@ def run_session(
         require_same_devices(session, devices, settings)
         if note := clock_note(session, devices.clock):
             announce(note)
-        first = link_runs(session, devices.clock.now())
+        connecting_steps = link_runs(session, devices.clock.now())
         total = len(session.steps)
         observe(len(session.done_steps()), total)
         # The report is written after the screen is dark and the journal is closed.
@@ -472,7 +471,7 @@ def run_session(
             observe(total - frame.remaining, total)
 
         judge = LiveJudge(settings, session.chart, session.illuminations)
-        return take_session(session, devices, settings, judge, count, announce, state, ending, first)
+        return take_session(session, devices, settings, judge, count, announce, state, ending, connecting_steps)
 
 
 @contextmanager
@@ -669,7 +668,7 @@ def _open_steps(session: Session, settings: LabSettings, first: Sequence[int]) -
         sequence.attempts,
         append,
         first,
-        unclosed_kinds(accepted_kinds),
+        missing_references(accepted_kinds),
         sequence.reference_every,
     )
 
@@ -698,8 +697,8 @@ def signs_of_life(
 ) -> Generator[SignOfLife]:
     """Send signs of life while the block runs, and finally the reason of its end.
 
-    `beat` sends a sign with the latest time of the next sign, which is `within_s` later. `newest` returns the last
-    state.
+    `beat`: sends a sign, with the time at which the next sign is overdue (after `within_s`). `newest`: returns the
+    state of the last sign.
     """
     last_s, reported_state = -math.inf, ""
 
@@ -770,7 +769,6 @@ class _Reports:
             self._journal.note(self._clock.now(), DOUBT, sentence)
 
     def report(self, event: str, sentence: str, /) -> None:
-        """Report an event."""
         self._announce(f"{event}: {sentence}")
         if event == "paused":
             self._pauses.paused(sentence)

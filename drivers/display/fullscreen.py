@@ -2,12 +2,12 @@
 
 The window fills one display in the mode that the desktop has set. `FullScreen.show` returns when every pixel has the
 requested code, both in the drawn buffer and on the screen. With X, the screen is read like a screenshot, over another
-connection. On macOS, the window's front buffer is read. If a display was disconnected, the next `show` fills it again
+connection. On macOS, the window's front buffer is read. After a disconnection, the next `show` fills the display again
 if its mode is the same. A display that another process uses is refused.
 
 - Only the thread that opened the window may use it, as OpenGL contexts and GLFW require.
 - The window disappears when the process ends, even if the process is killed.
-- GLFW and OpenGL are used only in this module. GLFW is initialised while a window is open.
+- GLFW and OpenGL are used only in this module.
 
 On Linux the window is an X window. Under Wayland it is shown by XWayland, and the compositor may scale or tint the
 image without notice. Gamma ramps (night light, colour management) change the image after it is read back.

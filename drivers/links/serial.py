@@ -1,4 +1,4 @@
-"""Serial port; the only module that imports pyserial.
+"""Serial port.
 
 The port has eight data bits, no parity, one stop bit and no flow control, as all projectors in
 `drivers.serial_projectors` require. It is opened exclusively, and earlier input is discarded. If the cable is

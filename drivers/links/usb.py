@@ -1,8 +1,7 @@
-"""Data pipes of USB still image devices (cameras); the only module that imports pyusb.
+"""Data pipes of USB still image devices (cameras).
 
 A device is selected by its vendor, serial number and port. Its address is not used, because it changes when the device
-restarts. The driver of the system's kernel is detached while the device is open, and attached again at the end. Errors
-of pyusb are converted to ours in this module only.
+restarts. The driver of the system's kernel is detached while the device is open, and attached again at the end.
 
 Sources: USB 2.0, clauses 5.8 (bulk), 5.7 (interrupt), 9.4 (SetConfiguration) and 9.6 (descriptors); error codes of
 libusb 1.0.

@@ -1,7 +1,7 @@
 """Codes of PTP and their names: those of the standard, and those of Canon for EOS bodies.
 
-All known responses and event records have a name, because they appear in messages to users. Other codes have one only
-if we use them. Canon's codes are valid only for EOS bodies, because other makers use the same numbers for other things.
+All known responses and event records have a name, because they appear in messages to users. Other codes have a name
+only if we use them. Canon's codes are valid only for EOS bodies, because other makers use the same numbers differently.
 
 Sources: ISO 15740:2013, tables of clauses 10 to 13. Canon's extensions have no public standard. Their numbers were
 recorded from devices, and their names are from libgphoto2.

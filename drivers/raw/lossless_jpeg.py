@@ -26,8 +26,8 @@ _SOI, _EOI, _SOF0, _SOF1, _SOF3, _DHT, _DQT, _DRI, _SOS = 0xD8, 0xD9, 0xC0, 0xC1
 # ignored only if all are equal.
 _PADDING: Final = 4
 
-# Run of zero bytes. If zero bits are the code of a difference, the run is damage, because a dozen samples never change
-# by equal steps.
+# Series of zero bytes. If zero bits are the code of a difference, the series is damage, because a dozen samples never
+# change by equal steps.
 _GAP: Final = bytes(16)
 
 _END: Final = bytes((0xFF, _EOI))

@@ -904,7 +904,7 @@ def _stated_areas(directory: Directory | None, tag: TiffTag, sensor: tuple[int, 
     )
 
 
-# Black level, counts, from which no photosite has less than half of it. At lower levels, noise is clipped at zero.
+# Least black level, counts, at which every photosite has at least half of it. Noise clips lower levels at zero.
 _MIN_BLACK = 16
 
 _TILE = (32, 256)  # Rows and columns of the smallest part that is checked; files store no smaller parts

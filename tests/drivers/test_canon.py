@@ -631,7 +631,7 @@ def test_calls_end_within_their_time_limits(fault: str) -> None:
         "busy": "answers DEVICE_BUSY",
         "silent": "sent nothing for 20 s, no connection for",
         "gone": "no camera on USB, no connection for",
-        "never announced": "announced no frame in time, and its memory has none",
+        "never announced": "announced no frame in time, and its memory contains no frame",
     }[fault]
     with pytest.raises(DeviceError, match=rf"^(Canon Digital Camera .* at USB port 1-1 )?{cause}"):
         lab.camera.expose()

@@ -805,7 +805,7 @@ def test_causes_are_lasting_or_void_other_frames() -> None:
     assert {name for name in CAUSES if lasting(white, grey, name)} == {"other_camera", "chart", "white_drift"}
     assert lasting(replace(white, refusals=("off_codes_deg", 3)), light, "off_codes_deg")
     assert not lasting(replace(white, refusals=("off_codes_deg", 2)), light, "off_codes_deg")
-    voids = judge._voids_others
+    voids = judge._voids_earlier_frames
     hidden = {"stray_share", "dark_drift", "leak_share"}
     unmodelled = hidden | {"rows", "uniformity", "off_codes_deg", "off_brightness", "white_drift"}
     assert {name for name in CAUSES if voids(white, name)} == unmodelled

@@ -117,7 +117,7 @@ def test_paper_level_has_no_selection_bias() -> None:
         # Light falls off by a quarter, as it does over a frame.
         scene[y - 5 : y + 6, x - 5 : x + 6] = 1000 * (1 - 0.25 * np.hypot(x - 300, y - 200) / 360)
     first, later = (np.asarray(scene + random.normal(0, 15, scene.shape), dtype=np.float32) for _ in range(2))
-    centres = measure._paper(first, np.array(middles, dtype=np.float64))
+    centres = measure._paper_centres(first, np.array(middles, dtype=np.float64))
     x, y = centres.T
     assert len(centres) == len(middles)
     assert np.abs(centres - middles).max() <= 2

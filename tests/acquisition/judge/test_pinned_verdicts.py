@@ -321,8 +321,11 @@ def test_measures_random_frames(pinned: Pinned) -> None:
             "levels": [one.brightest_dn, one.range_dn, one.clipped, one.empty, one.level, one.digest.hex()],
             "places": [places.x_edges, places.y_edges, places.tile_blocks, [places.tile_box(n) for n in (0, 25, 383)]],
             "exposure": measure_exposure(odd),
-            "paper": [measure._brightest(plane.values), measure._paper(plane.values, random.uniform(0, 70, (40, 2)))],
-            "texture": [tag.corners_px for tag in measure._textures(plane).tags],
+            "paper": [
+                measure._brightest_centres(plane.values),
+                measure._paper_centres(plane.values, random.uniform(0, 70, (40, 2))),
+            ],
+            "texture": [tag.corners_px for tag in measure._textured_areas(plane).tags],
             "noise": [measures._noise(random.normal(50, 3, (900, 2)) + rise) for rise in (0, np.arange(900)[:, None])],
         }  # fmt: skip
     pinned("frames of chance as measured", found, same=1e-5)

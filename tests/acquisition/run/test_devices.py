@@ -477,7 +477,7 @@ def test_recurring_fault_shares_patience() -> None:
 
 
 def test_back_off_continues_across_pauses() -> None:
-    """Tried again after 0, 5, 10, 20 … 300 s (docs/how-to/night-run.md), once more after one second."""
+    """Tried again after 0, 5, 10, 20 … 300 s (docs/how-to/events.md), once more after one second."""
     room = PausedRoom(math.inf)
     retry = room.retry
     waited: list[float] = []

@@ -10,7 +10,7 @@ from unittest.mock import Mock
 import pytest
 
 from acquisition.run.devices import PAUSE_S
-from acquisition.run.pipeline import StepQueue, Taken, unclosed_kinds
+from acquisition.run.pipeline import StepQueue, Taken, missing_references
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
@@ -458,8 +458,8 @@ def start_next(queue: StepQueue) -> SessionStep:
 
 
 def test_closes_illuminants_of_earlier_run() -> None:
-    assert unclosed_kinds(["white", "dark", "light", "white", "dark"]) == frozenset()
-    unclosed = unclosed_kinds(["white", "dark", "white", "dark", "light"])
+    assert missing_references(["white", "dark", "light", "white", "dark"]) == frozenset()
+    unclosed = missing_references(["white", "dark", "white", "dark", "light"])
     queue = queue_of({step.number for step in STEPS} - {1}, unclosed=unclosed)
     assert take(queue) == [1, 10], "the dark frame that is open closes them as well"
 
