@@ -33,7 +33,7 @@ class Component:
     title: str  # Name in reports
     assumed: bool  # True if the session does not show the effect, so that its usual size is assumed
     source: str  # How the component was measured, or why it was not
-    lights: _Array  # (L, 3, 3) float64, mean square relative error of each illuminant's white in R, G, B
+    lights: _Array  # (L, 3, 3) float64, mean products of the relative errors of R, G and B, for each ground truth
     cells: _Array  # (C, 3) float64, mean square relative error of each patch mean, without the error of bare paper
 
 
@@ -112,7 +112,7 @@ def direction_deg(white: _Array, relative: _Array) -> _Array:
 
     First-order propagation (JCGM 100, 5.1.2): only the error perpendicular to the vector changes its direction.
 
-    `relative`: (L, 3, 3) float64, mean square of the relative errors of the vectors' components.
+    `relative`: (L, 3, 3) float64, mean products of the relative errors of R, G and B.
     """
     length = np.linalg.norm(white, axis=1)
     along = white / np.maximum(length, 1e-9)[:, None]

@@ -2,8 +2,7 @@
 
 The published serial number of a camera would link a LUT to all photographs of its owner. Readers only need to see
 whether two LUTs are from one camera body, so a hash of the number is published. Serial numbers are short and could be
-guessed. The hash is therefore scrypt (RFC 7914), which makes each guess slow: all numbers of ten digits take more than
-twelve years on one core. A lab can also withhold the number.
+guessed. The hash is therefore scrypt (RFC 7914), which makes each guess slow. A lab can also withhold the number.
 
 A citation is a BibTeX entry of type `misc` (O. Patashnik, BibTeXing, 1988, section 3.1). Unknown values are omitted
 from the entry and listed in a comment.
@@ -34,7 +33,7 @@ SerialForm = Literal["hash", "plain", "withheld"]
 # that older LUTs of a body could not be recognised.
 _COST, _BLOCK, _PARALLEL = 1 << 14, 8, 1
 
-_BYTES = 16  # Length of the hash: 128 bits never coincide by chance
+_HASH_BYTES = 16  # Length of the hash: 128 bits never coincide by chance
 
 NOT_RECORDED: Final = "not recorded"  # Text for an unknown value
 
@@ -64,7 +63,7 @@ _TEX_REPLACEMENTS: Final = {
 def serial_hash(camera: str, serial: str) -> str:
     """Return the hash of a body's serial number, 32 hexadecimal digits: scrypt with the camera's name as salt."""
     salt = f"crop camera serial {camera}".encode()
-    return hashlib.scrypt(serial.encode(), salt=salt, n=_COST, r=_BLOCK, p=_PARALLEL, dklen=_BYTES).hex()
+    return hashlib.scrypt(serial.encode(), salt=salt, n=_COST, r=_BLOCK, p=_PARALLEL, dklen=_HASH_BYTES).hex()
 
 
 def published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> Mapping[tuple[str, str], str]:

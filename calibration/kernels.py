@@ -126,7 +126,7 @@ def light_around(
     multiplied by the local `light` (N, 3). The last kind, the background behind the print, has its own light.
     """
     for n in range(len(neighbours)):
-        # Each addition waits for the previous addition to the same sum. Three sums at once use this time.
+        # The processor calculates three independent sums in parallel.
         red, green, blue = 0.0, 0.0, 0.0
         for slot in range(neighbours.shape[1]):
             source = neighbours[n, slot]

@@ -102,7 +102,7 @@ class SessionMeasurements:
     codes: tuple[tuple[int, int, int], ...]  # 8-bit codes of each planned illuminant
 
 
-# Relative standard deviation of a frame's brightness, if it cannot be measured (judgement).
+# Relative standard deviation of a frame's brightness, if it cannot be measured. Chosen by judgement.
 _USUAL_SCATTER = 0.001
 
 _SCATTER_FRAMES = 3  # White frames needed to measure this scatter
@@ -110,7 +110,7 @@ _SCATTER_FRAMES = 3  # White frames needed to measure this scatter
 
 @dataclass(frozen=True, eq=False)
 class LightMeasurements:
-    """Measurements of the illuminants; a check has one row, of its frame."""
+    """Measurements of the illuminants. After `build-lut check`, there is only the row of its frame."""
 
     white: _Array  # (L, 3) float64 counts, ground truth in the units of the samples
     white_error: _Array  # (L, 3) float64 counts, standard error of `white`
@@ -119,7 +119,7 @@ class LightMeasurements:
     subtracted: _Array | None
     # (L,) float64, fraction of each illuminant's samples in the LUT that are 0; (0,) after a check
     share_at_zero: _Array
-    additivity: Additivity | None  # White against the sum of the primaries; None if a frame is missing
+    additivity: Additivity | None  # White compared with the sum of the primaries; None if a frame is missing
     # Agreement of illuminants and codes; None after a check. In `exchanges` and `seen_as`, indices ≥ L are white frames
     codes: CodeAgreement | None
     # Agreement of white frames and full white; None without white frames. If they differ by drift alone,

@@ -21,22 +21,24 @@ from drivers.raw.rawfile import CHANNELS, Mosaic, phases
 from experiment.framing.sharpness import MAX_BLUR_PX
 from foundation.compiled import compiled, inlined
 
-# A smaller difference between the rim and the centre of a patch, relative to its mean, is negligible (judgement).
+# A smaller difference between the rim and the centre of a patch, relative to its mean, is negligible. Chosen by
+# judgement.
 UNEVEN_SHARE = 0.01
 
-# The difference is significant from this number of standard deviations. Noise alone exceeds 5 σ once in 1.7 million
-# comparisons, and a full chart has 98 304.
+# Number of standard deviations from which this difference is significant. Noise alone exceeds 5 σ once in 1.7 million
+# comparisons, and a full chart has 98 304 comparisons.
 UNEVEN_SIGMA = 5.0
 
-# A photosite with less than this fraction of the light of its patch is dead. Next to a dark patch, the rim keeps more.
+# A photosite with less than this fraction of the light of its patch is dead. Blur from a dark neighbour reduces the
+# light at the rim of a patch less than this.
 DEAD_SHARE = 0.5
 
 # Patches with fewer counts are not searched for dead photosites, so that noise is not mistaken for them.
 DEAD_LEVEL = 300.0
 
-# Probability that noise alone makes a normal patch count as noisy. With 25 samples, the limit is 3.5 times the variance
-# of the model.
-NOISY = 1e-8
+# Probability that noise alone makes a normal patch count as noisy. With 25 samples, a patch is then noisy from 3.5
+# times the variance of the model.
+NOISY_PROBABILITY = 1e-8
 
 # Number of groups of patches with similar levels, from which noise is estimated; 1000 patches of a full chart in each.
 _NOISE_BINS = 32
@@ -46,7 +48,8 @@ _CURVE_BINS = 48  # Largest number of such groups for the photon-transfer curve
 # Possible sides of a sampling window, half-size px. They are odd, so that a window has a central pixel.
 WINDOWS = (3, 5, 7, 9)
 
-# Negligible fraction of a sample's light that comes from outside its patch. The accepted limit is 5 times higher.
+# Negligible fraction of the light of a sample that comes from outside its patch. The limit of the figure `bleed` is 5
+# times higher.
 SAFE_BLEED = 0.002
 
 MISPLACEMENT_PX = 0.75  # Largest error of a sample's position: rounding 0.5 px, registration 0.25 px
@@ -67,7 +70,7 @@ _Mask = npt.NDArray[np.bool_]
 
 
 def patch_means(values: npt.NDArray[np.uint16]) -> npt.NDArray[np.float64]:
-    """Return the means (N, 3) float64 of values (N, S, 3) uint16, eight times faster than NumPy."""
+    """Return the means (N, 3) float64 of values (N, S, 3) uint16."""
     means = np.empty((values.shape[0], 3))
     _patch_means(values, means)
     return means
@@ -238,8 +241,7 @@ def rim_difference(
 def unevenness(samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Return the relative difference of rim and centre of each patch in its worst channel, (N,) float64.
 
-    The result is 0 if no channel differs by more than 5 standard deviations and 1 % of the patch. In a window of 3×3,
-    the centre is a single pixel, so the difference is 2.5 times as noisy as with 5×5.
+    The result is 0 if no channel differs by more than 5 standard deviations and 1 % of the patch.
 
     `samples`: (N, S, 3) counts above black, the mean of evenly lit frames. `noise`: (N, 3) counts, standard deviation
     of one of these values.
@@ -264,7 +266,7 @@ def has_dead_photosite(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.bool
 def sample_noise(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Return the standard deviation of one sample of each patch, (N, 3) float64 counts.
 
-    It is estimated from all patches of a similar level, because a single patch gives it only to 25 %. `samples`:
+    It is estimated from all patches of a similar level, because a single patch has an error of 25 %. `samples`:
     (N, S, 3) counts above black.
     """
     inner = _inner(samples.shape[1])
@@ -347,7 +349,7 @@ def photon_transfer(level: _Array, variance: _Array, samples: int = 25) -> Photo
         lit_level = np.maximum(level[:, channel], 0)
         model = terms[0, channel] + terms[1, channel] * lit_level + terms[2, channel] * lit_level**2
         ratio = np.maximum(ratio, variance[:, channel] / np.maximum(model, 1e-9))
-    allowed = float(chi2.isf(NOISY, samples - 1)) / (samples - 1)
+    allowed = float(chi2.isf(NOISY_PROBABILITY, samples - 1)) / (samples - 1)
     with np.errstate(divide="ignore"):
         gain = np.where(terms[1] > 0, 1 / terms[1], np.inf)
     return PhotonTransfer(gain, np.sqrt(terms[0]), np.sqrt(terms[2]), misfit, ratio, allowed)
@@ -494,7 +496,7 @@ def gather_values(
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
     """Return `table_values` of the samples of `gather`, (N, S, 3) uint16, and the highest raw counts (N,) uint16.
 
-    This is three times faster than `gather` and `table_values`. `black`: (2, 2). `field`, `dark`: (N, 3).
+    `black`: (2, 2). `field`, `dark`: (N, 3).
     """
     dark = np.zeros(field.shape, dtype=np.float32) if dark is None else dark
     values = np.empty((len(sites.rows), sites.window**2, 3), dtype=np.uint16)

@@ -1,8 +1,8 @@
 """Judge a LUT: compare its figures with their limits, explain values beyond a limit, and select frames to take again.
 
-A figure is a measured property with limits (`calibration.figures`). The verdict depends only on the values. A value
-that could not be measured is not judged. Single frames are selected if they exceed a refusing limit or cause a value
-beyond a limit. If all frames have the same fault, none is selected, because new frames would have it as well.
+The verdict depends only on the values. A value that could not be measured is not judged. A frame is selected if its
+value exceeds the limit of refusal, or if it causes a value beyond a limit. If all frames have the same fault, none is
+selected, because new frames would have it.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Verdict:
 
     @property
     def remarks(self) -> tuple[JudgedValue, ...]:
-        """Values beyond the accepted limit, but not beyond the refusing limit."""
+        """Values beyond the accepted limit, but not beyond the limit of refusal."""
         return tuple(row for row in self.rows if row.outcome == "accept with remarks")
 
 
@@ -112,7 +112,7 @@ def judge(values: Mapping[str, float], figures: Sequence[Figure] = FIGURES) -> V
 
 
 def explain(figure: Figure, table: TableMeasurements) -> ProbableCause | None:
-    """Return the cause of a figure beyond its limit; None if there is no evidence, or if the figure explains itself."""
+    """Return the cause of a figure beyond its limit; None without evidence, or if the figure has only one cause."""
     gathered = None if figure.cause is None else figure.cause.gather(table, figure.accept)
     if figure.cause is None or gathered is None:
         return None
@@ -146,7 +146,7 @@ def findings(verdict: Verdict, table: TableMeasurements) -> dict[str, ProbableCa
 
 
 def retake_command(records: Sequence[FrameRecord]) -> str:
-    """Return the command that repeats frames: by number if all show illuminants, else from the report."""
+    """Return the command that repeats frames: with their numbers if all show illuminants, else with `bad`."""
     lights = [record.illumination for record in records if record.kind == "light"]
     numbers = [light for light in lights if light is not None]
     return COMMAND if len(numbers) < len(records) else COMMAND.replace("bad", lights_text(numbers))
@@ -187,7 +187,7 @@ def retake_json(records: tuple[FrameRecord, ...], registered_sha256: str, newest
 def _frames_beyond(
     row: JudgedValue, table: TableMeasurements, causes: Mapping[str, ProbableCause]
 ) -> list[FrameRecord] | None:
-    """Return the frames beyond a row's refusing limit.
+    """Return the frames whose value is beyond the limit of refusal.
 
     None if the value does not concern single frames, or if new frames would have the same fault.
     """
@@ -198,9 +198,9 @@ def _frames_beyond(
 
 
 def refusal(verdict: Verdict, table: TableMeasurements, *, reported: bool = False) -> str:
-    """Return reason and remedy of the refusal in one line, from the most informative refused row."""
+    """Return reason and remedy of the refusal in one line, for the most informative refused value."""
     causes = findings(verdict, table)
-    # A row with a known cause is more informative than a row without.
+    # A value with a known cause is more informative than a value without.
     explained = [row for row in verdict.refused if row.figure.name in causes and causes[row.figure.name].is_known]
     foremost = [row for row in verdict.refused if row.figure.foremost]
     main_row = (*foremost, *explained, *verdict.refused)[0]
@@ -230,7 +230,7 @@ def remark(row: JudgedValue, table: TableMeasurements) -> str:
 
 
 def detail_and_remedy(figure: Figure, table: TableMeasurements) -> tuple[str, str]:
-    """Return the text added to a figure's value beyond a limit, or "", and the remedy."""
+    """Return the text that is added to the value of a figure, or "", and the remedy."""
     detail = None if figure.detail is None else figure.detail(table)
     return ("", figure.remedy) if detail is None else detail
 
@@ -241,7 +241,7 @@ def _cause_text(cause: ProbableCause | None) -> str:
     decision = cause.decision
     if decision.rule is None:
         return "cause unknown; possible remedy: "
-    # If the cause was taken from a related figure, the message of that figure gives the reason.
+    # If the cause was taken from a related figure, the message of that figure contains the reason.
     why = "" if decision.follows else f" ({decision.rule.why})"
     return f"probably {decision.cause.description}{why}; "
 

@@ -26,9 +26,21 @@ _SOURCE_COLUMNS = ("command", "version", "date", "machine")
 _FIGURES_HEAD = """# Figures
 
 `build-lut` judges a LUT by these figures. A figure beyond the *accepted* limit causes a remark. If a figure is
-beyond the *refused* limit, no LUT is made. `acquire check` judges most figures before a session, from trial frames.
-`build-lut check` judges those that one frame determines. Figures that more frames can only make worse are judged if
-they are already *beyond* the limit. `report.json` uses the same names.
+beyond the *refused* limit, no LUT is made. `report.json` uses the same names. The columns are:
+
+- *In check*: `acquire check` judges the figure before a session, from trial frames.
+- *From one frame*: `build-lut check` judges the figure from one frame. With *beyond*, it judges the figure only if
+  the value of this frame is already beyond the accepted limit.
+- *Basis*: origin of the limits, or values without and with faults.
+
+Terms in the tables:
+
+- *White*: camera RGB of bare paper under an illuminant. It is predicted from its codes and from the whites of the
+  other illuminants. *Paper white* is bare paper under full white.
+- *Block*: group of adjacent patches that are compared together.
+- *Worst sample*: sample in the corner of a window, nearest to the neighbouring patches.
+- *Frame registered first*: usually the first white frame. The other frames are compared with it.
+- *Unfit patch*: patch that must not be used; `lut.json` lists unfit patches with the reason.
 
 *Written by `python -m docs.reference_pages` from `calibration/figures`.*
 """
@@ -36,24 +48,24 @@ they are already *beyond* the limit. `report.json` uses the same names.
 _CAUSES_HEAD = """# Causes
 
 Each remark and refusal of `build-lut` names the frame, the position on the print, the probable cause and the remedy.
-The cause follows from the table below. Its evidence is in `report.json` under `causes`, and in the report next to each
-cause. The first rule with matching intervals decides; values that were not measured match no interval. If no rule
-applies, the cause is reported as unknown, and the position is circled in the report.
+Each row of *The rules* is a rule. For a figure beyond its limit, the first rule decides whose conditions all hold for
+the evidence. A value that was not measured satisfies no condition. If no rule applies, the cause is reported as
+unknown, and the position is circled in the report. `report.json` contains the evidence under `causes`.
 
 *Written by `python -m docs.reference_pages` from `calibration/causes`.*
 """
 
-_AGAIN = {
+# Text for each value of `Cause.repeats`.
+_REPEATED_FRAMES = {
     "frames": "the named frames: `acquire run LAB.toml SESSION --retake 12,40`, or `--retake bad`",
     "session": "the session",
     "nothing": "nothing",
 }
 
-# Smallest value that is printed as "more than 0".
-_LEAST = 1e-9
+# Lower limit of an interval that excludes 0; it is printed as "0 <".
+_ABOVE_ZERO = 1e-9
 
-
-_OF_ONE_FRAME = {"known": "yes", "bounded": "beyond", "unknown": "–"}
+_OF_ONE_FRAME = {"known": "yes", "bounded": "beyond", "unknown": "–"}  # Text for each value of `Figure.of_one_frame`
 
 
 def figures_page() -> str:
@@ -62,22 +74,22 @@ def figures_page() -> str:
     for group, question in QUESTIONS.items():
         parts.append(f"## {group.capitalize()}\n\n{question}\n")
         parts.append(
-            "| figure | accepted | refused beyond | in `acquire check` | from one frame | effect beyond | remedy |"
+            "| figure | accepted | refused beyond | in check | from one frame | effect beyond | basis | remedy |"
         )
         parts += [
-            "|---|---|---|---|---|---|---|",
+            "|---|---|---|---|---|---|---|---|",
             *(_limits(figure) for figure in FIGURES if figure.group == group),
             "",
         ]
     for heading, limits in (("Before a session", RIG_LIMITS), ("While a session is taken", FRAME_LIMITS)):
-        parts += [f"## {heading}\n", "| limit | accepted | fault beyond | effect beyond | remedy |"]
-        parts += ["|---|---|---|---|---|", *(_plain_limit(figure) for figure in limits), ""]
+        parts += [f"## {heading}\n", "| limit | accepted | fault beyond | effect beyond | basis | remedy |"]
+        parts += ["|---|---|---|---|---|---|", *(_plain_limit(figure) for figure in limits), ""]
     return "\n".join(parts)
 
 
 def _plain_limit(limit: Limit) -> str:
     limits = f"{limit.expected} | {_refused(limit)}"
-    return f"| {limit.title} (`{limit.name}`) | {limits} | {limit.why} ({limit.source}) | {limit.remedy} |"
+    return f"| {limit.title} (`{limit.name}`) | {limits} | {limit.why} | {limit.source} | {limit.remedy} |"
 
 
 def _refused(limit: Limit) -> str:
@@ -89,7 +101,7 @@ def _limits(figure: Figure) -> str:
     remedy = figure.remedy or "depends on the detected fault"
     of_one_frame = _OF_ONE_FRAME[figure.of_one_frame]
     limits = f"{figure.expected} | {refused} | {before_session} | {of_one_frame}"
-    return f"| {figure.title} (`{figure.name}`) | {limits} | {figure.why} ({figure.source}) | {remedy} |"
+    return f"| {figure.title} (`{figure.name}`) | {limits} | {figure.why} | {figure.source} | {remedy} |"
 
 
 def causes_page() -> str:
@@ -97,11 +109,11 @@ def causes_page() -> str:
     parts = [_CAUSES_HEAD]
     parts += ["## Remedies\n", "| cause | description | remedy | frames to repeat |\n|---|---|---|---|"]
     parts += [
-        f"| {cause.name} | {cause.description} | {cause.remedy} | {_AGAIN[cause.repeats]} |"
+        f"| {cause.name} | {cause.description} | {cause.remedy} | {_REPEATED_FRAMES[cause.repeats]} |"
         for cause in CAUSES
         if cause is not UNKNOWN
     ]
-    parts += ["\n## The table\n", "| cause | figures | condition | reason |\n|---|---|---|---|"]
+    parts += ["\n## The rules\n", "| cause | figures | conditions | reason |\n|---|---|---|---|"]
     for rule in RULES:
         figures = ", ".join(f"`{name}`" for name in _names(rule))
         where = ", ".join(_interval(condition) for condition in rule.conditions)
@@ -120,7 +132,7 @@ def _interval(condition: Condition) -> str:
     low, high = (f"{value:.9g}" for value in (condition.low, condition.high))
     if condition.low == condition.high:
         return f"{condition.name} = {low}"
-    if condition.low == _LEAST:
+    if condition.low == _ABOVE_ZERO:
         return f"0 < {condition.name} ≤ {high}"
     if math.isinf(condition.high):
         return f"{condition.name} ≥ {low}"

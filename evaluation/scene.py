@@ -101,6 +101,8 @@ class SceneSet:
         Fold of each scene, from 0, as the authors of the data set define it; None if they define no folds.
     truth_uncertainty_deg
         Largest uncertainty (k = 2) of a ground truth, degrees; None if the data set does not report it.
+    black_bodies
+        Camera RGB of the black bodies among the illuminants, by their temperature in K; empty if unknown.
     """
 
     name: str
@@ -110,6 +112,9 @@ class SceneSet:
     treatment: Mapping[str, str] = field(default_factory=dict[str, str])
     folds: tuple[int, ...] | None = None
     truth_uncertainty_deg: float | None = None
+    black_bodies: Mapping[float, tuple[float, float, float]] = field(
+        default_factory=dict[float, tuple[float, float, float]]
+    )
 
     def __repr__(self) -> str:
         """Return one line, because the list of images may be very long."""

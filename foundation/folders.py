@@ -1,4 +1,4 @@
-"""Create folders atomically, lock them, detect unmounted disks, and find the user's cache folder.
+"""Create folders atomically, lock them, detect unmounted disks, measure free space, and find the user's cache folder.
 
 A folder is filled under a hidden name next to its final path, then renamed. `foundation.files` does the same for files.
 The operating system holds the locks, so a lock ends with its program. If a file system cannot lock folders, a file in
@@ -11,6 +11,7 @@ import contextlib
 import errno
 import fcntl
 import logging
+import math
 import os
 import re
 import shutil
@@ -281,3 +282,31 @@ def _is_at(handle: int, folder: Path) -> bool:
         return os.path.samestat(os.fstat(handle), folder.stat())
     except FileNotFoundError:
         return False
+
+
+def free_bytes_at(folder: Path) -> int:
+    """Return the free space on the disk of `folder`, which need not exist, bytes."""
+    existing = folder.absolute()
+    try:
+        while not existing.is_dir() and existing != existing.parent:
+            existing = existing.parent
+        if os.statvfs(existing).f_flag & os.ST_RDONLY:
+            raise storage_error(folder, OSError(errno.EROFS, os.strerror(errno.EROFS)))
+        if not os.access(existing, os.W_OK | os.X_OK):
+            raise storage_error(folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
+        return shutil.disk_usage(existing).free
+    except OSError as error:
+        raise storage_error(folder, error, "read") from error
+
+
+def bytes_text(number: float, up: bool = False) -> str:
+    """Return bytes as GB or MB with one decimal; `up`: whether to round up.
+
+    Examples
+    --------
+    >>> bytes_text(25_340_000), bytes_text(1.01e9), bytes_text(1.01e9, up=True)
+    ('25.3 MB', '1.0 GB', '1.1 GB')
+    """
+    unit, name = (1e9, "GB") if number >= 1e9 else (1e6, "MB")
+    tenths = number / unit * 10
+    return f"{(math.ceil(tenths) if up else round(tenths)) / 10:.1f} {name}"

@@ -22,11 +22,16 @@ from typing import Any, Final, Literal
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-# Smallest width of a drawing. On a narrower screen it is scrolled sideways, because its text would become too small.
+# A drawing is not made narrower than the smaller of these two, but scrolled, because its text would become too small.
 _MIN_SVG_WIDTH: Final = "36rem"
+_MIN_SVG_SCALE: Final = 0.75
 
-# Command options and intervals such as "1 – 2". Browsers would break lines after their hyphens and dashes.
-_UNBREAKABLE = re.compile(r"(?<![\w-])--[a-z][\w-]*|[-−]?\d[\d.]* – [-−]?\d[\d.]*")
+# Command options, intervals such as "1 – 2", and "p = 1e-05". Browsers would break lines in them.
+_NUMBER = r"[-−+]?\d[\d.]*(?:e[-+]\d+)?"
+_UNBREAKABLE = re.compile(
+    rf"(?<![\w-])--[a-z][\w-]*|{_NUMBER} (?:–|…|±|to) {_NUMBER}(?: %| px)?|\bp [=<≤] {_NUMBER}|\beffect {_NUMBER}"
+    r"|\d[\d.]*e[-+]\d+"
+)
 
 
 @dataclass(frozen=True)
@@ -114,12 +119,15 @@ def table(
     return _piece("table", title, heads, rows, numeric, notes)
 
 
-def figure(picture: bytes, caption: str, alt: str | None = None, wide: bool = False) -> Markup:
+def figure(
+    picture: bytes | Sequence[bytes], caption: str, alt: str | None = None, is_photograph: bool = False
+) -> Markup:
     """Return a figure from the bytes of an SVG, PNG or JPEG file; an SVG uses the colours of the page.
 
-    `wide`: whether a phone scrolls the figure sideways instead of scaling it, for figures with several panels in a row.
+    Several pictures are placed next to each other, on a phone below each other. A phone scrolls a drawing that would
+    become too small to read; a photograph is always shown as a whole.
     """
-    return _piece("figure", picture, caption, alt, None, wide)
+    return _piece("figure", [picture] if isinstance(picture, bytes) else picture, caption, alt, None, is_photograph)
 
 
 def row(parts: Sequence[Markup]) -> Markup:
@@ -167,7 +175,7 @@ def _unbroken(text: str) -> Markup:
     return Markup(_UNBREAKABLE.sub(r"<span class='unbroken'>\g<0></span>", str(escape(text))))
 
 
-def _element(picture: bytes, alt: str) -> Markup:
+def _element(picture: bytes, alt: str, is_photograph: bool = False) -> Markup:
     """Return the HTML element of a picture: SVG is inserted, PNG and JPEG become data URLs."""
     for start, kind in ((b"\x89PNG", "png"), (b"\xff\xd8", "jpeg")):
         if picture.startswith(start):
@@ -178,5 +186,9 @@ def _element(picture: bytes, alt: str) -> Markup:
         raise ValueError(f"image data start with {picture[:8]!r}, expected PNG, JPEG or SVG")
     # A drawing is never enlarged, so that the text of all drawings on a page has the same size.
     width = re.search(r'<svg\b[^>]* width="([\d.]+)pt"', svg[0])
-    style = f" style='min-width: min({_MIN_SVG_WIDTH}, {width[1]}pt)'" if width else ""
-    return Markup(svg[0].replace("<svg", f"<svg role='img' aria-label='{escape(alt)}'{style}", 1))
+    narrowest = f"min({_MIN_SVG_WIDTH}, {_MIN_SVG_SCALE * float(width[1]):g}pt)" if width else ""
+    style = f" style='min-width: {narrowest}'" if narrowest and not is_photograph else ""
+    # Drawings of equal size have equal identifiers. A reference to a drawing in a closed fold would not work.
+    key = hashlib.sha256(picture).hexdigest()[:8]
+    drawing = re.sub(r'(\bid="|="#|url\(#)', rf"\g<1>{key}-", svg[0])
+    return Markup(drawing.replace("<svg", f"<svg role='img' aria-label='{escape(alt)}'{style}", 1))

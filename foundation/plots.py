@@ -1,4 +1,4 @@
-"""Draw Matplotlib figures as SVG in the colours of the page, or as PNG on white. Equal data give equal bytes.
+"""Draw Matplotlib figures as SVG in the colours of the page. Equal data give equal bytes.
 
 Matplotlib is imported when a figure is drawn. Only its object interface is used, so there are no windows and no global
 state.
@@ -7,12 +7,11 @@ state.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import resources
 from io import BytesIO
-from typing import Any, Final
+from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -29,18 +28,17 @@ CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
 # Black is replaced by grey, which is also visible on a dark page. Yellow is omitted, because a light page hides it.
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f8790")
 
+PANEL = (4.4, 3.4)  # Size of a panel, inches, for `draw_panels`
+
 DASHES = ("-", "--", ":", "-.")  # Line styles; the style changes after every seven series
 
 # Variables of `templates/colours.css` that replace the colours of an SVG.
 _CSS_VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
 
-_PNG_DPI = 110  # A picture of 10 inches fills the page width of 1100 pixels
-
-# Compression level 4 makes PNG files as small as Matplotlib's level 6, in a third of the time.
-_PNG_SETTINGS: Final = (cv2.IMWRITE_PNG_COMPRESSION, 4)
-
 # Resolution of the images in an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
 _RASTER_DPI = 180
+
+_MAX_RASTER_PX = 1300  # Largest width of such an image, so that a page with photographs stays below a few megabytes
 
 _STYLE = {
     "font.size": 9,
@@ -56,9 +54,6 @@ _STYLE = {
     "axes.titlesize": 10,
     # Names of methods, images and data sets may contain "$", which must not start a formula.
     "text.parse_math": False,
-}
-
-_SVG_STYLE = _STYLE | {
     "axes.facecolor": "none",
     "figure.facecolor": "none",
     "axes.titlelocation": "left",
@@ -94,43 +89,44 @@ def legend_label(name: str) -> str:
     return f" {name}" if name.startswith("_") else name
 
 
-def draw_png(draw: Callable[..., None], *arguments: Any) -> bytes:
-    """Return the PNG of a figure; `draw(figure, *arguments)` sets its size and draws it."""
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    # `Any`, because Matplotlib's type hints do not describe keyword arguments.
-    library: Any = matplotlib
-    with library.rc_context(_STYLE):
-        figure: Any = Figure(layout="constrained", dpi=_PNG_DPI)
-        canvas: Any = FigureCanvasAgg(figure)
-        draw(figure, *arguments)
-        _write_plain_numbers(figure)
-        # Figure.savefig is slower, because it draws everything a second time for the layout.
-        canvas.draw()
-        pixels = np.asarray(canvas.buffer_rgba())
-    return cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGR), _PNG_SETTINGS)[1].tobytes()
-
-
 def draw_svg(draw: Callable[..., None], *arguments: Any, inches: tuple[float, float] = (7.2, 4.0)) -> bytes:
     """Return the SVG of a figure that `draw(figure, *arguments)` draws, for use in a page (`foundation.pages.figure`).
 
     The colours `INK`, `FAINT`, `GRID` and `PAPER` become CSS variables, which the page defines. Text is not converted
     to outlines.
     """
+    return _draw_figures(lambda figures: draw(figures[0], *arguments), [inches])[0]
+
+
+def draw_panels(draw: Callable[..., None], *arguments: Any, inches: Sequence[tuple[float, float]]) -> tuple[bytes, ...]:
+    """Return an SVG for each panel that `draw(panels, *arguments)` draws; a phone shows them below each other.
+
+    `panels` are axes, each on its own figure of the size in `inches`. `PANEL` fits two times into a page, and once into
+    the width of a phone.
+    """
+    return _draw_figures(lambda figures: draw([figure.add_subplot() for figure in figures], *arguments), inches)
+
+
+def _draw_figures(draw: Callable[[list[Any]], None], inches: Sequence[tuple[float, float]]) -> tuple[bytes, ...]:
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
+    # `Any`, because Matplotlib's type hints do not describe keyword arguments.
     library: Any = matplotlib
-    with library.rc_context(_SVG_STYLE):
-        figure: Any = Figure(figsize=inches, layout="constrained")
-        FigureCanvasSVG(figure)
-        draw(figure, *arguments)
-        _write_plain_numbers(figure)
-        stream = BytesIO()
-        figure.savefig(stream, format="svg", dpi=_RASTER_DPI, metadata={"Date": None})
+    with library.rc_context(_STYLE):
+        figures: list[Any] = [Figure(figsize=size, layout="constrained") for size in inches]
+        for figure in figures:
+            FigureCanvasSVG(figure)
+        draw(figures)
+        return tuple(map(_to_svg, figures))
+
+
+def _to_svg(figure: Any) -> bytes:
+    _write_plain_numbers(figure)
+    stream = BytesIO()
+    dpi = min(_RASTER_DPI, _MAX_RASTER_PX / figure.get_figwidth())
+    figure.savefig(stream, format="svg", dpi=dpi, metadata={"Date": None})
     text = stream.getvalue().decode()
     for colour, name in _CSS_VARIABLES.items():
         text = re.sub(re.escape(colour), f"var(--{name})", text, flags=re.IGNORECASE)
@@ -167,8 +163,9 @@ def draw_squares(
     width, height = page_mm
     # Matplotlib expects the area of a marker in square points; an inch has 72 points.
     points = max(72 * inches / width * side_mm, 1.2)
+    axes.grid(visible=False)
     axes.set(xlabel="mm", xlim=(0, width), ylim=(height, 0), aspect="equal")
-    return axes.scatter(*positions_mm.T, c=values, s=points**2, marker="s", linewidths=0, **colours)
+    return axes.scatter(*positions_mm.T, c=values, s=points**2, marker="s", linewidths=0, rasterized=True, **colours)
 
 
 def _write_plain_numbers(figure: Any) -> None:

@@ -5,7 +5,9 @@ It parses options, calls the library and prints. Slow libraries are imported onl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -26,6 +28,8 @@ from foundation.console import (
     with_option_groups,
 )
 from foundation.errors import InputError, QualityError, StorageError, counted
+from foundation.folders import bytes_text, free_bytes_at
+from foundation.remote import is_remote
 from foundation.secret_texts import masked, printable
 from generator.options import (
     ImageOptions,
@@ -43,6 +47,7 @@ if TYPE_CHECKING:
     from generator.dataset.making import Workers
     from generator.dataset.plan import Plan
     from generator.dataset.reader import Dataset
+    from generator.dataset.records import RenderingSummary
     from generator.rendering.matrices import ColourMatrix
 
 
@@ -95,6 +100,8 @@ def generate(
     work: WorkOptions,
 ) -> None:
     """Make a data set or one share of it, or verify an existing data set."""
+    if work.verify is not None and work.dry_run:
+        raise InputError("--verify and --dry-run exclude each other; omit one")
     if work.verify is not None and paths.lut is not None:
         raise InputError(f"--verify takes no LUT, but {paths.lut} is given; omit it")
     sheet = images.contact_sheet
@@ -120,6 +127,8 @@ def generate(
         if existing is not None:
             _print_summary(existing, paths.out, output, is_existing=True)
             _draw_sheet(existing, paths.out, sheet)
+        elif work.dry_run:
+            _print_forecast(plan, paths.out, work.shard, workers, output)
         elif work.shard is not None:
             _make_share(plan, paths.out, work.shard, workers, output)
         else:
@@ -207,6 +216,49 @@ def _plan(
     return plan
 
 
+def _print_forecast(plan: Plan, out: str, shard: str | None, workers: Workers, output: JsonOutput) -> None:
+    from generator.dataset.forecast import forecast
+    from generator.dataset.making import parse_share
+    from generator.stores import local_path
+
+    index, count = (0, 1) if shard is None else parse_share(shard)
+    free_bytes = None if is_remote(out) else free_bytes_at(local_path(out))
+    made = forecast(plan, sum(map(plan.images_of, range(index, plan.shards, count))), workers.count)
+    pictures = len(plan.sources)
+    output.add(
+        dataset=masked(out),
+        images=made.images,
+        pictures=pictures,
+        needed_bytes=made.needed_bytes,
+        free_bytes=free_bytes,
+        time_s=round(made.time_s, 3),
+        workers=workers.count,
+        outside_gamut=made.rendering.outside,
+        colour_error_deg=made.rendering.distance,
+        sampled=made.sampled,
+        skipped=[printable(reason) for reason in made.skipped],
+    )
+    free_text = "" if free_bytes is None else f", {bytes_text(free_bytes)} free"
+    print(f"{masked(out)}: {counted(made.images, 'image')} of {counted(pictures, 'picture')}")
+    print(f"{bytes_text(made.needed_bytes, up=True)} needed{free_text}")
+    if free_bytes is not None and made.needed_bytes > free_bytes:
+        print("the disk is too small; free space, or choose another location")
+    place = ", without the transfer to the store" if free_bytes is None else ""
+    print(f"about {timedelta(seconds=math.ceil(made.time_s))} with {counted(workers.count, 'thread')} here{place}")
+    _print_gamut(made.rendering)
+    for reason in made.skipped:
+        print(printable(f"will be skipped: {reason}"))
+    print(f"estimated from {made.sampled} of {counted(pictures, 'picture')}; nothing was written")
+
+
+def _print_gamut(rendering: RenderingSummary | None) -> None:
+    if rendering is not None and rendering.outside:
+        print(
+            f"{100 * rendering.outside:.2g} % of the pixels have colours that the print cannot show; the "
+            f"mean colour error is {rendering.distance or 0:.2g} degrees. The ground truth is not affected"
+        )
+
+
 def _make_whole(plan: Plan, out: str, workers: Workers, output: JsonOutput) -> Dataset:
     from generator.dataset.making import make_dataset
 
@@ -276,17 +328,12 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, is_existing: 
             f"{record.replaced_pixels} source pixels ({share:.2g} %) have colours that the LUT lists as unfit; "
             "they were replaced by the nearest usable colour"
         )
-    if record.rendering is not None and record.rendering.outside:
-        print(
-            f"{100 * record.rendering.outside:.2g} % of the pixels have colours that the print cannot show; the "
-            f"mean colour error is {record.rendering.distance or 0:.2g} degrees. The ground truth is not affected"
-        )
+    _print_gamut(record.rendering)
 
 
 def _verify(out: str, workers: int | None, output: JsonOutput) -> Dataset:
     from generator.dataset.making import Workers
     from generator.dataset.reader import file_faults, open_dataset
-    from generator.stores import is_remote
 
     default_count = max(processor_count(), _STORE_READERS if is_remote(out) else 1)
     reader_count = Workers(count=default_count if workers is None else workers).count
@@ -309,7 +356,7 @@ def _verify(out: str, workers: int | None, output: JsonOutput) -> Dataset:
 
 def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None, is_rerun: bool) -> None:
     from generator.dataset.making import holds_dataset
-    from generator.stores import is_remote, local_path
+    from generator.stores import local_path
 
     if shard is not None:
         raise InputError(

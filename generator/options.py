@@ -418,6 +418,15 @@ class WorkOptions:
             "Make only share I of N, with I from 0 to N - 1. After all shares, run the command without this option.",
         ),
     ] = None
+    dry_run: Annotated[
+        bool,
+        _work_option(
+            None,
+            "Print the number of images, the disk space, the time and the share of pixels outside of the gamut of the "
+            "print, from a sample of the images; write only to the cache.",
+            "--dry-run",
+        ),
+    ] = False
     verify: Annotated[
         str | None,
         _work_option(

@@ -10,17 +10,20 @@ A location is a path or a URL as the user writes it. A name is a path below it, 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
+import re
 import secrets
 import shutil
 import tempfile
+import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, cast
 
 from foundation.errors import CropError, FormatError, InputError, StorageError
 from foundation.files import (
@@ -32,6 +35,7 @@ from foundation.files import (
     storage_error,
     sync_folder,
 )
+from foundation.remote import filesystem, is_remote, remote_error
 from foundation.secret_texts import masked
 
 if TYPE_CHECKING:
@@ -41,10 +45,7 @@ if TYPE_CHECKING:
 DESCRIPTION: Final = "dataset.json"  # Marks a complete data set, so it is written last
 
 
-def is_remote(location: str) -> bool:
-    """Return whether `location` is the URL of a store; file:// is a path of this machine."""
-    scheme, separator, _ = location.partition("://")
-    return bool(separator) and scheme not in ("file", "local")
+_URL_AS_PATH: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
 def local_path(location: str | Path) -> Path:
@@ -52,27 +53,14 @@ def local_path(location: str | Path) -> Path:
     text = str(location)
     for scheme in ("file://", "local://"):
         text = text.removeprefix(scheme)
+    if isinstance(location, Path) and _URL_AS_PATH.match(text):
+        raise InputError(f"{text} is a Path, which removes a slash of a URL; give the URL as text (str)")
     path = Path(text)
     if text and path.name in ("", ".."):
         path = path.resolve()
     if not path.name:
         raise InputError(f"{str(location)!r} is not a folder name, expected a name such as images; give one")
     return path
-
-
-def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
-    """Return the fsspec file system of a URL, and the path in it."""
-    from fsspec.core import url_to_fs
-
-    try:
-        return url_to_fs(url)
-    except Exception as error:
-        # A store may connect here and raise its own errors; errors of ftplib are not OSError.
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(
-            f"cannot open the store {url}: {reason}; use a store that fsspec supports, and install its library (s3://: "
-            "s3fs, gs://: gcsfs, az://: adlfs)"
-        ) from error
 
 
 Pieces = Iterable[bytes | memoryview]  # The bytes of a file in order; each piece is valid until the next one
@@ -158,8 +146,9 @@ class LocalStore:
             return stream.read()
 
     @contextmanager
-    def open(self, name: str) -> Generator[BinaryIO]:
-        """Open a file for sequential reading; raises FormatError."""
+    def open(self, name: str, scattered: bool = False) -> Generator[BinaryIO]:
+        """Open a file for reading; raises FormatError. `scattered`: only some parts are read."""
+        del scattered
         try:
             # Lists of a foreign data set may contain any name, so names outside the folder are refused.
             with open_inside(self.root, name) as stream:
@@ -214,6 +203,79 @@ def _sync_file(path: Path) -> None:
         raise storage_error(path, error) from error
 
 
+# Parts of remote objects in memory: 256 MB. By default s3fs reads 50 MB ahead, so that each image of a tar file would
+# cost the whole file.
+_BLOCK: Final = 1 << 18
+_MOST_BLOCKS: Final = 1 << 10
+_KEPT_READ: Final = 1 << 23  # larger reads are not kept; a group of a Parquet file is smaller
+_blocks: Final[dict[tuple[str, int], bytes]] = {}
+_blocks_lock: Final = threading.Lock()
+
+
+@lru_cache(maxsize=1)
+def _shared_blocks() -> str:
+    """Register a cache of fsspec that all open objects share, and return its name."""
+    from fsspec.caching import BaseCache, register_cache
+
+    class SharedBlocks(BaseCache):
+        name = "crop-blocks"
+
+        def __init__(self, blocksize: int, fetcher: Callable[[int, int], bytes], size: int, key: str) -> None:
+            super().__init__(blocksize, fetcher, size)
+            self._key = key
+
+        def _fetch(self, start: int | None, stop: int | None) -> bytes:
+            first, last = start or 0, self.size if stop is None else min(stop, self.size)
+            if last - first > _KEPT_READ:
+                return self.fetcher(first, last)
+            keys = [(self._key, number) for number in range(first // _BLOCK, -(-last // _BLOCK))]
+            with _blocks_lock:
+                found = {key: _blocks.pop(key) for key in keys if key in _blocks}
+            missing = [key for key in keys if key not in found]
+            if missing:
+                begin, end = missing[0][1] * _BLOCK, (missing[-1][1] + 1) * _BLOCK
+                data = self.fetcher(begin, min(end, self.size))
+                for number in range(missing[0][1], missing[-1][1] + 1):
+                    found[self._key, number] = data[number * _BLOCK - begin :][:_BLOCK]
+            with _blocks_lock:
+                _blocks.update(found)
+                while len(_blocks) > _MOST_BLOCKS:
+                    del _blocks[next(iter(_blocks))]
+            return b"".join(found[key] for key in keys)[first % _BLOCK :][: max(0, last - first)]
+
+    register_cache(SharedBlocks, clobber=True)
+    return SharedBlocks.name
+
+
+class _RemoteFile(io.RawIOBase):
+    """An open object for `io.BufferedReader`, because streams of fsspec take no size in `readline`."""
+
+    def __init__(self, stream: Any, translated_errors: Callable[[], AbstractContextManager[None]]) -> None:
+        self._stream, self._translated_errors = stream, translated_errors
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        with self._translated_errors():
+            data = self._stream.read(len(buffer))
+        buffer[: len(data)] = data
+        return len(data)
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        return int(self._stream.seek(offset, whence))
+
+    def tell(self) -> int:
+        return int(self._stream.tell())
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
 @dataclass(frozen=True)
 class RemoteStore:
     """A location in an object store."""
@@ -260,26 +322,32 @@ class RemoteStore:
     def get(self, name: str) -> bytes:
         """Return the bytes of an object; raises FormatError."""
         _require_inside(self.location, name)
-        with self._translated_errors(name, reading=True):
+        with self._translated_errors(name, "read"):
             return self._files.cat_file(self._path(name))
 
     @contextmanager
-    def open(self, name: str) -> Generator[BinaryIO]:
-        """Open an object for reading; raises FormatError."""
+    def open(self, name: str, scattered: bool = False) -> Generator[BinaryIO]:
+        """Open an object for reading; raises FormatError. `scattered`: only some parts are read, perhaps repeatedly."""
         _require_inside(self.location, name)
-        with self._translated_errors(name, reading=True):
-            stream = self._files.open(self._path(name), "rb")
-        with stream:
-            yield stream
+        with self._translated_errors(name, "read"):
+            files, path = self._files, self._path(name)
+            options: dict[str, Any] = {}
+            if scattered:
+                # The answer of the store names the version, so that parts of a replaced object are not used.
+                key = f"{self.url} {name} {files.info(path)}"
+                options = {"block_size": _BLOCK, "cache_type": _shared_blocks(), "cache_options": {"key": key}}
+            stream = files.open(path, "rb", **options)
+        with io.BufferedReader(_RemoteFile(stream, lambda: self._translated_errors(name, "read")), _BUFFER) as file:
+            yield file
 
     def has(self, name: str) -> bool:
         """Return whether the object exists."""
-        with self._translated_errors(name, reading=True):
+        with self._translated_errors(name, "read"):
             return self._files.exists(self._path(name))
 
     def names(self, folder: str = "") -> Iterator[str]:
         """Return the names of all objects below `folder`."""
-        with self._translated_errors(folder, reading=True):
+        with self._translated_errors(folder, "read"):
             paths = self._files.find(self._path(folder))
         return (path[len(self._root) :].lstrip("/") for path in paths)
 
@@ -304,21 +372,13 @@ class RemoteStore:
         return f"{self._root}/{name}" if name else self._root
 
     @contextmanager
-    def _translated_errors(self, name: str, reading: bool = False) -> Generator[None]:
+    def _translated_errors(self, name: str, action: str = "write") -> Generator[None]:
         try:
             yield
         except (CropError, MemoryError):
             raise
         except Exception as error:
-            reason = masked(" ".join(f"{type(error).__name__}: {error}".split()))
-            if reading:
-                raise FormatError(
-                    f"cannot read {self.location}/{name}: {reason}; check the address and your permission to read"
-                ) from error
-            raise StorageError(
-                f"cannot write {self.location}/{name}: {reason}; check the address and your permission to write, then "
-                "run the same command again"
-            ) from error
+            raise remote_error(error, action, f"{self.location}/{name}".rstrip("/")) from error
 
 
 def _require_inside(location: str, name: str) -> None:

@@ -41,7 +41,7 @@ from acquisition.check.trial import (
 )
 from acquisition.judge.measure import Anchor, disagreement, refusal
 from acquisition.run.devices import Devices, RetryPolicy, ask_all, make_ready, period_s, reported_error
-from acquisition.run.plan import bytes_text, free_bytes_at, planned_steps, projector_state, settings_doubts
+from acquisition.run.plan import planned_steps, projector_state, settings_doubts
 from acquisition.run.rig.opening import open_rig
 from calibration.figures.light import LEAK_SHARE
 from calibration.figures.single_frames import EVENNESS, KEYSTONE, TURN
@@ -63,6 +63,7 @@ from experiment.measures.pose import keystone, off_level_deg
 from experiment.session.folder import Session
 from foundation.errors import RegistrationError, StorageError, counted
 from foundation.files import write_atomic
+from foundation.folders import bytes_text, free_bytes_at
 
 # If white is in this range of saturation, trial frames have the shutter time of the settings. Otherwise they have the
 # best tried shutter time.

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from acquisition.check.findings import Finding, judge_value, not_checked
-from acquisition.run.plan import bytes_text, free_bytes_at, needed_bytes
+from acquisition.run.plan import needed_bytes
 from calibration.figures.figure import format_value
 from calibration.figures.single_frames import BATTERY, CARD, DISK, NOISE_REDUCTION
 from drivers.camera import Camera, ReportsSupplies, Supplies
 from foundation.errors import DeviceError, StorageError
+from foundation.folders import bytes_text, free_bytes_at
 
 CHARGE = 440  # Number of frames for one battery charge; source: see `BATTERY`.
 

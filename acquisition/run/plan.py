@@ -7,9 +7,7 @@ run does not start if its plan has a fault, that is a problem that would end it.
 
 from __future__ import annotations
 
-import errno
 import math
-import os
 import shlex
 import shutil
 import statistics
@@ -49,7 +47,8 @@ from foundation.errors import (
     StorageError,
     counted,
 )
-from foundation.files import file_sha256, storage_error
+from foundation.files import file_sha256
+from foundation.folders import bytes_text, free_bytes_at
 from foundation.secret_texts import is_address, is_webhook, target_label
 
 # Settings that must not change during a session, because they change its frames.
@@ -251,34 +250,6 @@ def needed_bytes(frames: int, frame_bytes: float) -> int:
     if not frames:
         return 0
     return math.ceil(frames * (1 + RETAKEN_SHARE) * (frame_bytes + EXTRA_BYTES)) + SPARE_BYTES
-
-
-def free_bytes_at(folder: Path) -> int:
-    """Return the free space on the disk of `folder`, which need not exist, bytes."""
-    existing = folder.absolute()
-    try:
-        while not existing.is_dir() and existing != existing.parent:
-            existing = existing.parent
-        if os.statvfs(existing).f_flag & os.ST_RDONLY:
-            raise storage_error(folder, OSError(errno.EROFS, os.strerror(errno.EROFS)))
-        if not os.access(existing, os.W_OK | os.X_OK):
-            raise storage_error(folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
-        return shutil.disk_usage(existing).free
-    except OSError as error:
-        raise storage_error(folder, error, "read") from error
-
-
-def bytes_text(number: float, up: bool = False) -> str:
-    """Return bytes as GB or MB with one decimal; `up`: whether to round up.
-
-    Examples
-    --------
-    >>> bytes_text(25_340_000), bytes_text(1.01e9), bytes_text(1.01e9, up=True)
-    ('25.3 MB', '1.0 GB', '1.1 GB')
-    """
-    unit, name = (1e9, "GB") if number >= 1e9 else (1e6, "MB")
-    tenths = number / unit * 10
-    return f"{(math.ceil(tenths) if up else round(tenths)) / 10:.1f} {name}"
 
 
 _T = TypeVar("_T")

@@ -1,8 +1,8 @@
 """Gather the evidence for the cause of a figure beyond its limit.
 
 Each public function with a name `…_evidence` takes the measurements of a LUT and the accepted limit. It returns a
-`CauseEvidence`, or None if there is no evidence. The functions for positions on the print are first, followed by those
-for whole frames and for illuminants.
+`CauseEvidence`, or None if there is no evidence. The functions for positions on the print are first, then the functions
+for whole frames, then the functions for illuminants.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ IN_FIRST = 0.8
 
 # Another frame shows the same spot if it deviates by at least this fraction of the deviation of the spot. If at most
 # this fraction of the white frames shows the spot, these frames are faulty, and not the print.
-_HALF = 0.5
+_SAME_SPOT = 0.5
 
-# Relative residual of references from which an object is reported: ten times their noise under white.
+# Smallest relative residual of references for which an object is reported: ten times their noise under white.
 _MIN_RESIDUAL = 0.02
 
 # Mean relative residual of the outermost references below which a frame's corners are darker than its flat field.
@@ -42,18 +42,18 @@ DARK_RIM = -0.005
 # Smallest number of adjacent patches that proves added light, if all are brighter.
 _MIN_BRIGHT = 4
 
-# A thin shadow darkens at least this fraction of the patches on which it falls (judgement).
-_MOSTLY = 0.8
+# A thin shadow darkens at least this fraction of the patches on which it falls. Chosen by judgement.
+_MIN_DARK_FRACTION = 0.8
 
-# If fewer patches are darker, one of them must deviate by this fraction. A hand and a printed colour rarely differ less
-# (judgement).
-_COVERED = 0.1
+# Smallest deviation that proves an object if fewer patches than `_MIN_DARK_FRACTION` are darker. A hand and a printed
+# colour rarely differ less. Chosen by judgement.
+_MIN_COVERED_DEVIATION = 0.1
 
 # If at least this fraction of the noisy patches is in spots of the print, the spots explain the noise.
-_IN_SPOT = 0.5
+_MIN_SPOT_FRACTION = 0.5
 
-# An object that changes a block by more than this fraction also changes the mean of the references (judgement).
-_DISTURBED = 0.03
+# Smallest deviation of a block from which an object also changes the mean of the references. Chosen by judgement.
+_MIN_DISTURBED_BLOCK = 0.03
 
 # Exposures are equal if the logarithm of their ratio is smaller. Shutter times have steps of 26 %, and files contain
 # rounded times.
@@ -67,7 +67,7 @@ _Frames = list[FrameMeasurements]
 class PrintPosition:
     """A position on the print."""
 
-    file: str  # Frame that shows it best
+    file: str  # File of the frame that shows the position best
     x_mm: float  # Centre, from the sheet's top-left corner
     y_mm: float
     size_mm: float  # Diameter; 0 for a single patch
@@ -110,7 +110,7 @@ def _gather_block(table: TableMeasurements, worst: FrameMeasurements, limit: flo
     x, y = consistency.at_mm
     if in_first and (object_positions := _residual_evidence(table, table.registered_frame)[1]):
         # The patches under the object were not compared, because they did not match the chart. The white references
-        # show its position.
+        # show the position of the object.
         x, y = object_positions[0].x_mm, object_positions[0].y_mm
     position = PrintPosition(frames[0].record.file, x, y, size_mm)
     return CauseEvidence(evidence, tuple(frame.record for frame in frames), (position,))
@@ -126,8 +126,11 @@ def covered_deviation(deviations: npt.NDArray[np.float64]) -> float:
     if not len(darker):
         # A few brighter patches may be dark patches that a hand covers.
         return float(np.median(known_deviations)) if len(known_deviations) >= _MIN_BRIGHT else np.nan
-    # Blur also mixes neighbouring patches. It changes them slightly, and makes as many brighter as darker.
-    is_mixed = len(darker) < _MOSTLY * len(known_deviations) and np.abs(known_deviations).max() < _COVERED
+    # Blur also mixes neighbouring patches. It changes patches slightly, and makes as many brighter as darker.
+    is_mixed = (
+        len(darker) < _MIN_DARK_FRACTION * len(known_deviations)
+        and np.abs(known_deviations).max() < _MIN_COVERED_DEVIATION
+    )
     return np.nan if is_mixed else float(darker.min())
 
 
@@ -212,7 +215,7 @@ def noisy_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | No
     """Gather evidence on patches that are noisier than expected for their level."""
     noisy_cells, stains = np.flatnonzero(table.sensor.transfer.noisy), table.cells.stains
     is_in_spot = stains.stained | stains.doubtful
-    if len(noisy_cells) and stains.is_known and float(is_in_spot[noisy_cells].mean()) >= _IN_SPOT:
+    if len(noisy_cells) and stains.is_known and float(is_in_spot[noisy_cells].mean()) >= _MIN_SPOT_FRACTION:
         return spot_evidence(table, limit)
     gathered = chart_evidence(table, limit)
     hottest = table.dark_frames.hottest
@@ -243,7 +246,7 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
     colour = spot_colour(stains, spot)
     deviation, tint = _largest_deviation(colour)
     added, kept = light_of_spot(stains, spot, int(np.argmax(np.abs(colour))))
-    size_mm, min_deviation = max(position.size_mm, 1e-9), _HALF * abs(deviation)
+    size_mm, min_deviation = max(position.size_mm, 1e-9), _SAME_SPOT * abs(deviation)
     hottest = table.dark_frames.hottest
     deviating_whites = _faulty_whites(table, at_mm, position.size_mm, min_deviation)
     white_residual = len(deviating_whites) / max(len(table.white_frames), 1)
@@ -265,7 +268,7 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
     frames: list[FrameMeasurements] = []
     if evidence.in_first == 1:
         frames = [table.registered_frame]
-    elif 0 < white_residual <= _HALF:
+    elif 0 < white_residual <= _SAME_SPOT:
         frames = deviating_whites
     elif evidence.even_showing > 0:
         frames = _faulty_frames(table, at_mm, size_mm, min_deviation)
@@ -292,7 +295,7 @@ def _dark_rim_fraction(table: TableMeasurements) -> float:
 def _residual_evidence(
     table: TableMeasurements, frame: FrameMeasurements
 ) -> tuple[dict[str, float], tuple[PrintPosition, ...]]:
-    """Return evidence on the largest residual of the references in a white frame, and its position.
+    """Return evidence on the largest residual of the references in a white frame, and its position on the print.
 
     Both are empty if the residual is small or if there is no other white frame.
     """
@@ -306,7 +309,7 @@ def _residual_evidence(
         other = frame.paper.left
         distance_mm = float(np.linalg.norm(np.array(other.at_mm) - at_mm))
         largest, _ = _largest_deviation(np.array(other.deviation))
-        return abs(largest) >= _HALF * abs(deviation) and distance_mm < near_mm
+        return abs(largest) >= _SAME_SPOT * abs(deviation) and distance_mm < near_mm
 
     evidence = {
         "white_residual": float(np.mean([deviates_too(white) for white in whites])),
@@ -333,7 +336,7 @@ def reference_evidence(table: TableMeasurements, limit: float) -> CauseEvidence 
         "radial": residuals.radial,
         "rim_frames": _dark_rim_fraction(table),
     }
-    if 0 < evidence.get("white_residual", 0.0) <= _HALF:
+    if 0 < evidence.get("white_residual", 0.0) <= _SAME_SPOT:
         return CauseEvidence(Evidence(**evidence), (worst.record,), positions)
     distance_mm = np.linalg.norm(stains.places_mm - residuals.at_mm, axis=1)
     near_spots = [spot for spot in spots_of(stains) if distance_mm[spot].min() < 4 * cell_mm(stains)]
@@ -468,9 +471,9 @@ def drift_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on differences between white frames: other exposures, or an object on the print in one frame."""
     light = light_evidence(table, limit)
     worst = max(table.white_frames, key=lambda frame: frame.consistency.block, default=None)
-    if worst is None or light.frames or not worst.consistency.block > _DISTURBED:
+    if worst is None or light.frames or not worst.consistency.block > _MIN_DISTURBED_BLOCK:
         return light
-    block = _gather_block(table, worst, _DISTURBED)
+    block = _gather_block(table, worst, _MIN_DISTURBED_BLOCK)
     evidence = block.evidence.measured_values() | light.evidence.measured_values() | {"frames": block.evidence.frames}
     return CauseEvidence(Evidence(**evidence), block.frames, block.positions)
 
@@ -497,13 +500,13 @@ def sum_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     return CauseEvidence(evidence, frames, ())
 
 
-# The amounts of the primaries in white differ significantly if they differ by this factor times the colour range of
-# white frames. One primary is faulty if its difference from the next one is this factor times the difference of the
-# other two (judgement).
+# The amounts of the primaries in white differ significantly if their difference exceeds this factor times the range of
+# the colour of white frames. One primary is faulty if its difference from the next one is this factor times the
+# difference of the other two. Chosen by judgement.
 _LONE_RATIO = 3.0
 
 # If the frame of one primary contains another illuminant, white has an excess of one primary and a similar deficit of
-# another. This is the smallest ratio of the two (judgement).
+# another. This is the smallest ratio of the smaller to the larger of them. Chosen by judgement.
 _MIN_SIMILARITY = 0.7
 
 

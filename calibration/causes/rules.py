@@ -1,6 +1,5 @@
 """Probable causes of a figure beyond its limit, the evidence for them, and the rules that select one of them.
 
-A figure is a measured property of a session or LUT with limits (`calibration.figures`).
 The first rule that applies decides. If no rule applies, the cause is reported as unknown.
 """
 
@@ -149,7 +148,7 @@ MIXED = Cause(
     "take the frame of this primary again, and let the projected image settle longer (sequence.settle_s)",
     "frames",
 )
-UNKNOWN = Cause("unknown", "", "", "nothing")  # No rule applies; the remedy of the limit is reported
+UNKNOWN = Cause("unknown", "", "", "nothing")  # No rule applies; the remedy of the figure is reported
 
 CAUSES = (
     HOT_PHOTOSITES, OBJECT_IN_FRAME, REFLECTION, REFLECTION_IN_FRAME, STAIN, SHADOW, CURL, FALL_OFF, SPREAD, BUMP,
@@ -170,7 +169,7 @@ class Evidence:
     - `even_showing`: fraction of the white frames among them that show the deviation; 0 without white frames.
     - `white_residual`: fraction of white frames with white references that have at least half of this deviation.
     - `some_whites`: 1 if white references deviate at the position in some white frames but not in all; else 0.
-    - `spot`: fraction of the patches at the position with a wrong colour in the mean of the white frames.
+    - `spot`: fraction of the patches at the position that have a wrong colour in the mean of the white frames.
     - `in_first`: 1 if at least 80 % of the frames differ at the position from the frame registered first; else 0.
     - `share`: fraction of the print that deviates.
     - `deviation`: relative deviation in the channel that deviates most; negative is darker.
@@ -179,7 +178,7 @@ class Evidence:
     - `kept`: fraction of their own light that the patches at the position still have.
     - `rim`: mean relative deviation of the outermost white references from the flat field; negative is darker.
     - `rim_frames`: fraction of white frames in which `rim` is below −0.5 %.
-    - `radial`: fraction of the variance of all references' deviations that the distance from the centre explains.
+    - `radial`: fraction of the variance of the references' deviations that depends on the distance from the centre.
     - `hot`: fraction of the affected patches with a photosite that is hot in every dark frame.
     - `scatter`: relative scatter of all patches of the frame about the colours expected from their codes.
     - `softer`: additional light of neighbouring patches in the worst sample, because of blur, as a fraction.
@@ -296,10 +295,10 @@ def _subjects(*names: Subject) -> frozenset[Subject]:
     return frozenset(names)
 
 
-# Groups of subjects: a position in single frames, whole frames, positions on the print, illuminants and the lamp.
-PLACE = _subjects("block", "few cells")
-WHOLE_FRAME = _subjects("frame", "movement", "noisy cells")
-PRINT = _subjects("spot", "unfit cells", "references")
+# Groups of subjects.
+PLACE = _subjects("block", "few cells")  # A position in single frames
+WHOLE_FRAME = _subjects("frame", "movement", "noisy cells")  # All patches of single frames
+PRINT = _subjects("spot", "unfit cells", "references")  # A position on the print, in all frames
 SHEET = PRINT | _subjects("noisy cells")
 DRIFT = _subjects("drift")
 LIGHT = _subjects("names", "brightness", "sum", "drift")
@@ -307,7 +306,7 @@ DARK = _subjects("dark")
 STRAY = _subjects("stray")
 CHART = _subjects("chart")
 
-# No white frame differs from the frame registered first at the position. All frames therefore deviate there equally.
+# At the position, no white frame differs from the frame registered first. All frames therefore deviate there equally.
 _IN_ALL_FRAMES = (
     Condition("in_first", 0, 0), Condition("even_showing", 0, 0), Condition("some_whites", 0, 0),
     Condition("frames", 2, _INFINITY),
@@ -321,9 +320,9 @@ _IN_FEW_FRAMES = (
     Condition("in_first", 0, 0), Condition("frames", 3, _INFINITY), Condition("showing", 1e-9, 0.34),
 )  # fmt: skip
 
-# Rules in the order of decision. Rules based on file data and dark frames precede rules based on appearance. A wrong
-# cause may lead to an unnecessary session, and an unknown cause does less harm. Therefore the intervals of different
-# causes leave gaps.
+# Rules in the order of decision. Rules based on file data and dark frames precede rules based on appearance. The
+# intervals of different causes leave gaps, because a wrong cause may lead to an unnecessary session, and an unknown
+# cause does less harm.
 RULES: tuple[Rule, ...] = (
     Rule(
         OTHER_CAMERA,
@@ -389,13 +388,13 @@ RULES: tuple[Rule, ...] = (
         ROOM_LIGHT,
         STRAY,
         (Condition("stray", 0.004, 0.1),),
-        "a primary with code 0 has more or less light in frames of illuminants than in the dark frames",
+        "illuminants contain light of a primary whose code is 0, after subtraction of the dark frames",
     ),
     Rule(
         ROOM_LIGHT,
         STRAY,
         (Condition("stray_primaries", 0.004, 0.1),),
-        "red, green and blue alone add up to more than white by the same fraction of each, and the lamp is steady; "
+        "the sum of red, green and blue alone exceeds white by the same fraction in each, and the lamp is steady; "
         "a projector that reduces full white has the same effect",
     ),
     Rule(

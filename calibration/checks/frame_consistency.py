@@ -7,7 +7,7 @@ the frame. The codes are in random order on the print, so errors of the polynomi
 Three values describe the faults:
 
 - `scatter` is the scatter of all patches. It is large if the frame is blurred, because neighbours mix, or if the
-  patches have another order. The scatter that noise can cause is subtracted.
+  patches have another order. Scatter that noise can cause is subtracted.
 - `block` is the mean of neighbouring patches. It is large if a hand, a shadow or a reflection covers an area. A patch
   that differs from all its neighbours, for example by a hot photosite, gets the nearest value of a neighbour.
 - `disturbed` lists adjacent patches with large deviations, in areas too small to change the mean of a block
@@ -27,7 +27,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from calibration import kernels
-from calibration.checks.small_places import AROUND, LEAST_MODEL_ERROR, CoveredPatchFinder, cells_without_hot
+from calibration.checks.small_places import LEAST_MODEL_ERROR, NEIGHBOUR_COUNT, CoveredPatchFinder, cells_without_hot
 from drivers.raw.rawfile import FrameOrigin
 from experiment.measures.least_squares import (
     code_polynomial,
@@ -48,7 +48,7 @@ DEGREE = 4  # Degree of the polynomial in the code: 35 terms
 LEAST_COUNTS = 60.0  # Patches with fewer expected counts are not compared: the mean of 25 samples has an error of 3 %
 
 # Largest number of patches for scatter and blocks: a quarter of a full chart, to save time in every frame.
-CELLS = 8192
+MAX_CELLS = 8192
 
 FIT_CELLS = 1500  # Approximate number of patches for fitting the polynomial: forty per term
 
@@ -57,13 +57,13 @@ BLOCK_CELLS = 32
 
 LEAST_CELLS = 12  # Minimum number of compared patches in a block
 
-CELLS_A_TERM = 2  # Minimum number of patches per term; with fewer, the polynomial would fit faults
+CELLS_PER_TERM = 2  # Minimum number of patches per term; with fewer, the polynomial would fit faults
 
 _ROUNDS = 3  # Number of reweighted solutions after the unweighted one
 
 # Number of standard uncertainties subtracted from the mean of a block and from the scatter. With the 256 blocks of a
 # full chart, noise alone exceeds them in one of sixty frames.
-_CERTAIN = 4.0
+_CERTAIN_SIGMAS = 4.0
 
 # Variance of the standard deviation of N normal values that is estimated from their median deviation, in units of σ²/N
 # (P. Rousseeuw and C. Croux, Journal of the American Statistical Association 88, 1993: an efficiency of 37 %).
@@ -74,26 +74,27 @@ _SAME_FAULT_RATIO = 0.3  # Deviation relative to the worst block above which a b
 # Percentile of the expected levels of patches that represents the brightest patch.
 _BRIGHT_PERCENTILE = 99.0
 
-_MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0  # Standard uncertainty of a predicted patch: relative to its level, and counts
+# Standard uncertainty of a predicted patch: a fraction of its level, plus a number of counts.
+_MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0
 
 
 @dataclass(frozen=True)
 class FrameConsistency:
     """Differences between a frame and the reference frame; 0 if no patch can be compared."""
 
-    # relative scatter about the polynomial, minus noise and 4 standard uncertainties, in the worst channel
+    # relative scatter about the polynomial, minus noise and four standard uncertainties, in the worst channel
     scatter: float = 0.0
-    block: float = 0.0  # relative deviation of the worst block, beyond 4 standard uncertainties
+    block: float = 0.0  # relative deviation of the worst block, minus four standard uncertainties
     at_mm: tuple[float, float] = (0.0, 0.0)  # centre of the worst block on the print
     colour: tuple[float, float, float] = (0.0, 0.0, 0.0)  # relative deviation of this block in R, G, B; 0 if dim
     share: float = 0.0  # share of the blocks with at least 0.3 times this deviation
     extent_mm: float = 0.0  # side of a square with the area of these blocks
     added: float = 0.0  # light added to these blocks, relative to the brightest patch
-    kept: float = 1.0  # fraction of their own light that remains
+    kept: float = 1.0  # fraction of their own light that these blocks still have
     # covered patches, and the relative deviation of each: worst channel, 0 if too dark
     disturbed: tuple[tuple[int, float], ...] = ()
-    seeds: tuple[int, ...] = ()  # disturbed patches with large deviations; the others touch them
-    alone: tuple[int, ...] = ()  # isolated patches with a large deviation
+    seeds: tuple[int, ...] = ()  # disturbed patches with large deviations; other disturbed patches are adjacent to them
+    isolated: tuple[int, ...] = ()  # isolated patches with a large deviation
 
     def without_hot(self, hot: _Mask, cells_mm: _Array) -> FrameConsistency:
         """Return the same result without patches that deviate because of hot photosites.
@@ -103,10 +104,11 @@ class FrameConsistency:
         cells = np.array([cell for cell, _ in self.disturbed], dtype=np.int64)
         if not hot[cells].any():
             return self
-        is_disturbed, alone = cells_without_hot(cells, np.array(self.seeds, dtype=np.int64), hot, cells_mm)
+        is_disturbed, single = cells_without_hot(cells, np.array(self.seeds, dtype=np.int64), hot, cells_mm)
         disturbed = tuple(patch for patch, valid in zip(self.disturbed, is_disturbed.tolist(), strict=True) if valid)
         seeds = tuple(cell for cell in self.seeds if is_disturbed[np.searchsorted(cells, cell)])
-        return replace(self, disturbed=disturbed, seeds=seeds, alone=tuple(sorted({*self.alone, *alone.tolist()})))
+        isolated = tuple(sorted({*self.isolated, *single.tolist()}))
+        return replace(self, disturbed=disturbed, seeds=seeds, isolated=isolated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +143,7 @@ class _Channel:
 
 def has_enough_cells(cells: int) -> bool:
     """Return whether a chart with this number of patches can be checked."""
-    return cells >= CELLS_A_TERM * len(code_powers(DEGREE))
+    return cells >= CELLS_PER_TERM * len(code_powers(DEGREE))
 
 
 class ConsistencyCheck:
@@ -161,7 +163,7 @@ class ConsistencyCheck:
 
     def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, level: _Array, variance: _Array, usable: _Mask) -> None:
         # Blocks are means over many patches, so every fourth patch of a full chart is sufficient.
-        self._selection = slice(None, None, max(1, len(cells_mm) // CELLS))
+        self._selection = slice(None, None, max(1, len(cells_mm) // MAX_CELLS))
         all_terms = code_polynomial(np.asarray(rgb), DEGREE)
         terms = np.ascontiguousarray(all_terms[self._selection])
         self._usable = usable[self._selection]
@@ -175,7 +177,7 @@ class ConsistencyCheck:
         self._members = _members(block, len(self._block_centres))
         # Each deviation is limited to the deviations of its eight neighbours, so that a single patch cannot change the
         # mean of a block. A covered area contains several patches, so it is not affected.
-        neighbours = cKDTree(compared_mm).query(compared_mm, k=min(AROUND + 1, len(compared_mm)))[1]
+        neighbours = cKDTree(compared_mm).query(compared_mm, k=min(NEIGHBOUR_COUNT + 1, len(compared_mm)))[1]
         self._around = np.ascontiguousarray(np.atleast_2d(neighbours), dtype=np.int64)
 
     def compare(self, mean: _Array, variance: _Array) -> FrameConsistency:
@@ -193,12 +195,12 @@ class ConsistencyCheck:
         valid = {channel: deviations for channel, deviations in results.items() if deviations is not None}
         if not valid:
             return FrameConsistency()
-        disturbed, seeds, alone = self._disturbed(valid, mean, variance)
+        disturbed, seeds, isolated = self._disturbed(valid, mean, variance)
         scatter = max(deviations.significant_scatter for deviations in valid.values())
         excess = np.max([deviations.excess for deviations in valid.values()], axis=0)
         worst = int(np.argmax(excess))
         if not excess[worst] > 0:
-            return FrameConsistency(scatter, disturbed=disturbed, seeds=seeds, alone=alone)
+            return FrameConsistency(scatter, disturbed=disturbed, seeds=seeds, isolated=isolated)
         affected = np.flatnonzero(excess >= _SAME_FAULT_RATIO * excess[worst])
         red, green, blue = (float(valid[c].mean[worst]) if c in valid else 0.0 for c in range(3))
         x, y = self._block_centres[worst].tolist()
@@ -214,7 +216,7 @@ class ConsistencyCheck:
             kept=kept,
             disturbed=disturbed,
             seeds=seeds,
-            alone=alone,
+            isolated=isolated,
         )
 
     def _disturbed(
@@ -236,12 +238,12 @@ class ConsistencyCheck:
             sigma[row] += self._noise2[channel]
             sigma[row] += max(valid[channel].scatter, LEAST_MODEL_ERROR) ** 2
         np.sqrt(sigma, out=sigma)
-        cells, worst_deviation, seeds, alone = self._covered_finder.disturbed(deviation, sigma)
+        cells, worst_deviation, seeds, isolated = self._covered_finder.disturbed(deviation, sigma)
         disturbed = tuple(zip(cells.tolist(), worst_deviation.round(6).tolist(), strict=True))
-        return disturbed, tuple(seeds.tolist()), tuple(alone.tolist())
+        return disturbed, tuple(seeds.tolist()), tuple(isolated.tolist())
 
     def _channel_deviations(self, reference: _Channel, mean: _Array, variance: _Array) -> _Deviations | None:
-        if len(reference.bright) < CELLS_A_TERM * reference.terms.shape[1]:
+        if len(reference.bright) < CELLS_PER_TERM * reference.terms.shape[1]:
             return None
         design, level, measured = reference.design, reference.level[reference.fitted], mean[reference.fitted]
         # The weights depend on expected levels. With measured levels, dark covered patches would have large weights.
@@ -263,12 +265,12 @@ class ConsistencyCheck:
         scatter2 = robust_sigma(deviation[bright] - np.median(deviation[bright])) ** 2
         noise2 = float(np.median(variance[bright] / expected[bright] ** 2))
         # The relative uncertainty of a square is twice the uncertainty of its root.
-        error = _CERTAIN * 2 * float(np.sqrt(_SPREAD_ERROR2 / len(bright)))
+        error = _CERTAIN_SIGMAS * 2 * float(np.sqrt(_SPREAD_ERROR2 / len(bright)))
         kernels.clipped_to_neighbours(deviation[:-1].copy(), self._around, deviation[:-1])
         block_deviations = deviation[self._members]
         count = np.isfinite(block_deviations).sum(axis=1)
         average = np.nansum(block_deviations, axis=1) / np.maximum(count, 1)
-        excess = np.abs(average) - _CERTAIN * np.sqrt(scatter2 / np.maximum(count, 1))
+        excess = np.abs(average) - _CERTAIN_SIGMAS * np.sqrt(scatter2 / np.maximum(count, 1))
         compared = np.isfinite(deviation[:-1])
         return _Deviations(
             solution=solution,

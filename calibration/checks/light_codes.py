@@ -41,24 +41,25 @@ VERIFIED_DEG = 8.0
 # Largest standard uncertainty of the prediction of a verified illuminant, degrees. Red and blue are 85° apart.
 _VERIFIED_SD_DEG = 10.0
 
-_FEW = 24  # Up to this number of illuminants, each is omitted in turn; with more, robust weights are sufficient
+_FEW_LIGHTS = 24  # Up to this number of illuminants, each is omitted in turn; with more, robust weights are sufficient
 
-_SUSPECTS = 8  # Number of illuminants tested for exchanges: those whose omission improves the fit most
+_SUSPECT_COUNT = 8  # Number of illuminants tested for exchanges: those whose omission improves the fit most
 
-# An exchange is preferred to the omission of one illuminant if its misfit is at most this much larger. The omission
-# removes three values, each of which adds 1 to the misfit on average.
+# An exchange is preferred to the omission of one illuminant if the misfit of the exchange is at most this much larger.
+# The omission removes three values, each of which adds 1 to the misfit on average.
 _MISFIT_MARGIN = 9.0
 
 # Relative scatter of a channel against the other channels: usual value, and largest value attributed to the lamp. A
 # larger scatter has other causes, for example exposures that end within a turn of the colour wheel.
 _CHROMA_SD, _MOST_CHROMA_SD = 0.003, 0.012
 
-# Relative scatter of brightness: of a flickering lamp, and of a lamp with unknown drift because white frames are
-# missing.
+# Relative scatter of brightness: of a flickering lamp with known drift, and of a lamp without white frames, whose drift
+# is unknown.
 _BRIGHTNESS_SD, _UNKNOWN_DRIFT_SD = 0.03, 0.06
 
-# Largest misfit of few illuminants with correct names: constant part, and part per illuminant. In simulated rooms, it
-# was below 6 + 1.7 per illuminant without faults. With an exchange at 6° or more, it was above 12 + 3.3.
+# Largest misfit of few illuminants with correct names: constant part, and part per illuminant. In simulated rooms
+# without faults, the misfit was below 6 + 1.7 per illuminant. With an exchange at 6° or more, it was above 12 + 3.3 per
+# illuminant.
 _MAX_MISFIT, _MAX_MISFIT_EACH = 8.0, 2.5
 
 # Largest squared distance (χ² of six values) of two whites from the prediction for their exchanged codes. Noise alone
@@ -68,9 +69,10 @@ _MAX_DISTANCE2 = 50.0
 # Relative standard deviation of brightness that is large enough to make brightness irrelevant.
 _FREE_BRIGHTNESS_SD = 10.0
 
-# Two illuminants are not tested for an exchange if the squared distance of their predictions is larger, in units of
-# `EXCHANGE_EVIDENCE`, and both fit their codes. Exchanged illuminants at this distance would not fit.
-_NEAR_PAIRS = 3.0
+# Largest squared distance between the predictions of two illuminants that are tested for an exchange, in units of
+# `EXCHANGE_EVIDENCE`. At a larger distance, exchanged illuminants would not fit their codes. Illuminants that do not
+# fit their codes are tested at any distance.
+_MAX_PAIR_DISTANCE2 = 3.0
 
 _BLOCK_PAIRS = 20_000  # Pairs evaluated at a time: about 100 MB
 
@@ -124,7 +126,7 @@ def code_agreement(
     dark_known, drift_known : bool
         Whether dark light and lamp drift were measured.
     """
-    # The matrices are small: threads of the linear algebra library would mostly wait for each other.
+    # The matrices are small, so that several threads would be slower.
     with threadpool_limits(limits=1, user_api="blas"):
         fit, swap, misfit = _fit_codes(np.asarray(codes), white, error, dark_known=dark_known, drift_known=drift_known)
     count = len(white)
@@ -175,7 +177,7 @@ def _fit_codes(
         )
 
     count = len(white)
-    if count > _FEW:
+    if count > _FEW_LIGHTS:
         fitted = fit(codes, _CHROMA_SD, None)
         _, deviation, _ = _directions(*fitted.predicted(np.arange(count)[:, None]), white)
         # 1.39 is the median of χ² with two degrees of freedom.
@@ -196,7 +198,7 @@ def _fit_codes(
         best = fits[ranked[0]]
         is_healthy = best.misfit < _max_misfit(int(used.sum()) - 1)
         if used.all():
-            exchange, misfit_left = _best_exchange(fit, codes, fitted.misfit, ranked[:_SUSPECTS])
+            exchange, misfit_left = _best_exchange(fit, codes, fitted.misfit, ranked[:_SUSPECT_COUNT])
             if exchange is not None and misfit_left < best.misfit + _MISFIT_MARGIN:
                 remaining = ~np.isin(np.arange(count), exchange)
                 return fit(codes, _CHROMA_SD, remaining), exchange, misfit
@@ -207,7 +209,6 @@ def _fit_codes(
 
 
 def _max_misfit(lights: int) -> float:
-    # Measured in simulated rooms without faults, with 2 to 20 illuminants.
     return _MAX_MISFIT + _MAX_MISFIT_EACH * lights
 
 
@@ -268,13 +269,13 @@ def _pairs(
     `mean` (L, 3) and `cov` (L, 3, 3) are predictions. `is_off` (L,): illuminants that deviate from their codes.
     """
     pairs = np.stack(np.triu_indices(len(fit.white), 1), axis=-1)
-    if len(fit.white) > _FEW:
+    if len(fit.white) > _FEW_LIGHTS:
         # With many illuminants, only near pairs and pairs with a deviating illuminant are evaluated. In any other
         # pair, exchanged illuminants would deviate strongly.
         first, second = pairs.T
         difference = mean[first] - mean[second]
         distance2 = np.einsum("pa,pab,pb->p", difference, np.linalg.inv(cov[first] + cov[second]), difference)
-        pairs = pairs[(distance2 < _NEAR_PAIRS * EXCHANGE_EVIDENCE) | is_off[first] | is_off[second]]
+        pairs = pairs[(distance2 < _MAX_PAIR_DISTANCE2 * EXCHANGE_EVIDENCE) | is_off[first] | is_off[second]]
     blocks = [pairs[start : start + _BLOCK_PAIRS] for start in range(0, len(pairs), _BLOCK_PAIRS)]
     results = [_evaluate_pairs(fit, block) for block in blocks]
     empty = (np.zeros(0),) * 3

@@ -68,7 +68,7 @@ _OVERLAP, _OVERLAP_BEND, _OVERLAP_LENGTH = 0.2, 0.15, 120.0
 _SUBSETS: tuple[tuple[int, ...], ...] = ((0, 1), (0, 2), (1, 2), (0, 1, 2))
 
 # Each primary with its three overlaps.
-_TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if primary in subset]
+_OVERLAP_TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if primary in subset]
 
 
 # Prior standard deviations of the light at code 0, relative to the primary: after subtraction of dark frames, and
@@ -76,12 +76,12 @@ _TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if pr
 _REST_SD, _REST_SD_WITHOUT_DARK = 5e-4, 0.02
 
 # Uncertainty of all whites due to black level and stray light, relative to the brightest white.
-_FLOOR = 2e-4
+_LEVEL_ERROR = 2e-4
 
 _FREEDOM = 4.0  # Degrees of freedom of Student's t: outliers get small weights, others nearly 1
 
 # Relative noise added to whites in successive rounds, from the size of the prior uncertainties down to 0.
-_SCHEDULE = (0.5, 0.2, 0.06, 0.015, 0.0, 0.0, 0.0)
+_ADDED_NOISES = (0.5, 0.2, 0.06, 0.015, 0.0, 0.0, 0.0)
 
 _MAX_STEPS = 4  # Largest number of Gauss-Newton steps in each round
 
@@ -89,9 +89,9 @@ _SMALLEST_STEP = 1e-6  # Step, in prior standard deviations, that ends a round
 
 _DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)  # Damping factors to try, relative to the curvature
 
-_N = 12  # Number of principal components of a tone curve; further ones have standard deviations below 0.003
+_CURVE_TERMS = 12  # Number of principal components of a tone curve; further ones have standard deviations below 0.003
 
-_CURVES, _OVERLAPS = 4 * _N, len(_TERMS) * len(_OVERLAP_NODES)
+_CURVES, _OVERLAPS = 4 * _CURVE_TERMS, len(_OVERLAP_TERMS) * len(_OVERLAP_NODES)
 
 
 def _log_code(codes: npt.ArrayLike) -> _Array:
@@ -110,7 +110,7 @@ def _curve_basis() -> _Array:
     """Return (256, N): derivatives of the log tone curve at each code by the N curve parameters."""
     nodes = _log_code(_NODES)
     variance, components = np.linalg.eigh(_kernel(nodes, nodes))
-    variance, components = variance[-_N:], components[:, -_N:]
+    variance, components = variance[-_CURVE_TERMS:], components[:, -_CURVE_TERMS:]
     return np.asarray(_kernel(_log_code(np.arange(256)), nodes) @ (components / np.sqrt(variance)), dtype=np.float64)
 
 
@@ -150,7 +150,9 @@ class _Codes:
     @staticmethod
     def of(codes: npt.NDArray[np.integer]) -> _Codes:
         integers = np.asarray(codes, dtype=np.int64)
-        overlap_codes = np.stack([integers[:, subset].min(axis=1) for _, subset in _TERMS], axis=-1).reshape(-1, 3, 3)
+        overlap_codes = np.stack([integers[:, subset].min(axis=1) for _, subset in _OVERLAP_TERMS], axis=-1).reshape(
+            -1, 3, 3
+        )
         stacked = np.concatenate([integers[:, :, None], overlap_codes], axis=2)
         return _Codes(
             stacked > 0, _POWER * _log_code(stacked), _curve_basis()[stacked], _overlap_basis()[overlap_codes]
@@ -208,17 +210,17 @@ def fit_projector(
     relative scatter of the lamp. `used`: (L,) bool, illuminants in the fit; None: all, with robust weights.
     """
     code_basis = _Codes.of(codes)
-    level = np.maximum(np.abs(white), _FLOOR * white.max())
+    level = np.maximum(np.abs(white), _LEVEL_ERROR * white.max())
     scale = float(white.max())
     noise = np.zeros((len(white), 3, 3))
     channels = np.arange(3)
-    noise[:, channels, channels] = error**2 + (chroma_sd * level) ** 2 + (_FLOOR * scale) ** 2
+    noise[:, channels, channels] = error**2 + (chroma_sd * level) ** 2 + (_LEVEL_ERROR * scale) ** 2
     noise += brightness_sd**2 * level[:, :, None] * level[:, None, :]
     rest_sd = _REST_SD if dark_known else _REST_SD_WITHOUT_DARK
     state = np.zeros(9 + _CURVES + _OVERLAPS + 3)
     trust = np.ones(len(white)) if used is None else used.astype(np.float64)
     fitted, slopes = _model(state, code_basis, scale, rest_sd)
-    for added_noise in _SCHEDULE:
+    for added_noise in _ADDED_NOISES:
         round_noise = noise.copy()
         round_noise[:, channels, channels] += (added_noise * level) ** 2
         weights = np.linalg.inv(round_noise) * trust[:, None, None]
@@ -273,7 +275,7 @@ def _model(state: _Array, code_basis: _Codes, scale: float, rest_sd: float) -> t
     root = _primary_root()
     prior = np.log(_CONTRIBUTIONS * _CHANNELS[:, None] * scale)
     primaries = np.exp(np.clip(prior + (root @ state[:9]).reshape(3, 3), -40, 40))
-    curve_parameters = state[9 : 9 + _CURVES].reshape(4, _N)
+    curve_parameters = state[9 : 9 + _CURVES].reshape(4, _CURVE_TERMS)
     curves = np.sqrt(1 - _OWN_WEIGHT**2) * curve_parameters[0] + _OWN_WEIGHT * curve_parameters[1:]
     overlaps = state[9 + _CURVES : 9 + _CURVES + _OVERLAPS].reshape(3, 3, nodes)
     bent = np.einsum("lpjn,pn->lpj", code_basis.curves, curves)
@@ -283,11 +285,11 @@ def _model(state: _Array, code_basis: _Codes, scale: float, rest_sd: float) -> t
     curve_slopes = np.einsum("lpj,lpjn->lpn", contributions, code_basis.curves)
     overlap_slopes = (light[:, :, 1:, None] * code_basis.overlaps).reshape(count, 3, -1)
     state_slopes = np.zeros((count, 3, len(state)))
-    state_slopes[:, :, 9 : 9 + _N] = np.sqrt(1 - _OWN_WEIGHT**2) * curve_slopes
+    state_slopes[:, :, 9 : 9 + _CURVE_TERMS] = np.sqrt(1 - _OWN_WEIGHT**2) * curve_slopes
     rest_start = 9 + _CURVES + _OVERLAPS
     for primary in range(3):
-        own_start, overlap_start = 9 + _N * (1 + primary), 9 + _CURVES + 3 * nodes * primary
-        state_slopes[:, primary, own_start : own_start + _N] = _OWN_WEIGHT * curve_slopes[:, primary]
+        own_start, overlap_start = 9 + _CURVE_TERMS * (1 + primary), 9 + _CURVES + 3 * nodes * primary
+        state_slopes[:, primary, own_start : own_start + _CURVE_TERMS] = _OWN_WEIGHT * curve_slopes[:, primary]
         state_slopes[:, primary, overlap_start : overlap_start + 3 * nodes] = overlap_slopes[:, primary]
         state_slopes[:, primary, rest_start + primary] = rest_sd
     amounts = contributions.sum(axis=2) + rest_sd * state[rest_start:]

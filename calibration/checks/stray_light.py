@@ -6,9 +6,9 @@ checked in two ways:
 
 - *Codes of 0.* The amount of a primary with code 0 must be 0. If it is positive, room light is in the frame of this
   illuminant. If it is negative, room light is in the frame of a primary that the illuminant contains.
-- *White.* The amounts in white frames must be 1. If all three are less by the same value, and the lamp is steady, room
-  light is in the frames of the primaries. A projector that reduces full white has the same effect; a projector that
-  boosts white hides the room light.
+- *White.* The amounts in white frames must be 1. If all three are below 1 by the same value, and the lamp is steady,
+  room light is in the frames of the primaries. A projector that reduces full white has the same effect; a projector
+  that boosts white hides the room light.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-CERTAIN = 4.0  # Number of standard uncertainties subtracted from an amount, so that noise does not appear as light
+# Number of standard uncertainties subtracted from an amount, so that noise does not appear as light.
+CERTAIN_SIGMAS = 4.0
 
 # A projector that boosts white also boosts mixtures of two primaries, and part of the added light may look like the
-# third primary. This tolerance is relative to the boost of white (judgement). A fault in the frame of a primary also
-# looks like a boost, so a larger tolerance could disable the check.
-BOOST_ELSEWHERE = 0.25
+# third primary. This tolerance is relative to the boost of white. A fault in the frame of a primary also looks like a
+# boost, so a larger tolerance could disable the check. Chosen by judgement.
+BOOST_TOLERANCE = 0.25
 
-# Largest amount that is reported as room light (judgement). A larger amount means a wrong illuminant or exposure, which
-# other figures detect.
+# Largest amount that is reported as room light. A larger amount means a wrong illuminant or exposure, which other
+# figures detect. Chosen by judgement.
 _MAX_ROOM_LIGHT = 0.1
 
-# Minimum ratio of the smallest to the largest singular value of the counts under the primaries (judgement). Cameras
-# have 0.1 or more; below the minimum, the camera cannot separate the primaries.
+# Minimum ratio of the smallest to the largest singular value of the counts under the primaries. Cameras have 0.1 or
+# more; below the minimum, the camera cannot separate the primaries. Chosen by judgement.
 _MIN_SINGULAR_RATIO = 0.02
 
 _Array = npt.NDArray[np.float64]
@@ -42,7 +43,7 @@ _Mask = npt.NDArray[np.bool_]
 class StrayLight:
     """Room light in some frames of L illuminants that is not in the dark frames."""
 
-    # (L,) amount of a primary with code 0, furthest from 0; 1 at full code; NaN: not checked
+    # (L,) amount, relative to full code, of the primary with code 0 that differs most from 0; NaN: not checked
     at_zero: _Array
     certain: _Array  # (L,) absolute amount beyond four standard uncertainties, ≥ 0; 0 if not checked
     of_primaries: float  # certain room light in the frames of the primaries, relative to white; 0 if not checked
@@ -125,7 +126,7 @@ def stray_light(
     is_checked = np.ones(len(codes), dtype=np.bool_)
     is_checked[list(primaries)] = False
     boost = max(float(full.max()) - 1, 0.0) if len(full) else 0.0
-    tolerance = CERTAIN * spread + np.where(has_primary.sum(axis=1) > 1, BOOST_ELSEWHERE * boost, 0.0)[:, None]
+    tolerance = CERTAIN_SIGMAS * spread + np.where(has_primary.sum(axis=1) > 1, BOOST_TOLERANCE * boost, 0.0)[:, None]
     beyond = np.where(~has_primary & is_checked[:, None], np.maximum(np.abs(amounts) - tolerance, 0), 0.0)
     # A wrong illuminant or exposure changes all amounts, and by more than room light.
     beyond[(beyond > _MAX_ROOM_LIGHT).any(axis=1)] = 0
@@ -155,8 +156,8 @@ def _primary_excess(codes: npt.NDArray[np.int64], full: _Array, spread: _Array) 
     flicker = float(np.ptp(full.mean(axis=1)))
     # The frames of the primaries have the same flicker and slow changes as the white frames.
     error = float(np.sqrt((spread**2).max() + (_DEVIATION_PER_RANGE * flicker) ** 2))
-    share = float(excess.min()) - CERTAIN * error
-    is_equal = float(np.ptp(excess)) <= _MAX_DIFFERENCE * float(excess.mean())
+    share = float(excess.min()) - CERTAIN_SIGMAS * error
+    is_equal = float(np.ptp(excess)) <= _MAX_EXCESS_RANGE * float(excess.mean())
     return share if is_equal and 0 < share <= _MAX_ROOM_LIGHT else 0.0
 
 
@@ -168,25 +169,25 @@ def _are_clean(amounts: _Array, has_primary: _Mask, spread: _Array, share: float
     contains = np.where(has_primary, amounts, 0.0) >= _MIN_AMOUNT
     if not (contains.sum(axis=0) >= _MIN_MIXTURES).all():
         return False
-    missing = np.where(has_primary, 0.0, np.abs(amounts) + CERTAIN * spread).max(axis=1)
-    return bool(missing[contains.any(axis=1)].max() <= _MAX_MISSING * share)
+    missing = np.where(has_primary, 0.0, np.abs(amounts) + CERTAIN_SIGMAS * spread).max(axis=1)
+    return bool(missing[contains.any(axis=1)].max() <= _MAX_CLEAN_AMOUNT * share)
 
 
-# Smallest amount of a primary with which a mixture shows whether the frame of this primary contains room light. Room
-# light then gives the primary with code 0 a negative amount, at least half as large as the room light.
+# Smallest amount of a primary with which a mixture shows whether the frame of this primary contains room light. If it
+# does, the primary with code 0 gets a negative amount, at least half as large as the room light.
 _MIN_AMOUNT = 0.5
 
-_MIN_MIXTURES = 3  # Number of mixtures per primary that must agree (judgement: in one, errors may cancel)
+_MIN_MIXTURES = 3  # Number of mixtures per primary that must agree, because errors may cancel in one of them
 
 # The frames of the primaries are clean if the amounts of primaries with code 0, including their uncertainty, are below
 # this fraction of the supposed room light.
-_MAX_MISSING = 0.25
+_MAX_CLEAN_AMOUNT = 0.25
 
 _FULL_CODE = 255  # Largest code
 
 # Assumed ratio of the lamp's standard deviation to the range of the white frames; 0.6 is expected for three frames.
 _DEVIATION_PER_RANGE = 0.5
 
-# Largest range of the three excesses relative to their mean (judgement). Daylight has less, although its colour differs
-# from the lamp; flicker in the frames of the primaries has more.
-_MAX_DIFFERENCE = 0.6
+# Largest range of the three excesses relative to their mean. Daylight has a smaller range, although its colour differs
+# from the lamp. Flicker in the frames of the primaries has a larger range. Chosen by judgement.
+_MAX_EXCESS_RANGE = 0.6

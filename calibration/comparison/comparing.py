@@ -1,8 +1,7 @@
 """Compare two LUTs, A and B, and report whether noise alone explains their differences.
 
 All differences are B relative to A. The noise is taken from the LUTs. The standard error of a patch is the scatter of
-its samples, divided by the square root of their number. The standard errors of whites are in `references.csv`. Each
-thread holds one illuminant of both LUTs in memory.
+its samples, divided by the square root of their number. The standard errors of whites are in `references.csv`.
 
 L common illuminants, C colours.
 """
@@ -38,30 +37,30 @@ _Array = npt.NDArray[np.float64]
 _Numbers = npt.NDArray[np.int64]
 _Folders = tuple[Path, Path]
 
-# A difference is reported if the probability that noise causes it anywhere in the LUT is smaller. It must also exceed
-# one of the limits below: with so many samples, even negligible differences are significant.
-CHANCE = 0.01
+# Largest probability with which noise alone causes a reported difference anywhere in the LUT. A reported difference
+# must also exceed one of the limits below, because with so many samples even negligible differences are significant.
+MAX_CHANCE = 0.01
 
 # Factor for the standard errors of whites. They are too small, because they are the scatter about a polynomial that was
-# fitted to the same few references.
+# fitted to the same few white references.
 ERROR_FACTOR = 1.3
 
-# Negligible angle between whites, degrees: 1/200 of the error of a good method (judgement).
+# Negligible angle between whites, degrees: 1/200 of the error of a good method. Chosen by judgement.
 ANGLE_FLOOR_DEG = 0.005
 
 # Negligible relative difference of brightness. Two sheets of a small simulated chart differ by up to 0.17 %, because
 # their flat fields differ.
 BRIGHTNESS_FLOOR = 0.002
 
-# Largest RMS difference of patches that noise explains, in units of noise: of all patches, and of the patches under one
-# illuminant. Two sessions in the same simulated room give 1.00 to 1.05.
-CELL_SCORE = 1.1
-LIGHT_SCORE = 1.3
+# Largest RMS difference of patches that noise explains, in units of noise. Two sessions in the same simulated room give
+# 1.00 to 1.05.
+CELL_SCORE = 1.1  # of all patches
+LIGHT_SCORE = 1.3  # of the patches under one illuminant
 
-# A patch is listed if its mean difference over all illuminants exceeds two limits: in standard errors, and relative, as
-# for a stain in `build-lut`.
+# A patch is listed if its mean difference over all illuminants exceeds both limits. The first is in standard errors;
+# the second is the limit of a stain in `build-lut`.
 CELL_SIGMAS = 6.0
-CELL_FLOOR = STAINED
+CELL_FLOOR = STAINED  # relative
 
 # Patches with fewer counts are not compared. The mean of 25 samples of 300 counts has an error of 1 %.
 MIN_COUNTS = 300.0
@@ -211,8 +210,8 @@ def differing_cells(cells: CellDifferences) -> _Numbers:
 
 
 def _is_significant(chances: _Array) -> npt.NDArray[np.bool_]:
-    # Bonferroni correction: `CHANCE` is the probability for all illuminants together.
-    return chances < CHANCE / len(chances)
+    # Bonferroni correction: `MAX_CHANCE` is the probability for all illuminants together.
+    return chances < MAX_CHANCE / len(chances)
 
 
 def _answer(name: str, text: str, *faults: str) -> NoiseAnswer:

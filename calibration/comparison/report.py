@@ -22,7 +22,7 @@ from foundation.console import json_value
 from foundation.files import write_atomic
 from foundation.folders import atomic_folder
 from foundation.pages import figure, note, page, table, verdict
-from foundation.plots import INK, MARK, draw_png, draw_squares
+from foundation.plots import INK, MARK, draw_panels, draw_squares
 
 _ANSWERS = {True: "yes", False: "no"}
 
@@ -57,39 +57,39 @@ def comparison_json(comparison: TableComparison) -> dict[str, Any]:
     )
 
 
-def draw_lights(figure: Any, lights: LightDifferences) -> None:
+def draw_lights(panels: Any, lights: LightDifferences) -> None:
     """Draw angle, brightness and patch difference of every illuminant, with the limits for equal LUTs."""
-    figure.set_size_inches(10, 3.1)
-    panels = (
+    differences = (
         (lights.angle_deg, ANGLE_FLOOR_DEG, "angle between whites, °"),
         (100 * lights.brightness, 0, "brightness, B / A − 1, %"),
         (lights.cell_score, CELL_SCORE, "patches, RMS in units of noise"),
     )
-    for axes, (values, line, title) in zip(figure.subplots(1, 3), panels, strict=True):
+    for axes, (values, line, title) in zip(panels, differences, strict=True):
         axes.plot(lights.one, values, ".", color=INK, markersize=3)
         axes.axhline(line, color=MARK, linewidth=0.8, linestyle=(0, (4, 3)))
         axes.set(title=title, xlabel="illuminant of A")
 
 
-def draw_map(figure: Any, chart: Chart, cells: CellDifferences) -> None:
+def draw_map(panels: Any, chart: Chart, cells: CellDifferences) -> None:
     """Draw the mean differences of the patches on the print, in the channel that differs most."""
-    figure.set_size_inches(10, 8.6 * chart.page_mm[1] / chart.page_mm[0])
-    axes = figure.subplots()
+    (axes,) = panels
     deviation = np.nan_to_num(cells.mean - cells.offset)
     largest = 100 * np.take_along_axis(deviation, np.abs(deviation).argmax(axis=1)[:, None], axis=1)[:, 0]
     reach = max(0.5, float(np.percentile(np.abs(largest), 99)))
     centres_mm, side_mm = chart.centres_mm[chart.cell_of_colour], float(np.mean(chart.cell_mm))
-    image = draw_squares(axes, chart.page_mm, centres_mm, side_mm, largest, 8.2, cmap="RdBu", vmin=-reach, vmax=reach)
-    figure.colorbar(image, ax=axes, label="B / A − 1, %", shrink=0.8, extend="both")
+    image = draw_squares(axes, chart.page_mm, centres_mm, side_mm, largest, 6.0, cmap="RdBu", vmin=-reach, vmax=reach)
+    axes.figure.colorbar(image, ax=axes, label="B / A − 1, %", shrink=0.8, extend="both")
 
 
 def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | None = None) -> None:
     """Write a comparison into a new folder, completely or not at all; with a map of the print if `chart` is given."""
     (first, second), cells, same = comparison.folders, comparison.cells, comparison.same_within_noise
-    pictures = [figure(draw_png(draw_lights, comparison.lights), "Differences by illuminant.", wide=True)]
+    pictures = [
+        figure(draw_panels(draw_lights, comparison.lights, inches=[(3.3, 3.0)] * 3), "Differences by illuminant.")
+    ]
     if chart is not None:
         caption = "Differences of patches on the print. Noise appears as fine grain, stains and shadows as shapes."
-        pictures.append(figure(draw_png(draw_map, chart, cells), caption, wide=True))
+        pictures.append(figure(draw_panels(draw_map, chart, cells, inches=[(7.2, 5.4)]), caption))
     answers = [(_ANSWERS[answer.same_within_noise], answer.name, answer.said) for answer in comparison.answers]
     outcome, sentence = ("accept", "The same within noise.") if same else ("remark", "The difference exceeds noise.")
     elements = [

@@ -1,4 +1,4 @@
-"""All figures in the order in which they are judged and reported: the order of their definitions, module by module."""
+"""All figures, in the order in which they are judged and reported. It is the order of their definitions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from calibration.figures.figure import Figure
 
 
 def collect_figures() -> tuple[Figure, ...]:
-    """Return the figures of all modules; raise ValueError if one contradicts itself or another."""
+    """Return the figures of all modules; raise ValueError if their fields contradict each other."""
     modules = (geometry, radiometry, light, truth)
     figures = tuple(value for module in modules for value in vars(module).values() if isinstance(value, Figure))
     names = {figure.name for figure in figures}
@@ -18,7 +18,7 @@ def collect_figures() -> tuple[Figure, ...]:
         if not (figure.title and figure.why and figure.source):
             raise ValueError(f"{figure.name}: title, why and source are required")
         if figure.refuse is not None and (figure.refuse > figure.accept) != (figure.sense == "at most"):
-            raise ValueError(f"{figure.name}: refuse = {figure.refuse} contradicts {figure.sense} {figure.accept}")
+            raise ValueError(f"{figure.name} ({figure.sense}): refuse is not beyond accept = {figure.accept}")
         if figure.cause is not None and not names.issuperset(figure.cause.follows):
             raise ValueError(f"{figure.name}: follows = {figure.cause.follows} contains an unknown figure")
     if duplicates := sorted(name for name, count in name_counts.items() if count > 1):
@@ -27,7 +27,7 @@ def collect_figures() -> tuple[Figure, ...]:
     for figure in figures:
         for line in figure.lines:
             if line.position in owner_by_position:
-                raise ValueError(f"{figure.name}: line {line.position} belongs to {owner_by_position[line.position]}")
+                raise ValueError(f"{figure.name}: line {line.position} is used by {owner_by_position[line.position]}")
             owner_by_position[line.position] = figure.name
     return figures
 

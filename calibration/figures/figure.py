@@ -1,8 +1,8 @@
 """Type of a figure: a measured property of a session or LUT, with its limits, explanation and report lines.
 
 A value within `accept` is accepted. Between `accept` and `refuse`, the LUT is accepted with a remark. Beyond `refuse`,
-the LUT is not written. A figure without `refuse` only leads to remarks. Most limits are defined in this package.
-Limits that other modules apply as well are imported from them, for example from `calibration.registration.register`.
+the LUT is not written. A figure without `refuse` only leads to remarks. If another module applies a limit as well, the
+limit is imported from there, for example from `calibration.registration.register`.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ QUESTIONS: Final[dict[Group, str]] = {
 
 # Names of the plots in the report (`calibration.report.report`).
 Drawing = Literal[
-    "chart", "lights", "budget", "errors", "noise", "residuals", "field", "course"
+    "chart", "lights", "budget", "errors", "noise", "residuals", "field", "frames"
 ]  # fmt: skip
 
-JUDGEMENT: Final = "judgement"  # Source of a limit that is based on experience only
+JUDGEMENT: Final = "chosen by judgement"  # Source of a limit that is based on experience only
 
 # Source of a limit measured in simulated rooms with known ground truth (`benchmarks.rooms`, `benchmarks.accuracy`).
 SIMULATED: Final = "measured on simulated frames"
 
 Range = tuple[float | None, float | None]  # Lowest and highest value; None if unlimited
 
-# Smaller values are rounding errors of sums and are printed as 0. Limits other than 0 are at least 100 times higher.
+# Smaller values are rounding errors of sums and are printed as 0.
 _ZERO_BELOW = 1e-7
 
 _INTEGER_FROM = 1000.0  # Larger values are printed without decimals, because :.3g would print an exponent
@@ -55,8 +55,8 @@ class Explanation:
     """How the cause of a figure beyond its limit is determined (`calibration.causes`).
 
     - `about`: subject of the figure, by which rules are selected.
-    - `gather`: returns evidence, frames and positions for a LUT and the accepted limit.
-    - `follows`: names of figures with the same causes; their cause is reported if the cause of this figure is unknown.
+    - `gather`: returns evidence, frames and positions from the measurements of a LUT and the accepted limit.
+    - `follows`: names of related figures. If the cause of this figure is unknown, their cause is reported.
     """
 
     about: Subject
@@ -81,7 +81,7 @@ class SummaryRow:
 
 @dataclass(frozen=True)
 class Line:
-    """A line in the summary: its position among all lines, and a function that returns its row, or None to omit it."""
+    """A line in the summary: its rank among all lines, and a function that returns its row, or None for no row."""
 
     position: int
     row: Callable[[TableMeasurements], SummaryRow | None]
@@ -97,7 +97,7 @@ class Limit:
     - `unit`: unit of value and limits; "" for a number or ratio, "share" for a fraction 0 … 1.
     - `sense`: side of the limits on which a value is accepted.
     - `accept`: limit of acceptance without a remark.
-    - `refuse`: limit beyond which the LUT is refused or the frame is repeated; None if there are only remarks.
+    - `refuse`: limit beyond which the LUT is refused or the frame is repeated; None if the limit only causes remarks.
     - `why`: consequence of a value beyond the limit.
     - `source`: origin of the limits.
     - `remedy`: instruction for the user; "" if it depends on the detected fault.
@@ -149,18 +149,18 @@ class Figure(Limit):
     """A limit by which a LUT is judged, with the measurement and explanation of its value.
 
     - `measure`: returns the value; None if it could not be measured, for example without tags or dark frames.
-    - `before_session`: True if the trial frames of `acquire check` show the value as well as a session does.
+    - `before_session`: True if the trial frames of `acquire check` are sufficient to judge the value.
     - `of_one_frame`: use in `build-lut check`, which reads one light or white frame and one dark frame. `known`: the
-      value is judged. `bounded`: it is judged only if beyond its limit, because more frames can only make it worse.
-      `unknown`: it is not judged.
+      value is judged. `bounded`: a value beyond its limit is judged, because more frames cannot bring it back.
+      `unknown`: the value is not judged.
     - `where`: returns the frames, illuminants or position beyond the accepted limit as text; None if the cause
       contains them.
-    - `retake`: returns the frames beyond a limit; None if all are, or if the figure does not concern single frames.
-    - `cause`: how the cause is determined; None if the figure explains itself.
+    - `retake`: returns the frames beyond a limit; None if all frames are, or if the value is not of single frames.
+    - `cause`: how the cause is determined; None if the value has only one cause.
     - `drawing`: the plot that shows the figure, if any.
     - `lines`: lines of the figure in the summary.
     - `foremost`: True if a refusal reports this figure first, because other figures may follow from it.
-    - `detail`: returns an addition to messages, and the remedy, if they depend on the detected fault.
+    - `detail`: returns text to append to the value in messages, and a remedy, if both depend on the detected fault.
     """
 
     _: KW_ONLY

@@ -63,9 +63,9 @@ def _cell_row(table: TableMeasurements) -> SummaryRow:
 
 CELL_PX = Figure(
     "cell_px", "Shorter side of a patch", "geometry", "px", "at least", 8.6, MIN_CELL_PX,
-    why="the 25 pixels reach 3.25 px from a patch's centre, rounding and registration included",
-    source="geometry: at 8.6 px and a blur of 0.7 px, 1.3 % of the light of the worst sample comes from outside its "
-    "patch", remedy="move the camera closer or use a longer lens",
+    why="the outermost samples contain light from outside their patch",
+    source="calculated: with 8.6 px and a blur of σ = 0.7 px, this light is 1.3 % of the worst sample",
+    remedy="move the camera closer or use a longer lens",
     measure=lambda table: table.registration.cell_px, of_one_frame="known",
     drawing="chart", lines=(Line(40, _cell_row),),
 )  # fmt: skip
@@ -80,7 +80,7 @@ def _window_row(table: TableMeasurements) -> SummaryRow:
     registration, window = table.registration, table.cells.window
     largest = largest_window(registration.cell_px, registration.blur_px)
     safe = f"{100 * SAFE_BLEED:g} %"
-    note = f"up to {largest}×{largest}, at most {safe} of a sample's light comes from outside its patch"
+    note = f"in windows up to {largest}×{largest}, at most {safe} of a sample's light comes from outside its patch"
     if window > largest:
         worst_share = bleed(registration.cell_px, registration.blur_px, window)
         alternative = f"{largest}×{largest} has less than {safe}" if largest else f"no window has less than {safe}"
@@ -90,20 +90,19 @@ def _window_row(table: TableMeasurements) -> SummaryRow:
 
 BLEED = Figure(
     "bleed", "Light of neighbouring patches in the worst sample", "geometry", "share", "at most", 0.01, 0.03,
-    why="the lens's blur mixes neighbouring patches into the outermost pixels of the window",
-    source="integral of the blur beyond the patch's edge, for a sample misplaced by 0.75 px: with a sharp lens, 0.2 % "
-    "in patches of 10 px and 0.6 % in patches of 8.6 px; a thirtieth of these values in the mean of a patch",
+    why="the blur of the lens adds light of neighbouring patches to the outermost samples",
+    source="calculated: a sharp lens gives 0.2 % in patches of 10 px. A patch mean contains a thirtieth of it",
     remedy="focus on the print, stop down to f/8, move the camera closer, or use a smaller window (build-lut "
     "--window)", measure=_worst_sample_bleed, of_one_frame="known", drawing="chart",
     lines=(
         Line(50, _window_row),
-        Line(60, lambda table: SummaryRow("Blur", f"σ {table.registration.blur_px:.2f} px", "about 0.6 is sharp")),
+        Line(60, lambda table: SummaryRow("Blur", f"σ {table.registration.blur_px:.2f} px", "about 0.6 px is sharp")),
     ),
 )  # fmt: skip
 
 
 def _uncorrected_lens_light(table: TableMeasurements) -> float | None:
-    # With few patches, light spread by the lens cannot be measured. It is then only part of the uncertainty.
+    # With few patches, light spread by the lens cannot be measured. It is then part of the uncertainty and not judged.
     is_detectable = len(table.registration.mismatched_cells) >= _MIN_CELLS_FOR_GLARE or table.lens.is_uncorrected
     return table.lens.remaining_rms if table.lens.measured and is_detectable else None
 
@@ -140,22 +139,20 @@ def _lens_row(table: TableMeasurements) -> SummaryRow:
 
 
 CORRECTION_RESIDUAL = Figure(
-    "correction_residual", "Light of surroundings that may remain in patch means", "radiometry", "share", "at most",
-    0.01, 0.03,
-    why="samples may contain light spread by the lens, or veiling glare, which an evenly lit print cannot show",
-    source=SIMULATED + ": 0.3 to 0.5 % if the light falls off towards the corners; 1.4 % in even light or on a chart "
-    "of 512 colours, because veiling glare cannot be measured there",
+    "correction_residual", "Light spread by the lens that may remain in patch means", "radiometry", "share",
+    "at most", 0.01, 0.03,
+    why="patch means may contain light that the lens spreads from other parts of the print (veiling glare)",
+    source=SIMULATED + ": 0.3 to 0.5 %. In even light or on a chart of 512 colours, veiling glare cannot be measured, "
+    "and the value is 1.4 %",
     remedy=_REDUCE_GLARE,
     before_session=False, measure=_uncorrected_lens_light, where=_glare_text, lines=(Line(70, _lens_row),),
 )  # fmt: skip
 
 CORRECTION_WORST = Figure(
-    "correction_worst", "Light of surroundings that may remain in the worst patch", "radiometry", "share", "at most",
-    0.03, None,
-    why="veiling glare adds as much to dark patches as to bright ones; the relative error of dark ones is several "
-    "times the mean",
-    source="3 % is three standard deviations of a mean of 300 counts; " + SIMULATED + ": 0.3 to 1.9 % if "
-    "correction_residual is accepted", remedy=_REDUCE_GLARE,
+    "correction_worst", "Light spread by the lens that may remain in the worst patch", "radiometry", "share",
+    "at most", 0.03, None,
+    why="dark patches get as much veiling glare as bright patches, so that their relative error is larger",
+    source=SIMULATED + ": 0.3 to 1.9 %. The noise of 25 samples of 300 counts is 1 %", remedy=_REDUCE_GLARE,
     before_session=False, measure=_uncorrected_in_worst_cell, where=_glare_text,
 )  # fmt: skip
 
@@ -167,28 +164,29 @@ def _marks_text(table: TableMeasurements) -> str:
 def _final_residual_row(table: TableMeasurements) -> SummaryRow:
     has_no_tags = table.registration.framing.field is not None
     name = "Residual of the outline" if has_no_tags else "Residual of tags"
-    detector_note = "" if has_no_tags else "; the detector's own error is 0.09"
+    detector_note = "" if has_no_tags else "; the error of the tag detector is 0.09 px"
     value = f"{table.registration.marks_rms_px:.3f} px RMS"
     return SummaryRow(name, value, f"{_marks_text(table)} relative to the final registration{detector_note}")
 
 
 def _plane_residual_row(table: TableMeasurements) -> SummaryRow:
-    note = f"{_marks_text(table)} relative to a plane sheet: the waviness of the print"
+    note = f"{_marks_text(table)} relative to a plane sheet; it shows waves of the print"
     return SummaryRow("Residual of plane and lens", f"{table.registration.lens_residual_px:.2f} px RMS", note)
 
 
 TAG_RESIDUAL_PX = Figure(
-    "tag_residual_px", "Residual of tags, plane sheet", "geometry", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,
-    why="on a more wavy sheet, positions are based on the patches alone",
-    source=SIMULATED + ": waves of 6 mm with a curl of 10 mm give 2.3", remedy=_HANG_FLATTER,
+    "tag_residual_px", "Distance of tags from a plane sheet", "geometry", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,
+    why="the sheet is so wavy that only the patches show its shape",
+    source=SIMULATED + ": waves of 6 mm with a curl of 10 mm give 2.3 px", remedy=_HANG_FLATTER,
     measure=lambda table: table.registration.lens_residual_px, of_one_frame="known", drawing="residuals",
     lines=(Line(90, _plane_residual_row),),
 )  # fmt: skip
 
 TAG_FINAL_PX = Figure(
-    "tag_final_px", "Residual of tags, final registration", "geometry", "px RMS", "at most", 0.4, 2.0,
-    why="patches and tags give different positions of the print; limits are for patches of 10 px and scale with "
-    "their size", source=SIMULATED + ": 0.05 to 0.2, the detector's own error 0.09",
+    "tag_final_px", "Distance of tags from the final registration, scaled to patches of 10 px", "geometry",
+    "px RMS", "at most", 0.4, 2.0,
+    why="patches and tags give different positions of the print",
+    source=SIMULATED + ": 0.05 to 0.2 px. The error of the tag detector is 0.09 px",
     remedy="check that chart.json belongs to this print, and that the print is one flat sheet",
     measure=lambda table: table.registration.marks_rms_px / table.registration.clearance, of_one_frame="known",
     drawing="residuals", lines=(Line(80, _final_residual_row),),
@@ -196,14 +194,14 @@ TAG_FINAL_PX = Figure(
 
 
 def _blocks_row(table: TableMeasurements) -> SummaryRow:
-    value, note = f"{table.registration.block_rms_px:.3f} px RMS", "displacement that remains after registration"
+    value, note = f"{table.registration.block_rms_px:.3f} px RMS", "distance of blocks from the final registration"
     return SummaryRow("Residual of patch blocks", value, note, brief=True)
 
 
 BLOCK_RESIDUAL_PX = Figure(
-    "block_residual_px", "Residual of patch blocks", "geometry", "px RMS", "at most", 0.1, MAX_BLOCK_RESIDUAL_PX,
-    why="patches are sampled off their centres; limits are for patches of 10 px and scale with their size",
-    source=SIMULATED + ": 0.01 to 0.06", remedy=_HANG_FLATTER,
+    "block_residual_px", "Residual of patch blocks, scaled to patches of 10 px", "geometry", "px RMS", "at most", 0.1,
+    MAX_BLOCK_RESIDUAL_PX, why="patches are not sampled at their centres",
+    source=SIMULATED + ": 0.01 to 0.06 px", remedy=_HANG_FLATTER,
     measure=lambda table: table.registration.block_rms_px / table.registration.clearance, of_one_frame="known",
     drawing="residuals", lines=(Line(100, _blocks_row),),
 )  # fmt: skip
@@ -218,14 +216,14 @@ BLOCKS_GOOD = Figure(
 
 
 def _agreement_row(table: TableMeasurements) -> SummaryRow:
-    note = "correlation of the colours of patches and chart; about 0 for another chart"
+    note = "correlation of the colours of patches and chart; another chart has about 0"
     return SummaryRow("Correlation with the chart", f"{table.registration.agreement:.4f}", note, brief=True)
 
 
 AGREEMENT = Figure(
     "agreement", "Correlation of patches and chart", "geometry", "", "at least", 0.97, MIN_AGREEMENT,
-    why="the colours differ from the chart",
-    source=SIMULATED + ": at least 0.99; about 0 for another order of the patches",
+    why="the colours of the patches differ from the chart",
+    source=SIMULATED + ": at least 0.99. A chart with another order of patches has about 0",
     remedy="use the chart.json of this print, and print without colour management",
     measure=lambda table: table.registration.agreement, of_one_frame="known",
     cause=Explanation("chart", chart_evidence), drawing="chart", lines=(Line(110, _agreement_row),),

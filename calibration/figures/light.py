@@ -18,7 +18,7 @@ from calibration.causes.gathering import (
     stray_evidence,
     sum_evidence,
 )
-from calibration.checks.stray_light import CERTAIN
+from calibration.checks.stray_light import CERTAIN_SIGMAS
 from calibration.figures.figure import (
     JUDGEMENT,
     SIMULATED,
@@ -55,7 +55,7 @@ def percents(values: npt.NDArray[np.floating]) -> str:
 
 
 def _are_frames_comparable(table: TableMeasurements) -> bool:
-    # Counts of frames can be added only if names, camera and exposure are correct.
+    # Sums of the counts of several frames are valid only if names, camera and exposure are correct.
     exchanged = table.lights.codes is not None and len(table.lights.codes.exchanges) > 0
     return not exchanged and not table.origins.other_camera and not table.origins.other_exposure
 
@@ -107,23 +107,23 @@ def _drift_row(table: TableMeasurements) -> SummaryRow | None:
 WHITE_DRIFT = Figure(
     "white_drift", "Drift of paper white between white frames", "light", "share", "at most", 0.01, 0.15,
     why="illuminants taken at different times differ in brightness; the colour of each ground truth is correct",
-    source=JUDGEMENT + "; 1 % between whites is usual for a warm lamp", remedy=_WARM_UP,
-    measure=_white_drift, cause=Explanation("drift", drift_evidence), drawing="course", lines=(Line(130, _drift_row),),
+    source=JUDGEMENT + ". A warm lamp usually drifts by 1 % between white frames", remedy=_WARM_UP,
+    measure=_white_drift, cause=Explanation("drift", drift_evidence), drawing="frames", lines=(Line(130, _drift_row),),
 )  # fmt: skip
 
 
 def _drift_residual(table: TableMeasurements) -> float | None:
     drift = table.lights.drift
-    return drift.left if drift is not None and len(table.white_frames) > 1 else None
+    return drift.uncertainty if drift is not None and len(table.white_frames) > 1 else None
 
 
 DRIFT_LEFT = Figure(
-    "drift_left", "Drift that may remain between white frames", "light", "share", "at most", 0.002, 0.005,
+    "drift_left", "Drift that may remain after --correct-drift", "light", "share", "at most", 0.002, 0.005,
     why="the lamp jumps or flickers between two white frames, so that an illuminant gets a wrong brightness; the "
     "colour of its ground truth is correct",
-    source=SIMULATED + ": 0.1 % for a steady drift on a small chart; 0.5 % for a jump of 1 %",
+    source=SIMULATED + ": a steady drift has 0.1 %, a jump of 1 % has 0.5 %",
     remedy="build the LUT without --correct-drift, let the lamp warm up, or take white frames more often "
-    "(sequence.reference_every)", before_session=False, measure=_drift_residual, drawing="course",
+    "(sequence.reference_every)", before_session=False, measure=_drift_residual, drawing="frames",
 )  # fmt: skip
 
 
@@ -133,15 +133,15 @@ def _white_drift_deg(table: TableMeasurements) -> float | None:
 
 
 WHITE_DRIFT_DEG = Figure(
-    "white_drift_deg", "Drift of white's colour", "light", "°", "at most", 0.2, 2.0,
+    "white_drift_deg", "Drift of the colour of paper white", "light", "°", "at most", 0.2, 2.0,
     why="the lamp's spectrum changes, and not only its brightness",
-    source=JUDGEMENT + ": a tenth of a good method's error", remedy=_WARM_UP,
-    measure=_white_drift_deg, cause=Explanation("drift", drift_evidence), drawing="course",
+    source=JUDGEMENT + ": a tenth of the angular error of a good method", remedy=_WARM_UP,
+    measure=_white_drift_deg, cause=Explanation("drift", drift_evidence), drawing="frames",
 )  # fmt: skip
 
 
 def _shows_white(table: TableMeasurements) -> bool:
-    # The frame of a check may show a coloured illuminant.
+    # The single frame of `build-lut check` may show a coloured illuminant.
     return bool(table.white_frames) or not table.is_of_one_frame
 
 
@@ -165,7 +165,7 @@ def _dark_row(table: TableMeasurements) -> SummaryRow | None:
 LEAK_SHARE = Figure(
     "leak_share", "Light while the projector shows black, relative to white", "light", "share", "at most", 0.005, 0.1,
     why="every illuminant contains this light of projector and room, so that saturated colours become paler",
-    source=JUDGEMENT + "; a contrast of 1500 : 1 leaks 0.07 %",
+    source=JUDGEMENT + ". A projector with a contrast of 1500 : 1 has 0.07 %",
     remedy="darken the room, cover lamps and displays, or subtract this light (build-lut --subtract-dark)",
     measure=_leak_share, of_one_frame="known", cause=Explanation("dark", dark_evidence), lines=(Line(210, _dark_row),),
 )  # fmt: skip
@@ -174,7 +174,7 @@ DARK_DRIFT = Figure(
     "dark_drift", "Change of the light in dark frames, relative to white", "light", "share", "at most", 0.002,
     0.05,
     why="the light of the room changes; illuminants contain varying amounts of it, or a wrong amount is subtracted",
-    source=JUDGEMENT + ": 0.2 % of white is 1 % of a patch with 20 % of white",
+    source=JUDGEMENT + ": 0.2 % of white is 1 % of the light of a patch with a reflectance of 20 %",
     remedy="darken the room, and keep daylight out",
     measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None, of_one_frame="bounded",
     cause=Explanation("dark", dark_evidence),
@@ -192,8 +192,8 @@ def _stray_row(table: TableMeasurements) -> SummaryRow | None:
     if stray is None:
         return SummaryRow(name, "not measured", "needs frames of red, green and blue alone, and a dark frame")
     note = (
-        f"beyond {CERTAIN:g} standard errors; {int(stray.checked.sum())} of {len(stray.certain)} illuminants "
-        "have a code of 0 and were checked; the primaries were compared with white"
+        f"minus {CERTAIN_SIGMAS:g} standard errors, in {int(stray.checked.sum())} of {len(stray.certain)} illuminants "
+        "(those with a code of 0) and in the primaries"
     )
     return SummaryRow(name, f"{percent(stray.share)} of white", note)
 
@@ -203,8 +203,7 @@ STRAY_SHARE = Figure(
     "at most", 0.004, 0.01,
     why="some illuminants contain this light, so that saturated colours are paler under them than under others; "
     "subtracting dark frames does not help",
-    source=SIMULATED + ": below 0.1 % in rooms without faults; 1 % of white changes saturated illuminants by 1° to 2°, "
-    "as much as the error of a good method",
+    source=SIMULATED + ": below 0.1 % without faults. Light of 1 % changes a saturated illuminant by 1° to 2°",
     remedy="darken the room, keep doors, lamps and displays unchanged during the session, switch power saving and "
     "dynamic contrast off, and take the frames again",
     measure=_stray_share, cause=Explanation("stray", stray_evidence), lines=(Line(250, _stray_row),),
@@ -212,7 +211,7 @@ STRAY_SHARE = Figure(
 
 
 def _superposition_deviation(table: TableMeasurements) -> float | None:
-    # Largest deviation beyond two standard errors, over the levels of paper under the illuminants.
+    # Largest deviation minus two standard errors, over the range of counts of paper under the illuminants.
     superposition = table.sensor.superposition
     if not superposition.measured or not _are_names_right(table):
         return None
@@ -238,14 +237,14 @@ def _linearity_row(table: TableMeasurements) -> SummaryRow:
         unmeasured = table.sensor.superposition.unmeasured
         note = "illuminants have wrong names" if unmeasured is None else f"{unmeasured.why}; {unmeasured.remedy}"
         return SummaryRow("Linearity", "not measured", note)
-    note = "beyond two standard errors; from all patches under white, compared with red, green and blue alone"
+    note = "minus two standard errors; from all patches under white, compared with red, green and blue alone"
     return SummaryRow("Linearity", f"{percent(deviation)} from proportionality", note)
 
 
 LINEARITY = Figure(
     "linearity", "Deviation from linearity", "radiometry", "share", "at most", 0.01, 0.05,
     why="counts are not proportional to light, so that chromaticities change with brightness",
-    source="EMVA 1288; 1 % is " + JUDGEMENT,
+    source=JUDGEMENT + "; defined in EMVA 1288",
     remedy="expose less, and switch the camera's highlight priority and noise reduction off; a series of exposures "
     "of the chart, given with --linearity, shows the range of the deviation",
     measure=_linearity_deviation, of_one_frame="known", lines=(Line(185, _linearity_row),),
@@ -264,7 +263,7 @@ def _linearity_detail(table: TableMeasurements) -> tuple[str, str] | None:
 LINEARITY_KNOWN = Figure(
     "linearity_known", "Linearity measured", "radiometry", "", "at least", 1.0, None,
     why="the proportionality of counts and light is unknown; the uncertainty of the ground truth assumes a typical "
-    "camera", source="definition of the uncertainty budget",
+    "camera", source="by definition",
     remedy="plan red, green and blue alone (acquire illuminations does) for a chart of at least 512 colours, or give "
     "a series of exposures of the chart with --linearity",
     detail=_linearity_detail, before_session=False, measure=_is_linearity_measured,
@@ -272,8 +271,8 @@ LINEARITY_KNOWN = Figure(
 
 
 def _oversubtracted_share(table: TableMeasurements) -> float | None:
-    # If too much dark light is subtracted, each primary lacks it, so that white exceeds their sum in every channel. The
-    # excess is at most the dark light. A projector that brightens white adds more light, in another colour.
+    # If too much dark light is subtracted, the sum of the primaries lacks it three times, and white once. White then
+    # exceeds the sum in every channel. A projector that brightens white adds more light than the dark light.
     lights, dark = table.lights, table.dark_frames.light
     if lights.subtracted is None or lights.additivity is None or not _are_names_right(table):
         return None
@@ -286,15 +285,15 @@ def _oversubtracted_share(table: TableMeasurements) -> float | None:
     return float(certain.max()) if is_dark_light else 0.0
 
 
-_DARK_MARGIN = 1.25  # Dark light with its error explains an excess up to this multiple of the dark light
+_DARK_MARGIN = 1.25  # Dark light explains an excess up to this multiple of it, because its measurement has an error
 
 
 TOO_DARK = Figure(
     "too_dark", "Dark light subtracted in excess, relative to white", "light", "share", "at most", 0.0005, 0.002,
-    why="white exceeds the sum of red, green and blue, because each of them lacks the excess; the errors of saturated "
-    "and dim illuminants are much larger", source="0.2 % of white changes an illuminant with 10 % of white by 1°",
-    remedy="build the LUT without --subtract-dark; a lamp or a display was on during the dark frames, or the "
-    "projector closes an iris for black: take dark frames under the same conditions as the others",
+    why="too much light was subtracted from every illuminant, which changes the colours of saturated and dim ones most",
+    source="calculated: 0.2 % of white changes an illuminant with 10 % of white by 1°",
+    remedy="build the LUT without --subtract-dark, or take dark frames under the conditions of the other frames: with "
+    "the same lamps and displays, and without the iris that some projectors close for black",
     before_session=False, measure=_oversubtracted_share,
 )  # fmt: skip
 
@@ -325,15 +324,15 @@ def _sum_row(table: TableMeasurements) -> SummaryRow | None:
 ADDITIVITY = Figure(
     "additivity", "White above the sum of the primaries", "light", "share", "at most", 0.02, None,
     why="an illuminant cannot be predicted from its codes: the projector brightens or converts white, or frames have "
-    "wrong names or exposures", source=JUDGEMENT + "; the drift of the lamp is corrected first",
+    "wrong names or exposures", source=JUDGEMENT + ". Drift of the lamp is corrected before the comparison",
     remedy="switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
     measure=_sum_deviation(-1), cause=Explanation("sum", _sum_evidence), lines=(Line(260, _sum_row),),
 )  # fmt: skip
 
 WHITE_DEFICIT = Figure(
     "white_deficit", "White below the sum of the primaries", "light", "share", "at most", 0.05, 0.3,
-    why="no colour wheel reduces white: a frame of white or of a primary has another exposure, or the projector "
-    "reduces full white", source=JUDGEMENT + "; 2 % for a lamp that flickers by 1 %",
+    why="a frame of white or of a primary has another exposure, or the projector reduces full white",
+    source=JUDGEMENT + ". A lamp that flickers by 1 % causes 2 %",
     remedy="check the exposures of these frames, and switch dynamic contrast and power saving off",
     measure=_sum_deviation(1), cause=Explanation("brightness", light_evidence),
 )  # fmt: skip
@@ -377,15 +376,15 @@ def _codes_row(table: TableMeasurements) -> SummaryRow | None:
     if angle_deg is None:
         return None
     worst = int(np.argmax(angle_deg))
-    note = "angle between a white and its prediction from the codes of all others, beyond four standard errors"
+    note = "angle between a white and its prediction from all other whites, minus four standard errors"
     return SummaryRow("Illuminants against codes", f"{angle_deg[worst]:.2f}° at most, illuminant {worst}", note)
 
 
 OFF_CODES_DEG = Figure(
-    "off_codes_deg", "Angle of an illuminant's white to its prediction from codes", "light", "°", "at most", 2.0, 8.0,
-    why="a frame has the name of another illuminant, or was taken before the projected image changed: the codes do "
-    "not belong to the whites",
-    source=SIMULATED + ": 0 in rooms without faults; at least 28° if a list of frames is shifted by a row",
+    "off_codes_deg", "Angle between an illuminant's white and its prediction from codes", "light", "°", "at most", 2.0,
+    8.0,
+    why="a frame has the name of another illuminant, or was taken before the projected image changed",
+    source=SIMULATED + ": 0 without faults, and at least 28° if the list of frames is shifted by one row",
     remedy="correct the list of imported frames, let the projected image settle longer (sequence.settle_s), or "
     "expose whole turns of the colour wheel",
     foremost=True, measure=_largest_angle, where=_off_codes_text, retake=_frames_off_codes,
@@ -416,9 +415,8 @@ def _frames_off_brightness(table: TableMeasurements, limit: float) -> list[Frame
 OFF_BRIGHTNESS = Figure(
     "off_brightness", "Deviation of an illuminant's brightness from the prediction from its codes", "light", "share",
     "at most", 0.1, 0.3,
-    why="a frame has another exposure than its file records, or shows another illuminant; illuminants that should be "
-    "equally bright differ",
-    source=JUDGEMENT + ": lamps flicker by some per cent; the next shutter time differs by 26 %",
+    why="a frame has another exposure than its file records, or shows another illuminant",
+    source=JUDGEMENT + ": more than the flicker of a lamp, and less than one step of the shutter time (26 %)",
     remedy="keep one exposure for the session, and take the frames again",
     measure=_code_value(lambda codes: float(codes.off_brightness.max())), where=_brightness_text,
     retake=_frames_off_brightness,
@@ -427,18 +425,18 @@ OFF_BRIGHTNESS = Figure(
 
 EXCHANGED_LIGHTS = Figure(
     "exchanged_lights", "Pairs of illuminants with exchanged names", "light", "", "at most", 0, None,
-    why="the whites of two illuminants fit each other's codes; each ground truth is correct, but has the codes and "
-    "the colour temperature of the other illuminant",
-    source=SIMULATED + ": none in rooms without faults; all exchanges at a larger angle than exchange_deg are detected",
+    why="the ground truths of two illuminants are correct, but each has the codes and the colour temperature of the "
+    "other", source=SIMULATED + ": 0 without faults. Exchanges at a larger angle than exchange_deg are detected",
     remedy="correct the list of imported frames, or take both frames again",
     measure=_code_value(lambda codes: float(len(codes.exchanges))), where=_exchanges_text,
     cause=Explanation("names", name_evidence), drawing="lights",
 )  # fmt: skip
 
 CODE_MISFIT = Figure(
-    "code_misfit", "Total disagreement of few illuminants with their codes", "light", "", "at most", 1.0, None,
-    why="no projector produces these whites from these codes; the wrong illuminant cannot be identified",
-    source=SIMULATED + ": below 1 in rooms without faults; with more than 24 illuminants, each is judged separately",
+    "code_misfit", "Disagreement of all illuminants with their codes, for up to 24 illuminants", "light", "", "at most",
+    1.0, None,
+    why="at least one illuminant has wrong codes, but it cannot be identified",
+    source=SIMULATED + ": below 1 without faults. With more than 24 illuminants, each illuminant is judged separately",
     remedy="check that frames and illuminants belong together, and that the lamp was steady",
     before_session=False, measure=_code_value(lambda codes: codes.misfit), drawing="lights",
 )  # fmt: skip
@@ -446,7 +444,7 @@ CODE_MISFIT = Figure(
 EXCHANGE_DEG = Figure(
     "exchange_deg", "Angle above which exchanged names are detected", "light", "°", "at most", 8.0, None,
     why="exchanged names of two illuminants at a smaller angle would not be detected",
-    source=SIMULATED + ": 0.3° with 707 illuminants, 0° with eight very different illuminants",
+    source=SIMULATED + ": 0.3° with 707 illuminants, and 0° with eight very different illuminants",
     remedy="take white and the primaries in the session, and expose longer",
     before_session=False, measure=_code_value(lambda codes: codes.exchange_deg), drawing="lights",
 )  # fmt: skip
@@ -462,15 +460,15 @@ def _checked_row(table: TableMeasurements) -> SummaryRow | None:
     if codes is None:
         return None
     value = f"{_checked_text(table, 0.0)}; exchanged names detectable above {format_value(codes.exchange_deg, '°')}"
-    note = "a wrong name of the other illuminants would not be detected"
+    note = "wrong names of illuminants that were not compared would not be detected"
     return SummaryRow("Illuminants compared with codes", value, note)
 
 
 CROSS_CHECKED_SHARE = Figure(
     "cross_checked_share", "Illuminants that could be compared with their codes", "light", "share", "at least", 0.9,
     None,
-    why="wrong names of the other illuminants would not be detected",
-    source="a wrong name must be detectable from 8° on, the angle at which a LUT is refused",
+    why="wrong names of illuminants that were not compared would not be detected",
+    source=JUDGEMENT + ". An illuminant counts if a wrong name would be detected at angles of 8° and more",
     remedy="take white, red, green and blue in the session, and expose longer", before_session=False,
     measure=_code_value(lambda codes: float(codes.is_verified.mean())), where=_checked_text,
     lines=(Line(230, _checked_row),),
@@ -499,24 +497,24 @@ _above_angle = _white_frames_above(lambda white: white.off_deg)
 _above_brightness = _white_frames_above(lambda white: white.off_brightness)
 
 WHITE_FRAME_DEG = Figure(
-    "white_frame_deg", "Angle of a white frame to the prediction from illuminants", "light", "°", "at most", 2.0, 8.0,
+    "white_frame_deg", "Angle between a white frame and its prediction", "light", "°", "at most", 2.0, 8.0,
     why="the frame shows another illuminant than white, or the illuminants have wrong names",
-    source=SIMULATED + ": 0 in rooms without faults",
+    source=SIMULATED + ": 0 without faults",
     remedy="correct the list of imported frames, or take the white frame again",
     foremost=True, measure=_white_frame_value(lambda white: white.off_deg),
     where=lambda table, accepted: first_few([frame.file for frame in _above_angle(table, accepted)]),
-    retake=_above_angle, cause=Explanation("names", name_evidence), drawing="course",
+    retake=_above_angle, cause=Explanation("names", name_evidence), drawing="frames",
 )  # fmt: skip
 
 WHITE_FRAME_BRIGHTNESS = Figure(
-    "white_frame_brightness", "Deviation of a white frame's brightness from the prediction from the illuminants",
+    "white_frame_brightness", "Deviation of a white frame's brightness from its prediction",
     "light", "share", "at most", 0.1, 0.3,
     why="the white frame has another exposure than the illuminants, so that drift and stray light are wrong",
-    source=JUDGEMENT + ": lamps flicker by some per cent; the next shutter time differs by 26 %",
+    source=JUDGEMENT + ": more than the flicker of a lamp, and less than one step of the shutter time (26 %)",
     remedy="keep one exposure for the session, and take the white frame again",
     measure=_white_frame_value(lambda white: white.off_brightness),
     where=lambda table, accepted: first_few([frame.file for frame in _above_brightness(table, accepted)]),
-    retake=_above_brightness, cause=Explanation("brightness", light_evidence), drawing="course",
+    retake=_above_brightness, cause=Explanation("brightness", light_evidence), drawing="frames",
 )  # fmt: skip
 
 
@@ -530,14 +528,14 @@ def _missing_primaries(table: TableMeasurements) -> float | None:
 def _primary_fields_row(table: TableMeasurements) -> SummaryRow | None:
     if table.primaries is not None or table.lights.codes is None:
         return None
-    note = "no bright frames of red, green and blue alone; coloured patches are corrected with the field of paper"
+    note = "no bright frames of red, green and blue alone; coloured patches get the flat field of paper"
     return SummaryRow("Fields of the primaries", "not measured", note)
 
 
 PRIMARIES_LACKING = Figure(
     "primaries_lacking", "Primaries without a frame", "light", "", "at most", 0, None,
-    why="the fields of the primaries were not measured; coloured patches are corrected with the field of paper",
-    source="if the fields differ by 10 %, coloured patches at the corners have errors of some tenths of a per cent",
+    why="the flat fields of the primaries were not measured, so that coloured patches get the flat field of paper",
+    source="by definition. If the flat fields differ by 10 %, coloured patches at the corners have errors below 1 %",
     remedy="take red, green and blue alone in the session",
     before_session=False, measure=_missing_primaries, drawing="field", lines=(Line(240, _primary_fields_row),),
 )  # fmt: skip
@@ -554,17 +552,16 @@ def _tint_row(table: TableMeasurements) -> SummaryRow | None:
     tints = zip(table.greys.names, table.greys.tints_deg(table.lights.white).tolist(), strict=True)
     note = (
         "angle to the camera RGB of bare paper; 1° to 2.5° if printed with the printer's profile, which is neutral "
-        "for the eye and not for the camera; 4° to 8° if codes are ink codes"
+        "for the eye and not for the camera; 4° to 8° if printed without colour management"
     )
     return SummaryRow("Tint of the greys", ", ".join(f"{name}: {angle:.2f}°" for name, angle in tints), note)
 
 
 GREY_TINT_DEG = Figure(
     "grey_tint_deg", "Tint of the print's greys against paper", "radiometry", "°", "at most", 6.0, None,
-    why="the colour of paper is the ground truth, and the greys differ from it; on images rendered by codes, methods "
-    "that rely on grey have this error",
-    source=JUDGEMENT + "; simulated prints: 1° to 2.5° with the printer's profile; with ink codes, as in the "
-    "publication, 4.5° (poster paper) to 8° (glossy)",
+    why="the ground truth is the colour of paper, so that methods that rely on grey have this error on images rendered "
+    "by codes",
+    source=JUDGEMENT + ". Simulated prints have 1° to 2.5° with the printer's profile, and 4.5° to 8° without it",
     remedy="render by colour (the default), which uses the measured print; or have the chart printed with the "
     "printer's profile (docs/printing.md)", measure=_largest_tint, of_one_frame="known", lines=(Line(270, _tint_row),),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Figures of the patches of the print, of the frames relative to each other, and of the camera."""
+"""Figures of the patches of the print, of differences between frames, and of the camera."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ UNFIT_SHARE = Figure(
 DOUBTFUL_SHARE = Figure(
     "doubtful_share", "Patches in areas that deviate by 1 % from their codes' colours", "radiometry", "share",
     "at most", 0.0003, None,
-    why="the print, or the light on it, differs there from the rest; from 2 % on, the patches are listed as unfit",
-    source=SIMULATED + ": none on a clean flat print",
+    why="the print, or the light on it, differs in these areas; patches that deviate by 2 % are listed as unfit",
+    source=SIMULATED + ": 0 on a clean flat print",
     remedy="clean the print, hang it flatter, and look for shadows on it",
     measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.is_known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
@@ -98,9 +98,9 @@ DOUBTFUL_SHARE = Figure(
 ADDED_LIGHT = Figure(
     "added_light", "Light added to a large part of the print, relative to paper white", "radiometry", "share",
     "at most", 0.004, 0.01,
-    why="this light is equal on dark and bright patches, and changes more patches than those listed as unfit",
-    source=SIMULATED + ": 0 in rooms without faults; light of 1 % of paper white makes a patch of 10 % of paper white "
-    "10 % brighter, and a patch of 3 % 30 % brighter",
+    why="a reflection adds the same light to dark and bright patches, also to patches that are not listed as unfit",
+    source=SIMULATED + ": 0 without faults. Light of 1 % of paper white makes a patch with a reflectance of "
+    "10 % brighter by a tenth",
     remedy="turn the print or the projector until the print shows no reflection, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.is_known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
@@ -125,15 +125,14 @@ def _most_blurred_text(table: TableMeasurements, accepted: float) -> str:
 
 
 FRAME_BLUR = Figure(
-    "frame_blur", "Light of neighbouring patches added in the most blurred frame", "geometry", "share", "at most",
+    "frame_blur", "Additional light of neighbouring patches in the most blurred frame", "geometry", "share", "at most",
     0.003, 0.012,
-    why="a frame is out of focus or shaken; only white frames are checked patch by patch for such light",
-    source=SIMULATED + ": if the other frames have a blur of 0.5 px, a frame with 0.9 px has 0.8 % of added light, and "
-    "errors of 1.2 % in patches",
+    why="a frame is more blurred than the frame registered first, because it is out of focus or shaken",
+    source=SIMULATED + ": a blur of 0.9 px instead of 0.5 px adds 0.8 %, and causes errors of 1.2 % in patches",
     remedy="switch off autofocus and stabilisation, and keep the camera free from vibration",
     measure=lambda table: table.added_bleed(_most_blurred(table)), of_one_frame="bounded",
     where=_most_blurred_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
-    cause=Explanation("frame", blur_evidence), drawing="course",
+    cause=Explanation("frame", blur_evidence), drawing="frames",
 )  # fmt: skip
 
 
@@ -149,12 +148,12 @@ FRAME_SCATTER = Figure(
     "frame_scatter", "Scatter of patches about their codes' colours, worst frame", "radiometry", "share", "at most",
     0.012, 0.03,
     why="the frame's samples do not have the colours of their patches",
-    source=SIMULATED + ": up to 0.8 % beyond noise; a blur of 1.5 px gives 5 %, another print 50 %",
+    source=SIMULATED + ": up to 0.8 % without faults, 5 % with a blur of 1.5 px, and 50 % with another print",
     remedy="keep everything unchanged during the session",
     measure=_largest_of_frames(lambda table, frame: frame.consistency.scatter), of_one_frame="bounded",
     where=lambda table, accepted: f"in {max(table.frames, key=lambda frame: frame.consistency.scatter).record.file}",
     retake=_frames_beyond(lambda table, frame: frame.consistency.scatter),
-    cause=Explanation("frame", scatter_evidence, follows=("block_deviation", "disturbed_cells")), drawing="course",
+    cause=Explanation("frame", scatter_evidence, follows=("block_deviation", "disturbed_cells")), drawing="frames",
 )  # fmt: skip
 
 
@@ -162,11 +161,11 @@ BLOCK_DEVIATION = Figure(
     "block_deviation", "Deviation of the worst block of patches, worst frame", "radiometry", "share", "at most",
     0.01, 0.03,
     why="an object or a light changed the samples of an area in this frame, or in the frame registered first",
-    source=SIMULATED + ": up to 0.4 % beyond noise",
+    source=SIMULATED + ": up to 0.4 % without faults",
     remedy="keep people out of the space between lamp, print and camera",
     measure=_largest_of_frames(lambda table, frame: frame.consistency.block), of_one_frame="bounded",
     retake=_frames_beyond(lambda table, frame: frame.consistency.block),
-    cause=Explanation("block", block_evidence), drawing="course",
+    cause=Explanation("block", block_evidence), drawing="frames",
 )  # fmt: skip
 
 
@@ -179,10 +178,9 @@ def _disturbed_count(table: TableMeasurements) -> float | None:
 DISTURBED_CELLS = Figure(
     "disturbed_cells", "Adjacent patches with large deviations in an illuminant's frame", "radiometry", "", "at most",
     0, None,
-    why="the samples of these patches under the illuminant are wrong; the patches are listed as unfit, and other "
-    "patches are not affected",
-    source=SIMULATED + ": none in rooms without faults; two adjacent patches that deviate by five standard deviations "
-    "are sufficient, unless the dark frames show hot photosites there",
+    why="the samples of these patches are wrong under the illuminant, so that the patches are listed as unfit",
+    source=SIMULATED + ": 0 without faults. Two adjacent patches count if they deviate by five standard deviations and "
+    "have no hot photosites",
     remedy="keep the space between lamp, print and camera free", measure=_disturbed_count, of_one_frame="bounded",
     cause=Explanation("few cells", disturbed_evidence, follows=("block_deviation",)), drawing="errors",
 )  # fmt: skip
@@ -204,10 +202,10 @@ def _movement_row(table: TableMeasurements) -> SummaryRow | None:
 
 REREGISTERED_FRAMES = Figure(
     "reregistered_frames", "Frames registered again", "geometry", "", "at most", 0, None,
-    why="the chart or the camera moved between frames; the sampling grid followed", source=JUDGEMENT,
+    why="the chart or the camera moved between frames; samples were taken at the new positions", source=JUDGEMENT,
     remedy="fasten camera and print, and keep people away",
     measure=lambda table: float(_reregistered_count(table)), of_one_frame="bounded",
-    cause=Explanation("movement", movement_evidence), drawing="course", lines=(Line(120, _movement_row),),
+    cause=Explanation("movement", movement_evidence), drawing="frames", lines=(Line(120, _movement_row),),
 )  # fmt: skip
 
 
@@ -244,10 +242,10 @@ def _frames_of_other_exposure(table: TableMeasurements, limit: float) -> list[Fr
 
 
 OTHER_EXPOSURE = Figure(
-    "other_exposure", "Difference of a frame's exposure from most frames, according to the raw files", "radiometry",
+    "other_exposure", "Difference between the recorded exposure of a frame and that of most frames", "radiometry",
     "share", "at most", 0.01, 0.1,
     why="illuminants of equal brightness would differ in brightness, and the noise would change with the ISO speed",
-    source="shutter times have steps of 26 %, and files contain rounded times", remedy=_KEEP_EXPOSURE,
+    source="larger than the rounding of times in files; a step of the shutter time is 26 %", remedy=_KEEP_EXPOSURE,
     foremost=True, measure=lambda table: table.origins.exposure_difference, of_one_frame="bounded",
     where=lambda table, accepted: _foreign_frames_text(table.origins.other_exposure), retake=_frames_of_other_exposure,
     cause=Explanation("brightness", light_evidence),
@@ -264,9 +262,9 @@ OTHER_ISO = Figure(
 WHITE_FRAMES = Figure(
     "white_frames", "White frames", "light", "", "at least", 1, None,
     why="without white frames, drift of the lamp, stains and the uniformity of patches cannot be measured",
-    source="by definition; drift needs two white frames",
+    source="by definition. Drift needs two white frames",
     remedy="take white frames during the session (sequence.reference_every)",
-    before_session=False, measure=lambda table: float(len(table.white_frames)), drawing="course",
+    before_session=False, measure=lambda table: float(len(table.white_frames)), drawing="frames",
 )  # fmt: skip
 
 
@@ -278,8 +276,7 @@ def _black_row(table: TableMeasurements) -> SummaryRow:
 
 BLACK_DRIFT_COUNTS = Figure(
     "black_drift_counts", "Drift of the black level", "radiometry", "counts", "at most", MAX_BLACK_DRIFT, 16.0,
-    why="the sensor warmed up; the black level of each frame is subtracted, but its error is visible in dark patches "
-    "of about 30 counts",
+    why="the sensor warmed up; the black level of each frame is subtracted, but its error affects dark patches",
     source=JUDGEMENT, remedy="let the camera run for some minutes before the session, and pause between frames",
-    measure=lambda table: table.black_drift, of_one_frame="bounded", drawing="course", lines=(Line(140, _black_row),),
+    measure=lambda table: table.black_drift, of_one_frame="bounded", drawing="frames", lines=(Line(140, _black_row),),
 )  # fmt: skip

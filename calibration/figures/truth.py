@@ -35,14 +35,15 @@ def _at_zero_row(table: TableMeasurements) -> SummaryRow | None:
         return None
     worst = int(np.argmax(share))
     value = f"{100 * share.mean():.3f} %, {percent(share[worst])} under illuminant {worst}"
-    note = "samples with no light; negative noise is clipped to 0, which raises the mean of such patches slightly"
+    note = "negative values are stored as 0, which raises the means of patches without light slightly"
     return SummaryRow("Samples at 0", value, note)
 
 
 NOISE_MISFIT = Figure(
     "noise_misfit", "Deviation of patch noise from the photon-transfer curve", "noise", "share", "at most", 0.3, None,
     why="photons and sensor do not explain the scatter: the camera smooths its raw files, or the lamp flickers",
-    source="EMVA 1288 model; " + SIMULATED + ": 0.05 to 0.15", remedy="switch the camera's noise reduction off",
+    source=SIMULATED + ": 5 to 15 %. The curve is the model of EMVA 1288",
+    remedy="switch the camera's noise reduction off",
     measure=lambda table: float(table.sensor.transfer.misfit.max()), of_one_frame="known", drawing="noise",
     lines=(Line(170, _noise_row), Line(200, _at_zero_row)),
 )  # fmt: skip
@@ -58,8 +59,9 @@ def _transfer_row(table: TableMeasurements) -> SummaryRow:
 
 NOISY_SHARE = Figure(
     "noisy_share", "Patches noisier than expected for their level", "noise", "share", "at most", 0.002, 0.1,
-    why="the patches are not uniform: dirt, a fold, or a neighbour's edge", source="a variance of more than 3.5 times "
-    "the curve", remedy="clean the print, hang it flatter, and focus",
+    why="the patches are not uniform: dirt, a fold, or the edge of a neighbour",
+    source=JUDGEMENT + ". A patch counts if its variance is more than 3.5 times the curve",
+    remedy="clean the print, hang it flatter, and focus",
     measure=lambda table: float(table.sensor.transfer.noisy.mean()), of_one_frame="known",
     cause=Explanation("noisy cells", noisy_evidence), drawing="noise", lines=(Line(180, _transfer_row),),
 )  # fmt: skip
@@ -78,7 +80,7 @@ REFERENCES_USED = Figure(
     "references_used", "Used white references, worst frame", "truth", "share", "at least", 0.9, 0.3,
     why="flat field and ground truth are based on few positions", source=JUDGEMENT,
     remedy="uncover the print, bring all of it into the frame, and expose so that bare paper stays below saturation",
-    measure=_fraction_of_references, of_one_frame="bounded", where=_fewest_references_text, drawing="course",
+    measure=_fraction_of_references, of_one_frame="bounded", where=_fewest_references_text, drawing="frames",
 )  # fmt: skip
 
 
@@ -94,7 +96,7 @@ REFERENCE_SPREAD = Figure(
     "reference_spread", "Scatter of white references about the flat field, under white", "truth", "share", "at most",
     0.01, 0.05,
     why="the flat field does not describe local changes or an unusual fall-off of light, which remain in the samples",
-    source=SIMULATED + ": 0.3 % of noise and photosite response",
+    source=SIMULATED + ": 0.3 %, from noise and from differences between photosites",
     remedy="clean or flatten the print, and look for shadows on it",
     measure=lambda table: max(map(_frame_reference_spread, table.white_frames), default=None), of_one_frame="bounded",
     cause=Explanation("references", reference_evidence), drawing="field",
@@ -114,19 +116,20 @@ _REDUCE_COMPONENT = (
 )
 
 TRUTH_MEDIAN_DEG = Figure(
-    "truth_median_deg", "Expanded uncertainty of the ground truth, median illuminant", "truth", "°", "at most", 0.4,
-    1.0,
+    "truth_median_deg", "Expanded uncertainty (k = 2) of the ground truth, median illuminant", "truth", "°", "at most",
+    0.4, 1.0,
     why="the error of a method cannot be measured more accurately than the ground truth",
-    source=JUDGEMENT + ": a quarter of a good method's error; k = 2 (JCGM 100)", remedy=_REDUCE_COMPONENT,
+    source=JUDGEMENT + ": a quarter of the angular error of a good method", remedy=_REDUCE_COMPONENT,
     before_session=False, measure=lambda table: float(np.median(table.budget.expanded_deg)), drawing="budget",
     lines=(Line(190, _error_row),),
 )  # fmt: skip
 
 
 TRUTH_WORST_DEG = Figure(
-    "truth_worst_deg", "Expanded uncertainty of the ground truth, worst illuminant", "truth", "°", "at most", 0.5, 3.0,
+    "truth_worst_deg", "Expanded uncertainty (k = 2) of the ground truth, worst illuminant", "truth", "°", "at most",
+    0.5, 3.0,
     why="under that illuminant, the error of a method cannot be measured more accurately than the ground truth",
-    source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_REDUCE_COMPONENT,
+    source=JUDGEMENT, remedy=_REDUCE_COMPONENT,
     before_session=False, measure=lambda table: float(table.budget.expanded_deg.max()), drawing="budget",
 )  # fmt: skip
 
@@ -138,7 +141,7 @@ def _saturation_row(table: TableMeasurements) -> SummaryRow:
         if sensor.saturation_measured
         else "from the raw files, possibly too high; no photosite of a patch reached it"
     )
-    note = f"{source}; the maximum on bare paper is {table.lights.white.max():.0f}"
+    note = f"{source}; bare paper has at most {table.lights.white.max():.0f} counts"
     return SummaryRow("Saturation", f"{sensor.white_level} counts above black", note)
 
 
@@ -150,7 +153,7 @@ BRIGHTEST_SHARE = Figure(
     "brightest_share", "Bare paper under the brightest illuminant, relative to saturation", "radiometry", "share",
     "at most", 0.9, CLIPPING_SHARE,
     why="patches saturate at positions with more light",
-    source=JUDGEMENT + ": leaves a margin of 10 % for uneven light", remedy="expose less",
+    source=JUDGEMENT + ", with a margin of 10 % for uneven light", remedy="expose less",
     measure=lambda table: float(table.lights.white.max()) / table.sensor.white_level,
     of_one_frame="bounded", where=_brightest_text, drawing="lights", lines=(Line(150, _saturation_row),),
 )  # fmt: skip
@@ -167,8 +170,9 @@ def _darkest_text(table: TableMeasurements, accepted: float) -> str:
 
 DARKEST_COUNTS = Figure(
     "darkest_counts", "Bare paper under the darkest illuminant", "radiometry", "counts", "at least", 300.0, MIN_SIGNAL,
-    why="the mean of 25 samples of 300 counts has an error of 1 %; dark colours have a thirtieth of these counts",
-    source="photon noise at 1.8 electrons per count, 6 counts of read noise", remedy="expose longer",
+    why="patches under this illuminant are noisy, most of all dark colours, which have a thirtieth of these counts",
+    source="calculated: the mean of 25 samples of 300 counts has an error of 1 %",
+    remedy="expose longer",
     measure=lambda table: float(table.lights.white.max(axis=1).min()),
     of_one_frame="bounded", where=_darkest_text, drawing="lights", lines=(Line(160, _darkest_row),),
 )  # fmt: skip

@@ -173,11 +173,11 @@ def with_lens(
     around = view.around(registered.registration, registered.cells, registered.references)
     candidates = [_spread_frame(baseline, [decoded], view, is_mixed=False) for decoded in primaries]
     if not any(candidates) or chart.bits < VARYING_BITS:
-        # With few patches, noise limits the measurement of the lens; white frames reduce it.
+        # With few patches, noise limits the measurement of the lens. The mean of white frames has less noise.
         candidates.append(_spread_frame(baseline, chain([first], more_whites), view, is_mixed=True))
     frames = [frame for frame in candidates if frame is not None]
     reason = "" if baseline.options.lens_correction else "disabled by --no-lens-correction"
-    # On a busy machine, several threads of linear algebra wait for each other longer than they compute.
+    # On a busy machine, several threads would be slower.
     with threadpool_limits(limits=1, user_api="blas"):
         measurement = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS, reason)
     if measurement is None:
@@ -218,7 +218,7 @@ def _spread_frame(baseline: Baseline, frames: _Frames, view: PrintView, is_mixed
     if not count:
         return None
     whites, sensor = points.white_patches, baseline.superposition
-    # Correct for counts lost near black, because they would hide veiling glare.
+    # Correct for nonlinearity near black, because lost counts would hide veiling glare.
     means, beyond = (values / count for values in (total, beyond))
     usual = np.median(means[whites], axis=0)
     means, beyond = (values * (1 - sensor.difference(np.maximum(values, 0), usual)[0]) for values in (means, beyond))
@@ -281,7 +281,7 @@ def field_of_cells(
     order = LIGHT_ORDER if degree == CODE_DEGREE else min(2, degree)
     codes = code_polynomial(rgb, degree)
     light, at_paper = page_polynomial(cells_mm, page_mm, order), page_polynomial(paper_mm, page_mm, order)
-    # Light and colours share one constant; bare paper has its own, because code 255 may print ink.
+    # The polynomials of light and codes share one constant. Bare paper has its own, because code 255 may print ink.
     design = np.block(
         [
             [codes, light[:, 1:], np.zeros((len(codes), 1))],

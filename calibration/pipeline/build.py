@@ -144,17 +144,17 @@ def build(
     Raises
     ------
     FormatError
-        If the frames or the series cannot be used.
+        If the frames or the series of exposures cannot be used.
     QualityError
         If the LUT is refused.
     InputError
         If the folder cannot be written.
     """
     selected = select_frames(session)
-    if selected.lights_without:
+    if selected.missing_lights:
         raise FormatError(
-            f"{session.folder}: {len(selected.lights_without)} of {len(session.illuminations)} illuminants have no "
-            f"accepted frame, expected one each: {first_few(selected.lights_without)}; complete the session with "
+            f"{session.folder}: {len(selected.missing_lights)} of {len(session.illuminations)} illuminants have no "
+            f"accepted frame, expected one each: {first_few(selected.missing_lights)}; complete the session with "
             "acquire run, or add the available frames with build-lut --append"
         )
     _require_dark_frames(session, options)
@@ -191,12 +191,12 @@ def append(
 ) -> BuildResult | TableProgress:
     """Add the available frames of a session in progress.
 
-    The LUT is built under a hidden name. It appears after the last frame, with the same bytes as from one `build`.
+    The LUT is built under a hidden name. It gets its name after the last frame; its bytes are the same as from `build`.
     Parameters and errors as for `build`, except that illuminants may be missing.
     """
     selected = select_frames(session)
-    # An imported session may have an empty plan; then only its illuminants must be complete.
-    if not selected.lights_without and {step.number for step in session.steps} <= session.done_steps():
+    # An imported session may have an empty plan. It is complete if all illuminants have a frame.
+    if not selected.missing_lights and {step.number for step in session.steps} <= session.done_steps():
         return build(session, out, progress, report, options, linearity, judged_by)
     _require_dark_frames(session, options)
     with unfinished_table(out) as unfinished:
@@ -207,7 +207,7 @@ def append(
             accumulator, writer, _ = _accumulate_all(session, selected, options, linearity, unfinished, report_progress)
             unfinished.save(_checkpoint(accumulator, writer))
         lights = len(session.illuminations)
-        return TableProgress(lights - len(selected.lights_without), lights, frames - previous_count, frames)
+        return TableProgress(lights - len(selected.missing_lights), lights, frames - previous_count, frames)
 
 
 def check(
@@ -327,8 +327,8 @@ def _measure_frame(accumulator: Accumulator, record: FrameRecord, register_again
     located = locate(baseline, decoded, accumulator.registered, register_again)
     if located is None:
         return None
-    is_even = accumulator.selected.is_even(record)
-    return measure(baseline, sample(baseline, located, accumulator.dark, keep_samples=is_even))
+    is_evenly_lit = accumulator.selected.is_evenly_lit(record)
+    return measure(baseline, sample(baseline, located, accumulator.dark, keep_samples=is_evenly_lit))
 
 
 def _new_accumulator(session: Session, selected: SelectedFrames, options: BuildOptions) -> Accumulator:

@@ -60,10 +60,10 @@ class Accumulator:
     hot: HotPixels
     highest: npt.NDArray[np.uint16]  # (C,), highest raw count of each patch
     highest_at: npt.NDArray[np.int64]  # (C,), illuminant with this count; −1 for a white frame
-    outside: npt.NDArray[np.bool_]  # (C,), patch cut off in a frame
+    outside: npt.NDArray[np.bool_]  # (C,), patch partly outside a frame
     covered: npt.NDArray[np.bool_]  # (C,), patch does not match the chart in a registered frame
     place_error: _Array  # (C,) px, largest uncertainty of position (`Registration.expanded_px`) in registered frames
-    even_sum: npt.NDArray[np.float32]  # (C, S, 3) counts above black, sum of the evenly lit frames (`is_even`)
+    even_sum: npt.NDArray[np.float32]  # (C, S, 3) counts above black, sum of the evenly lit frames (`is_evenly_lit`)
     even_noise2: _Array  # (C, 3) counts², sum of the variances of one sample in these frames
     even_frames: int
 
@@ -77,8 +77,8 @@ class Accumulator:
     ) -> Accumulator:
         """Return the state before the first frame.
 
-        `saturation`: raw count of the first registered frame. `first_dark`: first dark frame, to subtract from frames
-        taken earlier.
+        `saturation`: raw count of the first registered frame. `first_dark`: first dark frame, which is
+        subtracted from the frames before it.
         """
         count, samples, first = baseline.chart.colour_count, baseline.options.samples, baseline.first
         inside = np.concatenate([first.cells.inside, first.references.inside])
@@ -168,12 +168,12 @@ class Accumulator:
         return {"registered": self.registered.file, "figures": to_plain(self.figures, _Figures)}
 
     def to_arrays(self) -> _Arrays:
-        """Return the part of a checkpoint stored as arrays (...), by name."""
+        """Return the part of a checkpoint that is stored as arrays of any shape, by name."""
         owners = {"": self, "estimate.": self.estimate, "hot.": self.hot, "dark.": self.dark}
         return {prefix + name: array for prefix, owner in owners.items() for name, array in _arrays_of(owner).items()}
 
     def restored(self, values: Mapping[str, Any], arrays: _Arrays) -> Accumulator:
-        """Return the stored state of a build; this state must be empty. `arrays`: (...) by name."""
+        """Return the state of a checkpoint; `self` must be empty. `values`, `arrays`: from `to_json`, `to_arrays`."""
         stored_figures = from_plain(_Figures, values["figures"], self.session.folder, "start the build again")
         figures = tuple(
             replace(value, record=record) for value, record in zip(stored_figures, self.selected.records, strict=False)
@@ -211,8 +211,8 @@ class Accumulator:
     def stains(self, field: _Array) -> Stains:
         """Return the areas of the print with colours that differ from patches of similar codes elsewhere.
 
-        `field`: (C, 3) float64, flat field of an evenly lit frame for the colour of each patch. The flat field of paper
-        would give errors if the primaries have different fields.
+        `field`: (C, 3) float64, flat field of an evenly lit frame for the colour of each patch. It differs from the
+        flat field of paper if the primaries have different flat fields.
         """
         cells_mm = self.baseline.points.cells_mm
         level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field
@@ -222,8 +222,8 @@ class Accumulator:
         """Return the unfit patches, each with the first cause that applies. `frames`: measurements of all frames."""
         added_share = added.certain_share_of(self.baseline.levels).max(axis=1)
         disturbed = disturbed_cells(frames)
-        alone_by_frame = [(frame.consistency.alone, frame.record.illumination) for frame in frames]
-        light_by_colour = {colour: light for cells, light in alone_by_frame if light is not None for colour in cells}
+        isolated_by_frame = [(frame.consistency.isolated, frame.record.illumination) for frame in frames]
+        light_by_colour = {colour: light for cells, light in isolated_by_frame if light is not None for colour in cells}
         even_count, summary = max(self.even_frames, 1), self.dark_summary()
         hottest = summary.hottest if len(summary.hottest) else np.zeros(self.baseline.chart.colour_count)
         dead = has_dead_photosite(self.even_sum / even_count)

@@ -63,7 +63,7 @@ class SelectedFrames:
 
     # Last accepted frame of each illuminant, and accepted white and dark frames, in the order taken
     records: tuple[FrameRecord, ...]
-    lights_without: tuple[int, ...]  # Illuminants without a frame
+    missing_lights: tuple[int, ...]  # Illuminants without a frame
     registered: FrameRecord  # Frame to register first
     primaries: tuple[FrameRecord, ...]  # Frames of red, green and blue alone; () if one is missing
     more_whites: tuple[FrameRecord, ...]  # Further white frames, to measure the lens on charts with few patches
@@ -82,10 +82,10 @@ class SelectedFrames:
     def _lit_frames(self) -> Iterator[FrameRecord]:
         return (record for record in self.records if record.kind != "dark")
 
-    def is_even(self, record: FrameRecord) -> bool:
-        """Return True if a frame is evenly lit: a white frame, or the first of all light and white frames.
+    def is_evenly_lit(self, record: FrameRecord) -> bool:
+        """Return True if a frame is used as evenly lit: a white frame, or the first of all light and white frames.
 
-        If several white frames have the same file, only the first counts, because their noise does not average out.
+        Of several white frames with the same file, only the first is used, because they have the same noise.
         """
         first = next((white for white in self.records if white.kind == "white" and white.sha256 == record.sha256), None)
         return record == first or record is next(self._lit_frames)
@@ -93,7 +93,7 @@ class SelectedFrames:
 
 ReportProgress = Callable[[int, int, str], None]  # Called with the numbers of finished and of all frames, and a text
 
-_CONFIGURED_RIGS = ("lab", "simulated")  # Only these rigs set the camera's exposure
+_CONFIGURED_RIGS = ("lab", "simulated")  # In sessions of these rigs, the settings contain the exposure
 
 
 def select_frames(session: Session) -> SelectedFrames:
@@ -110,7 +110,7 @@ def select_frames(session: Session) -> SelectedFrames:
     pure = pure_lights(session.illuminations) or ()
     return SelectedFrames(
         records=_in_order_taken(session, [*last.values(), *reference_frames]),
-        lights_without=tuple(light.index for light in session.illuminations if light.index not in last),
+        missing_lights=tuple(light.index for light in session.illuminations if light.index not in last),
         registered=_frame_to_register(session, accepted),
         primaries=tuple(last[light] for light in pure) if all(light in last for light in pure) else (),
         more_whites=tuple(whites[1 : 1 + _MAX_MORE_WHITES]) if session.chart.bits < VARYING_BITS else (),
@@ -119,8 +119,8 @@ def select_frames(session: Session) -> SelectedFrames:
 
 def _in_order_taken(session: Session, records: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
     """Return frames in the order taken; their times never decrease."""
-    # Drift is interpolated in time between white frames. If a clock was set back between two frames, the second frame
-    # is assumed to follow after the usual interval. For imported frames, only the times in their files are known.
+    # Drift is interpolated in time between white frames. If a clock was set back between two frames, the usual interval
+    # is assumed between them. For imported frames, only the times in their files are known.
     if any(event.what == "import" for event in session.journal.events()):
         return tuple(sorted(records, key=lambda record: (record.taken_at, record.file)))
     ordered = sorted(records, key=lambda record: record.attempt)

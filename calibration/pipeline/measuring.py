@@ -87,7 +87,7 @@ class GreyLevels:
 
     @classmethod
     def of(cls, references: Sequence[Reference]) -> GreyLevels:
-        """Return the levels of grey references, one level per printed code."""
+        """Return the levels of grey references; references with the same printed code have one level."""
         codes = sorted({reference.rgb for reference in references}, reverse=True)
         first = {reference.rgb: reference.name for reference in reversed(references)}
         return cls(
@@ -342,11 +342,11 @@ class Baseline:
         return reflectances(self.means, field, paper.white)
 
 
-def background_counts(decoded: DecodedFrame, beyond: Sites) -> _Array:
+def background_counts(decoded: DecodedFrame, background: Sites) -> _Array:
     """Return the mean (3,) float64 counts above black of the background behind the print; 0 if not visible."""
-    if not len(beyond.rows):
+    if not len(background.rows):
         return np.zeros(3)
-    return gather_means(decoded.mosaic, decoded.black, beyond).mean(axis=0)
+    return gather_means(decoded.mosaic, decoded.black, background).mean(axis=0)
 
 
 def compared_cells(chart: Chart, registered: RegisteredFrame) -> npt.NDArray[np.bool_]:
@@ -372,7 +372,7 @@ class LocatedFrame:
     """A frame with the position of the chart in it."""
 
     decoded: DecodedFrame
-    registered: RegisteredFrame  # The frame registered last; this one, if it was registered again
+    registered: RegisteredFrame  # The frame registered last, which may be this frame
     moved: RegisteredFrame  # `registered` with its sampling positions moved by `shift`
     shift: Shift  # Movement since the frame registered before this one
     reregistered: bool
@@ -468,7 +468,7 @@ def sample(baseline: Baseline, located: LocatedFrame, dark: DarkLight | None, ke
         samples, highest = gather(decoded.mosaic, decoded.black, moved.cells)
         values, noise = table_values(samples, shape, dark_of_cells), sample_noise(samples)
         if dark_of_cells is not None:
-            # These samples are used to find faulty patches. Their dark light is kept; light spread by the lens is not.
+            # These samples are used to find faulty patches. Only light spread by the lens is subtracted from them.
             added = dark_of_cells if dark is None else dark_of_cells - dark.patches[: len(dark_of_cells)]
             samples -= added[:, None]
     else:
@@ -497,7 +497,7 @@ def measure(baseline: Baseline, sampled: SampledFrame) -> MeasuredFrame:
     located, points, values = sampled.located, baseline.points, sampled.values
     decoded, shift, origin = located.decoded, located.shift, located.decoded.mosaic.origin
     greys, grey_errors = points.levels.read(sampled.greys, sampled.paper.field.at(points.greys_mm))
-    # Blur of the registered frame, plus the increase of blur in the areas that measure movement.
+    # Squared blur of the registered frame, plus the increase since then in the areas that measure movement.
     blur_growth_px2 = 0.0 if located.reregistered else shift.blur_growth_px2
     mean = patch_means(values)
     variance = baseline.transfer.variance(mean) / baseline.options.samples

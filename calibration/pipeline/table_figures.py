@@ -1,4 +1,4 @@
-"""Calculate the measurements of a LUT or a check from its accumulated frames, including the uncertainty budget.
+"""Calculate the measurements of a LUT or of `build-lut check` from the accumulated frames, with uncertainty budget.
 
 If a session does not show an effect, the usual size of the effect is assumed, never 0. The linearity measured with a
 series of exposures (`read_linearity`) does not change the samples.
@@ -50,27 +50,28 @@ from foundation.errors import FormatError, InputError, counted
 
 _Array = npt.NDArray[np.float64]
 
-# Standard uncertainty of the black level, counts, in addition to the scatter of frames (judgement: masked photosites
-# give 0.03).
+# Standard uncertainty of the black level, counts, in addition to the scatter of frames. Chosen by judgement, because
+# masked photosites give 0.03 counts.
 _BLACK_COUNTS = 0.05
 
-# Relative standard deviation of photosite response that noise may hide (cameras have 0.3 to 1 %).
-_RESPONSE = 0.003
+# Relative standard deviation of photosite response that is always assumed, because noise may hide it.
+_RESPONSE_SD = 0.003
 
-_DARK_CHANGE = 0.2  # Relative change of dark light over a session with a single dark frame (judgement)
+_DARK_CHANGE = 0.2  # Relative change of dark light over a session with a single dark frame; chosen by judgement
 
-# Relative difference between the dark light in dark frames and in other frames, if not measured (judgement).
+# Relative difference between the dark light in dark frames and in other frames, if not measured. Chosen by judgement.
 _USUAL_OVERSUBTRACTION = 0.2
 
-# Relative error due to lamp flicker or an incomplete turn of the colour wheel in an exposure of 0.5 s (judgement; Heinz
-# et al. 2018).
-_FLICKER = 5e-5
+# Relative error due to lamp flicker or an incomplete turn of the colour wheel in an exposure of 0.5 s (Heinz et al.
+# 2018). Chosen by judgement.
+_FLICKER_ERROR = 5e-5
 
-_STRAY = 1e-4  # Light from outside the print relative to the illuminant, if not measured (judgement)
+_STRAY_ERROR = 1e-4  # Light from outside the print relative to the illuminant, if not measured; chosen by judgement
 
-# Fraction of the mean square errors of flicker and stray light that is common to all channels (judgement). A lamp
-# flickers in all channels, but exposures end within one colour of a wheel, and walls reflect light in their own colour.
-_COMMON = 0.75
+# Fraction of the mean square errors of flicker and of stray light that all channels have in common. Chosen by
+# judgement: most flicker changes all channels alike. Channels differ if an exposure ends within one colour of the
+# wheel, or if walls reflect light in their own colour.
+_COMMON_FRACTION = 0.75
 
 
 def budget_of(table: TableMeasurements) -> Budget:
@@ -97,21 +98,21 @@ def _diagonal(squares: _Array) -> _Array:
 
 
 def _partly_common(size: float, lights: int) -> _Array:
-    """Return covariances (L, 3, 3) of a relative error, of which the fraction `_COMMON` is common to all channels."""
-    square = size**2 * (_COMMON * np.ones((3, 3)) + (1 - _COMMON) * np.eye(3))
+    """Return covariances (L, 3, 3) of a relative error; `_COMMON_FRACTION` of it is common to all channels."""
+    square = size**2 * (_COMMON_FRACTION * np.ones((3, 3)) + (1 - _COMMON_FRACTION) * np.eye(3))
     return np.broadcast_to(square, (lights, 3, 3))
 
 
 def _noise_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    # Each term of the flat field's polynomial adds the variance of white once.
+    # The variance of the flat field at a patch is the variance of white times the number of its coefficients.
     square = (table.lights.white_error / white) ** 2
-    field = max(len(factor) for frame in table.frames for factor in frame.paper.field.coefficients[0])
-    response = (table.sensor.transfer.response**2 + _RESPONSE**2) / table.cells.window**2
+    coefficients = max(len(factor) for frame in table.frames for factor in frame.paper.field.coefficients[0])
+    response = (table.sensor.transfer.response**2 + _RESPONSE_SD**2) / table.cells.window**2
     return Component(
         "noise", "noise of the white references", False,
         "scatter of the white references about each frame's flat field, and photosite response within a patch; noise "
         "of the samples is not included",
-        _diagonal(square), np.broadcast_to(field * square.min(axis=0) + response, cells.shape),
+        _diagonal(square), np.broadcast_to(coefficients * square.min(axis=0) + response, cells.shape),
     )  # fmt: skip
 
 
@@ -134,7 +135,7 @@ def _darkness_component(table: TableMeasurements, white: _Array, cells: _Array) 
         light = np.maximum(dark.light, 0)
         changes = np.var(dark.lights, axis=0, ddof=1) if len(dark.lights) > 1 else (_DARK_CHANGE * light) ** 2
         error = error + dark.error**2 + changes + _oversubtracted_counts(table, light) ** 2
-        source = "scatter of the dark frames; illuminants of several primaries against the primaries' sum"
+        source = "scatter of the dark frames; difference between mixtures and the sum of their primaries"
         assumed = lights.additivity is None or len(dark.lights) < 2
     at_cells = error / np.maximum(lights.brightest, 1e-9) ** 2
     return Component(
@@ -159,7 +160,7 @@ def _linearity_component(table: TableMeasurements, white: _Array, cells: _Array)
     paper = np.maximum(table.lights.brightest, 1e-9)
     level = np.maximum(cells, LEAST_LEVEL) * paper
     source = (
-        "red, green and blue alone against an illuminant that combines them"
+        "red, green and blue alone, compared with an illuminant that combines them"
         if superposition.unmeasured is None
         else f"usual for cameras: 1 % at saturation, 0.05 % of saturation near black; {superposition.unmeasured.why}"
     )
@@ -171,11 +172,11 @@ def _linearity_component(table: TableMeasurements, white: _Array, cells: _Array)
 
 def _added_light_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
     measured_share = 0.0 if table.lights.stray is None else table.lights.stray.share
-    lights = _partly_common(_STRAY, len(white)) + measured_share**2 * np.eye(3)
-    at_cells = (_STRAY**2 + measured_share**2 + table.cells.added.mean_square) / cells**2
+    lights = _partly_common(_STRAY_ERROR, len(white)) + measured_share**2 * np.eye(3)
+    at_cells = (_STRAY_ERROR**2 + measured_share**2 + table.cells.added.mean_square) / cells**2
     return Component(
         "added light", "reflections, and light in single frames", table.lights.stray is None,
-        "light added equally to dark and bright patches; light under codes of 0; white against the sum of primaries",
+        "light added equally to dark and bright patches; light of primaries with code 0; white minus all primaries",
         lights, at_cells,
     )  # fmt: skip
 
@@ -183,28 +184,29 @@ def _added_light_component(table: TableMeasurements, white: _Array, cells: _Arra
 def _flicker_component(white: _Array, cells: _Array) -> Component:
     return Component(
         "flicker", "flicker within an exposure", True,
-        "usual for lamps and colour wheels; drift between frames is part of each ground truth and no error",
-        _partly_common(_FLICKER, len(white)), np.broadcast_to(_FLICKER**2, cells.shape),
+        "usual for lamps and colour wheels; drift between frames is part of the ground truths and no error",
+        _partly_common(_FLICKER_ERROR, len(white)), np.broadcast_to(_FLICKER_ERROR**2, cells.shape),
     )  # fmt: skip
 
 
 def _geometry_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    # On average, an uncertain position has the same effect on a patch as a blur of this σ.
+    # On average, an uncertain position acts like a blur with σ equal to the uncertainty.
     registration, window = table.registration, table.cells.window
     blur_px = np.hypot(registration.blur_px, registration.uncertainty_px(table.cells.stains.places_mm))
-    of_neighbours = mean_bleed(registration.cell_px, blur_px, window)[:, None]
+    neighbour_share = mean_bleed(registration.cell_px, blur_px, window)[:, None]
     contrast = np.sqrt(((cells - cells.mean(axis=0)) ** 2 + cells.var(axis=0)) / cells**2)
     no_error = np.zeros((len(white), 3, 3))
     return Component(
         "geometry", "positions of patches, and blur", False,
-        "blur and uncertainty of position from the registration, with neighbours of average contrast",
-        no_error, (of_neighbours * contrast) ** 2,
+        "blur and uncertainty of position from the registration; neighbours are assumed to have average contrast",
+        no_error, (neighbour_share * contrast) ** 2,
     )  # fmt: skip
 
 
 _MIN_BITS = 3  # Bits per channel needed to predict a patch from its neighbours in colour
 
-# Minimum number of different exposure times (judgement): with fewer, errors of recorded times look like nonlinearity.
+# Minimum number of different exposure times. With fewer, errors of recorded times look like nonlinearity. Chosen by
+# judgement.
 MIN_EXPOSURES = 4
 
 
@@ -212,7 +214,7 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
     """Return the linearity measured with a series of exposures.
 
     `folder`: raw files of the chart at its position in the session, under one steady illuminant, with one ISO speed and
-    aperture, from dim to almost saturated; eight are usual. Hidden files are ignored.
+    aperture, from dim to almost saturated; eight files are usual. Hidden files are ignored.
     """
     try:
         paths = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
@@ -285,16 +287,16 @@ _FULL_CODE = 255  # Code of a primary at full brightness
 def table_figures(accumulator: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
     """Return the measurements of a LUT with all frames added. `linearity`: result of a series of exposures, if any."""
     frames = accumulator.frames
-    even_frame = next((frame for frame in frames if accumulator.selected.is_even(frame.record)), frames[0])
+    evenly_lit = next((frame for frame in frames if accumulator.selected.is_evenly_lit(frame.record)), frames[0])
     frame_by_light = {frame.record.illumination: frame for frame in frames if frame.record.kind == "light"}
     by_light = [frame_by_light[light.index] for light in accumulator.session.illuminations]
     greys = np.array([frame.greys for frame in by_light]), np.array([frame.grey_errors for frame in by_light])
     lights = _light_figures(accumulator, by_light)
-    return _table_measurements(accumulator, even_frame, len(by_light), lights, greys, linearity)
+    return _table_measurements(accumulator, evenly_lit, len(by_light), lights, greys, linearity)
 
 
 def check_figures(accumulator: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
-    """Return the measurements of a check, from the registered frame and a dark frame, if there is one."""
+    """Return the measurements of `build-lut check`, from the registered frame and a dark frame, if there is one."""
     (frame,) = accumulator.frames
     lights = LightMeasurements(
         white=frame.paper.white[None],
@@ -306,25 +308,25 @@ def check_figures(accumulator: Accumulator, linearity: LinearityMeasurements | N
         codes=None,
         white_frames=None,
     )
-    light_count = len(accumulator.session.illuminations) - len(accumulator.selected.lights_without)
+    light_count = len(accumulator.session.illuminations) - len(accumulator.selected.missing_lights)
     greys = frame.greys[None], frame.grey_errors[None]
     return _table_measurements(accumulator, frame, light_count, lights, greys, linearity)
 
 
 def _table_measurements(
     accumulator: Accumulator,
-    even_frame: FrameMeasurements,
+    evenly_lit: FrameMeasurements,
     lights_taken: int,
     lights: LightMeasurements,
     greys: tuple[_Array, _Array],
     linearity: LinearityMeasurements | None,
 ) -> TableMeasurements:
-    # `even_frame`: frame for measuring the uniformity of patches.
+    # `evenly_lit`: frame for measuring the uniformity of patches.
     session, baseline, saturation = accumulator.session, accumulator.baseline, accumulator.saturation
     stated = stated_origin(session)
     origins = [frame.origin for frame in accumulator.figures]
     published = with_published_serials(origins, stated.citation.camera_serial)
-    stains, dark = accumulator.stains(_field_at_cells(baseline, even_frame)), accumulator.dark_summary()
+    stains, dark = accumulator.stains(_field_at_cells(baseline, evenly_lit)), accumulator.dark_summary()
     frames = _without_hot(accumulator.frames, dark.hottest, stains.places_mm)
     added = _added_light_of_first(baseline)
     table = TableMeasurements(
@@ -385,10 +387,10 @@ def _lens_figures(baseline: Baseline) -> LensFigures:
     return baseline.lens.figures
 
 
-def _field_at_cells(baseline: Baseline, even_frame: FrameMeasurements) -> _Array:
+def _field_at_cells(baseline: Baseline, evenly_lit: FrameMeasurements) -> _Array:
     """Return the flat field (C, 3) float64 of a frame at the patches, for the colour of each."""
-    field = even_frame.paper.field.at(baseline.points.cells_mm)
-    return field if baseline.primaries is None else field * baseline.primaries.field_ratio(even_frame.paper.white)
+    field = evenly_lit.paper.field.at(baseline.points.cells_mm)
+    return field if baseline.primaries is None else field * baseline.primaries.field_ratio(evenly_lit.paper.white)
 
 
 def _without_hot(
@@ -447,7 +449,7 @@ def _code_agreement(
     dark: _Array,
     gains: _Array,
 ) -> CodeAgreement:
-    """Return the agreement of illuminants, followed by white frames, with their codes, at equal exposures."""
+    """Return the agreement with the codes, at equal exposures: rows of illuminants, then rows of white frames."""
     frames = [*by_light, *whites]
     codes = np.array([*(light.colour for light in illuminations), *((255, 255, 255) for _ in whites)])
     factor = _to_one_exposure(frames)

@@ -1,13 +1,13 @@
 """Evaluate dark frames: light while the projector shows black, read noise, and hot photosites.
 
 Projector leak and ambient light are measured together, on paper, and are called dark light. Dark light is part of every
-illuminant, and is only subtracted on request. A hot photosite is an outlier in every dark frame. The result after a
-dark frame depends only on this frame and earlier ones, so a resumed build gives identical bits.
+illuminant, and is only subtracted on request. A hot photosite is an outlier in every dark frame.
 
 In one dark frame, the noise of a patch is as large as its light. The subtracted light is therefore predicted as light
 of paper × field × reflectance of the patch (docs/decisions/0009-dark-light-is-predicted.md). The mean residual of the
-patch is added with weight w = 1 − noise² / variance of all residuals, per channel (empirical Bayes; B. Efron and C.
-Morris, Journal of the American Statistical Association 68, 1973).
+patch is added with the weight 1 − n² / v, where n is the noise of mean residuals, and v is their variance over all
+patches, per channel (empirical Bayes; B. Efron and C. Morris, Journal of the American Statistical Association 68,
+1973).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
 
 _LEAST_WHITE = 50.0  # minimum counts of paper in a channel for measuring reflectance in it
 
-_MOST_REFLECTANCE = 1.5  # upper bound relative to paper, against noise in a dim channel
+_MOST_REFLECTANCE = 1.5  # upper bound relative to paper; larger values are noise of a dim channel
 
 # Largest deviation of a sample from the median of its patch, in σ. Read noise alone exceeds it in less than one of a
 # hundred charts.
@@ -39,7 +39,7 @@ HOT_COUNTS = 32.0
 
 HOT_SIGMA = 10.0  # minimum excess of a hot sample, in σ of read noise
 
-_NEVER = 32767  # initial value of the least excess, before the first dark frame
+_NO_FRAME_YET = 32767  # value of `HotPixels.least` before the first dark frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class DarkLight:
 
     paper: _Array  # (3,) counts of paper, divided by the flat field; only recorded
     patches: npt.NDArray[np.float32]  # (P, 3) counts of each patch in the frame, not divided by the flat field
-    share: _Array  # (3,) weight of the mean residuals, 0 … 1
+    share: _Array  # (3,) weight of the mean residuals of patches, 0 … 1
 
 
 def winsorised_means(samples: npt.NDArray[np.float32], noise: _Array) -> _Array:
@@ -80,8 +80,8 @@ class DarkLightEstimate:
     reflectance: _Array  # (P, 3) of each patch
     inside: npt.NDArray[np.bool_]  # (P,) patches in the frame
     samples: int  # samples per patch
-    left: _Array  # (P, 3) sum of residuals from the prediction, counts
-    noise: _Array  # (3,) sum of the variances of a patch mean, counts²
+    residual_sum: _Array  # (P, 3) sum over the dark frames of measured minus predicted means, counts
+    variance_sum: _Array  # (3,) sum over the dark frames of the variance of a patch mean, counts²
     frames: int  # number of dark frames
 
     @staticmethod
@@ -104,13 +104,13 @@ class DarkLightEstimate:
         predicted = paper.white * field * self.reflectance
         updated = replace(
             self,
-            left=self.left + (means - predicted),
-            noise=self.noise + noise**2 / self.samples,
+            residual_sum=self.residual_sum + (means - predicted),
+            variance_sum=self.variance_sum + noise**2 / self.samples,
             frames=self.frames + 1,
         )
-        mean = updated.left / updated.frames
+        mean = updated.residual_sum / updated.frames
         spread = MAD_TO_SIGMA * np.median(np.abs(mean[self.inside] - np.median(mean[self.inside], axis=0)), axis=0)
-        noise2 = updated.noise / updated.frames**2
+        noise2 = updated.variance_sum / updated.frames**2
         share = np.clip(1 - noise2 / np.maximum(spread**2, 1e-12), 0, 1)
         return updated, DarkLight(paper.white, (predicted + share * mean).astype(np.float32), share)
 
@@ -178,7 +178,7 @@ class HotPixels:
     @staticmethod
     def start(cells: int, samples: int) -> HotPixels:
         """Return the state before the first dark frame."""
-        return HotPixels(np.full((cells, samples, 3), _NEVER, dtype=np.int16), np.zeros(cells))
+        return HotPixels(np.full((cells, samples, 3), _NO_FRAME_YET, dtype=np.int16), np.zeros(cells))
 
     def with_frame(self, excess: npt.NDArray[np.int16]) -> HotPixels:
         """Return the state after a frame with `excess` (C, S, 3) from `measure_dark_frame`."""
@@ -189,7 +189,7 @@ class HotPixels:
 
         `noise`: (3,) counts, standard deviation of a sample.
         """
-        return HotPixels(np.full_like(self.least, _NEVER), self.hottest(noise))
+        return HotPixels(np.full_like(self.least, _NO_FRAME_YET), self.hottest(noise))
 
     def hottest(self, noise: _Array) -> _Array:
         """Return the excess (C,) float64 of the hottest sample of each patch in every frame, counts; 0 if none.
@@ -197,7 +197,7 @@ class HotPixels:
         `noise`: (3,) counts, standard deviation of a sample.
         """
         limit = np.maximum(HOT_COUNTS, HOT_SIGMA * noise)
-        is_hot = (self.least > limit) & (self.least < _NEVER)
+        is_hot = (self.least > limit) & (self.least < _NO_FRAME_YET)
         return np.maximum(np.where(is_hot, self.least, 0).max(axis=(1, 2)).astype(np.float64), self.past)
 
 

@@ -1,8 +1,8 @@
 """Correct a LUT for lamp drift, and list all corrections of counts for `lut.json`.
 
 Each illuminant is scaled to the brightest state of the lamp. Samples are therefore multiplied by factors of at least 1.
-Different integers stay different, so the measured counts can be recovered exactly (`as_measured`). Samples and ground
-truth of an illuminant are divided by the same gain in each channel, so they stay consistent
+Different integers stay different, so that the measured counts can be recovered exactly (`as_measured`). Samples and
+ground truth of an illuminant are divided by the same gain in each channel, so they stay consistent
 (docs/decisions/0030-drift-is-taken-out-on-request.md).
 """
 
@@ -23,7 +23,7 @@ _Array = npt.NDArray[np.float64]
 SaturationSource = Literal["frames", "raw files", "settings"]
 
 # Decimals of gains in `lut.json`. Samples are divided by the rounded gains, so that the division can be undone.
-DIGITS = 6
+GAIN_DIGITS = 6
 
 # Source of the saturation value, for `lut.json`.
 _SATURATION_FROM: dict[SaturationSource, str] = {
@@ -145,8 +145,8 @@ def _dark_correction(subtracted: _Array) -> dict[str, Any]:
 class DriftCorrection:
     """Gains by which the illuminants of a LUT are divided, so that all have the brightest state of the lamp."""
 
-    gains: _Array  # (L, 3) lamp relative to the brightest white frame, in (0, 1], rounded to `DIGITS`
-    left: float  # relative uncertainty of the lamp between white frames (`drift_uncertainty`)
+    gains: _Array  # (L, 3) lamp relative to the brightest white frame, in (0, 1], rounded to `GAIN_DIGITS`
+    uncertainty: float  # relative, of the lamp between white frames (`drift_uncertainty`)
 
 
 def drift_correction(at_s: _Array, white_at_s: _Array, white: _Array) -> DriftCorrection:
@@ -161,7 +161,7 @@ def drift_correction(at_s: _Array, white_at_s: _Array, white: _Array) -> DriftCo
     gains: _Array = np.ones((len(at_s), 3))
     for channel in range(3):
         gains[:, channel] = np.interp(at_s, white_at_s, relative[:, channel])
-    return DriftCorrection(np.round(gains, DIGITS), drift_uncertainty(at_s, white_at_s, white))
+    return DriftCorrection(np.round(gains, GAIN_DIGITS), drift_uncertainty(at_s, white_at_s, white))
 
 
 def drift_uncertainty(at_s: _Array, white_at_s: _Array, white: _Array) -> float:

@@ -24,7 +24,7 @@ from experiment.measures.paper import FlatField, Paper
 
 _Array = npt.NDArray[np.float64]
 
-# Minimum counts above black level of paper under a primary for a precise field (judgement).
+# Minimum counts of paper above black level, under each primary, for measuring its flat field. Chosen by judgement.
 LEAST_PAPER = 300.0
 
 # Largest relative difference of a patch's field from the field of paper. A larger difference is noise and is ignored.
@@ -120,7 +120,7 @@ class Primaries:
     """The three primaries of a session, each from its own frame."""
 
     lights: tuple[int, int, int]  # indices of red, green and blue alone
-    # flat field of each, from its brightest channel, used for all channels
+    # flat field of each primary, from its brightest channel; used for all channels
     fields: tuple[FlatField, FlatField, FlatField]
     paper: _Array  # (3, 3) counts above black level of paper by primary and channel, without field
     at_cells: _Array  # (3, C) fields at the patches

@@ -1,11 +1,11 @@
 """Measure the linearity of the sensor by flux superposition: compare an illuminant with red, green and blue alone.
 
-The light of a patch under several primaries is the sum of its light under each primary, times the amount of the
-primary. Counts of a linear sensor add in the same way. Counts do not add if there is compression near saturation, loss
-near black or a wrong black level. The patches cover all levels from black ink to paper, so four frames show the whole
-curve. Chart, lens and photosite response do not matter, because the same photosites are compared. Lamp changes between
-frames do not matter, because the amounts of the primaries are fitted as well. This is the superposition or
-flux-addition method of detector calibration (C. L. Sanders, Applied Optics 1, 1962).
+The light of a patch under several primaries is a weighted sum: the light under each primary alone is multiplied by the
+amount of this primary. Counts of a linear sensor add in the same way. They do not add if there is compression near
+saturation, loss near black or a wrong black level. The patches cover all levels from black ink to paper, so four frames
+show the whole curve. Chart, lens and photosite response do not matter, because the same photosites are compared. Lamp
+changes between frames do not matter, because the amounts of the primaries are fitted as well. This is the superposition
+or flux-addition method of detector calibration (C. L. Sanders, Applied Optics 1, 1962).
 
 A factor common to all counts cannot be measured, and has no effect on chromaticities.
 """
@@ -35,29 +35,33 @@ _USUAL_LOSS = 0.0005
 
 _LOSS_SCALES = (0.0005, 0.002)  # levels at which this loss reaches 63 %, relative to saturation
 
-_USUAL_REST = 0.0003  # prior standard deviation of other deviations, relative to the level
+_USUAL_REST = 0.0003  # prior standard deviation of deviations of any other shape, relative to the level
 
-_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)  # candidate factors of these priors, with equal prior odds
+_PRIOR_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)  # candidate factors of these priors, with equal prior odds
 
-_LEAST_PATCHES = 100  # minimum number of patches (judgement)
+_LEAST_PATCHES = 100  # minimum number of patches; chosen by judgement
 
 _CODE_DEGREE = 4  # degree of the polynomial in the codes that predicts patches without noise
 
-_LOOSE = 10.0  # prior standard deviation of the amount of a primary, if nothing is known about it
+_FREE_SD = 10.0  # prior standard deviation of the amount of a primary, if nothing is known about it
 
-# Prior standard deviation of the differences between channels in the amount of a primary: its spectrum hardly changes.
-_OWN_SPECTRUM = 0.001
+# Prior standard deviation of the difference between channels in the amount of a primary, whose spectrum hardly changes.
+_CHANNEL_SD = 0.001
 
 # Models of full white: standard deviation of the amounts of the primaries, of their differences between channels, and
-# prior odds (judgement). First model: white is the sum of the primaries. Second: the exposures are no whole number of
-# turns of a colour wheel. Third: a projector that boosts white adds light of another spectrum.
-_WHITES = ((0.003, _OWN_SPECTRUM, 0.6), (0.05, _OWN_SPECTRUM, 0.3), (_LOOSE, _LOOSE, 0.1))
+# prior odds. First model: white is the sum of the primaries. Second: the exposures are no whole number of turns of a
+# colour wheel. Third: a projector that boosts white adds light of another spectrum. Chosen by judgement.
+_WHITE_MODELS = (
+    (0.003, _CHANNEL_SD, 0.6),
+    (0.05, _CHANNEL_SD, 0.3),
+    (_FREE_SD, _FREE_SD, 0.1),
+)
 
 _GROUPS = 12  # number of groups of similar levels for measuring the scatter
 
 _ROUNDS = 3  # number of solutions, each weighted and linearised by the previous one
 
-_AMOUNTS = 12  # number of unknowns before the nodes: amount of each primary, and its difference in each channel
+_AMOUNT_COUNT = 12  # number of unknowns before the nodes: amount of each primary, and its difference in each channel
 
 _Array = npt.NDArray[np.float64]
 
@@ -95,7 +99,7 @@ class Superposition:
     @staticmethod
     def usual(full: float, unmeasured: Unmeasured = NO_PRIMARIES) -> Superposition:
         """Return usual deviations of cameras, for a session without a measurement."""
-        return Superposition(full, np.zeros(len(NODES)), _usual(full), unmeasured)
+        return Superposition(full, np.zeros(len(NODES)), _usual_covariance(full), unmeasured)
 
     @property
     def measured(self) -> bool:
@@ -163,11 +167,11 @@ def superposition(
         why = f"the chart has {patches} usable patches, {needed} or more expected"
         return Superposition.usual(full, Unmeasured(why, f"use a chart with more colours, or {_GIVE_SERIES}"))
     levels, predictors = np.stack([together, *alone])[:, usable], predictors[usable]
-    hats, size = _hats(levels / full), _AMOUNTS + len(NODES)
-    whites = _WHITES if white else ((_LOOSE, _LOOSE, 1.0),)
-    priors = [(_prior(full, scale, *sigmas), odds) for scale, (*sigmas, odds) in product(_SCALES, whites)]
-    # The unknowns are differences from this start. Otherwise, the large squares of counts would hide the differences
-    # between priors.
+    hats, size = _hats(levels / full), _AMOUNT_COUNT + len(NODES)
+    whites = _WHITE_MODELS if white else ((_FREE_SD, _FREE_SD, 1.0),)
+    priors = [(_prior(full, scale, *sigmas), odds) for scale, (*sigmas, odds) in product(_PRIOR_SCALES, whites)]
+    # The unknowns are small differences from this start. With the full amounts, rounding errors would hide the
+    # differences of the evidence between priors.
     start = np.zeros(size)
     start[:3] = 1.0 if white else np.linalg.lstsq(levels[1:].reshape(3, -1).T, levels[0].ravel(), rcond=None)[0]
     solution, covariance = start, np.zeros((size, size))
@@ -180,7 +184,7 @@ def superposition(
             # Corrected counts are proportional: value - m(value) = sum of amount (primary - m(primary)).
             bend = hats[0, :, channel] - np.einsum("k,kpn->pn", amounts, hats[1:, :, channel])
             design = np.zeros((len(value), size))
-            design[:, :3], design[:, own], design[:, _AMOUNTS:] = primaries, primaries, bend
+            design[:, :3], design[:, own], design[:, _AMOUNT_COUNT:] = primaries, primaries, bend
             residual = value - design @ solution
             sigma = sigma_by_level(residual, value, _GROUPS) + 1e-9
             root = huber_weights(np.abs(residual) / sigma, 1.0) / sigma
@@ -192,7 +196,7 @@ def superposition(
             misfit = max(misfit, _misfit(rows, root * residual))
         difference, covariance = _posterior(matrix / misfit, right / misfit, priors)
         solution = start + difference
-    return Superposition(full, solution[_AMOUNTS:], covariance[_AMOUNTS:, _AMOUNTS:], None)
+    return Superposition(full, solution[_AMOUNT_COUNT:], covariance[_AMOUNT_COUNT:, _AMOUNT_COUNT:], None)
 
 
 def _posterior(matrix: _Array, right: _Array, priors: Sequence[tuple[_Array, float]]) -> tuple[_Array, _Array]:
@@ -231,15 +235,15 @@ def printed_predictors(codes: npt.ArrayLike, references: npt.NDArray[np.integer]
 
 
 def _prior(full: float, scale: float, amount_sd: float, channel_sd: float) -> _Array:
-    # Inverse of the prior covariance of all unknowns; arguments as in `_WHITES`.
-    prior = np.zeros((_AMOUNTS + len(NODES), _AMOUNTS + len(NODES)))
-    prior[:3, :3] = np.linalg.inv(_LOOSE**2 * np.ones((3, 3)) + amount_sd**2 * np.eye(3))
-    prior[3:_AMOUNTS, 3:_AMOUNTS] = np.eye(_AMOUNTS - 3) / channel_sd**2
-    prior[_AMOUNTS:, _AMOUNTS:] = np.linalg.inv(scale**2 * _usual(full))
+    # Inverse of the prior covariance of all unknowns; arguments as in `_WHITE_MODELS`.
+    prior = np.zeros((_AMOUNT_COUNT + len(NODES), _AMOUNT_COUNT + len(NODES)))
+    prior[:3, :3] = np.linalg.inv(_FREE_SD**2 * np.ones((3, 3)) + amount_sd**2 * np.eye(3))
+    prior[3:_AMOUNT_COUNT, 3:_AMOUNT_COUNT] = np.eye(_AMOUNT_COUNT - 3) / channel_sd**2
+    prior[_AMOUNT_COUNT:, _AMOUNT_COUNT:] = np.linalg.inv(scale**2 * _usual_covariance(full))
     return prior
 
 
-def _usual(full: float) -> _Array:
+def _usual_covariance(full: float) -> _Array:
     """Return the prior covariance (K, K) float64 counts²: curvature of all counts, and loss near black."""
     level = np.array(NODES)
     bends = [_USUAL_BEND * level**2, _USUAL_BEND * level**3]

@@ -14,13 +14,14 @@ if TYPE_CHECKING:
     from calibration.sampling import PhotonTransfer
     from calibration.table.lut import Lut
 
-_LIGHTS: Final = 6  # number of illuminants to measure; in a full LUT, their patches give each parameter to 1 %
+# Number of illuminants to measure. In a full LUT, each parameter of the curve is then accurate to 1 %.
+_LIGHT_COUNT: Final = 6
 
 # Largest RMS of the relative differences between variances and curve. Full simulated LUTs have 0.006, and LUTs with
 # eight patches per level 0.1.
-_MISFIT: Final = 0.25
+_MAX_MISFIT: Final = 0.25
 
-_FEWEST: Final = 32  # minimum number of patches for a curve of three parameters
+_MIN_PATCHES: Final = 32  # minimum number of patches for a curve of three parameters
 
 
 def noise_curve(lut: Lut) -> PhotonTransfer | None:
@@ -35,7 +36,7 @@ def noise_curve(lut: Lut) -> PhotonTransfer | None:
         If the samples do not follow the curve, or too few patches are usable.
     """
     count = lut.samples.shape[2]
-    lights = np.argsort(-lut.white.min(axis=1), kind="stable")[:_LIGHTS]
+    lights = np.argsort(-lut.white.min(axis=1), kind="stable")[:_LIGHT_COUNT]
     unfit = np.array([cell.colour for cell in lut.provenance.unfit], dtype=np.int64)
     means: list[npt.NDArray[np.float64]] = []
     variances: list[npt.NDArray[np.float64]] = []
@@ -46,17 +47,17 @@ def noise_curve(lut: Lut) -> PhotonTransfer | None:
             means.append(samples.mean(axis=1, dtype=np.float64))
             variances.append(samples.var(axis=1, ddof=1, dtype=np.float64))
     cells = sum(map(len, means))
-    if cells < _FEWEST:
+    if cells < _MIN_PATCHES:
         raise InputError(
             f"the noise of {lut.folder} cannot be measured: {cells} patches have several samples above 0, expected "
-            f"at least {_FEWEST}; omit --iso, --exposure and --gradient, or use another LUT"
+            f"at least {_MIN_PATCHES}; omit --iso, --exposure and --gradient, or use another LUT"
         )
     curve = photon_transfer(np.concatenate(means), np.concatenate(variances), count)
     has_noise = np.concatenate(variances).max() > 0
-    if has_noise and not curve.misfit.max() <= _MISFIT:
+    if has_noise and not curve.misfit.max() <= _MAX_MISFIT:
         raise InputError(
             f"the samples of {lut.folder} do not follow the photon-transfer curve: their variances differ by "
-            f"{curve.misfit.max():.0%} RMS, expected at most {_MISFIT:.0%}; omit --iso, --exposure and --gradient, or "
-            "use another LUT"
+            f"{curve.misfit.max():.0%} RMS, expected at most {_MAX_MISFIT:.0%}; omit --iso, --exposure and --gradient, "
+            "or use another LUT"
         )
     return curve if has_noise else None

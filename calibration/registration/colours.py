@@ -24,19 +24,19 @@ MIN_COLOURS = 64
 # high because model errors are not normally distributed.
 _MISMATCH_SIGMA = 10.0
 
-# The second limit, relative to paper. Errors of the model at the corners of the gamut are smaller.
+# The second limit, relative to paper. At the corners of the gamut, the model has smaller errors.
 _MISMATCH_SHARE = 0.08
 
-_NEIGHBOURS = 13  # The patch itself and the twelve patches within a distance of two patches
+_NEIGHBOUR_COUNT = 13  # The patch itself and the twelve patches within a distance of two patches
 
-# Share of mismatched neighbours above which a patch is also mismatched (judgement).
+# Share of mismatched neighbours above which a patch is also mismatched. Chosen by judgement.
 _MISMATCH_NEIGHBOURS = 0.35
 
 _MAX_AREA_CELLS = 16  # Largest width of an area that is tested for a displacement, in patches
 
 _MIN_SHIFT_CELLS = 0.5  # Smallest apparent displacement of a displaced area, in patches
 
-_MIN_SHIFT_SIGMAS = 6.0  # The same in standard uncertainties
+_MIN_SHIFT_SIGMAS = 6.0  # Smallest apparent displacement of a displaced area, in standard uncertainties
 
 # Number of independent measurements in an area. It is small, because model errors of neighbouring patches are
 # correlated.
@@ -57,8 +57,8 @@ _Mask = npt.NDArray[np.bool_]
 def mismatched(measured: _Array, expected: _Array, paper: _Array, chart: Chart) -> _Mask:
     """Return the mismatched patches (C,) bool: their colours are far from the model, or most neighbours are mismatched.
 
-    `measured`, `expected`: (C, 3) colours of the patches in chart order, optionally followed by (R, 3) of references;
-    NaN outside the frame. `paper`: (3,) colour of the paper.
+    `measured`, `expected`: (C, 3) colours of the patches in chart order, or (C + R, 3) with the references last; NaN
+    outside the frame. `paper`: (3,) colour of the paper.
     """
     count = chart.colour_count
     if count < MIN_COLOURS:
@@ -71,7 +71,7 @@ def mismatched(measured: _Array, expected: _Array, paper: _Array, chart: Chart) 
 
 def _with_neighbours(is_mismatched: _Mask, centres: _Array) -> _Mask:
     # A covered patch may match by chance, if the cover has its colour. Its neighbours show that it is covered.
-    neighbours = cKDTree(centres).query(centres, k=min(_NEIGHBOURS, len(centres)))[1]
+    neighbours = cKDTree(centres).query(centres, k=min(_NEIGHBOUR_COUNT, len(centres)))[1]
     mismatched_share = is_mismatched[np.asarray(neighbours).reshape(len(centres), -1)].mean(axis=1)
     return np.asarray(is_mismatched | (mismatched_share > _MISMATCH_NEIGHBOURS))
 

@@ -47,11 +47,11 @@ _COLLINEAR_MARKS_MESSAGE = (
 # over 20 knots.
 ROUGHNESS_PX = 0.2
 
-# The same for the roughest accepted sheet: waves of 6 mm with a period of 150 mm.
+# Prior standard deviation for the roughest accepted sheet: waves of 6 mm with a period of 150 mm.
 MAX_ROUGHNESS_PX = 2.0
 
 # Prior standard deviation of the displacement within the plane of the sheet, between its centre and its edge. Causes
-# are lens distortion beyond Brown's model, and paper expanded by humidity (judgement).
+# are lens distortion beyond Brown's model, and paper expanded by humidity. Chosen by judgement.
 _IN_PLANE_PX = 2.0
 
 # Added to the diagonal of the normal matrix, px⁻². It makes the matrix regular at knots without measurements.

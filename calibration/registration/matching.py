@@ -89,8 +89,8 @@ _RIM_SIGMAS = 3.0  # Width of the excluded rim of the patch area, in standard de
 # Number of neighbouring raster elements with the same colour error, for charts in smooth order.
 _CORRELATED_ELEMENTS = 10
 
-# Standard uncertainty of positions in a smooth order, in patches (simulated frames). A colour error there has the same
-# effect as a displacement.
+# Standard uncertainty of positions in a smooth order, in patches (simulated frames). It is caused by colour errors,
+# which look like displacements in such an order.
 _COLOUR_ERROR_CELLS = 0.005
 
 _SCORE_BLUR_CELLS = 0.6  # Blur for the scores of blocks in smooth order, in patches
@@ -101,7 +101,7 @@ _COLOUR_PATCHES = 5000  # Approximate number of patches for fitting the colour m
 
 _LENS_POINTS = 2000  # Approximate number of patches for refitting the lens; more do not improve it
 
-# Assumed standard uncertainty of the positions of these patches, px (judgement).
+# Assumed standard uncertainty of the positions of these patches, px. Chosen by judgement.
 _LENS_POINT_SIGMA_PX = 0.1
 
 # Blur that cubic interpolation adds to the rectified frame, as a standard deviation, measured on sharp edges. The
@@ -117,7 +117,7 @@ class Blocks:
 
     centres_mm: _Array  # (B, 2)
     score: _Array  # (B,) correlation of frame and predicted print, −1 … 1; 0 if not comparable
-    residual_px: _Array  # (B, 2) displacement from the final map, measured in the block
+    residual_px: _Array  # (B, 2) measured displacement of the block from the final map
 
     @property
     def good(self) -> _Mask:
@@ -354,7 +354,7 @@ class Matcher:
     def patches(self) -> tuple[_Array, _Array, _Array]:
         """Return measured and predicted camera RGB of all patches, and predicted camera RGB of the paper, in counts.
 
-        Patches, followed by references: (N, 3) float64; measured values are NaN outside the frame. Paper: (3,) float64.
+        Patches, with the references last: (N, 3) float64; measured values are NaN outside the frame. Paper: (3,).
         """
         self.colours = self._fit_colours()
         return self._measured_rgb(), self.colours.predict(self._rgb, self._centres), self._paper_rgb()

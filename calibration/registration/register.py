@@ -45,11 +45,11 @@ MAX_TAG_RESIDUAL_PX = 8.0
 # Minimum correlation of measured and predicted patch colours. A chart with another order of patches gives about 0.
 MIN_AGREEMENT = 0.8
 
-# The same for a chart without tags; 0.99 is usual. Neighbouring patches of such a chart have similar colours, so the
-# colour model can partly fit even an object in front of the chart.
+# Minimum correlation for a chart without tags; 0.99 is usual. Neighbouring patches of such a chart have similar
+# colours, so the colour model can partly fit even an object in front of the chart.
 MIN_PLAIN_AGREEMENT = 0.95
 
-MIN_GOOD_BLOCKS = 0.75  # Minimum share of blocks of patches that match the chart (judgement)
+MIN_GOOD_BLOCKS = 0.75  # Minimum share of blocks of patches that match the chart; chosen by judgement
 
 # Largest RMS residual of the blocks, for patches of 10 px. Waves of 3 mm give less than a tenth of it in simulation.
 MAX_BLOCK_RESIDUAL_PX = 0.5
@@ -57,8 +57,8 @@ MAX_BLOCK_RESIDUAL_PX = 0.5
 # Maximum number of Gauss-Newton steps. A flat print needs two or three steps, a curled print five.
 _GAUSS_NEWTON_STEPS = 8
 
-# The iteration ends if the RMS and the largest movement of a step are both below these limits. The second limit is
-# for a curled rim: it converges last and hardly changes the RMS.
+# The iteration ends if the RMS and the largest movement of a step are both below these limits. The second limit is for
+# a curled rim, which converges last and hardly changes the RMS.
 _CONVERGED_RMS_PX, _CONVERGED_MAX_PX = 0.015, 0.15
 
 # Standard uncertainty of a tag corner. Measured: 0.085 px under white, 0.20 px under a dim illuminant.
@@ -66,7 +66,7 @@ _TAG_SIGMA_PX = 0.15
 
 _MIN_TAG_SIGMA_PX = 0.03  # Standard uncertainty of a tag corner in the sharpest frames
 
-_OUTLINE_SIGMA_PX = 0.1  # Standard uncertainty of an outline point, across the outline (judgement)
+_OUTLINE_SIGMA_PX = 0.1  # Standard uncertainty of an outline point, across the outline; chosen by judgement
 
 # An outline point is an outlier if it is further from the curve of its side than both limits.
 _OUTLIER_SIGMAS, _OUTLIER_PX = 5.0, 1.0
@@ -148,7 +148,7 @@ class Registration:
 
     @property
     def block_rms_px(self) -> float:
-        """RMS residual, px, of the good blocks: an estimate of the registration error."""
+        """RMS residual, px, of the blocks that match the chart: an estimate of the registration error."""
         return rms(self.blocks.residual_px[self.blocks.good])
 
     @property
@@ -168,8 +168,6 @@ def register(
     neighbour: Registration | None = None,
 ) -> Registration:
     """Register the chart in a frame.
-
-    A full chart with tags takes about 5 s on one processor. A chart without tags takes three times as long.
 
     Parameters
     ----------
@@ -315,9 +313,9 @@ def _refuse_displaced_areas(matcher: Matcher, mismatched_cells: _Mask, frame_nam
     if len(displaced_mm) >= max(_MIN_DISPLACED_AREAS, _MIN_DISPLACED_SHARE * area_count):
         x, y = displaced_mm[0]
         raise RegistrationError(
-            f"{frame_name}: {len(displaced_mm)} of {area_count} areas of the chart match the neighbouring patches, "
-            f"the first near ({x:.0f}, {y:.0f}) mm from the top-left corner of the sheet; uncover the print, hang it "
-            "flatter, and check that chart.json describes the printed positions"
+            f"{frame_name}: {len(displaced_mm)} of {area_count} areas of the chart have the colours of the "
+            f"neighbouring patches, the first near ({x:.0f}, {y:.0f}) mm from the top-left corner of the sheet; "
+            "uncover the print, hang it flatter, and check that chart.json describes the printed positions"
         )
 
 

@@ -26,10 +26,10 @@ ToPixels = Callable[[_Array], _Array]  # from points (N, 2) mm to positions (N, 
 # Spacing of the nodes where the map is calculated exactly, in elements. Positions between nodes are interpolated.
 _LATTICE_STRIDE = 8
 
-# Minimum correlation of frame and predicted print around a tile; other tiles are not used (judgement).
+# Minimum correlation of frame and predicted print around a tile; other tiles are not used. Chosen by judgement.
 MIN_SCORE = 0.5
 
-# Minimum share of comparable elements in the window of a tile; otherwise its score is 0 (judgement).
+# Minimum share of comparable elements in the window of a tile; otherwise its score is 0. Chosen by judgement.
 _MIN_SHARE = 0.25
 
 _Float = npt.NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""Plots of the report, each on its own Matplotlib figure (`foundation.plots.draw_png`).
+"""Plots of the report, each with one or several panels (`foundation.plots.draw_panels`).
 
 Frames are drawn at half size, one pixel per 2×2 block, without interpolation (paper, section 3.3: "simple subsampling
 and debayering").
@@ -6,6 +6,7 @@ and debayering").
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,14 @@ from experiment.chart.model import Chart
 from experiment.framing.pictures import STILL_PX
 from experiment.measures.paper import FlatField
 from foundation.colorimetry import decode_srgb
-from foundation.plots import CHANNEL_INK, FAINT, INK, MARK, draw_squares
+from foundation.plots import CHANNEL_INK, FAINT, INK, MARK, PAPER, SERIES, draw_squares
 
 _PAPER_PERCENTILE = 99.5  # Percentile used as paper white; brighter pixels are highlights or hot photosites
 
-_GAMMA = 2.2  # Exponent that approximates the sRGB curve for display
+_GAMMA = 2.2  # Approximates the sRGB curve for display
+
+_PHOTOGRAPH_WIDTH = 9.6  # Inches, so that no panel fits next to it
+
 _Mask = npt.NDArray[np.bool_]
 
 
@@ -37,18 +41,14 @@ def viewable(picture: _Image) -> _Image:
     return np.clip(picture / white, 0, 1).astype(np.float32) ** np.float32(1 / _GAMMA)
 
 
-def draw_registration(figure: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:
-    """Draw the frame with the registered chart, and magnified areas with patches and samples.
+def draw_registration(panels: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:
+    """Draw the frame with the registered chart, and in five more panels magnified areas with patches and samples.
 
     `picture`: (H, W, 3) float32 counts, half-size frame. `window`: side of a sampling window, px.
     """
-    height, width = picture.shape[:2]
-    figure.set_size_inches(10, 10 * height / width + 2.4)
-    main, crops = figure.subfigures(2, 1, height_ratios=(10 * height / width, 2.4))
     view = viewable(picture)
-    step = max(1, width // 1400)
-    axes = main.subplots()
-    axes.imshow(view[::step, ::step], extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="antialiased")
+    axes, *crops = panels
+    _show_frame(axes, view)
     for tag in registration.framing.tags:
         outline = np.vstack([tag.corners_px, tag.corners_px[:1]])
         axes.plot(outline[:, 0], outline[:, 1], color=MARK, linewidth=1.4)
@@ -58,7 +58,6 @@ def draw_registration(figure: Any, picture: _Image, chart: Chart, registration: 
         axes.plot(pixels[:, 0], pixels[:, 1], color="white", linewidth=0.5, alpha=0.75)
     edge = registration.lens.to_pixels([(0, 0), (page_w, 0), (page_w, page_h), (0, page_h), (0, 0)])
     axes.plot(edge[:, 0], edge[:, 1], color=MARK, linewidth=0.8, linestyle=(0, (4, 3)))
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
     low, high = chart.centres_mm.min(axis=0), chart.centres_mm.max(axis=0)
     areas = [
         ("top left", low),
@@ -69,11 +68,19 @@ def draw_registration(figure: Any, picture: _Image, chart: Chart, registration: 
     ]
     reach = 3.6 * registration.cell_px
     pixels = registration.to_pixels(chart.centres_mm)
-    for axes, (name, point) in zip(crops.subplots(1, len(areas)), areas, strict=True):
+    for axes, (name, point) in zip(crops, areas, strict=True):
         nearest = int(((chart.centres_mm - np.asarray(point)) ** 2).sum(axis=1).argmin())
         middle = pixels[nearest]
         _draw_magnified(axes, view, middle, reach, chart, registration, pixels, window)
         axes.set_title(name)
+
+
+def _show_frame(axes: Any, view: _Image) -> None:
+    height, width = view.shape[:2]
+    axes.figure.set_size_inches(_PHOTOGRAPH_WIDTH, _PHOTOGRAPH_WIDTH * height / width)
+    step = max(1, width // 1200)
+    axes.imshow(view[::step, ::step], extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="antialiased")
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
 
 
 def _page_lines(chart: Chart) -> list[_Array]:
@@ -123,10 +130,9 @@ def _draw_magnified(
     )
 
 
-def draw_residuals(figure: Any, chart: Chart, registration: Registration) -> None:
-    """Draw the displacement of the sheet, and the residual of each block of patches."""
-    figure.set_size_inches(10, 3.9)
-    left_axes, right_axes = figure.subplots(1, 2)
+def draw_residuals(panels: Any, chart: Chart, registration: Registration) -> None:
+    """Draw the displacement beyond the lens, and its residual in each block of patches."""
+    left_axes, right_axes = panels
     page_w, page_h = chart.page_mm
     # The margin is not drawn, because the displacement is only measured at patches and tags.
     half = np.array(chart.cell_mm) / 2
@@ -138,7 +144,7 @@ def draw_residuals(figure: Any, chart: Chart, registration: Registration) -> Non
     image = left_axes.imshow(
         length, extent=(left_mm, right_mm, bottom_mm, top_mm), cmap="magma", interpolation="bilinear", vmin=0
     )
-    figure.colorbar(image, ax=left_axes, label="px", shrink=0.75)
+    left_axes.figure.colorbar(image, ax=left_axes, label="px", shrink=0.75)
     grid = np.s_[4::8, 4::8]
     arrows = moved.reshape(*x.shape, 2)[grid]
     left_axes.quiver(x[grid], y[grid], arrows[..., 0], -arrows[..., 1], color="white", alpha=0.85, width=0.0028)
@@ -147,7 +153,7 @@ def draw_residuals(figure: Any, chart: Chart, registration: Registration) -> Non
     good = blocks.good
     residual = blocks.residual_px[good]
     largest = float(np.linalg.norm(residual, axis=1).max(initial=1e-3))
-    arrows = right_axes.quiver(
+    right_axes.quiver(
         blocks.centres_mm[good, 0],
         blocks.centres_mm[good, 1],
         residual[:, 0],
@@ -157,24 +163,25 @@ def draw_residuals(figure: Any, chart: Chart, registration: Registration) -> Non
         scale=20 * largest,
         width=0.0028,
     )
-    right_axes.quiverkey(arrows, 0.9, 1.04, largest, f"{largest:.3f} px", labelpos="W")
     right_axes.plot(*blocks.centres_mm[~good].T, "x", color=MARK, label="does not match the chart")
     if (~good).any():
-        right_axes.legend(frameon=False, fontsize=8)
-    right_axes.set_title("residual of patch blocks", loc="left")
-    right_axes.set(xlabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")
+        right_axes.legend(fontsize=8)
+    right_axes.set(
+        title=f"residual of patch blocks, longest {largest:.3f} px",
+        xlabel="mm",
+        xlim=(0, page_w),
+        ylim=(page_h, 0),
+        aspect="equal",
+    )
 
 
-def draw_field(figure: Any, chart: Chart, shape: FlatField) -> None:
-    """Draw the flat field of a frame, channel by channel."""
-    figure.set_size_inches(10, 2.9)
+def draw_field(panels: Any, chart: Chart, shape: FlatField) -> None:
+    """Draw the flat field of a frame, one panel for each channel."""
     page_w, page_h = chart.page_mm
     x, y = np.meshgrid(np.linspace(0, page_w, 120), np.linspace(0, page_h, 80))
     field = shape.at(np.column_stack([x.ravel(), y.ravel()])).reshape(*x.shape, 3)
     low, high = float(field.min()), float(field.max())
-    grid = figure.subplots(1, 3, sharey=True)
-    image: Any = None
-    for channel, axes in enumerate(grid):
+    for channel, axes in enumerate(panels):
         image = axes.imshow(
             field[..., channel],
             extent=(0, page_w, page_h, 0),
@@ -185,59 +192,58 @@ def draw_field(figure: Any, chart: Chart, shape: FlatField) -> None:
         )
         levels = np.arange(np.floor(low * 50) / 50, high + 0.02, 0.02)
         axes.contour(x, y, field[..., channel], levels=levels, colors="white", linewidths=0.5, alpha=0.7)
-        axes.set(title="RGB"[channel], xlabel="mm")
-    grid[0].set_ylabel("mm")
-    figure.colorbar(image, ax=list(grid), label="light, mean 1", shrink=0.85)
+        axes.set(title="RGB"[channel], xlabel="mm", ylabel="mm")
+        axes.grid(visible=False)
+        axes.figure.colorbar(image, ax=axes, label="light, mean 1", shrink=0.6)
 
 
-def draw_chromaticities(
-    figure: Any, codes: _Array, black_body: _Mask, white: _Array, source: str, worst: int | None = None
-) -> None:
-    """Draw the rb-chromaticities of the illuminants, as projected and as recorded (the paper's figures).
+def draw_chromaticities(panels: Any, codes: _Array, kelvins: _Array, white: _Array, worst: int | None = None) -> None:
+    """Draw the rb-chromaticities of the illuminants in their colours, as projected and as recorded.
 
-    `codes`: (L, 3) float64, 8-bit codes. `black_body`: (L,) bool. `white`: (L, 3) float64 counts, the ground truth.
-    `source`: title for the recorded colours. `worst`: illuminant to mark with a circle, if any.
+    `codes`: (L, 3) float64, 8-bit codes. `kelvins`: (L,) float64, temperatures of the black bodies, NaN for other
+    illuminants. `white`: (L, 3) float64 counts, the ground truth. `worst`: illuminant to mark with a circle, if any.
     """
-    figure.set_size_inches(10, 3.7)
-    projected = decode_srgb(codes / 255)
-    panels = figure.subplots(1, 3)
-    for axes, linear, title, coloured in (
-        (panels[0], projected, "as projected", False),
-        (panels[1], white, source, False),
-        (panels[2], white, "ground truth in colour", True),
-    ):
+    for axes, linear, title in zip(panels, (decode_srgb(codes / 255), white), ("projected", "recorded"), strict=True):
         lit = linear.sum(axis=1) > 0
-        r, _, b = (linear[lit] / linear[lit].sum(axis=1, keepdims=True)).T
-        body = black_body[lit]
-        colour = linear[lit] / linear[lit].max(axis=1, keepdims=True)
-        colour = np.clip(colour, 0, 1) ** (1 / _GAMMA)
-        size = 14 if lit.sum() > 200 else 30
-        ink: Any = colour if coloured else INK
-        axes.plot([0, 1, 0, 0], [0, 0, 1, 0], color="0.8", linewidth=0.8, zorder=1)
-        axes.scatter(r[~body], b[~body], s=size, c=ink[~body] if coloured else ink, linewidths=0, zorder=2)
-        axes.scatter(
-            r[body],
-            b[body],
-            s=size,
-            facecolors=colour[body] if coloured else "white",
-            edgecolors=MARK,
-            linewidths=1.1,
-            zorder=3,
-        )
+        rb = linear[:, ::2] / np.maximum(linear.sum(axis=1, keepdims=True), 1e-300)
+        colours = np.clip(linear / np.maximum(linear.max(axis=1, keepdims=True), 1e-300), 0, 1) ** (1 / _GAMMA)
+        is_body = lit & np.isfinite(kelvins)
+        size = 14 if lit.sum() > _MANY_LIGHTS else 30
+        axes.plot([0, 1, 0, 0], [0, 0, 1, 0], color=FAINT, linewidth=0.6, zorder=1)
+        for shown, edge, width in ((lit & ~is_body, FAINT, 0.3), (is_body, INK, 0.9)):
+            axes.scatter(*rb[shown].T, s=size, c=colours[shown], edgecolors=edge, linewidths=width, zorder=3)
+        bodies = np.flatnonzero(is_body)[np.argsort(kelvins[is_body], kind="stable")]
+        axes.plot(*rb[bodies].T, color=INK, linewidth=0.9, zorder=2)
+        last = np.array([np.inf, np.inf])
+        for light in bodies:
+            # Labels closer than this would overlap.
+            if np.abs(rb[light] - last).max() > _LABEL_DISTANCE:
+                last = rb[light]
+                axes.annotate(
+                    f"{kelvins[light]:.0f} K",
+                    last,
+                    xytext=(-6, -3),
+                    textcoords="offset points",
+                    ha="right",
+                    fontsize=7.5,
+                )
+        axes.set(title=title, xlabel="r = R / (R + G + B)", ylabel="b = B / (R + G + B)", aspect="equal")
+        axes.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
         if worst is not None and lit[worst]:
-            share = linear[worst] / linear[worst].sum()
-            _ring(axes, float(share[0]), float(share[2]), f"illuminant {worst}")
-        axes.set(title=title, xlabel="r", aspect="equal", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
-    panels[0].set_ylabel("b")
+            _ring(axes, float(rb[worst, 0]), float(rb[worst, 1]), f"illuminant {worst}")
 
 
-def draw_budget(figure: Any, budget: Budget, levels: _Array) -> None:
+_MANY_LIGHTS = 200  # Number of illuminants from which their marks are smaller
+
+_LABEL_DISTANCE = 0.05  # Smallest distance of two labelled black bodies, in r or b
+
+
+def draw_budget(panels: Any, budget: Budget, levels: _Array) -> None:
     """Draw the expanded uncertainty of each illuminant by component, and of each patch against its level.
 
     `levels`: (C, 3) float64, relative to bare paper.
     """
-    figure.set_size_inches(10, 3.7)
-    lights, cells = figure.subplots(1, 2, width_ratios=(3, 2))
+    lights, cells = panels
     expanded = budget.expanded_deg
     order = np.argsort(-expanded, kind="stable")
     heights = expanded * budget.lights_deg**2 / np.maximum((budget.lights_deg**2).sum(axis=0), 1e-18)
@@ -248,28 +254,37 @@ def draw_budget(figure: Any, budget: Budget, levels: _Array) -> None:
             height,
             1.0 if len(order) > _MAX_LABELLED_BARS else 0.8,
             bottom=base,
-            color=f"C{number}",
+            color=SERIES[number % len(SERIES)],
             hatch="///" if component.assumed else None,
-            edgecolor="white" if component.assumed else "none",
+            edgecolor=PAPER if component.assumed else "none",
             linewidth=0,
             label=f"{component.name} (assumed)" if component.assumed else component.name,
         )
         base += height
     lights.set(title="ground truth", xlabel="illuminants, the worst first", ylabel="degrees, k = 2")
     lights.set_xlim(-0.6, len(at) - 0.4)
-    lights.legend(frameon=False, fontsize=8)
+    lights.set_ylim(0, 1.45 * lights.get_ylim()[1])  # Space for the legend
+    lights.legend(fontsize=8, loc="upper right", ncols=2)
     if len(at) <= _MAX_LABELLED_BARS:
         lights.set_xticks(at, [str(light) for light in order])
     else:
         lights.set_xticks([])
     for channel in range(3):
         uncertainty = 100 * budget.expanded_cells[:, channel]
-        cells.plot(levels[:, channel], uncertainty, ".", color=CHANNEL_INK[channel], markersize=2, label="RGB"[channel])
+        cells.plot(
+            levels[:, channel],
+            uncertainty,
+            ".",
+            color=CHANNEL_INK[channel],
+            markersize=2,
+            label="RGB"[channel],
+            rasterized=True,
+        )
     cells.set(title="patches", xlabel="level, bare paper 1", ylabel="% of the level, k = 2", xscale="log", yscale="log")
     for axis in (cells.xaxis, cells.yaxis):
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter("")
-    cells.legend(frameon=False, fontsize=8)
+    cells.legend(fontsize=8)
 
 
 _MAX_LABELLED_BARS = 40  # Largest number of illuminants for which bars are separate and numbered
@@ -290,7 +305,7 @@ def _ring(axes: Any, x: float, y: float, text: str) -> None:
     )
 
 
-_INWARD_FROM = 0.7  # Fraction of the axis above which labels are placed on the inner side of their point
+_INWARD_FROM = 0.7  # Beyond this fraction of an axis, labels are placed on the inner side of their point
 
 
 def _ring_largest(axes: Any, values: Any, table: TableMeasurements, smallest: bool = False) -> None:
@@ -302,14 +317,13 @@ def _ring_largest(axes: Any, values: Any, table: TableMeasurements, smallest: bo
     _ring(axes, index, float(array[index]), Path(table.frames[index].record.file).stem)
 
 
-def draw_course(figure: Any, table: TableMeasurements) -> None:
+def draw_frame_values(panels: Any, table: TableMeasurements) -> None:
     """Draw black level, movement, blur, white, deviation of patches and number of references of each frame.
 
     Rings mark the worst frames.
     """
     frames = table.frames
-    figure.set_size_inches(10, 5.4)
-    (black, shift, blur), (white, consistency, used) = figure.subplots(2, 3)
+    black, shift, blur, white, consistency, used = panels
     count = np.arange(len(frames))
     level = np.array([frame.black.mean() for frame in frames])
     blurs, movements = [frame.blur_px for frame in frames], [frame.shift.length_px for frame in frames]
@@ -342,9 +356,9 @@ def draw_course(figure: Any, table: TableMeasurements) -> None:
                 label="RGB"[channel],
                 linewidth=0.9,
             )
-        white.legend(frameon=False, fontsize=8)
-    white.axhline(0, color="0.8", linewidth=0.8, zorder=0)
-    white.set(title="bare paper under white", ylabel="change since the first white frame, %", xlabel="frame")
+        white.legend(fontsize=8)
+    white.axhline(0, color=FAINT, linewidth=0.8, zorder=0)
+    white.set(title="bare paper under white", ylabel="change since the first, %", xlabel="frame")
     _draw_consistency(consistency, count, table)
 
 
@@ -357,7 +371,7 @@ def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], table: TableMea
     block = [100 * frame.consistency.block for frame in table.frames]
     axes.plot(count, scatter, ".", color=INK, markersize=3, label="scatter of all patches")
     axes.plot(count, block, "x", color=MARK, markersize=3, label="worst block of patches")
-    axes.legend(frameon=False, fontsize=7, loc="upper right")
+    axes.legend(fontsize=7, loc="upper right")
     axes.set_ylim(bottom=0, top=max(1.5, 1.3 * axes.get_ylim()[1]))
     _ring_largest(axes, scatter, table)
     _ring_largest(axes, block, table)
@@ -372,34 +386,33 @@ _Image = npt.NDArray[np.float32]
 _Array = npt.NDArray[np.float64]
 
 
-def draw_errors(figure: Any, table: TableMeasurements, chart: Chart) -> None:
-    """Draw the deviation from patches with similar codes, and the uncertainty of their positions, over the print.
+def draw_errors(panels: Any, table: TableMeasurements, chart: Chart) -> None:
+    """Draw the deviation of patches from their codes' colours, and the uncertainty of their positions, over the print.
 
     Rings mark the worst patches. On charts with too few colours the first plot contains only a note.
     """
     page_w, page_h = chart.page_mm
-    figure.set_size_inches(10, 0.2 + 4.6 * page_h / page_w)
-    left, right = figure.subplots(1, 2)
+    left, right = panels
     side_mm = float(np.mean(chart.cell_mm))
     stains = table.cells.stains
     if stains.is_known:
         percent = 100 * stains.largest_deviation()
         mm = chart.centres_mm[chart.cell_of_colour]
         limit = max(1.0, float(np.abs(percent).max()))
-        image = draw_squares(left, chart.page_mm, mm, side_mm, percent, 4.1, cmap="RdBu", vmin=-limit, vmax=limit)
-        figure.colorbar(image, ax=left, label="%, brighter is positive", shrink=0.8)
+        image = draw_squares(left, chart.page_mm, mm, side_mm, percent, 3.3, cmap="RdBu", vmin=-limit, vmax=limit)
+        left.figure.colorbar(image, ax=left, label="%, brighter is positive", shrink=0.8)
         _mark(left, mm[int(np.argmax(np.abs(percent)))])
     else:
         left.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=left.transAxes)
     error = table.registration.uncertainty_px(chart.centres_mm)
     top = max(float(np.percentile(error, _SCALE_PERCENTILE)), 1e-3)
-    image = draw_squares(right, chart.page_mm, chart.centres_mm, side_mm, error, 4.1, cmap="cividis", vmin=0, vmax=top)
-    figure.colorbar(image, ax=right, label="half-size px", shrink=0.8, extend="max")
+    image = draw_squares(right, chart.page_mm, chart.centres_mm, side_mm, error, 3.3, cmap="cividis", vmin=0, vmax=top)
+    right.figure.colorbar(image, ax=right, label="half-size px", shrink=0.8, extend="max")
     _mark(right, chart.centres_mm[int(np.argmax(error))])
     left.set(title="deviation from similar patches", ylabel="mm")
     right.set(title="standard uncertainty of positions")
     for axes in (left, right):
-        axes.set(xlabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal", facecolor="#f2f3f5")
+        axes.set(xlabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")
 
 
 def _mark(axes: Any, place_mm: _Array) -> None:
@@ -426,15 +439,14 @@ def _samples(picture: _Image, pixels: _Array, window: int) -> tuple[npt.NDArray[
     return indices, samples.reshape(len(indices), window**2, 3)
 
 
-def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransfer, samples: int) -> None:
+def draw_noise(panels: Any, noise: tuple[_Array, _Array], transfer: PhotonTransfer, samples: int) -> None:
     """Draw the photon-transfer curve: variance of one sample against its level, measured and fitted.
 
     `noise`: mean and variance of each patch, both (N, 3) float64, from `cell_noise`.
     """
     from matplotlib.ticker import LogLocator, StrMethodFormatter
 
-    figure.set_size_inches(10, 3.9)
-    left, right = figure.subplots(1, 2)
+    left, right = panels
     level, variance = noise
     for channel in range(3):
         levels, variances = noise_levels(level[:, channel], variance[:, channel], samples)
@@ -454,16 +466,15 @@ def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransf
         right.semilogx(levels, levels / np.sqrt(variances), ".", color=CHANNEL_INK[channel], markersize=4)
         right.semilogx(grid, grid / np.sqrt(model), "-", color=CHANNEL_INK[channel], linewidth=0.9)
     left.set(title="variance of one sample", xlabel="counts above black", ylabel="counts²")
-    right.set(title="signal-to-noise ratio of one sample", xlabel="counts above black")
-    left.legend(frameon=False, fontsize=8, labelcolor=INK)
+    right.set(title="signal to noise of one sample", xlabel="counts above black")
+    left.legend(fontsize=7.5)
     for axes in (left, right):
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.minorticks_off()
-        axes.grid(color=FAINT, alpha=0.25, linewidth=0.5)
 
 
-_MIN_LEVELS = 6  # Minimum number of levels for reporting the three parameters of the curve (judgement)
+_MIN_LEVELS = 6  # Minimum number of levels for reporting the three parameters of the curve; chosen by judgement
 
 # Smallest radius of a circle, relative to the page width. A circle around a single patch would be too small to see.
 _MIN_RADIUS = 0.012
@@ -471,22 +482,22 @@ _MIN_RADIUS = 0.012
 LabelledPosition = tuple[str, PrintPosition]
 
 
-def draw_positions(figure: Any, picture: _Image, chart: Chart, registration: Registration, positions: Any) -> None:
-    """Draw a frame with numbered circles at positions, and their labels below.
+def numbered_labels(positions: Sequence[LabelledPosition]) -> dict[str, int]:
+    """Return the number of each label, from 1."""
+    return {label: number for number, label in enumerate(dict.fromkeys(label for label, _ in positions), 1)}
+
+
+def draw_positions(
+    panels: Any, picture: _Image, chart: Chart, registration: Registration, positions: Sequence[LabelledPosition]
+) -> None:
+    """Draw a frame with circles at positions, with the numbers of `numbered_labels`.
 
     `picture`: (H, W, 3) float32 counts, half-size frame.
     """
+    (axes,) = panels
     height, width = picture.shape[:2]
-    numbers = {label: number for number, label in enumerate(dict.fromkeys(label for label, _ in positions), 1)}
-    legend = 0.22 * len(numbers) + 0.1
-    figure.set_size_inches(10, 10 * height / width + legend)
-    axes, below = figure.subplots(2, 1, height_ratios=(10 * height / width, legend))
-    step = max(1, width // 1200)
-    axes.imshow(
-        viewable(picture)[::step, ::step],
-        extent=(-0.5, width - 0.5, height - 0.5, -0.5),
-        interpolation="antialiased",
-    )
+    numbers = numbered_labels(positions)
+    _show_frame(axes, viewable(picture))
     angles = np.linspace(0, 2 * np.pi, 90)
     unit_circle = np.column_stack([np.cos(angles), np.sin(angles)])
     # Deviations at the same position share a circle.
@@ -508,11 +519,7 @@ def draw_positions(figure: Any, picture: _Image, chart: Chart, registration: Reg
             x, y = corners[np.argmin(corners.sum(axis=1))]
             box = {"facecolor": MARK, "edgecolor": "white", "boxstyle": "round,pad=0.25"}
             text = ", ".join(map(str, shown_numbers))
-            axes.text(x, y, text, color="white", weight="bold", ha="right", va="bottom", bbox=box)
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
-    below.axis("off")
-    for row, (label, number) in enumerate(numbers.items()):
-        below.text(0.01, 1 - (row + 0.5) / len(numbers), f"{number}   {label}", va="center", transform=below.transAxes)
+            axes.text(x, y, text, color="white", weight="bold", fontsize=13, ha="right", va="bottom", bbox=box)
 
 
 def half_size(mosaic: Mosaic) -> npt.NDArray[np.float32]:

@@ -27,14 +27,15 @@ from calibration.report.plots import (
     cell_noise,
     draw_budget,
     draw_chromaticities,
-    draw_course,
     draw_errors,
     draw_field,
+    draw_frame_values,
     draw_noise,
     draw_positions,
     draw_registration,
     draw_residuals,
     half_size,
+    numbered_labels,
 )
 from calibration.sampling import largest_window
 from calibration.table.lut import REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION
@@ -58,7 +59,7 @@ from experiment.session.folder import Session
 from foundation.errors import counted, first_few
 from foundation.files import write_atomic
 from foundation.pages import render
-from foundation.plots import draw_png
+from foundation.plots import PANEL, draw_panels
 
 # Number of points across and down the page in `chart_places`. They describe the pose of the sheet and most of its curl.
 GRID_POINTS = (7, 5)
@@ -207,11 +208,11 @@ def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-MAX_FRAMES = 4  # Largest number of frames drawn with marked positions; each frame is read again
+MAX_FRAMES = 4  # Largest number of frames drawn with marked positions; each frame must be read from disk again
 
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
-    """Write `report.html` and `report.json` into a LUT's folder; takes some seconds."""
+    """Write `report.html` and `report.json` into a LUT's folder."""
     pictures = _pictures(result, session)
     write_atomic(folder / REPORT_PAGE, page(result, pictures, _position_pictures(result, session)))
     write_atomic(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
@@ -232,9 +233,9 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
         *_main_pictures(result, session, frame),
         _Picture(
             "Residuals of the registration",
-            "Left: distance of the patches from their positions on a flat sheet, caused by waves of the paper. "
-            "Right: residual of each block of patches, magnified. Short arrows in random directions are noise.",
-            draw_png(draw_residuals, chart, registration),
+            "First: distance of the patches from their positions on a flat sheet, caused by waves of the paper. "
+            "Second: residual of each block of patches, magnified. Short arrows in random directions are noise.",
+            draw_panels(draw_residuals, chart, registration, inches=[PANEL] * 2),
             "geometry",
             "residuals",
         ),
@@ -242,25 +243,26 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
             "Light on the print",
             "Flat field of the registered frame, from its white references. Samples and ground truth are divided by "
             f"the flat field. Contour lines are 2 % apart. {primaries}",
-            draw_png(draw_field, chart, table.registered_frame.paper.field),
+            draw_panels(draw_field, chart, table.registered_frame.paper.field, inches=[PANEL] * 3),
             "light",
             "field",
         ),
         _Picture(
-            "Course of the session",
-            "Black level, movement and blur of the chart, level of bare paper under white, deviation from patches "
-            "with similar codes, and number of white references in each frame. Rings mark the worst frames. A loss of "
+            "Values of each frame",
+            "Black level, movement and blur of the chart, counts of bare paper under white, deviation of patches from "
+            "patches with similar codes, and number of used white references. Circles mark the worst frames. A loss of "
             "focus affects all patches; a hand or a shadow affects a block of patches.",
-            draw_png(draw_course, table),
+            draw_panels(draw_frame_values, table, inches=[(3.3, 2.4)] * 6),
             "radiometry",
-            "course",
+            "frames",
         ),
         _Picture(
             "Uncertainty of the ground truth",
-            f"Left: expanded uncertainty (k = {COVERAGE:g}) of each ground truth, the largest first. Each bar is "
-            "divided in proportion to the squares of its components. Right: expanded uncertainty of each patch mean, "
+            f"First: expanded uncertainty (k = {COVERAGE:g}) of each ground truth, the largest first. Each bar is "
+            "divided in proportion to the squares of its components. Second: expanded uncertainty of each patch mean "
+            "against its level, "
             "without noise. " + "; ".join(f"{item.title}: {item.source}" for item in table.budget.components) + ".",
-            draw_png(draw_budget, table.budget, table.cells.levels),
+            draw_panels(draw_budget, table.budget, table.cells.levels, inches=[PANEL] * 2),
             "truth",
             "budget",
         ),
@@ -271,8 +273,7 @@ def _main_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np.
     table, chart = result.figures, session.chart
     registration, window = table.registration, table.cells.window
     codes = np.array([light.colour for light in session.illuminations])
-    black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
-    source = f"recorded by the {table.session.camera}"
+    kelvins = np.array([light.cct_k or np.nan for light in session.illuminations], dtype=np.float64)
     expanded = table.budget.expanded_deg
     worst = int(np.argmax(expanded)) if len(expanded) > 1 else None
     ring_text = "" if worst is None else f" A circle marks illuminant {worst}, with the largest uncertainty."
@@ -281,28 +282,35 @@ def _main_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np.
             "The registered chart",
             f"{table.session.registered_file} with the detected tags and increased contrast. Below, magnified: "
             f"outlines of patches and windows of their {window**2} samples, in the corners and in the centre.",
-            draw_png(draw_registration, frame, chart, registration, window),
+            draw_panels(draw_registration, frame, chart, registration, window, inches=[PANEL, *[(1.75, 2.0)] * 5]),
             name="chart",
+            is_photograph=True,
         ),
         _Picture(
             "The illuminants",
-            "rb-chromaticities of the illuminants. Left: as projected. Centre: as recorded on bare paper, which is the "
-            f"ground truth. Right: the ground truth, in colour. Rings are black bodies.{ring_text}",
-            draw_png(draw_chromaticities, codes, black_body, table.lights.white, source, worst),
+            f"Chromaticities of the illuminants as projected, and as recorded by the {table.session.camera} on bare "
+            f"paper, which are the ground truths. The line joins the black bodies.{ring_text}",
+            draw_panels(draw_chromaticities, codes, kelvins, table.lights.white, worst, inches=[(4.4, 4.5)] * 2),
             name="lights",
         ),
         _Picture(
             "Errors of patches",
-            "Left: deviation of the neighbourhood of each patch from patches with similar codes elsewhere. "
-            "Right: uncertainty of the position of each patch. Rings mark the worst patches.",
-            draw_png(draw_errors, table, chart),
+            "First: deviation of the neighbourhood of each patch from patches with similar codes elsewhere. "
+            "Second: uncertainty of the position of each patch. Rings mark the worst patches.",
+            draw_panels(draw_errors, table, chart, inches=[PANEL] * 2),
             name="errors",
         ),
         _Picture(
             "Noise",
-            "Left: variance of one sample against its level, and fitted curve (read noise, photon noise and response "
-            "of photosites). Points are medians of patches with similar levels. Right: signal-to-noise ratio.",
-            draw_png(draw_noise, cell_noise(frame, chart, registration, window), table.sensor.transfer, window**2),
+            "First: variance of one sample against its level, and fitted curve (read noise, photon noise and response "
+            "of photosites). Points are medians of patches with similar levels. Second: signal-to-noise ratio.",
+            draw_panels(
+                draw_noise,
+                cell_noise(frame, chart, registration, window),
+                table.sensor.transfer,
+                window**2,
+                inches=[PANEL] * 2,
+            ),
             name="noise",
         ),
     ]
@@ -317,12 +325,14 @@ def _position_pictures(result: BuildResult, session: Session) -> list[_Picture]:
     pictures: list[_Picture] = []
     for file, positions in list(by_file.items())[:MAX_FRAMES]:
         picture = half_size(read_raw(session.folder / file))
-        png = draw_png(draw_positions, picture, session.chart, result.figures.registration, positions)
+        drawings = draw_panels(
+            draw_positions, picture, session.chart, result.figures.registration, positions, inches=[PANEL]
+        )
         caption = (
             f"{file} with increased contrast. Circles mark deviations beyond their limits, at their positions in the "
-            "frame registered first."
-        )
-        pictures.append(_Picture(f"Position: {Path(file).stem}", caption, png))
+            "frame registered first. "
+        ) + "; ".join(f"{number}: {label}" for label, number in numbered_labels(positions).items())
+        pictures.append(_Picture(f"Position: {Path(file).stem}", caption, drawings, is_photograph=True))
     return pictures
 
 
@@ -336,13 +346,14 @@ _OUTCOME_ORDER: tuple[Outcome, ...] = tuple(_OUTCOME_WORDS)
 
 @dataclass(frozen=True)
 class _Picture:
-    """A plot of the report, PNG, with heading and caption."""
+    """A plot of the report, one SVG for each panel, with heading and caption."""
 
     heading: str
     caption: str
-    png: bytes
+    drawings: tuple[bytes, ...]
     group: Group | None = None  # Group that contains the plot; None for plots at the top
     name: Drawing | None = None  # As in `Figure.drawing`
+    is_photograph: bool = False  # As in `pages.figure`
 
 
 @dataclass(frozen=True)

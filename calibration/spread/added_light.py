@@ -25,12 +25,12 @@ _KNOTS = 9
 
 _FACTOR_ORDER = 4  # order of the polynomial over the page that multiplies levels, for errors of the flat field
 
-_FACTOR_SIGMA = 0.003  # prior standard deviation of the coefficients of this polynomial (judgement)
+_FACTOR_SIGMA = 0.003  # prior standard deviation of the coefficients of this polynomial; chosen by judgement
 
 # Candidate prior standard deviations of added light, relative to paper.
 _CANDIDATE_SIGMAS = (1e-5, 1e-4, 2e-4, 4e-4, 8e-4, 1.6e-3, 3.2e-3, 6.4e-3, 0.013, 0.026, 0.05)
 
-MOST_ADDED = 0.05  # largest added light of a usable patch, relative to its level (judgement)
+MOST_ADDED = 0.05  # largest added light of a usable patch, relative to its level; chosen by judgement
 
 _CERTAIN_SIGMAS = 4.0  # number of standard uncertainties to subtract, so that noise makes no patch unusable
 
@@ -45,7 +45,7 @@ _Array = npt.NDArray[np.float64]
 class AddedLight:
     """Added light on each patch."""
 
-    share: _Array  # (C, 3) relative to paper; the fifth percentile of patches is set to 0
+    share: _Array  # (C, 3) relative to paper; shifted so that the fifth percentile of the patches is 0
     error: _Array  # (C, 3) standard uncertainty of `share`
 
     @staticmethod

@@ -173,12 +173,12 @@ class LensFigures:
     worst: float  # largest change of a patch mean
     # RMS error of patch means after correction: uncertainty of the shares and uncorrected veiling glare
     residual: float
-    residual_worst: float  # the same for the worst patch
+    residual_worst: float  # error of the mean of the worst patch after correction
     worst_level: float  # level of the worst patch relative to paper
     veil: float  # most likely veiling glare relative to the mean light of the frame, worst channel
-    veil_error: float  # its standard uncertainty
+    veil_error: float  # standard uncertainty of `veil`
     beyond_cell: float  # share of light from outside of the patch, in the worst sample
-    left_in_worst: float  # excess of this share over the mean of the window; it is not corrected
+    left_in_worst: float  # `beyond_cell` minus the mean of this share in the window; this part is not corrected
     # (3, 3) covariance of the relative errors of white (ground truth), with usual veiling glare if not measured
     white_covariance: _Array
     # (C, 3) standard uncertainty of patch means relative to white, in the brightest frame of each channel

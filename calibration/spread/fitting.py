@@ -50,8 +50,8 @@ _CHANNEL_TERMS = _NEAR_TERMS + len(FAR_PX) + 1
 # Number of unknown shares: for each channel, all terms of near kernels, then far kernels, then veiling glare.
 TERMS = 3 * _CHANNEL_TERMS
 
-# Minimum χ² gain of a proven kernel: its share is then four standard uncertainties. In cross-validation, all kernels
-# together must gain as much.
+# Minimum χ² gain of a proven kernel: its share is then four standard uncertainties. In cross-validation, this is the
+# minimum gain of all kernels together.
 LEAST_GAIN = 16.0
 
 _Array = npt.NDArray[np.float64]
@@ -62,16 +62,17 @@ MOST_MISFIT = 5.0
 
 LEAST_COUNTS = 300.0  # minimum counts of paper above black level in a used channel
 
-# Prior standard deviation of the coefficients of the smooth factors: errors of the flat field and unevenness of the
-# print (judgement).
+# Prior standard deviation of the coefficients of the smooth factors, which describe errors of the flat field and
+# unevenness of the print. Chosen by judgement.
 USUAL_UNEVENNESS = 0.003
 
-LOOSE_UNEVENNESS = 0.03  # the same for light of several primaries with different flat fields (judgement)
+# `USUAL_UNEVENNESS` for light of several primaries with different flat fields. Chosen by judgement.
+LOOSE_UNEVENNESS = 0.03
 
 FOLDS = 4  # folds of cross-validation over parts of the print
 
 # Number of tiles along the longer page side. Each tile belongs to one fold, and each fold covers the whole print.
-_PATCHWORK = 10
+_TILES_PER_SIDE = 10
 
 # Orders of polynomials over the page: of light that no kernel explains, of smooth factors of levels, and of changes of
 # ink density (level times its logarithm).
@@ -97,44 +98,46 @@ _FAR_STEPS = (0.01, 0.01, 0.004, 0.003)
 # Factors of `_FAR_STEPS` for lenses with little, usual and much scatter; their prior probabilities are equal.
 _FAR_SIZES = (0.3, 1.0, 3.0)
 
-# Factor of the usual shares for a lens without scatter, and of the usual veiling glare for a lens without veiling
-# glare.
-_CLEAN = 0.001
+# Factor of the usual shares for a lens without scatter. It is also the factor of the usual veiling glare for a lens
+# without veiling glare.
+_CLEAN_SIZE = 0.001
 
-# Prior probability of a lens without scatter, for charts with many and with few colours (judgement). The first value
-# would give charts with few colours an uncertainty of several times the actual error.
+# Prior probability of a lens without scatter, for charts with many and with few colours. With few colours, the first
+# value would give several times the actual error as uncertainty. Chosen by judgement.
 _CLEAN_ODDS, _CLEAN_ODDS_OF_FEW = 0.3, 0.7
 
-# Prior probability that a lens with scatter has no veiling glare, on charts with few colours (judgement).
+# Prior probability that a lens with scatter has no veiling glare, on charts with few colours. Chosen by judgement.
 _CLEAR_ODDS_OF_FEW = 0.3
 
 # Assumed laws of scattered light: exponent of its decrease with distance, and factor of the far kernels. Two laws are
 # for polish, scratches and dust (J. E. Harvey, "Light-scattering characteristics of optical surfaces", 1976; I. R.
 # King, "The profile of a star image", 1971). The third is for aberrations, which end within a slot.
-_LAWS = ((2.0, 1.0), (3.0, 1.0), (3.0, _CLEAN))
+_LAWS = ((2.0, 1.0), (3.0, 1.0), (3.0, _CLEAN_SIZE))
 
-_POWER_ODDS = 0.5  # prior probability that scattered light follows one of these laws (judgement)
+_POWER_ODDS = 0.5  # prior probability that scattered light follows one of these laws; chosen by judgement
 
-_SCATTERED = 0.04  # prior standard deviation of all scattered light of a lens that follows a law (judgement)
+# Prior standard deviation of all scattered light of a lens that follows a law. Chosen by judgement.
+_SCATTERED_SD = 0.04
 
-# Prior standard deviation of the difference between a share and the law, relative to the law (judgement).
-_OFF_LAW = 0.35
+# Prior standard deviation of the difference between a share and the law, relative to the law. Chosen by judgement.
+_OFF_LAW_SD = 0.35
 
 # Standard deviation of the difference between a channel's far share and the common share of R, G and B, relative to the
-# share (judgement). Scatter and coatings vary over the visible spectrum.
+# share. Scatter and coatings vary over the visible spectrum. Chosen by judgement.
 CHANNELS_APART = 1 / 3
 
-_LAW_APART = 0.7  # as `CHANNELS_APART`, for these differences (judgement)
+_LAW_APART = 0.7  # as `CHANNELS_APART`, for differences between shares and the law; chosen by judgement
 
 _SCATTER_APART = 0.5  # as `CHANNELS_APART`, for a lens that follows a law
 
-# Expected share of a far kernel relative to the previous kernel. It would be 1 for a decrease with r⁻², 0.25 for r⁻³.
-_FAR_FALL = 0.5
+# Expected share of a far kernel relative to the previous kernel. A decrease of light with r⁻² would give 1, and r⁻³
+# would give 0.25.
+_FAR_SHARE_RATIO = 0.5
 
 # `CHANNELS_APART` for three kinds of lenses: similar channels, different channels, and coatings for one channel.
 _APART = (0.03, CHANNELS_APART, 0.7)
 
-_APART_ODDS = (0.4, 0.4, 0.2)  # prior probabilities of `_APART` (judgement)
+_APART_ODDS = (0.4, 0.4, 0.2)  # prior probabilities of `_APART`; chosen by judgement
 
 # Largest credible veiling glare on charts with few colours. Above it, the light may come from near kernels that grow
 # towards the corners, which such charts cannot show.
@@ -143,18 +146,18 @@ MOST_VEIL = 0.02
 # Lower bound of the misfit for charts with few colours, because the errors of a patch are correlated over channels.
 _MIN_MISFIT = 3.0
 
-_LEVELS = 40  # number of groups of similar levels for measuring the scatter
+_LEVEL_GROUPS = 40  # number of groups of similar levels for measuring the scatter
 
-_HUBER = 3.0  # residual in standard deviations above which the weight of a patch decreases
+_HUBER_SIGMAS = 3.0  # residual in standard deviations above which the weight of a patch decreases
 
 _ROUNDS = 2  # number of solutions; each solution gets its weights from the residuals of the previous solution
 
 # Stored shares are multiples of this step, so that the bytes of a LUT do not depend on rounding in linear algebra.
-_ROUNDING = 1e-7
+_SHARE_STEP = 1e-7
 
-# Prior standard deviation of the change of a share over the frame, if there are too few patches to measure the change
-# (judgement).
-_SMALL_SHARE = 0.002
+# Prior standard deviation of the change of a share over the frame, if there are too few patches to measure the change.
+# Chosen by judgement.
+_SHARE_CHANGE_SD = 0.002
 
 _EVEN_TERMS = 3  # number of unknowns of a share that is constant over the frame: one per channel
 
@@ -198,7 +201,7 @@ def far_groups() -> list[npt.NDArray[np.int64]]:
     return groups_of_terms()[-len(FAR_PX) - 1 :]
 
 
-def _bend_of(channel: int) -> int:
+def _bend_index(channel: int) -> int:
     # The unknown of nonlinearity follows the unknowns of light that no kernel explains.
     return TERMS + len(page_powers(_SHAPE_ORDER)) - 1 + channel
 
@@ -212,11 +215,11 @@ def free_terms() -> npt.NDArray[np.bool_]:
 class PointSpread:
     """Spread of the lens outside of its sharp core, measured on the chart."""
 
-    # (TERMS,) shares for the correction: 0 for near kernels that are not proven; all 0 if no kernel is proven
+    # (TERMS,) shares to correct: 0 for near kernels that are not proven; all 0 if no kernel is proven
     shares: _Array
     covariance: _Array  # (TERMS, TERMS) of all unknowns, proven or not
     gain: float  # χ² gain of the proven kernels; by chance, each unknown gains 1
-    held_out: float  # χ² gain in cross-validation
+    held_out: float  # χ² gain of the proven kernels in cross-validation
     misfit: float  # χ² gain from smooth light that no kernel explains, per unknown, ≥ 1; factor of the covariance
     likeliest: _Array  # (TERMS,) most likely shares, also if no kernel is proven
 
@@ -319,7 +322,7 @@ def fit_spread(
     factors = np.full(size, 1 / _PRIOR_SHARE**2)
     for item, row in zip(data, rows, strict=True):
         factors[row.unknowns[len(channel_terms(0)) + shapes :]] = 1 / item.unevenness**2
-        factors[_bend_of(item.channel)] = 1 / max(item.bend, _MIN_BEND) ** 2
+        factors[_bend_index(item.channel)] = 1 / max(item.bend, _MIN_BEND) ** 2
         factors[row.unknowns[-(len(page_powers(_INK_ORDER)) - 1) :]] = 1 / USUAL_UNEVENNESS**2
     prior = np.diag(factors)
     usual = np.asarray(np.linalg.inv(_prior_covariance(bits, _Lens())), dtype=np.float64)
@@ -334,15 +337,17 @@ def fit_spread(
             lens = [solution[channel_terms(item.channel)] for item in data]
             rows = [_rows(item, n, cells_mm, page_mm, bits, lens[n]) for n, item in enumerate(data)]
         normal, right = _normal_equations([*rows, *reference_rows], solution)
-        solution[others] = _solved(*_take(normal.sum(axis=0), right.sum(axis=0), prior, others), np.arange(TERMS))
+        solution[others] = _solve_all(
+            *_at_terms(normal.sum(axis=0), right.sum(axis=0), prior, others), np.arange(TERMS)
+        )
     is_few = bits < VARYING_BITS
     misfit = _misfit(normal.sum(axis=0), right.sum(axis=0), prior, shapes)
     normal, right = normal[:, others][:, :, others], right[:, others]
     prior = prior[np.ix_(others, others)]
-    matrix, vector = _without_factors(normal.sum(axis=0), right.sum(axis=0), prior)
+    matrix, vector = _eliminate_factors(normal.sum(axis=0), right.sum(axis=0), prior)
     # The misfit increases the variance of the data, but not of the prior.
     variance = max(misfit, _MIN_MISFIT) if is_few else misfit
-    inflated = _without_factors(normal.sum(axis=0), right.sum(axis=0), variance * prior)
+    inflated = _eliminate_factors(normal.sum(axis=0), right.sum(axis=0), variance * prior)
     weakened = inflated[0] / variance - usual, inflated[1] / variance
     lenses = _Lenses.of((matrix - usual, vector), weakened, bits)
     matrix = matrix + lenses.likeliest_prior - usual
@@ -356,7 +361,7 @@ def fit_spread(
         # If nonlinearity of the sensor reduces the counts of dark patches, it hides veiling glare of the same size.
         hidden = DARK_LEVEL * item.bend / float(np.median(item.even * item.field))
         extra[veil[item.channel], veil[item.channel]] += hidden**2
-    apparent_veil = _positive(matrix, vector, _terms(candidates))[0][veil]
+    apparent_veil = _solve_nonnegative(matrix, vector, _terms(candidates))[0][veil]
     # Apparent veiling glare may be other smooth light. On charts with few colours it may be near spread that grows
     # towards the corners.
     is_ambiguous = misfit > MOST_MISFIT or (is_few and apparent_veil.mean() > MOST_VEIL)
@@ -365,18 +370,18 @@ def fit_spread(
         extra[np.ix_(veil, veil)] += np.outer(apparent_veil, apparent_veil)
         candidates.pop()
         far.pop()
-    proven = _selected(matrix, vector, misfit, candidates)
+    proven = _proven_terms(matrix, vector, misfit, candidates)
     if is_ambiguous:
         extra += _usual_wide_light(bits, scatters=len(proven) > 0)
-    _, gain = _positive(matrix, vector, proven)
+    _, gain = _solve_nonnegative(matrix, vector, proven)
     # Far shares are corrected even if they are not proven, because every lens has some far spread.
     shares, covariance = lenses.shares(np.union1d(proven, _terms(far)))
     covariance += extra
     held_out = 0.0
     for fold in range(FOLDS):
         training = normal.sum(axis=0) - normal[fold], right.sum(axis=0) - right[fold]
-        fitted, plain = (_solved(*training, prior, terms) for terms in (proven, proven[:0]))
-        held_out += _explained(normal[fold], right[fold], fitted) - _explained(normal[fold], right[fold], plain)
+        fitted, plain = (_solve_all(*training, prior, terms) for terms in (proven, proven[:0]))
+        held_out += _chi2_gain(normal[fold], right[fold], fitted) - _chi2_gain(normal[fold], right[fold], plain)
     spread = PointSpread(shares, covariance, gain, held_out, misfit, likeliest=shares)
     return spread if spread.proven else replace(spread, shares=np.zeros(TERMS))
 
@@ -402,7 +407,7 @@ class _Lenses:
         priors = np.array([np.linalg.inv(_prior_covariance(bits, lens)) for lens in lenses])
         # Twice the logarithm of the evidence (D. MacKay, Bayesian interpolation, 1992). Veiling glare is restricted to
         # values ≥ 0, because a negative value is no evidence of veiling glare.
-        gains = np.array([_positive(matrix + prior, vector, np.arange(TERMS))[1] for prior in priors])
+        gains = np.array([_solve_nonnegative(matrix + prior, vector, np.arange(TERMS))[1] for prior in priors])
         evidence = gains + np.linalg.slogdet(priors)[1] - np.linalg.slogdet(matrix + priors)[1]
         odds = np.array([lens.odds for lens in lenses])
         weights = odds * np.exp(0.5 * (evidence - evidence.max()))
@@ -416,8 +421,8 @@ class _Lenses:
 
     def shares(self, terms: npt.NDArray[np.int64]) -> tuple[_Array, _Array]:
         """Return the mean shares (TERMS,) over all lenses, 0 except for `terms`, and their covariance."""
-        lens_shares = np.array([_positive(matrix, self.vector, terms)[0] for matrix in self.matrices])
-        mean = np.round(self.weights @ lens_shares / _ROUNDING) * _ROUNDING
+        lens_shares = np.array([_solve_nonnegative(matrix, self.vector, terms)[0] for matrix in self.matrices])
+        mean = np.round(self.weights @ lens_shares / _SHARE_STEP) * _SHARE_STEP
         difference = (lens_shares - mean) * np.sqrt(self.weights)[:, None]
         return mean, np.tensordot(self.weights, self.covariances, axes=1) + difference.T @ difference
 
@@ -438,7 +443,7 @@ class _Lens:
 def _assumed_lenses(few: bool) -> list[_Lens]:
     clean, clear = (_CLEAN_ODDS_OF_FEW, _CLEAR_ODDS_OF_FEW) if few else (_CLEAN_ODDS, 0.0)
     apart_odds = list(zip(_APART, _APART_ODDS, strict=True))
-    scatter = [(_Lens(near=_CLEAN, far=_CLEAN, odds=clean), clean)]
+    scatter = [(_Lens(near=_CLEAN_SIZE, far=_CLEAN_SIZE, odds=clean), clean)]
     law = (1 - clean) * _POWER_ODDS / len(_LAWS)
     scatter += [(_Lens(power=power, far=far, far_apart=_SCATTER_APART, odds=law), clear) for power, far in _LAWS]
     independent = (1 - clean) * (1 - _POWER_ODDS) / len(_FAR_SIZES)
@@ -446,7 +451,9 @@ def _assumed_lenses(few: bool) -> list[_Lens]:
         (_Lens(far=size, far_apart=apart, odds=independent * odds), clear)
         for size, (apart, odds) in product(_FAR_SIZES, apart_odds)
     ]
-    lenses = [replace(lens, veil=_CLEAN, odds=lens.odds * clear_odds) for lens, clear_odds in scatter if clear_odds]
+    lenses = [
+        replace(lens, veil=_CLEAN_SIZE, odds=lens.odds * clear_odds) for lens, clear_odds in scatter if clear_odds
+    ]
     return lenses + [
         replace(lens, veil_apart=veil_apart, odds=lens.odds * (1 - clear_odds) * odds)
         for (lens, clear_odds), (veil_apart, odds) in product(scatter, apart_odds)
@@ -471,19 +478,19 @@ def _prior_covariance(bits: int, lens: _Lens) -> _Array:
     usual = np.diag(np.full(TERMS, (lens.near * _PRIOR_SHARE) ** 2))
     if bits < VARYING_BITS:
         varying = np.concatenate([group for group in groups_of_terms() if len(group) > _EVEN_TERMS])
-        usual[varying, varying] = (lens.near * _SMALL_SHARE) ** 2
+        usual[varying, varying] = (lens.near * _SHARE_CHANGE_SD) ** 2
     *kernels, veil = (group for group in groups_of_terms() if len(group) <= _EVEN_TERMS)
     if lens.power:
-        law = _law(lens.power)
+        law = _law_shares(lens.power)
         law[len(NEAR_PX) :] *= lens.far
-        sizes = _SCATTERED**2 * np.outer(law, law)
-        off_law = np.diag(_OFF_LAW**2 * np.diag(sizes))
+        sizes = _SCATTERED_SD**2 * np.outer(law, law)
+        off_law = np.diag(_OFF_LAW_SD**2 * np.diag(sizes))
     else:
         kernels = kernels[len(NEAR_PX) :]
         transfer = np.eye(len(FAR_PX))
         # The second share does not depend on the first, because the first far kernel also describes near spread.
         for kernel in range(2, len(FAR_PX)):
-            transfer[kernel] += _FAR_FALL * transfer[kernel - 1]
+            transfer[kernel] += _FAR_SHARE_RATIO * transfer[kernel - 1]
         sizes = (transfer * (lens.far * np.array(_FAR_STEPS)) ** 2) @ transfer.T
         off_law = np.zeros_like(sizes)
     for first, row, off_row in zip(kernels, sizes, off_law, strict=True):
@@ -493,7 +500,7 @@ def _prior_covariance(bits: int, lens: _Lens) -> _Array:
     return usual
 
 
-def _law(power: float) -> _Array:
+def _law_shares(power: float) -> _Array:
     """Return the fraction (K,) of each near and far kernel in light that decreases with a power of the distance."""
     # The law is a mixture of Gaussians with weights σ^(1 − power) dσ. Each kernel represents the nearest range of σ.
     scale = np.array(NEAR_PX + FAR_PX)
@@ -509,17 +516,18 @@ def channels_alike(apart: float = CHANNELS_APART) -> _Array:
     return (1 - apart**2) + apart**2 * np.eye(3)
 
 
-def _take(normal: _Array, right: _Array, prior: _Array, terms: npt.NDArray[np.int64]) -> tuple[_Array, _Array, _Array]:
+def _at_terms(
+    normal: _Array, right: _Array, prior: _Array, terms: npt.NDArray[np.int64]
+) -> tuple[_Array, _Array, _Array]:
     return normal[np.ix_(terms, terms)], right[terms], prior[np.ix_(terms, terms)]
 
 
 def _misfit(normal: _Array, right: _Array, prior: _Array, shapes: int) -> float:
     """Return the χ² gain from smooth light that no kernel explains, per unknown; at least 1, the value by chance."""
-    # This light adds equally to dark and bright patches.
-    with_shape = _without_factors(normal, right, prior, TERMS + shapes)
+    with_shape = _eliminate_factors(normal, right, prior, TERMS + shapes)
     others = np.delete(np.arange(len(prior)), np.arange(TERMS, TERMS + shapes))
-    plain = _without_factors(*_take(normal, right, prior, others))
-    gains = [_explained(*pair, np.asarray(np.linalg.solve(*pair), dtype=np.float64)) for pair in (with_shape, plain)]
+    plain = _eliminate_factors(*_at_terms(normal, right, prior, others))
+    gains = [_chi2_gain(*pair, np.asarray(np.linalg.solve(*pair), dtype=np.float64)) for pair in (with_shape, plain)]
     return max(1.0, (gains[0] - gains[1]) / shapes)
 
 
@@ -574,7 +582,7 @@ def nonlinearity_change(level: _Array, field: _Array) -> _Array:
 def _by_fold(
     points: npt.NDArray[np.int64], places_mm: _Array, page_mm: tuple[float, float]
 ) -> tuple[npt.NDArray[np.int64], tuple[slice, ...]]:
-    tile = np.floor(places_mm[points] / (max(page_mm) / _PATCHWORK)).astype(np.int64)
+    tile = np.floor(places_mm[points] / (max(page_mm) / _TILES_PER_SIDE)).astype(np.int64)
     fold = (tile[:, 0] + 2 * tile[:, 1]) % FOLDS
     order = np.argsort(fold, kind="stable")
     ends = np.searchsorted(fold[order], np.arange(FOLDS + 1)).tolist()
@@ -592,15 +600,15 @@ def _reference_rows(data: ReferenceData, page_mm: tuple[float, float]) -> _Rows:
         design=rough[selected, 1:],
         level=np.full(len(data.level), float(data.level.mean())),
         folds=folds,
-        unknowns=np.append(channel_terms(data.channel), _bend_of(data.channel)),
+        unknowns=np.append(channel_terms(data.channel), _bend_index(data.channel)),
     )
 
 
 def _weights(residual: _Array, level: _Array) -> _Array:
-    groups = min(_LEVELS, len(residual) // 8) if float(np.ptp(level)) > 0 else 1
+    groups = min(_LEVEL_GROUPS, len(residual) // 8) if float(np.ptp(level)) > 0 else 1
     variance = sigma_by_level(residual, level, groups) ** 2 + 1e-12
     normalised = np.abs(residual) / np.sqrt(variance)
-    weights: _Array = np.minimum(1.0, _HUBER / np.maximum(normalised, 1e-9)) / variance
+    weights: _Array = np.minimum(1.0, _HUBER_SIGMAS / np.maximum(normalised, 1e-9)) / variance
     return weights
 
 
@@ -616,7 +624,7 @@ def _normal_equations(rows: Sequence[_Rows], solution: _Array) -> tuple[_Array, 
     return normal, right
 
 
-def _without_factors(normal: _Array, right: _Array, prior: _Array, count: int = TERMS) -> tuple[_Array, _Array]:
+def _eliminate_factors(normal: _Array, right: _Array, prior: _Array, count: int = TERMS) -> tuple[_Array, _Array]:
     full = normal + prior
     # The Schur complement eliminates all unknowns after the first `count`.
     elimination = np.linalg.solve(full[count:, count:], full[count:, :count]).T
@@ -624,9 +632,9 @@ def _without_factors(normal: _Array, right: _Array, prior: _Array, count: int = 
     return 0.5 * (matrix + matrix.T), right[:count] - elimination @ right[count:]
 
 
-def _solved(normal: _Array, right: _Array, prior: _Array, terms: npt.NDArray[np.int64]) -> _Array:
+def _solve_all(normal: _Array, right: _Array, prior: _Array, terms: npt.NDArray[np.int64]) -> _Array:
     # Solve for all unknowns; shares are 0 except for `terms`.
-    shares, _ = _positive(*_without_factors(normal, right, prior), terms)
+    shares, _ = _solve_nonnegative(*_eliminate_factors(normal, right, prior), terms)
     full = normal + prior
     solution = np.empty(len(right))
     solution[:TERMS] = shares
@@ -634,11 +642,11 @@ def _solved(normal: _Array, right: _Array, prior: _Array, terms: npt.NDArray[np.
     return solution
 
 
-def _explained(matrix: _Array, vector: _Array, solution: _Array) -> float:
+def _chi2_gain(matrix: _Array, vector: _Array, solution: _Array) -> float:
     return float(2 * vector @ solution - solution @ matrix @ solution)
 
 
-def _positive(matrix: _Array, vector: _Array, terms: npt.NDArray[np.int64]) -> tuple[_Array, float]:
+def _solve_nonnegative(matrix: _Array, vector: _Array, terms: npt.NDArray[np.int64]) -> tuple[_Array, float]:
     """Return the least-squares shares (TERMS,), 0 except for `terms`, and the χ² gain."""
     # Far kernels and veiling glare are ≥ 0: non-negative least squares of the Cholesky factor (C. Lawson and R. Hanson,
     # Solving Least Squares Problems, 1974), after elimination of the unconstrained shares.
@@ -652,20 +660,20 @@ def _positive(matrix: _Array, vector: _Array, terms: npt.NDArray[np.int64]) -> t
         shares[positive] = nnls(factor.T, np.linalg.solve(factor, right))[0]
     if len(signed):
         shares[signed] = np.linalg.solve(inner, vector[signed] - across @ shares[positive])
-    return shares, _explained(matrix, vector, shares)
+    return shares, _chi2_gain(matrix, vector, shares)
 
 
-def _selected(
+def _proven_terms(
     matrix: _Array, vector: _Array, misfit: float, candidates: list[npt.NDArray[np.int64]]
 ) -> npt.NDArray[np.int64]:
     """Return the unknowns of the proven kernels: the weakest kernel is dropped until all others gain enough."""
     kernels = list(candidates)
-    _, gain = _positive(matrix, vector, _terms(kernels))
+    _, gain = _solve_nonnegative(matrix, vector, _terms(kernels))
     while kernels:
         without = [
             np.concatenate([*kernels[:k], *kernels[k + 1 :], np.zeros(0, dtype=np.int64)]) for k in range(len(kernels))
         ]
-        gains = [_positive(matrix, vector, np.sort(remaining))[1] for remaining in without]
+        gains = [_solve_nonnegative(matrix, vector, np.sort(remaining))[1] for remaining in without]
         # By chance, each unknown gains 1 times the misfit.
         excess = [gain - less - misfit * (LEAST_GAIN + len(own) - 1) for less, own in zip(gains, kernels, strict=True)]
         weakest = int(np.argmin(excess))

@@ -32,18 +32,19 @@ FULL_BITS = 5
 VARYING_BITS = 4  # minimum bits per channel for prediction by neighbours; other charts have few colours
 
 # Side of a square of codes perpendicular to an axis. The curvature along the axis is averaged over this square.
-_SIDE = 5
+_PLANE_SIDE = 5
 
-# Length scale of the random function, in code steps of a chart with three bits (judgement; fitted values are 7 to 20).
+# Length scale of the random function, in code steps of a chart with three bits. Chosen by judgement: fitted values are
+# 7 to 20.
 _LENGTH_SCALE = 16.0
 
-_NOISES = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)  # candidates for the ratio of noise to function
+_NOISE_CANDIDATES = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)  # candidates for the ratio of noise to function
 
-_EQUAL_NOISE_LEVEL = 0.02  # level at which read noise and photon noise are equal (judgement)
+_EQUAL_NOISE_LEVEL = 0.02  # level at which read noise and photon noise are equal; chosen by judgement
 
 _MIN_LEVEL = 1e-3  # lower bound of levels before the square root is taken
 
-# Variance of unknown values: prior of the linear part of the function, and noise of unusable patches.
+# Variance that stands for an unknown value: prior of the linear part of the function, and noise of unusable patches.
 _UNKNOWN_VARIANCE = 1e4
 
 _OUTLIER_SIGMAS = 4.0  # a patch with a larger residual, in standard deviations, is not used for predicting others
@@ -127,9 +128,11 @@ def _residual_without_curvature(columns: npt.NDArray[np.floating], side: int) ->
             (*(slice(None),) * axis, indices) for indices in (slice(1, side - 1), slice(0, side - 2), slice(2, side))
         )
         difference = cube[inner] - 0.5 * (cube[previous] + cube[following])
-        window = [1 if dimension == axis else _SIDE for dimension in range(3)]
+        window = [1 if dimension == axis else _PLANE_SIDE for dimension in range(3)]
         # The mean over the surrounding codes excludes the patch itself.
-        total[inner] += (difference - uniform_filter(difference, [*window, 1], mode="nearest")) / (1 - 1 / _SIDE**2)
+        total[inner] += (difference - uniform_filter(difference, [*window, 1], mode="nearest")) / (
+            1 - 1 / _PLANE_SIDE**2
+        )
         count[inner] += 1
     return (total / np.maximum(count, 1)).reshape(columns.shape)
 
@@ -154,7 +157,7 @@ def _residual_matrix_of(root: _Array, usable: _Mask, bits: int) -> tuple[_Array,
     return _cached_residual_matrix(root.tobytes(), usable.tobytes(), bits)
 
 
-# The results are cached, because they are needed several times for each channel. Do not modify them.
+# The results are cached; do not modify them.
 @lru_cache(maxsize=6)
 def _cached_residual_matrix(root_bytes: bytes, usable_bytes: bytes, bits: int) -> tuple[_Array, _Array]:
     root, usable = np.frombuffer(root_bytes), np.frombuffer(usable_bytes, dtype=np.bool_)
@@ -174,9 +177,9 @@ def _cached_residual_matrix(root_bytes: bytes, usable_bytes: bytes, bits: int) -
 
 
 def _invert_likeliest(prior: _Array, noise: _Array, root: _Array, *shares: float) -> tuple[_Array, float]:
-    """Return the inverse covariance (C, C) with the most likely noise of `shares` or `_NOISES`, and this noise."""
+    """Return the inverse covariance (C, C) with the likeliest noise of `shares` or the candidates, and this noise."""
     candidates: list[tuple[float, float, _Array]] = []
-    for share in shares or _NOISES:
+    for share in shares or _NOISE_CANDIDATES:
         # The matrix is symmetric, so the transpose is a copy in LAPACK's order.
         covariance = prior.T.copy(order="F")
         covariance[np.diag_indices_from(covariance)] += share**2 * noise
@@ -185,7 +188,7 @@ def _invert_likeliest(prior: _Array, noise: _Array, root: _Array, *shares: float
         scale = float(inner @ inner) / len(root)
         candidates.append((0.5 * len(root) * np.log(scale) + float(np.log(np.diag(factor)).sum()), share, factor))
     _, share, factor = min(candidates, key=lambda candidate: candidate[:2])
-    # LAPACK's inversion of a factored matrix is four times as fast as a general solution. It fills one triangle only.
+    # LAPACK's inversion of a factored matrix fills one triangle only.
     inverse: _Array = lapack.dpotri(factor, lower=1)[0]
     inverse += np.tril(inverse, -1).T
     return inverse, share

@@ -2,7 +2,7 @@
 
 - The print is a grid of slots of one size, as made by `experiment.chart.layout`. A patch or a reference fills one slot,
   a tag fills 4 × 4 slots, and a module of a tag is 0.4 slots wide. In this module, "patches" are the patches in the
-  order of colour indices, followed by the white and the grey references.
+  order of colour indices, then the white references, then the grey references.
 - Near kernels are integrated over each slot and over each photosite of a window, in each channel. Tags and margins are
   divided into fifths of a slot. For far kernels, the print is blurred slot by slot.
 - Paper and black ink have one level each, multiplied by the local flat field. The background has the mean level that is
@@ -28,7 +28,7 @@ from drivers.raw.rawfile import CHANNELS, Mosaic, channel_offset_px, phases
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 
-PAD = 6  # number of slots around the outermost patches, for margins and background
+PAD_SLOTS = 6  # number of slots around the outermost patches, for margins and background
 
 _OFF_GRID = 0.02  # tolerance of positions on the grid, in slots, because positions in files are rounded
 
@@ -109,14 +109,14 @@ def _fits_grid(chart: Chart) -> bool:
 def printed_grid(chart: Chart) -> PrintedGrid:
     """Return the grid of a chart that is not `unsuitable`."""
     low, slots = _slots(chart)
-    column, row = np.rint(slots).astype(np.int64).T + PAD
+    column, row = np.rint(slots).astype(np.int64).T + PAD_SLOTS
     count = len(row)
-    rows, columns = int(row.max()) + 1 + PAD, int(column.max()) + 1 + PAD
+    rows, columns = int(row.max()) + 1 + PAD_SLOTS, int(column.max()) + 1 + PAD_SLOTS
     source = np.full((rows, columns), -1, dtype=np.int32)
     source[row, column] = np.arange(count)
     width, height = chart.cell_mm
-    x = low[0] + ((np.arange(columns * PARTS) + 0.5) / PARTS - 0.5 - PAD) * width
-    y = low[1] + ((np.arange(rows * PARTS) + 0.5) / PARTS - 0.5 - PAD) * height
+    x = low[0] + ((np.arange(columns * PARTS) + 0.5) / PARTS - 0.5 - PAD_SLOTS) * width
+    y = low[1] + ((np.arange(rows * PARTS) + 0.5) / PARTS - 0.5 - PAD_SLOTS) * height
     sheet = ((y > 0) & (y < chart.page_mm[1]))[:, None] & ((x > 0) & (x < chart.page_mm[0]))
     parts = np.where(sheet, count, count + 2).astype(np.int32)
     drawn = drawing(chart)
@@ -147,7 +147,7 @@ class FrameLevels:
     """Levels in a frame before the lens correction."""
 
     patches: _Array  # (P, 3) counts, mean of each patch
-    beyond: _Array  # (3,) counts of the background
+    background: _Array  # (3,) counts of the background behind the print
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +203,7 @@ class Surroundings:
         """Return the levels of paper, black ink and background, (3, 3) float64 counts, for a flat field of 1."""
         whites = levels.patches[self.whites] / self.light.patches[self.whites]
         # The first colour is the code (0, 0, 0), the black of tags.
-        return np.stack([np.median(whites, axis=0), levels.patches[0] / self.light.patches[0], levels.beyond])
+        return np.stack([np.median(whites, axis=0), levels.patches[0] / self.light.patches[0], levels.background])
 
     def mean(self, levels: FrameLevels, inks: _Array) -> _Array:
         """Return the mean light (3,) float64 counts of print and background in the frame; `inks` (3, 3) from `inks`."""

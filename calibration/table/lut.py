@@ -85,6 +85,7 @@ MOST_BYTES: Final = {
 OPTIONAL: Final = frozenset({REPORT_PAGE})
 
 _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")  # line of `SHA256SUMS`: hash and file name
+# Files besides `lut.json`, samples and hashes.
 _TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, REPORT_PAGE)
 RESTORE: Final = "restore it from a copy, fetch the LUT again, or build it again"
 
@@ -273,7 +274,7 @@ def samples_sha256(
 
 
 def sums_text(folder: Path, samples_sha256: str, provenance: str) -> str:
-    """Return the text of `SHA256SUMS` for a LUT that is complete except for `lut.json`; `provenance` is its hash."""
+    """Return the text of `SHA256SUMS` for a LUT without its `lut.json`; `provenance` is the hash of `lut.json`."""
     hashes = {name: file_sha256(folder / name) for name in _TEXTS if (folder / name).is_file()}
     hashes |= {SAMPLES: samples_sha256, PROVENANCE: provenance}
     return "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes))
@@ -428,7 +429,7 @@ class Lut:
 
 
 def open_lut(folder: Path, *, check: bool = True) -> Lut:
-    """Open a LUT folder; takes milliseconds for any size.
+    """Open a LUT folder.
 
     Parameters
     ----------
@@ -449,9 +450,9 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
     except OSError as error:
         if (partial_path(folder) / SAMPLES).is_file():
             raise FormatError(f"{folder} is not complete; complete it with build-lut SESSION {folder}") from error
-        raise FormatError(
-            f"{folder} is not a LUT: cannot read {PROVENANCE} ({error.strerror}); make one with build-lut"
-        ) from error
+        # A Path has one slash less than its URL.
+        remedy = "copy it with build-lut fetch URL FOLDER" if ":/" in str(folder) else "make one with build-lut"
+        raise FormatError(f"{folder} is not a LUT: cannot read {PROVENANCE} ({error.strerror}); {remedy}") from error
     provenance = parse_provenance(text, path)
     lights = load_illuminants(folder / ILLUMINATIONS, computed=True)
     white = _load_white(folder / ILLUMINATIONS)

@@ -48,6 +48,7 @@ from experiment.lights import load_illuminants
 from foundation.errors import RUN_AGAIN, CropError, FormatError, InputError, StorageError
 from foundation.files import file_sha256, parse_json_object, require_plain_tree, storage_error, write_atomic
 from foundation.folders import atomic_folder, require_free
+from foundation.remote import filesystem, is_remote, remote_error
 
 FORMAT: Final = "crop.lut.published"
 
@@ -73,11 +74,6 @@ HASH: Final = re.compile("[0-9a-f]{64}")  # SHA-256 in hexadecimal digits
 SHARD_LIGHTS: Final = 32  # number of illuminants per object of the store; 100 MB in a full LUT
 
 ReportLights = Callable[[int, int], None]  # called with the number of copied illuminants and the total number
-
-
-def error_text(error: Exception) -> str:
-    """Return kind and message of an error on one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
 
 
 def table_texts(attributes: dict[str, Any], url: str) -> dict[str, str]:
@@ -167,19 +163,17 @@ def require_space(folder: Path, size: int, url: str) -> None:
 
 def read_metadata(url: str) -> dict[str, Any] | None:
     """Return the metadata of an array, `zarr.json` (Zarr 3, "Array metadata"); None if it does not exist."""
-    from fsspec.core import url_to_fs
-
-    if "://" not in url or url.startswith("file://"):
+    if not is_remote(url):
         require_plain_tree(Path(url.removeprefix("file://")))
+    files, root = filesystem(url)
     try:
-        files, root = url_to_fs(url)
         with files.open(f"{root.rstrip('/')}/{_METADATA}", "rb") as stream:
             data = stream.read(_MOST_METADATA + 1)
     except FileNotFoundError:
         return None
     except Exception as error:
         # Each kind of store raises different errors.
-        raise InputError(f"cannot read {url}: {error_text(error)}; check the address") from error
+        raise remote_error(error, "read", url) from error
     if len(data) > _MOST_METADATA:
         raise FormatError(f"{url}: {_METADATA} has more than {_MOST_METADATA} bytes, expected fewer; check the address")
     return parse_json_object(data, f"{_METADATA} of {url}")
@@ -224,9 +218,7 @@ def publish(lut: Lut, url: str, progress: ReportLights | None = None) -> None:
         raise
     except Exception as error:
         # Each kind of store raises different errors.
-        raise StorageError(
-            f"cannot write {url}: {error_text(error)}; check the address and your permissions"
-        ) from error
+        raise remote_error(error, "write", url) from error
 
 
 def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: str | None = None) -> Lut:
@@ -270,7 +262,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
             array: Any = zarr.open_array(url, mode="r")
         except Exception as error:
             # Each kind of store raises different errors.
-            raise FormatError(f"cannot read {url}: {error_text(error)}; publish the LUT again") from error
+            raise remote_error(error, "read", url, "publish the LUT again") from error
         path = partial / SAMPLES
         try:
             with path.open("wb") as stream:
@@ -299,20 +291,16 @@ def _light(array: Any, light: int, shape: tuple[int, int, int, int], url: str) -
             raise ValueError(f"its shape is {samples.shape}, expected {shape[1:]}")
     except Exception as error:
         # Each kind of store raises different errors, and damaged chunks raise errors of the codec.
-        raise FormatError(
-            f"cannot read illuminant {light} of {url}: {error_text(error)}; publish the LUT again"
-        ) from error
+        raise remote_error(error, "read", f"illuminant {light} of {url}", "publish the LUT again") from error
     return samples
 
 
 def _require_free(url: str) -> None:
-    from fsspec.core import url_to_fs
-
     attributes = table_attributes(read_metadata(url))
     if attributes is not None and attributes.get("whole"):
         raise InputError(f"{url} already has a LUT; give another address, or remove it")
     if attributes is None:
-        files, root = url_to_fs(url)
+        files, root = filesystem(url)
         if files.exists(root) and files.find(root):
             raise InputError(f"{url} already has other files; give another address, or remove them")
 

@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from evaluation.metrics import ErrorKind
     from evaluation.results.files import MethodErrors
 
-# Largest number of comparisons that are printed with details; with more, only tests and verdicts are printed.
-_MAX_DETAILED = 3
-
 HELP = f"""Compare two methods on the same images, or one method in two runs, image by image.
 
 Reads one or two RESULTS: results folders, or their errors.csv. With one, compares all pairs of its methods; with two,
@@ -74,7 +71,7 @@ def compare(
     show_tables(output, [comparing.tests_table(comparisons)])
     for sentence in verdicts:
         print(sentence)
-    if output.is_requested or len(comparisons) <= _MAX_DETAILED:
+    if output.is_requested or len(comparisons) <= comparing.MAX_DETAILED:
         show_tables(output, [comparing.statistics_table(comparisons)])
         show_tables(output, [comparing.images_table(comparison, 5) for comparison in comparisons])
     if out is not None:

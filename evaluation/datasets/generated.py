@@ -102,6 +102,11 @@ def open_generated(location: Path | str, subset: str | None = None) -> SceneSet:
             + uncertainty_note,
         },
         truth_uncertainty_deg=uncertainty_deg,
+        black_bodies={
+            light.cct_k: light.white
+            for light in dataset.description.lights
+            if light.kind == "blackbody" and light.cct_k is not None
+        },
     )
 
 

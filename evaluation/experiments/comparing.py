@@ -42,6 +42,9 @@ _STATISTIC_HEADS: Final = dict(zip(STATISTICS, PAPER_COLUMNS[1:], strict=True))
 
 _VALUE_HEADS: Final = ("Of first", "Of second", "Difference", "from", "to", "Ratio", "ratio from", "ratio to")
 
+# Largest number of comparisons with details on the terminal and unfolded details on the page.
+MAX_DETAILED: Final = 3
+
 TEST_NOTES: Final = (
     "Wilcoxon signed-rank test, two-sided; equal errors are ranked, then excluded (Pratt).",
     "Effect: matched-pairs rank-biserial correlation; -1: the first is better on every image, 1: worse on every image.",
@@ -263,20 +266,44 @@ def error_scatter(matched: MatchedErrors) -> bytes:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_major_formatter("{x:g}")
 
-    return draw_svg(draw, inches=(5.6, 5.4))
+    return draw_svg(draw, inches=(4.6, 4.4))
 
 
 def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str]) -> str:
     """Return the HTML page of comparisons."""
-    elements: list[Markup] = [pages.paragraph(text) for text in (*notes, *map(verdict, comparisons))]
-    elements += [table_part(tests_table(comparisons)), table_part(statistics_table(comparisons))]
+    elements: list[Markup] = [*map(pages.paragraph, notes), table_part(tests_table(comparisons))]
     for comparison in comparisons:
         name_a, name_b = comparison.matched.names
         caption = f"One point for each image: above the line (blue) {name_a} is better, below it (orange) {name_b}."
         figure = pages.figure(error_scatter(comparison.matched), caption)
-        table = table_part(images_table(comparison))
-        elements += [pages.heading(f"{name_a} against {name_b}"), pages.row([figure, table])]
+        details = [
+            pages.paragraph(verdict(comparison)),
+            _statistics_part(comparison),
+            pages.row([figure, table_part(images_table(comparison))]),
+        ]
+        elements.append(pages.fold(f"{name_a} against {name_b}", details, is_open=len(comparisons) <= MAX_DETAILED))
     return pages.page(f"Comparison of {comparisons[0].matched.metric} errors", elements)
+
+
+def _statistics_part(comparison: Comparison) -> Markup:
+    def with_interval(values: tuple[float, float, float]) -> str:
+        value, low, high = ("–" if np.isnan(number) else f"{number:.3f}" for number in values)
+        return f"{value} ({low} – {high})"
+
+    rows = [
+        (
+            _STATISTIC_HEADS[pair.statistic],
+            f"{pair.value_a:.3f}",
+            f"{pair.value_b:.3f}",
+            *map(with_interval, (pair.difference, pair.ratio)),
+        )
+        for pair in comparison.statistics
+    ]
+    names = comparison.matched.names
+    table = statistics_table([comparison])
+    return pages.table(
+        table.title, ("Statistic", *names, "Difference", "Ratio"), rows, (False, *[True] * 4), table.notes
+    )
 
 
 def _interval_cells(pair: PairedFigure) -> list[Cell]:

@@ -90,6 +90,7 @@ def describe_run(
         notes=notes,
         software=software(),
         truth_uncertainty_deg=data.truth_uncertainty_deg,
+        black_bodies=data.black_bodies,
     )
 
 

@@ -7,10 +7,10 @@ but a colour cast is visible.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from types import MappingProxyType
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +39,8 @@ _COLUMNS = 3  # Panels in a row, for a page width of 1100 px
 # slowly.
 _MAX_VECTOR_POINTS = 3000
 
+_MIN_REACH = 0.01  # Half of the smallest range of an axis, for data sets with one illuminant
+
 _SCALE_PERCENTILE = 95  # The colour scale ends at this percentile of all methods' errors
 
 
@@ -59,19 +61,28 @@ def _draw_curves(figure: Any, results: Sequence[Result], metric: ErrorKind) -> N
         indices = np.ceil(shares / 100 * len(errors)).astype(int) - 1
         reached_errors = np.where(indices < 0, 0.0, errors[np.maximum(indices, 0)])
         axes.plot(reached_errors, shares, label=legend_label(result.method), linewidth=1.6, **series_style(number))
-    axes.set(xlim=(0, axis_end), ylim=(0, 100), xlabel=f"{metric} angular error, degrees", ylabel="share of images, %")
+    axes.set(xlim=(0, axis_end), ylim=(0, 100), xlabel=f"x: {metric} angular error, degrees")
+    axes.set_ylabel("share of images with error ≤ x, %")
     figure.legend(loc="outside lower left", ncols=2, handlelength=3)
 
 
-def error_planes(results: Sequence[Result], truths: npt.NDArray[np.float64], metric: ErrorKind) -> bytes:
+def error_planes(
+    results: Sequence[Result],
+    truths: npt.NDArray[np.float64],
+    metric: ErrorKind,
+    black_bodies: Mapping[float, tuple[float, float, float]] = MappingProxyType({}),
+) -> bytes:
     """Return the errors over the chromaticity plane as SVG, one panel for each of the first twelve methods.
 
-    `truths`: (N, 3) float64, ground truths, camera RGB of any length.
+    `truths`: (N, 3) float64, ground truths, camera RGB of any length. `black_bodies`: camera RGB by temperature, K.
     """
     drawn = results[:_PANELS]
     columns = _column_count(len(drawn))
-    width, height = (4.6, 3.6) if len(drawn) == 1 else (8.6, 0.7 + (7.8 / columns) * math.ceil(len(drawn) / columns))
-    return draw_svg(_draw_planes, drawn, truths, metric, inches=(width, height))
+    # Panels are squares, with a title above each.
+    width, height = (
+        (4.6, 3.9) if len(drawn) == 1 else (8.6, 0.5 + (7.0 / columns + 0.2) * math.ceil(len(drawn) / columns))
+    )
+    return draw_svg(_draw_planes, drawn, truths, metric, black_bodies, inches=(width, height))
 
 
 def _column_count(panels: int) -> int:
@@ -79,11 +90,23 @@ def _column_count(panels: int) -> int:
     return 2 if panels == 4 else min(_COLUMNS, panels)
 
 
-def _draw_planes(figure: Any, results: Sequence[Result], truths: npt.NDArray[np.float64], metric: ErrorKind) -> None:
+def _draw_planes(
+    figure: Any,
+    results: Sequence[Result],
+    truths: npt.NDArray[np.float64],
+    metric: ErrorKind,
+    black_bodies: Mapping[float, tuple[float, float, float]],
+) -> None:
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 
-    shares = truths / truths.sum(axis=1, keepdims=True)
+    kelvins = sorted(black_bodies)
+    colours = np.vstack([truths, *(black_bodies[kelvin] for kelvin in kelvins)])
+    rb = (colours / colours.sum(axis=1, keepdims=True))[:, ::2]
+    shares, locus = rb[: len(truths)], rb[len(truths) :]
+    # Both axes have the same scale, so that equal distances look equal.
+    middle, reach = (rb.max(axis=0) + rb.min(axis=0)) / 2, max(0.6 * float(np.ptp(rb, axis=0).max()), _MIN_REACH)
+    limits = np.stack([middle - reach, middle + reach])
     all_errors = np.concatenate([result.errors[metric] for result in results])
     scale_end = max(float(percentiles(all_errors, (_SCALE_PERCENTILE,))[0]), 1e-3)
     # Both ends of the colour scale must be visible on a light and on a dark page.
@@ -95,8 +118,7 @@ def _draw_planes(figure: Any, results: Sequence[Result], truths: npt.NDArray[np.
         errors = result.errors[metric]
         order = np.argsort(errors, kind="stable")  # The largest errors lie on top.
         points = axes.scatter(
-            shares[order, 0],
-            shares[order, 2],
+            *shares[order].T,
             c=errors[order],
             s=9,
             cmap=colours,
@@ -106,6 +128,12 @@ def _draw_planes(figure: Any, results: Sequence[Result], truths: npt.NDArray[np.
             rasterized=len(errors) * len(results) > _MAX_VECTOR_POINTS,
         )
         axes.set_title(result.method, fontsize=8.5)
+        axes.set(xlim=limits[:, 0], ylim=limits[:, 1], aspect="equal")
+        if len(kelvins) > 1:
+            axes.plot(*locus.T, color=FAINT, linewidth=0.9, zorder=1)
+            for end, offset, side in ((0, (-5, -8), "right"), (-1, (5, -2), "left")):
+                text = f"{kelvins[end]:.0f} K"
+                axes.annotate(text, locus[end], offset, textcoords="offset points", ha=side, fontsize=7, color=FAINT)
     panels = list(grid.flat)
     for axes in panels[len(results) :]:
         axes.remove()
@@ -239,14 +267,16 @@ def run_page(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], byt
         pages.heading("Cumulative error curves"),
         pages.figure(
             error_curves(run.results, metric),
-            f"Fraction of images with a {metric} error up to the value on the axis; higher is better. The "
-            f"axis ends at the 98th percentile of {'all methods together' if len(run.results) > 1 else 'the errors'}.",
+            f"Share of the images with a {metric} error of at most x; higher is better. The axis ends at the 98th "
+            f"percentile of {'all methods together' if len(run.results) > 1 else 'the errors'}.",
             "Cumulative error curves",
         ),
         pages.heading("Errors over the chromaticity plane"),
         pages.figure(
-            error_planes(run.results, run.truths, metric),
-            "Each point is the ground truth of an image; its colour is the error." + _omitted_methods_text(run.results),
+            error_planes(run.results, run.truths, metric, run.black_bodies),
+            "Each point is the ground truth of an image; its colour is the error."
+            + (" The line joins the black bodies among the illuminants." if len(run.black_bodies) > 1 else "")
+            + _omitted_methods_text(run.results),
             "Errors over chromaticities",
         ),
         *_image_elements(run, metric, pictures),
@@ -303,10 +333,19 @@ def _figure(run: Run, number: int, index: int, metric: ErrorKind, pictures: Mapp
 
 def _method_row(method: Mapping[str, Any]) -> tuple[str, str, str]:
     settings: Mapping[str, Any] = method.get("settings", method.get("estimates", {}))
-    settings_text = ", ".join(f"{name} {_shortened(value)}" for name, value in settings.items())
+    settings_text = ", ".join(f"{name} {_plain_text(value)}" for name, value in settings.items())
     return str(method.get("name", "")), str(method.get("class", "estimates of another program")), settings_text
 
 
-def _shortened(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value)
+def _plain_text(value: Any) -> str:
+    match value:
+        case None | bool():
+            text = {None: "none", True: "yes", False: "no"}[value]
+        case Mapping():
+            parts = cast("Mapping[str, Any]", value).items()
+            text = f"({', '.join(f'{name} {_plain_text(part)}' for name, part in parts)})"
+        case list():
+            text = f"({', '.join(map(_plain_text, cast('list[Any]', value)))})"
+        case _:
+            text = str(value)
     return text if len(text) <= 60 else f"{text[:57]}…"

@@ -183,6 +183,9 @@ class Run:
     notes: tuple[str, ...] = ()  # Sentences printed with the results
     software: str = ""  # Name and version of the software
     truth_uncertainty_deg: float | None = None
+    black_bodies: Mapping[float, tuple[float, float, float]] = field(
+        default_factory=dict[float, tuple[float, float, float]]
+    )
 
 
 def indistinct_methods(results: Sequence[Result], uncertainty_deg: float | None) -> tuple[str, ...]:

@@ -330,7 +330,7 @@ class JoinedLayout:
     def get(self, store: Store, name: str) -> bytes:
         """Return the bytes of a file by its name."""
         container, _, file = name.rpartition("/")
-        with store.open(container) as stream:
+        with store.open(container, scattered=True) as stream:
             try:
                 data = self.read(stream, file)
             except CropError:

@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from foundation.errors import RUN_AGAIN, CropError, DeviceError, FormatError, InputError
 from foundation.files import partial_path, storage_error
 from foundation.folders import clear_folder, locked_folder, require_free
+from foundation.remote import is_remote
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, load_description, open_dataset
 from generator.dataset.shards import (
@@ -52,7 +53,7 @@ from generator.dataset.shards import (
 from generator.lights.choices import listed_lights
 from generator.lights.lighting import LightChoice, Mixture
 from generator.pictures.sources import Source, changed_sha256
-from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
+from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, local_path, open_store
 
 if TYPE_CHECKING:
     import distributed

@@ -48,7 +48,7 @@ from generator.dataset.records import (
 from generator.files import decode_image
 from generator.lights.lighting import parse_mixture
 from generator.masks.maps import decode_ground_truth, decode_weights
-from generator.stores import DESCRIPTION, Store, open_store, read_bounded
+from generator.stores import DESCRIPTION, RemoteStore, Store, open_store, read_bounded
 
 # File name of an image: a number, for which ten digits suffice, and a suffix.
 _NAME: Final = re.compile(r"([0-9]{1,10})(\.[A-Za-z0-9.]*)?")
@@ -190,8 +190,7 @@ def file_faults(
     """
     store = open_store(location)
     sums = f"{store.location}/{SUMS}"
-    if not store.has(DESCRIPTION):
-        raise FormatError(f"{location} is not a data set, because {DESCRIPTION} is missing; make one with generate")
+    _require_description(store)
     with store.open(SUMS) as stream:
         total = sum(1 for _ in bounded_lines(stream, sums))
     listed_names: set[str] = {SUMS}
@@ -206,6 +205,20 @@ def file_faults(
                 progress(verified, total)
     for name in sorted(set(store.names()) - listed_names - set(COMPLETED_BY_HAND)):
         yield f"{name} is not listed in {SUMS}; remove it if you do not need it"
+
+
+def _require_description(store: Store) -> None:
+    if store.has(DESCRIPTION):
+        return
+    try:
+        store.get(DESCRIPTION)
+    except FormatError as error:
+        # The answer of a store tells a missing bucket from a missing file.
+        answer = f" ({error.__cause__})" if isinstance(store, RemoteStore) else ""
+        raise FormatError(
+            f"{store.location} is not a data set, because {DESCRIPTION} is missing{answer}; correct the address, or "
+            "make a data set with generate"
+        ) from error
 
 
 def _listed_files(lines: Iterator[bytes], listed_names: set[str]) -> Iterator[tuple[str, str, str | None]]:
@@ -419,8 +432,7 @@ def open_dataset(location: Path | str) -> Dataset:
     ((40, 50, 3), dtype('uint16'), (0.407407407, 0.296296296, 0.296296296))
     """
     store = open_store(location)
-    if not store.has(DESCRIPTION):
-        raise FormatError(f"{location} is not a data set, because {DESCRIPTION} is missing; make one with generate")
+    _require_description(store)
     dataset = Dataset(store, load_description(store))
     # Reads the lists, so that inconsistent lists are reported before images are used.
     _ = dataset.entries

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foundation.errors import FormatError, InputError, first_few
+from foundation.remote import is_remote
 from generator.dataset.layouts import LAYOUTS, FileLayout
 from generator.dataset.reader import Dataset
 from generator.dataset.records import GROUND_TRUTH, Description, Light
@@ -25,7 +26,7 @@ from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixtu
 from generator.masks.making import GivenMaskPlan, find_masks
 from generator.pictures.random_scenes import RandomScene
 from generator.pictures.sources import Preparation, Source, SourcePicture
-from generator.stores import is_remote, local_path
+from generator.stores import local_path
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -308,7 +308,7 @@ SILENT: Final = Callbacks()  # Callbacks that do nothing
 
 
 @dataclass(frozen=True)
-class _ReadSource:
+class ReadSource:
     """A source picture that was read."""
 
     cuts: tuple[Cut, ...]  # its crops, or the full picture as one crop; empty if all its images are finished
@@ -334,7 +334,7 @@ def make_shard(
     images: list[ImageRecord] = []
     used: set[int] = set()
     pending: deque[Future[Sample]] = deque()
-    reading: deque[Future[_ReadSource]] = deque()
+    reading: deque[Future[ReadSource]] = deque()
     finished = _finished_images(job, workplace, pool)
     if finished:
         callbacks.on_done(len(finished))
@@ -356,8 +356,8 @@ def make_shard(
     with _writer_of(job, workplace) as writer, _cancelling(pending, reading):
         for row, source in enumerate(job.sources):
             while len(reading) <= workers and row + len(reading) < len(job.sources):
-                reading.append(pool.submit(_read, job, lut, row + len(reading), finished))
-            shard_images = _images_of_source(job, job.position + row)
+                reading.append(pool.submit(read_source, job, lut, row + len(reading), finished))
+            shard_images = images_of_source(job, job.position + row)
             try:
                 read = reading.popleft().result()
             except FormatError as error:
@@ -376,7 +376,7 @@ def make_shard(
                 if number in finished:
                     pending.append(pool.submit(_reused_sample, finished[number]))
                 else:
-                    pending.append(pool.submit(_rendered, job, lut, workplace, writer, number, read, crop, lighting))
+                    pending.append(pool.submit(_stored, job, lut, workplace, writer, number, read, crop, lighting))
         while pending:
             finish_one(writer)
         files = writer.close()
@@ -465,8 +465,8 @@ def _planned_lut(folder: Path, sha256: str) -> Lut:
     return lut
 
 
-def _images_of_source(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
-    # Number, crop and lighting of each image of the source that is in the shard.
+def images_of_source(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
+    """Return number, crop and lighting of each image of a source that is in the shard."""
     crops, lights_each = job.options.crops, job.choice.lights_each
     numbered_images = (
         ((position * crops + crop) * lights_each + light_index, crop, lighting)
@@ -476,10 +476,11 @@ def _images_of_source(job: ShardJob, position: int) -> list[tuple[int, int, Ligh
     return [numbered_image for numbered_image in numbered_images if job.first <= numbered_image[0] < job.stop]
 
 
-def _read(job: ShardJob, lut: Lut, row: int, finished: Mapping[int, FinishedImage]) -> _ReadSource:
+def read_source(job: ShardJob, lut: Lut, row: int, finished: Mapping[int, FinishedImage]) -> ReadSource:
+    """Read source `row` of a job, unless all its images are finished."""
     recorded = _unchanged_source(job, job.position + row, finished) if finished else None
     if recorded is not None:
-        return _ReadSource((), recorded)
+        return ReadSource((), recorded)
     source: Source = job.sources[row]
     scene = source.read()
     source_cuts = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
@@ -517,12 +518,12 @@ def _read(job: ShardJob, lut: Lut, row: int, finished: Mapping[int, FinishedImag
         note="; ".join(notes) or None,
     )
     cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(source_cuts, repaired, strict=True))
-    return _ReadSource(cuts, record)
+    return ReadSource(cuts, record)
 
 
 def _unchanged_source(job: ShardJob, position: int, finished: Mapping[int, FinishedImage]) -> SourceRecord | None:
     # The record of a source with all images finished that has not changed since; else None.
-    images = _images_of_source(job, position)
+    images = images_of_source(job, position)
     records = [finished[number].source if number in finished else None for number, _, _ in images]
     first = records[0] if records else None
     if first is None or any(source != first for source in records):
@@ -531,16 +532,25 @@ def _unchanged_source(job: ShardJob, position: int, finished: Mapping[int, Finis
     return first if changed_sha256(job.sources[position - job.position], -math.inf) == first.sha256 else None
 
 
-def _rendered(
+def _stored(
     job: ShardJob,
     lut: Lut,
     workplace: Workplace,
     writer: ShardWriter,
     number: int,
-    source: _ReadSource,
+    source: ReadSource,
     crop: int,
     lighting: Lighting,
 ) -> Sample:
+    sample = writer.store(render_image(job, lut, number, source, crop, lighting))
+    if sample.stored:
+        finished = FinishedImage(image=sample.record, source=source.record, files=list(sample.stored))
+        workplace.note(job.shard, finished)
+    return sample
+
+
+def render_image(job: ShardJob, lut: Lut, number: int, source: ReadSource, crop: int, lighting: Lighting) -> Sample:
+    """Render an image. The pieces of its files are valid until this thread renders the next image."""
     options, cut = job.options, source.cuts[crop]
     height, width = cut.picture.shape[:2]
     white_level = lut.provenance.white_level
@@ -566,17 +576,14 @@ def _rendered(
         lights=light.rows,
         details=details | raw.details() | varied.details,
     )
-    sample = writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
-    if sample.stored:
-        workplace.note(job.shard, FinishedImage(image=record, source=source.record, files=list(sample.stored)))
-    return sample
+    return Sample(record, source.record.name, source.record.split, width, height, tuple(files))
 
 
 class NothingMadeError(FormatError):
     """None of the sources can be read, so there is no data set."""
 
 
-class _RenderingSums:
+class RenderingSums:
     """Sums over images for the rendering summary."""
 
     def __init__(self) -> None:
@@ -634,7 +641,7 @@ def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
     used: dict[int, Light] = {}
     labels: set[str] = set()
     details: _ListedFile | None = None
-    rendered = _RenderingSums()
+    rendered = RenderingSums()
     with ExitStack() as stack:
         truths = _ListedFile(stack, workplace.files, TRUTHS)
         table = _ListedFile(stack, workplace.files, GROUND_TRUTH)

@@ -28,6 +28,7 @@ from foundation.files import sha256_of, write_atomic
 from foundation.folders import cache_folder
 from foundation.local_server import LocalServer, Refusal, Request, Response
 from foundation.pages import render
+from foundation.remote import is_remote
 from foundation.secret_texts import masked
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.shards import chromaticity, light_of, photograph
@@ -40,7 +41,6 @@ from generator.pictures.sources import SUFFIXES, Picture, PictureFile, Preparati
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.colorimetric import reference_light
 from generator.rendering.matrices import ColourMatrix, matrix_for
-from generator.stores import is_remote
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

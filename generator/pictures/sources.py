@@ -38,6 +38,7 @@ import numpy.typing as npt
 from foundation.colorimetry import srgb_codes
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import file_sha256, sha256_of, stream_sha256
+from foundation.remote import filesystem, is_remote, remote_error
 from foundation.secret_texts import masked
 from generator import philox
 from generator.files import full_picture_index, upright
@@ -50,7 +51,7 @@ from generator.pictures.conversion import (
     space_of_primaries,
     to_srgb,
 )
-from generator.stores import DESCRIPTION, filesystem, is_remote, local_path
+from generator.stores import DESCRIPTION, local_path
 
 if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
@@ -899,7 +900,7 @@ def _below_url(url: str, search: _Search) -> list[str]:
         paths = [PurePosixPath(path).relative_to(root_path) for path in store.find(root)]
     except Exception as error:
         # Each store has its own exceptions.
-        raise InputError(f"cannot list {url}: {error}; check the address and the access rights") from error
+        raise remote_error(error, "list", url) from error
     datasets = {path.parent for path in paths if path.name == DESCRIPTION and len(path.parts) > 1}
     names = sorted(
         path.as_posix()

@@ -72,6 +72,7 @@ PAGES = {
         refused={"acquire run LAB.toml session/ --retake bad": "has no frame to repeat"},
         skipped={"acquire monitor": _SERVES},
     ),
+    "publishing.md": Page({"dataset": "dataset", "copy": "dataset", "lut": "lut"}),
     "rendering.md": Page(_GENERATE | {"lights.csv": "gt.txt"}, fresh={"generate": "out"}),
     "repeatability.md": Page(
         dict.fromkeys(("monday", "friday", "session"), "session")

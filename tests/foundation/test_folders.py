@@ -13,12 +13,13 @@ import stat
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from foundation import folders
 from foundation.errors import InputError, StorageError
-from foundation.folders import LOCK_FILE, locked_folder
+from foundation.folders import LOCK_FILE, free_bytes_at, locked_folder
 
 BUSY = "another program is at it; wait for it"
 Flock = Callable[[int, int], None]
@@ -192,3 +193,9 @@ def test_cache_is_where_the_system_keeps_caches(
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr("sys.platform", platform)
     assert folders.cache_folder() == tmp_path / below_home / "croplab"
+
+
+def test_free_space_reports_disk_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "statvfs", Mock(side_effect=OSError(errno.EIO, os.strerror(errno.EIO))))
+    with pytest.raises(StorageError):
+        free_bytes_at(tmp_path)

@@ -118,6 +118,16 @@ def test_refuses_other_data_than_pictures() -> None:
         pages.figure(b"GIF89a", "")
 
 
-def test_only_wide_figures_scroll() -> None:
-    assert "<figure class='wide'>" in pages.figure(b"<svg></svg>", "panels", wide=True)
-    assert "<figure>" in pages.figure(b"<svg></svg>", "one panel")
+def test_photograph_is_shown_as_a_whole_and_drawing_stays_readable() -> None:
+    svg = b"<svg width='400pt'></svg>".replace(b"'", b'"')
+    assert "min-width: min(36rem, 300pt)" in pages.figure(svg, "a drawing")
+    assert "min-width" not in pages.figure(svg, "a photograph", is_photograph=True)
+    panels = pages.figure([svg, svg.replace(b"></", b">2</")], "two")
+    assert [f"aria-label='two, {number} of 2'" in panels for number in (1, 2)] == [True, True]
+
+
+@pytest.mark.parametrize(
+    "text", ["-0.3 – 0.12", "p = 2.1e-05", "effect +0.45", "1.2e-07", "--max-side", "1.5 ± 0.2", "+0.1 to +0.2 %"]
+)
+def test_numbers_and_options_stay_on_one_line(text: str) -> None:
+    assert f"<span class='unbroken'>{text}</span>" in pages.paragraph(f"It is {text}, as expected.")

@@ -214,7 +214,7 @@ def test_resumes_after_failure_of_any_write(make_lut: MakeLut, tmp_path: Path, l
         try:
             make(lut, "failing://bucket/out", layout=layout, previews=False)
         except StorageError as error:
-            assert "ConnectionResetError: the store hung up; check the address" in str(error)  # noqa: PT017
+            assert "ConnectionResetError: the store hung up; check the server" in str(error)  # noqa: PT017
             with pytest.raises(FormatError):
                 open_dataset("failing://bucket/out")
         else:

@@ -36,6 +36,7 @@ function drawHead() {
   if (head.last) facts.push(fact("last frame", timeText(head.last)));
   if (!embedded && head.beat && head.state !== "complete") facts.push(element("div", { id: "beat" }));
   $("facts").replaceChildren(...facts);
+  document.body.classList.toggle("no-wall", Boolean(embedded) || head.state === "complete");
   drawBanner();
   drawClock();
 }

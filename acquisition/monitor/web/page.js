@@ -24,9 +24,37 @@ const STATES = {
   unknown: ["?", "state unknown"],
 };
 const LOUD = new Set(["paused", "late", "silent", "incomplete", "stopped", "complete"]);
-const WHITE = "white, red\u00a0─ green\u00a0╌ blue\u00a0┈";
-const BLACK = "black, red\u00a0─ green\u00a0╌ blue\u00a0┈";
-const PACE = "seconds per frame";
+const WHITE = "white";
+const BLACK = "black";
+const PACE = "pace";
+const LINES = "red\u00a0─ green\u00a0╌ blue\u00a0┈";
+// Titles and explanations of plots and checks (docs/reference/judge.md).
+const CHECKS = {
+  [WHITE]: [`Paper white: ${LINES}`, "Camera RGB of bare paper in the white frames, in percent of the first white frame"],
+  [BLACK]: [`Light in dark frames: ${LINES}`, "Camera RGB of bare paper while the projector shows black, in counts"],
+  [PACE]: ["Time per frame", "Time from one frame to the next"],
+  projector: ["Projector", "Faults that the projector reports"],
+  other_camera: ["Camera", "Whether model, serial number and frame size are those of the session"],
+  settings: ["Camera settings", "Whether aperture, shutter time and ISO speed are as requested"],
+  data: ["Photosites without counts", "Share of the photosites without counts, for example after a faulty download"],
+  repeated: ["Difference from earlier frames", "By their noise: 1 is a new exposure, 0 a file of an earlier frame"],
+  clipping: ["Saturated photosites", "Share of the photosites on the chart that are saturated"],
+  exposure: ["Exposure", "Brightest level on the chart, in percent of the saturation level"],
+  chart: ["Recognised marks of the chart", "Tags or paper areas that were recognised in the first white frame"],
+  movement: ["Movement of the chart", "Distance from the position of the chart in the first white frame"],
+  blur: ["Change of focus", "Blur compared with the first white frame; a positive value is less sharp"],
+  rows: ["Rows with wrong content", "Quarter rows of the frame with other content than expected"],
+  uniformity: ["Uneven light", "Largest deviation of a part of the frame from the light of this illuminant"],
+  off_codes_deg: ["Colour of the illuminant", "Difference between the recorded colour and its prediction from the codes"],
+  off_brightness: ["Brightness of the illuminant", "Difference from the brightness predicted from the codes"],
+  dark_drift: ["Change of the light in dark frames", "Change since the first dark frame, in percent of white"],
+  stray_share: ["Other light", "Light of the room that was added to several frames, in percent of white"],
+  leak_share: ["Dark light relative to white", "Light while the projector shows black, in percent of white"],
+  white_drift: ["Brightness of white", "Change of white since the first white frame"],
+  additivity: ["White against the primaries", "Difference between white and the sum of red, green and blue"],
+};
+const titleOf = (name) => CHECKS[name]?.[0] ?? name;
+const explanationOf = (name) => CHECKS[name]?.[1] ?? "";
 // Plots in order of interest; other checks follow in the order of the journal.
 const PLOT_ORDER = [
   WHITE,
@@ -285,7 +313,7 @@ function drawChoice(frames) {
       return element(
         "tr",
         reason ? { class: "bad" } : {},
-        element("th", { scope: "row" }, `${reason ? "✕ " : ""}${name}`),
+        element("th", { scope: "row", title: explanationOf(name) }, `${reason ? "✕ " : ""}${titleOf(name)}`),
         element("td", { class: "number" }, result),
         element("td", { class: "number note" }, limitText(low, high, unit)),
       );
@@ -415,7 +443,6 @@ function begin() {
   });
   if (embedded) {
     $("sound").hidden = true;
-    document.body.classList.add("report");
     const state = JSON.parse(embedded.textContent);
     model.pictures = state.pictures;
     take(state);

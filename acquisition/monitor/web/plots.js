@@ -32,7 +32,7 @@ function short(value) {
 /** Return a number with enough decimals for a range of `span`. */
 function within(value, span) {
   const decimals = Math.max(0, Math.min(6, 2 - Math.floor(Math.log10(span))));
-  return decimals > 4 ? short(value) : value.toFixed(decimals);
+  return decimals > 4 ? short(value) : value.toFixed(decimals).replace(/^-(0\.?0*)$/, "$1");
 }
 
 /** Return a value as text with its unit. */
@@ -183,13 +183,16 @@ function rangeOf(values, limits, least) {
   return [low < 0 ? low - margin : Math.max(0, low - margin), high + margin];
 }
 
+// Values that vary by less than this share of the height of their plot count as equal.
+const FLAT = 0.02;
+
 /**
  * Return a plot of one quantity over the attempts.
  *
  * Points are {index, value, good, low, high, curve}: `low` and `high` are limits or null, `curve` the number of the
  * line that joins them, 0 … 2.
  */
-function plotOf({ name, unit, points, count, least }) {
+function plotOf({ name, explanation, unit, points, count, least }) {
   const limits = points.flatMap((point) => [point.low, point.high].filter((limit) => limit !== null));
   const [low, high] = rangeOf(
     points.map((point) => point.value),
@@ -239,11 +242,14 @@ function plotOf({ name, unit, points, count, least }) {
   svg.append(cursor);
   const head = element(
     "div",
-    { class: "plot-head" },
+    { class: "plot-head", title: explanation },
     element("b", {}, name),
     element("span", {}, [values, allowed].filter(Boolean).join(", ")),
   );
-  return { box: element("div", { class: "plot" }, head, svg), cursor };
+  svg.prepend(shape("title", {}, explanation));
+  const numbers = points.map((point) => point.value);
+  const isFlat = !bad.length && Math.max(...numbers) - Math.min(...numbers) <= FLAT * (high - low);
+  return { box: element("div", { class: "plot" }, head, svg), cursor, isFlat };
 }
 
 const STRIP = { width: 1000, height: 34, left: 2, right: 2 };

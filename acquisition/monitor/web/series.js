@@ -28,9 +28,14 @@ function seriesOf(frames) {
   const rank = (name) => (PLOT_ORDER.includes(name) ? PLOT_ORDER.indexOf(name) : PLOT_ORDER.length);
   const names = [...series.values()].map((one) => one.name);
   const isDouble = (name) => names.indexOf(name) !== names.lastIndexOf(name);
-  for (const one of series.values()) one.label = isDouble(one.name) ? `${one.name}, ${one.unit || "number"}` : one.name;
+  for (const one of series.values()) {
+    one.explanation = explanationOf(one.name);
+    one.label = `${titleOf(one.name)}${isDouble(one.name) ? `, ${one.unit || "number"}` : ""}`;
+  }
   return [...series.values()].sort((one, other) => rank(one.name) - rank(other.name));
 }
+
+let flatOpen = false;
 
 function drawSeries(frames) {
   const count = frames.length;
@@ -42,7 +47,14 @@ function drawSeries(frames) {
   drawn.strip.svg.setAttribute("aria-label", `Verdicts of ${count} attempts`);
   $("verdicts").replaceChildren(drawn.strip.svg);
   drawn.plots = seriesOf(frames).map((one) => plotOf({ ...one, name: one.label, count }));
-  $("series").replaceChildren(...drawn.plots.map((plot) => plot.box));
+  const boxes = (isFlat) => drawn.plots.filter((plot) => plot.isFlat === isFlat).map((plot) => plot.box);
+  const flat = boxes(true);
+  $("series").replaceChildren(...boxes(false));
+  if (!flat.length) return;
+  const fold = element("details", { class: "flat" }, element("summary", {}, `Without change (${flat.length})`), element("div", {}, ...flat));
+  fold.open = flatOpen;
+  fold.addEventListener("toggle", () => (flatOpen = fold.open));
+  $("series").append(fold);
 }
 
 function chooseAt(event, plot) {

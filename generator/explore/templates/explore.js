@@ -1,6 +1,6 @@
 // The page of a LUT: the selection, and the updates of all panels.
 
-const RENDERINGS = { codes: "By codes", colorimetric: "By colour" };
+const RENDERINGS = { colorimetric: "By colour", codes: "By codes" };
 const VIEWS = {
   camera: "Camera RGB, tone mapped with the Flash operator like the previews of data sets.",
   balanced: "Divided by the ground truth. Grey surfaces are grey, except for colour errors of the print.",
@@ -44,6 +44,7 @@ const update = newest(async () => {
     return;
   }
   fault("");
+  state.at ??= [shown.picture.width >> 1, shown.picture.height >> 1];
   if (state.other === "") state.parts = shown.parts;
   drawLight(target);
   drawPicture();
@@ -92,7 +93,10 @@ function drawCommands() {
     ? "Run it in the folder in which generate explore was started; it makes exactly these counts. Give the folder instead of the picture to use all its pictures."
     : "Run it in the folder of the picture, which the browser does not report; it makes exactly these counts.";
   const rows = Object.entries(RENDERINGS).flatMap(([rendering, title]) => {
-    const code = element("code", { id: `command-${rendering}` }, shown.commands[rendering]);
+    // No line ends after the hyphens of an option.
+    const words = shown.commands[rendering].split(/(--[a-z-]+)/);
+    const texts = words.map((word) => (word.startsWith("--") ? element("span", { class: "unbroken" }, word) : word));
+    const code = element("code", { id: `command-${rendering}` }, ...texts);
     const button = element("button", { type: "button", class: "copy", "aria-label": `Copy the command, ${title}` }, "Copy");
     button.addEventListener("click", () => copy(code, button));
     return [element("b", {}, title), element("div", { class: "command" }, code, button)];
@@ -157,7 +161,7 @@ async function send(file) {
 function point(position, relative = false) {
   if (!shown) return;
   const { width, height } = shown.picture;
-  const origin = relative ? (state.at ?? [width >> 1, height >> 1]) : [0, 0];
+  const origin = relative ? state.at : [0, 0];
   const largest = [width - 1, height - 1];
   state.at = position.map((value, axis) => Math.min(Math.max(origin[axis] + value, 0), largest[axis]));
   for (const panel of panels) panel.point(state.at);
@@ -165,11 +169,11 @@ function point(position, relative = false) {
 }
 
 function measure() {
-  if (!state.at || !shown) return;
+  if (!shown) return;
   const [x, y] = state.at;
   for (const panel of panels) panel.measure(shown.number, shown.light, state.at);
   $("pixel-note").textContent =
-    `Pixel ${x}, ${y}. Each pixel is one sample; mean and standard deviation are of 256 samples of the same colour.`;
+    `Pixel ${x}, ${y}; click a picture or use the arrow keys for another one. Each pixel is one sample; mean and standard deviation are of 256 samples of the same colour.`;
 }
 
 function listen() {

@@ -29,6 +29,7 @@ from tests.serving import serving
 pytestmark = [pytest.mark.slow, needs_chromium]
 ROOT = Path(__file__).parents[3]
 WEB = ROOT / "acquisition" / "monitor" / "web"
+JUDGE_PAGE = ROOT / "docs" / "reference" / "judge.md"
 HOSTILE = '<img src=x onerror="window.hacked=1"><script>window.hacked=1</script>\'"&{data}'
 
 KILLED_RUN = """
@@ -103,7 +104,10 @@ def test_follows_run_frame_by_frame(tab: Tab, run: MadeUpRun) -> None:
         tab.wait_for(f"document.querySelectorAll('#planned .mark.accepted').length === {lights + 1}")
         assert f"illuminants {lights + 1} of 23" in " ".join(tab.text().split())
         assert tab.value("document.querySelectorAll('.plot').length") >= 8
+        heads = tab.value("[...document.querySelectorAll('.plot-head')].map((one) => [one.innerText, one.title])")
+        assert all(explanation and "_" not in title for title, explanation in heads)
         assert tab.value("document.getElementById('wall').textContent") == "Between two frames"
+        assert tab.value("getComputedStyle(document.getElementById('wall-card')).display") != "none"
         following = run.steps[30].colour
         run.expose(run.steps[30])
         codes = f"{following.red} {following.green} {following.blue}"
@@ -114,6 +118,31 @@ def test_follows_run_frame_by_frame(tab: Tab, run: MadeUpRun) -> None:
         assert tab.value(OUTSIDE) == []
         assert "NaN" not in tab.value("document.body.innerHTML")
         assert "undefined" not in tab.value("document.querySelector('main').innerHTML")
+
+
+def test_flat_plots_are_folded_until_opened(tab: Tab, run: MadeUpRun) -> None:
+    titles = "[...document.querySelectorAll('.flat .plot-head b')].map((one) => one.textContent)"
+    steady = """
+        for (const frame of model.frames.values())
+          for (const check of frame.checks ?? []) if (check[0] === "blur") check[2] = VALUE;
+        drawSeries(inOrder());
+    """
+    with shown(tab, run.folder):
+        tab.value(steady.replace("VALUE", "0.1"))
+        assert "Change of focus" in tab.value(titles)
+        tab.value("document.querySelector('.flat summary').click()")
+        tab.wait_for("flatOpen")
+        tab.value("drawSeries(inOrder())")
+        assert tab.value("document.querySelector('.flat').open"), "new frames leave it open"
+        tab.value(steady.replace("VALUE", "frame.id / 100"))
+        assert "Change of focus" not in tab.value(titles)
+
+
+def test_every_check_has_a_title() -> None:
+    checks = re.findall(r"`(\w+)`", "".join(re.findall(r"(?m)^\| (`\w+`(?:, `\w+`)*) \|", JUDGE_PAGE.read_text())))
+    assert len(checks) > 15
+    script = (WEB / "page.js").read_text()
+    assert [name for name in checks if f"  {name}: [" not in script] == []
 
 
 def test_session_texts_are_never_code(tab: Tab, run: MadeUpRun) -> None:
@@ -175,7 +204,7 @@ def test_shows_refused_frames_with_picture_and_reason(tab: Tab, run: MadeUpRun) 
         assert "repeated and accepted" in tab.value(f"{card}.innerText")
         tab.value(f"{card}.querySelector('button').click()")
         assert tab.value("document.getElementById('frame-title').textContent") == "Chosen frame"
-        assert tab.value("document.querySelector('#checks tr.bad th').textContent") == "✕ off_codes_deg"
+        assert tab.value("document.querySelector('#checks tr.bad th').textContent") == "✕ Colour of the illuminant"
 
 
 @pytest.mark.parametrize("dark", [False, True])

@@ -199,7 +199,7 @@ def test_lists_nothing_in_clean_frames(step: int) -> None:
     for level in (1.0, 0.5, 0.2):
         result = check.compare(*sheet.sample(level * sheet.other))
         assert not result.disturbed
-        assert not result.alone
+        assert not result.isolated
 
 
 @pytest.mark.slow
@@ -210,7 +210,7 @@ def test_ignores_colours_that_polynomial_misses() -> None:
     result = sheet.compare(sheet.other * np.where(is_missed, 0.9, 1.0)[:, None])
     assert is_missed.sum() > 200
     assert not result.disturbed
-    assert not result.alone
+    assert not result.isolated
 
 
 @pytest.mark.slow
@@ -222,7 +222,7 @@ def test_reports_isolated_patches_as_alone() -> None:
     counts[is_isolated] *= 0.7
     result = sheet.compare(counts)
     assert not result.disturbed
-    assert set(result.alone) == set(np.flatnonzero(is_isolated).tolist())
+    assert set(result.isolated) == set(np.flatnonzero(is_isolated).tolist())
 
 
 @pytest.mark.slow
@@ -271,7 +271,7 @@ def test_removes_adjacent_hot_photosites(count: int) -> None:
     assert not disturbed & set(np.flatnonzero(hot).tolist())
     assert set(covered) <= disturbed if count > 1 else not disturbed
     # a single covered patch is isolated now
-    assert set(cleaned.alone) == (set(covered) if count == 1 else set())
+    assert set(cleaned.isolated) == (set(covered) if count == 1 else set())
     assert cleaned.without_hot(hot, sheet.places) == cleaned
 
 

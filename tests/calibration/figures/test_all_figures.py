@@ -221,11 +221,11 @@ AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.arra
     [
         (light.REPEATED_FILES, {}, 0),
         (light.REPEATED_FILES, {"frames": TWICE}, 1),
-        (light.WHITE_DRIFT, {"drift": SimpleNamespace(left=0.001)}, None),
+        (light.WHITE_DRIFT, {"drift": SimpleNamespace(uncertainty=0.001)}, None),
         (light.WHITE_DRIFT, {"white_frames": [TWICE[0], TWICE[4]]}, None),
         (light.DRIFT_LEFT, {}, None),
-        (light.DRIFT_LEFT, {"drift": SimpleNamespace(left=0.001)}, 0.001),
-        (light.DRIFT_LEFT, {"drift": SimpleNamespace(left=0.001), "white_frames": [TWICE[0]]}, None),
+        (light.DRIFT_LEFT, {"drift": SimpleNamespace(uncertainty=0.001)}, 0.001),
+        (light.DRIFT_LEFT, {"drift": SimpleNamespace(uncertainty=0.001), "white_frames": [TWICE[0]]}, None),
         (light.WHITE_DRIFT_DEG, {}, 0),
         # The angle between (4, 9, 2) and (4, 9, 2.2).
         (light.WHITE_DRIFT_DEG, {"white_frames": TINTED}, 1.1129),

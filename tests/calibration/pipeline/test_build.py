@@ -310,7 +310,7 @@ def test_report_is_self_contained(built: BuildResult) -> None:
     # A figure leads to the picture that shows it.
     pictures = set(re.findall(r"<div id='(\w+)'", page))
     assert {"chart", "lights", "errors", "noise"} < pictures
-    assert pictures >= set(re.findall(r"href='#(\w+)'", page)) >= {"residuals", "course", "budget"}
+    assert pictures >= set(re.findall(r"href='#(\w+)'", page)) >= {"residuals", "frames", "budget"}
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
@@ -1176,7 +1176,7 @@ def test_a_white_frame_that_is_red_is_refused_as_such(small_lab: Lab, tmp_path: 
 
     message, _ = refused(small_lab, tmp_path, frame)
     assert (
-        "Angle of a white frame to the prediction" in message
+        "Angle between a white frame and its prediction" in message
         or "exchanged names: illuminant 1 and white frame 0" in message
     )
     assert "warm up" not in message

@@ -42,8 +42,8 @@ def clean() -> Stains:
     return Stains(NO_LIGHT, NO_LIGHT, NO_LIGHT, np.zeros(CELLS, np.bool_), NO_LIGHT + 1, np.zeros((CELLS, 2)))
 
 
-def frame(light: int | None, disturbed: dict[int, float], alone: tuple[int, ...] = ()) -> Any:
-    consistency = FrameConsistency(disturbed=tuple(disturbed.items()), alone=alone)
+def frame(light: int | None, disturbed: dict[int, float], isolated: tuple[int, ...] = ()) -> Any:
+    consistency = FrameConsistency(disturbed=tuple(disturbed.items()), isolated=isolated)
     return SimpleNamespace(record=SimpleNamespace(illumination=light), consistency=consistency)
 
 

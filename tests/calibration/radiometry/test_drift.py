@@ -18,7 +18,7 @@ def test_removes_linear_drift_completely() -> None:
     channels = np.array([0.01, 0.02, 0.03])
     correction = drift_correction(LIGHTS_S, EVERY_S, WHITE * (1 - np.outer(EVERY_S / 3600, channels)))
     assert correction.gains == pytest.approx(1 - np.outer(LIGHTS_S / 3600, channels), abs=1e-6)
-    assert correction.left < 1e-9
+    assert correction.uncertainty < 1e-9
 
 
 def test_scales_to_brightest_lamp() -> None:

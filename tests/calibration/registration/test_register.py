@@ -297,7 +297,7 @@ def test_refuses_blur_and_size_beyond_limits(cell_px: float, blur: float, messag
 )
 def test_refuses_several_displaced_areas(slipped: int, area_count: int, is_refused: bool) -> None:
     matcher: Any = SimpleNamespace(find_displaced_areas=lambda cells: (np.full((slipped, 2), 7.0), area_count))  # pyrefly: ignore[implicit-any-lambda]
-    with expect_refusal("match the neighbouring patches" if is_refused else ""):
+    with expect_refusal("colours of the neighbouring patches" if is_refused else ""):
         registering._refuse_displaced_areas(matcher, np.zeros(9, np.bool_), "it")
 
 

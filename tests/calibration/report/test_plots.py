@@ -20,6 +20,7 @@ from calibration.report.plots import (
     draw_chromaticities,
     draw_positions,
     half_size,
+    numbered_labels,
     viewable,
 )
 from drivers.raw.rawfile import Mosaic
@@ -29,13 +30,11 @@ from experiment.chart.layout import design_chart
 pytestmark = pytest.mark.slow
 
 
-def drawn(draw: Callable[..., None], *arguments: Any) -> Any:
-    """Return a figure that is drawn but not rendered."""
-    from matplotlib.figure import Figure
-
-    figure: Any = Figure()
-    draw(figure, *arguments)
-    return figure
+def drawn(draw: Callable[..., None], count: int, *arguments: Any) -> list[Any]:
+    """Return panels that are drawn but not rendered."""
+    panels = [empty_axes() for _ in range(count)]
+    draw(panels, *arguments)
+    return panels
 
 
 def empty_axes() -> Any:
@@ -98,7 +97,7 @@ def test_map_shows_channel_with_largest_difference() -> None:
     offset = np.array([0.001, -0.002, 0.0])
     count = np.ones((len(CELLS), 3), dtype=np.int64)
     cells = CellDifferences(count, mean, none, offset, 0.0, 0.0, 1.0)
-    (squares,) = drawn(draw_map, CHART, cells).axes[0].collections
+    (squares,) = drawn(draw_map, 1, CHART, cells)[0].collections
     left = mean - offset
     largest = [row[np.abs(row).argmax()] if np.isfinite(row).all() else 0.0 for row in left]
     np.testing.assert_allclose(np.asarray(squares.get_array()), 100 * np.array(largest))
@@ -107,16 +106,16 @@ def test_map_shows_channel_with_largest_difference() -> None:
 def test_draws_lights_at_their_chromaticities() -> None:
     codes = np.array([[255.0, 0, 0], [255, 255, 255], [0, 0, 0], [0, 0, 255]])
     white = np.array([[600.0, 300, 100], [200, 500, 300], [0, 0, 0], [100, 300, 600]])
-    bodies = np.array([False, True, False, False])
-    figure = drawn(draw_chromaticities, codes, bodies, white, "seen", 0)
-    for axes, places in zip(
-        figure.axes, [[(1, 0), (0, 1), (1 / 3, 1 / 3)], *[[(0.6, 0.1), (0.1, 0.6), (0.2, 0.3)]] * 2], strict=True
-    ):
+    kelvins = np.array([np.nan, 6500, np.nan, np.nan])
+    panels = drawn(draw_chromaticities, 2, codes, kelvins, white, 0)
+    expected = [[(1, 0), (0, 1), (1 / 3, 1 / 3)], [(0.6, 0.1), (0.1, 0.6), (0.2, 0.3)]]
+    for axes, places in zip(panels, expected, strict=True):
         # Black bodies come second; a light without light has no chromaticity.
         dots_at = np.concatenate([np.asarray(dots.get_offsets()) for dots in axes.collections])
         np.testing.assert_allclose(dots_at, places, atol=1e-9)
-    drawn(draw_chromaticities, codes, bodies, white, "seen")
-    drawn(draw_chromaticities, codes, bodies, white, "seen", 2)
+        assert [text.get_text() for text in axes.texts] == ["6500 K", "illuminant 0"]
+    drawn(draw_chromaticities, 2, codes, kelvins, white)
+    drawn(draw_chromaticities, 2, codes, kelvins, white, 2)
 
 
 # What each picture shows, read from what is drawn.
@@ -172,5 +171,6 @@ def test_labels_at_edge_point_inwards() -> None:
 def test_draws_shared_circles_once() -> None:
     places = [("one", PrintPosition("a", 30.0, 40.0, 20.0)), ("two", PrintPosition("a", 30.0, 40.0, 20.0)),
               ("one", PrintPosition("a", 60.0, 40.0, 0.0)), ("three", PrintPosition("a", 1.0, 40.0, 20.0))]  # fmt: skip
-    axes, _ = drawn(draw_positions, FRAME, CHART, registered(), places).axes
+    (axes,) = drawn(draw_positions, 1, FRAME, CHART, registered(), places)
+    assert numbered_labels(places) == {"one": 1, "two": 2, "three": 3}
     assert [text.get_text() for text in axes.texts] == ["1, 2", "1", "3"]

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from calibration.causes.gathering import PrintPosition
 from calibration.figures.all_figures import FIGURES
@@ -21,7 +17,7 @@ from calibration.report.plots import draw_positions
 from calibration.report.report import write_report
 from calibration.verdict import BuildResult
 from experiment.session.folder import Session
-from foundation.plots import draw_png
+from foundation.plots import draw_panels
 from tests.calibration.causes.rooms import HAND, nth_white, taken
 from tests.calibration.lab import Lab
 from tests.calibration.whole import LIMITS
@@ -35,12 +31,12 @@ pytestmark = pytest.mark.slow
 def test_report_names_and_circles_hand(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     circled: list[tuple[str, PrintPosition]] = []
 
-    def blank(draw: Callable[..., None], *arguments: Any) -> bytes:
+    def blank(draw: Callable[..., None], *arguments: Any, inches: object) -> tuple[bytes, ...]:
         # The last picture with places is that of the frame.
         circled[:] = arguments[-1] if draw is draw_positions else circled
-        return b"\x89PNG\r\n\x1a\n"
+        return (b"<svg></svg>",)
 
-    monkeypatch.setattr("calibration.report.report.draw_png", blank)
+    monkeypatch.setattr("calibration.report.report.draw_panels", blank)
     out = tmp_path / "lut"
     limits = [limit for limit in FIGURES if limit.name == "block_deviation"]
     with (
@@ -50,7 +46,8 @@ def test_report_names_and_circles_hand(lab: Lab, tmp_path: Path, monkeypatch: py
         build(session, out, report=write_report, judged_by=limits)
     page = (tmp_path / "lut.refused" / "report.html").read_text()
     assert "<b>hand or object in one frame</b>" in page
-    assert "<h2>Position: 0004_white</h2><div class='scroll'><img" in page
+    assert "<h2>Position: 0004_white</h2><div class='panels'><div class='scroll'><svg" in page
+    assert re.search(r"registered first\. 1: [^;<]+: hand or object in one frame", page)
     assert re.search(r"<details id='radiometry' open>.*in frames/0004_white\.dng, about \d+, \d+ mm", page, re.DOTALL)
     assert page.index("Take 1 frame again: ") < page.index("<h2>Probable causes</h2>") < page.index("<details")
     (result,) = json.loads((tmp_path / "lut.refused" / "report.json").read_text())["causes"]
@@ -70,26 +67,27 @@ def test_draws_all_report_pictures(
 ) -> None:
     shown: dict[str, list[Any]] = {}
 
-    def kept(draw: Callable[..., None], *arguments: Any) -> bytes:
-        def drawing(figure: Figure, *given: Any) -> None:
-            draw(figure, *given)
-            shown.setdefault(draw.__name__, []).append(drawn(figure))
+    svgs: list[bytes] = []
 
-        return draw_png(drawing, *arguments)
+    def kept(draw: Callable[..., None], *arguments: Any, inches: Sequence[tuple[float, float]]) -> tuple[bytes, ...]:
+        def drawing(panels: Sequence[Any], *given: Any) -> None:
+            draw(panels, *given)
+            shown.setdefault(draw.__name__, []).extend(drawn(axes.figure) for axes in panels)
 
-    monkeypatch.setattr("calibration.report.report.draw_png", kept)
+        drawings = draw_panels(drawing, *arguments, inches=inches)
+        svgs.extend(drawings)
+        return drawings
+
+    monkeypatch.setattr("calibration.report.report.draw_panels", kept)
     write_report(built, session, tmp_path)
     # That of noise hangs on which cells are left out.
     del shown["draw_noise"]
     pinned("table of 13 lights, pictures", shown, **LIMITS)
     page = (tmp_path / "report.html").read_text()
-    pictures = re.findall(r"data:image/png;base64,([^'\"]+)", page)
-    assert len(pictures) == 8
-    for picture in pictures:
-        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(picture), dtype=np.uint8), cv2.IMREAD_COLOR)
-        assert pixels is not None
-        assert pixels.shape[1] > 300
-        assert pixels.std() > 5, "something is on it"
+    assert page.count("<svg role='img'") == len(svgs) == 6 + 2 + 2 + 2 + 2 + 3 + 6 + 2
+    identifiers = re.findall(r'\bid="([0-9a-f]{8}-\w+)"', page)
+    assert len(identifiers) == len(set(identifiers)), "a reference leads into its own drawing"
+    assert all(b"var(--" in svg for svg in svgs), "in the colours of the page"
 
 
 def test_group_counts_figures_beyond_limits(built: BuildResult) -> None:

@@ -30,7 +30,7 @@ from calibration.spread.fitting import (
     far_groups,
 )
 from calibration.spread.surroundings import (
-    PAD,
+    PAD_SLOTS,
     FrameLevels,
     Surroundings,
     UsualLight,
@@ -361,7 +361,7 @@ def test_mean_light_is_mean_of_slots(sharp: Photograph) -> None:
     as_large = replace(around, frame_slots=float(len(slots)))
     assert as_large.mean(levels, inks) == pytest.approx(slots.mean(axis=0), rel=1e-6)
     # The background fills the rest of the frame.
-    expected = (slots.sum(axis=0) + 1000 * levels.beyond) / (len(slots) + 1000)
+    expected = (slots.sum(axis=0) + 1000 * levels.background) / (len(slots) + 1000)
     larger = replace(around, frame_slots=float(len(slots) + 1000))
     assert larger.mean(levels, inks) == pytest.approx(expected, rel=1e-6)
     assert around.frame_slots > len(slots)
@@ -458,7 +458,7 @@ def test_grid_has_every_patch_once() -> None:
     grid = printed_grid(CHART)
     patches = grid.source[grid.source >= 0]
     assert sorted(patches.tolist()) == list(range(len(grid.points_mm)))
-    assert (grid.source[:PAD] < 0).all()
+    assert (grid.source[:PAD_SLOTS] < 0).all()
     # tags have 64 modules of 2 × 2 parts, and a rim of one module
     black = (grid.parts == len(grid.points_mm) + 1).sum()
     assert black > 0

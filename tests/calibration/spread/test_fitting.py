@@ -29,7 +29,7 @@ def equations(rows: int, size: int, seed: int) -> tuple[npt.NDArray[np.float64],
 def test_far_shares_are_non_negative_least_squares(seed: int) -> None:
     design, value, matrix, vector = equations(2 * TERMS, TERMS, seed)
     terms = np.sort(np.random.default_rng(seed).permutation(TERMS)[: TERMS // 2])
-    shares, gain = fitting._positive(matrix, vector, terms)
+    shares, gain = fitting._solve_nonnegative(matrix, vector, terms)
     low = np.where(free_terms()[terms], -np.inf, 0.0)
     expected = np.zeros(TERMS)
     expected[terms] = lsq_linear(design[:, terms], value, (low, np.inf), tol=1e-12).x
@@ -49,7 +49,7 @@ def test_drops_kernels_with_small_gain() -> None:
     for group, gain in zip(groups, gains, strict=True):
         vector[group] = np.sqrt(gain / len(group))
     for misfit, expected in ((1.0, [0, len(groups) - 1]), (1.1, [])):
-        selected = fitting._selected(matrix, vector, misfit, groups)
+        selected = fitting._proven_terms(matrix, vector, misfit, groups)
         assert selected.tolist() == sorted(np.concatenate([np.zeros(0, int), *(groups[k] for k in expected)]).tolist())
 
 

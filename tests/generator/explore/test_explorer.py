@@ -393,11 +393,14 @@ def histogram(tab: Tab, panel: int) -> list[list[int]]:
 def test_page_shows_lut_and_first_picture(tab: Tab, page: Explorer) -> None:
     with shown(tab, page):
         assert tab.value("document.querySelectorAll('circle.light').length") == 3
+        assert tab.value("state.at.map((at, axis) => at / Object.values(shown.picture)[axis + 1])") == [0.5, 0.5]
+        tab.wait_for("panels.every((panel) => panel.rows.textContent.includes('±'))")
+        assert tab.value("document.querySelector('#commands code').id") == "command-colorimetric"
         assert text_of(tab, "command-codes").endswith("--max-side 100 --light 0 --rendering codes")
         assert text_of(tab, "command-colorimetric").endswith("--max-side 100 --light 0")
         truth = page.lut.white[0] / page.lut.white[0].sum()
         assert all(f"{number:.3f}" in text_of(tab, "light-facts") for number in truth)
-        for panel, rendering in enumerate(("codes", "colorimetric")):
+        for panel, rendering in enumerate(("colorimetric", "codes")):
             image = page.counts(0, "0", rendering)
             assert tab.value(f"[...panels[{panel}].counts.slice(0, 600)]") == image.ravel()[:600].tolist()
             label = tab.value(f"panels[{panel}].histogram.querySelector('svg').getAttribute('aria-label')")
@@ -474,7 +477,7 @@ def test_shows_last_of_many_selections(tab: Tab, page: Explorer) -> None:
         tab.value("(() => { for (let i = 0; i < 60; i++) pick(i % 3); pick(1); })()")
         tab.wait_for("shown.light === '1'")
         light(tab)
-        assert tab.value("[...panels[0].counts.slice(0, 300)]") == page.counts(0, "1", "codes").ravel()[:300].tolist()
+        assert tab.value("[...panels[1].counts.slice(0, 300)]") == page.counts(0, "1", "codes").ravel()[:300].tolist()
 
 
 @pytest.mark.slow
@@ -489,20 +492,20 @@ def test_measures_pixel(tab: Tab, page: Explorer) -> None:
         rows = (
             "[...panels[{}].rows.querySelectorAll('tr')].map((row) => [...row.cells].map((cell) => cell.textContent))"
         )
-        for panel, rendering in enumerate(("codes", "colorimetric")):
+        for panel, rendering in enumerate(("colorimetric", "codes")):
             tab.wait_for(f"panels[{panel}].rows.textContent.includes('±')")
             image = page.counts(0, "0", rendering)
             for channel, (_, count, spread) in enumerate(tab.value(rows.format(panel))):
                 mean, deviation = (float(number) for number in spread.split("±"))
                 assert int(count) == image[pixel[1], pixel[0], channel]
                 assert abs(int(count) - mean) < 5 * deviation
-        middle = "[...panels[0].loupe.getContext('2d').getImageData(66, 66, 1, 1).data]"
+        middle = "[...panels[1].loupe.getContext('2d').getImageData(66, 66, 1, 1).data]"
         assert tab.value(middle) == tab.value(
-            f"[...panels[0].canvas.getContext('2d').getImageData({pixel[0]}, {pixel[1]}, 1, 1).data]"
+            f"[...panels[1].canvas.getContext('2d').getImageData({pixel[0]}, {pixel[1]}, 1, 1).data]"
         )
         tab.value("pick(2)")
-        tab.wait_for("panels[0].drawn === '0 2' && panels[0].rows.textContent.includes('±')")
-        count, spread = tab.value(rows.format(0))[1][1:]
+        tab.wait_for("panels[1].drawn === '0 2' && panels[1].rows.textContent.includes('±')")
+        count, spread = tab.value(rows.format(1))[1][1:]
         assert int(count) == page.counts(0, "2", "codes")[pixel[1], pixel[0], 1]
         assert float(spread.split("±")[0]) == pytest.approx(page.pixel(0, "2", "codes", *pixel)["mean"][1], abs=0.06)
 
@@ -510,8 +513,8 @@ def test_measures_pixel(tab: Tab, page: Explorer) -> None:
 def shades(tab: Tab, view: str) -> np.ndarray[Any, Any]:
     """Return the image in the panel for codes, (H, W, 3) uint8."""
     tab.value(f"document.querySelector('input[value={view}]').click()")
-    width, height = tab.value("[panels[0].canvas.width, panels[0].canvas.height]")
-    data = "panels[0].canvas.getContext('2d').getImageData(0, 0, panels[0].canvas.width, panels[0].canvas.height).data"
+    width, height = tab.value("[panels[1].canvas.width, panels[1].canvas.height]")
+    data = "panels[1].canvas.getContext('2d').getImageData(0, 0, panels[1].canvas.width, panels[1].canvas.height).data"
     return np.array(tab.value(f"[...{data}]"), np.uint8).reshape(height, width, 4)[..., :3]
 
 
@@ -547,12 +550,12 @@ def test_browses_and_drops_pictures(tab: Tab, page: Explorer) -> None:
     with shown(tab, page):
         tab.value("document.getElementById('next').click()")
         tab.wait_for(f"shown.picture.name === 'other.png' && {DRAWN}")
-        assert tab.value("[panels[0].canvas.width, panels[0].canvas.height]") == [100, 83]
+        assert tab.value("[panels[1].canvas.width, panels[1].canvas.height]") == [100, 83]
         drop(tab, "mine.png", png(3, 80, 60))
         tab.wait_for(f"shown.picture.name === 'mine.png' && {DRAWN}")
         assert "(3 of 3)" in text_of(tab, "picture-name")
         assert "--sources mine.png" in text_of(tab, "command-codes")
-        assert tab.value("[panels[0].canvas.width, panels[0].canvas.height]") == [80, 60]
+        assert tab.value("[panels[1].canvas.width, panels[1].canvas.height]") == [80, 60]
         tab.value("document.getElementById('next').click()")
         tab.wait_for(f"state.picture === 0 && {DRAWN}")
     with shown(tab, page):
@@ -584,9 +587,9 @@ def test_failed_rendering_is_reported_in_its_panel(tab: Tab, page: Explorer, mon
     with ExploreServer(page, "127.0.0.1", 0) as server:
         threading.Thread(target=lambda: server.serve_forever(0.01), daemon=True).start()
         tab.open(f"http://127.0.0.1:{server.port}/")
-        tab.wait_for("typeof panels !== 'undefined' && panels[1]?.wait.textContent.includes('no contrast')")
-        tab.wait_for("panels[0].drawn === '0 1'")
-        assert tab.value("[panels[0].screen.hidden, panels[1].screen.hidden]") == [False, True]
+        tab.wait_for("typeof panels !== 'undefined' && panels[0]?.wait.textContent.includes('no contrast')")
+        tab.wait_for("panels[1].drawn === '0 1'")
+        assert tab.value("[panels[0].screen.hidden, panels[1].screen.hidden]") == [True, False]
         network = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
         tab.call("Network.emulateNetworkConditions", offline=True, **network)
         tab.value("pick(2)")
@@ -614,7 +617,7 @@ def test_unreadable_picture_is_reported_and_skipped(tab: Tab, page: Explorer, tm
         tab.value("document.getElementById('next').click()")
         tab.wait_for("document.getElementById('fault').textContent.includes('other.png')")
         tab.value("point([3, 4])")
-        tab.wait_for("panels[0].rows.textContent.includes('±')")
+        tab.wait_for("panels[1].rows.textContent.includes('±')")
         tab.value("document.getElementById('next').click()")
         tab.wait_for("document.getElementById('fault').hidden && state.picture === 0")
         clear_refused_requests(tab)

@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageCms
 
 from foundation.errors import FormatError, InputError, StorageError
+from foundation.remote import filesystem
 from generator.pictures import sources as sources_module
 from generator.pictures.conversion import to_srgb
 from generator.pictures.random_scenes import RandomScene, random_scenes
@@ -37,7 +38,6 @@ from generator.pictures.sources import (
     random_positions,
     read_picture,
 )
-from generator.stores import filesystem
 from tests.generator.pictures.icc import ADOBE_RGB, PROPHOTO_RGB, gamma_profile
 from tests.generator.pictures.oiio_files import write
 from tests.generator.said import said

@@ -1,0 +1,3 @@
+class DirCache:
+    use_listings_cache: bool
+    def clear(self) -> None: ...
