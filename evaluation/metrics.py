@@ -235,6 +235,8 @@ class Summary:
     - `trimean`: (Q1 + 2 Q2 + Q3) / 4.
     - `best25`, `worst25`: mean of the errors up to the 25th and from the 75th percentile.
     - `avg`: geometric mean of these five (J. T. Barron, "Convolutional color constancy", ICCV 2015).
+    - `worst5`: mean of the errors from the 95th percentile (M. Afifi et al., "Cross-camera convolutional color
+      constancy", ICCV 2021).
     - `p95`: 95th percentile.
     - `maximum`: largest error.
     - `below3`: fraction of the errors below 3 degrees, 0 … 1.
@@ -246,13 +248,14 @@ class Summary:
     best25: float
     worst25: float
     avg: float
+    worst5: float
     p95: float
     maximum: float
     below3: float
 
     def as_tuple(self) -> tuple[float, ...]:
-        """Return the six numbers of the paper's tables."""
-        return astuple(self)[:6]
+        """Return the numbers of tables: the six of the paper, and `worst5`."""
+        return astuple(self)[:7]
 
 
 def summarise(errors: npt.ArrayLike) -> Summary:
@@ -264,7 +267,7 @@ def summarise(errors: npt.ArrayLike) -> Summary:
     --------
     >>> summary = summarise([1, 2, 3, 4, 10])
     >>> summary.as_tuple()
-    (4.0, 3.0, 3.3125, 1.0, 10.0, 3.31...)
+    (4.0, 3.0, 3.3125, 1.0, 10.0, 3.31..., 10.0)
     >>> summary.p95, summary.maximum, summary.below3
     (10.0, 10.0, 0.4)
     """
@@ -285,6 +288,7 @@ def summarise(errors: npt.ArrayLike) -> Summary:
     return Summary(
         *first_five,
         avg=float(np.prod(np.asarray(first_five) ** 0.2)),
+        worst5=float(values[values >= p95].mean()),
         p95=p95,
         maximum=float(values.max()),
         below3=float((values < SMALL_DEG).mean()),

@@ -1,7 +1,7 @@
 """Read the settings in `LAB.toml` and check every value.
 
 An unknown key is an error, and its message suggests the closest known key. Relative paths are resolved against the
-folder of the file. No device is opened here.
+folder of the file.
 """
 
 from __future__ import annotations
@@ -143,8 +143,8 @@ class SequenceSettings(Settings):
     warm_up_s: NotNegative = 1200.0
     """Warm-up time of the lamp before the first frame, seconds."""
     patience_s: Annotated[float, BeforeValidator(_parse_seconds), Field(ge=0)] = 600.0
-    """Longest time that a run waits after a failure of a device or the disk, seconds; ``inf`` or ``"forever"``: no
-    limit. Then the run ends. Most devices restart within ten minutes."""
+    """Longest time that a run waits after a failure of a device or the disk, seconds. After this time, the run ends.
+    ``inf`` or ``"forever"``: no limit. Most devices restart within ten minutes."""
     order: Literal["shuffled", "listed"] = "shuffled"
     """Order of the illuminants. ``"shuffled"``: a random order from `seed`, so that lamp drift does not correlate with
     colour. ``"listed"``: the order of the file."""
@@ -159,8 +159,8 @@ class SequenceSettings(Settings):
     """Switch the projector on again if it goes to standby during a run, for example after a power cut. The run
     continues after the warm-up. Off by default, because somebody may have switched the projector off on purpose."""
     refused_gb: Annotated[float, Field(gt=0)] = 5.0
-    """Largest disk space for the refused and voided frames of one run, gigabytes; ``inf``: no limit. If they need more,
-    the run ends."""
+    """Largest disk space for the unused frames of one run, gigabytes; ``inf``: no limit. If these frames need more, the
+    run ends. Frames are unused if they were refused, or accepted first and contradicted later."""
     notify: Annotated[str, AfterValidator(_check_target), Field(repr=False)] = ""
     """Target of notices when a run pauses, resumes or ends: a URL that receives JSON by POST, or a command that
     receives JSON on its standard input. If empty, no notices are sent. ``{ env = "NAME" }`` or ``{ file = "PATH" }``
@@ -200,17 +200,17 @@ class JudgeSettings(Settings):
     false, a session has about 20 frames fewer, but wrong illuminants are detected less reliably."""
     moved_px: NotNegative = 0.2
     """Largest displacement of the chart from its reference position, px. The reference is the position in the first
-    white frame. If the chart is displaced slightly and then rests, its new position becomes the reference. The limit
+    white frame. If the chart is displaced slightly and then rests, its new position becomes the reference. The default
     is ten times the measurement error in a dark image."""
     blur_px: NotNegative = 0.3
-    """Largest growth of the blur since the first white frame, px: √(σ² − σ₀²) for the blur σ₀ of that frame and the
-    blur σ of a later one. The blur of a good lens is about 0.5 px."""
+    """Largest growth of the blur since the first white frame, px: √(σ² − σ₀²), with the blur σ₀ of this white frame and
+    the blur σ of a later frame. The blur of a good lens is about 0.5 px."""
     drift_percent: NotNegative = 1.0
     """Deviation of the lamp from its expected level that is always allowed, per cent. A warm lamp usually stays within
     it. If the levels of the lamp scatter, a larger deviation is allowed. `build-lut` warns from the same value."""
     dark_percent: NotNegative = 5.0
-    """Largest level of a dark frame, per cent of white. The limit is half of the limit of `build-lut`. `build-lut` and
-    `acquire check` already warn from 0.5 %, because stray light harms dark colours."""
+    """Largest level of a dark frame, per cent of white. The default is half of the limit of `build-lut`. The warnings
+    of `build-lut` and `acquire check` start at 0.5 %, because stray light harms dark colours."""
     ambient_percent: NotNegative = 0.2
     """Largest change of the level of dark frames since the first dark frame, per cent of white. `build-lut` warns from
     the same value."""
@@ -245,16 +245,16 @@ class SimulatedSettings(Settings):
     """The simulated laboratory."""
 
     body: str = "EOS 550D"
-    """EOS 550D, EOS 6D Mark II or Test; or spectral sensitivities, as in `sim table --camera`, by name or as a file
-    relative to the settings file."""
+    """EOS 550D, EOS 6D Mark II or Test (small frames). Or spectral sensitivities as in `sim table --camera`: a name, or
+    a file relative to the settings file."""
     camera: dict[str, Any] | None = None
-    """Properties that differ from this body, with the field names of sim.world.sensors.Body."""
+    """Properties in which the camera differs from this body, with the field names of sim.world.sensors.Body."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of all random numbers, for example of noise and paper structure."""
     room: dict[str, bool | int | float | str] = {}
     """Physical parameters of the room that differ from the default; see sim.world.world.Room."""
     events: tuple[dict[str, Any], ...] = ()
-    """Disturbances by frame or time; see sim.world.disturbances. They may change within a session."""
+    """Disturbances by frame or time; see sim.world.disturbances. They may be changed between two runs."""
 
 
 class CameraCable(Settings):
@@ -298,7 +298,7 @@ class ProjectorCable(Settings):
     baud: Annotated[int, Field(ge=300)] | None = None
     """Baud rate, if different from the default of the language."""
     refresh_hz: Positive = 60.0
-    """Images per second."""
+    """Refresh rate: images per second."""
     colour_wheel_hz: NotNegative = 60.0
     """Turns of the colour wheel per second; 0: none (LCD, LCoS, LED)."""
 
@@ -340,7 +340,7 @@ class LabSettings(Settings):
 
     @property
     def file(self) -> str:
-        """Name of the settings file in messages."""
+        """Name of the settings file, for messages."""
         return self._file
 
     def with_file_name(self, file: str) -> LabSettings:

@@ -28,7 +28,8 @@ COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")  # Columns of `illu
 
 NAME = "name"  # Additional column with names of illuminants, for LUTs that are computed from spectra
 
-# Steps along an edge of the chromaticity triangle. They give 666 points, which together with 41 black bodies are 707.
+# Steps along an edge of the chromaticity triangle. These 666 points and 41 black bodies are the 707 illuminants of the
+# paper.
 GRID = 35
 
 CCTS_K = tuple(range(2000, 10001, 200))  # Black bodies of the plan, K: from candle light to blue sky

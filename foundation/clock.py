@@ -1,7 +1,6 @@
 """Clocks, real and simulated.
 
-Code that waits or records a time takes a `Clock` as a parameter. `SystemClock` is the clock of the machine. The date of
-a `SteadyClock` never goes back. `SimulatedClock` is the clock of the simulated laboratory.
+Code that waits or records a time takes a `Clock` as a parameter.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ def elapsed_s() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
-# Smallest adjustment of the system date that counts as made by hand, s. Network time adjusts it less in one night.
+# Smallest adjustment of the system date that counts as made by hand, s. Network time makes smaller adjustments.
 MIN_STEP_S = 10.0
 
 
@@ -60,8 +59,8 @@ class SteadyClock:
     White frames are interpolated in time. If the date went back during a session, frames would be interpolated between
     the wrong white frames.
 
-    The start date is the date of `clock`, or `not_before` if that is later. `clock` was
-    `behind_s` seconds behind the start date. `sleep` uses `clock`. `elapsed` returns seconds since any origin, which
+    The start date is the date of `clock`, or `not_before` if this is later. `behind_s`: seconds by which `clock` was
+    then behind the start date. `sleep` uses `clock`. `elapsed`: function that returns seconds since any origin; they
     never decrease.
     """
 
@@ -77,7 +76,7 @@ class SteadyClock:
         self._offset_s = -self.behind_s
 
     def step_s(self) -> float:
-        """Return the adjustment of the date of `clock` since the last one returned, in s; 0 below `MIN_STEP_S`."""
+        """Return the adjustment of the date of `clock` since the last returned one, s; 0 below `MIN_STEP_S`."""
         offset_s = (self._clock.now() - self.now()).total_seconds()
         step_s = offset_s - self._offset_s
         if abs(step_s) < MIN_STEP_S:

@@ -48,7 +48,8 @@ class _LazyFunction:
         return (self._compiled or self.compile())(*arguments)
 
     def __reduce__(self) -> str:
-        # Pickle stores only the name, as for other functions. Objects with this function are sent to other processes.
+        # Pickle stores only the name, as for other functions. Objects that refer to this function are sent to other
+        # processes.
         return self._function.__qualname__
 
     @property
@@ -91,8 +92,9 @@ def _make_dispatcher(function: FunctionType) -> Any:
 
 
 def _numba_input(function: FunctionType) -> FunctionType:
-    """Return a copy that calls compiled functions; its closure variable `origin` holds source hash and settings."""
-    # numba's cache key contains closure variables, so code that was made from other sources or settings is not used.
+    """Return a copy of a function with compiled callees; its variable `origin` holds source hash and settings."""
+    # numba's cache key contains closure variables, such as `origin`. So code from other sources or settings is not
+    # used.
     code = function.__code__
     if code.co_freevars:
         raise ValueError(f"{function.__qualname__} uses outer variables {code.co_freevars}; pass them as arguments")
@@ -175,7 +177,7 @@ def _numba() -> Any:
 @cache
 def _checked_cache() -> Any:
     """Return a subclass of numba's cache that stores a hash and the code of each signature in a file."""
-    # numba's own cache raises an error if a file is damaged; this one compiles again.
+    # numba's own cache raises an error if a file is damaged. This class lets numba compile again.
     from numba.core import caching, serialize
 
     class CheckedCache(caching.FunctionCache):
@@ -236,7 +238,7 @@ def ordered_map(function: Callable[[_In], _Out], items: Iterable[_In], workers: 
     try:
         for item in items:
             futures.append(pool.submit(function, item))
-            # A short queue limits the memory that waiting results need.
+            # A short queue limits the memory for results that were not yielded yet.
             if len(futures) >= 2 * workers:
                 yield futures.popleft().result()
         while futures:

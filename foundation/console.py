@@ -90,7 +90,8 @@ def _make_printable() -> None:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
-            # The descriptor was closed when the interpreter started. The new one stays open until the process ends.
+            # The descriptor was closed when the interpreter started. The new descriptor stays open until the process
+            # ends.
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
         elif isinstance(stream, TextIOWrapper):
             if stream.errors == "strict":
@@ -106,7 +107,7 @@ _OUTPUTS = {1: "standard output", 2: "standard error"}
 
 
 class _Output(FileIO):
-    """Output stream that discards all text after its reader has ended, such as `head` or a closed pager.
+    """Output stream that discards all text after its reader, such as `head` or a pager, has ended.
 
     Other write errors are raised with the name of the stream.
     """
@@ -136,7 +137,7 @@ def _make_tolerant(stream: Any) -> TextIOWrapper:
 
 
 def resume_gc() -> None:
-    """Enable garbage collection after the imports of a command; it then skips the imported objects."""
+    """Enable garbage collection after the imports of a command; the collection skips the imported objects."""
     if not gc.isenabled():
         _freeze_once()
     gc.enable()
@@ -144,7 +145,7 @@ def resume_gc() -> None:
 
 @functools.cache
 def _freeze_once() -> None:
-    # gc.freeze exempts all present objects from collection. A second call would exempt garbage as well.
+    # gc.freeze exempts all existing objects from garbage collection. A second call would also exempt garbage.
     gc.freeze()
 
 
@@ -183,7 +184,7 @@ def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
             return _report_interruption(is_resumable)
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     except Exception as error:
-        # Python 3.11 wraps an interruption of an import in RuntimeError, if it comes while a class is made.
+        # If a class is being made when an import is interrupted, Python 3.11 raises a RuntimeError instead.
         cause: BaseException | None = error
         while cause is not None and not isinstance(cause, KeyboardInterrupt):
             cause = cause.__cause__ or cause.__context__
@@ -270,7 +271,7 @@ class EndRequest:
 def orderly_end() -> Generator[EndRequest]:
     """Treat `kill` and a closed terminal like Ctrl-C, so that devices are closed; ignored signals stay ignored."""
     outer = signal.getsignal(signal.SIGINT)
-    # The outer handler knows whether a signal repeats another one.
+    # The outer handler counts the signals, so it decides whether this request is a repetition.
     ending = EndRequest(interrupt=(lambda: outer(signal.SIGINT, None)) if callable(outer) else _interrupt)
     if threading.current_thread() is not threading.main_thread():
         yield ending
@@ -375,7 +376,7 @@ def _set_log_level(level: int) -> None:
     root, handler = logging.getLogger(), logging.StreamHandler(sys.stderr)
     handler.set_name(_HANDLER)
     handler.setFormatter(logging.Formatter(_FORMAT))
-    # A group of commands and its command may both have the option. Each record is printed once even then.
+    # A group and its command may both have the option. Replace the handler, so that each record is printed once.
     root.handlers[:] = [present for present in root.handlers if present.name != _HANDLER] + [handler]
     root.setLevel(level)
 
@@ -467,7 +468,7 @@ class _Styled:
         return option
 
 
-# Names of options and arguments, and names that other programs use for them.
+# Our names of options and arguments, with the names that other programs use.
 _OTHER_NAMES = {
     "workers": "j jobs n-jobs threads n-threads num-threads num-workers processes cores cpus parallel nproc",
     "out": "o output output-dir outdir output-folder dest destination save",
@@ -505,7 +506,7 @@ class StyledCommand(_Styled, TyperCommand):
         try:
             return super().make_context(*arguments, **keywords)
         except typer.BadParameter as error:
-            # Remove the prefix that pydantic adds.
+            # Remove the prefix that pydantic adds to messages.
             error.message = error.message.removeprefix("Value error, ")
             raise
         except Exception as error:
@@ -515,7 +516,7 @@ class StyledCommand(_Styled, TyperCommand):
             raise
 
     def _suggest(self, error: Any) -> None:
-        """Add our name of an unknown option that other programs have."""
+        """If an unknown option is one of `_OTHER_NAMES`, add our name to its error."""
         word = error.option_name.lstrip("-").lower().replace("_", "-")
         ours = [name for name, others in _OTHER_NAMES.items() if word in (name, *others.split())]
         options = [f"--{name}" for name in ours if any(f"--{name}" in each.opts for each in self.params)]
@@ -541,13 +542,13 @@ class _StyledTyper(typer.Typer):
         register = super().command(name, **keywords)
 
         def decorate(function: Callable[..., None]) -> Callable[..., None]:
-            register(_with_common(function))
+            register(_with_common_options(function))
             return function
 
         return decorate
 
 
-def _with_common(function: Callable[..., None]) -> Callable[..., None]:
+def _with_common_options(function: Callable[..., None]) -> Callable[..., None]:
     hints = get_type_hints(function, include_extras=True)
     own = [
         parameter.replace(annotation=hints[name]) for name, parameter in inspect.signature(function).parameters.items()
@@ -581,7 +582,7 @@ def new_app(help_text: str | None = None, **options: Any) -> typer.Typer:
         **options,
     )
     if help_text is not None:
-        app.callback()(_with_common(_no_action))
+        app.callback()(_with_common_options(_no_action))
     return app
 
 
@@ -683,7 +684,7 @@ def option(metavar: str | None, text: str, *names: str, panel: str | None = None
 
 
 def with_option_groups(function: Callable[..., None]) -> Callable[..., None]:
-    """Replace each group of options among the parameters of a command by its options.
+    """Replace each parameter of a command that is a group of options by the options of this group.
 
     A group is a frozen dataclass. Its fields are ``Annotated`` with ``Option`` or ``Argument`` of typer, and have
     defaults. A field name must occur only once in a command.

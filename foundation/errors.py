@@ -52,8 +52,8 @@ class CropError(Exception):
     about
         File, folder or device with the fault, the first part of the message. None if `problem` names it.
     remedy
-        What the user should do, the last part of the message. If empty, the part of `problem` after its first
-        semicolon.
+        What the user should do, the last part of the message. If empty, the remedy is the part of `problem` after the
+        first semicolon.
     value, expected
         Value found and value expected, for programs.
 

@@ -36,6 +36,7 @@ _PARTIAL = ".partial"
 _MAX_COMPONENT_BYTES = 255  # NAME_MAX of the usual file systems
 _BROKEN_LINK = "it is a link to a place that does not exist: create or mount that place, or choose another path"
 _PART_IS_A_FILE = "a part of that path is a file, not a folder; choose another path"
+# Remedies for errors of a path, by errno
 _REMEDIES = {
     errno.EACCES: "ask its owner for permission, or choose another path",
     errno.EPERM: "ask its owner for permission, or choose another path",
@@ -69,7 +70,8 @@ _DISK_REMEDIES = {
     "ENFILE": f"close other programs, {RUN_AGAIN}",
 }
 _DISK_FAULTS = {getattr(errno, name): remedy for name, remedy in _DISK_REMEDIES.items() if hasattr(errno, name)}
-# Errors of a write to an open file contain no file name. Errors that sockets or reads may also cause are excluded.
+# An error of a write to an open file has no file name. It is recognised by its code. Codes that errors of sockets or
+# reads may also have are excluded.
 _NAMELESS_WRITE_ERRORS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT, errno.ENOTCONN}
 
 FOLDER_ATTEMPTS = 1000  # Attempts to make a folder, because another program may remove it at the same time
@@ -79,7 +81,7 @@ def partial_path(path: Path) -> Path:
     """Return the hidden name of `path` while it is incomplete."""
     name = f".{path.name}{_PARTIAL}"
     if len(os.fsencode(name)) > _MAX_COMPONENT_BYTES >= len(os.fsencode(path.name)):
-        # The name itself is allowed, so it is replaced by its hash in the hidden name.
+        # `path` has an allowed length, but the hidden name would be too long. So it contains a hash of the name.
         name = f".{sha256_of(os.fsencode(path.name))}{_PARTIAL}"
     return path.with_name(name)
 
@@ -100,7 +102,7 @@ def disk_remedy(error: OSError) -> str | None:
 
 
 def storage_error(path: Path, error: OSError, action: str = "write") -> InputError | StorageError:
-    """Return an error with a remedy for a failed `action` on `path`, an InputError if the path itself is the cause."""
+    """Return the error for a failed `action` on `path`, with a remedy; an InputError if the path is the cause."""
     remedy = path_remedy(error)
     is_path_fault = remedy is not None and not isinstance(error, PermissionError)
     return (InputError if is_path_fault else StorageError)(
@@ -134,7 +136,7 @@ def reading_error(path: Path, error: OSError, remedy: str, description: str = ""
 def read_text(path: Path, remedy: str, description: str = "", is_table: bool = False) -> str:
     """Return the text of a file in UTF-8; errors as in `reading_error`.
 
-    A table may also be in UTF-16 with a byte order mark, since spreadsheet programs save text in it.
+    A table may also be in UTF-16 with a byte order mark, because spreadsheet programs write this format.
     """
     try:
         data = path.read_bytes()
@@ -194,7 +196,7 @@ def make_folder(folder: Path, target: Path | None = None) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
-            # If nothing is there now, another program has removed it in the meantime; try again.
+            # If the path is free now, another program has removed the file in the meantime; try again.
             if os.path.lexists(folder) and not folder.is_dir():
                 raise InputError(
                     f"cannot write {path}: {_BROKEN_LINK if folder.is_symlink() else _PART_IS_A_FILE}"
@@ -253,7 +255,7 @@ def read_buffer(path: Path) -> memoryview:
     import numpy as np
 
     with path.open("rb", buffering=0) as stream:
-        # numpy uses large memory pages, so it is faster than `bytes`.
+        # An array is faster than `bytes`, because numpy uses large memory pages.
         buffer = np.empty(os.fstat(stream.fileno()).st_size, np.uint8).data
         filled = 0
         while filled < len(buffer) and (count := stream.readinto(buffer[filled:])):

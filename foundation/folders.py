@@ -1,8 +1,7 @@
 """Create folders atomically, lock them, detect unmounted disks, measure free space, and find the user's cache folder.
 
-A folder is filled under a hidden name next to its final path, then renamed. `foundation.files` does the same for files.
-The operating system holds the locks, so a lock ends with its program. If a file system cannot lock folders, a file in
-the folder is locked.
+A folder is filled under a hidden name next to its final path, then renamed. The operating system holds the locks, so a
+lock ends with its program. If a file system cannot lock folders, a file in the folder is locked.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ def cache_folder() -> Path | None:
 
 
 def require_free(path: Path, content: str) -> None:
-    """Raise an error if `path` exists and is not an empty folder, or if it cannot be written.
+    """Raise an error unless `path` is free or an empty folder, and can be written.
 
     `content`: what is written there, for the message, such as "the LUT".
     """
@@ -153,7 +152,7 @@ def clear_folder(folder: Path) -> None:
 
 LOCK_FILE: Final = ".lock"  # File that is locked if the file system cannot lock the folder
 
-# Errors of file systems without locks for a file or a folder (flock(2); NFS, Lustre, FUSE, SMB, macOS).
+# Errors of file systems that cannot lock a file or a folder (flock(2); NFS, Lustre, FUSE, SMB, macOS).
 _NO_LOCKS: Final = {errno.ENOLCK, errno.EBADF, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL}
 
 _log = logging.getLogger(__name__)
@@ -179,8 +178,8 @@ def locked_folder(
     """Lock a folder while the block runs; a missing folder is made.
 
     If another program has the lock, an InputError with the message `busy` is raised. With `share_if`, wait instead
-    until the other program allows sharing (`FolderLock.share`). If `share_if()` is then true, share the lock, otherwise
-    try again. Messages name `target`, by default the folder.
+    until the other program allows sharing (`FolderLock.share`). Then share the lock if `share_if()` is true, or try
+    again if it is false. Messages name `target`, by default the folder.
     """
     for _ in range(FOLDER_ATTEMPTS):
         make_folder(folder, target)

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 
 from foundation.errors import DeviceRefused
 
-# Number of refused processes that can get the process number of the owner; later ones do not get it.
+# Number of refused processes that can get the process number of the owner. Later processes get no number.
 _QUEUE_LENGTH = 128
 
 

@@ -45,9 +45,9 @@ HEAD_S = 5.0
 
 BODY_S = 30.0  # Time limit for the body of a request, s, after its head
 
-ANSWER_S = 2.0  # Time after which a new connection may replace one whose answer is unfinished, s
+ANSWER_S = 2.0  # Time after which a new connection may replace a connection with an unfinished answer, s
 
-# A connection without requests is closed after this time, s. A hidden page sends one every 10 s.
+# A connection without requests is closed after this time, s. A hidden page sends a request every 10 s.
 IDLE_S = 30.0
 
 GZIP_FROM_BYTES = 2048  # Smaller answers are not compressed, because they fit into two packets
@@ -105,7 +105,7 @@ class Connections:
             self._open[id(link)] = _Connection(link, address, "new", self._now())
             return True
 
-    def mark(self, link: socket.socket, state: Literal["idle", "answered"]) -> None:
+    def mark(self, link: socket.socket, state: Literal["idle", "busy"]) -> None:
         """Record that a connection waits for its next request ("idle"), or that a request is being answered."""
         with self._lock:
             if connection := self._open.get(id(link)):
@@ -117,21 +117,22 @@ class Connections:
             self._open.pop(id(link), None)
 
     def _replaceable(self) -> _Connection | None:
-        # Of the address with most connections, choose one without a request, then an idle one, then a slow one.
-        earliest_start = self._now() - ANSWER_S
-        ranks = {"new": 0, "idle": 1, "answered": 2}
-        connections = [c for c in self._open.values() if c.state != "answered" or c.since < earliest_start]
+        # Replace a connection of the address with most connections: preferably a new connection, or an idle connection,
+        # or else a connection that is busy for longer than `ANSWER_S`.
+        latest_start = self._now() - ANSWER_S
+        ranks = {"new": 0, "idle": 1, "busy": 2}
+        connections = [c for c in self._open.values() if c.state != "busy" or c.since < latest_start]
         counts = Counter(connection.address for connection in self._open.values())
         return min(connections, key=lambda c: (-counts[c.address], ranks[c.state], c.since), default=None)
 
 
 @dataclass(eq=False)
 class _Connection:
-    """`state` is "new" before the first request. `since` is the time at which the state began, in seconds."""
+    """`state` is "new" before the first request, and "busy" during an answer. `since`: start of the state, seconds."""
 
     link: socket.socket
     address: str
-    state: Literal["new", "idle", "answered"]
+    state: Literal["new", "idle", "busy"]
     since: float
 
 
@@ -162,7 +163,7 @@ class _TimedLink(io.RawIOBase):
         return io.BufferedReader(self)
 
     def expect(self, within_s: float | None = None) -> None:
-        """Set the time limit of the next data, `within_s`; None means the limits of a new request."""
+        """Set the time in which the next data must arrive; None means the limits of a new request."""
         self._deadline = None if within_s is None else time.monotonic() + within_s
 
     def readable(self) -> bool:
@@ -281,7 +282,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.request.expect()
 
     def do_GET(self) -> None:  # name of http.server
-        self.server.connections.mark(self.request.link, "answered")
+        self.server.connections.mark(self.request.link, "busy")
         request = self.server.access.check(self.path, self.headers.get("Host"))
         self._send(request if isinstance(request, Refusal) else self.server.answer(request))
 
@@ -302,11 +303,11 @@ class _Handler(BaseHTTPRequestHandler):
             return
         self.request.expect(BODY_S)
         body = self.rfile.read(int(length))
-        self.server.connections.mark(self.request.link, "answered")
+        self.server.connections.mark(self.request.link, "busy")
         self._send(self.server.answer(replace(request, body=body)))
 
     def _refuse(self) -> None:
-        # The body is not read, so the connection is closed. Otherwise the body would be read as the next request.
+        # Close the connection, because the body is not read and would be taken for the next request.
         headers = {"Allow": "GET, HEAD", "Connection": "close"}
         self._answer(405, _TEXT, b"method not allowed; use GET\n", headers)
 
@@ -415,8 +416,8 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
     if not number.is_unspecified:
         return (f"[{host}]" if number.version == 6 else host,)
     addresses: list[str] = []
-    # A datagram socket that is connected sends nothing, but gets an address of this machine. The destinations are
-    # reserved for documentation (RFC 5737, RFC 3849), so the system uses the default route.
+    # A connected datagram socket sends nothing, but gets the address that this machine uses for the destination. The
+    # destinations are reserved for documentation (RFC 5737, RFC 3849), so the system uses the default route.
     for family, destination in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
         if family == socket.AF_INET6 and number.version == 4:
             continue

@@ -171,7 +171,7 @@ def _hash(text: str) -> str:
 
 
 def _unbroken(text: str) -> Markup:
-    # A style prevents the line break. Special characters would also be in text that a reader copies.
+    # A style prevents the line break. A special character would be copied with the text.
     return Markup(_UNBREAKABLE.sub(r"<span class='unbroken'>\g<0></span>", str(escape(text))))
 
 

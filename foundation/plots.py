@@ -1,4 +1,4 @@
-"""Draw Matplotlib figures as SVG in the colours of the page. Equal data give equal bytes.
+"""Draw Matplotlib figures as SVG for a page, or as PDF or SVG for a paper. Equal data give equal bytes.
 
 Matplotlib is imported when a figure is drawn. Only its object interface is used, so there are no windows and no global
 state.
@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Sequence
 from importlib import resources
 from io import BytesIO
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -35,10 +35,10 @@ DASHES = ("-", "--", ":", "-.")  # Line styles; the style changes after every se
 # Variables of `templates/colours.css` that replace the colours of an SVG.
 _CSS_VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
 
-# Resolution of the images in an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
+# Resolution of raster images in an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
 _RASTER_DPI = 180
 
-_MAX_RASTER_PX = 1300  # Largest width of such an image, so that a page with photographs stays below a few megabytes
+_MAX_RASTER_PX = 1300  # Largest width of a raster image, so that a page with photographs stays below a few megabytes
 
 _STYLE = {
     "font.size": 9,
@@ -66,6 +66,9 @@ _STYLE = {
     "svg.hashsalt": "crop",
 }
 
+# TrueType fonts in a PDF, because many journals refuse Matplotlib's default, Type 3. Outlines in an SVG.
+_PAPER_STYLE = {"figure.facecolor": "white", "pdf.fonttype": 42, "svg.fonttype": "path"}
+
 
 def series_style(number: int) -> dict[str, str]:
     """Return the Matplotlib keywords `color` and `linestyle` of a series, numbered from 0.
@@ -89,44 +92,56 @@ def legend_label(name: str) -> str:
     return f" {name}" if name.startswith("_") else name
 
 
-def draw_svg(draw: Callable[..., None], *arguments: Any, inches: tuple[float, float] = (7.2, 4.0)) -> bytes:
-    """Return the SVG of a figure that `draw(figure, *arguments)` draws, for use in a page (`foundation.pages.figure`).
+# Use of a vector figure: SVG in a page, or a file for a paper.
+FigureForm = Literal["page", "pdf", "svg"]
 
-    The colours `INK`, `FAINT`, `GRID` and `PAPER` become CSS variables, which the page defines. Text is not converted
-    to outlines.
+
+def draw_svg(
+    draw: Callable[..., None],
+    *arguments: Any,
+    inches: tuple[float, float] = (7.2, 4.0),
+    form: FigureForm = "page",
+) -> bytes:
+    """Return a vector figure that `draw(figure, *arguments)` draws.
+
+    For a page (`foundation.pages.figure`), the colours `INK`, `FAINT`, `GRID` and `PAPER` become CSS variables, which
+    the page defines, and text is not converted to outlines. A file for a paper has a white background and contains its
+    fonts.
     """
-    return _draw_figures(lambda figures: draw(figures[0], *arguments), [inches])[0]
+    return _draw_figures(lambda figures: draw(figures[0], *arguments), [inches], form)[0]
 
 
 def draw_panels(draw: Callable[..., None], *arguments: Any, inches: Sequence[tuple[float, float]]) -> tuple[bytes, ...]:
-    """Return an SVG for each panel that `draw(panels, *arguments)` draws; a phone shows them below each other.
+    """Return one SVG for each panel that `draw(panels, *arguments)` draws. A phone shows the panels below each other.
 
-    `panels` are axes, each on its own figure of the size in `inches`. `PANEL` fits two times into a page, and once into
-    the width of a phone.
+    `panels` are axes, each on its own figure of the size in `inches`. Two panels of size `PANEL` fit next to each other
+    on a page, one on a phone.
     """
     return _draw_figures(lambda figures: draw([figure.add_subplot() for figure in figures], *arguments), inches)
 
 
-def _draw_figures(draw: Callable[[list[Any]], None], inches: Sequence[tuple[float, float]]) -> tuple[bytes, ...]:
+def _draw_figures(
+    draw: Callable[[list[Any]], None], inches: Sequence[tuple[float, float]], form: FigureForm = "page"
+) -> tuple[bytes, ...]:
     import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     # `Any`, because Matplotlib's type hints do not describe keyword arguments.
     library: Any = matplotlib
-    with library.rc_context(_STYLE):
+    with library.rc_context(_STYLE if form == "page" else _STYLE | _PAPER_STYLE):
         figures: list[Any] = [Figure(figsize=size, layout="constrained") for size in inches]
-        for figure in figures:
-            FigureCanvasSVG(figure)
         draw(figures)
-        return tuple(map(_to_svg, figures))
+        return tuple(_to_file(figure, form) for figure in figures)
 
 
-def _to_svg(figure: Any) -> bytes:
+def _to_file(figure: Any, form: FigureForm) -> bytes:
     _write_plain_numbers(figure)
     stream = BytesIO()
     dpi = min(_RASTER_DPI, _MAX_RASTER_PX / figure.get_figwidth())
-    figure.savefig(stream, format="svg", dpi=dpi, metadata={"Date": None})
+    date = {"CreationDate": None} if form == "pdf" else {"Date": None}
+    figure.savefig(stream, format="pdf" if form == "pdf" else "svg", dpi=dpi, metadata=date)
+    if form != "page":
+        return stream.getvalue()
     text = stream.getvalue().decode()
     for colour, name in _CSS_VARIABLES.items():
         text = re.sub(re.escape(colour), f"var(--{name})", text, flags=re.IGNORECASE)

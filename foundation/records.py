@@ -54,7 +54,7 @@ FloatArray = Annotated[npt.NDArray[np.float64], PlainValidator(_as_floats), Plai
 
 
 class Record(BaseModel):
-    """Frozen record. Unknown keys in a file are ignored, because later versions may add keys."""
+    """Frozen record; unknown keys in a file are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
@@ -67,7 +67,8 @@ def _adapter(record_type: Any) -> TypeAdapter[Any]:
 def to_plain(record: Any, record_type: Any = None) -> Any:
     """Convert a record, or a dataclass with typed fields, to dictionaries, lists and numbers for JSON.
 
-    `record_type` is needed if the class of the object does not give all types, as for `tuple[Frame, ...]`.
+    `record_type` is needed if the class of the object does not define the types of its items, as in `tuple[Frame,
+    ...]`.
     """
     return _adapter(record_type or cast("Any", type(record))).dump_python(record, mode="json")
 
@@ -116,7 +117,7 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
 
 
 def list_mistakes(mistakes: Collection[str]) -> str:
-    """Return the end of a message: a space and a single mistake, or the number of mistakes and a line for each."""
+    """Return mistakes as the end of a message: a space and one mistake, or their number and a line for each of them."""
     lines = "".join(f"\n  {mistake}" for mistake in mistakes)
     return f" {next(iter(mistakes))}" if len(mistakes) == 1 else f" {len(mistakes)} mistakes:{lines}"
 
@@ -153,7 +154,7 @@ def find_mistakes(
             # A whole table is too long for a message.
             value_text = "" if isinstance(value, dict) else f" = {MASK if is_secret(key) else repr(value)}"
             prefix = f"{key}{value_text}: " if key else ""
-            # A value that may have several types has an error for each of them.
+            # A value that may have several types has an error for each type.
             mistakes[key] = (
                 f"{mistakes[key]}, or {expected.removeprefix('expected ')}"
                 if key in mistakes

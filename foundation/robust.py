@@ -10,10 +10,10 @@ import numpy.typing as npt
 # Standard deviation of a normal distribution divided by its median absolute deviation: 1 / Φ⁻¹(3/4).
 MAD_TO_SIGMA: Final = 1.4826
 
-# Standard error of the median divided by that of the mean, for many normal values: √(π/2).
+# Standard error of the median divided by the standard error of the mean, for many normal values: √(π/2).
 MEDIAN_ERROR: Final = 1.2533
 
-# Residuals up to this number of standard deviations have weight 1. These are 95 % of normal residuals.
+# Residuals up to this number of standard deviations have weight 1: 95 % of normally distributed residuals.
 _HUBER_SIGMAS: Final = 2.0
 
 

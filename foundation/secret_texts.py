@@ -1,7 +1,7 @@
 """Mask passwords and tokens in texts, and escape control characters.
 
 Sessions, data sets, reports and logs are copied and published, so they must not contain secrets. Code that writes or
-prints an address masks it first. `foundation.console` masks all error messages again.
+prints an address masks it first.
 """
 
 from __future__ import annotations

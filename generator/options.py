@@ -257,10 +257,11 @@ class ImageOptions:
         ),
     ] = "png"
     layout: Annotated[
-        Literal["folder", "webdataset", "parquet"],
+        Literal["folder", "c5", "webdataset", "parquet"],
         _image_option(
             None,
-            "One file for each image, or one file for each shard: tar (WebDataset) or Parquet (Hugging Face datasets).",
+            "One file for each image (folder); PNG and metadata for each image, as C5 and CCMNet read them (c5); or "
+            "one file for each shard: tar (WebDataset) or Parquet (Hugging Face datasets).",
         ),
     ] = "folder"
     split: Annotated[

@@ -35,6 +35,7 @@ VEILS: Final = 9  # Share of the black of the print that is subtracted from an i
 EXPOSURES: Final = 12  # Exposure of an image
 GRADIENTS: Final = 13  # Fall-off of brightness over an image
 NOISE: Final = 14  # Keys of the noise added to the rows of an image
+ROUNDING: Final = 15  # Keys of the rounding of pixels rendered by colour
 
 _WORD: Final = 0xFFFFFFFF  # Mask of one word, the lower 32 bits
 

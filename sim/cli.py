@@ -149,7 +149,7 @@ def camera(
     if watch_screen is None and watch_projector is not None:
         raise ConfigurationError("--watch-projector is given without --watch-screen; give both")
     changes = dict(_setting("--room", text) for text in room or ())
-    # Lamp drift is off by default. It counts from `SIM_START`, which is long ago, so the lamp would now be dark.
+    # Lamp drift is off by default. It would count from `SIM_START`, so long ago that the lamp would now be dark.
     world = World(
         _grey_squares() if chart is None else _print(context, chart),
         sensor,
@@ -247,7 +247,7 @@ def _until_interrupted(announcement: str) -> None:
     signals = queue.SimpleQueue[int]()
     for request in (signal.SIGINT, signal.SIGTERM):
         signal.signal(request, lambda number, _: signals.put(number))
-    # Handlers are set before the address is printed, because a program may read it and send a signal at once.
+    # Handlers are set before the address is printed, because a program that reads it may send a signal at once.
     print(announcement, flush=True)
     signals.get()
     print("stopped")

@@ -19,12 +19,13 @@ Each camera channel becomes (1 − v) · light + v · mean light, where the mean
 
 **Lateral chromatic aberration.** The lens magnifies red and blue differently from green. Let ρ be the distance from the
 axis relative to the corner, and d the shift in the corner. Then red or blue is shifted outwards by d · ρ · (1 + ρ²) / 2
-relative to green. The linear term is the chromatic difference of magnification, the cubic term that of distortion
-(W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 10). Their equal weights are chosen.
+relative to green. The linear term is the chromatic difference of magnification, the cubic term the chromatic difference
+of distortion (W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 10). Equal weights of both terms are an
+assumption.
 
-**Fall-off.** The lens transmits 1 / (1 + c r²)² at the distance r from the axis, which is cos⁴ of the angle to the
-axis. A primary of the projector has the light g / (1 + c d²) at the distance d from its brightest point, with the gain
-g. `sim.world.rendering.light` applies both.
+**Fall-off.** The lens transmits 1 / (1 + c r²)² at the distance r from the axis. This is cos⁴ of the angle to the axis.
+A primary of the projector has the light g / (1 + c d²) at the distance d from its brightest point, with the gain g.
+`sim.world.rendering.light` applies both.
 
 Positions are half-size pixels, centres at integers, x right, y down.
 """
@@ -40,7 +41,7 @@ from numpy.typing import NDArray
 
 
 def lens_falloff(axis: tuple[float, float], size: tuple[int, int], lost: float) -> NDArray[np.float64]:
-    """Return (3,) float64: x, y of the axis, in photosites, and c. `lost`: share of the light lost in the corners."""
+    """Return (3,) float64: x, y of the axis, photosites, and c. `lost`: share of the light lost in the corners."""
     corner2 = (size[0] ** 2 + size[1] ** 2) / 4
     return np.array([*axis, ((1 - lost) ** -0.5 - 1) / corner2])
 
@@ -61,10 +62,10 @@ def projector_falloff(
 # of the photosite, the MTF is 0.96 at 10 lp/mm and 0.73 at 30 lp/mm.
 MILD_SHOULDERS: Final = {"blur_px": 0.46, "shoulder_share": 0.0116, "shoulder_px": 3.0}
 
-# Settings for a worse lens, with an MTF of 0.93 and 0.64 at the same frequencies.
+# Settings for a worse lens: the MTF is 0.93 at 10 lp/mm and 0.64 at 30 lp/mm.
 STRONG_SHOULDERS: Final = {"blur_px": 0.535, "shoulder_share": 0.0452, "shoulder_px": 3.0}
 
-# Radius of the kernel, relative to the length a. The kernel is normalised, which adds the light outside, 0.12 %.
+# Radius of the kernel, relative to the length a. Its normalisation replaces the light outside, 0.12 %.
 _KERNEL_RADIUS: Final = 9.0
 
 # Points per pixel and axis over which the kernel is averaged, because its peak is narrower than a pixel.

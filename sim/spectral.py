@@ -22,10 +22,10 @@ measured prints on photo paper.
 
 Papers ``matt`` and ``glossy`` follow prints of an Epson XP-960 without colour management, measured with a ColorMunki
 (olemagnp/print_profiles on GitHub; no data are copied). Inks and overprints differ by 2.5 CIEDE2000 on average from the
-prints on PermaJet Matt Plus 240 and Ilford Galerie Smooth Pearl. Densities of black agree with that collection, with
-an Epson P800 (metebalci/profiling-an-epson-p800-printer) and with a review of more papers (M. McNamee, "The whole
-range", swpp.co.uk, 2010). The volumes of printed colours in CIELAB (D50) are near the smallest measured ones, because
-the model has four inks and those printers have six or more. Black is constant over wavelength, like measured pigment
+prints on PermaJet Matt Plus 240 and Ilford Galerie Smooth Pearl. Densities of black agree with that collection, with an
+Epson P800 (metebalci/profiling-an-epson-p800-printer) and with a review of more papers (M. McNamee, "The whole range",
+swpp.co.uk, 2010). The volumes of printed colours in CIELAB (D50) are near the smallest measured volumes, because the
+model has four inks and the measured printers have six or more. Black is constant over wavelength, like measured pigment
 blacks (P800, Canon Pro-300).
 
 **Profiles.** With ``unmanaged``, the codes of the file are ink codes, as in Banić et al. 2019. Greys then have the tint
@@ -36,10 +36,10 @@ of equal inks. ``managed`` converts like an ICC profile of a print shop, in thre
    neutral print, and luminance between them is linear;
 3. XYZ to ink codes of the paper.
 
-Colours out of gamut become the nearest printable colour in CIELAB relative to paper. Differences of hue count twice
-(chosen), because profiles preserve hue rather than chroma. The conversion table has 33 nodes per channel, like an ICC
-profile, and is the numerical inverse of the print model. Interpolation in tetrahedra keeps greys neutral, because grey
-codes depend on grey nodes only (Kasson and others, J. Electronic Imaging 4 (1995) 226).
+Colours out of gamut become the nearest printable colour in CIELAB relative to paper. Differences of hue count twice,
+because profiles preserve hue rather than chroma. The conversion table is the numerical inverse of the print model.
+Interpolation in tetrahedra keeps greys neutral, because grey codes depend on grey nodes only (Kasson and others, J.
+Electronic Imaging 4 (1995) 226).
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def resampled(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array
             values[:, number] = np.interp(onto_nm, wavelengths_nm, curves[:, number], left=0, right=0)
         return values
     if float(np.diff(wavelengths_nm).max()) > 0.999 * step:
-        # Otherwise, grid points inside a wide step would be 0, and those at its ends too large.
+        # On the original grid, new points inside a wide step would be 0, and points at the ends of the step too large.
         wavelengths_nm, curves = _densified(wavelengths_nm, curves, step)
     # Each wavelength represents half the distance to its neighbours.
     edges = np.concatenate([wavelengths_nm[:1], (wavelengths_nm[1:] + wavelengths_nm[:-1]) / 2, wavelengths_nm[-1:]])
@@ -196,8 +196,8 @@ def _read(name: str) -> dict[str, PublishedSpectrum]:
 # End of the file names in `sim.data`: first and last wavelength and step, as in rawtoaces-data.
 SUFFIX: Final = "_380_780_5.json"
 
-# Highest allowed response at the first and last wavelength of a file, relative to the peak (chosen). Less than 1 % of
-# the light is then missing.
+# Highest allowed response at the first and last wavelength of a file, relative to the peak. At this limit, the missing
+# light is below 1 %.
 EDGE_SHARE: Final = 0.05
 
 _CHANNELS: Final = ("R", "G", "B")
@@ -394,24 +394,26 @@ PaperName = Literal["poster", "matt", "glossy"]  # Papers of the simulated print
 
 SURFACE_REFLECTANCE = 0.03  # Share of the light that the surface of plain matt paper reflects.
 
-MATT_SURFACE = 0.0165  # The same for coated matt photo paper; its measured black reflects 0.016 to 0.026.
+MATT_SURFACE = 0.0165  # This share for coated matt photo paper, whose measured black reflects 0.016 to 0.026.
 
-# The same for glossy paper outside of the mirror direction; its black reflects at least 0.0038.
+# This share for glossy paper outside of the mirror direction. Measured black on glossy paper reflects at least 0.0038.
 GLOSSY_SURFACE = 0.0035
 
-# Density of solid matt black without the reflection of the surface. With this reflection, it equals the measured one.
+# Density of solid matt black without the reflection of the surface. With this reflection, it equals the measured
+# density.
 MATT_BLACK = 1.8
 
-GLOSSY_BLACK = 2.0  # The same for solid photo black on glossy paper.
+GLOSSY_BLACK = 2.0  # Density of solid photo black on glossy paper, also without the reflection.
 
 YULE_NIELSEN_N = 2.0  # Yule-Nielsen factor; 2 is full optical dot gain.
 
 DOT_GAIN = 0.14  # Mechanical dot gain: increase of a coverage of 0.5.
 
-# Coverage of black on poster paper at full coverage of the other inks; below 1, so that these stay visible (chosen).
+# Coverage of black on poster paper at full coverage of the other inks. Chosen below 1, so that the other inks stay
+# visible.
 _BLACK_GENERATION = 0.9
 
-# Share of black by which the other inks are reduced, so that dark patches keep their inks (chosen).
+# The other inks are reduced by this share of black. Chosen small enough that dark patches keep these inks.
 _UNDERCOLOUR_REMOVAL = 0.4
 
 
@@ -545,7 +547,7 @@ ProfileName = Literal["unmanaged", "managed"]  # Conversion of codes of the file
 
 NODES = 33  # Nodes per channel of the table, as in ICC output profiles.
 
-_HUE_WEIGHT = 2.0  # Weight of hue differences for colours out of gamut (chosen).
+_HUE_WEIGHT = 2.0  # Weight of hue differences for colours out of gamut, relative to lightness and chroma.
 
 # Largest CIELAB distance of the black point from neutral; a distance of 1 is visible. A smaller limit gives a paler
 # black, because the darkest mix of inks is not neutral.
@@ -651,7 +653,8 @@ class _Inks:
             active_codes, difference, matrix = codes[active], differences[active], axes[active]
             slope = np.empty((len(active), 3, 3))
             for channel in range(3):
-                # Codes change away from the nearer bound, so that they stay between 0 and 1.
+                # The small change for the derivative leads away from the nearer bound, so that codes stay between 0 and
+                # 1.
                 nudge = np.where(active_codes[:, channel] < 0.5, 1e-5, -1e-5)
                 shifted = active_codes.copy()
                 shifted[:, channel] += nudge

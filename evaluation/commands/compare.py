@@ -10,10 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evaluation.commands.options import AngularError, argument, choose_learners, choose_methods
+from evaluation.commands.options import (
+    AngularError,
+    Figures,
+    argument,
+    choose_learners,
+    choose_methods,
+    require_results_folder,
+)
 from foundation.console import EXIT_CODES, JsonOutput, option, with_json
 from foundation.errors import InputError
-from foundation.folders import require_free
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -47,6 +53,7 @@ def compare(
     ] = None,
     error: Annotated[AngularError, typer.Option(help="Angular error to compare.")] = "reproduction",
     out: Annotated[Path | None, option("FOLDER", "Write tables and scatter plots to this new folder.")] = None,
+    figures: Figures = None,
     *,
     output: JsonOutput,
 ) -> None:
@@ -57,14 +64,13 @@ def compare(
 
     if len(results) > 2:
         raise InputError(f"{len(results)} RESULTS are given, expected one or two; omit the others")
-    if out is not None:
-        require_free(out, "the comparison")
+    require_results_folder(out, "the comparison", figures)
     runs = [read_errors(location) for location in results]
     pairs = _match_pairs(runs, results, method, error)
     comparisons = comparing.compare(pairs)
     notes = [*dict.fromkeys(note for pair in pairs for note in pair.notes), *_treatment_notes(results)]
     if out is not None:
-        comparing.write_comparisons(out, comparisons, notes)
+        comparing.write_comparisons(out, comparisons, notes, figures)
     show_notes(output, notes)
     verdicts = [comparing.verdict(comparison) for comparison in comparisons]
     output.add(results=results, error=error, verdicts=verdicts)

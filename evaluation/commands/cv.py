@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from evaluation.commands.options import (
     Data,
+    Figures,
     PrintedError,
     Read,
     argument,
     choose_without_constant,
     image_steps,
     open_data,
+    require_results_folder,
     split_names,
     thread_option,
 )
@@ -20,7 +22,6 @@ from evaluation.commands.train import LEARNERS_HELP
 from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, option, orderly_end, with_json
 from foundation.errors import counted, first_few
-from foundation.folders import require_free
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,6 +59,7 @@ def cv(
     seed: Annotated[int, option("N", "Seed of the folds and of the training.", min=0)] = 0,
     error: PrintedError = "reproduction",
     out: Annotated[Path | None, option("RESULTS", "Write all results to this new folder.")] = None,
+    figures: Figures = None,
     workers: Annotated[int | None, thread_option(" that read images; results do not depend on it")] = None,
     read: Read = None,
     output: JsonOutput,
@@ -74,8 +76,7 @@ def cv(
 
     trained_learners, left_out = choose_without_constant(split_names([method]))
     learners = [ConstantLight(), *trained_learners]
-    if out is not None:
-        require_free(out, "the results")
+    require_results_folder(out, "the results", figures)
     data_set = open_data(data, read)
     image_folds, origin = choose_folds(data_set, folds, seed)
     count, threads = len(data_set.scenes), workers or processor_count()
@@ -91,7 +92,7 @@ def cv(
         records = [describe_method(learner) for learner in learners]
         result_run = describe_run(data_set, results, records, {"seed": seed, "folds": origin}, image_folds, notes)
         if out is not None:
-            write_run(result_run, data_set.scenes, out, error, threads)
+            write_run(result_run, data_set.scenes, out, error, threads, figures)
     output.add(data_set=data_set.name, images=count, folds=len(set(image_folds.tolist())), seed=seed, error=error)
     show_tables(output, [summary_table(result_run.subject, results, error, output.is_requested)])
     show_notes(output, result_run.notes, result_run.treatment)

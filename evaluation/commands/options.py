@@ -17,6 +17,7 @@ import typer
 
 from foundation.console import option, orderly_end, progress
 from foundation.errors import InputError, nearest_names
+from foundation.folders import require_free
 
 if TYPE_CHECKING:
     from evaluation.datasets.options import DataOptions
@@ -45,6 +46,20 @@ PrintedError = Annotated[
 ]
 
 
+Figures = Annotated[
+    Literal["pdf", "svg"] | None,
+    typer.Option(help="Also write the figures for a paper to the results folder.", show_default=False),
+]
+
+
+def require_results_folder(out: Path | None, content: str, figures: str | None) -> None:
+    """Raise InputError if the results folder exists, or if it is missing and figures are requested."""
+    if out is not None:
+        require_free(out, content)
+    elif figures is not None:
+        raise InputError(f"--figures {figures} is given without --out, expected a results folder; add --out FOLDER")
+
+
 @contextmanager
 def image_steps(count: int) -> Generator[Callable[[], None]]:
     """Show the progress of `count` images; yield a function that counts one image."""
@@ -58,9 +73,10 @@ Read = Annotated[
     option(
         "KEY=VALUE",
         "How DATA is read; repeat the option for several keys. layout=NAME: generated, thumbnails, cube-plus, cube++, "
-        "simple-cube++, nus8, gehler-shi, intel-tau, lsmi, ffcc or folder. camera=NAME: one of several. subset=NAME: a "
-        "part, such as train or test. truth=NAME: one of several ground truths. black=LEVEL, saturation=LEVEL: in the "
-        "units of the files. partial: skip images missing in a copy. docs/reference/datasets.md lists the names. "
+        "simple-cube++, nus8, gehler-shi, intel-tau, lsmi, levi, ffcc or folder. camera=NAME: one of several. "
+        "subset=NAME: a part, such as train or test. truth=NAME: one of several ground truths. black=LEVEL, "
+        "saturation=LEVEL: in the units of the files. partial: skip images missing in a copy. "
+        "docs/reference/datasets.md lists the names. "
         "\\[default: detected layout, with its own values]",
     ),
 ]

@@ -7,25 +7,26 @@ from typing import Annotated
 
 from evaluation.commands.options import (
     Data,
+    Figures,
     PrintedError,
     Read,
     choose_estimates,
     choose_methods,
     image_steps,
     open_data,
+    require_results_folder,
     split_names,
     thread_option,
 )
 from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, option, with_json
-from foundation.folders import require_free
 
 HELP = f"""Estimate the illuminant of every image of a data set and summarise the errors.
 
 Reads DATA: a data set made by generate (folder or URL), or a real data set in its published layout. A method belongs
 to this suite, or is your own class, a trained model, or a file with estimates of another program; by default the seven
-standard methods are used. Prints mean, median, trimean, best 25 %, worst 25 % and Avg. (their geometric mean) in
-degrees, as in the paper. With several illuminants in an image also prints errors by pixel and region. Prints how the
+standard methods are used. Prints mean, median, trimean, best 25 %, worst 25 %, Avg. (their geometric mean) and
+worst 5 % in degrees. With several illuminants in an image also prints errors by pixel and region. Prints how the
 images were treated. Writes files only with --out.
 
 {EXIT_CODES}
@@ -52,6 +53,7 @@ def run(
         Path | None,
         option("RESULTS", "Write tables, the errors of all images, report.html and LaTeX to this new folder."),
     ] = None,
+    figures: Figures = None,
     workers: Annotated[
         int | None, thread_option(", one image each; your own classes run in one thread at a time")
     ] = None,
@@ -67,15 +69,14 @@ def run(
     names = split_names(method or ["standard"])
     files = [name for name in names if name.endswith(".csv")]
     methods = choose_methods(name for name in names if name not in files)
-    if out is not None:
-        require_free(out, "the results")
+    require_results_folder(out, "the results", figures)
     data_set = open_data(data, read)
     estimates = choose_estimates(files, [scene.name for scene in data_set.scenes])
     threads = workers or processor_count()
     with image_steps(len(data_set.scenes)) as step:
         result_run = run_methods(data_set, [*methods, *estimates], threads, step)
         if out is not None:
-            write_run(result_run, data_set.scenes, out, error, threads)
+            write_run(result_run, data_set.scenes, out, error, threads, figures)
     if output.is_requested:
         table = statistics_rows(result_run.subject, result_run.results)
         output.add(data_set=result_run.subject.name, images=len(result_run.subject.images))

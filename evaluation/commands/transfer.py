@@ -12,6 +12,7 @@ import typer
 
 from evaluation.commands.options import (
     AngularError,
+    Figures,
     Read,
     argument,
     choose_methods,
@@ -19,13 +20,13 @@ from evaluation.commands.options import (
     image_steps,
     is_learner,
     open_data,
+    require_results_folder,
     split_names,
     thread_option,
 )
 from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, option, with_json
 from foundation.errors import InputError
-from foundation.folders import require_free
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,8 +50,8 @@ cross-validation of the same method on TEST, the constant illuminant (median of 
 without training. --naive adds training without a look-up table: linear sRGB of the same pictures times the same
 illuminants, with and without the camera's colour matrix. --real adds two trainings with N real images of the other
 folds: on these images alone, and on each TRAIN with adaptation to these images. Prints mean, median, trimean, best and
-worst 25 %, bootstrap intervals, and ratios to the cross-validation, paired by image. Training images that share a
-picture with the test set, by name or content, are excluded. Writes files only with --out.
+worst 25 %, worst 5 %, bootstrap intervals, and ratios to the cross-validation, paired by image. Training images that
+share a picture with the test set, by name or content, are excluded. Writes files only with --out.
 
 {EXIT_CODES}
 """
@@ -79,6 +80,7 @@ def transfer(
     seeds: Annotated[int, option("K", "Number of seeds of learners, training images and folds.", min=1)] = 1,
     error: Annotated[AngularError, typer.Option(help="Angular error of the statistics.")] = "reproduction",
     out: Annotated[Path | None, option("FOLDER", "Write tables, errors and a report to this new folder.")] = None,
+    figures: Figures = None,
     workers: Annotated[int | None, thread_option()] = None,
     read: Read = None,
     *,
@@ -94,8 +96,7 @@ def transfer(
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
 
-    if out is not None:
-        require_free(out, "the results")
+    require_results_folder(out, "the results", figures)
     threads = workers or processor_count()
     names = split_names(method or ["all", "gray-world", "shades-of-gray", "gray-edge-1"])
     learned = [name for name in names if name.lower() == "all" or is_learner(name)]
@@ -117,8 +118,8 @@ def transfer(
             generated_name=test_set.name if is_generated(test_set) else "",
             real_counts=counts,
         )
-    figures = figures_of(rows, error, groups=groups_of(test_set.scenes))
-    plan = replace(plan, notes=(*notes, *harm_notes(figures)))
+    row_figures = figures_of(rows, error, groups=groups_of(test_set.scenes))
+    plan = replace(plan, notes=(*notes, *harm_notes(row_figures)))
     settings: dict[str, Any] = {
         "methods": [describe_method(method_or_learner) for method_or_learner in (*learners, *references)],
         "images": images,
@@ -129,9 +130,9 @@ def transfer(
         "error": error,
         "read": list(read or ()),
     }
-    outcome = TransferOutcome(test_set, plan, rows, figures, folds, settings)
+    outcome = TransferOutcome(test_set, plan, rows, row_figures, folds, settings)
     if out is not None:
-        save_outcome(outcome, out)
+        save_outcome(outcome, out, figures)
     output.add(test=test_set.name, error=error, settings=settings)
     show_tables(output, list(outcome.tables()), "")
     show_notes(output, plan.notes)

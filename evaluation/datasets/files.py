@@ -217,6 +217,36 @@ def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, Mapping
         raise FormatError(f"{path} cannot be read: {error}; restore it") from error
 
 
+_NAMED_COLUMNS = ("image", "r", "g", "b")  # of a line in a text file of named ground truths
+
+
+def is_named_light(line: str) -> bool:
+    """Return True if a line of text has a name and three numbers, separated by blanks.
+
+    Examples
+    --------
+    >>> is_named_light("my photo.png 0.2 0.5 0.3"), is_named_light("0.2 0.5 0.3")
+    (True, False)
+    """
+    words = line.rsplit(maxsplit=3)
+    try:
+        return len(words) == 4 and all(math.isfinite(float(word)) for word in words[1:])
+    except ValueError:
+        return False
+
+
+def read_named_lights(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
+    """Yield the lines `name r g b` of a text file as `read_rows` yields rows; empty lines and `#` lines are ignored."""
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        if line.strip() and not line.startswith("#"):
+            if not is_named_light(line):
+                raise FormatError(
+                    f"{path}, line {number}: {line[:80]!r}, expected a name and three numbers, separated by blanks; "
+                    "correct the line"
+                )
+            yield f"{path}, line {number}", dict(zip(_NAMED_COLUMNS, line.rsplit(maxsplit=3), strict=True))
+
+
 def parse_light(row: Mapping[str, str], columns: Sequence[str], origin: str, remedy: str = "restore the file") -> Light:
     """Return the illuminant in three columns of a row; `remedy` ends the message if the values are wrong."""
     return check_light([parse_number(row[column], origin, column) for column in columns], origin, remedy)

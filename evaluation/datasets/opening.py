@@ -21,6 +21,7 @@ from evaluation.datasets.published.cube import (
 )
 from evaluation.datasets.published.gehler_shi import is_gehler_shi, open_gehler_shi
 from evaluation.datasets.published.intel_tau import is_intel_tau, open_intel_tau
+from evaluation.datasets.published.levi import is_levi, open_levi
 from evaluation.datasets.published.lsmi import is_lsmi, open_lsmi
 from evaluation.datasets.published.nus8 import is_nus8, open_nus8
 from evaluation.datasets.thumbnails import open_thumbnails
@@ -132,6 +133,14 @@ LAYOUTS: Mapping[str, Layout] = {
         ("camera", "subset", *_LEVELS, "partial"),
         is_unverified=True,
     ),
+    "levi": Layout(
+        "LEVI, night images",
+        "gt.mat and folders img and msk",
+        is_levi,
+        open_levi,
+        (*_LEVELS, "partial"),
+        is_unverified=True,
+    ),
     "ffcc": Layout(
         "FFCC's thumbnails",
         "NAME.png with NAME.txt",
@@ -143,7 +152,7 @@ LAYOUTS: Mapping[str, Layout] = {
     ),
     "folder": Layout(
         "images of your own",
-        "a .csv with image,r,g,b",
+        "a .csv with image,r,g,b, or a .txt with name r g b",
         is_plain_folder,
         open_plain_folder,
         (*_LEVELS, "partial"),
@@ -254,12 +263,14 @@ def _recognise_layout(location: str) -> tuple[str, Folder | None]:
         return "generated", None
     path = Path(location)
     if path.is_file():
-        by_ending = {".npz": "thumbnails", ".csv": "folder"}
+        by_ending = {".npz": "thumbnails", ".csv": "folder", ".txt": "folder"}
         if path.name in ("errors.csv", "results.csv"):
             _refuse_results(path.parent, location)
         if path.suffix.lower() in by_ending:
             return by_ending[path.suffix.lower()], None
-        raise FormatError(f"{location} is a file, expected an archive .npz or a table .csv; give one, or a folder")
+        raise FormatError(
+            f"{location} is a file, expected an archive .npz or a table .csv or .txt; give one, or a folder"
+        )
     if not path.is_dir():
         raise FormatError(f"{location} does not exist, expected a data set; give its folder, file or URL")
     _refuse_results(path, location)

@@ -6,12 +6,13 @@ Layout::
                         columns black, saturation: levels of the image, in the units of its file, optional
                         column mask: a picture that is not 0 at pixels that must not be used, optional
                         column fold: whole numbers from 0 for cross-validation, optional
+    gt.txt              instead of gt.csv: lines of name r g b, separated by blanks
     photo1.png …        linear camera RGB, red first: PNG or TIFF of 16 bits, TIFF of floats, or NumPy files
     photo1_mask.png     mask of photo1 if column mask is empty, optional
 
-The table may have any name if no other .csv of the folder has these columns; else its path must be given. Images
-without a row are refused, so that no image is excluded by mistake. JPEG and 8-bit sRGB are refused, because their
-values are not proportional to light.
+The table may have any name if no other .csv of the folder has these columns; else its path must be given. A .txt is
+used if there is no such .csv. Images without a row are refused, so that no image is excluded by mistake. JPEG and 8-bit
+sRGB are refused, because their values are not proportional to light.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from evaluation.datasets.files import (
     Light,
     Mask,
     RawScene,
+    is_named_light,
     parse_light,
     parse_number,
     read_mask,
+    read_named_lights,
     read_rows,
     split_header,
 )
@@ -52,7 +55,7 @@ _PICTURES = (".jpg", ".jpeg", ".webp", ".heic", ".gif", ".bmp")
 _RAWS = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef", ".srw", ".crw")
 _MASK = "_mask"
 _MASK_ENDINGS = (".png", ".tif", ".tiff")
-_MAX_HEADER_BYTES = 4096  # of the first line of a table
+_MAX_HEADER_BYTES = 4096  # of a table, to find its first line
 _INSPECTED_TABLES = 50  # number of tables whose headers are read to find the one with ground truths
 
 
@@ -93,7 +96,8 @@ def open_plain_folder(location: str, options: DataOptions, scanned_folder: Folde
     given_columns: set[str] = set()
     paths: dict[str, str] = {}
     indices: dict[str, _FolderIndex] = {"": _FolderIndex(scanned_folder)} if scanned_folder else {}
-    for origin, row in read_rows(path, COLUMNS):
+    rows = read_named_lights(path) if _is_text(path.name) else read_rows(path, COLUMNS)
+    for origin, row in rows:
         name = row["image"].strip()
         if not name or name in names:
             problem = f"image {name!r} is listed twice, expected once" if name else "no image name, expected one"
@@ -197,21 +201,26 @@ def refuse_unusable_table(folder: Folder) -> None:
 
 
 def _tables(folder: Folder) -> list[str]:
-    return [name for name, header in _headers(folder).items() if all(column in _columns(header) for column in COLUMNS)]
+    tables = [name for name, line in _headers(folder).items() if all(column in _columns(line) for column in COLUMNS)]
+    return tables or [name for name, line in _headers(folder, (".txt",)).items() if is_named_light(line)]
 
 
-def _headers(folder: Folder) -> dict[str, str]:
+def _is_text(name: str) -> bool:
+    return name.lower().endswith(".txt")
+
+
+def _headers(folder: Folder, endings: tuple[str, ...] = (".csv",)) -> dict[str, str]:
     headers: dict[str, str] = {}
-    for name in [name for name in folder.files if name.lower().endswith(".csv")][:_INSPECTED_TABLES]:
+    for name in [name for name in folder.files if name.lower().endswith(endings)][:_INSPECTED_TABLES]:
         try:
             with (folder.path / name).open("rb") as file:
-                line = file.readline(_MAX_HEADER_BYTES)
+                start = file.read(_MAX_HEADER_BYTES)
         except OSError:
             continue
         # Bytes that are not UTF-8 are reported when the table is read.
-        is_utf_16 = line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        text = line.decode("utf-16" if is_utf_16 else "utf-8-sig", errors="ignore")
-        headers[name] = text.partition("\n")[0]
+        is_utf_16 = start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text = start.decode("utf-16" if is_utf_16 else "utf-8-sig", errors="ignore")
+        headers[name] = next((line for line in text.splitlines() if not line.startswith("#")), "")
     return headers
 
 

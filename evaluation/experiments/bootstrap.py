@@ -38,10 +38,15 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 # Statistics by their names in `evaluation.metrics.Summary`.
-Statistic = Literal["mean", "median", "trimean", "best25", "worst25", "avg"]
+Statistic = Literal["mean", "median", "trimean", "best25", "worst25", "avg", "worst5"]
 
 # All statistics in the order of the paper's tables.
-STATISTICS: tuple[Statistic, ...] = ("mean", "median", "trimean", "best25", "worst25", "avg")
+STATISTICS: tuple[Statistic, ...] = ("mean", "median", "trimean", "best25", "worst25", "avg", "worst5")
+
+
+# Smallest number of groups for an interval of worst 5 %. With 80 gamma-distributed errors, the interval of 95 %
+# contains the true value in 68 % of the cases, because the mean is over 4 errors; with 320 errors, in 96 %.
+TAIL_GROUPS: Final = 200
 
 
 class BoundedFigure(NamedTuple):
@@ -115,6 +120,16 @@ def bounded_figures(
     return tuple(BoundedFigure(*map(float, row)) for row in rows)
 
 
+def hide_tails(figures: Sequence[BoundedFigure], groups: int) -> tuple[BoundedFigure, ...]:
+    """Return batches of `STATISTICS`; with fewer than `TAIL_GROUPS` groups the interval of worst 5 % is NaN."""
+    return tuple(
+        figure._replace(low=np.nan, high=np.nan)
+        if groups < TAIL_GROUPS and STATISTICS[index % len(STATISTICS)] == "worst5"
+        else figure
+        for index, figure in enumerate(figures)
+    )
+
+
 def _hazen_position(count: Indices, percent: float) -> tuple[Indices, Indices, Floats]:
     # A percentile by Hazen's definition lies between two sorted errors. Returns the indices of both, and the weight of
     # the upper one.
@@ -143,11 +158,11 @@ class ErrorSample:
         return cls(order, values[order])
 
     def estimate(self) -> Floats:
-        """Return the statistics (6,) float64 of the sample itself."""
+        """Return the statistics (7,) float64 of the sample itself."""
         return self.statistics(np.ones((1, len(self.order)), np.int64))[0]
 
     def statistics(self, counts: Indices) -> Floats:
-        """Return statistics (B, 6) float64 of B resamples; `counts` (B, N): how often each image was drawn."""
+        """Return statistics (B, 7) float64 of B resamples; `counts` (B, N): how often each image was drawn."""
         # Statistics follow `evaluation.metrics.summarise`, with its percentiles and its treatment of equal errors.
         rows, images = counts.shape
         counts = counts[:, self.order]
@@ -168,17 +183,20 @@ class ErrorSample:
             )
             return lower + (upper - lower) * weight
 
-        q1, q2, q3 = (quantile(percent) for percent in (25, 50, 75))
+        def mean_from(threshold: Floats) -> Floats:
+            last_below = np.searchsorted(self.errors, threshold, side="left") - 1
+            sum_below = np.where(last_below >= 0, sums[row, last_below], 0)
+            count_below = np.where(last_below >= 0, cumulative_counts[row, last_below], 0)
+            return (sums[:, -1] - sum_below) / (totals - count_below)
+
+        q1, q2, q3, p95 = (quantile(percent) for percent in (25, 50, 75, 95))
         best_end = np.searchsorted(self.errors, q1, side="right") - 1
-        worst_start = np.searchsorted(self.errors, q3, side="left") - 1
         best_mean = sums[row, best_end] / cumulative_counts[row, best_end]
-        sum_below = np.where(worst_start >= 0, sums[row, worst_start], 0)
-        count_below = np.where(worst_start >= 0, cumulative_counts[row, worst_start], 0)
-        worst_mean = (sums[:, -1] - sum_below) / (totals - count_below)
-        first_five = np.stack([sums[:, -1] / totals, q2, (q1 + 2 * q2 + q3) / 4, best_mean, worst_mean], axis=-1)
+        first_five = np.stack([sums[:, -1] / totals, q2, (q1 + 2 * q2 + q3) / 4, best_mean, mean_from(q3)], axis=-1)
         # If all errors are 0, rounding of sums may give a small negative value.
         non_negative = np.where(first_five < 0, np.nan, first_five)
-        return np.concatenate([first_five, np.prod(non_negative**0.2, axis=-1, keepdims=True)], axis=-1)
+        average = np.prod(non_negative**0.2, axis=-1)
+        return np.concatenate([first_five, np.stack([average, mean_from(p95)], axis=-1)], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -218,7 +236,8 @@ def compare_paired(
         value_a, value_b = sample_a.statistics(counts), sample_b.statistics(counts)
         return np.concatenate([value_a - value_b, safe_ratio(value_a, value_b)], axis=-1)
 
-    figures = bounded_figures(statistics, images, groups, seed, count)
+    count_of_groups = images if groups is None else len(set(groups))
+    figures = hide_tails(bounded_figures(statistics, images, groups, seed, count), count_of_groups)
     values = zip(STATISTICS, sample_a.estimate().tolist(), sample_b.estimate().tolist(), strict=True)
     return tuple(
         PairedFigure(statistic, value_a, value_b, figures[index], figures[index + len(STATISTICS)])

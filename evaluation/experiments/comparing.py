@@ -25,12 +25,12 @@ from evaluation.experiments.bootstrap import LEVEL, STATISTICS, TIE_DEG, PairedF
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import MethodErrors
-from evaluation.results.tables import PAPER_COLUMNS, Cell, Table, table_to_csv
+from evaluation.results.tables import ERROR_COLUMNS, Cell, Table, table_to_csv
 from foundation import pages
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted, first_few
 from foundation.folders import atomic_folder
-from foundation.plots import FAINT, SERIES, draw_svg
+from foundation.plots import FAINT, SERIES, FigureForm, draw_svg
 
 # Smaller errors are drawn at this value, degrees: a logarithmic axis has no zero, and no ground truth is more accurate.
 _FLOOR_DEG: Final = 0.01
@@ -38,7 +38,7 @@ _FLOOR_DEG: Final = 0.01
 # Largest accepted angle between two ground truths of the same image, degrees. Files round ground truths differently.
 _SAME_TRUTH_DEG: Final = 0.01
 
-_STATISTIC_HEADS: Final = dict(zip(STATISTICS, PAPER_COLUMNS[1:], strict=True))
+_STATISTIC_HEADS: Final = dict(zip(STATISTICS, ERROR_COLUMNS[1:], strict=True))
 
 _VALUE_HEADS: Final = ("Of first", "Of second", "Difference", "from", "to", "Ratio", "ratio from", "ratio to")
 
@@ -232,7 +232,8 @@ def statistics_table(comparisons: Sequence[Comparison]) -> Table:
         digits=3,
         notes=(
             f"Intervals of {LEVEL:.0%}: BCa bootstrap over images or groups of images, {bootstrap.RESAMPLES} "
-            "resamples, the same for both methods. A single group has no interval.",
+            f"resamples, the same for both methods. A single group has no interval; worst 5% has "
+            f"none with fewer than {bootstrap.TAIL_GROUPS} images or groups.",
         ),
     )
 
@@ -251,8 +252,8 @@ def images_table(comparison: Comparison, count: int = 10) -> Table:
     )
 
 
-def error_scatter(matched: MatchedErrors) -> bytes:
-    """Return a figure as SVG: errors of the second method against errors of the first, with the line of equality."""
+def error_scatter(matched: MatchedErrors, form: FigureForm = "page") -> bytes:
+    """Return a figure: errors of the second method against errors of the first, with the line of equality."""
 
     def draw(figure: Any) -> None:
         x, y = np.maximum(matched.errors_a, _FLOOR_DEG), np.maximum(matched.errors_b, _FLOOR_DEG)
@@ -266,7 +267,7 @@ def error_scatter(matched: MatchedErrors) -> bytes:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_major_formatter("{x:g}")
 
-    return draw_svg(draw, inches=(4.6, 4.4))
+    return draw_svg(draw, inches=(4.6, 4.4), form=form)
 
 
 def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str]) -> str:
@@ -311,8 +312,10 @@ def _interval_cells(pair: PairedFigure) -> list[Cell]:
     return [None if np.isnan(number) else number for number in (*pair.difference, *pair.ratio)]
 
 
-def write_comparisons(folder: Path, comparisons: Sequence[Comparison], notes: Sequence[str]) -> None:
-    """Write a new folder: `tests.csv`, `statistics.csv`, `tables.tex` and `report.html`."""
+def write_comparisons(
+    folder: Path, comparisons: Sequence[Comparison], notes: Sequence[str], figures: FigureForm | None = None
+) -> None:
+    """Write a new folder: `tests.csv`, `statistics.csv`, `tables.tex`, `report.html`, and figures of a form."""
     tables = {"tests.csv": tests_table(comparisons), "statistics.csv": statistics_table(comparisons)}
     texts = {name: table_to_csv(table) for name, table in tables.items()}
     texts["tables.tex"] = "\n".join(map(table_to_latex, tables.values()))
@@ -320,3 +323,6 @@ def write_comparisons(folder: Path, comparisons: Sequence[Comparison], notes: Se
     with atomic_folder(folder, "the comparison") as partial_folder:
         for name, text in texts.items():
             (partial_folder / name).write_text(text, encoding="utf-8")
+        if figures is not None:
+            for number, comparison in enumerate(comparisons, start=1):
+                (partial_folder / f"scatter_{number}.{figures}").write_bytes(error_scatter(comparison.matched, figures))

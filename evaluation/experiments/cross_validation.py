@@ -30,7 +30,7 @@ from evaluation.methods.naming import find_method
 from evaluation.methods.prepared import shrink, unit
 from evaluation.metrics import ErrorKind, Summary, recovery_error, reproduction_error, summarise
 from evaluation.results.result import NO_PIXEL, Result, SceneAnswer, collect_results, read_estimate
-from evaluation.results.tables import PAPER_COLUMNS, Cell, Table
+from evaluation.results.tables import ERROR_COLUMNS, Cell, Table
 from evaluation.scene import Image, Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
@@ -275,7 +275,7 @@ def tune_family(
 
 def tuning_table(tuning: Tuning) -> Table:
     """Return the table of settings: spreads × 1000, errors in degrees."""
-    error_columns = PAPER_COLUMNS[1:] if tuning.metric else ()
+    error_columns = ERROR_COLUMNS[1:] if tuning.metric else ()
     errors_text = f"; {tuning.metric} angular error, degrees" if tuning.metric else ""
     notes: list[str] = []
     if tuning.counted < tuning.images:

@@ -17,7 +17,14 @@ from evaluation.experiments.suspicions import suspicions
 from evaluation.learning.model_files import StoredMethod, TrainingRecord, scenes_sha256
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
-from evaluation.reports.run_page import MAX_METHODS, chosen_images, developed_pictures, run_page
+from evaluation.reports.run_page import (
+    MAX_METHODS,
+    chosen_images,
+    developed_pictures,
+    error_curves,
+    error_planes,
+    run_page,
+)
 from evaluation.reports.table_output import table_to_latex
 from evaluation.results.files import ERRORS_FILE, errors_csv, run_json, several_lights_csv
 from evaluation.results.method_records import describe_method
@@ -28,6 +35,7 @@ from foundation.compiled import ordered_map
 from foundation.errors import InputError, first_few
 from foundation.files import write_atomic
 from foundation.folders import atomic_folder
+from foundation.plots import FigureForm
 from foundation.version import software
 
 
@@ -54,12 +62,21 @@ def run_methods(
 
 
 def write_run(
-    run: Run, scenes: Sequence[Scene], folder: Path, metric: ErrorKind = "reproduction", workers: int = 1
+    run: Run,
+    scenes: Sequence[Scene],
+    folder: Path,
+    metric: ErrorKind = "reproduction",
+    workers: int = 1,
+    figures: FigureForm | None = None,
 ) -> None:
-    """Write results to a new results folder."""
+    """Write results to a new results folder, with the figures of the report as files if `figures` is given."""
     with atomic_folder(folder, "the results") as partial:
         for name, text in _files(run, metric, _pictures(run, scenes, metric, workers)).items():
             write_atomic(partial / name, text)
+        if figures:
+            write_atomic(partial / f"curves.{figures}", error_curves(run.results, metric, figures))
+            planes = error_planes(run.results, run.truths, metric, run.black_bodies, figures)
+            write_atomic(partial / f"chromaticities.{figures}", planes)
 
 
 def describe_run(

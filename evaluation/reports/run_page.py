@@ -24,7 +24,7 @@ from evaluation.scene import MixedScene, Scene
 from foundation import pages
 from foundation.colorimetry import srgb_codes
 from foundation.errors import counted
-from foundation.plots import FAINT, draw_svg, legend_label, series_style
+from foundation.plots import FAINT, FigureForm, draw_svg, legend_label, series_style
 
 # The axis of errors ends at this percentile of all methods' errors, because a few outliers would compress the curves.
 _AXIS_PERCENTILE = 98
@@ -44,10 +44,10 @@ _MIN_REACH = 0.01  # Half of the smallest range of an axis, for data sets with o
 _SCALE_PERCENTILE = 95  # The colour scale ends at this percentile of all methods' errors
 
 
-def error_curves(results: Sequence[Result], metric: ErrorKind) -> bytes:
-    """Return the cumulative error curves of methods as SVG: fraction of images up to each error."""
+def error_curves(results: Sequence[Result], metric: ErrorKind, form: FigureForm = "page") -> bytes:
+    """Return the cumulative error curves of methods: fraction of images up to each error."""
     rows = math.ceil(len(results) / 2)
-    return draw_svg(_draw_curves, results, metric, inches=(8.6, 3.9 + 0.19 * rows))
+    return draw_svg(_draw_curves, results, metric, inches=(8.6, 3.9 + 0.19 * rows), form=form)
 
 
 def _draw_curves(figure: Any, results: Sequence[Result], metric: ErrorKind) -> None:
@@ -71,8 +71,9 @@ def error_planes(
     truths: npt.NDArray[np.float64],
     metric: ErrorKind,
     black_bodies: Mapping[float, tuple[float, float, float]] = MappingProxyType({}),
+    form: FigureForm = "page",
 ) -> bytes:
-    """Return the errors over the chromaticity plane as SVG, one panel for each of the first twelve methods.
+    """Return the errors over the chromaticity plane, one panel for each of the first twelve methods.
 
     `truths`: (N, 3) float64, ground truths, camera RGB of any length. `black_bodies`: camera RGB by temperature, K.
     """
@@ -82,7 +83,7 @@ def error_planes(
     width, height = (
         (4.6, 3.9) if len(drawn) == 1 else (8.6, 0.5 + (7.0 / columns + 0.2) * math.ceil(len(drawn) / columns))
     )
-    return draw_svg(_draw_planes, drawn, truths, metric, black_bodies, inches=(width, height))
+    return draw_svg(_draw_planes, drawn, truths, metric, black_bodies, inches=(width, height), form=form)
 
 
 def _column_count(panels: int) -> int:
@@ -228,8 +229,8 @@ MAX_METHODS = 12  # Largest number of methods with images; more would make the p
 _DEFINITIONS = (
     "Recovery error: angle between estimated and true illuminant. Reproduction error: angle between white and a white "
     "surface after correction. Tri.: (Q1 + 2 Q2 + Q3) / 4. Best and worst 25%: mean of the errors up to the 25th and "
-    "from the 75th percentile. Avg.: geometric mean of mean, median, trimean, best and worst 25%. Percentiles as in "
-    "MATLAB's prctile (Hazen)."
+    "from the 75th percentile. Avg.: geometric mean of mean, median, trimean, best and worst 25%. Worst 5%: mean of "
+    "the errors from the 95th percentile. Percentiles as in MATLAB's prctile (Hazen)."
 )
 
 

@@ -1,12 +1,13 @@
 """Output of result tables for people: terminal, LaTeX, HTML.
 
-On a narrow terminal, names are wrapped; numbers are never cut. LaTeX follows tables 1 and 2 of the paper and needs no
-package. Tables are floats with a caption, and headings of several words are stacked. Tables with the same columns can
-be joined, each with its title.
+On a narrow terminal, names are wrapped; numbers are never cut. LaTeX needs the package booktabs, and graphicx for wide
+tables. Tables are floats with a caption and a label, the best numbers are bold, and headings of several words are
+stacked. Tables with the same columns can be joined, each with its title.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 from markupsafe import Markup
@@ -111,7 +112,7 @@ _LATEX_TEXTS = {
 }
 
 
-_NORMAL_COLUMNS = 7  # Columns of the paper's tables; wider tables use a smaller font to fit the text width
+_NORMAL_COLUMNS = 8  # Columns of a table with all error statistics; wider tables are scaled to the text width
 
 
 def escape_latex(text: str) -> str:
@@ -126,25 +127,27 @@ def escape_latex(text: str) -> str:
 
 
 def table_to_latex(table: Table) -> str:
-    r"""Return the table as a LaTeX float, with its title as caption and its notes below.
+    r"""Return the table as a LaTeX float, with its title as caption, a label, its best numbers bold and notes below.
 
     Examples
     --------
     >>> from evaluation.results.tables import Table
     >>> print(table_to_latex(Table("Errors", ("Algorithm", "Best 25%"), (("Gray-world", 1.5),))), end="")
+    % \usepackage{booktabs}
     \begin{table}[ht]
     \centering
     \caption{Errors}
-    \begin{tabular}{|l|r|}
-    \hline
-    \textbf{Algorithm} & \shortstack{\strut\textbf{Best}\\\textbf{25\%}}\\
-    \hline
+    \label{tab:errors}
+    \begin{tabular}{lr}
+    \toprule
+    Algorithm & \shortstack{\strut Best\\25\%}\\
+    \midrule
     Gray-world & 1.50\\
-    \hline
+    \bottomrule
     \end{tabular}
     \end{table}
     """
-    return _float(table.title, table, [_head_row(table), *_rows(table)], table.notes)
+    return _float(table.title, table, [_head_row(table), "\\midrule", *_rows(table)], table.notes)
 
 
 def tables_to_latex(caption: str, tables: Sequence[Table]) -> str:
@@ -156,27 +159,31 @@ def tables_to_latex(caption: str, tables: Sequence[Table]) -> str:
         )
     lines: list[str] = []
     for index, table in enumerate(tables):
-        title = f"\\multicolumn{{{len(table.columns)}}}{{|c|}}{{{escape_latex(table.title)}}}\\\\"
-        lines += ["\\hline", "\\hline"] if index else []
-        lines += [title, "\\hline", _head_row(table), *_rows(table)]
+        title = f"\\multicolumn{{{len(table.columns)}}}{{c}}{{{escape_latex(table.title)}}}\\\\"
+        lines += ["\\midrule"] if index else []
+        lines += [title, "\\midrule", _head_row(table), "\\midrule", *_rows(table)]
     return _float(caption, tables[0], lines, [note for table in tables for note in table.notes])
 
 
 def _float(caption: str, layout: Table, lines: Sequence[str], notes: Sequence[str]) -> str:
-    alignments = ["r" if is_number else "l" for is_number in layout.numeric()]
+    alignments = "".join("r" if is_number else "l" for is_number in layout.numeric())
+    is_wide = len(alignments) > _NORMAL_COLUMNS
     note_text = " ".join(f"{note.rstrip('.')}." for note in dict.fromkeys(notes))
     note_lines = [f"\\\\[.3em]\\parbox{{\\linewidth}}{{\\footnotesize {escape_latex(note_text)}}}"] if notes else []
+    label = re.sub(r"[^a-z0-9]+", "-", caption.lower()).strip("-")
     return "\n".join(
         [
+            "% \\usepackage{booktabs,graphicx}" if is_wide else "% \\usepackage{booktabs}",
             "\\begin{table}[ht]",
             "\\centering",
             f"\\caption{{{escape_latex(caption)}}}",
-            *(["\\scriptsize\\setlength{\\tabcolsep}{3pt}"] if len(alignments) > _NORMAL_COLUMNS else []),
-            f"\\begin{{tabular}}{{|{alignments[0]}|{''.join(alignments[1:])}{'|' if alignments[1:] else ''}}}",
-            "\\hline",
+            f"\\label{{tab:{label}}}",
+            *(["\\setlength{\\tabcolsep}{3pt}\\resizebox{\\linewidth}{!}{%"] if is_wide else []),
+            f"\\begin{{tabular}}{{{alignments}}}",
+            "\\toprule",
             *lines,
-            "\\hline",
-            "\\end{tabular}",
+            "\\bottomrule",
+            "\\end{tabular}" + "}" * is_wide,
             *note_lines,
             "\\end{table}",
             "",
@@ -187,20 +194,28 @@ def _float(caption: str, layout: Table, lines: Sequence[str], notes: Sequence[st
 def _head_row(table: Table) -> str:
     # Columns of numbers are narrow, so their headings are stacked.
     heads = [
-        _stacked(head) if is_number else f"\\textbf{{{escape_latex(head)}}}"
+        _stacked(head) if is_number else escape_latex(head)
         for head, is_number in zip(table.columns, table.numeric(), strict=True)
     ]
-    return f"{' & '.join(heads)}\\\\\n\\hline"
+    return f"{' & '.join(heads)}\\\\"
 
 
 def _stacked(head: str) -> str:
-    words = [f"\\textbf{{{escape_latex(word)}}}" for word in head.split()]
+    words = [escape_latex(word) for word in head.split()]
     over_each_other = r"\\".join(words)
-    return words[0] if len(words) == 1 else f"\\shortstack{{\\strut{over_each_other}}}"
+    return words[0] if len(words) == 1 else f"\\shortstack{{\\strut {over_each_other}}}"
 
 
 def _rows(table: Table) -> list[str]:
-    return [f"{' & '.join(map(escape_latex, row))}\\\\" for row in table.texts()]
+    best = table.best_cells()
+    cells = [
+        [
+            f"\\textbf{{{escape_latex(text)}}}" if (row, column) in best else escape_latex(text)
+            for column, text in enumerate(texts)
+        ]
+        for row, texts in enumerate(table.texts())
+    ]
+    return [f"{' & '.join(row)}\\\\" for row in cells]
 
 
 def table_part(table: Table) -> Markup:

@@ -1,14 +1,15 @@
 """Tables of results as values, printed by commands, shown on pages and written as CSV.
 
-Contains the general `Table`, its CSV text, and the tables of errors: the six statistics of Banić et al. 2019, all
-statistics, and errors under several illuminants. `reports.table_output` prints the tables.
+Contains the general `Table`, its CSV text, and the tables of errors: the statistics of Banić et al. 2019 and worst 5 %,
+all statistics, and errors under several illuminants. `reports.table_output` prints the tables.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,8 @@ class Table:
     - `rows`: each with one value for each column. A column of numbers and None is aligned as numbers.
     - `digits`: number of decimals of a float in printed tables; CSV has nine significant digits.
     - `notes`: sentences below the table.
+    - `best`: for columns of numbers, whether the smallest or the largest is printed bold in LaTeX.
+    - `margins`: half-widths of the intervals of numbers by row and column; printed after "±", not in CSV.
 
     Examples
     --------
@@ -44,6 +47,10 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     digits: int = 2
     notes: tuple[str, ...] = ()
+    best: Mapping[str, Literal["smallest", "largest"]] = field(
+        default_factory=dict[str, Literal["smallest", "largest"]]
+    )
+    margins: Mapping[tuple[int, int], float] = field(default_factory=dict[tuple[int, int], float])
 
     def __post_init__(self) -> None:
         lengths = {len(row) for row in self.rows} | {len(self.columns)}
@@ -54,7 +61,28 @@ class Table:
 
     def texts(self) -> tuple[tuple[str, ...], ...]:
         """Return the rows as text, numbers rounded to `digits`."""
-        return tuple(tuple(_text(cell, self.digits) for cell in row) for row in self.rows)
+        return tuple(
+            tuple(
+                _text(cell, self.digits)
+                + (f" ± {self.margins[row, column]:.{self.digits}f}" if (row, column) in self.margins else "")
+                for column, cell in enumerate(cells)
+            )
+            for row, cells in enumerate(self.rows)
+        )
+
+    def best_cells(self) -> set[tuple[int, int]]:
+        """Return row and column of the best numbers of the columns in `best`; equal texts are equal."""
+        best: set[tuple[int, int]] = set()
+        for name, direction in self.best.items() if len(self.rows) > 1 else ():
+            column = self.columns.index(name)
+            numbers = {
+                row: round(cell, self.digits)
+                for row, cells in enumerate(self.rows)
+                if isinstance(cell := cells[column], float) and math.isfinite(cell)
+            }
+            limit = (min if direction == "smallest" else max)(numbers.values(), default=None)
+            best |= {(row, column) for row, number in numbers.items() if number == limit}
+        return best
 
     def numeric(self) -> tuple[bool, ...]:
         """Return True for each column that contains numbers and no text."""
@@ -101,11 +129,16 @@ def table_to_csv(table: Table) -> str:
 
 PAPER_COLUMNS = ("Algorithm", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")  # Columns of Banić et al. 2019
 
+# Columns of all tables that do not reproduce tables of the paper.
+ERROR_COLUMNS = (*PAPER_COLUMNS, "Worst 5%")
+
+BEST_ERRORS: Mapping[str, Literal["smallest"]] = dict.fromkeys(ERROR_COLUMNS[1:], "smallest")
+
 # Further statistics: 95th percentile, maximum, and percentage of errors below 3 degrees.
 FURTHER_COLUMNS = ("95%", "Max.", "< 3° (%)")
 
 # Names of all statistics in files for programs; `below3` is a fraction, 0 … 1.
-STATISTICS_COLUMNS = ("mean", "median", "trimean", "best25", "worst25", "avg", "p95", "maximum", "below3")
+STATISTICS_COLUMNS = ("mean", "median", "trimean", "best25", "worst25", "avg", "worst5", "p95", "maximum", "below3")
 
 _NO_PIXEL_CAUSES = "too small for it, clipped, black or uniform"  # Reasons for an image without a usable pixel
 
@@ -113,7 +146,7 @@ _NAMED_IMAGES = 3  # Images named in a note; errors.csv lists all
 
 
 def summary_table(subject: Subject, results: Sequence[Result], metric: ErrorKind, with_further: bool = False) -> Table:
-    """Return the six statistics of one kind of error for each method, with notes on images without an estimate.
+    """Return the statistics of one kind of error for each method, with notes on images without an estimate.
 
     `with_further`: adds the 95th percentile, the maximum and the percentage below 3 degrees.
     """
@@ -123,9 +156,10 @@ def summary_table(subject: Subject, results: Sequence[Result], metric: ErrorKind
         mixed_text = " under several illuminants, compared with their mean"
     return Table(
         f"{subject.name}: {metric} angular error of {len(subject.images)} images{mixed_text}, degrees",
-        (*PAPER_COLUMNS, *(FURTHER_COLUMNS if with_further else ())),
+        (*ERROR_COLUMNS, *(FURTHER_COLUMNS if with_further else ())),
         tuple((result.marked_name, *_statistics(result.errors[metric], with_further)) for result in results),
         notes=tuple(note for result in results for note in _missing_estimate_notes(subject, result)),
+        best=BEST_ERRORS,
     )
 
 
@@ -145,7 +179,7 @@ def lights_tables(subject: Subject, results: Sequence[Result], metric: ErrorKind
         )
         single_results = [result.at(np.flatnonzero(single)) for result in results]
         rows = tuple((result.marked_name, *_statistics(result.errors[metric], False)) for result in single_results)
-        tables.append(Table(title, PAPER_COLUMNS, rows))
+        tables.append(Table(title, ERROR_COLUMNS, rows, best=BEST_ERRORS))
     return tuple(tables)
 
 
@@ -215,6 +249,7 @@ def _mixed_table(subject: Subject, results: Sequence[Result]) -> Table:
             "Mean light: one estimate for the whole image against the mean of its illuminants, as in the table above",
             *(excluded_note if excluded else ()),
         ),
+        best=dict.fromkeys(("MAE_illum", "MAE_rgb", "By region", "Mean light"), "smallest"),
     )
 
 

@@ -10,8 +10,8 @@
 - All other slots are achromatic references. They are spread evenly but irregularly, because a regular grid would cause
   streaks in the fitted flat field.
 
-The same bits, page and seed give the same chart. On A0, 221 × 155 slots hold 32 768 colours, 35 tags and 927
-references. For existing sheets, `paper_chart` makes the plain grid of the paper with 256 × 128 patches.
+The same bits, page and seed give the same chart. For existing sheets, `paper_chart` makes the plain grid of Banić et
+al. (2019) with 256 × 128 patches.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ TAG_IDS = 587  # Number of codes in the family 36h11
 
 MARGIN_MM = 8.0  # Smallest white margin. Printers need 3 to 5 mm, rulers and targets need the rest.
 
-# Columns and rows of blocks in the grid of the paper, for each number of bits. There is one block for each level of
+# Columns and rows of blocks in `paper_chart`, for each number of bits. A block contains all patches with one level of
 # blue.
 PAPER_BLOCKS = {1: (2, 1), 2: (2, 2), 3: (4, 2), 4: (4, 4), 5: (8, 4)}
 
 PAPER_REFERENCE_MM = 100.0  # Largest distance between the white references in the margins of `paper_chart`
 
-# Side of these references, 5 mm. It is even, so that the centre is a whole pixel.
+# Side of these references, 5 mm. The number is even, so that the centre has whole coordinates.
 PAPER_REFERENCE_PX = 118
 
 PAPER_REFERENCE_INTERVALS = 4  # Smallest number of intervals between white references in the top and right margin
@@ -112,13 +112,13 @@ class _Grid:
         """Number of slots without tags, for colours and references."""
         return self.columns * self.rows - len(self.tag_slots) * TAG_SLOTS**2
 
-    def holds(self, bits: int) -> bool:
-        # A chart needs at least two by two tags.
+    def fits(self, bits: int) -> bool:
+        # A chart of `bits` bits needs places for its colours and references, and at least two by two tags.
         if min(self.columns, self.rows) < 2 * TAG_SLOTS or len(self.tag_slots) > TAG_IDS:
             return False
         return self.free_slot_count >= 8**bits + _least_references(bits)
 
-    def mm(self, column: float, row: float) -> tuple[float, float]:
+    def position_mm(self, column: float, row: float) -> tuple[float, float]:
         """Return the position (x, y) of a point of the slot grid, mm."""
         x0, y0 = self.origin_px
         return (x0 + column * self.slot_px) * PX_MM, (y0 + row * self.slot_px) * PX_MM
@@ -138,7 +138,7 @@ def _least_references(bits: int) -> int:
 
 def smallest_page(bits: int) -> str:
     """Return the name of the smallest A page, landscape, on which a chart of `bits` bits fits."""
-    return next(name for name in reversed(A_SERIES_MM) if _Grid.on(A_SERIES_MM[name]).holds(bits))
+    return next(name for name in reversed(A_SERIES_MM) if _Grid.on(A_SERIES_MM[name]).fits(bits))
 
 
 def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, seed: int = 1) -> Chart:
@@ -155,8 +155,7 @@ def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, s
 
     Returns
     -------
-        The chart. The side of its patches is 5.292 mm. On a page that is too small for this, it is the largest multiple
-        of 5 pixels at 600 dpi that fits.
+        The chart, with the sizes that the module docstring gives.
     """
     if not 1 <= bits <= 5:
         raise InputError(f"{bits} bits per channel are given, expected 1 to 5; give another number")
@@ -186,7 +185,7 @@ def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, s
 def _choose_grid(bits: int, page: str | tuple[float, float] | None) -> tuple[_Grid, tuple[float, float]]:
     page_mm = _page_mm(smallest_page(bits) if page is None else page)
     grid = _Grid.on(page_mm)
-    if grid.holds(bits):
+    if grid.fits(bits):
         return grid, page_mm
     if len(grid.tag_slots) > TAG_IDS:
         raise InputError(
@@ -194,12 +193,12 @@ def _choose_grid(bits: int, page: str | tuple[float, float] | None) -> tuple[_Gr
             f"{TAG_FAMILY} has {TAG_IDS}; choose a smaller page"
         )
     smaller = (_Grid.on(page_mm, slot) for slot in range(SLOT_PX - SLOT_STEP_PX, LEAST_SLOT_PX - 1, -SLOT_STEP_PX))
-    fitting_grid = next((grid for grid in smaller if grid.holds(bits)), None)
+    fitting_grid = next((grid for grid in smaller if grid.fits(bits)), None)
     problem = (
         f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm is too small for the {8**bits} colours of a chart of {bits} bits"
     )
     if fitting_grid is None:
-        name = next(name for name in reversed(A_SERIES_MM) if _Grid.on(A_SERIES_MM[name], LEAST_SLOT_PX).holds(bits))
+        name = next(name for name in reversed(A_SERIES_MM) if _Grid.on(A_SERIES_MM[name], LEAST_SLOT_PX).fits(bits))
         width, height = A_SERIES_MM[name]
         raise InputError(
             f"{problem}, even with the smallest printable patches of {LEAST_SLOT_PX * PX_MM:.2f} mm; choose at least "
@@ -209,9 +208,9 @@ def _choose_grid(bits: int, page: str | tuple[float, float] | None) -> tuple[_Gr
 
 
 def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) -> Chart:
-    """Return the plain grid of the paper: 256 × 128 patches, each of the 32 768 colours once, without tags.
+    """Return the plain grid of Banić et al. (2019): 256 × 128 patches, one for each of 32 768 colours, without tags.
 
-    The paper does not describe the order of the colours, so this order is a reconstruction. There are 8 × 4 blocks of
+    The authors do not describe the order of the colours, so this order is a reconstruction. There are 8 × 4 blocks of
     32 × 32 patches. Red changes along the columns of a block, green along its rows, and blue from block to block. The
     directions alternate between blocks, so that neighbouring patches usually differ by one step in one channel.
 
@@ -298,7 +297,7 @@ def _tag(grid: _Grid, number: int, column: int, row: int) -> Tag:
     rim = TAG_SLOTS / (TAG_MODULES + 2)
     near, far = rim, rim + TAG_MODULES * rim
     corners = [(near, near), (far, near), (far, far), (near, far)]
-    return Tag(TAG_FAMILY, number, np.array([grid.mm(column + x, row + y) for x, y in corners]))
+    return Tag(TAG_FAMILY, number, np.array([grid.position_mm(column + x, row + y) for x, y in corners]))
 
 
 def _references(grid: _Grid, is_reference: _Slots, rng: np.random.Generator) -> list[Reference]:
@@ -306,8 +305,7 @@ def _references(grid: _Grid, is_reference: _Slots, rng: np.random.Generator) -> 
     codes[is_reference] = PAPER_WHITE[0]
     is_white = is_reference.copy()
     count = int(is_reference.sum())
-    # Each grey gets an eighth of the references. If there are few references, each grey gets fewer, so that at least
-    # `LEAST_WHITES` are white.
+    # Each grey gets an eighth of the references, or less, so that at least `LEAST_WHITES` references are white.
     grey_count = min(count // (2 * len(GREY_CODES)), (count - LEAST_WHITES) // len(GREY_CODES))
     for code in GREY_CODES:
         is_grey = spread(is_white, grey_count, rng)
@@ -317,7 +315,7 @@ def _references(grid: _Grid, is_reference: _Slots, rng: np.random.Generator) -> 
         Reference(
             name="white" if code == PAPER_WHITE[0] else f"grey {code}",
             rgb=(code, code, code),
-            centre_mm=grid.mm(int(column) + 0.5, int(row) + 0.5),
+            centre_mm=grid.position_mm(int(column) + 0.5, int(row) + 0.5),
             size_mm=grid.cell_mm,
         )
         for row, column in np.argwhere(is_reference)
@@ -329,8 +327,7 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
     """Choose `count` of the allowed slots (rows, columns), spread evenly but irregularly over the grid.
 
     Source: R. Ulichney, "The void-and-cluster method for dither array generation", 1993. The first choice is random.
-    Then each chosen slot in turn moves to the emptiest position in its quarter of the grid. One pass is enough: on A0,
-    no two references are closer than 4 slots, and no slot is farther than 6 slots from a reference.
+    Then each chosen slot in turn moves to the emptiest position in its quarter of the grid. One pass is enough.
     """
     rows, columns = allowed.shape
     middle_row, middle_column = (rows + 1) // 2, (columns + 1) // 2
@@ -346,7 +343,8 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
         is_chosen.flat[rng.choice(slots, quota, replace=False)] = True
     if count == 0:
         return is_chosen
-    # On A0, 0.4 times the mean distance between neighbours gives the most even pattern.
+    # Standard deviation of the Gaussian weights, in slots. On A0, 0.4 times the mean distance between neighbours gives
+    # the most even pattern.
     sigma = 0.4 * math.sqrt(allowed.size / count)
     down, across = _nearness(rows, sigma), _nearness(columns, sigma)
     # Small random numbers decide between slots with equal densities.
@@ -356,7 +354,6 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
         density -= np.multiply(down[:, row, None], across[:, column], out=contribution)
         penalty[row, column] = 0.0
         quarter = quarters[2 * int(row >= middle_row) + int(column >= middle_column)]
-        # The score of a slot that must not be chosen is infinite.
         score = density[quarter] + penalty[quarter]
         row, column = divmod(int(slot_numbers[quarter].flat[score.argmin()]), columns)
         density += np.multiply(down[:, row, None], across[:, column], out=contribution)

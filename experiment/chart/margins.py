@@ -39,7 +39,7 @@ def whole_px(boxes_mm: npt.ArrayLike) -> Boxes:
     )
 
 
-# Width of bare paper around the patches, 1.5 mm: three half-size pixels of the EOS 550D, which is more than its blur.
+# Width of bare paper around the patches, 1.5 mm. In an image by the EOS 550D, this is wider than the blur.
 GAP_PX = 35
 
 # Length and width of the strokes of a crop mark, 5 mm and 0.2 mm.
@@ -57,8 +57,7 @@ BARS_PX = (30, 20, 15, 12, 10, 8, 6, 5, 4, 3, 2, 1)
 
 BAR_LENGTH_PX = 75  # Length of the bars, 3.2 mm: several half-size pixels, which can be averaged
 
-# Diameter and number of spokes of the Siemens star. At its edge it has 0.75 line pairs per millimetre, which a
-# half-size image of the EOS 550D resolves.
+# Diameter and number of spokes of the Siemens star. At its edge it has 0.75 line pairs per millimetre.
 STAR_PX, STAR_CYCLES = 120, 12
 
 # Slanted edge of ISO 12233 with 4.8 degrees: number of steps, length of a step, and smallest depth of the black area.
@@ -160,13 +159,13 @@ class Margins:
     def __init__(self, field: Boxes, page_px: tuple[int, int], occupied: Boxes) -> None:
         self._field = field
         self._page = page_px
-        self._taken = [occupied.reshape(-1, 4)]
-        self._placed: list[Boxes] = []
+        self._occupied = [occupied.reshape(-1, 4)]
+        self._marks: list[Boxes] = []
 
     @property
     def boxes(self) -> Boxes:
         """(N, 4) int64 px, all marks."""
-        return np.concatenate([np.empty((0, 4), dtype=np.int64), *self._placed])
+        return np.concatenate([np.empty((0, 4), dtype=np.int64), *self._marks])
 
     def length(self, side: Side) -> int:
         """Return the extent of the patch area along a margin, px."""
@@ -184,8 +183,8 @@ class Margins:
         # Try the first position alone, because it is usually free.
         if len(positions) and self.put(side, boxes + np.array([positions[0], 0, positions[0], 0])):
             return True
-        is_taken = self._taken_at(side, boxes, positions)
-        return any(self.put(side, boxes + np.array([u, 0, u, 0])) for u in positions[~is_taken].tolist())
+        overlaps = self._overlaps_at(side, boxes, positions)
+        return any(self.put(side, boxes + np.array([u, 0, u, 0])) for u in positions[~overlaps].tolist())
 
     def crop_marks(self) -> None:
         """Mark each corner of the sheet by two strokes along the edges to be cut."""
@@ -251,11 +250,11 @@ class Margins:
                 placed = (right + v0, top + u0, right + v1, top + u1)
         return np.stack(placed, axis=1)
 
-    def _taken_at(self, side: Side, boxes: Boxes, shifts: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    def _overlaps_at(self, side: Side, boxes: Boxes, shifts: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
         """Return for each shift (M,) px along a margin whether boxes (N, 4) px in (u, v) overlap other marks."""
-        # If a box and a mark overlap in v, one open interval of shifts makes them overlap in u.
+        # A box and a mark that overlap in v also overlap in u for one open interval of shifts.
         axis, across = (0, 1) if side in {"top", "bottom"} else (1, 0)
-        boxes, marks = self._on_sheet(side, boxes), np.concatenate(self._taken)
+        boxes, marks = self._on_sheet(side, boxes), np.concatenate(self._occupied)
         lows, highs = boxes[:, None, across] - _MARK_GAP_PX, boxes[:, None, across + 2] + _MARK_GAP_PX
         marks = marks[(lows.min() < marks[:, across + 2]) & (marks[:, across] < highs.max())]
         box_index, other_index = np.nonzero((lows < marks[:, across + 2]) & (marks[:, across] < highs))
@@ -274,11 +273,11 @@ class Margins:
         margin = np.array([-_MARK_GAP_PX, -_MARK_GAP_PX, _MARK_GAP_PX, _MARK_GAP_PX])
         # Only marks that overlap the bounding box can overlap one of the boxes.
         enlarged_hull = hull[None] + margin
-        near_boxes = [mark_boxes[_overlapping(mark_boxes, enlarged_hull)] for mark_boxes in self._taken]
+        near_boxes = [mark_boxes[_overlapping(mark_boxes, enlarged_hull)] for mark_boxes in self._occupied]
         if any(_any_overlap(boxes + margin, mark_boxes) for mark_boxes in near_boxes):
             return False
-        self._taken.append(boxes)
-        self._placed.append(boxes)
+        self._occupied.append(boxes)
+        self._marks.append(boxes)
         return True
 
 
@@ -316,7 +315,7 @@ def margin_marks(field: Boxes, page_px: tuple[int, int], occupied: Boxes, lines:
     targets = target_boxes()
     target_length = int(targets[:, 2].max()) + GAP_PX
     across, down = margins.length("top"), margins.length("right")
-    # If text and targets do not both fit above, the targets are only on the right.
+    # If the text does not fit next to targets above, it has priority.
     name_length = max(int(text_boxes(line)[:, 2].max(initial=0)) for line in text_lines) if text_lines else 0
     has_room = across >= 2 * target_length + name_length
     if has_room:

@@ -30,15 +30,15 @@ PAPER_WHITE = (255, 255, 255)  # Printed code of bare paper: no ink
 # Family of the AprilTags: codes of 36 bits, any two of which differ in at least 11 bits (E. Olson, ICRA 2011).
 TAG_FAMILY = "36h11"
 
-# Number of modules along the black square of a tag: 6 modules of data, and a border of one module on each side. The
-# white rim is outside the square.
+# Number of modules (small squares) along the black square of a tag: 6 for data, and one for the border on each side.
+# The white rim is outside the square.
 TAG_MODULES = 8
 
 
 def colour_of_index(index: npt.ArrayLike, bits: int) -> npt.NDArray[np.uint8]:
     """Return the printed 8-bit RGB codes (..., 3) uint8 of colour indices; unused low bits are 0.
 
-    `bits`: bits per channel, 1 … 5 (the paper has 5, that is 32³ colours, section 3.2).
+    `bits`: bits per channel, 1 … 5. Banić et al. (2019, section 3.2) use 5 bits, that is 32³ colours.
     """
     index = np.asarray(index)
     mask = (1 << bits) - 1
@@ -93,7 +93,7 @@ class Chart:
     cell_mm
         Width and height of a patch.
     centres_mm
-        (8**bits, 2) float64, centre of each patch, in the order of the file.
+        (8**bits, 2) float64, centre of each patch, in the order of `chart.json`.
     colours
         (8**bits,) int64, colour index of each patch, in the same order.
     tags, references
@@ -120,7 +120,7 @@ class Chart:
 
     @cached_property
     def rgb(self) -> npt.NDArray[np.uint8]:
-        """(8**bits, 3) uint8, printed code of each patch, in the order of the file."""
+        """(8**bits, 3) uint8, printed code of each patch, in the order of `chart.json`."""
         return colour_of_index(self.colours, self.bits)
 
     @cached_property
@@ -136,7 +136,7 @@ class Chart:
         return tuple(reference for reference in self.references if reference.is_white)
 
     def to_json(self) -> str:
-        """Return the text of `chart.json`. Equal charts have the same text, also after they are saved and read."""
+        """Return the text of `chart.json`, which is the same for equal charts."""
         document = {
             "format": FORMAT,
             "version": VERSION,
@@ -158,7 +158,7 @@ class Chart:
                 for reference in self.references
             ],
         }
-        # Omit keys without a value, so that a chart that is read and saved again keeps its hash.
+        # Keys without a value are omitted. Thus a chart that was read has the hash of its file.
         document |= {
             key: value for key, value in (("seed", self.seed), ("software", self.software)) if value is not None
         }
@@ -210,7 +210,7 @@ def load_chart(path: Path) -> Chart:
         raise reading_error(path, error, "give the chart.json of the print", "chart") from error
     if path.suffix.lower() != ".json" and not text.lstrip().startswith(b"{"):
         remedy = "give chart.json, which acquire chart writes next to the files to print"
-        raise FormatError("not a chart: chart.json contains JSON text", about=path, remedy=remedy)
+        raise FormatError("not a chart, expected the JSON text of chart.json", about=path, remedy=remedy)
     document = from_json(_Document, text, path, "restore it from a copy")
     count = 8**document.bits
     colours = np.asarray(document.cells.colour, dtype=np.int64)

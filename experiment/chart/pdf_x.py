@@ -8,9 +8,9 @@ PDF/X-4 has these requirements. The numbers are clauses of ISO 32000-1 (PDF 1.7)
 - XMP metadata with the version of PDF/X, dates, identifiers and trapping (14.3.2, 14.11.6).
 - No fonts, actions or external files; no transparency, no transfer functions.
 
-The codes on the page are not tagged, so they are not changed if colour management is off. For printing with colour
-management, the output intent of a PDF needs the ICC profile of an output device, and a TIFF needs that of an input
-device or display. Both profiles declare sRGB (IEC 61966-2-1). Neither describes a printer.
+The codes on the page have no profile (they are untagged), so they are not changed if colour management is off. For
+printing with colour management, the output intent of a PDF needs the ICC profile of an output device, and a TIFF needs
+the profile of an input device or display. Both profiles declare sRGB (IEC 61966-2-1). Neither describes a printer.
 
 Source of the profiles: ICC.1:2001-04 (version 2.4), header 6.1, required tags 6.3, lut16Type 6.5.8,
 textDescriptionType 6.5.17. The primaries of sRGB are adapted to D50 by the Bradford transform, as in the sRGB profiles
@@ -86,7 +86,7 @@ def row_of_pixels(codes: Sequence[Code], box: Box) -> bytes:
 
 
 def save_page(path: Path, size_pt: tuple[float, float], content: bytes, title: str, subject: str) -> None:
-    """Write a page as PDF/X-4; the same content gives the same bytes."""
+    """Write a page as PDF/X-4."""
     packed, profile = zlib.compress(content, 6), zlib.compress(srgb_output_profile(), 9)
     name = hashlib.sha256(content + title.encode() + subject.encode()).hexdigest()
     metadata = _metadata(title, subject, name).encode()
@@ -173,7 +173,7 @@ def srgb_output_profile() -> bytes:
     # XYZ is a linear function of linear RGB, so a table with two points on each axis is exact.
     xyz, rgb = np.rint(_ONE_XYZ * (corners @ _PRIMARIES.T)).astype(np.uint16), (_FULL * corners).astype(np.uint16)
     to_pcs = _lut16(np.eye(3), _curves(decode_srgb(np.linspace(0, 1, _CURVE))), xyz, _LINEAR)
-    # The matrix is applied to encoded values; an encoded 1 is 65535 / 32768 in XYZ.
+    # The matrix is applied to encoded XYZ divided by 65535. The quotient 1 is X = 65535 / 32768.
     from_xyz = np.linalg.inv(_PRIMARIES) * _FULL / _ONE_XYZ
     from_pcs = _lut16(from_xyz, _LINEAR, rgb, _curves(encode_srgb(np.linspace(0, 1, _CURVE))))
     tags = {

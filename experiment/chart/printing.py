@@ -1,10 +1,10 @@
 """Draw the sheet as rectangles on bare paper, and save it as TIFF, PDF and preview.
 
-- The files have true size: print them at 100 %, never with "fit to page". In the TIFF, all patches and all tag modules
-  have the same whole number of pixels. Unequal modules would shift the detected corners of a tag.
-- The codes are amounts of ink, not colours. The colours are measured later. Therefore the codes are untagged on the
-  page of the PDF and in the normal TIFF. For printing with colour management, the output intent of the PDF and the
-  tagged TIFF declare sRGB.
+- The files have true size: print them at 100 %, never with "fit to page". In the TIFF, each patch has the same whole
+  number of pixels, and each tag module, too. Unequal modules would shift the detected corners of a tag.
+- The codes are amounts of ink, not colours. Therefore the codes have no profile (they are untagged) on the page of the
+  PDF and in the normal TIFF. For printing with colour management, the output intent of the PDF and the tagged TIFF
+  declare sRGB.
 - An A0 sheet at 600 dpi has 1.7 GB of pixels, so it is compressed strip by strip and never completely in memory.
 """
 
@@ -31,12 +31,12 @@ POINTS_PER_MM = 72 / MM_PER_INCH  # A PDF has 72 points per inch (ISO 32000-1, 8
 # Number of rows in a strip of the TIFF. A strip of an A0 sheet at 600 dpi has 5 MB.
 _STRIP_ROWS = 64
 
-_BANDS = 64  # Number of bands of equal rows that are painted at a time, which limits memory
+_BANDS = 64  # A band is a group of equal rows; this number of bands is painted at a time to limit memory
 
 _SUPERSAMPLING = 8  # A preview pixel is the mean of this number of fine pixels in each direction
 
-# In the PDF, a patch overlaps the next patches by the first length, so that no line of paper is visible between them.
-# Every rectangle is reduced by the second length on all sides, so that rounding errors do not paint the next pixel.
+# In the PDF, a patch overlaps the next patches by `_OVERLAP_PX`, so that no line of paper is visible between them.
+# Every rectangle is reduced by `_INSET_PX` on all sides, so that rounding errors do not paint the next pixel.
 _OVERLAP_PX, _INSET_PX = 0.2, 0.01
 
 
@@ -47,7 +47,7 @@ class Drawing:
     page_mm: tuple[float, float]  # width and height of the sheet
     rectangles_mm: npt.NDArray[np.float64]  # (N, 4), left, top, right, bottom, from the top-left corner of the sheet
     rgb: npt.NDArray[np.uint8]  # (N, 3), printed code of each rectangle; (255, 255, 255) is bare paper
-    tiles: int = 0  # number of adjacent patches and references, row by row, at the end of the rectangles
+    tiles: int = 0  # so many rectangles at the end are adjacent patches and references, row by row
 
 
 def drawing(chart: Chart) -> Drawing:
@@ -109,8 +109,8 @@ def _marks_px(chart: Chart) -> Boxes:
 def tag_modules(tag: Tag) -> npt.NDArray[np.bool_]:
     """Return the modules of a tag on the upright print, (8, 8) bool, true for white.
 
-    OpenCV's `DICT_APRILTAG_36h11` has each tag rotated by 180° against the tag of the AprilTag authors. Their detector
-    returns the same id, and the corners of `corners_mm` in the order [1, 0, 3, 2].
+    In OpenCV's `DICT_APRILTAG_36h11`, each tag is rotated by 180° against the tag of the AprilTag authors. The detector
+    of these authors returns the same id, and the corners of `corners_mm` in the order [1, 0, 3, 2].
     """
     import cv2
 
@@ -152,7 +152,7 @@ def label_lines(chart: Chart) -> tuple[str, str]:
 
 
 def label(chart: Chart) -> str:
-    """Return `label_lines` in one line."""
+    """Return both lines of `label_lines` as one line."""
     return ". ".join(label_lines(chart))
 
 
@@ -195,7 +195,7 @@ def _require_whole_pixels(chart: Chart, dpi: int) -> None:
         pixels = length * dpi / MM_PER_INCH
         if dpi < 1 or round(pixels) < 1 or abs(pixels - round(pixels)) > 1e-3:
             raise InputError(
-                f"at {dpi} dpi a length of {length:.3f} mm is {pixels:.2f} pixels, expected a whole number; "
+                f"at {dpi} dpi a patch or tag module of {length:.3f} mm has {pixels:.2f} px, expected a whole number; "
                 f"choose {_whole_pixel_resolutions(lengths)} dpi, or print the PDF"
             )
 
@@ -241,10 +241,7 @@ def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI, tagged: bool = Fa
 
 
 def save_pdf(chart: Chart, path: Path) -> None:
-    """Write the sheet as PDF/X-4: one page of filled rectangles in DeviceRGB.
-
-    The same chart gives the same bytes.
-    """
+    """Write the sheet as PDF/X-4: one page of filled rectangles in DeviceRGB."""
     save_drawing(drawing(chart), path, label(chart), f"chart.json has SHA-256 {chart.sha256}")
 
 
@@ -289,7 +286,6 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     band_tops, band_bottoms = np.array([[top, bottom] for top, bottom, _ in bands]).T
     tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
     shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)
-    # The matrix is sparse, because each row overlaps few bands.
     weights = sparse.csr_array(np.maximum(shared, 0) / _SUPERSAMPLING)
     picture = np.asarray(weights @ means.reshape(len(bands), -1), dtype=np.float64)
     return np.rint(picture).reshape(height_px, width_px, 3).astype(np.uint8)

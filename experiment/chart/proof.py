@@ -21,7 +21,7 @@ from foundation.files import write_atomic
 
 PAGE_MM = (297.0, 210.0)  # A4, landscape (ISO 216), which every printer has
 
-# Largest width and height of the area with patches.
+# Largest width and height of the area with patches on the proof page.
 WINDOW_MM = (262.0, 107.0)
 
 CORNER_PX = (360, 330)  # Left and top of the area with patches, px at 600 dpi
@@ -137,8 +137,8 @@ In the RIP      Colour management: off / "none" / "as target (profiling chart)".
                 printer: as usual.
 In a driver     "No colour adjustment" / "application manages colours", from a program that does not convert colours
                 (Adobe Color Printer Utility, ColorSync Utility "print as colour target").
-If you need     Use none, and do not convert to CMYK. The output intent of the PDF is sRGB only because PDF/X requires
-a profile       an output intent. Do not convert to it.
+Profile         Use no profile, and do not convert to CMYK. The output intent of the PDF is sRGB only because PDF/X
+                requires an output intent. Do not convert to it.
 Quality         The best of the printer, at least 600 dpi; no smoothing, sharpening or interpolation of the image.
 Paper           Matte, white, heavy enough to hang flat (180 g/m² or more). If possible, no optical brighteners.
 Finish          None: no varnish, no lamination, no mounting under film or glass.

@@ -4,8 +4,8 @@ The corners come from the user or from another frame of the session. Their order
 chart. The image is compared with the printed codes, so a wrong order and a mirrored image are detected.
 
 Users give corners in pixels of the raw file before any rotation: x to the right, y down, (0, 0) is the first visible
-pixel. The first corner is the one that is printed top-left, and the others follow clockwise. All other positions are
-in half-size pixels. The traced outline includes lens distortion; `homography` does not.
+pixel. The first corner is printed top-left, and the other three follow clockwise. Positions in the code are in
+half-size pixels. The traced outline includes lens distortion; `homography` does not.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ CORNER_REACH_PX = 24.0
 SIDE_POINTS = 160  # Number of points on each side at which the edge is searched
 
 
-# Shortest side of the patch area, raw pixels: twice the width of the band in which its edge is searched.
+# Shortest side of the patch area, raw pixels: twice the width of the band in which an edge is searched.
 LEAST_SIDE_PX = 192
 
 
-# Smallest fraction of the variance between patches that the printed codes must explain. The codes of a different chart
+# The printed codes must explain at least this fraction of the variance between patches. The codes of a different chart
 # explain almost nothing.
 MIN_EXPLAINED = 0.5
 
-# The given orientation is refused if its residual exceeds the residual of the best orientation by more than this
-# factor.
+# The given orientation is refused if its misfit of colours, divided by this factor, is still larger than the misfit of
+# the best orientation.
 MIN_ADVANTAGE = 1.3
 
 MIRRORED = 4  # Orientations from this number on are mirrored: 0 … 3 are quarter turns, 4 … 7 mirrored quarter turns
@@ -70,14 +70,14 @@ _REFINE_ALONG_PX = np.arange(-2.0, 2.1)
 _REFINE_ACROSS_PX = np.arange(-3.5, 2.1, 0.5)
 
 # Iterations of the fit of a blurred step. Each iteration moves the step by at most 0.5 px.
-_REFINE_STEPS = 6
+_REFINE_ROUNDS = 6
 
 _INTERPOLATION_PX = 0.4  # σ of the blur that linear interpolation adds to an edge, half-size px
 
 # Largest correction of an edge position, half-size px. The samples do not reach farther.
 _LARGEST_CORRECTION_PX = 1.5
 
-_CLEAR_EDGE = 0.15  # Smallest step whose position is accurate to 0.1 px, relative to paper
+_CLEAR_EDGE = 0.15  # Smallest step from patches to paper, relative to paper, whose position is accurate to 0.1 px
 
 # Order of the curve through the deviations along a side. It is high enough for curled corners, and too low to follow
 # marks in the margin.
@@ -195,7 +195,7 @@ def _find_near_field(planes: Sequence[Plane], chart: Chart, near_px: _Points, im
         placed = _PlacedChart.of(outline, chart, 0)
         explained = 1 - _colour_misfit(picture, placed, chart)[1]
         if explained >= MIN_EXPLAINED:
-            return placed.field(explained)
+            return placed.detected_field(explained)
     raise RegistrationError(
         f"{image_name}: the patch area is not within {2 * CORNER_REACH_PX:.0f} pixels of {corners_text(near_px)}, its "
         "position in another frame; uncover the chart and light all of it, or, if it was moved, take the following "
@@ -218,7 +218,7 @@ def _find_given_field(picture: PreparedImage, chart: Chart, corners_px: _Points,
     best_turn = int(np.argmin([misfit for misfit, _ in misfits]))
     fits_other_turn = best_turn > 0 and MIN_ADVANTAGE * misfits[best_turn][0] < misfits[0][0]
     if explained >= MIN_EXPLAINED and not fits_other_turn:
-        return placed_charts[0].field(explained)
+        return placed_charts[0].detected_field(explained)
     if 1 - misfits[best_turn][1] < MIN_EXPLAINED or not fits_other_turn:
         raise RegistrationError(
             f"{image_name}: within the given corners {given_corners}, the chart's colours explain "
@@ -271,7 +271,7 @@ class _PlacedChart:
         return cls(corners_mm, corners_px, homography, mm, px, normals)
 
     def to_pixels(self, points_mm: _Points) -> _Points:
-        """Map points (N, 2) to the image by the homography, corrected by its interpolated errors at the four sides."""
+        """Map points (N, 2) to the image by the homography, and add its errors, interpolated from the four sides."""
         mapped = project(self.homography, points_mm)
         (left, top), (right, bottom) = self.corners_mm[0], self.corners_mm[2]
         fraction = (points_mm - (left, top)) / (right - left, bottom - top)
@@ -286,7 +286,7 @@ class _PlacedChart:
                 mapped[:, axis] += weight * np.interp(position, side_position, deviation[:, axis])
         return mapped
 
-    def field(self, explained: float) -> DetectedField:
+    def detected_field(self, explained: float) -> DetectedField:
         mm, px, normals = (np.concatenate(sides) for sides in (self.sides_mm, self.sides_px, self.normals))
         return DetectedField(self.corners_px, self.homography, mm, px, normals, explained)
 
@@ -294,8 +294,9 @@ class _PlacedChart:
 def _colour_misfit(picture: PreparedImage, placed: _PlacedChart, chart: Chart) -> tuple[float, float]:
     """Return two misfits between the image and the printed codes, each 0 … 1.
 
-    For each channel, the scatter of the patches around a fit of light and codes is divided by the scatter around a fit
-    of light alone. The first misfit is the product of these ratios, the second is the mean of their squares.
+    Two models are fitted to each channel: light and codes, and light alone. The scatter of the patches around the first
+    fit is divided by the scatter around the second. The first misfit is the product of these ratios, the second is the
+    mean of their squares.
     """
     sampled_patches = np.random.default_rng(1).permutation(chart.colour_count)[:_COMPARED_CELLS]
     points = chart.centres_mm[sampled_patches]
@@ -550,10 +551,10 @@ def _fitted_step(profile: _Points, sigma: float) -> tuple[_Points, _Points]:
     """Fit a step blurred by `sigma` px to each profile (N, M); return the offsets (N,) px and heights (N,)."""
     offsets: _Points = np.zeros(len(profile))
     heights: _Points = np.zeros(len(profile))
-    for _ in range(_REFINE_STEPS):
+    for _ in range(_REFINE_ROUNDS):
         distances = (_REFINE_ACROSS_PX[None] - offsets[:, None]) / sigma
         step, slope = ndtr(distances), np.exp(-0.5 * distances**2) / np.sqrt(2 * np.pi) / sigma
-        # The brightness changes between patches, so their side of the step also has a slope.
+        # The brightness changes from patch to patch, so the patches' side of the step also has a slope.
         design = np.stack([np.ones_like(step), step, slope, np.minimum(_REFINE_ACROSS_PX[None], 0) + 0 * step], axis=-1)
         gram = np.einsum("kni,knj->kij", design, design) + 1e-9 * np.eye(4)
         solution = np.linalg.solve(gram, np.einsum("kni,kn->ki", design, profile)[..., None])[..., 0].astype(np.float64)

@@ -26,7 +26,8 @@ from foundation.errors import InputError, RegistrationError
 
 MIN_TAGS = 2  # Smallest number of tags for a homography: two tags have eight corners, and four points are needed.
 
-# Smallest fraction of the tags that must be detected. Otherwise a part of the chart is covered, dark or outside.
+# At least this fraction of the tags must be detected. If not, a part of the chart is covered, dark or outside the
+# image.
 MIN_TAG_SHARE = 0.75
 
 MIN_MODULE_PX = 3.0  # Smallest module of a tag, half-size px; tags with smaller modules are often missed
@@ -63,14 +64,14 @@ class ChartPose:
     """Pose of the chart in one image, in half-size pixels."""
 
     plane: Plane  # colour plane in which the chart was detected
-    tags: tuple[DetectedTag, ...]  # detected tags of the chart, by id
+    tags: tuple[DetectedTag, ...]  # detected tags of the chart, sorted by id
     missing: tuple[int, ...]  # ids of the tags that were not detected
     homography: npt.NDArray[np.float64]  # (3, 3), print (mm) to image (px), without lens distortion
     residual_px: float  # RMS residual of tag corners or outline; includes lens distortion and waves of the paper
     module_px: float  # module of the smallest tag; NaN without tags
-    fill: float  # larger of page width / image width and page height / image height
+    fill: float  # page width / image width, or page height / image height, whichever is larger
     inside: bool  # whether all four page corners are in the image
-    rotation_deg: float  # clockwise, page x axis against image x axis
+    rotation_deg: float  # rotation of the x axis of the page, clockwise from the x axis of the image
     field: DetectedField | None = None  # patch area of a chart without tags, else None
 
     @property
@@ -241,7 +242,7 @@ def _detect(image: npt.NDArray[np.uint8], offset_px: tuple[float, float]) -> tup
     detector: Detector = _detectors.detector
     tags: dict[int, DetectedTag] = {}
     for detection in detector.detect(np.ascontiguousarray(image)):
-        # In AprilTag, whole coordinates are the corners of pixels. Here they are the centres.
+        # In AprilTag, whole coordinates are corners of pixels. In our code, they are centres of pixels.
         corners = detection.corners[_CORNERS] - 0.5 + np.asarray(offset_px)
         tag = DetectedTag(detection.tag_id, corners, float(detection.decision_margin))
         if detection.hamming <= 1 and (tag.id not in tags or tags[tag.id].margin < tag.margin):
@@ -261,10 +262,10 @@ _Image = npt.NDArray[np.uint8]
 
 
 def annotated_png(mosaic: Mosaic, chart: Chart, pose: ChartPose | None) -> bytes:
-    """Draw the pose of the chart onto a frame of half size and return it as PNG bytes.
+    """Draw the pose of the chart onto a frame of half size, and return the drawing as PNG bytes.
 
     The drawing shows the page and the tags, or the outline of the patch area. Without `pose`, it shows all detected
-    tags and the expected ids; for a chart without tags, an instruction to give its corners.
+    tags and the expected ids. If the chart has no tags, it shows how to give the corners of the patch area.
     """
     black = frame_black(mosaic)
     plane = pose.plane if pose is not None else strongest_plane(mosaic, black)
@@ -338,7 +339,7 @@ def _draw_text(image: _Image, *lines: str) -> None:
 # Smallest side of a patch, half-size px: 5 px for its 5 × 5 samples, and 3 px for rounding, registration and blur.
 MIN_CELL_PX = 8.0
 
-# Width and height of a half-size image, px, for the cameras of the paper (Banić et al. 2019, section 3.3).
+# Width and height of a half-size image, px, for both cameras of Banić et al. (2019, section 3.3).
 HALF_SIZE_PX = {"EOS 550D": (2601, 1732), "EOS 6D Mark II": (3132, 2090)}
 
 FILL = 0.94  # Assumed fraction of the image that the page fills in width or height, whichever is larger
@@ -364,7 +365,7 @@ class _ApparentSize:
 
 
 def apparent_sizes(chart: Chart) -> list[_ApparentSize]:
-    """Return the size of a chart in the image of each camera of the paper, if it fills 94 % of the frame."""
+    """Return the size of a chart in the image of each camera in `HALF_SIZE_PX`, if it fills 94 % of the frame."""
     module_mm = min((float(np.ptp(tag.corners_mm[:, 0])) / TAG_MODULES for tag in chart.tags), default=None)
     page = sorted(chart.page_mm)
     sizes: list[_ApparentSize] = []
@@ -375,7 +376,7 @@ def apparent_sizes(chart: Chart) -> list[_ApparentSize]:
 
 
 def small_parts_warning(chart: Chart) -> str | None:
-    """Return a warning if a camera of the paper cannot separate the patches or read the tags, else None."""
+    """Return a warning if a camera in `HALF_SIZE_PX` cannot separate the patches or read the tags, else None."""
     sizes = apparent_sizes(chart)
     if all(size.is_sufficient for size in sizes):
         return None

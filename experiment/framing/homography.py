@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-# Points count as collinear if their extent across a line is at most this fraction of their extent along it. Two small
-# tags at opposite ends of an A0 sheet have 1e-3.
+# Points count as collinear if their extent across a line is at most this fraction of their extent along it. For two
+# small tags at opposite ends of an A0 sheet, the ratio is 1e-3.
 _COLLINEAR_RATIO = 1e-6
 
 _Points = npt.NDArray[np.float64]
@@ -78,7 +78,7 @@ def fit_homography(points: _Points, targets: _Points, tolerance: float | None = 
     # Collinear points do not determine a homography, but OpenCV may return one.
     if on_one_line(points) or on_one_line(targets):
         return None
-    # For other degenerate pairs OpenCV returns None, so the array has no shape.
+    # For other degenerate pairs OpenCV returns None, and the shape of the array is ().
     method, threshold = (0, 3.0) if tolerance is None else (cv2.RANSAC, tolerance)
     matrix = np.asarray(cv2.findHomography(points, targets, method, threshold)[0], dtype=np.float64)
     return matrix if matrix.shape == (3, 3) else None

@@ -22,14 +22,14 @@ from experiment.framing.field import DetectedField
 from experiment.framing.finding import AMBER, FONT, GREEN, RED, ChartPose, DetectedTag
 from foundation.robust import huber_weights, robust_sigma
 
-# Largest movement that can be measured, half-size px. After a larger one, the edge is outside the crop around its
+# Largest movement that can be measured, half-size px. After a larger movement, the edge is outside the crop around its
 # gauge.
 MAX_SHIFT_PX = 3.0
 
 # Largest movement after which the sampling grid stays where it is, half-size px.
 STILL_PX = 0.1
 
-# Largest movement after which the grid is only shifted, half-size px. After a larger one, the chart is registered
+# Largest movement after which the grid is only shifted, half-size px. After a larger movement, the chart is registered
 # again, because it may also have rotated.
 REREGISTER_PX = 0.5
 
@@ -42,7 +42,7 @@ _SETTLED_PX = 1e-3  # The iteration ends after a step below this length, half-si
 # Margin that is read around a tag, half-size px: space for the largest movement and for the smoothing.
 _AROUND_TAG_PX = 12
 
-_STRIPS = 32  # Number of strips along the outline: enough to outvote some covered strips
+_STRIPS = 32  # Number of strips along the outline: so many that some covered strips have little influence
 
 _STRIP_ALONG, _STRIP_ACROSS = 30, 8  # Half the extent of a strip along and across the edge, px
 
@@ -51,7 +51,9 @@ _STRIP_REACH_PX = 6
 
 _MIN_STRIPS = 8  # Smallest number of strips: twice the number of parameters of the movement
 
-_LEAST_CORRELATION = 0.5  # Smallest correlation of a gauge between the two frames (judgement)
+# Smallest correlation of a gauge between the two frames. Chosen by judgement: a covered gauge has a smaller
+# correlation.
+_LEAST_CORRELATION = 0.5
 
 # Smallest eigenvalue of the scaled normal matrix of a tag. Below it, the image of the tag has too little structure.
 _LEAST_EIGENVALUE = 1e-6
@@ -63,12 +65,12 @@ _Points = npt.NDArray[np.float64]
 class Shift:
     """Movement of the chart between two frames, half-size px."""
 
-    dx: float  # median over tags, or robust fit of the strips; positive to the right
-    dy: float  # the same in the other direction; positive downwards
+    dx: float  # movement to the right: median over tags, or robust fit of the strips
+    dy: float  # movement downwards, from the same tags or strips
     largest_px: float  # largest movement of a tag or of a corner of the patch area, which includes rotation
     gauges: int  # number of measured tags or strips; 0 means that the movement is unknown
-    # Variance σ² of the blur in the later frame minus σ² in the earlier frame, px²; median over the gauges. Values
-    # above 1 px² are too low, because the calculation is a linear approximation.
+    # Variance σ² of the blur in the later frame minus σ² in the earlier frame, px²; median over the gauges. The
+    # calculation is a linear approximation, so it underestimates a growth of more than 1 px².
     blur_growth_px2: float = 0.0
 
     @property
@@ -112,7 +114,7 @@ def shift_between(reference: Plane, pose: ChartPose, plane: Plane) -> Shift:
     """Measure movement and growth of blur of the chart between two planes of the same channel.
 
     The brightness may change between the frames by a factor and an offset. Movements up to `MAX_SHIFT_PX` are measured.
-    The error is about 0.005 px if paper has some hundred counts.
+    The error is about 0.005 px if paper has a few hundred counts.
 
     Parameters
     ----------
@@ -135,7 +137,6 @@ def shift_between(reference: Plane, pose: ChartPose, plane: Plane) -> Shift:
 
 
 def _gauge_tags(pose: ChartPose) -> list[DetectedTag]:
-    # A few tags with evenly spaced ids.
     tags = sorted(pose.tags, key=lambda tag: tag.id)
     last = len(tags) - 1
     return [tags[index] for index in sorted({round(last * step / (_GAUGE_TAGS - 1)) for step in range(_GAUGE_TAGS)})]
@@ -213,7 +214,7 @@ def _field_shift(reference: Plane, plane: Plane, field: DetectedField) -> Shift:
         return _UNKNOWN
     earlier = _sampled(reference, samples)
     slope = np.asarray(np.gradient(earlier, axis=2))
-    # The blur term is as for a tag, but only across the edge, because blur along an edge has no effect.
+    # The term of the blur (see `_tag_shift`) has only the direction across the edge: blur along an edge has no effect.
     bend = np.zeros_like(earlier)
     bend[:, :, 1:-1] = np.diff(earlier, 2, axis=2)
     # The samples at the ends of a strip lack a neighbour, so they are not used.
@@ -287,7 +288,9 @@ _LETTER_PX = 7.4  # Width of a letter at `_SCALE`, px
 
 _SCALE = 0.42  # Scale of OpenCV's font: the smallest that is easy to read
 
-_LEAST_WHITE = 0.01  # Lower limit of the level that is shown as white, relative to white; limits visible noise
+# Smallest level that a preview shows at full brightness, relative to white paper. A lower level would make the noise of
+# a dark frame visible.
+_LEAST_FULL_LEVEL = 0.01
 
 
 def preview_jpeg(
@@ -312,7 +315,7 @@ def preview_jpeg(
         row, column = positions[channel][0]
         scale = np.float32(1 / max(float(white[index]), 1.0))
         small[:, :, 2 - index] = (blocks[row, column, ::step, ::step] - np.float32(black[row, column])) * scale
-    brightest = max(float(np.percentile(small[::4, ::4].max(axis=2), 99.5)), _LEAST_WHITE)
+    brightest = max(float(np.percentile(small[::4, ::4].max(axis=2), 99.5)), _LEAST_FULL_LEVEL)
     image = (np.sqrt(np.clip(small, 0, brightest) / np.float32(brightest)) * 255).astype(np.uint8)
     for corners in outlines_px:
         cv2.polylines(image, [(corners / step).round().astype(np.int32)], True, GREEN, 1, cv2.LINE_AA)

@@ -1,7 +1,8 @@
 """Measure one frame: light in all regions, noise and exposure.
 
-Every photosite of the visible area belongs to one tile and one strip, so every local change of the light is measured.
-No result depends on other frames, on the chart or on the requested illuminant.
+Tiles are rectangles of the frame, and strips are parts of its rows. Every photosite of the visible area belongs to one
+tile and one strip, so every local change of the light is measured. No result depends on other frames, on the chart or
+on the requested illuminant.
 
 Positions are in 2×2 blocks of the mosaic (half-size pixels). There are T = 384 tiles, S strips (four in each row of
 blocks) and M sampled blocks.
@@ -31,10 +32,12 @@ SEGMENTS = 4
 # Number of sampled blocks in which the noise of two frames is compared; correlations are then accurate to 1 %.
 SAMPLES = 8192
 
-# A photosite is empty (without data) if its count is below this fraction of the black level. Noise lowers counts less.
+# A photosite is empty (without data) if its count is below this fraction of the black level. Noise lowers no count so
+# far.
 _EMPTY_SHARE = 0.5
 
-# Smallest black level at which empty photosites can be detected, counts. Older cameras by Nikon subtract black.
+# Smallest black level at which empty photosites can be detected, counts. Older cameras by Nikon subtract the black
+# level themselves, so their counts may be 0.
 _LEAST_BLACK = 64.0
 
 _NOISE_BINS = 6  # Number of levels at which noise is measured, with more than a thousand blocks each
@@ -84,7 +87,7 @@ class FramePlaces:
 
 
 def _mean_counts(
-    counts: npt.NDArray[np.uint16], division: FramePlaces, clipping: float, floor: float
+    counts: npt.NDArray[np.uint16], division: FramePlaces, clipping: float, empty_limit: float
 ) -> tuple[_Array, _Array, _Array]:
     """Return mean counts of tiles (T, 4) and strips (rows, 4, 4), and fractions (2,) of clipped and empty photosites.
 
@@ -93,7 +96,7 @@ def _mean_counts(
     sums = np.zeros((division.rows, TILE_COLUMNS, 4), dtype=np.int64)
     top = min(int(np.ceil(clipping)), 65535)
     totals = np.zeros(2, dtype=np.int64)
-    _sum_rows(counts, division.x_edges, top, max(int(floor), 0), sums, totals)
+    _sum_rows(counts, division.x_edges, top, max(int(empty_limit), 0), sums, totals)
     tiles = np.add.reduceat(sums, division.y_edges[:-1], axis=0).reshape(-1, 4) / division.tile_blocks
     ends = np.arange(0, TILE_COLUMNS, TILE_COLUMNS // SEGMENTS)
     widths = np.add.reduceat(np.diff(division.x_edges), ends)
@@ -115,7 +118,7 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class GreenNoise:
-    """Noise of blocks: the difference of their two green photosites, in which colour and light cancel."""
+    """Noise of blocks: the difference between the two greens of a block, in which the signal cancels."""
 
     pattern: _Array  # (M,), counts, centred at 0, outliers clipped
     deviation: float  # standard deviation of the pattern, counts
@@ -144,7 +147,8 @@ class Measured:
     black: float  # mean black level, counts
     black_measured: bool  # whether black was measured in a masked border of the frame
     range_dn: float  # saturation level minus black level
-    brightest_dn: float  # `BRIGHTEST_PERCENTILE` of the counts above black, at the brightest position of the block
+    # `BRIGHTEST_PERCENTILE` of the counts above black, for the brightest of the four positions in a block
+    brightest_dn: float
     clipped: float  # fraction of photosites close to saturation, 0 … 1
     empty: float  # fraction of photosites without counts, 0 … 1
     camera: str  # from the file; "" if missing
@@ -238,11 +242,11 @@ def _sum_rows(
     counts: npt.NDArray[np.uint16],
     x_edges: npt.NDArray[np.int64],
     top: int,
-    floor: int,
+    empty_limit: int,
     sums: npt.NDArray[np.int64],
     totals: npt.NDArray[np.int64],
 ) -> None:
-    """Sum counts (H, W) by tile into `sums` (rows, tiles, 4); count clipped and empty ones in `totals` (2,)."""
+    """Sum counts (H, W) by tile into `sums` (rows, tiles, 4); count clipped and empty photosites in `totals` (2,)."""
     clipped, empty = 0, 0
     for row in range(sums.shape[0]):
         for half in range(2):
@@ -255,7 +259,7 @@ def _sum_rows(
                     left += np.uint32(first)
                     right += np.uint32(second)
                     high += np.uint32(first >= top) + np.uint32(second >= top)
-                    low += np.uint32(first < floor) + np.uint32(second < floor)
+                    low += np.uint32(first < empty_limit) + np.uint32(second < empty_limit)
                 sums[row, tile, 2 * half] = left
                 sums[row, tile, 2 * half + 1] = right
                 clipped += high

@@ -29,7 +29,7 @@ _LEAST_RESIDUAL = 0.1
 # Number of points that are summed at a time; their data fit into the level 2 cache.
 _POINTS_AT_A_TIME = 2048
 
-_RIDGE = 1e-10  # Ridge relative to the mean diagonal of the normal matrix, so that equal columns can be solved
+_RIDGE = 1e-10  # Ridge relative to the mean diagonal of the normal matrix; it allows designs with equal columns
 
 _BIWEIGHT_SIGMAS = 6.0  # Residuals beyond this many robust standard deviations get no weight (J. W. Tukey's biweight).
 
@@ -100,7 +100,7 @@ def least_absolute_line(x: _Array, y: _Array) -> tuple[float, float]:
 def held_out_squares(design: _Array, values: _Array, weights: _Array, counts: tuple[int, ...]) -> _Array:
     """Return the cross-validated mean squared error of fits by the first `counts[m]` columns of a design.
 
-    Every point is predicted by the fit to all others.
+    Every point is predicted by a fit to all other points.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tup
     page_mm
         Width and height of the page.
     outside_only
-        Whether all references are around the patches and none between them; the order is then at most 3.
+        Whether all references are around the patches and none between them. The polynomials then have at most order 3.
 
     Returns
     -------
@@ -195,7 +195,7 @@ def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tup
 
     # Order of the groups, with the distance r from the centre: constant, slope, curvature; r⁴ and r⁶; other terms of
     # third and fourth order; r⁸; other terms of fifth and sixth order. The group of r⁴ also contains x·r² and y·r²,
-    # which describe a shift of its centre. The groups of r⁶ and r⁸ contain similar terms. Up to the sixth order, each
+    # which describe a shift of the centre. The groups of r⁶ and r⁸ contain similar terms. Up to the sixth order, each
     # radial term replaces a monomial of its order.
     groups = (
         [power(0), power(1), power(2), power(3)]

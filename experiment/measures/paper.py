@@ -42,7 +42,7 @@ MAX_ORDER = 8
 # in the margin.
 MAX_ORDER_AROUND = 3
 
-# Smallest number of usable white references in a frame (judgement).
+# Smallest number of usable white references in a frame, chosen by judgement.
 MIN_REFERENCES = 6
 
 REFERENCES_A_TERM = 3  # Smallest number of references for each term of a fit
@@ -53,8 +53,8 @@ OUTLIER_REFERENCES_A_TERM = 12
 
 _SECOND_ORDER_TERMS = 6  # Number of terms up to second order: constant, slope and curvature
 
-# Smallest decrease of N log(E) for which a further term is used, with the cross-validated mean squared error E of N
-# references. It was chosen in simulations: with 0, terms fit noise; with 4, weak shapes are missed.
+# A further term is used if it decreases N log(E) by more than this price. E is the cross-validated mean squared error
+# of N references. The price was chosen in simulations: with 0, terms fit noise; with 4, weak shapes are missed.
 TERM_PRICE = 1.0
 
 # Signal at which photon noise equals read noise, counts. The variance of a reference is proportional to its signal plus
@@ -68,11 +68,12 @@ _ROUNDS = 4
 # detected.
 _RINGS = 10
 
-_AVERAGED_REFERENCES = 4  # The largest deviation is averaged over this number of neighbouring references
+_AVERAGED_REFERENCES = 4  # Number of neighbouring references over which the largest residual is averaged
 
-_OUTLIER_SIGMAS = 5.0  # Largest usual deviation of a reference, in standard deviations
+_OUTLIER_SIGMAS = 5.0  # Largest usual residual of a reference, in standard deviations
 
-_UNLIKELY = 0.01  # Fits with a lower likelihood are ignored when the error is calculated
+# Numbers of terms with a lower likelihood are ignored in the error of the ground truth.
+_UNLIKELY = 0.01
 
 _ROUNDING_ERROR = 1e-9  # Smaller coefficients are rounding errors
 
@@ -84,7 +85,7 @@ class FlatField:
     """Spatial distribution of the light over the print, mean 1 over the patches."""
 
     page_mm: tuple[float, float]
-    # For each channel, coefficients (terms,) float64 of the polynomials whose product is the flat field.
+    # For each channel, one or more polynomials, whose product is the flat field: coefficients (terms,) float64 of each.
     coefficients: tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ...]]
 
     @classmethod
@@ -129,7 +130,7 @@ class Paper:
     error: FloatArray  # (3,), standard error of `white`, counts
     references: int  # number of white references used
     spread: FloatArray  # (3,), RMS residual of all references including stained ones, relative to `white`
-    left: FieldResidual = FieldResidual()  # details of the residuals
+    left: FieldResidual = FieldResidual()  # what is left: details of the residuals
 
 
 class PaperReader:
@@ -203,7 +204,7 @@ class PaperReader:
         for channel, fit in enumerate(fits):
             solution, weights = fit.solution, fit.weights
             level = float((local[channel] * shape_before[:, channel]).mean())
-            # Without enough light in a channel, its shape is constant.
+            # If a channel has too little light, its shape is constant.
             terms = solution / level if level > 0 and local[channel].min() > LEAST_FIELD * level else np.ones(1)
             if len(terms) > 1:
                 shape[:, channel] *= local[channel] / level
@@ -329,7 +330,6 @@ def _field_residual(residuals: _Array, places_mm: _Array, page_mm: tuple[float, 
     worst = int(np.argmax(np.abs(channel_residuals)))
     squared_distances = ((places_mm - places_mm[worst]) ** 2).sum(axis=1)
     nearest = np.argsort(squared_distances)[:_AVERAGED_REFERENCES]
-    # Average over the neighbours whose residuals have the same sign.
     same_sign = nearest[np.sign(channel_residuals[nearest]) == np.sign(channel_residuals[worst])]
     red, green, blue = residuals[same_sign].mean(axis=0).tolist()
     x, y = places_mm[worst].tolist()

@@ -18,7 +18,7 @@ def off_level_deg(rotation_deg: float) -> tuple[float, int]:
 
 
 def keystone(corners_px: npt.NDArray[np.float64]) -> tuple[float, float]:
-    """Return by which fraction the longer of two opposite sides exceeds the shorter: left or right, top or bottom.
+    """Return longer / shorter − 1 for two pairs of opposite sides: left and right, top and bottom.
 
     `corners_px`: (4, 2) float64 px, corners of the page clockwise from the printed top-left.
     """

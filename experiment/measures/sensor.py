@@ -2,8 +2,8 @@
 
 EMVA 1288 (release 4.0, linearity error) plots the mean counts of a sensor against exposure, and measures the deviation
 from a straight line between 5 and 95 % of saturation. Here every patch of the chart gives such a curve. If a sensor is
-linear, the counts of all patches rise by the same factor from one frame to the next. This factor need not be known. If
-it depends on the level, the sensor is not linear.
+linear, the counts of all patches rise by the same factor from one frame to the next. If this factor depends on the
+level, the sensor is not linear.
 
 One nonlinearity is not visible in this way: counts that follow a power of the light. Its exponent is determined from
 the exposure times of all frames together, because cameras round the single times (0.3 s for 0.315 s).
@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from experiment.measures.least_squares import least_squares
 
-# Largest drift of the black level during a session without a remark, counts (judgement). It is a thirtieth of the
+# Largest drift of the black level during a session without a remark, counts. Chosen by judgement: a thirtieth of the
 # darkest patches in use.
 MAX_BLACK_DRIFT = 1.0
 
@@ -30,7 +30,7 @@ _LEAST_PATCHES = 50.0  # Smallest number of patches near a level for a measureme
 
 _STEPS_PER_STOP = 3  # Number of shutter speeds per stop
 
-_LEAST_POWER = 0.1  # Lower limit of the exponent, if the counts do not follow the exposure times
+_LEAST_POWER = 0.1  # Lower limit of the exponent. It is reached only if the counts do not follow the exposure times.
 
 # Weights of the constraints, relative to the weight of a patch. Hard: mean and slope of the deviations are 0. Soft:
 # each deviation is small.
@@ -69,8 +69,8 @@ def deviations(levels: _Array, exposure_s: _Array) -> tuple[_Array, _Array]:
     for channel in range(3):
         both_times = (exposure_s, _exact_times(exposure_s))
         fits = [_deviation(levels[..., channel], np.log(times), nodes) for times in both_times]
-        # If a camera records 0.3 s, it may have exposed for 0.3 s or for 0.315 s, a step of a third of a stop. The
-        # times with the better fit are used.
+        # Cameras round times: 0.3 s may be exact, or may be 0.315 s, a time on the scale of thirds of a stop. The times
+        # with the better fit are used.
         deviation[channel] = min(fits, key=lambda fit: fit[1])[0]
     return nodes, deviation
 

@@ -1,12 +1,13 @@
 """Find stains, folds, shadows and reflections on the print.
 
 A stain changes whole patches, so neither the edges nor the noise of a patch reveal it. It is detected because
-neighbouring patches deviate from patches with similar codes elsewhere on the sheet. A patch is listed as unfit if this
-deviation is statistically significant and exceeds a limit. No patch is corrected.
+neighbouring patches deviate from patches with similar codes elsewhere on the sheet. If this deviation is statistically
+significant and exceeds a limit, the patch is listed as unfit for use. No patch is corrected.
 
 A stain absorbs a fraction of the light of a patch. A reflection adds the same light to all patches. In a spot, the
-measured light is therefore a linear function of the predicted light. The slope is the fraction that remains, and the
-intercept is the added light (dichromatic reflection: S. Shafer, Color Research & Application 10, 1985, eq. 1).
+measured light is therefore a linear function of the predicted light. The slope is the remaining fraction of the patch's
+light, and the intercept is the added light (dichromatic reflection: S. Shafer, Color Research & Application 10, 1985,
+eq. 1).
 """
 
 from __future__ import annotations
@@ -43,20 +44,21 @@ LEAST_COUNTS = 30.0  # Smallest level of a judged patch: one count of stray ligh
 LEAST_BITS = 3
 
 
-LEAST_CELLS = 6  # Smallest number of patches for the fit of a line
+LEAST_CELLS = 6  # Smallest number of patches for the fit of a line (`light_of_spot`)
 
-# A spot is large if it contains more than this fraction of all patches. A smaller reflection affects few patches that
-# are not listed.
+# A spot is large if it contains more than this fraction of all patches. Around a smaller reflection, few unlisted
+# patches are affected.
 LARGE_SPOT = 0.005
 
-# Smallest fraction of its own light that a patch keeps under a reflection. If it keeps less, an object covers it.
+# Under a reflection, a patch keeps at least this fraction of its own light. If less is left, an object covers the
+# patch.
 OWN_KEPT = 0.85
 
-_ROUNDS = 3  # Largest number of rounds; each predicts without the patches that were stained in the previous round
+_ROUNDS = 3  # Largest number of rounds; the patches that are stained in one round are not used in the next
 
-_LEAST_KNOWN = 9  # Smallest number of known codes among 25 neighbours for a median curvature
-
-_LEAST_EQUAL_CODES = 3  # Smallest number of known codes with two equal values for a median curvature
+# Smallest numbers of patches for a median of the curvature (see `_log_ratios`): among 25 similar codes, and among codes
+# with two equal values.
+_LEAST_SIMILAR_CODES, _LEAST_EQUAL_CODES = 9, 3
 
 _LEAST_NEIGHBOURS = 5  # Smallest number of known patches in a neighbourhood for its mean
 
@@ -68,7 +70,8 @@ _BRIGHT_PERCENTILE = 99.0  # Percentile of the patch levels that represents whit
 # Largest distance between neighbouring patches of one spot, in patch sides. One clean patch may lie between them.
 _SPOT_DISTANCE = 2.3
 
-# The added light of a spot is measured in unlisted patches within this distance, in patch sides: two rings (judgement).
+# The added light of a spot is measured in unlisted patches within this distance, in patch sides. Two rings of patches
+# are chosen by judgement.
 _SURROUNDING_DISTANCE = 2.5
 
 _Array = npt.NDArray[np.float64]
@@ -80,9 +83,9 @@ _Mask = npt.NDArray[np.bool_]
 class Stains:
     """Deviations of C patches from the prediction by patches with similar codes elsewhere on the sheet."""
 
-    deviation: _Array  # (C, 3), measured / expected − 1 of the neighbourhood of each patch; NaN if unknown
+    deviation: _Array  # (C, 3), measured / predicted light − 1, mean over the neighbourhood of a patch; NaN if unknown
     error: _Array  # (C, 3), standard error of `deviation`
-    alone: _Array  # (C, 3), deviation of each single patch, including noise and prediction error; NaN if unknown
+    patch_deviation: _Array  # (C, 3), measured / predicted light − 1 of each patch alone; NaN if unknown
     stained: _Mask  # (C,), whether each patch is listed as unfit
     level: _Array  # (C, 3), mean counts above black
     places_mm: _Array  # (C, 2), positions of the patches on the sheet
@@ -104,7 +107,7 @@ class Stains:
     def deviation_of(self, cell: int) -> float:
         """Return the signed deviation of a patch or of its neighbourhood, whichever is larger."""
         deviations = np.array(
-            [_largest_of_channels(self.deviation[[cell]])[0], _largest_of_channels(self.alone[[cell]])[0]]
+            [_largest_of_channels(self.deviation[[cell]])[0], _largest_of_channels(self.patch_deviation[[cell]])[0]]
         )
         return float(deviations[np.abs(deviations).argmax()])
 
@@ -121,8 +124,8 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     Parameters
     ----------
     level
-        (8**bits, 3) float64, mean counts above black by colour index, divided by the flat field; best averaged over
-        all white frames.
+        (8**bits, 3) float64, mean counts above black by colour index, divided by the flat field; if possible averaged
+        over all white frames.
     centres_mm
         (8**bits, 2) float64, position of each colour on the sheet.
     bits
@@ -139,8 +142,8 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     clean = usable.copy()
     deviation, error, log_ratios = (np.full(level.shape, np.nan) for _ in range(3))
     stained = np.zeros(len(level), dtype=np.bool_)
-    # A patch is predicted from patches with neighbouring codes, which are elsewhere on the sheet. This needs no model
-    # of ink or paper. The prediction is repeated without the stained patches.
+    # A patch is predicted from patches with neighbouring codes, which are elsewhere on the sheet. The prediction is
+    # repeated without the stained patches.
     for _ in range(_ROUNDS):
         log_ratios = _log_ratios(np.where(clean[:, None], level, np.nan), level, usable, bits)
         deviation, error = _neighbourhood_means(log_ratios, neighbours)
@@ -172,9 +175,9 @@ def _is_significant(deviation: _Array, error: _Array, threshold: float) -> _Mask
 def _log_ratios(clean_level: _Array, level: _Array, usable: _Mask, bits: int) -> _Array:
     """Return the logarithm (C, 3) of measured / predicted level of each patch; NaN without a prediction."""
     # Along each axis of the code, a patch is predicted by the mean logarithm of its two neighbours. The curvature of
-    # the ink curve is missing in this mean. It changes slowly, so its median over neighbouring codes is subtracted. If
-    # two values of a code are equal, the curve has a bend, because printers replace equal amounts of three inks by
-    # black.
+    # the ink curve is missing in this mean. The curvature changes slowly, so its median over neighbouring codes is
+    # subtracted. If two values of a code are equal, the curve has a bend, because printers replace equal amounts of
+    # three inks by black.
     side = 1 << bits
     with np.errstate(invalid="ignore", divide="ignore"):
         logs = np.log(np.where(clean_level > LEAST_COUNTS, clean_level, np.nan)).reshape(side, side, side, 3)
@@ -213,7 +216,7 @@ def _median_over_neighbour_codes(cube: _Array, axis: int) -> _Array:
     ranked = np.sort(stack, axis=0)
     low, high = (np.maximum(known_count - 1, 0) // 2)[None], (known_count // 2)[None]
     middle = 0.5 * (np.take_along_axis(ranked, low, axis=0) + np.take_along_axis(ranked, high, axis=0))[0]
-    return np.where(known_count >= _LEAST_KNOWN, middle, np.nan)
+    return np.where(known_count >= _LEAST_SIMILAR_CODES, middle, np.nan)
 
 
 def _median_at_equal_codes(curvature: _Array, axis: int) -> _Array:
@@ -279,25 +282,25 @@ def spots_of(stains: Stains) -> list[_Index]:
 
 
 def spot_colour(stains: Stains, spot: _Index) -> _Array:
-    """Return the median deviation (3,) float64 of the patches of a spot, relative; 0 if unknown."""
-    alone = stains.alone[spot]
-    finite = [channel[np.isfinite(channel)] for channel in alone.T]
+    """Return the median relative deviation (3,) float64 of the patches of a spot; 0 if unknown."""
+    own_deviation = stains.patch_deviation[spot]
+    finite = [channel[np.isfinite(channel)] for channel in own_deviation.T]
     return np.array([float(np.median(values)) if len(values) else 0.0 for values in finite])
 
 
 def light_of_spot(stains: Stains, spot: _Index, channel: int) -> tuple[float, float]:
-    """Return the light added in a spot, relative to white paper, and the fraction of its own light that remains.
+    """Return the light added in a spot, relative to white paper, and the remaining fraction of the patches' own light.
 
-    They are intercept and slope of a line fitted to one channel by least absolute deviations. NaN if there are too few
+    These are intercept and slope of a line fitted to one channel by least absolute deviations. NaN if there are too few
     patches.
     """
-    levels, alone = stains.level[:, channel], stains.alone[:, channel]
-    patches = spot[np.isfinite(alone[spot]) & (alone[spot] > -0.99)]
+    levels, own_deviation = stains.level[:, channel], stains.patch_deviation[:, channel]
+    patches = spot[np.isfinite(own_deviation[spot]) & (own_deviation[spot] > -0.99)]
     if len(patches) < LEAST_CELLS:
         return np.nan, np.nan
     white_level = float(np.nanpercentile(levels, _BRIGHT_PERCENTILE))
     y = levels[patches] / white_level
-    x = y / (1 + alone[patches])
+    x = y / (1 + own_deviation[patches])
     return least_absolute_line(x, y)
 
 
@@ -305,8 +308,9 @@ def added_light(stains: Stains) -> float:
     """Return the light that a large reflection adds to patches that are not listed, 0 … 1 of white paper.
 
     A spot is a large reflection if it has more than `LARGE_SPOT` of all patches, is brighter than predicted, and keeps
-    at least `OWN_KEPT` of its own light. Its patches are listed as unfit, but a broad reflection continues around
-    them. The added light is measured there. The result is the largest value of all reflections; 0 without reflections.
+    at least `OWN_KEPT` of its own light. The patches of the spot are listed as unfit, but a broad reflection continues
+    around them. There the added light is measured. The result is the largest value of all reflections; 0 without
+    reflections.
     """
     largest = 0.0
     for spot in spots_of(stains):

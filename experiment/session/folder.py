@@ -1,4 +1,4 @@
-"""Create, open and check the folder of a session. No device is used here.
+"""Create, open and check the folder of a session.
 
 A frame is recorded in two steps: first its raw file is written, flushed and renamed, then its row in the journal is
 committed. If a crash happens between the steps, the next run appends `.stray` to the file name and ignores the
@@ -86,12 +86,12 @@ class Session:
         require_plain_folder(folder, MOST_BYTES, ("frames", "previews"))
         self.chart: Chart = _own_copy(load_chart, folder / "chart.json", "chart")
         self.illuminations: tuple[Illuminant, ...] = _own_copy(
-            load_illuminants, folder / "illuminations.csv", "illuminants"
+            load_illuminants, folder / "illuminations.csv", "illuminations"
         )
         self.steps: tuple[SessionStep, ...] = journal.steps()
         self._require_planned_lights()
 
-    # If the file differed from the plan, frames would be assigned to wrong codes.
+    # If illuminations.csv differed from the plan, frames would be assigned to wrong codes.
     def _require_planned_lights(self) -> None:
         for step in self.steps:
             if step.illumination is None:
@@ -320,8 +320,7 @@ def _own_copy(load: Callable[[Path], _Loaded], path: Path, content: str) -> _Loa
         return load(path)
     except FormatError as error:
         remedy = (
-            f"restore it from a copy of the session, or copy the {content} of the session there; session.toml has "
-            "the path"
+            f"restore it from a copy of the session, or copy the {content} file that session.toml names to this place"
         )
         raise FormatError(error.problem, about=error.about, remedy=remedy, value=error.value) from error
 

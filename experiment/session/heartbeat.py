@@ -23,14 +23,15 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Literal
 
-# State of a run: it takes frames, a step takes longer than expected, it waits for something that happens automatically,
-# it is paused until somebody acts, or it has ended.
+# State of a run. "running": it takes frames. "late": a step takes longer than expected. "waiting": it waits for
+# something that happens automatically. "paused": it waits until somebody acts.
 RunState = Literal["running", "late", "waiting", "paused", "ended"]
 
-# Delay after which a sign of life counts as missing, seconds (judgement). A disk may block for seconds.
+# Delay after which a sign of life counts as missing, seconds. Chosen by judgement, because a disk may block for
+# seconds.
 LATE_S = 30.0
 
-# Interval between two signs of life while frames are taken, seconds. Each is a write to the disk.
+# Interval between two signs of life while frames are taken, seconds. Each sign is written to the disk.
 BEAT_S = 5.0
 
 
@@ -89,7 +90,7 @@ class SessionPlace:
     """Path of a session, and the inode numbers of its files, which differ in a copy.
 
     A renamed folder keeps its numbers, and NFS shows the numbers of the server. A restored journal may get the number
-    of the previous journal. Then the state of the process shows whether there is a run.
+    of the previous journal. In this case, the state of the process shows whether there is a run.
     """
 
     folder: str  # path of the folder, without links
@@ -137,7 +138,7 @@ class Heartbeat:
     place: SessionPlace | None = None  # session of the run; None if unknown
 
     def belongs_to(self, here: SessionPlace | None) -> bool | None:
-        """Return whether the run used the session at `here`; False if `here` is a copy, None if unknown."""
+        """Return whether the run uses the session at `here`; False if that session is a copy, None if unknown."""
         session_place = self.place
         if session_place is None or here is None or not (session_place.inode and here.inode):
             return None

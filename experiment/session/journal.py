@@ -3,8 +3,7 @@
 - Every write is a transaction that is on disk when the call returns. A frame without a committed row is not accepted.
   Rows are never deleted, but an accepted frame can be voided.
 - During a run the journal is in SQLite's write-ahead mode, if the disk allows it. Readers then see the last commit and
-  block no writer. After a normal end the journal is a single file again. A reader creates and changes no file.
-- A session may come from an unknown source, so `experiment.session.opening` refuses invalid rows.
+  block no writer. After a normal end the journal is a single file again.
 - Another program may delete, replace or truncate the file. SQLite would not notice this, because it caches pages. So a
   run checks that the journal on disk is the open journal and is complete (`_JournalGuard`).
 - All rows except signs of life and the place of the session are called facts. They are also written to the ledger,
@@ -104,7 +103,7 @@ class IncomingFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._final = path
-        # If the folder is missing, its disk was unmounted, and a new folder would be on another disk.
+        # Do not make a missing folder. Its disk was probably unmounted, so the new folder would be on another disk.
         self._file = atomic_file(path, lambda: self._final, make_parents=False)
         self._open = True
         self.stream: BinaryIO = self._file.__enter__()
@@ -116,7 +115,7 @@ class IncomingFile:
         if error is None:
             self.abandon()
         else:
-            self._leave(kind, error, trace)
+            self._close_file(kind, error, trace)
 
     def complete(self, captured: CapturedFrame) -> ReceivedFile:
         """Check the size, then hash, flush and rename the file; callable from any thread."""
@@ -131,16 +130,16 @@ class IncomingFile:
             sha256 = stream_sha256(self.stream)
             self._final = self._path.with_name(self._path.name + Path(captured.name).suffix.lower())
         except BaseException:
-            self._leave(*sys.exc_info())
+            self._close_file(*sys.exc_info())
             raise
-        self._leave(None, None, None)
+        self._close_file(None, None, None)
         return ReceivedFile(self._final, size, sha256, captured)
 
     def abandon(self) -> None:
         """Delete the file unless it is complete; a second call does nothing."""
-        self._leave(_Abandoned, _Abandoned(), None)
+        self._close_file(_Abandoned, _Abandoned(), None)
 
-    def _leave(self, kind: Any, error: Any, trace: Any) -> None:
+    def _close_file(self, kind: Any, error: Any, trace: Any) -> None:
         if self._open:
             self._open = False
             self._file.__exit__(kind, error, trace)
@@ -149,7 +148,7 @@ class IncomingFile:
 class Journal:
     """An open journal, for one thread; close it after use.
 
-    `retry`: repeats writes while other programs use the file; None for a reader, because reads wait in SQLite.
+    `retry`: repeats writes while other programs use the file. None for a reader, because SQLite itself waits for reads.
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection, retry: Retry | None = None) -> None:
@@ -224,7 +223,7 @@ class Journal:
             self._connection.close()
 
     def retry_locked(self, patience_s: float, announce: Callable[[str], object]) -> None:
-        """Change how long writes wait for other programs, and the receiver of the message about it."""
+        """Change how long writes wait for other programs, and the function that announces the wait."""
         self._retry = _LockRetry(self.path, patience_s, announce)
 
     @contextmanager
@@ -473,7 +472,7 @@ class Journal:
             if self._ledger is not None:
                 self._ledger.confirm()
         except LostJournalError:
-            # The ledger keeps the transaction, although the journal is lost.
+            # Keep the transaction in the ledger, because the journal is lost.
             if self._ledger is not None:
                 self._ledger.confirm()
             raise
@@ -581,7 +580,7 @@ def time_text(at: datetime) -> str:
     return at.isoformat(timespec="microseconds")
 
 
-# Number of cached rows of each kind. During a run, a reader reads all frames again after each new frame.
+# Number of cached rows of each kind. The cache is useful because a reader reads all frames after each new frame.
 _ROWS_KEPT: Final = 8192
 
 _accepted_file: Final = lru_cache(_ROWS_KEPT)(AcceptedFile)
@@ -627,8 +626,6 @@ def _verdict_text(verdict: str, reason: str) -> str:
 
 @dataclass(frozen=True)
 class _FileState:
-    """Properties of a file, from which changes are detected."""
-
     numbers: tuple[int, int]  # device and inode
     size: int
     written: int  # time of the last write, ns
@@ -650,7 +647,7 @@ class _JournalGuard:
         self._states = {file: state for file in self._files if (state := self._file_state(file)) is not None}
 
     def require_same(self) -> None:
-        """Raise `LostJournalError` if the journal changed since the last write of the run."""
+        """Raise `LostJournalError` if the journal was replaced or lost rows since the last write of the run."""
         for folder, previous in self._folders.items():
             current = self._file_state(folder)
             if current is None or previous is None or (self._has_fixed_numbers and current.numbers != previous.numbers):
@@ -707,8 +704,6 @@ class LostJournalError(StorageError):
 
 
 class _LockRetry:
-    """Waits while another program holds the journal."""
-
     def __init__(self, path: Path, seconds: float, announce: Callable[[str], object]) -> None:
         self._path = path
         self._seconds = seconds
@@ -725,7 +720,7 @@ class _LockRetry:
                     raise
                 if not announced:
                     self._announce(
-                        f"another program is using {self._path}; the run resumes automatically when it is free"
+                        f"another program is using {self._path}; the run resumes automatically when the file is free"
                     )
                     announced = True
 
@@ -761,7 +756,7 @@ def ledger_path(folder: Path) -> Path:
 
 
 def rows_of(connection: sqlite3.Connection) -> Rows:
-    """Return the facts in a journal of this version."""
+    """Return the facts in a journal."""
     rows: Rows = {}
     for table in _ROW_KEYS:
         cursor = connection.execute(f"SELECT * FROM {table} ORDER BY rowid")
@@ -845,8 +840,8 @@ def _ledger_lines(rows: Rows) -> bytes:
 class _Ledger:
     """A ledger that a run writes; close it after use.
 
-    `rows`: facts of the journal. If the file has other facts, it is written again. If it has frames that the journal
-    lacks, a `FormatError` is raised.
+    `rows`: facts of the journal. If the ledger has other facts, it is written again. If the ledger has frames that the
+    journal lacks, a `FormatError` is raised.
     """
 
     def __init__(self, path: Path, rows: Rows) -> None:
@@ -937,7 +932,7 @@ def settled_frames(path: Path) -> Frames:
 
 
 def _missing_frames(settled: Frames, journal_frames: Frames) -> Frames:
-    # If the journal has voided a frame, its state is newer, because `VOIDED` is always the last verdict.
+    # A frame that is voided in the journal is newer there, because `VOIDED` is always the last verdict.
     voided = {(attempt, sha256) for attempt, sha256, verdict in journal_frames if verdict == VOIDED}
     return {frame for frame in settled - journal_frames if frame[:2] not in voided}
 

@@ -95,7 +95,7 @@ CREATE TABLE heartbeat (
 CREATE TABLE records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
 """
 
-# Error codes of SQLite if it would have to write in order to read a file.
+# Error codes of SQLite for a file that cannot be read without writing next to it.
 _NEEDS_WRITING = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
 
 # Errors of a file system without locks (fcntl(2); Lustre, FUSE, NFS without its lock service).
@@ -250,7 +250,7 @@ def _is_lockless(path: Path) -> bool:
 
 
 def _open_or_copy(path: Path) -> sqlite3.Connection:
-    # A copy is needed if SQLite would have to write in order to read.
+    # If SQLite cannot read the file without writing next to it, a copy is read.
     try:
         return connect(path, "ro")
     except sqlite3.OperationalError as error:
@@ -282,8 +282,8 @@ def _is_write_ahead(path: Path) -> bool:
 
 
 def _switch_to_write_ahead(path: Path, connection: sqlite3.Connection, retry: Retry) -> sqlite3.Connection:
-    # The mode cannot be changed while another program reads. If a reader does not end, the file is replaced by a copy,
-    # which the run uses. The reader keeps the old file, which then has no name.
+    # The mode cannot be changed while another program reads. If a reader does not end, a copy replaces the file, and
+    # the run uses this copy. The reader keeps the old file, which no longer has a name.
     try:
         connection.execute("PRAGMA journal_mode = WAL").fetchall()
     except sqlite3.OperationalError as error:
@@ -438,14 +438,14 @@ _MOMENT = "????-??-??T??:??:??"
 
 _ZONE = "[+-]??:??"
 
-_FORMS = f"{{0}} GLOB '{_MOMENT}.{6 * '[0-9]'}{_ZONE}' OR {{0}} GLOB '{_MOMENT}{_ZONE}'"
+_TIME_FORMS = f"{{0}} GLOB '{_MOMENT}.{6 * '[0-9]'}{_ZONE}' OR {{0}} GLOB '{_MOMENT}{_ZONE}'"
 
 
 # `julianday` checks the zone and all digits except fractions of a second. It ignores text after a zero byte, reads
 # 30 February as 2 March, and accepts 24:00, so these cases have conditions of their own. The fastest condition is
 # first, because monitoring reads the journal every two seconds.
 _TIME = (
-    f"typeof({{0}}) = 'text' AND ({_FORMS}) AND length(CAST({{0}} AS BLOB)) = length({{0}}) "
+    f"typeof({{0}}) = 'text' AND ({_TIME_FORMS}) AND length(CAST({{0}} AS BLOB)) = length({{0}}) "
     "AND {0} BETWEEN '1970' AND '9999' AND julianday({0}) IS NOT NULL AND substr({0}, 12, 2) < '24' "
     "AND (substr({0}, 9, 2) < '29' OR date(substr({0}, 1, 10), '+0 days') = substr({0}, 1, 10))"
 )

@@ -37,7 +37,7 @@ class Check:
     """One check of a frame."""
 
     name: str  # name of the corresponding figure of the look-up table (LUT), or another name, such as "movement"
-    value: float | None = None  # result in `unit`; None if it is not a number
+    value: float | None = None  # result in `unit`; None if the check has no number
     low: float | None = None  # lower limit of `value`; None without limit
     high: float | None = None  # upper limit of `value`; None without limit
     unit: str = ""  # "%", "px", "DN"; empty for a pure number
@@ -64,9 +64,9 @@ class Judgement:
     seen: tuple[float, float, float] | None = None  # camera RGB of the paper above black, counts; None if not measured
     measurement: bytes = b""  # data of the judge for later frames, opaque to all others
     preview: bytes = b""  # JPEG of the frame; empty if there is none
-    # Whether this frame shows that earlier frames must not be used. For a reference, these are all frames after the
-    # last good reference. For another frame, these are all frames since the start of the run, or since its last pause
-    # for a lasting cause.
+    # Whether this frame shows that earlier frames must not be used. If it is a white or dark frame, these are all
+    # frames after the last good frame of its kind. If not, these are all frames of the run since its start, or since
+    # its last pause for a lasting cause.
     voids: bool = False
     lasting: bool = False  # whether a repetition is useless until somebody has removed the cause
 
@@ -138,7 +138,7 @@ class Attempt:
 
     @property
     def has_frame(self) -> bool:
-        """Whether there is a raw file. Without one, the field `file` may name the file of the next attempt."""
+        """Whether there is a raw file. If not, the field `file` may name the file of the next attempt."""
         return self.taken_at is not None
 
 
@@ -242,7 +242,6 @@ def time_left(attempts: Iterable[TimedAttempt], remaining_frames: int) -> float 
     accepted_count = sum(attempt.is_accepted for attempt in recent)
     if not intervals or not accepted_count:
         return None
-    # A single long interval does not change the median.
     return statistics.median(intervals) * len(recent) / accepted_count * remaining_frames
 
 
@@ -276,7 +275,8 @@ MIDDLE = 136  # Code with a quarter of the light, at which the response of each 
 
 # First frames of a session, from which the light of all codes is predicted. Greys show how light depends on the code.
 # Pairs of primaries show whether their light adds up. Primaries at `MIDDLE` show whether each responds like grey. Dark
-# greys are closer together, because there the light changes faster, relative to its level (judgement).
+# greys are closer together, because the light of dark codes changes faster, relative to its level. The codes were
+# chosen by judgement.
 RESPONSE = (
     *PRIMARIES,
     *(Colour(code, code, code) for code in (TOP, 232, 208, 184, 160, 136, 112, 88, 64, 48, 32, 16)),
@@ -334,8 +334,8 @@ def plan_steps(
 def link_steps(first_number: int) -> tuple[SessionStep, ...]:
     """Return the first frames of a resumed run, which make its frames comparable with earlier frames.
 
-    A grey and the primaries measure the response of the projector again. A white and a dark frame are the new
-    references of the next illuminants, because the lamp may have changed during the pause.
+    A grey and the primaries measure the response of the projector again. The next illuminants are compared with a new
+    white and a new dark frame, because the lamp may have changed during the pause.
     """
     colours = (Colour(TOP, TOP, TOP), *PRIMARIES)
     frames: list[tuple[FrameKind, Colour]] = [*(("response", colour) for colour in colours), ("white", WHITE)]

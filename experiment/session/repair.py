@@ -27,7 +27,7 @@ BAD = "bad"  # Text that selects the illuminants refused by the newest report
 # probably a loose cable, not bad sectors.
 MOST_UNREADABLE = 3
 
-# Largest number of files that are hashed at the same time (judgement): so many threads are faster than any disk.
+# Largest number of files that are hashed at the same time. Chosen by judgement: so many threads outrun any disk.
 MOST_THREADS = 8
 
 _RANGE = re.compile(r"\s*(\d{1,9})\s*(?:[-–]\s*(\d{1,9})\s*)?")
@@ -56,7 +56,7 @@ def damaged_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callabl
 
 
 def require_frames_folder(folder: Path) -> None:
-    """Refuse a session without its folder of raw files; otherwise all frames would be repeated."""
+    """Refuse a session without its folder of raw files, because all its frames would be repeated."""
     if not (folder / "frames").is_dir():
         raise FormatError(
             f"{folder / 'frames'} with the raw files of the session is missing; restore it from a copy, or start a new "
@@ -150,8 +150,8 @@ def lights_text(lights: Collection[int]) -> str:
 def newest_report(session: Path, attempts: Mapping[str, int]) -> RefusedFrames:
     """Return the frames that the newest report refuses. Reports are searched in the session folder and next to it.
 
-    The newest report is the report with the newest frame. File times decide only between reports with the same newest
-    frame, because clocks may be wrong.
+    The newest report is the report with the newest frame. If reports have the same newest frame, the file times decide.
+    They are not used in other cases, because clocks may be wrong.
 
     `attempts`: attempt of each frame of the session, by hash.
     """

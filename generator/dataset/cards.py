@@ -261,7 +261,7 @@ def _configs(description: Description) -> str:
         files = "".join(
             f"  - split: {'train' if split == 'data' else split}\n    path: {pattern}\n"
             for split in description.parts
-            for pattern in layout.patterns([split], "")
+            for pattern in layout.patterns([split], "", description.table.camera)
         )
     return f"configs:\n- config_name: default\n  data_files:\n{files}"
 
@@ -270,7 +270,7 @@ def _reading(description: Description) -> str:
     layout = LAYOUTS[option(description, "layout")]
     if isinstance(layout, JoinedLayout):
         return layout.reading
-    names = layout.patterns(description.parts, suffix_of(option(description, "format")))
+    names = layout.patterns(description.parts, suffix_of(option(description, "format")), description.table.camera)
     files = " and ".join(f"`{name.replace('*', 'NNNNNN')}`" for name in names)
     return (
         f"{files} are linear, with 16 bits if the format supports them. `load_dataset` returns the rows of "

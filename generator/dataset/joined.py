@@ -184,7 +184,7 @@ _INT = {"dtype": "int64", "_type": "Value"}
 _TRUTH = {"feature": {"dtype": "float64", "_type": "Value"}, "length": 3, "_type": "List"}
 
 
-def _schema(previews: bool, maps: bool, details: bool) -> pa.Schema:
+def _schema(extras: Extras) -> pa.Schema:
     # The metadata have the features for `datasets`. Only previews are decoded: `datasets` decodes with Pillow, which
     # keeps 8 of 16 bits.
     import pyarrow as pa
@@ -209,7 +209,11 @@ def _schema(previews: bool, maps: bool, details: bool) -> pa.Schema:
         ("masks", pa.list_(file), {"feature": _FILE, "_type": "List"}),
         ("ground_truth", file, _FILE),
     ]
-    left_out = {"preview": not previews, "details": not details, "masks": not maps, "ground_truth": not maps}
+    without_maps = not extras.maps
+    left_out = {
+        **{"preview": not extras.previews, "details": not extras.details},
+        **{"masks": without_maps, "ground_truth": without_maps},
+    }
     used_columns = [column for column in columns if not left_out.get(column[0])]
     features = {name: feature for name, _, feature in used_columns}
     info = json.dumps({"info": {"features": features}})
@@ -300,11 +304,14 @@ def _read_parquet(stream: BinaryIO, file: str) -> bytes | None:
 
 
 class Extras(NamedTuple):
-    """Optional content of a data set: previews, maps of several illuminants, details of each image."""
+    """Content of a data set besides its images, and its camera."""
 
     previews: bool
-    maps: bool
-    details: bool
+    maps: bool  # of several illuminants
+    details: bool  # of each image
+    camera: str
+    # ColorMatrix and ForwardMatrix of the camera (`generator.rendering.matrices.dng_matrices`); None if not needed
+    matrices: tuple[list[list[float]], list[list[float]]] | None = None
 
 
 @dataclass(frozen=True)
@@ -323,8 +330,9 @@ class JoinedLayout:
         """Return the writer of a shard."""
         return JoinedWriter(store, shard, self.ending, lambda stream: self.start(stream, extras))
 
-    def name_of(self, file_kind: str, split_name: str, shard: int, key: str, ending: str) -> str:
+    def name_of(self, file_kind: str, split_name: str, shard: int, key: str, ending: str, camera: str) -> str:
         """Return the name of a file of an image: the file of its shard, and the name inside."""
+        del camera
         return f"{split_name}/{shard_key(shard)}.{self.ending}/{_member_name(file_kind, key, ending)}"
 
     def get(self, store: Store, name: str) -> bytes:
@@ -343,9 +351,9 @@ class JoinedLayout:
             raise FormatError(f"{store.location}/{container} lacks the listed file {file}; make the data set again")
         return data
 
-    def patterns(self, split_names: Sequence[str], ending: str) -> list[str]:
+    def patterns(self, split_names: Sequence[str], ending: str, camera: str) -> list[str]:
         """Return the glob patterns of the files with images."""
-        del ending
+        del ending, camera
         return [f"{split_name}/*.{self.ending}" for split_name in split_names]
 
 
@@ -369,7 +377,7 @@ JOINED: Final[Mapping[str, JoinedLayout]] = {
     ),
     "parquet": JoinedLayout(
         ending="parquet",
-        start=lambda stream, extras: _Parquet(stream, _schema(*extras)),
+        start=lambda stream, extras: _Parquet(stream, _schema(extras)),
         read=_read_parquet,
         library="pyarrow",
         is_read_by_hugging_face=True,

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import ClassVar, Final, Self
+from typing import Any, ClassVar, Final, Self
 
 from foundation.errors import InputError
 from foundation.files import HashingWriter
 from generator.dataset.joined import JOINED, ExitReason, Extras, JoinedLayout, JoinedWriter
 from generator.dataset.records import FileSum, Sample, split_name
+from generator.files import Format
 from generator.stores import Store
 
 # Number of images whose files are synchronised together, so that one wait for the disk serves many files.
@@ -25,8 +28,14 @@ class FileWriter:
     A separate thread synchronises files with the disk while other images are made; `close` waits for the last ones.
     """
 
-    def __init__(self, store: Store, file_name: Callable[[str, str, str], str]) -> None:
-        self._store, self._file_name = store, file_name
+    def __init__(
+        self,
+        store: Store,
+        file_name: Callable[[str, str, str, str], str],
+        extras: Extras,
+        metadata: Callable[[Sample, Extras], dict[str, Any]] | None,
+    ) -> None:
+        self._store, self._file_name, self._extras, self._metadata = store, file_name, extras, metadata
         self._files: list[FileSum] = []
         self._thread = ThreadPoolExecutor(1)
         self._syncing: list[Future[None]] = []
@@ -36,8 +45,13 @@ class FileWriter:
     def store(self, sample: Sample) -> Sample:
         """Write the files of a sample; return the sample without their bytes."""
         sums: list[FileSum] = []
-        for file_kind, ending, data in sample.files:
-            name = self._file_name(file_kind, split_name(sample.split), f"{sample.key}{ending}")
+        files = sample.files
+        if self._metadata is not None:
+            text = json.dumps(self._metadata(sample, self._extras), ensure_ascii=False, indent=1) + "\n"
+            files = (*files, ("metadata", "_metadata.json", (text.encode(),)))
+        for file_kind, ending, data in files:
+            split = split_name(sample.split)
+            name = self._file_name(file_kind, split, f"{sample.key}{ending}", self._extras.camera)
             with self._store.create(name) as stream:
                 hashed = HashingWriter(stream)
                 for piece in data:
@@ -82,21 +96,24 @@ ShardWriter = FileWriter | JoinedWriter
 class FileLayout:
     """A layout with one file for each image."""
 
-    # Name in the data set. Arguments: file kind (`images`, `previews`, `masks`, `ground_truth`); split, or `data` if
-    # the data set is not divided; name of the file, such as ``000123.png``.
-    file_name: Callable[[str, str, str], str]
+    # Name in the data set. Arguments: file kind (`images`, `previews`, `masks`, `ground_truth`, `metadata`); split, or
+    # `data` if the data set is not divided; name of the file, such as ``000123.png``; camera.
+    file_name: Callable[[str, str, str, str], str]
+    # Content of the metadata file of an image; None if the layout has no such files.
+    metadata: Callable[[Sample, Extras], dict[str, Any]] | None = None
+    format: Format | None = None  # the only format of images that programs for this layout read
     library: ClassVar[str] = ""
     is_read_by_hugging_face: ClassVar[bool] = False
 
     def open_writer(self, store: Store, shard: int, extras: Extras) -> FileWriter:
         """Return the writer of a shard."""
-        del shard, extras
-        return FileWriter(store, self.file_name)
+        del shard
+        return FileWriter(store, self.file_name, extras, self.metadata)
 
-    def name_of(self, file_kind: str, split_name: str, shard: int, key: str, ending: str) -> str:
+    def name_of(self, file_kind: str, split_name: str, shard: int, key: str, ending: str, camera: str) -> str:
         """Return the name of a file of an image in the data set."""
         del shard
-        return self.file_name(file_kind, split_name, f"{key}{ending}")
+        return self.file_name(file_kind, split_name, f"{key}{ending}", camera)
 
     def get(self, store: Store, name: str) -> bytes:
         """Return the bytes of a file by its name."""
@@ -104,19 +121,54 @@ class FileLayout:
 
     def folder(self, file_kind: str, split_names: Sequence[str]) -> str | None:
         """Return the folder of all files of a kind; None if there are several."""
-        folders = {self.file_name(file_kind, split_name, "").removesuffix("/") for split_name in split_names}
+        names = (self.file_name(file_kind, split_name, "NAME", "") for split_name in split_names)
+        folders = {name.rpartition("/")[0] for name in names}
         return folders.pop() if len(folders) == 1 else None
 
-    def patterns(self, split_names: Sequence[str], ending: str) -> list[str]:
+    def patterns(self, split_names: Sequence[str], ending: str, camera: str) -> list[str]:
         """Return the glob patterns of image files that end in `ending`."""
-        return list(dict.fromkeys(self.file_name("images", split_name, f"*{ending}") for split_name in split_names))
+        names = (self.file_name("images", split_name, f"*{ending}", camera) for split_name in split_names)
+        return list(dict.fromkeys(names))
+
+
+def _c5_name(file_kind: str, split_name: str, name: str, camera: str) -> str:
+    # Programs list all PNG files of a folder as images, and find more images of a camera by the text after
+    # `sensorname_` (`load_files` and `get_rand_examples_from_sensor` of src/dataset.py, github.com/mahmoudnafifi/C5).
+    if file_kind not in ("images", "metadata"):
+        return f"{file_kind}/{name}"
+    stem, rest = re.split(r"(?=[._])", name, maxsplit=1)
+    sensor = re.sub(r"[^a-z0-9]+", "_", camera.lower()).strip("_") or "camera"
+    return f"{split_name}/{stem}_sensorname_{sensor}{rest}"
+
+
+def _c5_metadata(sample: Sample, extras: Extras) -> dict[str, Any]:
+    # C5 and CCMNet read `illuminant_color_raw`. CCMNet reads also `cm1` to `fm2`, the matrices of a DNG file under
+    # illuminants A and D65 (src/dataset.py of github.com/DY112/CCMNet). Only the matrices under D65 are known, and DNG
+    # uses a single matrix for all illuminants.
+    assert extras.matrices is not None
+    color, forward = extras.matrices
+    return {
+        **{"illuminant_color_raw": list(sample.record.truth), "camera": extras.camera, "source": sample.source},
+        **{"cm1": color, "cm2": color, "fm1": forward, "fm2": forward},
+    }
 
 
 # All layouts by name.
 LAYOUTS: Final[Mapping[str, FileLayout | JoinedLayout]] = {
-    "folder": FileLayout(file_name=lambda file_kind, split_name, name: f"{file_kind}/{name}"),
+    "folder": FileLayout(file_name=lambda file_kind, _split_name, name, _camera: f"{file_kind}/{name}"),
+    "c5": FileLayout(file_name=_c5_name, metadata=_c5_metadata, format="png"),
     **JOINED,
 }
+
+
+def require_format(layout: str, form: str) -> None:
+    """Raise InputError if the programs that read a layout do not read a format of images."""
+    entry = LAYOUTS[layout]
+    if isinstance(entry, FileLayout) and entry.format not in (None, form):
+        raise InputError(
+            f"the layout {layout} and the format {form} exclude each other, expected {entry.format}, the only format "
+            f"that programs for {layout} read; use --format {entry.format}"
+        )
 
 
 def require_library(layout: str) -> None:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 from foundation.errors import InputError
 from foundation.secret_texts import masked_values
 from foundation.version import software
-from generator.dataset.layouts import LAYOUTS, require_library
+from generator.dataset.layouts import LAYOUTS, require_format, require_library
 from generator.dataset.records import SPLITS, Layout, TableRecord
 from generator.files import FORMATS, Format, libraries_of
 from generator.philox import key_of
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 SHARD_IMAGES: Final = 256
 
 # Version of colorimetric rendering. It is increased when equal options give other pixels.
-RENDERING_VERSION: Final = 4
+RENDERING_VERSION: Final = 5
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class DatasetOptions:
     form
         File format of the images: ``"png"``, ``"tiff"``, ``"exr"``, ``"jxl"`` or ``"dng"``.
     layout
-        ``"folder"``: one file for each image; ``"webdataset"`` or ``"parquet"``: one file for each shard.
+        ``"folder"`` or ``"c5"``: one file for each image; ``"webdataset"`` or ``"parquet"``: one file for each shard.
     previews
         Whether tone-mapped previews are written.
     split
@@ -139,6 +139,7 @@ class DatasetOptions:
                 raise InputError(
                     f"the {option_name} of a data set is {value!r}, expected one of {', '.join(choices)}; correct it"
                 )
+        require_format(self.layout, self.form)
         if self.rendering == "codes" and self.matrix is not None:
             raise InputError("a colour matrix needs colorimetric rendering, but rendering is codes; omit the matrix")
         if self.shard_images < 1:

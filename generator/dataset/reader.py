@@ -349,7 +349,7 @@ class Dataset:
 
     @property
     def layout(self) -> str:
-        """The layout: ``"folder"``, ``"webdataset"`` or ``"parquet"``."""
+        """The layout: ``"folder"``, ``"c5"``, ``"webdataset"`` or ``"parquet"``."""
         return self._options.layout
 
     @cached_property
@@ -392,7 +392,8 @@ class Dataset:
     def _name(self, entry: Entry, file_kind: str, ending: str) -> str:
         key = PurePosixPath(entry.image).stem
         shard = _number(entry.image) // self._options.shard_images
-        return LAYOUTS[self.layout].name_of(file_kind, split_name(entry.split), shard, key, ending)
+        camera = self.description.table.camera
+        return LAYOUTS[self.layout].name_of(file_kind, split_name(entry.split), shard, key, ending, camera)
 
     def _bytes(self, name: str) -> bytes:
         require_library(self.layout)

@@ -38,6 +38,7 @@ IMAGES: Final = "images.csv"
 SOURCES: Final = "sources.csv"
 SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile", "note")
 TRUTHS: Final = "gt.txt"
+NAMED_TRUTHS: Final = "named_gt.txt"  # As `TRUTHS`, with the name of the image before the numbers; for other programs
 SUMS: Final = "SHA256SUMS"
 DATASHEET: Final = "DATASHEET.md"
 CARD: Final = "README.md"
@@ -49,7 +50,7 @@ Triple = tuple[float, float, float]
 # Details of one image, by column of `images.csv`; all images of a data set have the same columns.
 Details = dict[str, int | float | str]
 
-Layout = Literal["folder", "webdataset", "parquet"]
+Layout = Literal["folder", "c5", "webdataset", "parquet"]
 Split = Literal["train", "validation", "test"]
 SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
 

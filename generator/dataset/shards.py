@@ -46,7 +46,7 @@ from foundation.records import from_json
 from foundation.version import software
 from generator.dataset.cards import card, datasheet
 from generator.dataset.joined import Extras
-from generator.dataset.layouts import LAYOUTS, ShardWriter
+from generator.dataset.layouts import LAYOUTS, FileLayout, ShardWriter
 from generator.dataset.plan import DatasetOptions, ShardJob, versions
 from generator.dataset.reader import Dataset, load_description
 from generator.dataset.records import (
@@ -56,6 +56,7 @@ from generator.dataset.records import (
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,
     IMAGES,
+    NAMED_TRUTHS,
     SOURCE_COLUMNS,
     SOURCES,
     SPLITS,
@@ -90,7 +91,7 @@ from generator.masks.maps import encode_maps, mean_weights
 from generator.pictures.sources import Cut, Picture, Source, changed_sha256
 from generator.rendering.black_points import black_subtraction, subtract_black
 from generator.rendering.colorimetric import rendering_with
-from generator.rendering.matrices import matrix_for
+from generator.rendering.matrices import dng_matrices, matrix_for
 from generator.stores import DESCRIPTION, LocalStore, Pieces, Store, open_store
 from generator.variation.variation import AppliedVariation
 
@@ -353,7 +354,7 @@ def make_shard(
         if changed:
             callbacks.on_done(-len(changed))
 
-    with _writer_of(job, workplace) as writer, _cancelling(pending, reading):
+    with _writer_of(job, lut, workplace) as writer, _cancelling(pending, reading):
         for row, source in enumerate(job.sources):
             while len(reading) <= workers and row + len(reading) < len(job.sources):
                 reading.append(pool.submit(read_source, job, lut, row + len(reading), finished))
@@ -403,12 +404,17 @@ def _reused_sample(image: FinishedImage) -> Sample:
     return Sample(image.image, source.name, source.split, source.width, source.height, (), tuple(image.files))
 
 
-def _writer_of(job: ShardJob, workplace: Workplace) -> ShardWriter:
+def _writer_of(job: ShardJob, lut: Lut, workplace: Workplace) -> ShardWriter:
     options = job.options
     lightings = job.choice.lightings_of(job.position * options.crops)
     maps = options.tints or any(lighting.masks is not None for lighting in lightings)
-    extras = Extras(options.previews, maps, options.has_details)
-    return LAYOUTS[options.layout].open_writer(workplace.files, job.shard, extras)
+    camera = lut.provenance.camera
+    layout = LAYOUTS[options.layout]
+    has_metadata = isinstance(layout, FileLayout) and layout.metadata is not None
+    matrices = dng_matrices(lut) if has_metadata else None
+    return layout.open_writer(
+        workplace.files, job.shard, Extras(options.previews, maps, options.has_details, camera, matrices)
+    )
 
 
 @contextmanager
@@ -644,6 +650,7 @@ def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
     rendered = RenderingSums()
     with ExitStack() as stack:
         truths = _ListedFile(stack, workplace.files, TRUTHS)
+        named_truths = _ListedFile(stack, workplace.files, NAMED_TRUTHS)
         table = _ListedFile(stack, workplace.files, GROUND_TRUTH)
         sources_file = _ListedFile(stack, workplace.files, SOURCES)
         split_files = {
@@ -668,7 +675,9 @@ def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
                 source = names[image.position]
                 name = f"{image_key(image.number)}{suffix}"
                 table.write(_image_rows(name, source.name, image, used if has_uncertainty else None))
-                truths.write("{:.9f} {:.9f} {:.9f}\n".format(*image.truth))
+                truth_text = "{:.9f} {:.9f} {:.9f}\n".format(*image.truth)
+                truths.write(truth_text)
+                named_truths.write(f"{name} {truth_text}")
                 labels.update(light.illumination for light in image.lights)
                 if image.details:
                     rendered.add(image.details, source.width * source.height)
@@ -704,7 +713,7 @@ def assemble(workplace: Workplace, identity: Mapping[str, Any]) -> Dataset:
             rendering=rendered.summary() if {"rendering", "black_point"} & options.keys() else None,
         )
         text = (description.model_dump_json(indent=2) + "\n").encode()
-        written = [table, truths, sources_file, *split_files.values()]
+        written = [table, truths, named_truths, sources_file, *split_files.values()]
         if details is not None:
             written.append(details)
         for file in written:

@@ -89,7 +89,8 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
     return builder.or_(builder.or_(field(0), field(1)), field(2))
 
 
-def _hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
+def hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
+    """Return 16 random words, h of the module docstring for i = word, word + 1 …; `keys` are k0, k1 and k2."""
     # Three rounds are needed. After one, images of two seeds would differ only by swapped neighbours. After two, pixels
     # at distances near a power of two would be correlated.
     numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
@@ -143,7 +144,7 @@ def choose(
     `word` is the first i of the group (module docstring), `count` is S. 96 bytes are read, 128 written.
     """
     stride = broadcast(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
-    for half, choices in enumerate(_choices_of_words(builder, _hashed(builder, word, (k0, k1, k2)), count)):
+    for half, choices in enumerate(_choices_of_words(builder, hashed(builder, word, (k0, k1, k2)), count)):
         begin = builder.add(picture, ir.Constant(I64, 3 * LANES * half))
         colours = builder.mul(_colours(builder, begin, bits), stride)
         offsets = builder.add(colours, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
@@ -175,7 +176,7 @@ def choose_for_colours(
 
     The samples of the pixel's colour begin at this offset.
     """
-    for half, choices in enumerate(_choices_of_words(builder, _hashed(builder, word, (k0, k1, k2)), count)):
+    for half, choices in enumerate(_choices_of_words(builder, hashed(builder, word, (k0, k1, k2)), count)):
         colour_offsets = load(builder, colours, 4 * LANES * half, WORDS)
         offsets = builder.add(colour_offsets, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
         store(builder, offsets, target, 4 * LANES * half)
@@ -219,9 +220,9 @@ def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
 
 
 @inlined
-def row_keys(y: Any, stream: Any, image: Any, seed: Any) -> Any:
-    """Return the three keys (uint32) of row `y`; `seed` is uint64."""
-    k0, k1, k2, _ = philox4x32(uint32(y), uint32(stream), uint32(image), _SAMPLES_PURPOSE, seed)
+def row_keys(y: Any, stream: Any, image: Any, seed: Any, purpose: Any = _SAMPLES_PURPOSE) -> Any:
+    """Return the three keys (uint32) of row `y`; `seed` is uint64, `purpose` a uint32 of `philox`."""
+    k0, k1, k2, _ = philox4x32(uint32(y), uint32(stream), uint32(image), purpose, seed)
     return k0, k1, k2
 
 

@@ -16,6 +16,12 @@ The print under an illuminant is described at nodes. A node is a colour with one
   photon-transfer curve, interpolated like m. k is a factor of the node for each channel: the noise at the node, divided
   by the noise of the 25 samples of the patch and by σ of the node.
 
+Images are rounded down to whole counts after adding a random number u, 0 ≤ u < 1, to each channel. The samples of a
+patch are whole counts, so rounding to the nearest count would move all deviations of a flat area in the same direction.
+With u, the mean over many pixels is exact. u is ⌊h/2²¹⌋, ⌊h/2¹¹⌋ or ⌊h/2⌋ mod 2¹⁰, divided by 2¹⁰, for red, green and
+blue. h is the word of `kernels/choice.py` with i = x and the keys of the purpose `philox.ROUNDING`, stream 0. Crops are
+not rounded.
+
 If several illuminants are mixed, each has its own samples, chosen independently (stream i of `choice.row_keys` for the
 i-th). Each deviation is multiplied by the square root of the weight, as in `kernels/mixing.py`.
 """
@@ -41,6 +47,7 @@ from generator.kernels.choice import (
     choose_for_colours,
     copied_back,
     emit_prefetch,
+    hashed,
     packed_rows,
     prefetch,
     readable,
@@ -72,6 +79,7 @@ from generator.kernels.vector import (
     step,
     store,
 )
+from generator.philox import ROUNDING
 
 SIDE: Final = 17  # Nodes per channel
 
@@ -83,6 +91,7 @@ NODE_CODES: Final = (*range(0, 256, 16), 255)  # sRGB codes of the nodes of a ch
 _RED, _GREEN, _BLUE = np.int32(SIDE * SIDE), np.int32(SIDE), np.int32(1)
 _ALL = np.int32(SIDE * SIDE + SIDE + 1)
 _HALF = np.int32(8)  # Half the distance between nodes, codes
+_ROUNDING_PURPOSE: Final = np.uint32(ROUNDING)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +172,8 @@ def means_at(
 _FOUR: Final = ir.VectorType(F32, 4)
 PRINTED_BLOCK: Final = LANES  # Pixels of a block, which are planned and interpolated together
 # The plan of a block has eight rows of 16 numbers, one per pixel: byte offsets of three nodes, weights of four nodes,
-# and the offset of the nearest node. The fourth node needs no row: it is the next one after the first in all channels.
+# and 4 times the index of the nearest node. The fourth node needs no row: it is the next one after the first in all
+# channels.
 _PLAN_ROWS: Final = 8
 _ROW: Final = 4 * PRINTED_BLOCK  # Bytes of a row of the plan: one 32-bit number per pixel
 _PLAN_BYTES: Final = _ROW * _PLAN_ROWS
@@ -196,13 +206,12 @@ def plan_block(builder: Builder, picture: Value, fractions: Value, target: Value
     strides = [filled(16 * int(stride)) for stride in (_RED, _GREEN, _BLUE)]
 
     def node(offset: int, scale: int) -> Value:
-        # `scale` times the index of the node at (codes + offset) / 16.
-        total: Value = None
-        for codes, stride in zip(channels, (_RED, _GREEN, _BLUE), strict=True):
-            node_code = builder.lshr(builder.add(codes, filled(offset)), filled(4))
-            summand = builder.mul(node_code, filled(scale * int(stride)))
-            total = summand if total is None else builder.add(total, summand)
-        return total
+        # `scale`, a power of two, times the index of the node at (codes + offset) / 16; shifts are fast.
+        red, green, blue = (builder.lshr(builder.add(codes, filled(offset)), filled(4)) for codes in channels)
+        index = red
+        for codes in (green, blue):
+            index = builder.add(builder.add(builder.shl(index, filled(4)), index), codes)
+        return builder.shl(index, filled(scale.bit_length() - 1))
 
     def at_least(first: Value, second: Value) -> Value:
         return builder.fcmp_ordered(">=", first, second)
@@ -229,7 +238,7 @@ def plan_block(builder: Builder, picture: Value, fractions: Value, target: Value
         store(builder, offsets, target, _ROW * row)
     for row, row_weights in enumerate(weights):
         store(builder, row_weights, target, _ROW * (3 + row))
-    store(builder, node(int(_HALF), 32), target, _ROW * 7)
+    store(builder, node(int(_HALF), 4), target, _ROW * 7)
 
 
 @step(*[ADDRESS] * 5)
@@ -241,8 +250,7 @@ def place_samples(builder: Builder, plan: Value, cells: Value, choices: Value, s
     """
     for pixel in range(PRINTED_BLOCK):
         nearest_offset = load(builder, plan, _ROW * 7 + 4 * pixel, I32)
-        node_offset = builder.zext(builder.lshr(nearest_offset, ir.Constant(I32, 3)), I64)
-        first = load(builder, builder.add(cells, node_offset), 0, I32)
+        first = load(builder, builder.add(cells, builder.zext(nearest_offset, I64)), 0, I32)
         address = builder.add(first, load(builder, choices, 4 * pixel, I32))
         store(builder, address, target, 4 * pixel)
         emit_prefetch(builder, builder.add(samples, builder.zext(address, I64)), 3)
@@ -281,6 +289,7 @@ def _with_deviations(builder: Builder, values: Value, first_pixel: int, addresse
     noise = builder.shuffle_vector(values, values, constant(WORDS, [lane | 3 for lane in range(LANES)]))
     node_row = builder.add(plan, ir.Constant(I64, 7 * _ROW))
     node_offsets, pixel_offsets = (_load_offsets(builder, at, 4 * first_pixel) for at in (node_row, sample_offsets))
+    node_offsets = [builder.shl(offset, ir.Constant(I64, 3)) for offset in node_offsets]
     cell_mean, spread_factor = (_load_pixels(builder, bases, node_offsets, shift, _FOUR) for shift in (0, 16))
     drawn = builder.zext(_load_pixels(builder, samples, pixel_offsets, 0, ir.VectorType(I16, 4)), WORDS)
     deviation = builder.fsub(builder.sitofp(drawn, FLOATS), cell_mean)
@@ -349,14 +358,23 @@ def write_mirrored(builder: Builder, line: Value, scales: Value, red: Value, gre
     _write_planes(builder, line, scales, (red, green, blue), mirrored=True)
 
 
-@step(ADDRESS, "float32", ADDRESS)
-def write_pixels(builder: Builder, line: Value, upper_limit: Value, target: Value) -> None:
-    """Write a block as uint16 RGB pixels (96 bytes), rounded and clipped to 0 … `upper_limit`."""
-    zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
+@step("uint32", "uint32", "uint32", "uint32", ADDRESS)
+def write_words(builder: Builder, x: Value, k0: Value, k1: Value, k2: Value, target: Value) -> None:
+    """Write the words for rounding of a block, uint32; `x` is the position of its first pixel in the image."""
+    store(builder, hashed(builder, x, (k0, k1, k2)), target, 0)
+
+
+@step(ADDRESS, ADDRESS, "float32", ADDRESS)
+def write_pixels(builder: Builder, words: Value, line: Value, upper_limit: Value, target: Value) -> None:
+    """Write a block as uint16 RGB pixels (96 bytes), rounded at random and clipped to 0 … `upper_limit`."""
+    masks = constant(WORDS, [1023 << shift for shift in (21, 11, 1, 1)] * 4)
+    zero, steps = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [2.0**-31, 2.0**-21, 2.0**-11, 2.0**-11] * 4)
     limit, shorts = broadcast(builder, upper_limit, FLOATS), ir.VectorType(I16, LANES)
     rounded: list[Value] = []
     for quarter in range(4):
-        value = builder.fadd(load(builder, line, 64 * quarter, FLOATS), half)
+        pixel_words = builder.bitcast(_repeated_four_times(builder, words, 16 * quarter), WORDS)
+        parts = builder.sitofp(builder.and_(pixel_words, masks), FLOATS)
+        value = builder.fadd(load(builder, line, 64 * quarter, FLOATS), builder.fmul(parts, steps))
         value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
         rounded.append(builder.trunc(builder.fptosi(minimum(builder, value, limit), WORDS), shorts))
     lanes = [lane for lane in range(2 * LANES) if lane % 4 < 3]
@@ -378,12 +396,10 @@ def _plan_segment(
     stop: int,
     width: int,
     x0: int,
-    y: int,
     tables: Any,
     samples: Any,
     count: Any,
-    seed: Any,
-    image: int,
+    keys: Any,
     plans: int,
     sample_offsets: int,
     choices: int,
@@ -395,7 +411,7 @@ def _plan_segment(
         plan_block(row + 3 * _block_at(block, width), fractions, plans + (block - first) * _PLAN_BYTES)
     low, high = (x0 + _block_at(first, width)) // GROUP, (x0 + _block_at(stop - 1, width) + PRINTED_BLOCK - 1) // GROUP
     for number in range(len(samples)):
-        k0, k1, k2 = row_keys(y, number, image, seed)
+        k0, k1, k2 = keys[number, 0], keys[number, 1], keys[number, 2]
         for group in range(low, high + 1):
             choose_for_colours(zeros, uint32(LANES * group), k0, k1, k2, count, choices + 4 * GROUP * (group - low))
         for block in range(first, stop):
@@ -457,16 +473,20 @@ def print_segments(
     `masked`, `shares` (height, width, M) are the weights of M illuminants.
     """
     x0, y0, width, height = frame
-    plans, sample_offsets, choices, line, factors, lines = memory
+    plans, sample_offsets, choices, line, words, factors, lines, keys = memory
     samples, roots, _ = members
     for number in range(len(samples)):
         factors[number] = roots[number]
     blocks = (width + PRINTED_BLOCK - 1) // PRINTED_BLOCK
     segments = (blocks + _SEGMENT - 1) // _SEGMENT
+    rounding = row_keys(y0, 0, image, seed, _ROUNDING_PURPOSE)
     for segment in range(height * segments + 1):
         if segment < height * segments:
             y, first = segment // segments, _SEGMENT * (segment % segments)
             slot, stop = segment & 1, min(first + _SEGMENT, blocks)
+            if first == 0:
+                for number in range(len(samples)):
+                    keys[number, 0], keys[number, 1], keys[number, 2] = row_keys(y0 + y, number, image, seed)
             _plan_segment(
                 source + y * pitch,
                 pitch,
@@ -474,12 +494,10 @@ def print_segments(
                 stop,
                 width,
                 x0,
-                y0 + y,
                 tables,
                 samples,
                 count,
-                seed,
-                image,
+                keys,
                 plans + slot * _SEGMENT * _PLAN_BYTES,
                 sample_offsets + slot * _SEGMENT * _ROW * len(samples),
                 choices,
@@ -488,10 +506,15 @@ def print_segments(
             continue
         y, first = (segment - 1) // segments, _SEGMENT * ((segment - 1) % segments)
         slot = segment - 1 & 1
+        if first == 0 and scales == 0:
+            rounding = row_keys(y0 + y, 0, image, seed, _ROUNDING_PURPOSE)
         for block in range(first, min(first + _SEGMENT, blocks)):
             x = _block_at(block, width)
             plan = plans + (slot * _SEGMENT + block - first) * _PLAN_BYTES
             block_offsets = sample_offsets + (slot * _SEGMENT * len(samples) + block - first) * _ROW
+            if scales == 0:
+                # Written before the block is interpolated, which hides the latency of the products.
+                write_words(uint32(x0 + x), rounding[0], rounding[1], rounding[2], words)
             if masked:
                 _mix_block(plan, block_offsets, tables, members, shares[y, x : x + PRINTED_BLOCK], factors, lines)
             else:
@@ -500,7 +523,7 @@ def print_segments(
                     bases, offsets = tables[1] + 32 * NODES * number, block_offsets + _ROW * _SEGMENT * number
                     add_deviations(plan, bases, samples[number], offsets, factors.ctypes.data + _ROW * number, line)
             if scales == 0:
-                write_pixels(line, upper_limit, target + y * pitches[0] + SAMPLE_BYTES * x)
+                write_pixels(words, line, upper_limit, target + y * pitches[0] + SAMPLE_BYTES * x)
                 continue
             red = target + y * pitches[1] + 4 * (width - PRINTED_BLOCK - x if flip else x)
             green, blue = red + pitches[0], red + 2 * pitches[0]
@@ -511,7 +534,7 @@ def print_segments(
 
 
 class PrintMemory:
-    """Scratch memory of `print_segments`: plans, choices and offsets of samples, and pixels."""
+    """Scratch memory of `print_segments`: plans, choices and offsets of samples, pixels, and keys of a row."""
 
     def __init__(self, components: int) -> None:
         sizes = {
@@ -519,6 +542,7 @@ class PrintMemory:
             "sample_offsets": 2 * _SEGMENT * _ROW * components,
             "choices": 4 * GROUP * _SEGMENT_GROUPS,
             "lines": 2 * _LINE_BYTES,
+            "words": _ROW,
             "factors": _ROW * max(components, 2),
         }
         self._bytes = np.zeros(sum(sizes.values()) + LINE, np.uint8)
@@ -531,6 +555,7 @@ class PrintMemory:
             *addresses,
             arrays["factors"].view(np.float32).reshape(-1, PRINTED_BLOCK),
             arrays["lines"].view(np.float32).reshape(2, PRINTED_BLOCK, 4),
+            np.zeros((components, 3), np.uint32),
         )
 
 

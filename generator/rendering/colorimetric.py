@@ -45,7 +45,7 @@ from generator.lights.lighting import Mixture
 from generator.rendering import print_inverse, print_profiles
 from generator.rendering.black_points import black_subtraction
 from generator.rendering.matrices import ColourMatrix
-from generator.rendering.print_inverse import corners, invert, nearest_positions
+from generator.rendering.print_inverse import corners, invert
 from generator.rendering.print_profiles import PrintProfile, profile_of
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ def compute_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
     source = source_colours(matrix)
     targets = black + (profile.white - black) * source
     # The last digits differ between processors and libraries. Rounding makes pixels equal on all of them.
-    positions = _rounded(invert(colours, targets.mean(axis=1), targets, bits))
+    positions = _rounded(invert(colours, targets, bits))
     around, weights = corners(positions, bits)
     weights = weights * usable[around]
     sums = weights.sum(axis=1)
@@ -305,7 +305,7 @@ def black_point(profile: PrintProfile, colours: _Array, bits: int) -> float:
     levels = profile.black * np.linspace(1.0, MOST_LIFT, 26)
     levels = levels[levels <= profile.white]
     targets = levels[:, None] * np.ones(3)
-    around, weights = corners(nearest_positions(colours, targets, np.full((len(levels), 3), 0.5), bits), bits)
+    around, weights = corners(invert(colours, targets, bits), bits)
     is_neutral = angles_deg(np.einsum("kc,kcx->kx", weights, colours[around]), targets) <= BLACK_WITHIN_DEG
     return float(levels[int(is_neutral.argmax())])
 

@@ -170,6 +170,32 @@ def recorded_matrix(lut: Lut) -> ColourMatrix | None:
 
 
 _RECORDED: Final = "expected 3 x 3 numbers as rows, and their source; compute the LUT again"
+# Linear sRGB to XYZ with white D50, by Bradford's adaptation: the sRGB profile of the International Color Consortium.
+_SRGB_TO_XYZ_D50: Final = np.array(
+    [[0.4360747, 0.3850649, 0.1430804], [0.2225045, 0.7168786, 0.0606169], [0.0139322, 0.0971045, 0.7141733]]
+)
+
+
+def dng_matrices(lut: Lut) -> tuple[list[list[float]], list[list[float]]]:
+    """Return ColorMatrix and ForwardMatrix of the camera of a LUT under D65, as DNG 1.7.1 defines them.
+
+    ColorMatrix converts XYZ to camera RGB; for a camera without a listed matrix, its white is the white of the LUT.
+    ForwardMatrix converts white-balanced camera RGB to XYZ with white D50.
+    """
+    camera = camera_matrix(lut.provenance.camera)
+    rows = matrix_for(lut).rows
+    if camera is not None:
+        to_camera = np.array(_TO_CAMERA[camera.name]).reshape(3, 3) / 10_000
+    else:
+        white = lut.white[_daylight(lut)]
+        to_camera = (white / white.max())[:, None] * rows @ np.linalg.inv(_SRGB_TO_XYZ)
+    return to_camera.round(6).tolist(), (_SRGB_TO_XYZ_D50 @ np.linalg.inv(rows)).round(6).tolist()
+
+
+def _daylight(lut: Lut) -> int:
+    # The black body nearest to 6500 K; if there is none, the illuminant with the most even white.
+    bodies = [(abs(light.cct_k - DAYLIGHT_K), light.index) for light in lut.illuminations if light.cct_k is not None]
+    return min(bodies)[1] if bodies else int(np.ptp(np.log(lut.white), axis=1).argmin())
 
 
 def fitted_matrix(lut: Lut) -> ColourMatrix:
@@ -177,8 +203,7 @@ def fitted_matrix(lut: Lut) -> ColourMatrix:
 
     If the LUT has no black body, the illuminant with the most even white is used.
     """
-    bodies = [(abs(light.cct_k - DAYLIGHT_K), light.index) for light in lut.illuminations if light.cct_k is not None]
-    light = min(bodies)[1] if bodies else int(np.ptp(np.log(lut.white), axis=1).argmin())
+    light = _daylight(lut)
     rows, residual = fit_matrix(profile_of(lut, light))
     source = f"least squares over the LUT's colours under illuminant {light}; median residual {residual:.1f} degrees"
     return ColourMatrix(TABLE, rows, source)

@@ -9,10 +9,13 @@ white: trilinear interpolation of the means of the eight patches around p. The p
 S converts channel differences to brightness and chromaticity, with less weight on brightness. The errors of methods are
 angles, so a colour outside the gamut of the print should keep its hue rather than its brightness.
 
-The target moves from the grey of equal brightness to the colour, in `STEPS` steps. Each step starts at the previous
-position and makes Levenberg-Marquardt iterations within the chart (K. Levenberg 1944, D. Marquardt 1963; bounds by
-projection, C. T. Kelley, *Iterative Methods for Optimization*, 1999, section 5.4). Outside the gamut, positions follow
-its surface, so similar colours have neighbouring positions.
+R has kinks at patches, and noise folds it in dark colours, so a descent through the chart may stop far from the
+minimum. The search is therefore exhaustive. A cell is the cube between eight neighbouring patches. Inside a cell, R is
+a weighted mean of the eight patches, so each channel and each ratio of two channels lies between the smallest and the
+largest of the patches. This gives a lower bound of the minimum in a cell. Cells are tried in the order of their bounds
+by bounded least squares (K. Levenberg 1944, D. Marquardt 1963; bounds by projection, C. T. Kelley, *Iterative Methods
+for Optimization*, 1999, section 5.4), until no other cell can be better (branch and bound: A. H. Land, A. G. Doig
+1960).
 """
 
 from __future__ import annotations
@@ -24,16 +27,15 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.compiled import compiled
-from generator.kernels.choice import channels_of
 
 _Array = npt.NDArray[np.float64]
 
-# Steps of a path from grey to a colour; with twice as many, positions change by less than 0.01 patch.
-STEPS: Final = 8
+# A cell is not tried if it cannot reduce the residual, a relative difference of colours, by more than this amount.
+_TOLERANCE: Final = 1e-4
 
-_ROUNDS: Final = 12  # Levenberg-Marquardt iterations per step of a path; inside the gamut 4 are enough
+_ROUNDS: Final = 100  # Iterations in a cell; 6 are enough for most, 60 for colours far outside the gamut
 
-_STRIDE: Final = 4.0  # Largest change of a position per iteration along each axis, patches
+_SMALLEST_STEP: Final = 1e-5  # Iterations end at this change of the position, patches, far below its rounding
 
 # Weight of brightness differences; chromaticity differences have the weight 1 (docs/reference/rendering.md).
 BRIGHTNESS_COST: Final = 0.5
@@ -61,30 +63,26 @@ def corners(positions: _Array, bits: int) -> tuple[npt.NDArray[np.int64], _Array
 
 
 @compiled
-def _evaluate(colours: Any, position: Any, target: Any, side: Any, scale: Any, residual: Any, jacobian: Any) -> Any:
-    # Fills `residual` (3,) with S (log R(p) - log t) and `jacobian` (3, 3) with its derivatives; returns |residual|².
-    low_r = min(max(math.floor(position[0]), 0), side - 2)
-    low_g = min(max(math.floor(position[1]), 0), side - 2)
-    low_b = min(max(math.floor(position[2]), 0), side - 2)
-    red, green, blue = position[0] - low_r, position[1] - low_g, position[2] - low_b
-    first = (low_r * side + low_g) * side + low_b
+def _evaluate(patches: Any, fraction: Any, target: Any, scale: Any, residual: Any, jacobian: Any) -> Any:
+    # Fills `residual` (3,) with S (log R - log t) at a fraction (3,) of the cell between `patches` (8, 3), and
+    # `jacobian` (3, 3) with its derivatives; returns |residual|².
     residual[:], jacobian[:] = 0.0, 0.0
     for channel in range(3):
         value, by_red, by_green, by_blue = 0.0, 0.0, 0.0, 0.0
         for corner in range(8):
             up_r, up_g, up_b = corner >> 2, corner >> 1 & 1, corner & 1
-            colour = colours[first + (up_r * side + up_g) * side + up_b, channel]
             weight_r, weight_g, weight_b = (
-                red if up_r else 1 - red,
-                green if up_g else 1 - green,
-                blue if up_b else 1 - blue,
+                fraction[0] if up_r else 1 - fraction[0],
+                fraction[1] if up_g else 1 - fraction[1],
+                fraction[2] if up_b else 1 - fraction[2],
             )
-            value += weight_r * weight_g * weight_b * colour
-            by_red += (2 * up_r - 1) * weight_g * weight_b * colour
-            by_green += (2 * up_g - 1) * weight_r * weight_b * colour
-            by_blue += (2 * up_b - 1) * weight_r * weight_g * colour
+            value += weight_r * weight_g * weight_b * patches[corner, channel]
+            by_red += (2 * up_r - 1) * weight_g * weight_b * patches[corner, channel]
+            by_green += (2 * up_g - 1) * weight_r * weight_b * patches[corner, channel]
+            by_blue += (2 * up_b - 1) * weight_r * weight_g * patches[corner, channel]
+        difference = math.log(value) - target[channel]
         for axis in range(3):
-            residual[axis] += scale[axis, channel] * (math.log(value) - target[channel])
+            residual[axis] += scale[axis, channel] * difference
             jacobian[axis, 0] += scale[axis, channel] * by_red / value
             jacobian[axis, 1] += scale[axis, channel] * by_green / value
             jacobian[axis, 2] += scale[axis, channel] * by_blue / value
@@ -92,102 +90,137 @@ def _evaluate(colours: Any, position: Any, target: Any, side: Any, scale: Any, r
 
 
 @compiled
-def _descend(colours: Any, targets: Any, positions: Any, side: Any, scale: Any, rounds: Any, costs: Any) -> None:
-    # Moves each of the positions (K, 3) to the minimum, and fills `costs` (K,) with the squared residuals.
-    top = side - 1.0
-    residual, new_residual, jacobian, new_jacobian = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    gradient, trial, normal, is_bound = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3, np.bool_)
-    for k in range(len(positions)):
-        position, damping = positions[k], 1e-3
-        cost = _evaluate(colours, position, targets[k], side, scale, residual, jacobian)
-        for _ in range(rounds):
-            largest = 0.0
-            for p in range(3):
-                gradient[p] = jacobian[0, p] * residual[0] + jacobian[1, p] * residual[1] + jacobian[2, p] * residual[2]
-                is_bound[p] = (position[p] <= 0 and gradient[p] > 0) or (position[p] >= top and gradient[p] < 0)
-            for p in range(3):
-                for q in range(3):
-                    normal[p, q] = 0.0
-                    if not (is_bound[p] or is_bound[q]):
-                        for axis in range(3):
-                            normal[p, q] += jacobian[axis, p] * jacobian[axis, q]
-                largest = max(largest, normal[p, p])
-            for p in range(3):
-                normal[p, p] += damping * (normal[p, p] + 1e-3 * (largest + 1e-12))
-                if is_bound[p]:
-                    normal[p, p] += largest + 1e-12
-                    gradient[p] = 0.0
-            # Cholesky factor in the lower triangle, then both substitutions.
-            for p in range(3):
-                for q in range(p + 1):
-                    for r in range(q):
-                        normal[p, q] -= normal[p, r] * normal[q, r]
-                    normal[p, q] = math.sqrt(normal[p, p]) if p == q else normal[p, q] / normal[q, q]
-            for p in range(3):
-                trial[p] = -gradient[p]
-                for r in range(p):
-                    trial[p] -= normal[p, r] * trial[r]
-                trial[p] /= normal[p, p]
-            for p in range(2, -1, -1):
-                for r in range(p + 1, 3):
-                    trial[p] -= normal[r, p] * trial[r]
-                trial[p] /= normal[p, p]
-            for p in range(3):
-                trial[p] = min(max(position[p] + min(max(trial[p], -_STRIDE), _STRIDE), 0.0), top)
-            new_cost = _evaluate(colours, trial, targets[k], side, scale, new_residual, new_jacobian)
-            if new_cost < cost:
-                position[:], residual[:], jacobian[:], cost = trial, new_residual, new_jacobian, new_cost
-                damping *= 0.3
-            else:
-                damping *= 8.0
-        costs[k] = cost
+def _descend(patches: Any, target: Any, scale: Any, fraction: Any, memory: Any) -> Any:
+    # Moves `fraction` (3,) to a minimum within the cell between `patches` (8, 3); returns the squared residual.
+    vectors, matrices = memory
+    residual, new_residual, gradient, trial = vectors
+    jacobian, new_jacobian, normal = matrices
+    is_bound = np.empty(3, np.bool_)
+    damping, cost = 1e-3, _evaluate(patches, fraction, target, scale, residual, jacobian)
+    for _ in range(_ROUNDS):
+        largest = 0.0
+        for p in range(3):
+            gradient[p] = jacobian[0, p] * residual[0] + jacobian[1, p] * residual[1] + jacobian[2, p] * residual[2]
+            is_bound[p] = (fraction[p] <= 0 and gradient[p] > 0) or (fraction[p] >= 1 and gradient[p] < 0)
+        for p in range(3):
+            for q in range(3):
+                normal[p, q] = 0.0
+                if not (is_bound[p] or is_bound[q]):
+                    for axis in range(3):
+                        normal[p, q] += jacobian[axis, p] * jacobian[axis, q]
+            largest = max(largest, normal[p, p])
+        for p in range(3):
+            normal[p, p] += damping * (normal[p, p] + 1e-3 * (largest + 1e-12))
+            if is_bound[p]:
+                normal[p, p] += largest + 1e-12
+                gradient[p] = 0.0
+        # Cholesky factor in the lower triangle, then both substitutions.
+        for p in range(3):
+            for q in range(p + 1):
+                for r in range(q):
+                    normal[p, q] -= normal[p, r] * normal[q, r]
+                normal[p, q] = math.sqrt(normal[p, p]) if p == q else normal[p, q] / normal[q, q]
+        for p in range(3):
+            trial[p] = -gradient[p]
+            for r in range(p):
+                trial[p] -= normal[p, r] * trial[r]
+            trial[p] /= normal[p, p]
+        step = 0.0
+        for p in range(2, -1, -1):
+            for r in range(p + 1, 3):
+                trial[p] -= normal[r, p] * trial[r]
+            trial[p] /= normal[p, p]
+        for p in range(3):
+            trial[p] = min(max(fraction[p] + trial[p], 0.0), 1.0)
+            step = max(step, abs(trial[p] - fraction[p]))
+        if step < _SMALLEST_STEP:
+            break
+        new_cost = _evaluate(patches, trial, target, scale, new_residual, new_jacobian)
+        if new_cost < cost:
+            fraction[:], residual[:], jacobian[:], cost = trial, new_residual, new_jacobian, new_cost
+            damping *= 0.3
+        else:
+            damping *= 8.0
+    return cost
 
 
-def nearest_positions(colours: _Array, targets: _Array, start: _Array, bits: int) -> _Array:
-    """Return the positions (K, 3) at which a print is nearest to target colours, starting from `start` (K, 3).
+@compiled
+def _search(colours: Any, bounds: Any, targets: Any, side: Any, scale: Any, positions: Any) -> None:
+    # Fills `positions` (K, 3). Rows of `bounds` (8, cells): the smallest values of log R/G, log G/B, log B/R and of
+    # the sum of log R, G and B in each cell, then the largest ones.
+    cells = side - 1
+    lower, candidates = np.empty(cells**3), np.empty(cells**3, np.int64)
+    memory = np.empty((4, 3)), np.empty((3, 3, 3))
+    patches, fraction = np.empty((8, 3)), np.empty(3)
+    for k in range(len(targets)):
+        red, green, blue = targets[k]
+        ratios = red - green, green - blue, blue - red
+        for cell in range(cells**3):
+            total = 0.0
+            for i in range(3):
+                distance = max(bounds[i, cell] - ratios[i], ratios[i] - bounds[4 + i, cell], 0.0)
+                total += distance * distance
+            distance = max(bounds[3, cell] - red - green - blue, red + green + blue - bounds[7, cell], 0.0)
+            lower[cell] = (total + BRIGHTNESS_COST * distance * distance) / 3
+        # The cell of the smallest bound is tried first; only cells with a smaller bound than its minimum remain.
+        nearest, count, best = np.argmin(lower), 0, np.inf
+        while True:
+            low_r, low_g, low_b = nearest // cells**2, nearest // cells % cells, nearest % cells
+            for corner in range(8):
+                patch = ((low_r + (corner >> 2)) * side + low_g + (corner >> 1 & 1)) * side + low_b + (corner & 1)
+                patches[corner] = colours[patch]
+            is_first = best == np.inf
+            # A cell may have several minima, so descents start at four corners of a tetrahedron in it.
+            for start in range(4):
+                fraction[0], fraction[1] = 0.2 + 0.6 * (start >> 1), 0.2 + 0.6 * (start & 1)
+                fraction[2] = 0.2 + 0.6 * ((start >> 1) ^ (start & 1))
+                cost = _descend(patches, targets[k], scale, fraction, memory)
+                if cost < best:
+                    best = cost
+                    positions[k, 0] = low_r + fraction[0]
+                    positions[k, 1] = low_g + fraction[1]
+                    positions[k, 2] = low_b + fraction[2]
+                limit = max(math.sqrt(best) - _TOLERANCE, 0.0) ** 2
+                if limit == 0.0:
+                    break
+            if is_first:
+                lower[nearest] = np.inf
+                for cell in range(cells**3):
+                    if lower[cell] < limit:
+                        candidates[count] = cell
+                        count += 1
+            chosen = -1
+            for i in range(count):
+                if lower[candidates[i]] < limit and (chosen < 0 or lower[candidates[i]] < lower[candidates[chosen]]):
+                    chosen = i
+            if chosen < 0:
+                break
+            nearest = candidates[chosen]
+            count -= 1
+            candidates[chosen] = candidates[count]
 
-    `colours`: (8**bits, 3) float64 > 0, camera RGB of the patches. `targets`: (K, 3) float64 > 0.
+
+def _bounds(colours: _Array, bits: int) -> _Array:
+    logs = np.log(colours)
+    numbers = np.concatenate([logs - np.roll(logs, -1, axis=1), logs], axis=1).reshape((1 << bits,) * 3 + (6,))
+    ends: list[_Array] = []
+    for pick in (np.minimum, np.maximum):
+        corner = numbers
+        for axis in range(3):
+            slices = np.moveaxis(corner, axis, 0)
+            corner = np.moveaxis(pick(slices[:-1], slices[1:]), 0, axis)
+        ends.append(
+            np.concatenate([corner[..., :3], corner[..., 3:].sum(axis=3, keepdims=True)], axis=3).reshape(-1, 4)
+        )
+    return np.ascontiguousarray(np.concatenate(ends, axis=1).T)
+
+
+def invert(colours: _Array, targets: _Array, bits: int) -> _Array:
+    """Return the positions (K, 3) float64, 0 … 2ⁿ - 1, at which a print is nearest to target colours.
+
+    `colours`: (8**bits, 3) float64 > 0, camera RGB of the patches relative to white. `targets`: (K, 3) float64 > 0.
     """
-    return _nearest_with_costs(colours, targets, start, bits)[0]
-
-
-def _nearest_with_costs(colours: _Array, targets: _Array, start: _Array, bits: int) -> tuple[_Array, _Array]:
-    positions, costs = np.array(start, np.float64), np.empty(len(start))
-    inputs = np.array(colours, np.float64), np.log(np.array(targets, np.float64))
-    _descend(*inputs, positions, 1 << bits, _SCALE, _ROUNDS, costs)
-    return positions, costs
-
-
-def invert(colours: _Array, greys: _Array, targets: _Array, bits: int) -> _Array:
-    """Return the positions (K, 3) float64, 0 … 2ⁿ - 1, of target colours, along paths from greys.
-
-    `colours`: (8**bits, 3) float64 > 0, camera RGB of the patches relative to white. `greys`: (K,) float64, brightness
-    of the grey at which each path begins. `targets`: (K, 3) float64 > 0.
-    """
-    grey = np.repeat(greys[:, None], 3, axis=1)
-    levels, level_index = np.unique(greys, return_inverse=True)
-    start = _grey_positions(colours, levels, bits)[level_index]
-    positions = start
-    for step in range(1, STEPS + 1):
-        share = step / STEPS
-        positions = nearest_positions(colours, (1 - share) * grey + share * targets, positions, bits)
+    positions = np.empty((len(targets), 3))
+    inputs = np.array(colours, np.float64), _bounds(colours, bits), np.log(np.array(targets, np.float64))
+    _search(*inputs, 1 << bits, _SCALE, positions)
     return positions
-
-
-def _grey_positions(colours: _Array, levels: _Array, bits: int) -> _Array:
-    top = (1 << bits) - 1
-    targets = np.repeat(levels[:, None], 3, axis=1)
-    logs = np.log(colours) @ _SCALE.T
-    nearest = [((logs - target) ** 2).sum(axis=1).argmin() for target in np.log(targets) @ _SCALE.T]
-    # On a chart of few patches, a path from the nearest patch may end in a local minimum off the grey axis. A second
-    # path starts on the diagonal of equal codes, and the better result is used.
-    starts = [channels_of(nearest, bits).astype(np.float64)]
-    brightness = np.maximum.accumulate(np.sort(colours.mean(axis=1)[_diagonal(bits)]))
-    diagonal_codes = np.interp(levels, brightness, np.linspace(0, top, len(brightness)))
-    starts.append(np.repeat(diagonal_codes[:, None], 3, axis=1))
-    (first, costs), (second, second_costs) = (_nearest_with_costs(colours, targets, start, bits) for start in starts)
-    return np.where((second_costs <= costs)[:, None], second, first)
-
-
-def _diagonal(bits: int) -> npt.NDArray[np.int64]:
-    return np.arange(1 << bits) * (1 | 1 << bits | 1 << 2 * bits)

@@ -94,7 +94,7 @@ class PtpIpService:
                     case Ping():
                         _send(channel, Pong())
                     case _:
-                        # The remaining packets of a cancelled transaction are ignored.
+                        # Packets that still arrive of a cancelled transaction are ignored.
                         pass
         finally:
             initiator.hang_up()
@@ -124,7 +124,7 @@ class PtpIpService:
                     pass
 
     def _operate(self, initiator: _Initiator, request: PtpRequest, sends_data: bool) -> None:
-        initiator.cancelled = None  # An earlier cancelled transaction has ended
+        initiator.cancelled = None  # A transaction that was cancelled earlier has ended
         command, data = initiator.command, None
         if sends_data:
             data = _collect(command)

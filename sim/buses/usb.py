@@ -315,7 +315,7 @@ _ERRORS = {
 _HIGH_SPEED = 3  # LIBUSB_SPEED_HIGH, 480 Mbit/s, as in real bodies.
 
 # Fields of each descriptor type after length and type (USB 2.0, 9.6). Fields with the prefix w, id or bcd have two
-# bytes, others one.
+# bytes, other fields one byte.
 _FIELDS = {
     _DEVICE: "bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol bMaxPacketSize0 idVendor idProduct bcdDevice "
     "iManufacturer iProduct iSerialNumber bNumConfigurations",

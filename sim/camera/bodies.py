@@ -1,7 +1,7 @@
 """EOS bodies of the simulated camera: identification, properties, and lists of allowed values.
 
-There is no public recording of the PTP data of an EOS 550D or 6D Mark II. Unknown values are those of an EOS 60D, of
-which a recording exists. Properties are in the order in which the 60D sends them.
+There is no public recording of the PTP data of an EOS 550D or 6D Mark II. Unknown values are copied from an EOS 60D,
+for which there is a recording. Properties are in the order in which the 60D sends them.
 
 Sources: a recorded EOS 60D (firmware 1.1.0); settings of an EOS 550D (firmware 1.0.9) and a 6D Mark II (1.0.2) that
 users of libgphoto2 published; libgphoto2 2.5.34 for structures; specifications of Canon for battery and burst.
@@ -43,7 +43,7 @@ class PropertySpec:
     """A property as a body reports it."""
 
     code: int  # A `drivers.ptp.codes.Property`, or a number without name
-    # Encoded; None if it is sent on request only, `b""` if it is calculated from the state of the camera
+    # Encoded value. None if it is sent only on request, `b""` if it is calculated from the state of the camera.
     value: bytes | None
     kind: int = NO_LIST  # `NO_LIST`, `LIST` or `FREE`
     choices: tuple[int, ...] = ()  # Allowed values, in the order of the body
@@ -59,7 +59,7 @@ class EosModel:
     properties: tuple[PropertySpec, ...]  # At power-on, with the mode dial at M and manual focus
     shutter_codes: tuple[int, ...]  # Allowed shutter times in modes M and Tv
     aperture_codes: tuple[int, ...]  # Allowed apertures; empty for a lens without contacts
-    burst: int  # Number of raw frames that its memory can hold
+    burst: int  # Number of raw frames that the memory of the body can hold
     frame_bytes: int  # Expected size of a frame, for the number of free shots
     write_s: float  # Time from the end of an exposure until the file is ready
     shots_per_charge: int  # Frames per battery charge
@@ -190,7 +190,7 @@ def _thirds(first: int, last: int) -> tuple[int, ...]:
 
 
 def _jpegs(*sizes: tuple[int, bool]) -> tuple[ImageFile, ...]:
-    # JPEG formats. Each argument is a size number, and whether the size exists in normal quality besides fine quality.
+    # JPEG formats. Each argument is a size number, and whether this size also has normal quality, not only fine.
     return tuple(ImageFile(1, size, quality) for size, normal in sizes for quality in ((3, 2) if normal else (3,)))
 
 
@@ -412,10 +412,10 @@ EOS_BODIES: Mapping[str, EosModel] = MappingProxyType(
 
 
 def eos_with(sensor: Body, name: str) -> EosModel:
-    """Return the body with a name, by default an EOS 550D, that reports the camera of a sensor as raw files do."""
+    """Return the EOS body `name`, by default an EOS 550D, which reports maker and model of the camera of `sensor`."""
     body = EOS_BODIES.get(name, EOS_550D)
     maker, model = body.info.manufacturer, sensor.model
     if "canon" not in sensor.maker.lower():
-        # The driver requires the word Canon; names of cameras contain only the first word of the maker.
+        # The driver requires the word Canon in the maker. The first word of the maker starts the name of the camera.
         maker, model = f"{sensor.camera.split(' ')[0]} (simulated Canon EOS)", sensor.camera
     return replace(body, info=replace(body.info, manufacturer=maker, model=model))

@@ -86,7 +86,7 @@ BULB = 0x0C  # Shutter speed code of bulb exposures, which are simulated with th
 U32 = 0xFFFFFFFF
 _MEMORY = 0xA0000000  # First handle of objects in the camera's memory (assumed).
 _MOST_SHOTS = 0x7FFFFFFF  # Highest reported number of free shots: the largest signed 32-bit number.
-_TEXTS = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT)
+_TEXT_PROPERTIES = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT)
 
 
 class OperationRefusal(Exception):
@@ -120,7 +120,7 @@ class PropertyState:
 
     value: bytes
     list_kind: int
-    reported: bool
+    reported: bool  # Whether the body sends the value without a request
     choices: tuple[int, ...] = ()
     formats: tuple[ImageFormat, ...] = ()
 
@@ -183,8 +183,6 @@ class _Refusal(Enum):
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame in progress."""
-
     number: int
     taken_at: datetime
     raw: Future[bytes | None]  # Raw file; None if the film failed
@@ -192,7 +190,8 @@ class _Frame:
     destination: int
 
 
-_FREELY_SET = (*_TEXTS, Property.EOS_CAMERA_TIME)
+# Properties that the initiator may set to any value
+_FREELY_SET = (*_TEXT_PROPERTIES, Property.EOS_CAMERA_TIME)
 
 _SHUTDOWN_WARNING_S = 10.0  # Time from the warning until the camera switches itself off, s (assumed).
 
@@ -272,7 +271,7 @@ class SimulatedEos:
             for spec in body.properties
         }
         self._properties[Property.EOS_SERIAL_NUMBER].value = text_value(serial)
-        for code in _TEXTS:
+        for code in _TEXT_PROPERTIES:
             self._properties[code].value = text_value("")
         if auto_power_off_s is not None:
             self._properties[Property.EOS_AUTO_POWER_OFF].value = number_value(auto_power_off_s)
@@ -346,7 +345,6 @@ class SimulatedEos:
     # The values of properties.
 
     def _value(self, code: int) -> bytes:
-        """Return the value of a property; some values are computed from the state."""
         match code:
             case Property.EOS_AVAILABLE_SHOTS:
                 return number_value(self._available_shots())
@@ -571,7 +569,7 @@ class SimulatedEos:
         settings = self._settings()
         refusal = self._refusal(settings)
         if refusal is None:
-            self._plan(self._clock.monotonic(), settings)
+            self._plan_exposure(self._clock.monotonic(), settings)
             self._update()
         return refusal
 
@@ -594,7 +592,7 @@ class SimulatedEos:
         return None
 
     def _settings(self) -> ExposureSettings:
-        """Return the nominal exposure settings, with assumed values in place of those of a light meter."""
+        """Return the nominal exposure settings, with assumed values instead of the values of a light meter."""
         iso = self._number_of(Property.EOS_ISO_SPEED)
         aperture = self._number_of(Property.EOS_APERTURE)
         shutter = self._number_of(Property.EOS_SHUTTER_SPEED)
@@ -613,7 +611,7 @@ class SimulatedEos:
 
     # The shutter.
 
-    def _plan(self, opens_at: float, settings: ExposureSettings) -> None:
+    def _plan_exposure(self, opens_at: float, settings: ExposureSettings) -> None:
         self._unfinished += 1
         self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
 
@@ -645,7 +643,7 @@ class SimulatedEos:
                 self._film.accept(settings)
                 self._film.expose(settings, opened, buffer)
             except (DeviceError, CropError):
-                # The frame never arrives, as from a real camera with an internal error.
+                # No file is sent, as if a real camera had an internal error.
                 return None
             return buffer.getvalue()
 
@@ -656,7 +654,7 @@ class SimulatedEos:
         return future
 
     def _finish_frame(self, frame: _Frame) -> None:
-        # The calculation may take longer than a real body needs.
+        # The calculation of a frame may take longer than the exposure and writing of a real body. Then try again later.
         if not frame.raw.done():
             self._schedule(self._clock.monotonic() + 0.01, lambda: self._finish_frame(frame))
             return
@@ -793,7 +791,7 @@ class SimulatedEos:
             return Answer(PtpResponse(ResponseCode.OK, request.transaction, reply.parameters), reply.data)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return hints that GetEvent has events. An empty queue that gets its first event causes one hint."""
+        """Return hints that GetEvent has events. There is one hint each time an empty queue gets an event."""
         with self._updated():
             hints, self._hints = tuple(self._hints), []
             return hints
@@ -945,7 +943,7 @@ class SimulatedEos:
         """Answer OK."""
 
     def _handlers(self) -> dict[int, Callable[[Arguments], OperationResult | None]]:
-        # In the order of the 60D. Real bodies support more operations, such as uploads and live view.
+        # In the order of the 60D.
         return {
             Operation.GET_DEVICE_PROP_DESC: self._get_device_prop_desc,
             Operation.GET_DEVICE_PROP_VALUE: self._get_device_prop_value,

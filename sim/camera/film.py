@@ -128,7 +128,8 @@ def _colour_matrix(body: Body) -> tuple[int, ...]:
     return _LINEAR_SRGB if rows is None else tuple(round(10_000 * value) for row in rows for value in row)
 
 
-# First integer of the noise key of a `WatchedFilm`. It is no colour code, so that it differs from keys of `WorldFilm`.
+# First integer of the noise key of a `WatchedFilm`. It differs from all colour codes, with which the keys of a
+# `WorldFilm` start.
 _WATCHED_KEY = 256
 
 
@@ -152,9 +153,9 @@ class Film(Protocol):
 class WatchedFilm:
     """Frames of a `World` under measured light, in real time.
 
-    `gather` measures the light of an exposure, given its number, from 0, and its duration in seconds. It waits until
-    the exposure has ended. It returns the mean projected picture (h, w, 3) float32, 0 to 1 of the full light of each
-    primary, and the relative lamp brightness. `opened`: time from which lamp drift counts.
+    `gather(number, seconds)` measures the light of an exposure with a number, from 0, and a duration. It waits until
+    the exposure has ended, and returns two values: the mean projected picture (h, w, 3) float32, 0 to 1 of the full
+    light of each primary, and the relative lamp brightness. `opened`: time from which lamp drift counts.
     """
 
     suffix = ".dng"

@@ -16,8 +16,6 @@ from sim.projectors.projector import INPUTS, SimulatedProjector
 
 @dataclass
 class _Connection:
-    """State of one connection."""
-
     last_received_s: float  # Time of the last received data, by the clock of the projector
     received: bytes = b""  # Bytes of an incomplete line
     expected_digest: str = ""  # Digest of the password; empty if not required or already verified

@@ -1,7 +1,4 @@
-"""Simulated projector with a lamp, and simulated screen with one uniform colour.
-
-Other modules of this package implement the control protocols of the projector.
-"""
+"""Simulated projector with a lamp, and simulated screen with one uniform colour."""
 
 from __future__ import annotations
 
@@ -66,10 +63,7 @@ class ProjectorTraits:
 
 
 class SimulatedProjector:
-    """Simulated lamp projector (`drivers.projector.Projector`); methods may be called by several threads.
-
-    Each method first updates the power state to the current time.
-    """
+    """Simulated lamp projector (`drivers.projector.Projector`); methods may be called by several threads."""
 
     def __init__(self, clock: Clock, power: Power = Power.STANDBY, traits: ProjectorTraits | None = None) -> None:
         self.clock = clock

@@ -1,8 +1,8 @@
 """Simulated projector that is controlled by lines of text, in any `Language` of a maker.
 
 A `LinePeer` is the projector end of a cable: it receives bytes and returns the bytes of its answers. A new connection
-discards an incomplete command. If manuals are ambiguous, the projector refuses or does not answer, because this is more
-difficult for a driver.
+discards an incomplete command. If manuals are ambiguous, the projector refuses a command or does not answer, because
+this tests a driver more strictly.
 """
 
 from __future__ import annotations

@@ -32,10 +32,10 @@ POLL_S: Final = 0.1  # Interval of queries of the projector, s.
 
 FINEST_PX: Final = 480  # Maximum width of an averaged picture. One pixel is then 2.6 mm on an A0 chart.
 
-# Relative light of a lamp during warm-up (chosen), because PJLink does not report the progress.
+# Relative light of a lamp during warm-up. A constant is assumed, because PJLink does not report the progress.
 WARMING_SHARE: Final = 0.5
 
-_INSTANT_S: Final = 1e-4  # Remaining exposure times below this, s, are treated as 0.
+_INSTANT_S: Final = 1e-4  # An exposure ends if less than this time is left, s.
 
 # Largest difference of light in a uniform picture. It is a ninth of the difference between the two highest codes.
 _UNIFORM_TOLERANCE: Final = 1e-3
@@ -190,7 +190,7 @@ class Beam:
         while ends - at > _INSTANT_S:
             share, picture = self._current_light()
             self._clock.sleep(min(SAMPLE_S, max(ends - self._clock.monotonic(), 0.0)))
-            # A picture represents the time until the next one.
+            # A picture represents the time until the next picture.
             end = min(self._clock.monotonic(), ends)
             lit += share * (end - at)
             total = _sum(total, picture.astype(np.float64) * (share * (end - at)))

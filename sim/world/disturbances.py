@@ -1,7 +1,7 @@
 """Disturbances of a simulated session, such as a bumped chart: events that last for some frames or seconds.
 
 Frames and seconds count from the start of the session. Frames are numbered from 0 as the camera exposes them, including
-repeated ones; seconds follow the clock of the laboratory. An event changes the displayed colour, the `Situation`
+repeated frames. Seconds follow the clock of the laboratory. An event changes the displayed colour, the `Situation`
 (light, chart, lens, sensor), or the counts in the file. The effect depends only on the event and the `Moment`, not on
 earlier calls.
 
@@ -71,7 +71,7 @@ class Disturbance:
             if first is not None and last is not None and last < first:
                 raise ValueError(f"its end to_{name} = {last:g} is before its start from_{name} = {first:g}")
 
-    def is_there(self, moment: Moment) -> bool:
+    def is_active(self, moment: Moment) -> bool:
         """Return whether the event is active at a moment."""
         return (
             self.from_frame <= moment.frame
@@ -95,14 +95,14 @@ class Disturbance:
 
 @dataclass(frozen=True)
 class _Gradual(Disturbance):
-    """An event whose effect grows linearly until its end and then remains constant."""
+    """An event whose effect grows linearly until the end of the event, and then remains constant."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.to_frame is None and self.to_s is None:
             raise ValueError("its end is missing, expected to_frame or to_s; add one")
 
-    def is_there(self, moment: Moment) -> bool:
+    def is_active(self, moment: Moment) -> bool:
         return self.from_frame <= moment.frame and (self.from_s is None or self.from_s <= moment.at_s)
 
     def progress(self, moment: Moment) -> float:
@@ -123,14 +123,14 @@ class FrozenScreen(Disturbance):
     def shown(self, colour: Colour, moment: Moment) -> Colour:
         """Return the colour that was ordered for the last frame before the event."""
         for frame, (at_s, ordered) in reversed(tuple(enumerate(moment.earlier_frames))):
-            if not self.is_there(Moment(frame, at_s)):
+            if not self.is_active(Moment(frame, at_s)):
                 return ordered
         return BLACK
 
 
 @dataclass(frozen=True)
 class PopUp(Disturbance):
-    """A window in front of the picture: its rectangle on the page, its codes and its share of the exposure time."""
+    """A window in front of the picture covers `place` with the codes `colour` for `share` of the exposure time."""
 
     what: Literal["pop-up"] = "pop-up"
     place: Place = (0.55, 0.05, 0.9, 0.3)
@@ -237,7 +237,7 @@ class Defocus(Disturbance):
 
 @dataclass(frozen=True)
 class Person(Disturbance):
-    """A person in front of the chart: a dark ellipse in the rectangle `place`; `left` is the light that remains."""
+    """A person in front of the chart: a dark ellipse in the rectangle `place`, with the share `left` of the light."""
 
     what: Literal["person"] = "person"
     place: Place = _LOWER_RIGHT_QUARTER
@@ -262,7 +262,7 @@ class SensorWarming(_Gradual):
 
 @dataclass(frozen=True)
 class StaleFile(Disturbance):
-    """The camera delivers the counts of the previous frame again; with `new_header`, the file has the new date."""
+    """The camera delivers the previous counts again. If `new_header` is true, the file has the new date."""
 
     what: Literal["stale file"] = "stale file"
     new_header: bool = False
@@ -277,7 +277,7 @@ class ZeroedStrip(Disturbance):
     bottom: float = 0.55
 
     def counted(self, counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """Return the counts (rows, columns) uint16 with these rows 0."""
+        """Return the counts (rows, columns) uint16, 0 in the lost rows."""
         damaged = counts.copy()
         damaged[_rows(counts, self.top, self.bottom)] = 0
         return damaged
@@ -327,7 +327,7 @@ class DeadPrimary(Disturbance):
 
 @dataclass(frozen=True)
 class ScreenSaver(Disturbance):
-    """A screen saver with soft patches over the projected picture; `share` is its share of the light."""
+    """A screen saver with soft patches of random colours; the ordered colour keeps 1 − `share` of the light."""
 
     what: Literal["screen saver"] = "screen saver"
     share: float = 1.0
@@ -360,13 +360,13 @@ KINDS: Final = tuple(str(event.what) for event in get_args(AnyDisturbance))  # N
 
 @dataclass(frozen=True)
 class Disturbances:
-    """All events of a session; later ones are applied after earlier ones."""
+    """All events of a session. They are applied in this order."""
 
     events: tuple[AnyDisturbance, ...] = ()
 
     def at(self, moment: Moment) -> tuple[AnyDisturbance, ...]:
         """Return the active events."""
-        return tuple(event for event in self.events if event.is_there(moment))
+        return tuple(event for event in self.events if event.is_active(moment))
 
     def shown(self, moment: Moment) -> Colour:
         """Return the displayed colour."""
@@ -413,7 +413,7 @@ def read_disturbances(tables: Sequence[Any], where: str, key: str = "simulated.e
 
 
 def _message(fault: ErrorDetails) -> str:
-    # Follows the key; gives the value, the expectation and the remedy.
+    # The end of a message, after the key: the value, the expectation and the remedy.
     value = f" = {fault['input']!r}"
     kinds = ", ".join(KINDS)
     messages = {"union_tag_not_found": f"{value} has no event name; add what, one of {kinds}"}

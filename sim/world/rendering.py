@@ -6,7 +6,7 @@ roll, then tilt, then pan. A pinhole camera with Brown's lens distortion project
 calibration", 1971; coordinates and coefficients as in OpenCV).
 
 **Rendering.** `light` is compiled by numba and runs without the interpreter lock, so `sim.world.world` calls it from
-several threads for blocks of rows. Blocks do not change the result, because a row depends only on its arguments.
+several threads for blocks of rows.
 
 Pixels are half-size, centres at integers, x right, y down. Millimetres are on the print, from its top left corner.
 Photosites are counted in the visible frame.
@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from foundation.compiled import compiled
 
-_RIPPLE: Final = 0.1  # With `wave_mm`, height of the weak waves relative to the strong wave (chosen).
+_RIPPLE: Final = 0.1  # If `wave_mm` is given: height of the weak waves relative to the strong wave, assumed.
 
 _NEWTON_STEPS = 6  # Maximum number of steps of `View.locate`, which ends earlier if all errors are below 10⁻⁷ px.
 
-# Half step of the numerical derivatives, mm: small compared with folds, but large compared with rounding errors.
+# Half the step of numerical derivatives, mm: small compared with folds, but large compared with rounding errors.
 _STEP_MM = 0.05
 
 
@@ -246,7 +246,7 @@ def label_map(sheet: Print) -> LabelMap:
     (x_lines, left, right), (y_lines, top, bottom) = _lines(boxes[:, 0::2]), _lines(boxes[:, 1::2])
     labels = np.full((len(y_lines) + 1, len(x_lines) + 1), len(codes), dtype=np.int32)
     label = label.reshape(-1).astype(np.int32)
-    # The page, which is last in the list, is below all rectangles.
+    # Draw the page first, although it is last in the list, because it is below all rectangles.
     for k in (len(label) - 1, *range(len(label) - 1)):
         labels[top[k] + 1 : bottom[k] + 1, left[k] + 1 : right[k] + 1] = label[k]
     return LabelMap(x_lines, y_lines, labels, codes)

@@ -4,8 +4,8 @@ A `Body` describes a sensor; `counts` calculates the counts of any sensor. Photo
 the sensor, including masked borders. Counts (DN) are the values in the raw file.
 
 Sources: sizes and margins from dcraw 9.28 (`adobe_coeff` and the Canon table in `identify`), masked rectangles from
-cameras.xml of rawspeed, saturation from camconst.json of RawTherapee. Gain and read noise are typical of EMVA 1288
-measurements of such sensors, not measured on these bodies.
+cameras.xml of rawspeed, saturation from camconst.json of RawTherapee. Gain and read noise were not measured on these
+bodies, but are typical of EMVA 1288 measurements of such sensors.
 
 Bodies in `SENSITIVITY_BODIES` are selected by the name of their sensitivities. Their sizes are the makers' numbers of
 recorded pixels; the other values are typical of such sensors. A settings file can replace all these values.
@@ -53,7 +53,7 @@ class Body:
     bits: int  # Bits per count
     electrons_per_dn: float  # Electrons per count at ISO 100; proportional to 100/ISO
     read_noise_dn: float  # Standard deviation of dark counts at ISO 100, DN
-    # Part of the read noise before the amplifier, electrons; in DN, it increases with the ISO speed
+    # Part of the read noise that arises before the amplifier, electrons. In DN, it is proportional to the ISO speed.
     sensor_noise_e: float
     sensitivities: str  # Name in `sim.data`, or a file; see `sim.spectral.sensitivities`
     masked: tuple[Rectangle, ...]  # Rectangles covered from light, from which the black level is measured
@@ -93,10 +93,11 @@ class HotPattern:
     The excess is their dark signal. It is proportional to exposure time and ISO speed, and has the shot noise of its
     electrons.
 
-    The number of hot photosites increases with age. It is proportional to size⁻³ of the photosites and to √ISO, by
-    G. Chapman and others (DFT 2022, doi 10.1109/DFT56152.2022.9962368; size⁻²·⁵ in Proc. SPIE 7875 (2011)). At ISO 100
-    this gives about 3 per million on an EOS 550D (4.3 µm) after ten years, and 0.4 on an EOS 6D Mark II (5.7 µm) after
-    three. Hot photosites of new bodies are not included. The exponential distribution is an assumption.
+    The number of hot photosites increases with age. It is proportional to size⁻³ of the photosites and to √ISO, by G.
+    Chapman and others (DFT 2022, doi 10.1109/DFT56152.2022.9962368; size⁻²·⁵ in Proc. SPIE 7875 (2011)). At ISO 100,
+    about 3 per million are hot on an EOS 550D (4.3 µm) after ten years. On an EOS 6D Mark II (5.7 µm), 0.4 per million
+    are hot after three years. Hot photosites of new bodies are not included. The exponential distribution is an
+    assumption.
     """
 
     rows: NDArray[np.int64]  # (H,) int64, ascending rows of the sensor
@@ -194,11 +195,12 @@ _TEST = replace(
 BODIES: Mapping[str, Body] = MappingProxyType({"EOS 550D": _EOS_550D, "EOS 6D Mark II": _EOS_6D_MARK_II, "Test": _TEST})
 
 
-_BORDER: Final = (50, 140)  # Typical masked rows above and masked columns left of the image on Canon sensors.
+# Typical numbers of masked rows above the image, and of masked columns to its left, on Canon sensors.
+_BORDER: Final = (50, 140)
 
 
 def _sensor_areas(width: int, height: int) -> dict[str, Any]:
-    # Values of the size fields of `Body` for a number of visible photosites.
+    # Values of the fields `sensor`, `visible` and `masked` of `Body` for an image size.
     rows, columns = _BORDER
     sensor = height + rows, width + columns
     return {
@@ -225,7 +227,7 @@ def _canon(
     )
 
 
-# Cameras by the name of their sensitivities. The EOS 600D has a sensor of the same generation as the EOS 550D.
+# The EOS 600D has a sensor of the same generation as the EOS 550D.
 SENSITIVITY_BODIES: Final[Mapping[str, Body]] = MappingProxyType(
     {
         "Canon_EOS_600D": replace(BODIES["EOS 550D"], model="Canon EOS 600D"),
@@ -311,8 +313,8 @@ def counts(
 ) -> None:
     """Write the counts of some rows of the sensor.
 
-    Counts are normally distributed with the variance signal / gain + read noise² (EMVA 1288 release 4.0 linear, section
-    2.2).
+    Counts are normally distributed with the variance signal / `gain_e` + read noise² (EMVA 1288 release 4.0 linear,
+    section 2.2).
 
     Parameters
     ----------

@@ -8,9 +8,9 @@ primary (`_render`). A frame is the weighted sum of these three images, plus noi
 - `project`, `white`, `reflected`, `camera_rgb_at` and `field` return exact values, without point spread and veiling
   glare. An ideal look-up table would contain these values; tests compare with them.
 
-The signal is ∫ primary × reflectance × sensitivity dλ. Its scale is given by bare paper under full white at 0.5 s, f/8
-and ISO 100: the strongest channel has the share `Room.white_level_share` of the range from black to saturation.
-Positions are millimetres on the print or half-size pixels; DN are counts above the black level.
+The signal is ∫ primary × reflectance × sensitivity dλ. Bare paper under full white at 0.5 s, f/8 and ISO 100 gives the
+scale: its strongest channel is `Room.white_level_share` times the range from black to saturation. Positions are
+millimetres on the print or half-size pixels; DN are counts above the black level.
 
 A `Room` describes light, lens and print. A `Situation` describes the differences of one frame from the undisturbed
 room. Positions in a situation are relative to the page: (0, 0) is the top left corner, (1, 1) the bottom right corner,
@@ -85,10 +85,11 @@ class Room:
     waviness_mm
         Peak-to-valley height of the waves of an A0 sheet. It is scaled with the diagonal of other sheets.
     wave_mm
-        Wavelength of the waves of an A0 sheet, scaled in the same way. 150 is plausible for damp paper. 0 gives at
-        most three waves on the longer side.
+        Wavelength of the waves of an A0 sheet, scaled like `waviness_mm`. 150 is plausible for damp paper. With 0, the
+        longer side has at most three waves.
     curl_mm
-        Height of the left and right edges of an A0 sheet above the centre, towards the camera, scaled in the same way.
+        Height of the left and right edges of an A0 sheet above the centre, towards the camera, scaled like
+        `waviness_mm`.
     blur_px
         Standard deviation of the lens blur, half-size pixels, without the aperture of the photosite.
     shoulder_share, shoulder_px
@@ -103,8 +104,8 @@ class Room:
     projector_falloff
         Share of the projector's light that is lost half a page diagonal from its brightest point.
     primary_difference
-        Relative difference of `projector_falloff` between primaries. It is also the spread of their brightest points,
-        in half page diagonals.
+        Relative difference of `projector_falloff` between primaries. The brightest points of the primaries differ by up
+        to this number of half page diagonals.
     lamp_spectrum
         ``uhp`` (mercury lamp and colour wheel) or ``led``.
     transfer
@@ -124,18 +125,19 @@ class Room:
         Rotations of the colour wheel per second; 0 for steady light. Red, green and blue each fill a third of the
         wheel. The primaries differ if an exposure is not a whole number of rotations.
     shutter_jitter_s
-        Standard deviation of the exposure time, s; has an effect with a colour wheel only.
+        Standard deviation of the exposure time, s. It has an effect only with a colour wheel.
     stain_mm, stain_depth
         Diameter of a stain on the print (25 for a thumb, 0 for no stain), and the share of blue light that it absorbs.
         The stain absorbs 0.6 times this share of green light and 0.3 times this share of red light.
     fold_mm
         Height of a crease across the print, 0 for none.
     hot_per_million
-        Photosites per million with high dark current, the same in all frames. 20 is plausible for an EOS 550D after
-        ten years, 2 for an EOS 6D Mark II after three. These numbers (chosen) also include hot photosites of a new
-        body, unlike those of `sim.world.sensors.HotPattern`.
+        Photosites per million with high dark current, the same in all frames. 20 is assumed for an EOS 550D after ten
+        years, 2 for an EOS 6D Mark II after three years. Unlike the numbers in `sim.world.sensors.HotPattern`, these
+        numbers include hot photosites of a new body.
     hot_dn_per_s
-        Mean dark signal of a hot photosite, DN per second at ISO 100 (chosen); exponentially distributed.
+        Mean dark signal of a hot photosite, DN per second at ISO 100; an assumption. The signals are exponentially
+        distributed.
     profile
         ``unmanaged``: codes of the file are ink codes. ``managed``: a profile converts them, so that greys are
         neutral.
@@ -238,15 +240,15 @@ class Stain:
         return 1 - cover[..., None] * (1 - np.array(self.transmittance))
 
 
-def wear(room: Room, page_mm: tuple[float, float], random: np.random.Generator) -> tuple[Stain | None, Fold | None]:
+def damage(room: Room, page_mm: tuple[float, float], rng: np.random.Generator) -> tuple[Stain | None, Fold | None]:
     """Draw the stain and the fold of a room at random positions away from the edges; None if the room has none."""
     page = np.array(page_mm)
-    x, y = (page * random.uniform(0.25, 0.75, 2)).tolist()
+    x, y = (page * rng.uniform(0.25, 0.75, 2)).tolist()
     absorbed = room.stain_depth * np.array([0.3, 0.6, 1.0])
     red, green, blue = (1 - absorbed).tolist()
     stain = Stain((x, y), room.stain_mm, (red, green, blue)) if room.stain_mm else None
-    along = math.radians(random.uniform(-6, 6))
-    crease = float(page[0] * random.uniform(0.3, 0.7)), float(page[1] / 2)
+    along = math.radians(rng.uniform(-6, 6))
+    crease = float(page[0] * rng.uniform(0.3, 0.7)), float(page[1] / 2)
     direction = math.sin(along), math.cos(along)
     return stain, Fold(crease, direction, room.fold_mm, _SLANT) if room.fold_mm else None
 
@@ -277,7 +279,7 @@ class Blob:
     """A dark object between chart and camera: an ellipse with a soft edge that fills a rectangle."""
 
     place: Place
-    left: float = 0.08  # Light behind the object, relative to the light without the object, 0 to 1
+    left: float = 0.08  # Remaining light behind the object, relative to the light without the object, 0 to 1
 
     def transmittance(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the share of the light (...) that reaches points (..., 2), given relative to the page."""
@@ -304,11 +306,11 @@ class Situation:
     """Differences from the undisturbed room during one frame."""
 
     lamp: tuple[float, float, float] = (1.0, 1.0, 1.0)  # Relative light of each primary
-    # Additional ambient light of each primary, relative to its full light
+    # Additional ambient light with the spectrum of each primary, relative to the full light of this primary
     ambient: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # (h, w, 3) float32, mean light of the projected picture, 0 to 1 of each primary; None: one uniform colour
     picture: NDArray[np.float32] | None = None
-    patches: tuple[Patch, ...] = ()  # Rectangles of other colours in the picture, later ones on top
+    patches: tuple[Patch, ...] = ()  # Rectangles of other colours in the picture, later rectangles on top
     blobs: tuple[Blob, ...] = ()  # Objects in front of the chart
     glares: tuple[Glare, ...] = ()  # Specular reflections of the print
     # Shift of the chart in its plane, right and down, half-size pixels at its centre; adds to `bump_mm`
@@ -319,7 +321,7 @@ class Situation:
     black_dn: float = 0.0  # Increase of the black level, DN
 
     @property
-    def is_even(self) -> bool:
+    def scales_uniformly(self) -> bool:
         """Whether the light of each primary changes by the same factor at all points of the chart."""
         plain = self.picture is None or self.picture.shape[:2] == (1, 1)
         return plain and not self.patches and not self.blobs and not self.glares
@@ -432,7 +434,7 @@ class World:
         self.body = body
         self.room = room
         rows, columns = body.half_size
-        self.stain, self.fold = wear(room, sheet.page_mm, self._random(5))
+        self.stain, self.fold = damage(room, sheet.page_mm, self._random(5))
         self.view = View.framed(
             sheet_of(room, sheet.page_mm, self.fold),
             (columns, rows),
@@ -527,15 +529,15 @@ class World:
         """Return the light (3, rows, columns) of each primary and weights (3,); their weighted sum is the signal."""
         (light, veil), ambient = self._render(situation), np.array(situation.ambient)
         plain = self.decoded(colour) if situation.picture is None else situation.picture[0, 0].astype(np.float64)
-        if situation.is_even:
-            return light, self._collected(plain, settings, lamp, ambient).astype(np.float32)
+        if situation.scales_uniformly:
+            return light, self._relative_exposure(plain, settings, lamp, ambient).astype(np.float32)
         nodes, page = self._nodes(UNDISTURBED), self.sheet.page_mm
         frame_light = np.empty_like(light)
 
         def block(first: int, last: int) -> None:
             points = self._points(nodes, first, last)
             picture_light = situation.picture_light(points, page, plain, self.decoded)
-            weights = self._collected(picture_light, settings, lamp, ambient)
+            weights = self._relative_exposure(picture_light, settings, lamp, ambient)
             weights *= situation.transmittance(points, page)[..., None]
             patch_light = self.lens.unveiled(light[:, first:last], veil, first)
             if situation.glares:
@@ -631,9 +633,9 @@ class World:
         `colour` and `settings` as in `expose`. `lamp` and `ambient` may have one value per primary; `ambient` is added
         to the ambient light of the room.
         """
-        return self._collected(self.decoded(colour), settings, lamp, ambient)
+        return self._relative_exposure(self.decoded(colour), settings, lamp, ambient)
 
-    def _collected(
+    def _relative_exposure(
         self,
         linear: NDArray[np.float64],
         settings: ExposureSettings,
@@ -662,9 +664,9 @@ class World:
         """Return the light at points of the print: lens vignetting times fall-off of the projector.
 
         `points_mm`: (..., 2) float64. Returns (..., 3) float64 for each primary. The factor of the lens is 1 on its
-        axis, the factor of green is 1 at the brightest point of green. Red and blue are scaled to the mean of green
-        over the sheet, so `white` has the chromaticity of the mean light. The field of a camera channel is the mean of
-        the fields of the primaries, weighted by the signal of the channel under each primary.
+        axis, the factor of green is 1 at the brightest point of green. The means of red and blue over the sheet are
+        scaled to the mean of green, so `white` has the chromaticity of the mean light. The field of a camera channel is
+        the mean of the fields of the primaries, weighted by the signal of the channel under each primary.
         """
         points = np.asarray(points_mm, dtype=np.float64)
         photosites = 2 * self.project(points) + 0.5
@@ -674,7 +676,6 @@ class World:
         return passed[..., None] * self._falloff[:, 3] / (1 + self._falloff[:, 2] * from_spot)
 
     def _balance(self) -> NDArray[np.float64]:
-        # Gains that scale the mean of each primary over the sheet to the mean of green.
         width, height = self.sheet.page_mm
         x, y = np.meshgrid((np.arange(60) + 0.5) * width / 60, (np.arange(40) + 0.5) * height / 40)
         means = self.field(np.stack([x, y], axis=-1)).mean(axis=(0, 1))
@@ -738,7 +739,6 @@ class World:
         return out, self.lens.add_veil(out, self.body.pattern)
 
     def _response(self, first: int, last: int) -> NDArray[np.float32]:
-        # Response (rows, columns) float32 of the photosites of a block of rows.
         response = self._random(3, first).standard_normal((last - first, self.body.visible.width), dtype=np.float32)
         response *= np.float32(self.room.response_spread)
         response += np.float32(1)
@@ -781,7 +781,7 @@ class World:
 
 
 def _run_in_blocks(rows: int, work: Callable[[int, int], None]) -> None:
-    # Calls `work(first, last + 1)` for each block of rows.
+    # Calls `work(first, end)` for each block of rows.
     firsts = range(0, rows, _BLOCK_ROWS)
     with ThreadPoolExecutor(processor_count()) as threads:
         for future in [threads.submit(work, first, min(first + _BLOCK_ROWS, rows)) for first in firsts]:

@@ -341,17 +341,17 @@ def test_shares_of_a_lens(pinned: Pinned) -> None:
         _, value, matrix, vector = equations(2 * size, size, seed)
         prior = np.diag(np.linspace(0.5, 2, size))
         free = np.flatnonzero(fitting.free_terms())
-        result.append(brief(fitting._solved(matrix, vector, prior, free)))
+        result.append(brief(fitting._solve_all(matrix, vector, prior, free)))
         left = np.random.default_rng(seed).standard_normal(size * 2)
         result.append(brief(fitting._weights(left, np.abs(value) * 1000)))
         if size == fitting.TERMS:
-            shares, gain = fitting._positive(matrix, vector, np.arange(size)[::2])
+            shares, gain = fitting._solve_nonnegative(matrix, vector, np.arange(size)[::2])
             result.append(
-                [brief(shares), gain, fitting._selected(100 * matrix, 100 * vector, 1.0, fitting.groups_of_terms())]
+                [brief(shares), gain, fitting._proven_terms(100 * matrix, 100 * vector, 1.0, fitting.groups_of_terms())]
             )
     random = np.random.default_rng(16)
     spots = random.uniform(-5, 60, (30, 2))
-    laws = [fitting._law(power) for power in (0.5, 1.0, 1.5, 3.0, 6.0)]
+    laws = [fitting._law_shares(power) for power in (0.5, 1.0, 1.5, 3.0, 6.0)]
     pinned("shares of a lens", [result, brief(fitting.frame_terms(spots, (40, 50))), laws], **LOOSE)
 
 

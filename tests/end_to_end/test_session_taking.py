@@ -223,7 +223,7 @@ def test_waits_for_locked_journal_up_to_patience(lab: Path, monkeypatch: pytest.
 def test_takes_series_longer_than_battery(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = load_lab(lab)
     few = {name: replace(body, shots_per_charge=4) for name, body in EOS_BODIES.items()}
-    monkeypatch.setattr("acquisition.run.rig.simulated.EOS_BODIES", few)
+    monkeypatch.setattr("sim.camera.bodies.EOS_BODIES", few)
     with open_rig(settings, load_chart(settings.chart)) as devices:
         devices.camera.configure(settings.camera.exposure)
         frames = {capture(devices.camera, io.BytesIO()).name for _ in range(9)}

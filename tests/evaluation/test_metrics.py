@@ -152,7 +152,7 @@ def test_estimate_with_zero_channel() -> None:
 def test_summary_matches_hand_calculation() -> None:
     # By MATLAB's prctile the errors stand at 6.25, 18.75, 31.25 ... percent: Q1 = 2.5, Q2 = 4.5, Q3 = 6.5.
     summary = summarise([8, 1, 7, 2, 6, 3, 5, 4])
-    assert summary.as_tuple() == pytest.approx((4.5, 4.5, 4.5, 1.5, 7.5, (4.5**3 * 1.5 * 7.5) ** 0.2))
+    assert summary.as_tuple() == pytest.approx((4.5, 4.5, 4.5, 1.5, 7.5, (4.5**3 * 1.5 * 7.5) ** 0.2, 8))
     assert summary.maximum == 8
     assert summary.below3 == 2 / 8  # 3 itself is not below 3.
 
@@ -162,6 +162,14 @@ def test_summary_matches_hand_calculation() -> None:
 
     # The 19th of 20 stands at 92.5 percent, the 20th at 97.5: half-way.
     assert summarise(np.arange(1, 21)).p95 == pytest.approx(19.5)
+
+
+def test_worst_5_matches_program_of_c5() -> None:
+    # `error_metrics` of evaluation/evaluation.py (github.com/mahmoudnafifi/C5). Of 40 errors, NumPy's and MATLAB's
+    # percentiles select the same two.
+    errors = np.random.default_rng(4).gamma(1.5, 2.0, (40, 1))
+    limit = np.percentile(errors, [25, 50, 75, 95])[3]
+    assert summarise(errors).worst5 == pytest.approx(np.mean(errors[np.argwhere(np.squeeze(errors) >= limit)]))
 
 
 def test_percentiles_match_matlab() -> None:

@@ -79,7 +79,7 @@ def test_camera_takes_sensitivities(model: str, tmp_path: Path) -> None:
 
 def test_unknown_camera_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["camera", "--port", "0", "--model", "Canon_EOS_600"]) == 2
-    assert "did you mean 'Canon_EOS_600D'?" in capsys.readouterr().err
+    assert "did you mean 'Canon_EOS_600D'" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from evaluation.methods.prepared import usable
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result, SceneAnswer, collect_results, read_estimate
-from evaluation.results.tables import PAPER_COLUMNS, Table
+from evaluation.results.tables import ERROR_COLUMNS, Table
 from evaluation.scene import Image, Scene, report_progress
 from foundation.compiled import ordered_map
 from generator.files import Flash, fit_flash
@@ -130,7 +130,7 @@ def bits_table(bits_result: BitsResult, metric: ErrorKind, name: str) -> Table:
     versions = {"as it is": bits_result.raw, **{str(count): results for count, results in bits_result.reduced.items()}}
     return Table(
         f"{name}: {metric} angular error after bits of the codes made by Flash were set to zero, degrees",
-        ("Algorithm", "Bits set to zero", *PAPER_COLUMNS[1:]),
+        ("Algorithm", "Bits set to zero", *ERROR_COLUMNS[1:]),
         tuple(
             (results[index].method, label, *results[index].summary(metric).as_tuple())
             for index in range(len(bits_result.raw))

@@ -201,7 +201,7 @@ def block_table(block: Block, metric: ErrorKind) -> Table:
     published = TABLE1.get(block.cell, {})
     rows: list[tuple[str | float | None, ...]] = []
     for result in block.results:
-        rows.append((result.marked_name, *result.summary(metric).as_tuple()))
+        rows.append((result.marked_name, *result.summary(metric).as_tuple()[:6]))
         if result.method in published:
             rows.append(("paper", *published[result.method].as_tuple()))
     notes = [f"{counted(len(block.scenes), 'image')}; illuminants {block.lights}."]
@@ -222,7 +222,7 @@ def joint_table(blocks: Sequence[Block]) -> Table:
         published = TABLE1.get(block.cell, {})
         for result in block.results:
             row_start = (*block.cell, len(block.scenes), result.method)
-            statistics = {str(metric): result.summary(metric).as_tuple() for metric in kinds}
+            statistics = {str(metric): result.summary(metric).as_tuple()[:6] for metric in kinds}
             if result.method in published:
                 statistics["paper"] = published[result.method].as_tuple()
             rows += [(*row_start, name, *numbers) for name, numbers in statistics.items()]
@@ -322,7 +322,7 @@ def table2_tables(
         published = TABLE2["real" if training == "real" else "generated"]
         for trained in comparisons:
             result = trained.real if training == "real" else trained.generated
-            rows.append((result.marked_name, *result.summary(metric).as_tuple()))
+            rows.append((result.marked_name, *result.summary(metric).as_tuple()[:6]))
             published_row = published.get(LEARNERS.get(trained.learner, ""))
             if published_row and with_published:
                 rows.append(("paper", *published_row.as_tuple()))

@@ -16,9 +16,19 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from evaluation.datasets.generated import GeneratedScene
-from evaluation.experiments.bootstrap import LEVEL, STATISTICS, BoundedFigure, ErrorSample, bounded_figures, safe_ratio
+from evaluation.experiments.bootstrap import (
+    LEVEL,
+    STATISTICS,
+    TAIL_GROUPS,
+    BoundedFigure,
+    ErrorSample,
+    bounded_figures,
+    hide_tails,
+    safe_ratio,
+)
 from evaluation.experiments.folds import folds_to_csv, groups_of
 from evaluation.experiments.transfer.plan import TransferPlan, is_generated
 from evaluation.experiments.transfer.rows import NAIVE, TransferRow
@@ -26,12 +36,12 @@ from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import errors_csv
 from evaluation.results.result import Result
-from evaluation.results.tables import PAPER_COLUMNS, Table, finite_or_none, table_to_csv
+from evaluation.results.tables import BEST_ERRORS, ERROR_COLUMNS, MISSING, Table, finite_or_none, table_to_csv
 from evaluation.scene import SceneSet
 from foundation import pages
 from foundation.files import write_atomic
 from foundation.folders import atomic_folder
-from foundation.plots import draw_svg, legend_label, series_style, standalone_svg
+from foundation.plots import FigureForm, draw_svg, legend_label, series_style, standalone_svg
 from foundation.version import software
 
 Floats = npt.NDArray[np.float64]
@@ -85,7 +95,9 @@ def figures_of(rows: Sequence[TransferRow], error: ErrorKind, groups: Sequence[s
         ratios = [safe_ratio(means[row], means[base]) for indices in pairs.values() for row, base in indices]
         return np.concatenate([*means, *ratios], axis=1)
 
-    figures = _batches(bounded_figures(statistics, len(samples[0][0].order), groups))
+    images = len(samples[0][0].order)
+    bounded = hide_tails(bounded_figures(statistics, images, groups), len(set(groups or range(images))))
+    figures = _batches(bounded)
     entries = tuple(RowFigures(row, next(figures), _spread(seeds)) for row, seeds in zip(rows, samples, strict=True))
     ratios = {
         name: tuple(RowRatio(rows[row], rows[base], next(figures)) for row, base in indices)
@@ -138,28 +150,34 @@ def _spread(seeds: Sequence[ErrorSample]) -> tuple[float, ...] | None:
     return tuple(float(deviation) for deviation in deviations)
 
 
-# All six statistics, because a single statistic can mislead.
-STATISTIC_HEADS: Final = PAPER_COLUMNS[1:]
+# All statistics, because a single statistic can mislead.
+STATISTIC_HEADS: Final = ERROR_COLUMNS[1:]
 
 
 def errors_table(figures: TransferFigures, name: str, images: int) -> Table:
     """Return the statistics of all rows without `real_use`; with several seeds, their means."""
     unadapted = [row for row in figures.rows if not row.row.real_use]
+    seeds = max(len(row.row.results) for row in figures.rows)
+    # Student's interval of a mean over seeds; the first three columns are texts.
+    margins = {
+        (number, column): float(stats.t.ppf((1 + LEVEL) / 2, seeds - 1)) * deviation / math.sqrt(seeds)
+        for number, row in enumerate(unadapted)
+        for column, deviation in enumerate(row.spread or (), start=3)
+    }
     notes = [
         f"{row.row.method}, {row.row.training}: no estimate for {guessed.sum()} images; grey was used instead"
         for row in figures.rows
         if (guessed := row.row.results[0].guessed).any()
     ]
-    if any(row.spread for row in figures.rows):
-        median = [row.spread[1] for row in figures.rows if row.spread]
-        notes.append(
-            f"Means over seeds; the standard deviation of a median over seeds is up to {max(median):.2f} degrees."
-        )
+    if margins:
+        notes.append(f"Means over {seeds} seeds with their {LEVEL * 100:.0f} % intervals (Student's t).")
     return Table(
         f"{name}: {figures.error} angular error of {images} images, degrees",
         ("Method", "Trained on", "Images", *STATISTIC_HEADS),
         tuple((*_row_start(row.row), *(statistic.value for statistic in row.statistics)) for row in unadapted),
         notes=tuple(notes),
+        best=BEST_ERRORS,
+        margins=margins,
     )
 
 
@@ -169,11 +187,12 @@ def intervals_table(figures: TransferFigures, name: str) -> Table:
         f"{name}: {LEVEL * 100:.0f} % intervals of the {figures.error} angular error, degrees",
         ("Method", "Trained on", "Images", *STATISTIC_HEADS),
         tuple(
-            (*_row_start(row.row), *(f"{statistic.low:.2f} – {statistic.high:.2f}" for statistic in row.statistics))
-            for row in figures.rows
-            if not row.row.real_use
+            (*_row_start(row.row), *map(_interval_text, row.statistics)) for row in figures.rows if not row.row.real_use
         ),
-        notes=("BCa bootstrap over the test images: range expected for other images of the same kind.",),
+        notes=(
+            "BCa bootstrap over the test images: range expected for other images of the same kind. Worst 5% needs "
+            f"{TAIL_GROUPS} images.",
+        ),
     )
 
 
@@ -215,7 +234,12 @@ _BASE_NOTE: Final = "Images: training images of the row. Base: training images o
 
 
 def _ratio_text(figure: BoundedFigure) -> str:
-    return f"{figure.value:.2f} ({figure.low:.2f} – {figure.high:.2f})" if math.isfinite(figure.value) else "–"
+    interval = f" ({_interval_text(figure)})" if math.isfinite(figure.low) else ""
+    return f"{figure.value:.2f}{interval}" if math.isfinite(figure.value) else MISSING
+
+
+def _interval_text(figure: BoundedFigure) -> str:
+    return f"{figure.low:.2f} – {figure.high:.2f}" if math.isfinite(figure.low) else MISSING
 
 
 def adaptation_table(figures: TransferFigures, name: str) -> Table | None:
@@ -297,8 +321,8 @@ def _row_start(row: TransferRow) -> tuple[str, str, int | None]:
     return row.method, row.training, row.images or None
 
 
-def adaptation_plot(figures: TransferFigures) -> bytes:
-    """Return the mean error against the number of real images as SVG: one panel for each method, 95 % intervals."""
+def adaptation_plot(figures: TransferFigures, form: FigureForm = "page") -> bytes:
+    """Return the mean error against the number of real images: one panel for each method, 95 % intervals."""
     panels: dict[str, dict[str, dict[float, BoundedFigure]]] = {}
     for entry in figures.rows:
         row = entry.row
@@ -315,7 +339,26 @@ def adaptation_plot(figures: TransferFigures) -> bytes:
         panels,
         figures.error,
         inches=(max(4.6, 3.1 * len(panels) + 0.4), 5.2 if len(panels) == 1 else 4.4),
+        form=form,
     )
+
+
+def errors_plot(figures: TransferFigures, form: FigureForm = "page") -> bytes:
+    """Return the mean error of each row with its 95 % interval over the test images; one colour for each method."""
+    return draw_svg(_draw_rows, figures, inches=(7.2, 0.9 + 0.24 * len(figures.rows)), form=form)
+
+
+def _draw_rows(figure: Any, figures: TransferFigures) -> None:
+    axes = figure.subplots()
+    methods = list(dict.fromkeys(row.row.method for row in figures.rows))
+    for position, entry in enumerate(figures.rows):
+        value, low, high = entry.statistics[0]
+        ends = None if math.isnan(low) else [[value - low], [high - value]]
+        colour = series_style(methods.index(entry.row.method))["color"]
+        axes.errorbar([value], [position], xerr=ends, marker="o", markersize=4, capsize=2, color=colour)
+    names = [row.labels(1)[0] for row in (entry.row for entry in figures.rows)]
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set(ylim=(len(names) - 0.5, -0.5), xlim=(0, None), xlabel=f"mean {figures.error} error, degrees")
 
 
 def _draw_panels(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, BoundedFigure]]], error: str) -> None:
@@ -375,10 +418,10 @@ def labelled_results(rows: Sequence[TransferRow]) -> tuple[Result, ...]:
     return tuple(labelled)
 
 
-def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
+def save_outcome(outcome: TransferOutcome, folder: Path, figures: FigureForm | None = None) -> None:
     """Write the results folder: results.csv, errors.csv, folds_SEED.csv, tables.tex, report.html, run.json.
 
-    If real images were used, also beside_real.svg.
+    If real images were used, also beside_real.svg. With `figures`, also the figures for a paper.
     """
     names = [scene.name for scene in outcome.test.scenes]
     truths = np.stack([scene.truth for scene in outcome.test.scenes])
@@ -392,6 +435,10 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
         write_atomic(partial / "report.html", report_page(outcome))
         if outcome.figures.to_better:
             write_atomic(partial / "beside_real.svg", standalone_svg(adaptation_plot(outcome.figures)))
+        if figures:
+            write_atomic(partial / f"means.{figures}", errors_plot(outcome.figures, figures))
+        if figures and outcome.figures.to_better:
+            write_atomic(partial / f"real_images.{figures}", adaptation_plot(outcome.figures, figures))
         write_atomic(partial / "run.json", json.dumps(_provenance(outcome), indent=2, ensure_ascii=False) + "\n")
 
 

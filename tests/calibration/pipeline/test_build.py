@@ -291,7 +291,7 @@ def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Pat
 def test_report_is_self_contained(built: BuildResult) -> None:
     assert built.lut is not None
     page = (built.lut / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 8
+    assert page.count("<svg") + page.count("data:image/png;base64,") >= 8
     # Verdict, what to do, and the four pictures to look at first stand before everything that is folded.
     heads = re.findall(r"<h2>([^<]+)</h2>", page[: page.index("<details")])
     assert [head for head in heads if head not in ("Probable causes",) and not head.startswith("Position: ")] == [
@@ -548,7 +548,7 @@ def test_reports_window_larger_than_cells(session: Session, built: BuildResult) 
     note = next(row.note for row in report_summary(result.figures) if row.name == "Window")
     assert "less than 0.2 %" in note
     plain = next(row.note for row in report_summary(built.figures) if row.name == "Window")
-    assert plain.startswith("up to 5×5")
+    assert "up to 5×5" in plain
 
 
 def test_reports_dark_cells_affected_by_glare(built: BuildResult) -> None:
@@ -756,7 +756,7 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
     assert judged_values(result.figures).keys().isdisjoint({"frame_scatter", "block_deviation", "doubtful_share"})
     if bits == 1:
         report = (tmp_path / "report.html").read_text()
-        assert "Course of the session" in report
+        assert "Values of each frame" in report
         assert "The LUT can be used" in report
     table = open_lut(tmp_path / "lut")
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
@@ -833,10 +833,10 @@ def test_uneven_primaries_are_no_dirt_on_the_print(tmp_path: Path) -> None:
     expected = np.log(own / of_paper)
     assert expected.std(axis=0).min() > 0.003
     for channel in range(3):
-        is_measured = np.isfinite(stains.alone[:, channel])
+        is_measured = np.isfinite(stains.patch_deviation[:, channel])
         # 1 where cells are evened by the field of paper.
         differs = expected[is_measured, channel] - expected[is_measured, channel].mean()
-        assert abs(differs @ stains.alone[is_measured, channel] / (differs @ differs)) < 0.3
+        assert abs(differs @ stains.patch_deviation[is_measured, channel] / (differs @ differs)) < 0.3
 
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
@@ -1218,7 +1218,7 @@ def test_lights_whose_files_state_another_exposure_are_refused(small_lab: Lab, t
         return small_lab.dng(step.colour, step.number, stated=replace(SETTINGS, iso=200) if deviation else SETTINGS)
 
     message, report = refused(small_lab, tmp_path, frame)
-    assert "exposure from most frames" in message
+    assert "Difference between the recorded exposure" in message
     assert "instead of 0.5 s, ISO 100, f/8" in message
     assert report["retake"] == "4-5"
 
@@ -1230,7 +1230,7 @@ def test_white_frames_at_half_exposure_are_no_brilliant_colour(small_lab: Lab, t
         tmp_path,
         lambda step: small_lab.dng(step.colour, step.number, HALF if step.kind == "white" else SETTINGS),
     )
-    assert "exposure from most frames" in message
+    assert "Difference between the recorded exposure" in message
     assert "additivity" not in report["figures"]  # pyrefly: ignore[not-iterable]
 
 

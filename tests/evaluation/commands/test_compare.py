@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -93,9 +94,30 @@ def test_writes_tables_and_page(runs: tuple[str, str], tmp_path: Path) -> None:
     assert main(["compare", *runs, "--out", str(out)]) == 0
     assert {path.name for path in out.iterdir()} == {"tests.csv", "statistics.csv", "tables.tex", "report.html"}
     rows = list(csv.DictReader((out / "statistics.csv").read_text().splitlines()))
-    assert [row["Statistic"] for row in rows[:6]] == ["Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg."]
+    assert [row["Statistic"] for row in rows[:7]] == [
+        *("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.", "Worst 5%")
+    ]
     assert float(rows[0]["Ratio"]) == pytest.approx(1 / 0.7, rel=1e-5)
     page = (out / "report.html").read_text()
     assert "B &lt;i&gt;" in page
     assert page.count("<svg") == 2
     assert main(["compare", *runs, "--out", str(out)]) == 2
+
+
+def test_writes_figures_for_papers(runs: tuple[str, str], tmp_path: Path) -> None:
+    for form in ("pdf", "svg"):
+        for name in ("one", "two"):
+            assert main(["compare", *runs, "--figures", form, "--out", str(tmp_path / form / name)]) == 0
+    pdf, svg = (tmp_path / form / "one" / f"scatter_1.{form}" for form in ("pdf", "svg"))
+    # Fonts are embedded as TrueType (FontFile2 of ISO 32000-1, table 126), not as Type 3.
+    assert pdf.read_bytes()[:5] == b"%PDF-"
+    assert b"/FontFile2" in pdf.read_bytes()
+    assert b"/Type3" not in pdf.read_bytes()
+    assert not re.search(rb"var\(--|<text", svg.read_bytes())
+    for path in (pdf, svg):
+        assert path.read_bytes() == (path.parents[1] / "two" / path.name).read_bytes()
+
+
+def test_figures_need_results_folder(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", *runs, "--figures", "pdf"]) == 2
+    assert "add --out" in capsys.readouterr().err

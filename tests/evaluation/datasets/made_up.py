@@ -140,6 +140,17 @@ def gehler_shi(folder: Path) -> None:
     write_mat(folder / "real_illum_568..mat", {"real_rgb": rows[:, ::-1].copy()})
 
 
+def levi(folder: Path) -> None:
+    """Write 11 images of 8 × 10 px, so that 10 and 2 are in another order by name; the chart has two pixels."""
+    mask = np.zeros((8, 10, 3), np.uint8)
+    mask[3, 4:6] = 255
+    for number in range(1, 12):
+        write_png(folder / "img" / f"{number}.png", image_of(8, 10))
+        write_png(folder / "msk" / f"{number}.png", mask)
+    write_mat(folder / "gt.mat", {"gts": np.arange(1, 12)[:, None] + np.array([[0.0, 100.0, 200.0]])})
+    (folder / "LEVI dataset EXIF information.csv").write_text("name,ISO\n1.png,500\n")
+
+
 def intel_tau(folder: Path) -> None:
     """Write two cameras with one and two subsets, 8 × 10 px, two pixels painted over."""
     image = image_of(8, 10)
@@ -266,6 +277,7 @@ COPIES = {
     "lsmi": MadeUp("lsmi", lsmi),
     "lsmi camera": MadeUp("lsmi", lsmi, "sony"),
     "lsmi prepared": MadeUp("lsmi", lsmi_preprocessed, "sony_512"),
+    "levi": MadeUp("levi", levi),
     "ffcc": MadeUp("ffcc", ffcc),
     "folder": MadeUp("folder", plain_folder),
     "folder table": MadeUp("folder", plain_folder, "gt.csv"),

@@ -328,3 +328,18 @@ def test_array_in_any_byte_order(tmp_path: Path, dtype: str) -> None:
     values, _ = open_scenes(tmp_path).scenes[0].read()
     assert values.dtype.isnative
     np.testing.assert_array_equal(values, np.maximum(image.astype(float) - 100, 0))
+
+
+def test_reads_named_ground_truths_as_text(tmp_path: Path) -> None:
+    # numpy.savetxt is the program that writes the file.
+    names = ["b 2.png", "a.png", "10.png"]
+    lights = np.array([[0.2, 0.5, 0.3], [0.25, 0.5, 0.25], [0.1, 0.6, 0.3]])
+    for name in names:
+        write_png(tmp_path / name, image_of(4, 5))
+    np.savetxt(tmp_path / "gt.txt", np.column_stack([names, lights.astype(str)]), fmt="%s", header="name r g b")
+    for location in (tmp_path, tmp_path / "gt.txt"):
+        scenes = open_scenes(location, "folder" if location.is_dir() else None).scenes
+        assert {scene.name: scene.truth.tolist() for scene in scenes} == dict(zip(names, lights.tolist(), strict=True))
+    (tmp_path / "gt.txt").write_text("a.png 0.25 0.5 0.25\nb 2.png 0.2 0.5\n")
+    with pytest.raises(FormatError, match="line 2"):
+        open_scenes(tmp_path / "gt.txt")

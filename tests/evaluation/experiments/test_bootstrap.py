@@ -76,6 +76,8 @@ def test_intervals_have_nominal_coverage() -> None:
     for _ in range(WORLDS):
         for name, (low, high) in intervals(skewed(random, 80), count=1000).items():
             hits[name] += low <= truth[name] <= high
+    # Worst 5 % of 80 images has no interval in tables (`TAIL_GROUPS`): too few contain the true value.
+    assert hits.pop("worst5") / WORLDS < 0.8
     assert {name: hit for name, hit in hits.items() if not 0.88 < hit / WORLDS < 0.99} == {}
 
 
@@ -104,7 +106,7 @@ def test_order_of_images_and_methods_does_not_matter() -> None:
     for reversed_pair, back in zip(compare_paired(errors_a, errors_b), compare_paired(errors_b, errors_a), strict=True):
         difference, low, high = reversed_pair.difference
         turned = -back.difference[0], -back.difference[2], -back.difference[1]
-        assert (difference, low, high) == pytest.approx(turned, abs=0.02)
+        assert (difference, low, high) == pytest.approx(turned, abs=0.02, nan_ok=True)
         ours, theirs = (getattr(summarise(errors), reversed_pair.statistic) for errors in (errors_a, errors_b))
         assert (reversed_pair.value_a, reversed_pair.value_b) == pytest.approx((ours, theirs))
         assert difference == pytest.approx(ours - theirs)

@@ -121,7 +121,7 @@ def test_waits_for_another_writer(path: Path, at_start: bool, monkeypatch: pytes
             if running:
                 journal.retry_locked(60, announce)
             journal.note(NOW, "written")
-    assert messages == [f"another program is using {path}; the run resumes automatically when it is free"]
+    assert messages == [f"another program is using {path}; the run resumes automatically when the file is free"]
     assert event_names(path) == ["written"]
 
 

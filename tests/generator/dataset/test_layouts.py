@@ -74,7 +74,8 @@ def test_every_layout_is_offered() -> None:
 
 @pytest.mark.parametrize("form", ["png", "tiff", "exr", "jxl", "dng"])
 def test_formats_are_equal_in_every_layout(make: Make, form: str) -> None:
-    folder, *other_layouts = (make(layout, form=form, scenes=4) for layout in LAYOUTS)
+    names = [layout for layout in LAYOUTS if layout != "c5" or form == "png"]
+    folder, *other_layouts = (make(layout, form=form, scenes=4) for layout in names)
     assert [variant.entries for variant in other_layouts] == [folder.entries] * len(other_layouts)
     assert [entry.image for entry in folder.entries] == [f"{number:06d}.{form}" for number in range(8)]
     for entry in folder.entries[::3]:
@@ -93,7 +94,7 @@ def test_adds_file_layout_by_one_entry(make: Make, monkeypatch: pytest.MonkeyPat
         (default.read_image(image_entry), default.read_weights(image_entry), default.read_preview(image_entry))
         for image_entry in default.entries
     ]
-    entry = FileLayout(file_name=lambda kind, split_name, name: f"{split_name}/{kind}/{name}")
+    entry = FileLayout(file_name=lambda kind, split_name, name, _camera: f"{split_name}/{kind}/{name}")
     monkeypatch.setitem(cast("dict[str, Any]", layouts.LAYOUTS), "folder", entry)
     variant = make("folder", lights, split=split)
     splits = {"train", "test"} if split else {"data"}
@@ -106,6 +107,30 @@ def test_adds_file_layout_by_one_entry(make: Make, monkeypatch: pytest.MonkeyPat
     card = (folder_of(variant) / "README.md").read_text()
     assert all(f"`{split_name}/images/NNNNNN.png`" in card for split_name in splits)
     assert (entry.folder("masks", ["train", "test"]), entry.folder("masks", ["test"])) == (None, "test/masks")
+
+
+def test_c5_and_ccmnet_read_images(make: Make) -> None:
+    """Follows src/dataset.py and `read_image` of src/ops.py of github.com/mahmoudnafifi/C5 and DY112/CCMNet."""
+    with pytest.raises(InputError, match="--format png"):
+        make("c5", form="tiff")
+    data_set = make("c5", split=(0.6, 0.0, 0.4))
+    splits = {split: folder_of(data_set) / split for split in ("train", "test")}
+    entries = {(str(entry.split), entry.image[:6]): entry for entry in data_set.entries}
+    for split, folder in splits.items():
+        for file in [file for file in folder.iterdir() if file.name.endswith((".png", ".PNG"))]:
+            entry = entries.pop((split, file.name[:6]))
+            stored = cv2.imread(str(file), -1)
+            assert stored is not None
+            np.testing.assert_array_equal(stored[..., ::-1], data_set.read_image(entry))
+            metadata = json.loads(Path(f"{file.with_suffix('')}_metadata.json").read_text())
+            assert metadata["illuminant_color_raw"] == pytest.approx(entry.truth, abs=1e-9)
+            # All images of a camera have the same text after "sensorname_".
+            assert str(file.with_suffix("")).split("sensorname_")[-1] == "test_camera"
+            for name in ("cm1", "cm2", "fm1", "fm2"):
+                assert np.array(metadata[name]).reshape(9).shape == (9,)
+            # DNG 1.7.1, chapter 6: ForwardMatrix converts white to the white D50.
+            np.testing.assert_allclose(np.sum(metadata["fm2"], axis=1), [0.9642, 1, 0.8249], atol=4e-4)
+    assert not entries
 
 
 READER = """
@@ -236,7 +261,7 @@ def maps_in_parquet(folder: Path) -> list[bytes]:
 
 
 # Read both masks and the ground truth map of the fourth image without our reader.
-MAPS_OF = {"folder": maps_in_folder, "webdataset": maps_in_tar, "parquet": maps_in_parquet}
+MAPS_OF = {"folder": maps_in_folder, "c5": maps_in_folder, "webdataset": maps_in_tar, "parquet": maps_in_parquet}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
