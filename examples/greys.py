@@ -31,7 +31,7 @@ from generator.pictures.sources import open_picture
 from generator.rendering.colorimetric import ColorimetricRendering, source_colours
 from generator.rendering.matrices import matrix_for
 
-# Nodes of equal codes of red, green and blue.
+# Nodes are the source colours of a regular grid; these have equal codes of red, green and blue.
 GREYS = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)
 
 Array = npt.NDArray[np.float64]

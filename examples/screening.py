@@ -6,7 +6,7 @@ patches, so there is no dithering noise and no sensor noise.
 
 Everything else is as in the commands. Illuminants come from the half of the camera's images that is not tested. The
 learned methods are those of `evaluate`. They are compared with cross-validation on all real images of the camera.
-Ratios are pooled over the cameras, with bootstrap intervals over the images, and averaged over the seeds.
+Ratios of errors are pooled over the cameras and averaged over the seeds, with bootstrap intervals over the images.
 
     python examples/screening.py --pictures BSDS500/data/images --pictures imagenet-sample-images \
         --archives ARCHIVES --lever naive-matrix --lever random-like
@@ -20,8 +20,9 @@ A lever is a variant of the training images:
 - keep, compensate, random: rendering by colour under the projector's white, with this treatment of the print's black;
 - relit: real scenes of the other cameras under other illuminants.
 
-The suffix -neutral, as in keep-neutral, selects the 75 % of the pictures with the most neutral mean. With the suffix
--like, pictures are drawn so that the distribution of their grey-world offsets is like that of the real images.
+The suffix -neutral, as in keep-neutral, selects the 75 % of the pictures with the most neutral mean. The suffix
+-like draws pictures so that their grey-world offsets (mean colour relative to the illuminant) are distributed like the
+offsets of the real images.
 """
 
 from __future__ import annotations
@@ -59,9 +60,9 @@ CAMERAS = {
 LINEAR = decode_srgb(np.arange(256) / 255)
 WIDTH = 32
 CODES = np.rint(np.arange(WIDTH) * 255 / (WIDTH - 1)).astype(np.int64)
-SIDE, SMALL = 128, 64
-# White of the target colours relative to paper, and the largest share of the print's black that is subtracted.
-WHITE, VEIL = 0.97, 0.97
+SIDE, SMALL = 128, 64  # side of pictures and of training images, px
+TARGET_WHITE = 0.97  # white of the target colours, relative to paper
+MAX_BLACK = 0.97  # largest share of the print's black that is subtracted
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,14 +140,14 @@ class Print:
         return np.maximum(solve(self.paper.T, light / light[1]), 0)
 
     def node_responses(self, colorimetric: bool) -> Floats:
-        """Return the mean responses (32768, 9) float32 to each node of source codes, primaries × channels."""
+        """Return the mean responses (32768, 9) float32 to each source colour (node); the 9 are primaries × channels."""
         if not colorimetric:
             return self.responses.transpose(1, 0, 2).reshape(-1, 9).astype(np.float32)
         white = self.paper.sum(axis=0)
         relative = np.tensordot(self.weights(white / white.sum()), self.responses, 1)
         relative = relative / relative[-1]
         black = relative[0].mean()
-        target = black + (WHITE - black) * np.clip(np.maximum(LINEAR[self.codes] @ self.matrix.T, 0), 0, 1)
+        target = black + (TARGET_WHITE - black) * np.clip(np.maximum(LINEAR[self.codes] @ self.matrix.T, 0), 0, 1)
         mesh: Any = Delaunay(relative)
         simplex = mesh.find_simplex(target)
         transforms = mesh.transform[simplex]
@@ -179,11 +180,11 @@ class Training:
     """Training images of one lever for one camera."""
 
     def __init__(self, lever: str, pictures: Floats, camera_print: Print, real: Real, others: Sequence[Real]) -> None:
-        self.rendering, _, self.choice = lever.partition("-")
+        self.rendering, _, self.suffix = lever.partition("-")
         self.camera_print, self.real, self.others = camera_print, real, others
         rng, made = np.random.default_rng(0), []
         if self.rendering == "naive":
-            matrix = camera_print.matrix if self.choice == "matrix" else np.eye(3)
+            matrix = camera_print.matrix if self.suffix == "matrix" else np.eye(3)
             linear = [np.maximum(LINEAR[picture] @ matrix.T, 0) for picture in pictures]
             made = [_halved(image) for image in linear]
         elif self.rendering != "relit":
@@ -201,26 +202,26 @@ class Training:
             relit = [scenes[number] * light for number, light in zip(order, lights, strict=False)]
             return [(image / image.max()).astype(np.float32) for image in relit], lights
         count = len(self.images)
-        if self.choice == "like":
+        if self.suffix == "like":
             own, target = (self._offsets(0.5 if self.rendering == "random" else 0), self.real.offsets()[training_half])
             density: Any = gaussian_kde(target.T)(own.T) / np.maximum(gaussian_kde(own.T)(own.T), 1e-3)
             density = np.minimum(density, np.quantile(density, 0.98))
             chosen = rng.choice(count, len(lights), p=density / density.sum())
         else:
             pool = np.arange(count)
-            if self.choice == "neutral":
-                pool = np.argsort(np.hypot(*self._offsets(VEIL).T))[: count * 3 // 4]
+            if self.suffix == "neutral":
+                pool = np.argsort(np.hypot(*self._offsets(MAX_BLACK).T))[: count * 3 // 4]
             chosen = np.concatenate([rng.permutation(pool) for _ in range(len(lights) // len(pool) + 1)])[: len(lights)]
         pairs = [self._image(number, light, rng) for number, light in zip(chosen.tolist(), lights, strict=True)]
         return [image for image, _ in pairs], np.array([truth for _, truth in pairs])
 
-    def _offsets(self, veil: float) -> Floats:
+    def _offsets(self, black_share: float) -> Floats:
         weights = self.camera_print.weights(self.camera_print.paper.sum(axis=0) / self.camera_print.paper.sum())
         white = weights @ self.camera_print.paper
         black = np.tensordot(weights, self.camera_print.responses[:, 0], 1)
         means = self.images.astype(np.float32).mean(axis=(1, 2)).reshape(-1, 3, 3)
         colours = np.tensordot(means, weights, ((1,), (0,)))
-        return _offset((colours - veil * black) / (1 - veil * black / white) / white)
+        return _offset((colours - black_share * black) / (1 - black_share * black / white) / white)
 
     def _image(self, number: int, light: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
         if self.rendering == "naive":
@@ -232,7 +233,7 @@ class Training:
         black = np.tensordot(weights, self.camera_print.responses[:, 0], 1)
         parts = self.images[number].astype(np.float32).reshape(SMALL, SMALL, 3, 3)
         image = np.tensordot(parts, weights.astype(np.float32), ((2,), (0,)))
-        share = {"keep": 0, "codes": 0, "compensate": VEIL, "random": rng.uniform(0, VEIL)}[self.rendering]
+        share = {"keep": 0, "codes": 0, "compensate": MAX_BLACK, "random": rng.uniform(0, MAX_BLACK)}[self.rendering]
         image = np.maximum((image - share * black) / (1 - share * black / white), 0) / white.max()
         return np.ascontiguousarray(image, dtype=np.float32), white / white.sum()
 
@@ -317,10 +318,10 @@ def _print_ratios(
             texts = [f"{name} {ratios[name][0]:.2f} ({ratios[name][1]:.2f} – {ratios[name][2]:.2f})" for name in _SHOWN]
             by_camera: list[str] = []
             for camera in cameras:
-                alone = dict(
+                camera_ratios = dict(
                     zip(STATISTICS, ratios_of(errors[lever][camera, key], errors[base][camera, key]), strict=True)
                 )
-                by_camera.append(f"{camera} {alone['median'][0]:.2f}/{alone['mean'][0]:.2f}")
+                by_camera.append(f"{camera} {camera_ratios['median'][0]:.2f}/{camera_ratios['mean'][0]:.2f}")
             medians = np.median(pair[0], axis=1) / np.median(pair[1], axis=1)
             range_text = f"; medians by seed {medians.min():.2f} … {medians.max():.2f}" if len(medians) > 1 else ""
             print(f"{lever} against {base}, {key}: {', '.join(texts)}; {', '.join(by_camera)}{range_text}", flush=True)

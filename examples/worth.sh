@@ -20,7 +20,7 @@ mkdir -p "$out" && cd "$out"
 declare -A archive=([600d]=nus_canon_600d_64x64 [1ds]=nus_canon_1ds_mk3_64x64 [5dsr]=intel_tau_5dsr_64x64)
 declare -A part=([600d]=Canon [1ds]=Canon [5dsr]=field)
 declare -A sensitivities=([600d]=Canon_EOS_600D [1ds]=Canon_EOS-1Ds_Mark_III [5dsr]=Canon_EOS_5DS)
-# Number of parts, each tested once: three for the 5DS R, so that the other parts have 400 images.
+# Number of parts, each tested once: three for the 5DS R, so that the other two together have 400 images.
 declare -A parts=([600d]=2 [1ds]=2 [5dsr]=3)
 declare -A matrix=([600d]="Canon EOS 600D" [1ds]="Canon EOS-1Ds Mark III" [5dsr]="Canon EOS 5DS R")
 declare -A relit=([600d]=1ds [1ds]=600d [5dsr]=1ds)
