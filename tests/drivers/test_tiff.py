@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
+import tifffile
 
 from drivers.tiff import TiffDamaged, TiffTag, read_directories
 
@@ -67,3 +68,17 @@ def test_refuses_huge_directories() -> None:
 def test_reads_floating_point_numbers() -> None:
     (directory,) = read_directories(tiff(TAG, 12, 1, struct.pack("<d", 2047.5)))
     assert directory.numbers(TiffTag.BLACK_LEVEL) == (2047.5,)
+
+
+# Names of tifffile that differ from ours: an older edition of Exif, and a tag of Canon that Adobe named.
+_OTHER_NAMES = {
+    "ExifTag": "EXIF_IFD_POINTER",
+    "ISOSpeedRatings": "PHOTOGRAPHIC_SENSITIVITY",
+    "RawImageSegmentation": "CR2_SLICES",
+}
+
+
+@pytest.mark.parametrize("tag", TiffTag)
+def test_tags_have_the_codes_of_the_registry(tag: TiffTag) -> None:
+    registered = str(tifffile.TIFF.TAGS.get(tag.value))
+    assert _OTHER_NAMES.get(registered, registered).replace("_", "").lower() == tag.name.replace("_", "").lower()
