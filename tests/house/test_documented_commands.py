@@ -117,7 +117,7 @@ def test_tutorial_states_number_of_frames(tmp_path: Path) -> None:
     lights = plan_illuminants(grid, tuple(range(first, last + 1, step)))
     steps = planned_steps(load_lab(tmp_path / "LAB.toml"), lights)
     kinds = Counter(step.kind for step in steps)
-    assert f"these are {len(lights)}." in text
+    assert f"this one has {len(lights)}." in text
     counts = re.search(
         r"There are (\d+) frames: a white and a dark frame, (\d+) response frames", " ".join(text.split())
     )
