@@ -9,7 +9,8 @@ noise of each sample is multiplied by √w_i::
     y = Σ w_i m_i + Σ √w_i (x_i − m_i),   x_i drawn independently for each illuminant
 
 The variance of y is Σ w_i (g m_i + r²). Photon noise is exact for any weights. Read noise is exact if the weights sum
-to 1. For another sum, it is √(Σ w_i) times its true value. A single illuminant of weight 1 gives its own samples exactly.
+to 1. For another sum, it is √(Σ w_i) times its true value. A single illuminant of weight 1 gives its own
+samples exactly.
 
 There are three approximations:
 

@@ -274,7 +274,8 @@ def valid_light(lut: Lut, light: int) -> int:
 def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.NDArray[np.uint16]:
     """Return the samples (8**bits, S, 3) uint16 of illuminant `light`.
 
-    If `pixels` is `WHOLE_LIGHT_PIXELS` or more, they are copied to memory. For fewer, they are read from disk when used.
+    If `pixels` is `WHOLE_LIGHT_PIXELS` or more, they are copied to memory. For fewer pixels, they are read from
+    disk when used.
     """
     mapped = lut.light_samples(valid_light(lut, light))
     return np.array(mapped) if pixels >= WHOLE_LIGHT_PIXELS else mapped
