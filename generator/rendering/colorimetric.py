@@ -8,7 +8,7 @@ Nodes are 17 × 17 × 17 source colours (`kernels.printing.NODE_CODES`). Once pe
 calculates the position of each node: the three chart codes, usually not whole, at which the camera records t under a
 reference illuminant. Like the profile of a printer, positions do not depend on the illuminant of an image. Under an
 illuminant of the LUT, the value of a node is interpolated between the means of the patches around its position. Values
-under several illuminants are added, because light is additive. A new illuminant takes a few milliseconds and no space on the disk.
+under several illuminants are added, because light is additive. A new illuminant takes a few milliseconds.
 
 Greys of a print are tinted by some degrees if inks are not neutral, and the tint changes with the illuminant. Methods
 and the eye judge an illuminant by greys, so greys are made neutral. Each grey is multiplied by a factor per channel

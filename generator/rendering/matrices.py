@@ -179,7 +179,7 @@ _SRGB_TO_XYZ_D50: Final = np.array(
 def dng_matrices(lut: Lut) -> tuple[list[list[float]], list[list[float]]]:
     """Return ColorMatrix and ForwardMatrix of the camera of a LUT under D65, as DNG 1.7.1 defines them.
 
-    ColorMatrix converts XYZ to camera RGB; without a listed matrix of the camera, the white of the matrix is that of the LUT.
+    ColorMatrix converts XYZ to camera RGB. Without a listed matrix of the camera, it maps D65 to the white of the LUT.
     ForwardMatrix converts white-balanced camera RGB to XYZ with white D50.
     """
     camera = camera_matrix(lut.provenance.camera)

@@ -162,7 +162,7 @@ def _search(colours: Any, bounds: Any, targets: Any, side: Any, scale: Any, posi
                 total += distance * distance
             distance = max(bounds[3, cell] - red - green - blue, red + green + blue - bounds[7, cell], 0.0)
             lower[cell] = (total + BRIGHTNESS_COST * distance * distance) / 3
-        # The cell with the smallest bound is tried first. Then only cells with a bound below its minimum are candidates.
+        # The cell with the smallest bound is tried first. Then only cells with a bound below its minimum remain.
         nearest, count, best = np.argmin(lower), 0, np.inf
         while True:
             low_r, low_g, low_b = nearest // cells**2, nearest // cells % cells, nearest % cells
