@@ -10,7 +10,8 @@ except for p and q::
              h = (h ⊕ ⌊h/2¹⁵⌋) · 0x31848BAB
     sample   p = h S,  q = (p mod 2³²) S,  index of the sample: ⌊p/2³²⌋ if x mod 16 < 8, else ⌊q/2³²⌋
 
-`stream` is 0 for one illuminant. If several illuminants are mixed per pixel, it is the index of the illuminant.
+`stream` is 0 for an image under one illuminant. If several illuminants are mixed per pixel, the stream of each is its
+index.
 
 A group is 32 consecutive pixels of a row. The offset of a sample is its distance from the start of the samples, in
 bytes. Functions decorated with `step` emit LLVM vector code (`kernels/vector.py`); only compiled functions can call
@@ -161,7 +162,7 @@ def write_colours(
     second_stride: Value,
     second_target: Value,
 ) -> None:
-    """Write the colour indices (uint32) of 32 pixels to both targets, multiplied by the stride of the target."""
+    """Write the colour indices (uint32) of 32 pixels to two targets, each multiplied by the stride of its target."""
     for half in range(2):
         colours = _colours(builder, builder.add(picture, ir.Constant(I64, 3 * LANES * half)), bits)
         for factor, address in ((stride, target), (second_stride, second_target)):
@@ -172,9 +173,9 @@ def write_colours(
 def choose_for_colours(
     builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
 ) -> None:
-    """Do the same as `choose`, with one offset (uint32) for each pixel at `colours`.
+    """Do the same as `choose`, but with known colours.
 
-    The samples of the pixel's colour begin at this offset.
+    `colours` is the address of one uint32 per pixel: the offset of the first sample of its colour.
     """
     for half, choices in enumerate(_choices_of_words(builder, hashed(builder, word, (k0, k1, k2)), count)):
         colour_offsets = load(builder, colours, 4 * LANES * half, WORDS)

@@ -9,13 +9,14 @@ noise of each sample is multiplied by √w_i::
     y = Σ w_i m_i + Σ √w_i (x_i − m_i),   x_i drawn independently for each illuminant
 
 The variance of y is Σ w_i (g m_i + r²). Photon noise is exact for any weights. Read noise is exact if the weights sum
-to 1, otherwise it is √(Σ w_i) times its true value. A single illuminant of weight 1 gives its own samples exactly.
+to 1. For another sum, it is √(Σ w_i) times its true value. A single illuminant of weight 1 gives its own
+samples exactly.
 
 There are three approximations:
 
 - m_i is the mean of S samples, not of the whole patch.
-- Differences within the print and between photosites are proportional to the light, but here they are multiplied by
-  √w_i. For illuminants of equal brightness they are 1/√(Σ w_i) of their true value.
+- Differences between points of the print and between photosites are proportional to the light, but are multiplied by
+  √w_i here. For illuminants of equal brightness they are 1/√(Σ w_i) of their true value.
 - Samples clipped by the sensor stay clipped.
 """
 
@@ -212,8 +213,8 @@ def _fill_means(samples: int, colours: Any, count: int, means: int, stride: int)
 
 @inlined
 def _single_light(pair_weights: Any, count: int) -> int:
-    # Returns the index of the only illuminant with nonzero weights in the first `count` pixels, if all its weights are
-    # equal to 1, and −1 in all other cases.
+    # Returns the illuminant with weight 1 in all of the first `count` pixels, if the weights of all others are 0 there.
+    # Returns −1 if there is no such illuminant.
     lit, single = 0, -1
     for pair in range(len(pair_weights)):
         flags = weight_flags(pair_weights[pair], count)
@@ -240,7 +241,7 @@ def _draw_segment(
     lines_per_group: int,
     base: int,
 ) -> None:
-    # This code is not part of `_mix_pixels`, because its loop would then need too many registers.
+    # Separate from `_mix_pixels`, because one function with both loops would need too many registers.
     choose_first_groups(row, width, keys, count, bits, scratch, low, high)
     draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, prefetch_from, lines_per_group, base)
 
@@ -294,7 +295,7 @@ def _mix_segment(
             continue
         plan[lit_pairs, 0], plan[lit_pairs, 5] = line, means + 2 * MEAN_BYTES * pair
         for member in range(2):
-            # If all weights of an illuminant are 0, the samples of the partner are read in its place.
+            # If all weights of one illuminant are 0, the samples of the other one of the pair are read for both.
             drawn_member = member if lit >> member & 1 else 1 - member
             offsets = line + SEGMENT_BYTES * (2 + drawn_member)
             plan[lit_pairs, 1 + member], plan[lit_pairs, 3 + member] = offsets, tables[light + drawn_member]
@@ -356,7 +357,7 @@ def _mix_pixels(
             for pair in range(pairs):
                 line, light = lines + PAIR_BYTES * pair, 2 * pair
                 first, stride = weights + y * weight_steps[0] + light * weight_steps[2], weight_steps[1]
-                # If the number of illuminants is odd, the partner of the last one has no weight.
+                # If the number of illuminants is odd, the second illuminant of the last pair has weight 0.
                 second, second_stride = (first + weight_steps[2], stride) if light + 1 < lights else (zero_weight, 0)
                 if stride == 8 and second == first + 4:
                     pair_weights[pair] = first + stride * start
@@ -459,8 +460,8 @@ def mix_samples(
     Returns
     -------
     ndarray
-        (H, W, 3) uint16, computed in float32, rounded to the nearest count, halves up. Illuminants 2 j and 2 j + 1 are
-        added first, then the pairs in order.
+        (H, W, 3) uint16, computed in float32, rounded to the nearest count, halves up. The light of illuminants 2 j
+        and 2 j + 1 is added first, then the sums of these pairs in order.
 
     Raises
     ------

@@ -6,8 +6,8 @@ samples are multiplied by a gain, divided by the saturation level and clipped at
     out[c, y, x] = min(float32(sample) · float32(gain / white_level), 1)
 
 The gain is digital: it scales signal and noise equally. A gain below 1 also makes saturated pixels darker. Part of the
-black of the print may be subtracted (`generator.rendering.black_points`). Then, with s[c] = gain · stretch[c] /
-white_level::
+black of the print may be subtracted: black_counts[c], followed by multiplication by stretch[c]
+(`generator.rendering.black_points`). With s[c] = gain · stretch[c] / white_level, the crop is then::
 
     out[c, y, x] = min(float32(sample) · float32(s[c]) + float32(-black_counts[c] · s[c]), float32(min(gain, 1)))
 

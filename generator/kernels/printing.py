@@ -13,8 +13,8 @@ The print under an illuminant is described at nodes. A node is a colour with one
 - x is a sample of the patch of the nearest node, chosen as in `kernels/choice.py`. If two nodes are equally near, the
   one with the higher code is used. b is the mean of all samples of the patch, so x - b is a recorded deviation.
 - k σ(v) scales the deviation to the noise of the LUT at m(v). σ is the total noise of the three channels by the
-  photon-transfer curve, interpolated like m. k is a factor of the node for each channel: the noise at the node, divided
-  by the noise of the 25 samples of the patch and by σ of the node.
+  photon-transfer curve, interpolated like m. The nearest node has a factor k = s / (d σ) for each channel. s is the
+  noise of this channel by the curve, and d is the standard deviation of the 25 samples of the patch.
 
 Images are rounded down to whole counts after adding a random number u, 0 ≤ u < 1, to each channel. The samples of a
 patch are whole counts, so rounding to the nearest count would move all deviations of a flat area in the same direction.
@@ -145,7 +145,7 @@ def means_at(
     """Calculate the mean counts of nodes under an illuminant.
 
     `samples` (N, S, 3) uint16; `cells` (U,) are the patches that the K nodes use. `corners` (K, 8) and `nearest` (K,)
-    are positions in `cells`, and `weights` (K, 8) are the weights of the corners. Three arrays (K, 3) float64 are
+    are indices into `cells`, and `weights` (K, 8) are the weights of the corners. Three arrays (K, 3) float64 are
     filled: `means` of the nodes, and mean (`bases`) and variance (`spreads`) of the samples of the nearest patch.
     """
     count = samples.shape[1]
@@ -222,11 +222,12 @@ def plan_block(builder: Builder, picture: Value, fractions: Value, target: Value
     def larger(first: Value, second: Value) -> Value:
         return builder.select(builder.fcmp_ordered(">", first, second), first, second)
 
+    # Whether red ≥ green, red ≥ blue and green ≥ blue.
     red_green, red_blue, green_blue = (at_least(*two) for two in ((red, green), (red, blue), (green, blue)))
-    green_red, blue_least = at_least(red, green), builder.and_(at_least(red, blue), at_least(green, blue))
+    blue_least = builder.and_(red_blue, green_blue)
     high = builder.select(green_blue, strides[1], strides[2])
     high = builder.select(builder.and_(red_green, red_blue), strides[0], high)
-    low = builder.select(blue_least, strides[2], builder.select(green_red, strides[1], strides[0]))
+    low = builder.select(blue_least, strides[2], builder.select(red_green, strides[1], strides[0]))
     upper, lower = larger(red, green), smaller(red, green)
     middle = smaller(upper, larger(lower, blue))
     upper, lower = larger(upper, blue), smaller(lower, blue)
@@ -581,7 +582,7 @@ class PrintedMembers:
         self.largest_size = max(sizes)
 
 
-_ZEROS: Final = np.zeros(GROUP, np.uint32)  # With these colour offsets, `choose_for_colours` writes only the choices
+_ZEROS: Final = np.zeros(GROUP, np.uint32)  # Used as `colours` of `choose_for_colours` for offsets within a colour
 
 
 class SharedTables:

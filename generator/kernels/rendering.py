@@ -85,7 +85,7 @@ def draw_groups(
 ) -> None:
     """Write the samples of groups `begin` … `end` − 1 of a row; `base` is the target address of the row's first pixel.
 
-    Offsets are chosen `LEAD` groups before their samples are read, for groups up to `limit` − 1. With each group,
+    Offsets of groups before `limit` are chosen `LEAD` groups before their samples are read. With each group,
     `lines_per_group` cache lines that are needed later are prefetched, starting at `prefetch_from`. The two bytes after
     the last pixel are overwritten, except at the end of the row.
     """
@@ -274,7 +274,8 @@ def valid_light(lut: Lut, light: int) -> int:
 def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.NDArray[np.uint16]:
     """Return the samples (8**bits, S, 3) uint16 of illuminant `light`.
 
-    For pictures of `WHOLE_LIGHT_PIXELS` or more they are copied to memory; otherwise they are read from disk when used.
+    If `pixels` is `WHOLE_LIGHT_PIXELS` or more, they are copied to memory. For fewer pixels, they are read from
+    disk when used.
     """
     mapped = lut.light_samples(valid_light(lut, light))
     return np.array(mapped) if pixels >= WHOLE_LIGHT_PIXELS else mapped

@@ -134,8 +134,8 @@ class DrawnLights:
 class SimultaneousLights:
     """Several illuminants of another choice in each image, combined by masks.
 
-    Image i of a picture gets `together` illuminants of `choice`, from number i · together on. It gets the masks of
-    image number position · lights_each + i.
+    For each picture, `choice` has a list of illuminants. Image i of the picture gets the next `together` of them, from
+    index i · together on. The masks are those of image number position · lights_each + i.
     """
 
     choice: LightChoice
@@ -277,7 +277,7 @@ def light_of(light: int | str | Mixture, lut: Lut) -> Mixture:
 
 
 def listed_lights(lights: Iterable[int | str | Mixture] | str | float | Mixture, lut: Lut) -> ListedLights:
-    """Return the choice of the same illuminants for every picture, each given as for `light_of`."""
+    """Return a choice with these illuminants for every picture. Each is given as for `light_of`."""
     if isinstance(lights, str | int | float | Mixture):
         raise InputError(f"lights is {value_text(lights)}, expected a list such as [0, 3] or ['D65']; correct it")
     # Numbers stay numbers, so that `describe` returns the same record as for the command.

@@ -43,8 +43,8 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
 def ground_truths_by_line(path: Path) -> dict[int, list[float]]:
     """Return the ground truths of a file, linear camera RGB ≥ 0, by line number.
 
-    A CSV file has the columns `GT_R,GT_G,GT_B` or `r,g,b`; others are ignored. Otherwise each line has three numbers,
-    separated by blanks or commas, as in `gt.txt` and Cube+. Raises FormatError.
+    A CSV file has the columns `GT_R,GT_G,GT_B` or `r,g,b`; other columns are ignored. Any other file has three
+    numbers in each line, separated by blanks or commas, as in `gt.txt` and Cube+. Raises FormatError.
     """
     lines = read_text(path, "give a text file", "ground truths").splitlines()
     numbered = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
@@ -159,7 +159,7 @@ class Fitted:
         return cls(rb, root, file, hashlib.sha256(np.ascontiguousarray(truths, dtype="<f8").tobytes()).hexdigest())
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
-        """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words; the third selects kernels."""
+        """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words. The third selects kernels."""
         kernels = (words[2].astype(np.uint64) * np.uint64(len(self.rb))) >> np.uint64(32)
         normal, root = standard_normal(words), self.root
         offsets = np.stack([root[0, 0] * normal[:, 0], root[1, 0] * normal[:, 0] + root[1, 1] * normal[:, 1]], axis=1)

@@ -5,11 +5,11 @@ plane of r = R / (R + G + B) and b = B / (R + G + B), this cone is the convex hu
 suffice for any point in it (Carathéodory). `Gamut.match` selects, in this order:
 
 1. one illuminant, if it is within `TOLERANCE_DEG` of the target;
-2. two neighbours, if a mixture of them is within this angle; of several pairs the two that are nearest to each other;
+2. two neighbours, if a mixture of them is within this angle; of several such pairs, the pair with the smallest angle;
 3. the three neighbours around the target, which match exactly.
 
-Neighbours are defined by the Delaunay triangulation of the rb-chromaticities. Near illuminants have similar spectra, so
-their mixture renders all colours like a real illuminant. A mixture of distant illuminants would match only white, as a
+Neighbours are defined by the Delaunay triangulation of the rb-chromaticities. Neighbours have similar spectra, so their
+mixture renders all colours like a real illuminant. A mixture of distant illuminants would match only white, as a
 metamer.
 """
 
@@ -149,8 +149,8 @@ class Gamut:
     def _inverses(self) -> _Array:
         # (T, 3, 3) float64: for each triangle, the matrix from RGB to the shares of its three corners.
         corners = self.directions[self.triangles].transpose(0, 2, 1)
-        # A triangle without area has no inverse. Entries of -1 make all shares negative, so that an edge is used in its
-        # place.
+        # A triangle without area has no inverse. Entries of -1 make all shares negative, so that an edge is used
+        # instead of the triangle.
         flat = np.abs(np.linalg.det(corners)) < 1e-15 if len(corners) else np.zeros(0, bool)
         inverses = np.full(corners.shape, -1.0)
         inverses[~flat] = np.linalg.inv(corners[~flat])
@@ -205,7 +205,7 @@ def black_body(lut: Lut, cct_k: float) -> Mixture:
 
     The temperature is the setting of the projector. Its three primaries were mixed so that the CIE 1931 standard
     observer sees the colour of the black body (`experiment.lights.blackbody_light`). The camera is not this observer,
-    so the ground truth differs from its response to the real black body.
+    so the ground truth differs from the response of the camera to the real black body.
     """
     # Chromaticities of black bodies are nearly linear in mired (10⁶ / K). For steps of 200 K the error is at most 0.2°.
     # This is less than the quantisation of 8-bit projector codes; a cubic spline is not better.

@@ -4,8 +4,8 @@
 `generator.lights.choices`. Rules:
 
 - The ground truth of a mixture is the same mixture of ground truths, because light adds.
-- Weights of a mixture sum to 1, so that stray light and the noise of one exposure are counted once
-  (`kernels.mixing.mixed_table`).
+- Weights of a mixture sum to 1. All samples contain stray light and read noise, so that with a larger sum both would
+  be too large (`kernels.mixing`).
 - Weights are multiples of 10⁻⁹, so that a label specifies the mixture exactly.
 - The masks sum to 1 at each pixel, in multiples of 1/65535, so that a 16-bit file stores them without loss.
 """
@@ -177,7 +177,7 @@ class LightChoice(Protocol):
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values for `dataset.json`.
 
-        With the sources, they determine every byte of the data set.
+        These values and the sources determine every byte of the data set.
         """
         ...
 

@@ -77,10 +77,10 @@ def stepped(x: Any) -> Any:
 
 @dataclass(frozen=True)
 class HalfPlanes:
-    """Parallel strips, one for each illuminant; for two illuminants, these are half planes."""
+    """Parallel strips, one for each illuminant; for two, half planes. A parameter that is None is random."""
 
-    angle: float | None = None  # from the first illuminant to the last, degrees, clockwise from the right; None: random
-    width: float | None = 0.0  # of the soft edges; 0 for one pixel; None: random from 0.1 to 0.6
+    angle: float | None = None  # direction from the first illuminant to the last, degrees, clockwise from the right
+    width: float | None = 0.0  # width of the soft edges; 0 for one pixel; None: random from 0.1 to 0.6
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to the shares (K, h, W) float32 of the illuminants.
@@ -114,7 +114,7 @@ class Spots:
     """Soft discs of every illuminant except the first."""
 
     count: int | None = None  # discs of each illuminant; None: random from 1 to 4
-    radius: float | None = None  # at which the share is 0.5; None: random from 0.08 to 0.3
+    radius: float | None = None  # radius at which the share is 0.5; None: random from 0.08 to 0.3
     softness: float = 0.8  # width of the edge relative to the radius, at most 2
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
@@ -196,8 +196,8 @@ class SmoothFields:
 class Windows:
     """Daylight through windows: panes in perspective, one window for each illuminant except the first."""
 
-    columns: int | None = None  # of panes; None: 2 or 3
-    rows: int | None = None  # of panes; None: 2 or 3
+    columns: int | None = None  # columns of panes; None: 2 or 3
+    rows: int | None = None  # rows of panes; None: 2 or 3
     softness: float | None = None  # width of the penumbra relative to the window; None: random from 0.02 to 0.1
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
@@ -409,7 +409,7 @@ def checked_weights(weights: npt.ArrayLike, shape: tuple[int, int, int]) -> Weig
             f"with a sum above 0; correct {np.count_nonzero(is_invalid)} of {is_invalid.size} pixels"
         )
     normalised = np.empty(shape, np.float32)
-    # Division by the largest weight first, because the sum of very large weights is infinite.
+    # Weights are first divided by the largest one, because the sum of very large weights would be infinite.
     quantise_shares(np.ascontiguousarray((values / largest).transpose(2, 0, 1), np.float32), normalised)
     return normalised
 
@@ -471,7 +471,7 @@ class GivenMaskPlan:
     sha256: str  # hash of the names and bytes of all files in this order
     # Index of the set by image number, if the file names have image numbers; else empty, and sets are used in turn.
     set_of_image: Mapping[int, int] = field(default_factory=dict[int, int])
-    set_of_picture: tuple[int, ...] = ()  # index of the set of each picture, if they have the same names; else empty
+    set_of_picture: tuple[int, ...] = ()  # index of the set of each picture if both have the same names, else empty
     images_each: int = 1  # images of each picture
 
     def maker(self, number: int) -> GivenMasks:
@@ -516,7 +516,7 @@ def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
         raise FormatError(f"cannot list the masks of {folder}: {error.strerror}; give a folder of masks") from error
     groups: dict[str, list[tuple[int, Path]]] = {}
     for path in files:
-        # Up to three digits are the number of a mask; cameras number files with four or more.
+        # Up to three digits are the number of a mask. Four or more are a file number of a camera.
         match = re.fullmatch(r"(.+)_(\d{1,3})", path.stem)
         name, number = (f"{match[1]}_", int(match[2])) if match else (path.stem, 0)
         groups.setdefault(name, []).append((number, path))

@@ -55,7 +55,7 @@ def _quantise_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: A
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1] // 2):
             first, second = weights[y, 2 * x], weights[y, 2 * x + 1]
-            # The sum starts from 0, as for any number of illuminants, so that the result is equal to the last bit.
+            # The sum starts from 0, as for any number of illuminants, so that results are equal to the last bit.
             red = _ZERO + first * whites[0, 0] + second * whites[1, 0]
             green = _ZERO + first * whites[0, 1] + second * whites[1, 1]
             blue = _ZERO + first * whites[0, 2] + second * whites[1, 2]

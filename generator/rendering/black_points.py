@@ -81,7 +81,7 @@ class BlackPoint:
 
     def share(self, seed: int, image: int) -> float:
         """Return the share of the print's black that is subtracted from an image, 0 … 1."""
-        # Random words are drawn only if needed: they take as long as all other bookkeeping of a small image.
+        # Random words are drawn only for a random share: they take as long as all other bookkeeping of a small image.
         words = philox.words(seed, 0, 0, image, philox.VEILS)[0] if self.kind == "random" else np.zeros((), np.uint32)
         return float(self.shares(words))
 
@@ -171,7 +171,7 @@ def subtract_black(
 @compiled
 def _clipping_offset(values: Any, count: int) -> float:
     # Returns the offset to subtract from values before they are clipped at 0, so that clipping keeps their mean.
-    # Without it, black would be too bright by 0.4 σ. If the mean is not above 0, all values become 0.
+    # Without the offset, black would be too bright by 0.4 σ. If the mean is not above 0, all values become 0.
     total, upper = 0.0, 0.0
     for i in range(count):
         total += values[i]

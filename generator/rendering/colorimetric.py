@@ -5,10 +5,10 @@ black and the paper of a print are not ideal. Black is therefore mapped to the b
 its white point w, as in black point compensation (ISO 18619:2015; there in XYZ, here in camera RGB): t = b + (w - b) a.
 
 Nodes are 17 × 17 × 17 source colours (`kernels.printing.NODE_CODES`). Once per look-up table (LUT), `print_inverse`
-calculates the position of each node: the place in the chart at which the camera records t under a reference illuminant.
-Like the profile of a printer, positions do not depend on the illuminant of an image. Under an illuminant of the LUT,
-the value of a node is interpolated between the means of the patches around its position. Values under several
-illuminants are added, because light is additive. A new illuminant takes a few milliseconds and no space on the disk.
+calculates the position of each node: the three chart codes, usually not whole, at which the camera records t under a
+reference illuminant. Like the profile of a printer, positions do not depend on the illuminant of an image. Under an
+illuminant of the LUT, the value of a node is interpolated between the means of the patches around its position. Values
+under several illuminants are added, because light is additive. A new illuminant takes a few milliseconds.
 
 Greys of a print are tinted by some degrees if inks are not neutral, and the tint changes with the illuminant. Methods
 and the eye judge an illuminant by greys, so greys are made neutral. Each grey is multiplied by a factor per channel
@@ -76,16 +76,15 @@ MOST_LIFT: Final = 1.25
 # cause larger factors.
 MOST_TINT: Final = 1.5
 
-# Limit of the factors that scale recorded deviations to the expected noise. Factors differ from 1, because 25 samples
-# give their standard deviation only to 1/7, and because the nearest patch has another level.
+# Limit of the factors that scale the deviations of the nearest patch to the expected noise of the node. Patch and node
+# have different counts, and the standard deviation of 25 samples is uncertain by 1/7.
 MOST_SPREAD: Final = 2.0
 
 # After subtraction of black, noise is reduced until the mean is this many standard deviations above 0. Clipping at 0
 # then raises the mean by 2 %.
 NOISE_MARGIN: Final = 1.5
 
-# Positions and levels are rounded to 1/1024 of the distance between neighbours, far above the rounding differences of
-# processors.
+# Positions are rounded to 1/1024 of a patch, levels to 1/1024 of a grey node. Processors differ by far less.
 _ROUNDING_STEPS: Final = 1024
 
 _GREYS: Final = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)  # Nodes of three equal codes
@@ -108,12 +107,12 @@ class PrintMap:
     """Positions of the nodes in a chart, and the properties of the print there.
 
     - `cells`: (U,) int64, indices of the patches that the nodes use.
-    - `around`: (4913, 8) int64, positions in `cells` of the patches around each node.
+    - `around`: (4913, 8) int64, indices in `cells` of the eight patches around the position of each node.
     - `weights`: (4913, 8) float64, weights of these patches, sum 1.
-    - `nearest`: (4913,) int64, position in `cells` of the patch whose samples a node uses.
-    - `levels`: (4913,) float64, 0 … 16: grey node of equal brightness, interpolated.
+    - `nearest`: (4913,) int64, index in `cells` of the patch whose samples a node uses.
+    - `levels`: (4913,) float64, 0 … 16: place of the grey of equal brightness among the 17 grey nodes.
     - `distance`: (4913,) float64, angle between the colour at the position and the target, degrees.
-    - `outside`: (4913,) bool, whether the colour is outside the gamut of the print; see `GAMUT_TOLERANCE`.
+    - `outside`: (4913,) bool, whether the target is outside the gamut of the print; see `GAMUT_TOLERANCE`.
     - `noise`: (3, 3) float64, coefficients of 1, y and y² in the variance at y counts, one column per channel; 0 if the
       noise of the LUT cannot be measured.
     """
@@ -271,7 +270,7 @@ def _require_contrast(lut: Lut, light: int | str, black: float, white: float) ->
 
 def _usable_elsewhere(lut: Lut, reference: int) -> npt.NDArray[np.bool_]:
     # Hot photosites are most visible under the illuminants that are darkest in a channel. Patches that are unreliable
-    # there are excluded.
+    # under these illuminants are excluded.
     darkest_lights = {int(light) for light in lut.white.argmin(axis=0)} - {reference}
     usable = np.ones(8**lut.provenance.bits, bool)
     for light in darkest_lights:
@@ -345,14 +344,14 @@ class ColorimetricRendering:
         return self.map.cells[self.map.nearest].astype(np.uint32)
 
     @cached_property
-    def _lights(self) -> Any:
+    def _cached_nodes_of(self) -> Any:
         return lru_cache(maxsize=_CACHED_LIGHTS)(self._nodes_of)
 
     def _nodes_of(self, light: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Return node means (4913, 3) under an illuminant of the LUT, counts, and values of the nearest patches.
+        """Return the mean counts of the nodes (4913, 3) under an illuminant of the LUT, and values (4913, 2, 4).
 
-        The values (4913, 2, 4) are means, and the factors that scale deviations to the noise of the LUT at the node.
-        The fourth column is unused.
+        Values [:, 0] are the mean counts of the nearest patches. Values [:, 1] are the factors that scale their
+        deviations to the noise of the LUT at the node. The fourth column is unused.
         """
         chart, samples = self.map, np.asarray(self.lut.light_samples(light))
         means, spreads, cell_values = np.empty((NODES, 3)), np.empty((NODES, 3)), np.zeros((NODES, 2, 4), np.float32)
@@ -372,7 +371,7 @@ class ColorimetricRendering:
         white = light.white(self.lut)
         means = np.zeros((NODES, 3))
         for number, weight in zip(light.lights, light.weights, strict=True):
-            means += weight * self._lights(number)[0]
+            means += weight * self._cached_nodes_of(number)[0]
         relative = means[_GREYS] / white
         brightness = relative.mean(axis=1, keepdims=True)
         _require_contrast(self.lut, light.label, float(brightness[0, 0]), float(brightness[-1, 0]))
@@ -394,7 +393,7 @@ class ColorimetricRendering:
         `share`: share of the print's black that is subtracted, 0 … 1. Noise that would reach below 0 is then reduced.
         """
         nodes = self.node_means(light)
-        cells = np.stack([self._lights(number)[1] for number in light.lights])
+        cells = np.stack([self._cached_nodes_of(number)[1] for number in light.lights])
         sigmas = np.sqrt(self._variance(nodes))
         means = np.empty((NODES, 4), np.float32)
         means[:, 3] = np.linalg.norm(sigmas, axis=1)

@@ -6,10 +6,10 @@ which is for D65, too. Rows are scaled to sum 1: white becomes (1, 1, 1), which 
 A computed look-up table (LUT) records a matrix that `sim table` calculated from the sensitivities of its camera. It is
 used if the camera has no listed matrix.
 
-For other cameras the matrix is fitted to the LUT. The patches were printed from sRGB codes. If the
-print shop reproduces sRGB, the camera RGB of the patches is C · linear sRGB, and least squares give C. If the print was
-not colour-managed, C also contains the errors of the print, mostly colours that are too pale. The `source` of the
-matrix reports the residual.
+For other cameras the matrix C is fitted to the LUT. The patches were printed from sRGB codes. If the print shop
+reproduces sRGB, the camera RGB of the patches is C · linear sRGB, and least squares give C. If the print was not
+colour-managed, C also contains the errors of the print, mostly colours that are too pale. The `source` of the matrix
+reports the residual.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def _normalised(rows: npt.NDArray[np.float64], name: str) -> npt.NDArray[np.floa
     if sums.min() < _SMALLEST_ROW_SUM:
         raise InputError(
             f"{name}: the rows of the colour matrix have sums {' '.join(f'{row_sum:g}' for row_sum in sums[:, 0])}, "
-            "expected sums > 0, the camera RGB of white"
+            "expected sums > 0, because they are the camera RGB of white"
         )
     return rows / sums
 
@@ -179,7 +179,7 @@ _SRGB_TO_XYZ_D50: Final = np.array(
 def dng_matrices(lut: Lut) -> tuple[list[list[float]], list[list[float]]]:
     """Return ColorMatrix and ForwardMatrix of the camera of a LUT under D65, as DNG 1.7.1 defines them.
 
-    ColorMatrix converts XYZ to camera RGB; for a camera without a listed matrix, its white is the white of the LUT.
+    ColorMatrix converts XYZ to camera RGB. Without a listed matrix of the camera, it maps D65 to the white of the LUT.
     ForwardMatrix converts white-balanced camera RGB to XYZ with white D50.
     """
     camera = camera_matrix(lut.provenance.camera)

@@ -35,7 +35,7 @@ _TOLERANCE: Final = 1e-4
 
 _ROUNDS: Final = 100  # Iterations in a cell; 6 are enough for most, 60 for colours far outside the gamut
 
-_SMALLEST_STEP: Final = 1e-5  # Iterations end at this change of the position, patches, far below its rounding
+_SMALLEST_STEP: Final = 1e-5  # Iterations end if the position changes by less, in patches
 
 # Weight of brightness differences; chromaticity differences have the weight 1 (docs/reference/rendering.md).
 BRIGHTNESS_COST: Final = 0.5
@@ -162,7 +162,7 @@ def _search(colours: Any, bounds: Any, targets: Any, side: Any, scale: Any, posi
                 total += distance * distance
             distance = max(bounds[3, cell] - red - green - blue, red + green + blue - bounds[7, cell], 0.0)
             lower[cell] = (total + BRIGHTNESS_COST * distance * distance) / 3
-        # The cell of the smallest bound is tried first; only cells with a smaller bound than its minimum remain.
+        # The cell with the smallest bound is tried first. Then only cells with a bound below its minimum remain.
         nearest, count, best = np.argmin(lower), 0, np.inf
         while True:
             low_r, low_g, low_b = nearest // cells**2, nearest // cells % cells, nearest % cells

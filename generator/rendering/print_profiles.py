@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 # The mean of a patch is unreliable if it is more than this many standard errors from the median. With normally
-# distributed samples, the means of 100 000 patches are much nearer. One clipped photosite of 25 in a patch at 0.1 of
-# saturation moves the mean by more.
+# distributed samples, the means of 100 000 patches are far within this limit. One clipped photosite of 25 in a
+# patch at 0.1 of saturation moves the mean by more.
 ODD_SIGMAS: Final = 8.0
 
 ODD_SHIFT: Final = 0.02  # Smallest relevant shift of a mean, relative to the median: 0.02 changes the hue by 1° at most
@@ -33,7 +33,7 @@ ODD_SHIFT: Final = 0.02  # Smallest relevant shift of a mean, relative to the me
 # colours would have to be mixed. With this margin, greys near white of simulated unmanaged prints are within 0.1°.
 WHITE_MARGIN: Final = 0.99
 
-# Largest white point relative to the mean of the paper. Below 1, white is interpolated between several patches, too.
+# Largest white point relative to the mean of the paper. Below 1, white is interpolated like other greys.
 PAPER_MARGIN: Final = 0.97
 
 _Array = npt.NDArray[np.float64]
@@ -57,7 +57,7 @@ class PrintProfile:
 
     @property
     def black(self) -> float:
-        """The darkest grey that mixtures of patches make, or else the print's black; 1 = ideal white."""
+        """The darkest grey that mixtures of patches make, or the print's black if none is grey; 1 = ideal white."""
         return self._neutral[0]
 
     @property
@@ -107,7 +107,7 @@ def odd_cells(samples: npt.NDArray[np.uint16], means: _Array) -> npt.NDArray[np.
     """
     medians = np.median(samples, axis=1)
     deviations = np.median(np.abs(samples - medians[:, None]), axis=1)
-    # Half a count, for rounding, is the smallest deviation. Otherwise mostly equal samples would have a deviation of 0.
+    # Rounding errors reach half a count, but mostly equal samples would have a deviation of 0.
     sigmas = MEDIAN_ERROR * MAD_TO_SIGMA * np.maximum(deviations, 0.5) / np.sqrt(samples.shape[1])
     shifts = np.abs(means - medians)
     return ((shifts > ODD_SIGMAS * sigmas) & (shifts > ODD_SHIFT * medians)).any(axis=1)

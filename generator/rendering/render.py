@@ -73,7 +73,7 @@ def render(
     ------
     InputError
         If the LUT has no such illuminant, the rendering is unknown, `lut` or `picture` has the wrong type, weights are
-        missing or invalid, or not exactly one of `light` and `lights` is given.
+        missing or invalid, or both or neither of `light` and `lights` are given.
     QualityError
         If the print has no contrast under the illuminant, so that rendering by colour is impossible.
 

@@ -2,8 +2,8 @@
 
 `Crops` draws any number of crops from a look-up table (LUT) and a gallery. Item i of an epoch depends only on seed,
 epoch and i. Its random numbers are the words of Philox4x32-10 with counter (i, epoch, k, 7). k = 0: picture, column,
-row, illuminant; k = 1: mirroring, gain, share of the subtracted black; k = 2: seed of the samples. Items do not depend
-on the number of workers.
+row, illuminant; k = 1: mirroring, gain, subtracted share of the print's black; k = 2: seed of the samples. Items do not
+depend on the number of workers.
 
 Only `torch_crops` needs PyTorch; it has data sets for PyTorch::
 
@@ -72,8 +72,8 @@ class RecycledMemory:
         """Return an array (...) float32 in C order, with arbitrary content."""
         size = 4 * int(np.prod(shape))
         memory = self._memory(size)
-        # All views refer to `values`, because the base of `values` is not an array. Thus `values` exists as long as any
-        # view.
+        # In numpy, the base of a view of a view is the first array, here `values`. `values` therefore exists as long as
+        # any view of it, and is finalised when the last view is gone.
         values = np.frombuffer(memory, dtype=np.float32)
         weakref.finalize(values, self._free.append, memory).atexit = False
         return values.reshape(shape)
@@ -158,8 +158,8 @@ class Crops:
         Noise of the samples, `generator.variation.sensor_noise.measured_noise(lut)`. Crops with a gain below 1 then get
         the noise of a camera in less light. With None, the gain scales signal and noise equally.
     iso
-        ISO speed that determines the noise of the crops; needs `noise`. None for the speed of the LUT. A gain above
-        `iso.ratio` gives more noise.
+        ISO speed that determines the noise of the crops; needs `noise`. None for the speed of the LUT. Crops
+        with a gain above `iso.ratio` have the noise of a higher ISO speed.
     flip
         Mirror half of the crops left to right.
     seed
@@ -472,7 +472,7 @@ class _Prints:
 
     @property
     def cells(self) -> npt.NDArray[np.uint32]:
-        """Patch whose samples each node uses; see `kernels.printing`."""
+        """Patch whose samples each node (`kernels.printing`) uses."""
         return self._rendering.cells
 
     def __getitem__(self, light: int) -> PrintedLight:
@@ -482,7 +482,7 @@ class _Prints:
         return self._printed_lights[light]
 
     def black(self, light: int) -> npt.NDArray[np.float64]:
-        """Return the counts to which black is mapped, (3,); raise QualityError if it is half as bright as white."""
+        """Return the counts (3,) that black becomes in the print; raise QualityError if they reach half of white."""
         if light not in self._blacks:
             mixture = self._lights[light]
             self._blacks[light] = black_subtraction(self._lut, mixture, 1.0, self._rendering.black(mixture)).counts

@@ -1,8 +1,8 @@
 """Change the exposure of a raw image: scale its counts and add the noise of a camera at the new exposure.
 
 A count x of a look-up table (LUT) has the mean m and the variance read² + shot · m (`sensor_noise`). The new exposure
-multiplies counts by a, at k times the ISO speed of the LUT, with k ≥ a. Its mean is a m and its variance
-read_k² + k · shot · a m, where read_k is the read noise at this speed. The product a x has too little noise: its
+multiplies counts by a, at k times the ISO speed of the LUT, with k ≥ a. Then the mean is a m and the variance
+read_k² + k · shot · a m, where read_k is the read noise at k times the speed. The product a x has too little noise: its
 variance is a² read² + a · shot · a m. The missing noise is added, with a standard normal deviate z:
 
     y = a x + √max(0, (read_k² − a² read²) + (k − a) shot · a x) · z
@@ -255,7 +255,7 @@ def _weights_of(image: Image, weights: npt.NDArray[np.float32] | None) -> tuple[
 
 
 _ZERO: Final = np.float32(0)
-# Lower limit if values below black are kept. Noise does not reach so far below 0.
+# Lower limit if values below black are kept. Noise never reaches it.
 _NO_FLOOR: Final = np.float32(-1)
 _ONE: Final = np.float32(1)
 
@@ -331,7 +331,7 @@ def add_noise(
     gain_column = gains[:, None]
     dark = np.maximum((np.square(final_noise.read) - gain_column**2 * np.square(noise.read)) / white_level**2, -1)
     shot = np.maximum(iso_ratio - gain_column, 0) * np.array(noise.shot) / white_level
-    # A crop with a gain above the ratio already has the noise of a higher ISO speed.
+    # A crop with a gain above `iso_ratio` already has the noise of a higher ISO speed.
     dark = np.where(gain_column > iso_ratio, 0, dark)
     variances = dark.astype(np.float32), shot.astype(np.float32)
     deviates, lower_limit = normal_deviates(), _NO_FLOOR if below_black else _ZERO

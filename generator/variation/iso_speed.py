@@ -1,4 +1,4 @@
-"""Simulate a higher ISO speed: images get its noise instead of the noise of their look-up table (LUT)."""
+"""Simulate a higher ISO speed: images get the noise of that speed, not of their look-up table (LUT)."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class IsoSpeed:
 
 
 def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SENSOR_ELECTRONS) -> IsoSpeed:
-    """Return the ISO speed of a text such as ``1600/100`` (images / LUT), or ``1600/100:read=2.8`` with electrons."""
+    """Return the ISO speed of a text such as ``1600/100`` (images / LUT). A suffix ``:read=2.8`` gives electrons."""
     speed_text, _, options = text.strip().partition(":")
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*(?:/\s*(\d+(?:\.\d*)?)\s*)?", speed_text, re.ASCII)
     table_speed = base if match is None or match[2] is None else float(match[2])

@@ -8,8 +8,8 @@ Differences between photosites and within the print add a term in y². The model
 together with the sample. read and shot are measured from means and variances of the samples of dark and bright patches.
 
 At k times the ISO speed of the LUT, a count stands for k times fewer electrons, so shot becomes k · shot. Read noise
-that arises before the amplifier grows with k, read noise after it does not. A LUT of one speed does not show how large
-the two are. Therefore `SENSOR_ELECTRONS` is assumed before the amplifier, unless a value is given.
+that arises before the amplifier grows with k, read noise after it does not. A LUT of one speed shows only their sum.
+Therefore the part before the amplifier is assumed to be `SENSOR_ELECTRONS`, unless a value is given.
 
 Normal deviates come from a table of 2¹⁴ numbers: the quantiles of the standard normal distribution at (i + ½) / 2¹⁴,
 scaled to variance 1. Their mean is exactly 0. They reach 4.0 standard deviations; 6 of 100 000 normal numbers lie
@@ -44,9 +44,9 @@ def normal_deviates() -> npt.NDArray[np.float32]:
 
 Three = tuple[float, float, float]
 
-# Read noise of a photosite that arises before the amplifier, electrons (judgement). Sensors of 2008 to 2020 have about
-# 2 to 3 at their highest speeds, where other read noise is negligible (W. Claff, photonstophotos.net, input-referred
-# read noise).
+# Read noise of a photosite that arises before the amplifier, electrons. Chosen by judgement: sensors of 2008 to 2020
+# have about 2 to 3 at their highest speeds, where other read noise is negligible (W. Claff, photonstophotos.net,
+# input-referred read noise).
 SENSOR_ELECTRONS: Final = 2.5
 
 # Photosites averaged for red, green and blue of a sample, a half-size pixel of a Bayer mosaic.

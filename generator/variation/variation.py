@@ -66,8 +66,8 @@ class Gradient:
 
     - `shape`: shape of the fall-off, as for masks of two illuminants.
     - `stops`, `min_stops`: the far end is darker by a random number of stops, uniform between `min_stops` and `stops`.
-    - `colour`: largest difference of ln(R/G) and of ln(B/G) between far end and near end. Both are random, uniform and
-      independent.
+    - `colour`: largest difference of ln(R/G) and of ln(B/G) between far end and near end. The two differences
+      are random, uniform and independent.
     """
 
     shape: Shape = SmoothFields()  # noqa: RUF009  frozen
@@ -190,7 +190,7 @@ class AutomaticExposure:
 
     - `share`: share of the pixels whose largest channel reaches the level; with 0 no pixel reaches it.
     - `levels`: quantiles of the random level, relative to saturation, 0 … 1. Between quantiles, its logarithm is
-      interpolated linearly. Level 1 saturates the share.
+      interpolated linearly. Level 1 saturates this share of the pixels.
     - `limit`: largest factor, so that a dark picture stays dark.
     """
 
@@ -318,7 +318,7 @@ class AppliedVariation:
 
 @dataclass(frozen=True)
 class Variation:
-    """Differences between images; at least one of the first three is set.
+    """Differences between images; at least one of exposure, gradient and ISO speed is set.
 
     - `exposure`: amount of light; None for the exposure of the LUT.
     - `gradient`: fall-off over the image; None for even light.
