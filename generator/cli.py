@@ -313,11 +313,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, is_existing: 
     print(f"{masked(out)}: {counted(record.images, 'image')} of {pictures} under {counted(lights, 'illuminant')}{note}")
     if record.splits:
         split_text = ", ".join(f"{images} for {split}" for split, images in record.splits.items())
-        print(
-            split_text
-            if record.splits.get("validation")
-            else f"{split_text} (a split of two shares has no validation images)"
-        )
+        print(split_text if record.splits.get("validation") else f"{split_text} (no images for validation)")
     if record.skipped:
         tried = record.sources + len(record.skipped)
         was = "was" if len(record.skipped) == 1 else "were"
