@@ -29,8 +29,8 @@ from foundation.compiled import compiled
 LITERALS: Final = 286  # Symbols for literals, the end of a block and lengths (RFC 1951, 3.2.5)
 DISTANCES: Final = 30  # Symbols for distances (RFC 1951, 3.2.5)
 END: Final = 256  # Symbol for the end of a block (RFC 1951, 3.2.5)
-# Largest length of a code for literals and distances, in bits. Three codes fit into 64 bits,
-# together with seven bits that wait to be written.
+# Largest length of a code for literals and distances, in bits. Three codes and seven bits that
+# wait to be written fit into 64 bits.
 LONGEST: Final = 12
 
 # Largest length of a code for code lengths, in bits: the largest number in the three bits of RFC 1951, 3.2.7.

@@ -149,9 +149,7 @@ def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
                 "replace negative values of measurement noise by 0"
             )
     powers = resampled(table[:, 0], table[:, 1:], WAVELENGTHS_NM)
-    return tuple(
-        _normalised_light(name, power, None, where) for name, power in zip(headings[1:], powers.T, strict=True)
-    )
+    return tuple(_scaled_light(name, power, None, where) for name, power in zip(headings[1:], powers.T, strict=True))
 
 
 def table_illuminants(lights: Sequence[LightSpectrum]) -> tuple[Illuminant, ...]:
@@ -168,7 +166,7 @@ def table_illuminants(lights: Sequence[LightSpectrum]) -> tuple[Illuminant, ...]
     )
 
 
-def _normalised_light(name: str, power: _Array, cct_k: float | None, where: str) -> LightSpectrum:
+def _scaled_light(name: str, power: _Array, cct_k: float | None, where: str) -> LightSpectrum:
     low, high = np.searchsorted(WAVELENGTHS_NM, [400, 700])
     if not power[low : high + 1].max() > 0:
         raise FormatError(f"{where}: {name!r} has no power from 400 to 700 nm; correct or omit it")
@@ -216,7 +214,7 @@ def _resampled_light(name: str, spectrum: PublishedSpectrum, cct_k: float | None
     if spectrum.power.min() < 0:
         raise FormatError(f"{name!r} has published values below 0, expected 0 or more; give another illuminant")
     power = resampled(spectrum.wavelengths_nm, spectrum.power[:, None], WAVELENGTHS_NM)[:, 0]
-    return _normalised_light(name, power, cct_k, "published spectra")
+    return _scaled_light(name, power, cct_k, "published spectra")
 
 
 def _linear_srgb(power: _Array) -> _Array:

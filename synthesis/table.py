@@ -2,8 +2,8 @@
 
 The same camera, illuminants, settings and seed give the same bytes with any number of threads. Computed frames are
 evaluated like photographs in `calibration.pipeline.measuring`: the black level is subtracted, flat field and white are
-measured on the white references, and samples are divided by the flat field of their patch colour. Therefore the ground truth
-has the same kinds of errors as in a LUT from photographs.
+measured on the white references, and samples are divided by the flat field of their patch colour. Therefore the ground
+truth has the same kinds of errors as in a LUT from photographs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The card and the datasheet of a data set.
 
 `README.md` is a dataset card, the front page of a data set on the Hugging Face Hub. `DATASHEET.md` answers the
-questions of Gebru et al., "Datasheets for Datasets", Communications of the ACM 64 (2021). Questions that only the authors of a data set can answer are marked.
+questions of Gebru et al., "Datasheets for Datasets", Communications of the ACM 64 (2021). Questions that only the
+authors of a data set can answer are marked.
 """
 
 from __future__ import annotations
@@ -122,7 +123,7 @@ def noise_of(description: Description) -> str:
     return (
         f"In the model of the sensor, one count is {gain * 100 / iso:.4g} electrons at its ISO {iso:g}. "
         f"At ISO 100 one count is {gain:.4g} electrons, and the read noise of a photosite is {read:.4g} "
-        f"counts. The part of the noise before the amplifier is {early:.4g} electrons. {green}"
+        f"counts. The part of it that arises before the amplifier is {early:.4g} electrons. {green}"
     )
 
 

@@ -1,10 +1,10 @@
 """Plan of a data set: it assigns a number to every image and a shard to every number.
 
-A data set is a function of its LUT, sources, choice of illuminants, seed and options. A scene is a crop of a
-source, or the whole source. Crop c of the source at `position` is scene s = `position · crops + c`. Image number
-`s · lights_each + k` shows scene s under its illuminant k. The number does not depend on whether other sources can be
-read. A shard has n images; shard i has the numbers from i · n to (i + 1) · n − 1. Any worker can therefore make any shard at any time, and a shard that is
-made twice has the same bytes.
+A data set is a function of its LUT, sources, choice of illuminants, seed and options. A scene is a crop of a source, or
+the whole source. Crop c of the source at `position` is scene s = `position · crops + c`. Image `s · lights_each + k`
+shows scene s under its illuminant k. Its number does not depend on whether other sources can be read. A shard has
+n images; shard i has the numbers from i · n to (i + 1) · n − 1. Any worker can therefore make any shard at any time,
+and a shard that is made twice has the same bytes.
 """
 
 from __future__ import annotations

@@ -378,7 +378,7 @@ _RADIANCE_PRIMARIES: Final = re.compile(rb"^PRIMARIES=((?:\s+[-+.0-9eE]+){8})\s*
 
 
 def _stated_space(path: Path, spec: Any, chunks: Mapping[bytes, bytes], icc: bytes | None) -> RgbSpace | None:
-    # The colour space that a file states, for conversion; None if it states none, or only sRGB or linear sRGB by name.
+    # The colour space that a file states by primaries and transfer function, or by a profile of linear light.
     if b"cICP" not in chunks and icc is not None:
         return linear_space(icc)
     if chunks:
