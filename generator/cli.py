@@ -277,14 +277,14 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers, output: Json
         done_count, shard_count = make_share(plan, out, share, workers, callbacks)
     output.add(dataset=masked(out), shard=shard, shards_done=done_count, shards=shard_count)
     finish = "run the same command without --shard to complete the data set"
-    next_step = finish if done_count == shard_count else "run the same command with the other shares first"
+    next_step = finish if done_count == shard_count else "run the same command with the other shares of --shard first"
     print(masked(f"{done_count} of {shard_count} shards of {out} are done; {next_step}"))
 
 
 def _print_summary(dataset: Dataset, out: str, output: JsonOutput, is_existing: bool = False) -> None:
     record = dataset.description
     lights = len(dataset.light_labels)
-    # A picture drawn several times is a source each time; a computed picture has no hash.
+    # A picture may be several sources. A computed picture has no hash, so its name is used.
     different = len({source.sha256 or source.name for source in dataset.sources})
     noted = [source for source in dataset.sources if source.note]
     pictures = counted(record.sources, "picture")
@@ -313,7 +313,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, is_existing: 
     print(f"{masked(out)}: {counted(record.images, 'image')} of {pictures} under {counted(lights, 'illuminant')}{note}")
     if record.splits:
         split_text = ", ".join(f"{images} for {split}" for split, images in record.splits.items())
-        print(split_text if record.splits.get("validation") else f"{split_text} (two shares mean train and test)")
+        print(split_text if record.splits.get("validation") else f"{split_text} (no images for validation)")
     if record.skipped:
         tried = record.sources + len(record.skipped)
         was = "was" if len(record.skipped) == 1 else "were"

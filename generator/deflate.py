@@ -2,11 +2,11 @@
 
 `Packer.pack` packs a band of rows with one of two methods, whichever gives fewer bytes:
 
-    repeats     No filter. A pixel equal to an earlier one in the window of 32 KiB becomes a match of six bytes, or of
-                more in a run. A LUT has few samples of each colour, so half of the pixels of a photograph match.
-                Matches shorter than a pixel are not searched.
-    neighbours  Difference to the pixel on the left (filter Sub), with Huffman codes only. It is smaller for smooth
-                images, in which few pixels share a colour.
+    repeats     No filter. A pixel equal to an earlier one in the window of 32 KiB becomes a match of six bytes, or
+                part of a longer match in a run. A LUT has few samples of each colour, so half of the pixels of a
+                photograph match. Matches shorter than a pixel are not searched.
+    neighbours  Difference to the pixel on the left (filter Sub), with Huffman codes only. This method gives fewer
+                bytes for smooth images, in which few pixels share a colour.
 
 Each band is one block with its own codes. It ends on a whole byte and refers to no other band, so several threads can
 pack bands in parallel. All arithmetic is in integers, so equal images give equal bytes on every machine.
@@ -29,10 +29,11 @@ from foundation.compiled import compiled
 LITERALS: Final = 286  # Symbols for literals, the end of a block and lengths (RFC 1951, 3.2.5)
 DISTANCES: Final = 30  # Symbols for distances (RFC 1951, 3.2.5)
 END: Final = 256  # Symbol for the end of a block (RFC 1951, 3.2.5)
-# Largest length of a code for literals and distances, in bits. Three codes and seven waiting bits fit into 64 bits.
+# Largest length of a code for literals and distances, in bits. Three codes and seven bits that
+# wait to be written fit into 64 bits.
 LONGEST: Final = 12
 
-# The same for a code of code lengths; the number 7 fits into the three bits of RFC 1951, 3.2.7.
+# Largest length of a code for code lengths, in bits: the largest number in the three bits of RFC 1951, 3.2.7.
 _LONGEST_OF_LENGTHS: Final = 7
 _LENGTHS: Final = 19  # Symbols of the code for code lengths (RFC 1951, 3.2.7)
 _SYMBOL_BITS: Final = 9  # Bits of a symbol (below 512); frequency and symbol are sorted as one number
@@ -99,7 +100,8 @@ def code_lengths(frequencies: Any, longest: int) -> Any:
     for length in range(1, longest + 1):
         excess += number[length] << (longest - length)
     while excess > 0:
-        # A longest code becomes the sibling of the deepest shorter code, which gets one bit longer.
+        # A code of `longest` bits becomes the sibling of the longest of the other codes. That code gets one more bit,
+        # and both siblings have equal length.
         length = longest - 1
         while not number[length]:
             length -= 1
@@ -143,7 +145,7 @@ def flush(out: Any, offset: Any, waiting: Any, bit_count: Any) -> Any:
 
     Eight bytes are written at `offset`, which advances by the complete bytes; up to seven bits remain waiting.
     """
-    # The compiler combines these into a single store.
+    # The compiler combines these eight stores into one.
     out[offset] = uint8(waiting)
     out[offset + uint64(1)] = uint8(waiting >> uint64(8))
     out[offset + uint64(2)] = uint8(waiting >> uint64(16))
@@ -200,7 +202,7 @@ def _run_lengths(sequence: Any, tokens: Any) -> int:
 
 @compiled
 def _used_length(lengths: Any, minimum: int) -> int:
-    # Zeros at the end of the lengths are not written.
+    # Number of lengths to write: zeros at the end are omitted.
     used = len(lengths)
     while used > minimum and not lengths[used - 1]:
         used -= 1
@@ -235,8 +237,8 @@ def put_head(out: Any, writer: Any, literals: Any, distances: Any, last: int) ->
         put(out, writer, tokens[i, 1], tokens[i, 2])
 
 
-# Largest number of pixels in a row. An entry of the history has 64 bits: 31 for a byte position, and 33 for
-# the bits of a pixel that are not in its hash.
+# Largest number of pixels in a row. An entry of the history in `find_repeats` has 64 bits: 31 for a byte
+# position, and 33 for the bits of a pixel that are not in its hash.
 WIDEST: Final = 1 << 28
 
 _WINDOW: Final = 32768  # Largest distance of a match in bytes (RFC 1951, 2)
@@ -248,15 +250,15 @@ _HASHES: Final = 1 << 15
 _MIX: Final = 0x9E3779B97F4B
 # Pixels on which both methods are compared: one window to fill the history, and two that are counted.
 _TRIAL_PIXELS: Final = 3 * _WINDOW_PIXELS
-# Interval of the counted rows in a large band. Counting all rows would take much longer and make files only 0.17 %
-# smaller.
-_STEP: Final = 8
+# In a large band, symbols are counted in one of this number of rows. Counting all rows would take much longer and make
+# files only 0.17 % smaller.
+_ROW_STEP: Final = 8
 _FEW_ROWS: Final = 4  # Smallest number of counted rows, so that no single row decides
 # Smallest number of counted symbols that represents a band; with fewer, all rows are counted.
 _FEW_SYMBOLS: Final = 1 << 13
 _FLUSH_BITS: Final = 56  # Bits that can be added to seven waiting bits before a flush of 63 bits
-# Bytes for the head and end of a block, and for the bytes that a flush writes too many. Codes have less than 16 bits
-# (`LONGEST`), so packed rows have less than twice the bytes of the rows.
+# Bytes for the head and the end of a block, and for the last flush, which always writes eight bytes. Codes have less
+# than 16 bits (`LONGEST`), so packed rows have less than twice the bytes of the rows.
 _EXTRA_BYTES: Final = 1024
 
 
@@ -319,7 +321,8 @@ def _subtract(rows: Any, filtered: Any) -> None:
 
 @compiled
 def _count_bytes(rows: Any, literals: Any) -> None:
-    # With four counters for each value, an increment rarely waits for the previous increment of the same counter.
+    # Add the frequencies of the bytes to `literals`. With four counters for each value, an increment rarely waits for
+    # the previous increment of the same counter.
     counts = np.zeros((4, 256), np.uint32)
     data = rows.reshape(-1)
     aligned_size = len(data) // 4 * 4
@@ -342,10 +345,10 @@ def find_repeats(image: Any, history: Any, distances: Any) -> None:
     The distance is 0 if the window has no equal pixel. `history` (32768,) uint64 is working memory.
     """
     # An entry of `history` has the byte position of the last pixel with this hash in its high bits. Its low bits are
-    # the bits of the mixed pixel that are not in the hash. Mixing is one to one, so pixels with equal hash and equal
-    # low bits are equal.
+    # the bits of the pixel times `_MIX` that are not in the hash. This product is one to one, so pixels with equal hash
+    # and equal low bits are equal.
     shift, rotation = uint64(48) - uint64(15), uint64(64 - 48 + 15)
-    open_bits = (uint64(1) << shift) - uint64(1)
+    unhashed_mask = (uint64(1) << shift) - uint64(1)
     for slot in range(_HASHES):
         history[slot] = 0
     samples, flat_distances = image.reshape(-1), distances.reshape(-1)
@@ -363,11 +366,11 @@ def find_repeats(image: Any, history: Any, distances: Any) -> None:
             )
             mixed = pixel * uint64(_MIX)
             slot = (mixed >> shift) & uint64(_HASHES - 1)
-            entry = (position << shift) | (mixed & open_bits)
+            entry = (position << shift) | (mixed & unhashed_mask)
             difference = entry - history[slot]
             history[slot] = entry
-            # The distance to the last pixel with this hash. If that pixel differs, high bits are not 0. There is no
-            # branch, because the processor cannot predict repeats.
+            # The distance to the last pixel with this hash. If that pixel differs, the result exceeds the window. There
+            # is no branch, because the processor cannot predict repeats.
             distance = (difference >> shift) | (difference << rotation)
             flat_distances[pixels] = uint16(distance) if distance - uint64(1) < uint64(_WINDOW) else uint16(0)
             index += uint64(3)
@@ -390,7 +393,7 @@ def _symbol_of(distance: Any) -> Any:
 @compiled
 def _count(rows: Any, distances: Any, step: int, literals: Any, distance_counts: Any) -> None:
     # Add the symbols of one row in `step` to the frequencies of literals and distances. There is no branch on a match,
-    # because it cannot be predicted. Each byte of a pixel has its own counter, so that increments do not wait.
+    # because the processor cannot predict it. Each byte of a pixel has its own counter, so that increments do not wait.
     counts = np.zeros((6, 256), np.uint32)
     matches = 0
     for y in range(step // 2, rows.shape[0], step):
@@ -450,7 +453,7 @@ def _are_repeats_smaller(image: Any, plain: Any, filtered: Any, distances: Any, 
 @compiled
 def _estimate(plain: Any, distances: Any, literals: Any, distance_counts: Any) -> None:
     # Estimate the frequencies of literals and distances of a band; every symbol that may occur gets at least 1.
-    step = max(1, min(_STEP, len(distances) // _FEW_ROWS))
+    step = max(1, min(_ROW_STEP, len(distances) // _FEW_ROWS))
     _count(plain, distances, step, literals, distance_counts)
     if step > 1 and literals.sum() < _FEW_SYMBOLS:
         literals[:], distance_counts[:], step = 0, 0, 1
@@ -484,7 +487,8 @@ def _join_codes(codes: Any, largest: Any, samples: Any) -> None:
 
 @compiled
 def _run_codes(codes: Any) -> Any:
-    # Code and extra bits (at most 12 + 5) of each run length, from bit 8 on; the lowest eight bits have their number.
+    # Code and extra bits (at most 12 + 5) of each run length, from bit 8 on; the lowest eight bits have the number of
+    # these bits.
     runs = np.zeros(_LONGEST_RUN + 1, np.uint64)
     for run in range(1, _LONGEST_RUN + 1):
         code, extra = uint64(codes[_RUNS[run, 0]]), uint64(_RUNS[run, 2])
@@ -542,14 +546,16 @@ def _put_bytes(out: Any, writer: Any, rows: Any, codes: Any) -> None:
 
 
 @compiled
-def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, back_codes: Any, joined: Any) -> None:
+def _put_repeats(
+    out: Any, writer: Any, image: Any, distances: Any, codes: Any, distance_codes: Any, joined: Any
+) -> None:
     # `joined` has the codes of both bytes of each sample value (`_join_codes`).
     offset, waiting, bit_count = writer[0], writer[1], writer[2]
     u0, u1, u2, u3, byte, low = uint64(0), uint64(1), uint64(2), uint64(3), uint64(8), uint64(63)
     samples, flat_distances = image.reshape(-1), distances.reshape(-1)
     runs = _run_codes(codes)
     single = runs[1] & low
-    matches = _match_codes(runs[1], back_codes)
+    matches = _match_codes(runs[1], distance_codes)
     width = uint64(image.shape[1])
     row_code = uint64(codes[0])
     x = u0
@@ -560,7 +566,8 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
         while x < end:
             distance = uint64(flat_distances[x])
             following = uint64(flat_distances[x + u1]) if x + u1 < end else u0
-            # A match rarely continues. One sign bit tests it, because LLVM compiles two conditions to two branches.
+            # A match rarely continues at the next pixel. A single sign bit tests both conditions, because LLVM would
+            # compile them to two branches.
             if (((following ^ distance) - u1) & (u0 - distance)) >> low:
                 run = u2
                 while run < uint64(_LONGEST_RUN) and x + run < end and uint64(flat_distances[x + run]) == distance:
@@ -571,7 +578,8 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
                 offset, waiting, bit_count = flush(out, offset, waiting, bit_count + length)
                 x += run
                 continue
-            # Both codes are computed, because this is faster than a branch that is often predicted wrongly.
+            # The codes of three literals and of a match are both computed, because this is faster than a branch that is
+            # often predicted wrongly.
             i = u3 * x
             red, green = uint64(joined[samples[i]]), uint64(joined[samples[i + u1]])
             blue = uint64(joined[samples[i + u2]])

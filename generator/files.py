@@ -45,7 +45,7 @@ class ImageMetadata:
     """Ground truth and camera of one image."""
 
     white_level: int  # saturation level in counts, 1 … 65535
-    white: tuple[float, float, float]  # ground truth: linear camera RGB of an achromatic surface, of any length
+    white: tuple[float, float, float]  # ground truth: linear camera RGB of an achromatic surface, not normalised
     camera: str  # maker and model, from the LUT
 
     def to_json(self) -> str:
@@ -66,9 +66,9 @@ _ZLIB: Final = bytes([0x78, 0x01])  # zlib header: deflate, window of 32 KiB, fa
 # Compression level of ISA-L (0 to 3) for maps, and for OpenEXR after prediction. With the filter Up, ISA-L compresses
 # maps as well as OpenCV in a fifth of the time.
 _LEVEL: Final = 1
-# Number of bytes at the start that are compressed separately. ISA-L compresses so few bytes in another loop; the
-# first hash of its usual loop is undefined (docs/decisions/0051-first-bytes-apart.md).
-_APART: Final = 8
+# Number of bytes at the start that are compressed separately. The first hash in the main loop of ISA-L is undefined,
+# but so few bytes are compressed in another loop (docs/decisions/0051-first-bytes-apart.md).
+_FIRST_BYTES: Final = 8
 _UP: Final = 2  # Filter type Up (clause 9.2)
 # Colour types (clause 11.2.2).
 _GREY: Final = 0
@@ -117,8 +117,8 @@ def _packed(data: npt.NDArray[np.uint8]) -> bytes:
     packer, plain = isal_zlib.compressobj(_LEVEL), data.reshape(-1).data
     # In a single call, ISA-L would hash bytes 3 to 6 with an undefined register, and equal maps would give different
     # files.
-    first = packer.compress(plain[:_APART]) + packer.flush(isal_zlib.Z_SYNC_FLUSH)
-    return b"".join([first, packer.compress(plain[_APART:]), packer.flush()])
+    first = packer.compress(plain[:_FIRST_BYTES]) + packer.flush(isal_zlib.Z_SYNC_FLUSH)
+    return b"".join([first, packer.compress(plain[_FIRST_BYTES:]), packer.flush()])
 
 
 def _png_head(width: int, height: int, colour: int) -> bytes:
@@ -322,7 +322,7 @@ def full_picture_index(path: Path) -> int:
 
 def _full_page(file: TiffFile) -> tuple[TiffPage, int | None]:
     # The first picture that is neither reduced nor a transparency mask (TIFF 6.0, NewSubfileType, bits 0 and 2), and
-    # its index; None in a SubIFD. The first picture if all are reduced.
+    # its index, which is None in a SubIFD. If all pictures are reduced, the first one is returned.
     hidden = _REDUCED | _TRANSPARENCY
     subpages: list[TiffPage] = []
     for index, page in enumerate(file.pages):
@@ -384,7 +384,7 @@ def read_native(path: Path) -> NativeImage:
     finally:
         stream.close()
     values = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
-    # For a GIF file OpenImageIO reports the channel after the last.
+    # For a GIF file, OpenImageIO reports an alpha channel that is too high by one.
     alpha = min(spec.alpha_channel, spec.nchannels - 1) if spec.alpha_channel > 0 else None
     compression = spec.get_string_attribute("compression")
     return NativeImage(values, alpha, spec.get_int_attribute("Orientation", 1), form, compression)
@@ -623,9 +623,9 @@ _BLACK: Final = np.float32(1e-30)  # Replaces 0 before the logarithm in float32;
 class Flash:
     """The tone mapping operator Flash with the parameters of one image."""
 
-    k: float  # semi-saturation: a · exp(mean ln V), where V is the brightness of the fitted image
+    k: float  # semi-saturation: strength `a` of `fit_flash`, times exp(mean ln V) for the brightness V
     scale: float  # 255 divided by the value of the brightest pixel before scaling
-    gamma: float  # display exponent g of y ** (1 / g); 1 for none
+    gamma: float  # display exponent: mapped values are raised to 1 / gamma; 1 for none
 
     def apply(self, linear: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
         """Return codes (..., 3) float64 of linear RGB (..., 3) ≥ 0; the brightest fitted value becomes 255."""
@@ -635,7 +635,8 @@ class Flash:
 
     def invert(self, codes: npt.NDArray[np.floating] | npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
         """Return linear RGB (..., 3) float64 of codes (..., 3), 0 … 255."""
-        # From y = x / (V + k), the largest channel is W = V / (V + k), hence x = y k / (1 − W).
+        # For a linear value x, brightness V and mapped value y = x / (V + k), the largest channel is W = V / (V + k),
+        # hence x = y k / (1 − W).
         mapped = (np.asarray(codes, dtype=np.float64) / self.scale) ** self.gamma
         largest = mapped.max(axis=-1, keepdims=True)
         # A code that was rounded up may give W = 1, which corresponds to infinite brightness.
@@ -788,7 +789,8 @@ def _brightest(samples: Any, logs: Any) -> Any:
 
 @compiled
 def _tone_map(samples: Any, roots: Any, shades: Any, out: Any) -> None:
-    # Fill `out` with the rounded product of the gamma root of each sample and the shade of the largest channel.
+    # Fill `out` with the rounded product of the gamma root of each sample and a factor. `shades` has this factor for
+    # each value of the largest channel.
     i = uint64(0)
     for _ in range(len(samples) // 3):
         red, green, blue = samples[i], samples[i + uint64(1)], samples[i + uint64(2)]

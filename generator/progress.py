@@ -37,7 +37,7 @@ def show_progress(images: int) -> Generator[Callbacks]:
     with ExitStack() as stack:
         count = _ImageCounter(images, stack)
         try:
-            yield Callbacks(on_done=count.leave_out, on_image=count.advance, on_skip=count.skip, on_wait=count.warn)
+            yield Callbacks(on_done=count.count_reused, on_image=count.advance, on_skip=count.skip, on_wait=count.warn)
         finally:
             count.end()
 
@@ -47,12 +47,12 @@ class _ImageCounter:
 
     def __init__(self, total: int, stack: ExitStack) -> None:
         self._total = total
-        self._shown = stack
+        self._stack = stack
         self._made = self._reused = self._reported = 0
         self._start = time.monotonic()
         self._bar: Progress | None = None
 
-    def leave_out(self, images: int) -> None:
+    def count_reused(self, images: int) -> None:
         """Count images of an earlier run; a negative number subtracts images that must be made again."""
         self._total -= images
         self._reused += images
@@ -63,7 +63,7 @@ class _ImageCounter:
         if not self._reported:
             self._report_reused()
         if self._bar is None and sys.stderr.isatty() and time.monotonic() - self._start > SOON_S:
-            self._bar = self._shown.enter_context(_bar())
+            self._bar = self._stack.enter_context(_bar())
             self._bar.add_task("images", total=self._total, rate="", left="")
         self._update()
 
@@ -84,7 +84,7 @@ class _ImageCounter:
             print(f"images {self._made}/{self._total} {self._rate():.1f}/s", file=sys.stderr)
 
     def _report_reused(self) -> None:
-        # Unfinished shards are resumed one after another, so that the number may rise during the run.
+        # Unfinished shards are resumed one after another, so the number of reused images may rise during the run.
         if self._reused > self._reported:
             self._print(
                 f"{counted(self._reused, 'image exists', 'images exist')} from an earlier run"

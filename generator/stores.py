@@ -80,7 +80,7 @@ _WITH_FOLDERS: Final = frozenset({"ftp", "sftp", "ssh", "smb", "webdav", "webdav
 
 @dataclass(frozen=True)
 class LocalStore:
-    """A folder of this machine, which must exist. Publishing a data set renames it, so that later writes fail."""
+    """A folder of this machine, which must exist. Publishing a data set renames the folder, so later writes fail."""
 
     root: Path
 
@@ -203,11 +203,11 @@ def _sync_file(path: Path) -> None:
         raise storage_error(path, error) from error
 
 
-# Parts of remote objects in memory: 256 MB. By default s3fs reads 50 MB ahead, so that each image of a tar file would
-# cost the whole file.
+# Blocks of remote objects that are kept in memory, 256 MB in total. By default s3fs reads 50 MB ahead, so reading one
+# image would fetch the whole tar file.
 _BLOCK: Final = 1 << 18
 _MOST_BLOCKS: Final = 1 << 10
-_KEPT_READ: Final = 1 << 23  # larger reads are not kept; a group of a Parquet file is smaller
+_LARGEST_KEPT_READ: Final = 1 << 23  # Larger reads, bytes, are not kept; a group of a Parquet file is smaller
 _blocks: Final[dict[tuple[str, int], bytes]] = {}
 _blocks_lock: Final = threading.Lock()
 
@@ -226,7 +226,7 @@ def _shared_blocks() -> str:
 
         def _fetch(self, start: int | None, stop: int | None) -> bytes:
             first, last = start or 0, self.size if stop is None else min(stop, self.size)
-            if last - first > _KEPT_READ:
+            if last - first > _LARGEST_KEPT_READ:
                 return self.fetcher(first, last)
             keys = [(self._key, number) for number in range(first // _BLOCK, -(-last // _BLOCK))]
             with _blocks_lock:
@@ -333,7 +333,7 @@ class RemoteStore:
             files, path = self._files, self._path(name)
             options: dict[str, Any] = {}
             if scattered:
-                # The answer of the store names the version, so that parts of a replaced object are not used.
+                # The key has the version that the store reports, so that blocks of a replaced object are not used.
                 key = f"{self.url} {name} {files.info(path)}"
                 options = {"block_size": _BLOCK, "cache_type": _shared_blocks(), "cache_options": {"key": key}}
             stream = files.open(path, "rb", **options)

@@ -149,7 +149,7 @@ def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
                 "replace negative values of measurement noise by 0"
             )
     powers = resampled(table[:, 0], table[:, 1:], WAVELENGTHS_NM)
-    return tuple(_light(name, power, None, where) for name, power in zip(headings[1:], powers.T, strict=True))
+    return tuple(_scaled_light(name, power, None, where) for name, power in zip(headings[1:], powers.T, strict=True))
 
 
 def table_illuminants(lights: Sequence[LightSpectrum]) -> tuple[Illuminant, ...]:
@@ -166,7 +166,7 @@ def table_illuminants(lights: Sequence[LightSpectrum]) -> tuple[Illuminant, ...]
     )
 
 
-def _light(name: str, power: _Array, cct_k: float | None, where: str) -> LightSpectrum:
+def _scaled_light(name: str, power: _Array, cct_k: float | None, where: str) -> LightSpectrum:
     low, high = np.searchsorted(WAVELENGTHS_NM, [400, 700])
     if not power[low : high + 1].max() > 0:
         raise FormatError(f"{where}: {name!r} has no power from 400 to 700 nm; correct or omit it")
@@ -179,7 +179,7 @@ def _published_lights(name: str, text: str) -> Iterable[LightSpectrum]:
         # Computed at 1 nm and resampled like the other spectra, so that integrals are preserved.
         wavelengths = np.arange(380.0, 781.0)
         for cct_k in parse_ccts(black_bodies[1]):
-            yield _as_light(f"{cct_k:g}K", PublishedSpectrum(wavelengths, planck(wavelengths, cct_k)), cct_k)
+            yield _resampled_light(f"{cct_k:g}K", PublishedSpectrum(wavelengths, planck(wavelengths, cct_k)), cct_k)
     elif daylights := re.fullmatch(r"daylight:(.+)", name, re.IGNORECASE):
         for cct_k in parse_ccts(daylights[1].rstrip("kK")):
             if not DAYLIGHT_K[0] <= cct_k <= DAYLIGHT_K[1]:
@@ -187,11 +187,11 @@ def _published_lights(name: str, text: str) -> Iterable[LightSpectrum]:
                     f"--lights {text}: daylight of {cct_k:g} K, expected {DAYLIGHT_K[0]:g} to "
                     f"{DAYLIGHT_K[1]:g} K, as the CIE defines it; give a black body, {cct_k:g}K"
                 )
-            yield _as_light(f"daylight {cct_k:g}K", daylight(cct_k))
+            yield _resampled_light(f"daylight {cct_k:g}K", daylight(cct_k))
     else:
         spectra = published_spectra()
         for key in _matching_names(name, list(spectra), text):
-            yield _as_light(key, spectra[key])
+            yield _resampled_light(key, spectra[key])
 
 
 def _matching_names(name: str, published: list[str], text: str) -> list[str]:
@@ -209,12 +209,12 @@ def _matching_names(name: str, published: list[str], text: str) -> list[str]:
     raise InputError(f"--lights {text}: {name!r} is not a file or a published illuminant; {hint}")
 
 
-def _as_light(name: str, spectrum: PublishedSpectrum, cct_k: float | None = None) -> LightSpectrum:
+def _resampled_light(name: str, spectrum: PublishedSpectrum, cct_k: float | None = None) -> LightSpectrum:
     require_grid(spectrum.wavelengths_nm, name)
     if spectrum.power.min() < 0:
         raise FormatError(f"{name!r} has published values below 0, expected 0 or more; give another illuminant")
     power = resampled(spectrum.wavelengths_nm, spectrum.power[:, None], WAVELENGTHS_NM)[:, 0]
-    return _light(name, power, cct_k, "published spectra")
+    return _scaled_light(name, power, cct_k, "published spectra")
 
 
 def _linear_srgb(power: _Array) -> _Array:
@@ -288,7 +288,7 @@ class PatchSensor:
         light
             (3, rows, columns) float32 from `PatchSensor.light`.
         weights
-            (3,) float64, exposure to each primary, by which its light is multiplied.
+            (3,) float64, exposure to each primary: factor of the light of this primary.
         iso
             ISO speed, which sets gain and read noise.
         frame
@@ -362,7 +362,7 @@ class SpectralLamp:
     powers: _Array  # (L, 81) float64, relative power per nm of each illuminant
     sensor: PatchSensor
     reflectance: _Array  # (N, 81) float64, reflectance of each patch
-    field: _Array  # (N,) float64, illumination of each patch, as by the green primary of the simulated projector
+    field: _Array  # (N,) float64, relative illumination of each patch; that of the simulated projector in green
 
     def signals(self, light: int) -> _Array:
         """Return the signal of each patch under an illuminant, (N, 3) float64, DN above black."""

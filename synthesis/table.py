@@ -2,8 +2,8 @@
 
 The same camera, illuminants, settings and seed give the same bytes with any number of threads. Computed frames are
 evaluated like photographs in `calibration.pipeline.measuring`: the black level is subtracted, flat field and white are
-measured on the white references, and samples are divided by the flat field for their colour. Therefore the ground truth
-has the same kinds of errors as in a LUT from photographs.
+measured on the white references, and samples are divided by the flat field of their patch colour. Therefore the ground
+truth has the same kinds of errors as in a LUT from photographs.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class PatchMeasurement:
         """Measure a white frame and the frames of the primaries."""
         reader = PaperReader(points.whites_mm, points.cells_mm, page_mm)
         first = PatchMeasurement(points, sensor, lamp, iso, reader)
-        # Charts with tags have white references among the patches. Other charts have them only around the patches.
+        # Charts with tags have white references among the patches; other charts, only around the patches.
         order = MAX_ORDER if tagged else MAX_ORDER_AROUND
         base = first._white_frame_paper().field
         uncorrected = replace(first, reader=PaperReader(points.whites_mm, points.cells_mm, page_mm, base, order))
@@ -129,7 +129,7 @@ def _require_unclipped(whites: _Array, frame_name: str) -> None:
 
 ReportLights = Callable[[int, int], None]  # Called with the number of completed illuminants and their total
 
-# Disk space for text files, bytes: lut.json has 2.2 kB per illuminant (1.6 MB for 707), references.csv a third of it.
+# Disk space for text files, bytes: lut.json has 2.2 kB per illuminant, references.csv a third of that.
 SPARE_BYTES: Final = 16 << 20
 
 

@@ -1,7 +1,8 @@
 """The card and the datasheet of a data set.
 
-`README.md` is a card for the Hugging Face Hub. `DATASHEET.md` answers the questions of Gebru et al., "Datasheets for
-Datasets", Communications of the ACM 64 (2021). Questions that only the authors of a data set can answer are marked.
+`README.md` is a dataset card, the front page of a data set on the Hugging Face Hub. `DATASHEET.md` answers the
+questions of Gebru et al., "Datasheets for Datasets", Communications of the ACM 64 (2021). Questions that only the
+authors of a data set can answer are marked.
 """
 
 from __future__ import annotations
@@ -121,8 +122,8 @@ def noise_of(description: Description) -> str:
         return f"The LUT does not record gain and read noise. {green}"
     return (
         f"In the model of the sensor, one count is {gain * 100 / iso:.4g} electrons at its ISO {iso:g}. "
-        f"At ISO 100 one count is {gain:.4g} electrons, and the read noise of a photosite is {read:.4g} counts, of "
-        f"which {early:.4g} electrons are noise before the amplifier. {green}"
+        f"At ISO 100 one count is {gain:.4g} electrons, and the read noise of a photosite is {read:.4g} "
+        f"counts. The part of it that arises before the amplifier is {early:.4g} electrons. {green}"
     )
 
 
@@ -192,7 +193,8 @@ def datasheet(description: Description) -> str:
         "uncertainty": uncertainty_of(description),
         "white_level": table.white_level,
     }
-    # The number of marks in the template, plus the mark that `authors` always contains.
+    # `count` is the number of questions marked with `OPEN`: those in the template, and `authors`, which is always
+    # marked.
     return template.substitute(answers, count=template.template.count("${open}") + 1)
 
 
@@ -254,7 +256,7 @@ def _front_matter(description: Description) -> str:
 
 def _configs(description: Description) -> str:
     layout = LAYOUTS[option(description, "layout")]
-    # With single files, the Hub reads the rows of the table of ground truths.
+    # If each image has its own file, the Hub reads the rows of the table of ground truths.
     if not layout.is_read_by_hugging_face:
         files = "  - split: train\n    path: ground_truth.csv\n"
     else:

@@ -87,8 +87,8 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     if is_grid:
         is_shared = len({entry.lights for line in grid for entry in line}) == 1
 
-    # In inches. A row is as high as its highest image. In a grid, images in portrait format are reduced to squares,
-    # because their neighbours are mostly in landscape format.
+    # Sizes in inches. A cell is the place of one image; a row is as high as its highest image. In a grid, images in
+    # portrait format are reduced to squares, because their neighbours are mostly in landscape format.
     cell, gap, margin, caption = 1.75, 0.12, 0.4, 0.26
     max_aspect = 1.0 if is_grid else np.inf
     heights = [

@@ -28,9 +28,9 @@ from generator.lights.lighting import Lighting
 from generator.stores import join_pieces
 
 _SAMPLED: Final = 32  # Images that are rendered; their mean size then has a standard error of some percent
-_LONGEST_S: Final = 20.0  # Time after which no further pictures are read, for very large ones
-_LISTED_BYTES: Final = 300  # Lines about one file in the lists of a data set, or its head in a tar file
-_TEXT_BYTES: Final = 20_000  # Description, card and datasheet
+_READING_LIMIT_S: Final = 20.0  # No further pictures are read after this time; only very large ones need so long
+_LISTED_BYTES: Final = 300  # Bytes for a file besides its content: its lines in the lists, or its head in a tar file
+_TEXT_BYTES: Final = 20_000  # Bytes of description, card and datasheet
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def forecast(plan: Plan, images: int, workers: int) -> Forecast:
     _rendered(plan, first_images[0])
     with ThreadPoolExecutor(workers) as pool:
         for first in range(0, len(positions), workers):
-            if read_s + render_s > _LONGEST_S and rendered_count:
+            if read_s + render_s > _READING_LIMIT_S and rendered_count:
                 break
             begin = time.monotonic()
             results = list(pool.map(read, positions[first : first + workers]))

@@ -266,8 +266,8 @@ class _Parquet:
         self._rows, self._size = [], 0
 
 
-def _cell_of(file: str) -> tuple[str, int | None]:
-    # Returns the column of a file with a name as in a tar file, and the index in its list if the column has lists.
+def _column_of(file: str) -> tuple[str, int | None]:
+    # Returns the column of a file that is named as in a tar file. If this column has lists, also the index in the list.
     infix = file.split(".")[1:-1]
     if not infix:
         return "image", None
@@ -279,7 +279,7 @@ def _read_parquet(stream: BinaryIO, file: str) -> bytes | None:
     import pyarrow.parquet as pq
 
     number = int(file.partition(".")[0])
-    column, index = _cell_of(file)
+    column, index = _column_of(file)
     size = stream.seek(0, 2)
     table = pq.ParquetFile(
         stream, thrift_string_size_limit=_MOST_TEXT_BYTES, thrift_container_size_limit=_MOST_LIST_ITEMS
@@ -307,8 +307,8 @@ class Extras(NamedTuple):
     """Content of a data set besides its images, and its camera."""
 
     previews: bool
-    maps: bool  # of several illuminants
-    details: bool  # of each image
+    maps: bool  # masks and ground truth maps of several illuminants
+    details: bool  # columns of `images.csv`
     camera: str
     # ColorMatrix and ForwardMatrix of the camera (`generator.rendering.matrices.dng_matrices`); None if not needed
     matrices: tuple[list[list[float]], list[list[float]]] | None = None

@@ -1,11 +1,12 @@
-"""Generate data sets: complete, or in shares by several programs.
+"""Generate data sets: complete, or in shares by several programs; share i of n has the shards with number mod n = i.
 
 Threads of this program or workers of a Dask cluster make the shards (`generator.dataset.shards`). Contract of the
 workplace, the folder or store location in which a data set is made (`shards.Workplace`):
 
 - A workplace belongs to one plan. Another plan is refused, and the message lists the differences. Records have the
   identifier of their plan, because a worker of a removed plan may still be running.
-- A program that makes the complete data set locks the folder exclusively; programs that make shares share the lock.
+- A program that makes the complete data set locks the folder exclusively. Programs that make shares can hold the
+  lock together.
 - If the work fails before an image is finished, the workplace is removed. After an `InputError`, the command must be
   changed; the workplace is then removed unless a shard is complete.
 """
@@ -418,7 +419,7 @@ def make_share(
     index, count = share
     if not 0 <= index < count:
         raise InputError(f"the share is {index} of {count}, expected 0 to {count - 1}; correct it")
-    with open_workplace(out, plan.identity(), alone=False) as workplace:
+    with open_workplace(out, plan.identity(), exclusive=False) as workplace:
         _make_missing(plan, workplace, range(index, plan.shards, count), workers or Workers(), callbacks)
         return workplace.count_done(), plan.shards
 
@@ -436,7 +437,7 @@ def _make_missing(plan: Plan, workplace: Workplace, shards: range, workers: Work
 
 
 def is_complete(out: str | Path, identity: PlanIdentity) -> bool:
-    """Return whether the data set of this plan is complete; if so, remove notes left by a killed program."""
+    """Return whether the data set of this plan is complete; if so, remove plan and records left by a killed program."""
     notes = _notes(out)
     if not open_store(out).has(DESCRIPTION):
         return False
@@ -474,8 +475,8 @@ def differences(stored: Any, planned: Any) -> list[str]:
 
 
 @contextmanager
-def open_workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Generator[Workplace]:
-    """Open or create the workplace of the data set `out`."""
+def open_workplace(out: str | Path, identity: PlanIdentity, exclusive: bool = True) -> Generator[Workplace]:
+    """Open or create the workplace of the data set `out`; `exclusive` locks it against all other programs."""
     if isinstance(out, str) and is_remote(out):
         yield from _open_remote_workplace(out, identity)
         return
@@ -484,7 +485,7 @@ def open_workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) 
     # Absolute, because a worker may run in another folder.
     folder = partial_path(path).absolute()
     busy = f"{path} is being made by another program; wait until it has ended, or choose another location"
-    has_plan = None if alone else (folder / "plan" / PLAN).is_file
+    has_plan = None if exclusive else (folder / "plan" / PLAN).is_file
     with locked_folder(folder, busy, share_if=has_plan, target=path) as lock:
         notes = LocalStore(folder / "plan")
         plan_id = _plan_id(identity)
@@ -499,12 +500,12 @@ def open_workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) 
                 _create_folders(folder, plan_id)
                 notes.put(PLAN, _plan_bytes(identity))
                 notes.sync([PLAN])
-            if not alone:
+            if not exclusive:
                 lock.share()
             yield workplace
         except BaseException as error:
             # After an InputError the command must change, and another plan cannot use these images.
-            if alone and folder.is_dir() and not workplace.has_finished(isinstance(error, InputError)):
+            if exclusive and folder.is_dir() and not workplace.has_finished(isinstance(error, InputError)):
                 shutil.rmtree(folder, ignore_errors=True)
             raise
 

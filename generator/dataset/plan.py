@@ -1,10 +1,10 @@
 """Plan of a data set: it assigns a number to every image and a shard to every number.
 
-A data set is a function of its LUT, sources, choice of illuminants, seed and options. Image number
-`(position · crops + c) · lights_each + k` shows crop c of the source at `position` under illuminant k of scene
-`position · crops + c`. The number does not depend on whether other sources can be read. A shard has n images; shard i
-has the numbers from i · n to (i + 1) · n − 1. Any worker can therefore make any shard at any time, and a shard that is
-made twice has the same bytes.
+A data set is a function of its LUT, sources, choice of illuminants, seed and options. A scene is a crop of a source, or
+the whole source. Crop c of the source at `position` is scene s = `position · crops + c`. Image `s · lights_each + k`
+shows scene s under its illuminant k. Its number does not depend on whether other sources can be read. A shard has
+n images; shard i has the numbers from i · n to (i + 1) · n − 1. Any worker can therefore make any shard at any time,
+and a shard that is made twice has the same bytes.
 """
 
 from __future__ import annotations
@@ -147,14 +147,14 @@ class DatasetOptions:
         if self.crops < 1:
             raise InputError(f"crops is {self.crops}, expected 1 or more; correct it")
         split = self.split
-        if split is not None and not (len(split) == 3 and min(split) >= 0 and abs(sum(split) - 1) < _ROUNDED):
+        if split is not None and not (len(split) == 3 and min(split) >= 0 and abs(sum(split) - 1) < _SUM_TOLERANCE):
             shares = ",".join(f"{share:g}" for share in split)
             raise InputError(
                 f"the split is {shares}, expected three shares ≥ 0 with the sum 1 as in 0.8,0.1,0.1; correct it"
             )
 
 
-_ROUNDED: Final = 1e-6  # Allowed difference of a sum of shares from 1
+_SUM_TOLERANCE: Final = 1e-6  # Allowed difference of a sum of shares from 1
 
 
 def parse_split(text: str) -> tuple[float, float, float]:
@@ -174,7 +174,7 @@ def parse_split(text: str) -> tuple[float, float, float]:
         )
     total = sum(shares)
     is_whole = total >= 1 and all(share == int(share) for share in shares)
-    if not (is_whole or abs(total - 1) < _ROUNDED or abs(total - 100) < 100 * _ROUNDED):
+    if not (is_whole or abs(total - 1) < _SUM_TOLERANCE or abs(total - 100) < 100 * _SUM_TOLERANCE):
         raise InputError(
             f"the split {text} has the sum {total:.10g}, expected 1; give shares such as 0.8,0.1,0.1, or integers such "
             "as 8,1,1"

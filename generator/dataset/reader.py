@@ -52,10 +52,10 @@ from generator.stores import DESCRIPTION, RemoteStore, Store, open_store, read_b
 
 # File name of an image: a number, for which ten digits suffice, and a suffix.
 _NAME: Final = re.compile(r"([0-9]{1,10})(\.[A-Za-z0-9.]*)?")
-_VALID: Final = "with r + g + b = 1 and no negative number"
+_VALID_TRUTH: Final = "with r + g + b = 1 and no negative number"
 # Tolerance for sums and means of chromaticities: above the rounding of six digits, below 0.001 degrees.
 _ROUNDING: Final = 2e-6
-_KEPT: Final = 4096  # Number of cached illuminants, several times the number in a LUT; many images share an illuminant
+_CACHED_LIGHTS: Final = 4096  # Number of cached illuminants: several times that of a LUT
 
 
 def read_entries(store: Store, description: Description) -> Iterator[Entry]:
@@ -112,7 +112,7 @@ def _read_rows(
         except (KeyError, TypeError, ValueError, InputError) as error:
             raise FormatError(
                 f"{name}, line {line} is {_excerpt(','.join(map(str, row.values())))}, expected "
-                f"{','.join(GROUND_TRUTH_COLUMNS)} {_VALID}; make the data set again"
+                f"{','.join(GROUND_TRUTH_COLUMNS)} {_VALID_TRUTH}; make the data set again"
             ) from error
     return source, *_unzipped(tuple(lights))
 
@@ -123,7 +123,7 @@ def _truth(store: Store, text: str, line: int, image: str, lights: tuple[Triple,
         truth = _triple(*text.split())
     except (TypeError, ValueError) as error:
         raise FormatError(
-            f"{name}: {image} has {_excerpt(text.strip())}, expected r g b {_VALID}; make the data set again"
+            f"{name}: {image} has {_excerpt(text.strip())}, expected r g b {_VALID_TRUTH}; make the data set again"
         ) from error
     if not _may_be_mean(truth, lights):
         expected = " and ".join("{:g} {:g} {:g}".format(*light) for light in lights)
@@ -134,7 +134,7 @@ def _truth(store: Store, text: str, line: int, image: str, lights: tuple[Triple,
     return truth
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=_CACHED_LIGHTS)
 def _may_be_mean(mean: Triple, lights: tuple[Triple, ...]) -> bool:
     # The weights of the illuminants are not in the lists, so only the range of each channel is checked.
     return all(
@@ -160,17 +160,17 @@ def _number(image: str) -> int:
     return int(match[1]) if match else -1
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=_CACHED_LIGHTS)
 def _light(label: str, red: str, green: str, blue: str) -> tuple[str, Triple]:
     return parse_mixture(label).label, _triple(red, green, blue)
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=_CACHED_LIGHTS)
 def _unzipped(lights: tuple[tuple[str, Triple], ...]) -> tuple[tuple[str, ...], tuple[Triple, ...]]:
     return tuple(label for label, _ in lights), tuple(white for _, white in lights)
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=_CACHED_LIGHTS)
 def _triple(red: str, green: str, blue: str) -> Triple:
     triple = float(red), float(green), float(blue)
     if not (min(triple) >= 0 and abs(sum(triple) - 1) <= _ROUNDING):
@@ -178,7 +178,7 @@ def _triple(red: str, green: str, blue: str) -> Triple:
     return triple
 
 
-_LINE: Final = re.compile("[0-9a-f]{64}")  # A hash in the format of `sha256sum`
+_SHA256: Final = re.compile("[0-9a-f]{64}")  # SHA-256 of a file in hexadecimal digits
 
 
 def file_faults(
@@ -186,7 +186,7 @@ def file_faults(
 ) -> Iterator[str]:
     """Yield a text for each file that is missing, changed or not listed; reads every byte of the data set.
 
-    The card and the datasheet are not checked, because they are completed by hand.
+    `README.md` and `DATASHEET.md` are not checked, because the authors complete them by hand.
     """
     store = open_store(location)
     sums = f"{store.location}/{SUMS}"
@@ -225,7 +225,7 @@ def _listed_files(lines: Iterator[bytes], listed_names: set[str]) -> Iterator[tu
     # Yields name, hash and fault of each line, and adds the names to `listed_names`.
     for number, line in enumerate(lines, start=1):
         digest, _, name = line.decode("utf-8", "replace").rstrip("\n").partition("  ")
-        if not _LINE.fullmatch(digest) or not is_inside_name(name):
+        if not _SHA256.fullmatch(digest) or not is_inside_name(name):
             yield (
                 "",
                 "",
@@ -268,13 +268,13 @@ class Dataset:
         Location of the files.
     description
         Content of `dataset.json`; `description.table.white_level` is the saturation level.
-    made_under
-        `light_labels` of a data set that was just generated; None to read them from its lists.
+    known_light_labels
+        `light_labels`, if they are known because the data set was just generated; None to read them from its lists.
     """
 
     store: Store
     description: Description
-    made_under: frozenset[str] | None = field(default=None, compare=False)
+    known_light_labels: frozenset[str] | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         """Return one line, because the list of entries may be very long."""
@@ -291,8 +291,8 @@ class Dataset:
         Returns
         -------
         ndarray
-            (H, W, 3) uint16, linear camera RGB, black 0, saturation `description.table.white_level`; of the format
-            ``dng`` the half-size image.
+            (H, W, 3) uint16, linear camera RGB, black 0, saturation `description.table.white_level`. For the
+            format ``dng``, it is the half-size image.
 
         Raises
         ------
@@ -343,8 +343,8 @@ class Dataset:
     @cached_property
     def light_labels(self) -> frozenset[str]:
         """All illuminants of the images without repetitions; see `Entry.lights`."""
-        if self.made_under is not None:
-            return self.made_under
+        if self.known_light_labels is not None:
+            return self.known_light_labels
         return frozenset(label for entry in self.entries for label in entry.lights)
 
     @property

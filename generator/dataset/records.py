@@ -84,7 +84,7 @@ class Light(SparseRecord):
     illumination: int  # number in the LUT
     kind: str
     cct_k: float | None
-    codes: tuple[int, int, int]  # of the projector; for a computed spectrum codes of a similar colour
+    codes: tuple[int, int, int]  # of the projector; for a computed spectrum, codes of a similar colour
     white: Triple  # ground truth in linear camera RGB, not normalised
     name: str | None = None  # of a computed spectrum
     uncertainty_deg: float | None = None  # expanded uncertainty (k = 2), if the LUT reports it

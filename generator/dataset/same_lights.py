@@ -1,6 +1,6 @@
 """Repeat the scenes and illuminants of a data set with the LUT of another camera.
 
-- Illuminants of two LUTs are equal if the projector showed the same codes; their numbers may differ. The user must
+- Illuminants of two LUTs are equal if the projectors showed the same codes; their numbers may differ. The user must
   ensure that the projectors are equal. Computed spectra must also have equal names, because different spectra may have
   one colour.
 - Image number i of both data sets shows the same scene. A picture that the first data set skipped is skipped again.
@@ -120,15 +120,15 @@ def lights_of(dataset: Dataset, lut: Lut) -> LightsOf:
     """Return the illuminants of a data set, with their numbers in another LUT."""
     description = dataset.description
     numbers = _same_lights(description.lights, lut, dataset.store.location)
-    tinted = _is_tinted(dataset)
+    is_tinted = _is_tinted(dataset)
     if description.table.sha256 != lut.sha256:
-        _require_single(dataset, tinted)
-    masks = None if tinted else _masks_of(dataset)
+        _require_single(dataset, is_tinted)
+    masks = None if is_tinted else _masks_of(dataset)
     mixtures_by_label: dict[str, Mixture] = {}
     lightings: dict[int, Lighting] = {}
     for entry in dataset.entries:
         number = int(entry.image.partition(".")[0])
-        labels = entry.lights[:1] if tinted else entry.lights
+        labels = entry.lights[:1] if is_tinted else entry.lights
         mixtures = tuple(mixtures_by_label.setdefault(label, _renumbered(label, numbers)) for label in labels)
         lightings[number] = Lighting(mixtures, None if masks is None else masks.maker(number))
     first = next(iter(lightings.values()))
@@ -201,14 +201,14 @@ def _same_lights(used: Sequence[Light], lut: Lut, location: str) -> dict[int, in
     return numbers
 
 
-def _require_single(dataset: Dataset, tinted: bool) -> None:
+def _require_single(dataset: Dataset, is_tinted: bool) -> None:
     # Mixtures of spectra that were exposed separately are refused: their weights differ for another camera.
     if all(light.name is None for light in dataset.description.lights):
         return
     mixed = [
         entry.image
         for entry in dataset.entries
-        if len(parse_mixture(entry.lights[0]).lights) > 1 or (len(entry.lights) > 1 and not tinted)
+        if len(parse_mixture(entry.lights[0]).lights) > 1 or (len(entry.lights) > 1 and not is_tinted)
     ]
     if mixed:
         raise InputError(

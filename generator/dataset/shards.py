@@ -113,7 +113,7 @@ _threads: Final = threading.local()
 # Shorter side in px below which a picture gets a note: probably an icon or a failed download, not a photograph.
 TINY_PX: Final = 16
 
-_HASH_VALUES: Final = 1 << 64  # Number of values of eight bytes; eight bytes of a hash select the split
+_HASH_VALUES: Final = 1 << 64  # Number of values of eight bytes: the first eight bytes of a hash select the split
 
 
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
@@ -182,7 +182,7 @@ def photograph(
 ) -> RawImage:
     """Return the raw image of a print of `picture` (H, W, 3) uint8, sRGB codes.
 
-    For rendering by codes, all colours must have samples in the LUT. `number` is the number of the image;
+    For rendering by codes, all colours must have samples in the LUT. `number` is the number of the image.
     `white_level` limits the counts of images with masks.
     """
     # The data set records the hash of the LUT, so the samples must still match the hashes in the LUT.
@@ -377,7 +377,7 @@ def make_shard(
                 if number in finished:
                     pending.append(pool.submit(_reused_sample, finished[number]))
                 else:
-                    pending.append(pool.submit(_stored, job, lut, workplace, writer, number, read, crop, lighting))
+                    pending.append(pool.submit(_write, job, lut, workplace, writer, number, read, crop, lighting))
         while pending:
             finish_one(writer)
         files = writer.close()
@@ -528,7 +528,7 @@ def read_source(job: ShardJob, lut: Lut, row: int, finished: Mapping[int, Finish
 
 
 def _unchanged_source(job: ShardJob, position: int, finished: Mapping[int, FinishedImage]) -> SourceRecord | None:
-    # The record of a source with all images finished that has not changed since; else None.
+    # The record of a source if all its images are finished and the source has not changed since; None in other cases.
     images = images_of_source(job, position)
     records = [finished[number].source if number in finished else None for number, _, _ in images]
     first = records[0] if records else None
@@ -538,7 +538,7 @@ def _unchanged_source(job: ShardJob, position: int, finished: Mapping[int, Finis
     return first if changed_sha256(job.sources[position - job.position], -math.inf) == first.sha256 else None
 
 
-def _stored(
+def _write(
     job: ShardJob,
     lut: Lut,
     workplace: Workplace,
@@ -853,10 +853,10 @@ class Workplace:
         """Return the image of a piece; None if one of its files has changed."""
         return _record_in(piece, FinishedImage) if piece.is_complete(self.files.open) else None
 
-    def has_finished(self, shard: bool = False) -> bool:
-        """Return whether any plan has a finished image, or with `shard` a complete shard."""
+    def has_finished(self, needs_shard: bool = False) -> bool:
+        """Return whether any plan has a finished image; if `needs_shard`, whether any plan has a complete shard."""
         names = self.notes.names(RECORDS)
-        return any(not shard or _SHARD_PIECE in read_pieces(self.notes.get(name)) for name in names)
+        return any(not needs_shard or _SHARD_PIECE in read_pieces(self.notes.get(name)) for name in names)
 
     def discard(self) -> None:
         """Remove the records of complete shards, because resuming them would fail again."""

@@ -53,10 +53,11 @@ MOST_UPLOADS: Final = 8  # Largest number of uploaded pictures that are kept, an
 # Largest number of pixels of an uploaded picture. Decoding of such a picture needs 200 MB.
 MOST_UPLOADED_PIXELS: Final = 1 << 26
 
-# Side of a uniform area for measuring noise, px. Its 256 pixels give the standard deviation to 5 %.
-_DRAWS: Final = 16
+# Side of the uniform area in which noise is measured, px. With its 256 pixels, the standard deviation has a standard
+# error of 5 %.
+_NOISE_SIDE: Final = 16
 
-_STEPS: Final = 33  # Points of the black-body curve
+_CURVE_POINTS: Final = 33  # Points of the black-body curve
 
 _OUTPUT: Final = "dataset"  # Output folder in the command on the page
 
@@ -93,7 +94,8 @@ class Explorer:
 
         lut, gamut = self.lut, self._gamut
         lights = [light_of(lut, number) for number in range(len(lut.white))]
-        # Illuminants on a line have no triangles; their edges give the hull. A single illuminant has no edge either.
+        # Illuminants on a line have no triangles; the ends of their edges give the hull. A single illuminant has no
+        # edge.
         on_hull = ConvexHull(gamut.rb).vertices.tolist() if len(gamut.triangles) else {0, *gamut.edges.ravel().tolist()}
         return {
             "name": self._lut_argument,
@@ -165,7 +167,7 @@ class Explorer:
         if not (0 <= y < picture.shape[0] and 0 <= x < picture.shape[1]):
             height, width = picture.shape[:2]
             raise InputError(f"the pixel {x}, {y} is outside the picture of {width}x{height} px; select another one")
-        field = np.broadcast_to(picture[y, x], (_DRAWS, _DRAWS, 3)).copy()
+        field = np.broadcast_to(picture[y, x], (_NOISE_SIDE, _NOISE_SIDE, 3)).copy()
         drawn = self._photograph(field, self._mixture(light), rendering, 1).reshape(-1, 3).astype(np.float64)
         mean, deviation = drawn.mean(axis=0), drawn.std(axis=0, ddof=1)
         return {
@@ -199,7 +201,7 @@ class Explorer:
         bodies = {light.cct_k for light in self.lut.illuminations if light.cct_k is not None}
         if len(bodies) < 2:
             return []
-        mired = np.linspace(1e6 / min(bodies), 1e6 / max(bodies), _STEPS)
+        mired = np.linspace(1e6 / min(bodies), 1e6 / max(bodies), _CURVE_POINTS)
         kelvins = np.clip(1e6 / mired, min(bodies), max(bodies)).tolist()
         return [[kelvin, *rb_of(black_body(self.lut, kelvin).white(self.lut)).tolist()] for kelvin in kelvins]
 

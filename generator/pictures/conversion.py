@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from PIL.ImageCms import ImageCmsProfile, ImageCmsTransform
 
 
-# Codes per channel of the test grid, 729 colours, that shows if a profile is sRGB.
+# Number of codes per channel in a test grid of 729 colours. The grid shows whether a profile is sRGB.
 _PROBE_STEPS: Final = 9
 
 _ADOBE_GAMMA: Final = 563 / 256  # Adobe RGB (1998) Color Image Encoding, clause 4.3.1.2
@@ -75,10 +75,10 @@ _SRGB_GAMMA_TOLERANCE: Final = 0.05
 # Cone responses of the Bradford adaptation (ICC.1:2022, annex E.3).
 _BRADFORD: Final = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
-# Largest difference of a matrix from the identity, and of chromaticities, that still counts as sRGB.
+# Largest difference between the identity and the matrix of a space that still counts as sRGB.
 _SAME_MATRIX: Final = 0.002
 
-# Codes by which the greys of a profile may differ from those of linear light.
+# Largest difference between the greys of a profile and those of linear light, in codes, if the profile is linear.
 _LINEAR_TOLERANCE: Final = 2
 
 
@@ -120,7 +120,7 @@ class RgbSpace:
 def space_of_primaries(name: str, chromaticities: Sequence[float], exponent: float = 1.0) -> RgbSpace:
     """Return the space with the chromaticities x, y of red, green, blue and white (8 values).
 
-    `exponent` is that of the transfer function; 1 for linear light. Raises FormatError if they define no colour space.
+    `exponent` is that of the transfer function; 1 for linear light. Raises FormatError if the values define no space.
     """
     given = np.asarray(chromaticities, dtype=np.float64).reshape(4, 2)
     matrix: _Array = np.full((3, 3), math.nan)
@@ -179,7 +179,7 @@ def codes_text(codes: Sequence[int]) -> str:
 def space_of_gamma(file_gamma: float, chromaticities: Sequence[float] | None) -> RgbSpace:
     """Return the space of the PNG chunks gAMA and cHRM (PNG, third edition, clauses 11.3.2.1 and 11.3.2.2).
 
-    `file_gamma`: exponent from light to codes; 0 without a chunk. `chromaticities`: of white, red, green and blue.
+    `file_gamma`: exponent from light to codes; 0 without gAMA. `chromaticities`: x, y of white, red, green and blue.
     """
     is_srgb_curve = not file_gamma or abs(file_gamma / _SRGB_FILE_GAMMA - 1) <= _SRGB_GAMMA_TOLERANCE
     exponent = _SRGB_CURVE if is_srgb_curve else 1 / file_gamma
@@ -226,6 +226,7 @@ def from_adobe_rgb(codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 @lru_cache(maxsize=16)
 def _transform(icc: bytes) -> tuple[ImageCmsTransform | None, str, str, RgbSpace | None]:
+    # Transform to sRGB, or None; Pillow mode of the profile; how the profile is treated; its space if it is linear.
     from PIL import Image, ImageCms
 
     try:

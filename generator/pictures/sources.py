@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
 
 
-ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"  # Treatment of a photograph in that space
+ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"  # Treatment of a photograph in Adobe RGB
 
 # Notes on a picture, for `sources.csv` of the data set.
 LINEAR: Final = "floating-point values, taken as linear light"
@@ -66,7 +66,8 @@ PROFILE_UNUSED: Final = "colour profile not applied"
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"  # First bytes of a PNG file
 
-# Candidates for each crop after the first (judgement). With only one, two crops could be nearly equal.
+# Number of candidates for each crop after the first, chosen by judgement. With one candidate, two crops could be nearly
+# equal.
 _CROP_CANDIDATES: Final = 8
 
 
@@ -377,7 +378,7 @@ _RADIANCE_PRIMARIES: Final = re.compile(rb"^PRIMARIES=((?:\s+[-+.0-9eE]+){8})\s*
 
 
 def _stated_space(path: Path, spec: Any, chunks: Mapping[bytes, bytes], icc: bytes | None) -> RgbSpace | None:
-    # The colour space of a file if it is neither sRGB nor linear light of its primaries.
+    # The colour space that a file states by primaries and transfer function, or by a profile of linear light.
     if b"cICP" not in chunks and icc is not None:
         return linear_space(icc)
     if chunks:
@@ -501,7 +502,7 @@ def _interoperability(path: Path) -> str:
         with Image.open(path) as picture:
             index = picture.getexif().get_ifd(IFD.Interop).get(1, "")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        # Damaged EXIF data, or too large for Pillow. OpenImageIO has read the picture itself.
+        # The EXIF data are damaged, or the picture is too large for Pillow. OpenImageIO has already read the picture.
         return ""
     return str(index).strip("\0 ")
 

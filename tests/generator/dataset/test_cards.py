@@ -133,7 +133,7 @@ def test_texts_of_computed_lut(folder_data_set: Dataset) -> None:
     assert "The report of the LUT has the verdict" not in text
     assert "The frames of the LUT" not in text
     assert "one count is 0.9 electrons at its ISO 200" in text
-    assert "read noise of a photosite is 6 counts, of which 2.8" in text
+    assert "read noise of a photosite is 6 counts. The part of it that arises before the amplifier is 2.8" in text
     assert "The report of the LUT has the verdict" in datasheet(folder_data_set.description)
     # A LUT computed by others may lack these values.
     assert "does not record gain" in card(with_origin(folder_data_set, None, computed={"by": "others"}))

@@ -408,7 +408,7 @@ def test_shares_give_complete_data_set(make_lut: MakeLut, tmp_path: Path) -> Non
 
 def test_shares_run_in_parallel(make_lut: MakeLut, tmp_path: Path) -> None:
     lut = make_lut()
-    with open_workplace(tmp_path / "out", plan_of(lut).identity(), alone=False):
+    with open_workplace(tmp_path / "out", plan_of(lut).identity(), exclusive=False):
         assert make_share(plan_of(lut), tmp_path / "out", (0, 1)) == (6, 6)
         with pytest.raises(InputError):
             make_dataset(plan_of(lut), tmp_path / "out")
@@ -427,7 +427,7 @@ def test_shard_made_twice_is_equal(make_lut: MakeLut, tmp_path: Path, monkeypatc
             make_share(plan, out, (0, 2))
         return reused
 
-    with open_workplace(out, plan.identity(), alone=False) as workplace, ThreadPoolExecutor(1) as pool:
+    with open_workplace(out, plan.identity(), exclusive=False) as workplace, ThreadPoolExecutor(1) as pool:
         assert make_shard(plan.job(1), lut, workplace, pool, 1) == make_shard(plan.job(1), lut, workplace, pool, 1)
         monkeypatch.setattr(Workplace, "done", done_with_concurrent_share)
         assert make_share(plan, out, (0, 2)) == (4, 6)
@@ -570,7 +570,7 @@ def test_bytes_do_not_depend_on_workers_or_shares(make_lut: MakeLut, pictures: P
     plan = Plan(lut, find_pictures(pictures), ListedLights((1, 2)), 5, BY_COLOUR)
     job = pickle.loads(pickle.dumps(plan.job(0)))
     out = tmp_path / "shares"
-    with open_workplace(out, plan.identity(), alone=False) as workplace, ThreadPoolExecutor(1) as pool:
+    with open_workplace(out, plan.identity(), exclusive=False) as workplace, ThreadPoolExecutor(1) as pool:
         make_shard(job, lut, workplace, pool, 1)
     make_share(plan, out, (0, 1))
     make_dataset(plan, out)
