@@ -1,7 +1,7 @@
 """Angular errors of illuminant estimates, their statistics, and errors by pixel under several illuminants.
 
-All angles are degrees. Angular errors follow section 4.1 of the paper. Percentiles follow MATLAB's `prctile`, which
-the published tables of the field use: the i-th of n sorted errors is the 100 (i − ½) / n percentile, with linear
+All angles are degrees. Angular errors follow section 4.1 of the CroP paper. Percentiles follow MATLAB's `prctile`,
+which the published tables of the field use: the i-th of n sorted errors is the 100 (i − ½) / n percentile, with linear
 interpolation (Hazen; R. J. Hyndman, Y. Fan, "Sample quantiles in statistical packages", The American Statistician
 50(4), 1996, definition 5).
 
@@ -13,7 +13,8 @@ illumination", ICCV 2021, as computed by its authors' program (github.com/DY112/
 MAE_illum
     Recovery error of each pixel, averaged over the unmasked pixels of an image, then over images.
 MAE_rgb
-    Angle between two corrections of a pixel, by the estimate and by the ground truth, averaged in the same way.
+    Angle between a pixel corrected by the estimate and the same pixel corrected by the ground truth, averaged in the
+    same way.
 
 The error by region is our own definition: the mean error of the pixels that receive more than half of their light from
 one illuminant. It also shows errors for illuminants that reach only a few pixels.
@@ -34,7 +35,7 @@ from foundation.errors import InputError
 ErrorKind = Literal["reproduction", "recovery"]
 
 # Replaces 0 in an estimate, relative to its largest channel; the angle then equals the limit in double precision.
-_ZERO: Final = 1e-12
+_ZERO_REPLACEMENT: Final = 1e-12
 
 
 def recovery_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -69,7 +70,8 @@ def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDA
 
     Returns
     -------
-    (...) float64, degrees, 0 … 54.74: arccos(1/√3), white corrected to a single channel.
+    (...) float64, degrees, 0 … 54.74. The limit arccos(1/√3) is reached if only one channel of the corrected white is
+    not zero.
 
     Examples
     --------
@@ -82,7 +84,7 @@ def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDA
     19.471
     """
     channels = np.asarray(estimate, dtype=np.float64)
-    floor = _ZERO * channels.max(axis=-1, keepdims=True)
+    floor = _ZERO_REPLACEMENT * channels.max(axis=-1, keepdims=True)
     corrected = np.asarray(truth, dtype=np.float64) / np.maximum(channels, floor)
     return angles_deg(corrected, np.ones_like(corrected))
 
@@ -219,7 +221,7 @@ def _rgb_errors(pixels: _Array, estimated: _Array, actual: _Array, saturation: f
 
 def _gains(lights: _Array) -> _Array:
     # Gains leave green unchanged.
-    floored = np.maximum(lights, _ZERO * lights.max(axis=1, keepdims=True))
+    floored = np.maximum(lights, _ZERO_REPLACEMENT * lights.max(axis=1, keepdims=True))
     return floored[:, 1:2] / floored
 
 

@@ -103,7 +103,8 @@ def match_images(
 ) -> tuple[list[int], str]:
     """Return the indices of the listed `names` that exist in `images`, and a note on their number.
 
-    `source` is the list and `folder` the place of the images, for messages. If `partial`, missing images are allowed.
+    `source` and `folder` are used in messages: the name of the list, and the place of the images. If `partial`, missing
+    images are allowed.
 
     Examples
     --------
@@ -192,7 +193,7 @@ def split_header(line: str) -> tuple[list[str], str]:
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield the fields of each row of a table by column, after its file and line number for messages."""
+    """Yield for each row of a table a text for messages with file and line number, and the fields by column."""
     lines = files.read_text(path, "restore it", is_table=True).splitlines()
     header, separator = split_header(lines[0] if lines else "")
     missing = [name for name in columns if name not in header]
@@ -265,7 +266,7 @@ Mask = npt.NDArray[np.bool_]  # (H, W), True for pixels that must not be used
 
 @dataclass(frozen=True, slots=True)
 class RawScene:
-    """Image in a file, with its levels. Layouts with masks define subclasses.
+    """Image in a file, with its black and saturation levels. Layouts with masks define subclasses.
 
     - `name`: name of the image, unique in its data set.
     - `path`: path of the image file.
@@ -287,7 +288,7 @@ class RawScene:
 
     @property
     def saturation(self) -> float | None:
-        """Saturation level minus black level, as for the image that `read` returns; None if no pixel is clipped."""
+        """Saturation level of the image that `read` returns, so minus black level; None if no pixel is clipped."""
         return None if self.white is None else self.white - self.black
 
     def read(self) -> tuple[Image, Mask | None]:
@@ -459,7 +460,7 @@ def _unreadable(path: str, error: Exception, remedy: str) -> FormatError:
     return FormatError(f"{path} cannot be read: {reason or type(error).__name__}; {remedy}")
 
 
-# Formats in which every mask pixel is stored exactly, and compressions of TIFF in which it is not.
+# Formats that store every mask pixel exactly, and compressions of TIFF that change pixels.
 _LOSSLESS_FORMATS = frozenset({"png", "tiff", "bmp", "gif", "pnm"})
 _LOSSY_COMPRESSIONS = ("jpeg", "jp2", "webp", "lerc", "jxl")
 

@@ -1,8 +1,8 @@
 """Recognise copies of images without decoding them.
 
-A model file stores hashes of its training images, so that a test on the same images is noticed. The hash is calculated
-from name and ground truth, or for a generated image from its source picture. Renamed images, and images with another
-ground truth, are not recognised.
+A model file stores hashes of its training images, so that a test on the same images is noticed. The hash of a
+photograph is calculated from its name and ground truth, the hash of a generated image from its source picture. Renamed
+photographs, and photographs with another ground truth, are not recognised.
 """
 
 from __future__ import annotations
@@ -51,18 +51,18 @@ def find_training_images(scenes: Sequence[Scene], training_identities: npt.NDArr
     recognised_names: list[str] = []
     for scene, (image_number, _) in zip(scenes, identities(scenes).tolist(), strict=True):
         if isinstance(scene, GeneratedScene):
-            counterpart = _hash("real", _stem(scene.entry.source))
+            counterpart_hash = _hash("real", _stem(scene.entry.source))
         else:
-            counterpart = _hash("generated", _stem(scene.name))
-        if image_number in images or counterpart in names:
+            counterpart_hash = _hash("generated", _stem(scene.name))
+        if image_number in images or counterpart_hash in names:
             recognised_names.append(scene.name)
     return tuple(recognised_names)
 
 
 def source_digests(dataset: Dataset, cache: dict[int, Mapping[str, str]]) -> Mapping[str, str]:
-    """Return the SHA-256 of each source picture by name, or its name and seed if it is random.
+    """Return the SHA-256 of each source picture by name; for a random picture, return its name and seed instead.
 
-    `cache`: results of earlier calls by the id of the data set; it is filled here.
+    `cache`: results of earlier calls by the `id` of the data set; new results are added.
     """
     if id(dataset) not in cache:
         seed = dataset.description.seed
@@ -78,7 +78,7 @@ def _hash(role: str, text: str) -> int:
     return int(sha256_of(f"{role}\t{text}".encode())[:16], 16)
 
 
-# Length of the section of a file that is compared. Its 100 000 or more pixels have different noise in any two
+# Number of bytes of a file that are compared. They contain 100 000 pixels or more, whose noise differs between any two
 # photographs.
 _COMPARED_BYTES: Final = 1 << 20
 

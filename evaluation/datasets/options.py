@@ -11,7 +11,7 @@ from foundation.errors import InputError
 
 @dataclass(frozen=True)
 class DataOptions:
-    """Selected part of a data set, and levels that replace the levels of its layout.
+    """Selected part of a data set, and black and saturation levels that replace those of its layout.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def choose_name(requested: str | None, available: Collection[str], option: str, 
 
 
 def level_note(level: float | None, otherwise: str) -> str:
-    """Return a text with the level given by the user, or if it is None, `otherwise`: level and source of the layout.
+    """Return a text with the level given by the user; if it is None, return `otherwise`, the text of the layout.
 
     Examples
     --------

@@ -2,7 +2,7 @@
 
 Layout::
 
-    gt.csv              image,r,g,b: one row per image; image is a path relative to the table, ending optional
+    gt.csv              image,r,g,b: one row per image; image is a path relative to the table, its ending is optional
                         columns black, saturation: levels of the image, in the units of its file, optional
                         column mask: a picture that is not 0 at pixels that must not be used, optional
                         column fold: whole numbers from 0 for cross-validation, optional
@@ -10,9 +10,9 @@ Layout::
     photo1.png …        linear camera RGB, red first: PNG or TIFF of 16 bits, TIFF of floats, or NumPy files
     photo1_mask.png     mask of photo1 if column mask is empty, optional
 
-The table may have any name if no other .csv of the folder has these columns; else its path must be given. A .txt is
-used if there is no such .csv. Images without a row are refused, so that no image is excluded by mistake. JPEG and 8-bit
-sRGB are refused, because their values are not proportional to light.
+The table may have any name. If several .csv files of the folder have these columns, the path of one must be given. A
+.txt is used if no .csv has these columns. Images without a row are refused, so that no image is excluded by mistake.
+JPEG and 8-bit sRGB are refused, because their values are not proportional to light.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ ASSUMED_BLACK = "0: assumed, because neither a column black nor --read black giv
 
 _PICTURES = (".jpg", ".jpeg", ".webp", ".heic", ".gif", ".bmp")
 _RAWS = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef", ".srw", ".crw")
-_MASK = "_mask"
+_MASK_SUFFIX = "_mask"
 _MASK_ENDINGS = (".png", ".tif", ".tiff")
-_MAX_HEADER_BYTES = 4096  # of a table, to find its first line
+_MAX_HEADER_BYTES = 4096  # bytes of a table that are read to find its first line
 _INSPECTED_TABLES = 50  # number of tables whose headers are read to find the one with ground truths
 
 
 @dataclass(frozen=True, slots=True)
 class OwnScene(RawScene):
-    """Image of the user; `mask_path`: picture that is not 0 at pixels that must not be used, or empty."""
+    """Image of the user; `mask_path` is the path of its mask picture, or empty."""
 
     mask_path: str = ""
 
@@ -168,10 +168,10 @@ def _mask_source(given_columns: set[str], path: Path, scenes: Sequence[OwnScene]
     )
 
 
-def _level_note(column: str, given_columns: set[str], path: Path, option: float | None, otherwise: str) -> str:
+def _level_note(column: str, given_columns: set[str], path: Path, option: float | None, default: str) -> str:
     if column in given_columns:
         return f"column {column} of {path.name}" + ("" if option is None else f", {option:g} if empty")
-    return level_note(option, otherwise)
+    return level_note(option, default)
 
 
 def _find_table(location: Path, scanned_folder: Folder | None) -> Path:
@@ -188,7 +188,7 @@ def _find_table(location: Path, scanned_folder: Folder | None) -> Path:
 
 
 def refuse_unusable_table(folder: Folder) -> None:
-    """Raise FormatError if a folder with images has only one table, and required columns are missing there."""
+    """Raise FormatError if a folder with images has exactly one table, and this table lacks required columns."""
     headers = _headers(folder)
     if len(headers) == 1 and folder.images(IMAGE_ENDINGS):
         ((name, header),) = headers.items()
@@ -250,8 +250,8 @@ class _FolderIndex:
         for endings in (_PICTURES, _MASK_ENDINGS):
             for name in sorted(self.files, reverse=True):
                 stem = name.rpartition(".")[0]
-                if stem.endswith(_MASK) and _ending(name) in endings:
-                    mask_files[stem[: -len(_MASK)]] = self.files[name]
+                if stem.endswith(_MASK_SUFFIX) and _ending(name) in endings:
+                    mask_files[stem[: -len(_MASK_SUFFIX)]] = self.files[name]
         return mask_files
 
     @cached_property
@@ -265,7 +265,7 @@ def _ending(file: str) -> str:
 
 
 def _find_image(folder: Path, name: str, origin: str, indices: dict[str, _FolderIndex]) -> str | None:
-    """Return the path of an image with this name in the table, with or without ending; None if it does not exist."""
+    """Return the path of an image by its name in the table, which may lack the ending; None if it does not exist."""
     parent, _, file = comparable(name).rpartition("/")
     if _ending(file) in (*_PICTURES, *_RAWS):
         raise FormatError(f"{origin}: {name} is {_refusal_reason(file)}")
@@ -333,8 +333,8 @@ def _unlisted_note(
             file for file in files if file not in images and file not in masks
         )
     # Unused masks are reported only if there are no other images without a row.
-    near_images = [file for file in near_images if not Path(file).stem.endswith(_MASK)] or near_images
-    # If the user gave one of several tables, it is a selection of images. Otherwise an image without a row is an error.
+    near_images = [file for file in near_images if not Path(file).stem.endswith(_MASK_SUFFIX)] or near_images
+    # A table that the user chose from several may list only some images. In a single table, a missing row is an error.
     is_selection = location.is_file() and len(_tables(root)) > 1
     if near_images and not (partial or is_selection):
         raise FormatError(
@@ -368,10 +368,10 @@ def _scene(
     return OwnScene(name, image, light, black or 0.0, white, str(folder / mask) if mask else mask_path)
 
 
-def _parse_level(row: Mapping[str, str], column: str, origin: str, otherwise: float | None) -> float | None:
+def _parse_level(row: Mapping[str, str], column: str, origin: str, default: float | None) -> float | None:
     text = row.get(column, "").strip()
     if not text:
-        return otherwise
+        return default
     level = parse_number(text, origin, column)
     if not (np.isfinite(level) and level >= 0):
         raise FormatError(f"{origin}: {column} is {text}, expected 0 or more, in the units of the file; correct it")

@@ -1,7 +1,7 @@
-"""Read thumbnails of a real data set in one NumPy archive, as used for training neural networks.
+"""Read thumbnails of a real data set from one NumPy archive, as used for training neural networks.
 
 The archive (`.npz`) contains `images` (N, H, W, 3), float32 or uint16, linear camera RGB minus black level; `gt`
-(N, 3), the ground truths; and `names` (N,). Pixels of masked calibration targets are exactly zero.
+(N, 3), the ground truths; and `names` (N,), the image names. Pixels of masked calibration targets are exactly zero.
 """
 
 from __future__ import annotations

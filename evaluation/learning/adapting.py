@@ -21,7 +21,7 @@ from evaluation.metrics import recovery_error
 
 PRETRAINED_WORTH: Final = 200.0  # W: number of local images to which a pretrained model is equivalent
 PRIOR_IMAGES: Final = 25.0  # weight of the prior for w, as a number of images
-_SHARES: Final = np.linspace(0, 1, 101)  # candidates for w
+_WEIGHTS: Final = np.linspace(0, 1, 101)  # candidates for w
 _FOLDS: Final = 3  # folds of the N images for cross-validation; few, because each fold requires a fit
 
 
@@ -63,7 +63,10 @@ def fit_local(
 
 
 def adapt(pretrained: LearnedMethod, local_fit: LocalFit, worth: float = PRETRAINED_WORTH) -> LearnedMethod:
-    """Return a pretrained method adapted to a local fit; `worth` is W, and 0 returns the local method."""
+    """Return a pretrained method adapted to a local fit; with `worth` 0, return the local method.
+
+    `worth` is W, the number of local images to which the pretrained method is equivalent.
+    """
     if pretrained.learner != local_fit.method.learner:
         raise ValueError(f"pretrained {pretrained.learner}, local {local_fit.method.learner}, expected equal learners")
     if not worth > 0:
@@ -73,7 +76,7 @@ def adapt(pretrained: LearnedMethod, local_fit: LocalFit, worth: float = PRETRAI
     tuned = model
     if not isinstance(model, BlendedModel):
         tuned = pretrained.learner.tune(model, local_fit.features, local_fit.truths, worth, local_fit.seed)
-    # The expected w is W / (W + N). After tuning it is 1, because tuning has already used the N images.
+    # The expected w is W / (W + N). After tuning, w is expected to be 1, because tuning has already used the N images.
     share = worth / (worth + count) if tuned is model else 1.0
     if local_fit.held_out is not None:
         share = stacked_share(model.lights(local_fit.features), local_fit.held_out, local_fit.truths, share)
@@ -87,6 +90,8 @@ def stacked_share(
 ) -> float:
     """Return the weight, 0 … 1, of the first of two estimates (N, 3) float64 of ground truths (N, 3) float64.
 
+    `expected`: weight that is returned if there are no images, and to which the prior draws.
+
     Examples
     --------
     The expected weight is 0, but only the first estimate is correct. Its weight increases with the number of images:
@@ -96,12 +101,12 @@ def stacked_share(
     [0.0, 0.5, 1.0]
     """
     # Stacking: L. Breiman, "Stacked regressions", Machine Learning 24, 1996. A prior is added, because twenty images
-    # are too few to select the weight. The final models are also better than the models compared here.
+    # are too few to select the weight, and because the final models, fitted to all images, are better than those here.
     if not len(truths):
         return expected
-    errors = np.array([recovery_error(_log_mean(first, second, share), truths).sum() for share in _SHARES])
-    prior_errors = PRIOR_IMAGES * recovery_error(first, second).mean() * (_SHARES - expected) ** 2
-    return float(_SHARES[np.argmin(errors + prior_errors)]) if prior_errors.any() else expected
+    errors = np.array([recovery_error(_log_mean(first, second, share), truths).sum() for share in _WEIGHTS])
+    prior_errors = PRIOR_IMAGES * recovery_error(first, second).mean() * (_WEIGHTS - expected) ** 2
+    return float(_WEIGHTS[np.argmin(errors + prior_errors)]) if prior_errors.any() else expected
 
 
 def _log_mean(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64], share: float) -> npt.NDArray[np.float64]:

@@ -4,12 +4,12 @@ K. Koščević, N. Banić, S. Lončarić, "Color Beaver: bounding illumination e
 The estimate of an underlying method (Gray-world in the table of the paper) is moved into a region of the chromaticity
 plane. A genetic algorithm fits the region: it minimises the median angular error of the training images.
 
-The paper was not accessible, so the following is our reconstruction. The plane is r and b of r + g + b = 1. The region
-is a band along the locus of illuminants: a polyline of `corners` points with a half-width at each end. Estimates
-outside the band move to its nearest point. A genome has the corners, the half-widths and the index of the underlying
-method. The first genomes are near the main axis of the training illuminants. The best genomes survive unchanged.
-Parents are selected by tournaments. Genes of children are blended (BLX-α, L. J. Eshelman, J. D. Schaffer 1993) and
-mutated by normally distributed steps, which decrease over the generations. The error is the recovery error.
+The paper was not accessible, so the following is our reconstruction. The plane has the axes r and b, for r + g + b = 1.
+The region is a band along the locus of illuminants: a polyline of `corners` points with a half-width at each end.
+Estimates outside the band move to its nearest point. A genome has the corners, the half-widths and the index of the
+underlying method. The first genomes are near the main axis of the training illuminants. The best genomes survive
+unchanged. Parents are selected by tournaments. Genes of children are blended (BLX-α, L. J. Eshelman, J. D. Schaffer
+1993) and mutated by normally distributed steps, which decrease over the generations. The error is the recovery error.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ELITE_SIZE = 4  # genomes that survive unchanged: few, so that most genomes of 
 _TOURNAMENT_SIZE = 3  # genomes in a tournament; the best one becomes a parent
 # A child's gene may be outside the interval of its parents' genes by this fraction of the interval (BLX-α).
 _CROSSOVER_MARGIN = 0.3
-_MUTATION = 0.15  # probability of a mutation per gene: one or two per genome
+_MUTATION_PROBABILITY = 0.15  # probability of a mutation per gene: one or two per genome
 # Standard deviation of a mutation in the first and in the last generation, relative to the spread of the illuminants.
 _STEPS = (0.5, 0.02)
 
@@ -176,8 +176,8 @@ def _evolve(
         mix = rng.uniform(-_CROSSOVER_MARGIN, 1 + _CROSSOVER_MARGIN, (count - _ELITE_SIZE, len(genes)))
         children = population[first] + mix * (population[second] - population[first])
         step = scale * _STEPS[0] * (_STEPS[1] / _STEPS[0]) ** (generation / max(1, settings.generations - 1))
-        children += (rng.random(children.shape) < _MUTATION) * rng.normal(0, step, children.shape)
-        is_mutated = rng.random(len(children)) < _MUTATION
+        children += (rng.random(children.shape) < _MUTATION_PROBABILITY) * rng.normal(0, step, children.shape)
+        is_mutated = rng.random(len(children)) < _MUTATION_PROBABILITY
         child_bases = np.where(is_mutated, rng.integers(0, bases, len(children)), base_indices[first])
         population = np.concatenate([population[best], children])
         base_indices = np.concatenate([base_indices[best], child_bases])
@@ -193,7 +193,7 @@ def _decode(genomes: npt.NDArray[np.float64], corners: int) -> tuple[npt.NDArray
 
 
 def _angles(red_blue: npt.NDArray[np.float64], truths: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    # Angles (P, N) in degrees between r and b, (P, N, 2), and ground truths (N, 3).
+    # Angles (P, N), degrees, between illuminants given by r and b, (P, N, 2), and ground truths (N, 3).
     red, blue = red_blue[..., 0], red_blue[..., 1]
     green = 1 - red - blue
     units = truths / np.linalg.norm(truths, axis=1, keepdims=True)

@@ -17,8 +17,8 @@ from evaluation.scene import Image
 class ConstantLight(FeatureLearner):
     """Returns the median of the training illuminants for every image.
 
-    The median is calculated for each of the chromaticities r, g and b. A learned method that is not better has learned
-    only the distribution of illuminants.
+    The median is calculated for each of the chromaticities r, g and b. A learned method that is not better than
+    this median has learned only the distribution of illuminants.
     """
 
     key: ClassVar[str] = "constant-light"

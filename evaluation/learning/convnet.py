@@ -5,9 +5,9 @@ fully convolutional network returns four channels: a local illuminant and its co
 over the image, scaled to length 1, is the estimate (equations 4 to 6). The angular error is the loss (equation 7).
 
 *Differences to the paper.* Three convolutions on thumbnails replace AlexNet or SqueezeNet pretrained on ImageNet, so
-that training takes a minute on a processor. The image is divided by its mean. The input is its square root and a mask
-of usable pixels. Local illuminants are exponentials of three channels. Images are flipped and get random gains as in
-section 5.1, but gains change a channel by at most 10 %.
+that training takes a minute on a processor. The image is divided by its mean. The input is the square root of this
+quotient, and a mask of usable pixels. Local illuminants are exponentials of three channels. Images are flipped and get
+random gains as in section 5.1, but gains change a channel by at most 10 %.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _BATCH_SIZE = 16  # images per step of the optimiser, as in the paper
 # which is important with a few hundred images.
 _GAIN_RANGE = (0.9, 1.1)
 _TUNING_FACTOR = 4  # tuning has fewer epochs and a smaller learning rate by this factor; our choice
-_DECAY = 1e-4  # weight decay, because the network has more weights than there are images
+_WEIGHT_DECAY = 1e-4  # weight decay, because the network has more weights than there are images
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class ConvNet(FeatureLearner):
     def tune(
         self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
     ) -> ConvNetModel:
-        """Return the network after further training with smaller steps and fewer epochs."""
+        """Return the network after further training with smaller steps and fewer epochs; `worth` is not used."""
         del worth
         if not isinstance(model, ConvNetModel):
             raise TypeError(f"the model is {type(model).__name__}, expected ConvNetModel")
@@ -106,7 +106,7 @@ class ConvNet(FeatureLearner):
         try:
             images = torch.from_numpy(np.moveaxis(features, 3, 1).astype(np.float32))
             lights = torch.from_numpy(truths.astype(np.float32))
-            optimiser = torch.optim.Adam(list(weights.values()), lr=rate, weight_decay=_DECAY)
+            optimiser = torch.optim.Adam(list(weights.values()), lr=rate, weight_decay=_WEIGHT_DECAY)
             schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(1, epochs))
             for _ in range(epochs):
                 for batch in torch.randperm(len(images), generator=generator).split(_BATCH_SIZE):

@@ -2,10 +2,11 @@
 
 C. Saunders, A. Gammerman, V. Vovk, "Ridge regression learning algorithm in dual variables", ICML 1998. The estimate is
 a weighted sum of kernels between an image and each training image. The weights a are the solution of (K + λ I) a = y.
-V. Agarwal, A. V. Gribok, A. Koschan, M. A. Abidi, "Estimating illumination chromaticity via kernel regression", ICIP
-2006, use kernel regression on chromaticity histograms.
+Here K has the kernels between training images, and y their chromaticities (r, g) minus the mean of all. V. Agarwal, A.
+V. Gribok, A. Koschan, M. A. Abidi, "Estimating illumination chromaticity via kernel regression", ICIP 2006, use kernel
+regression on chromaticity histograms.
 
-The kernel is K = exp(-d² / 2). Here d² = Σ (√p - √q)² ≤ 2, p and q are the bin fractions of two images, and d is
+The kernel is exp(-d² / 2). Here d² = Σ (√p - √q)² ≤ 2, p and q are the bin fractions of two images, and d is
 proportional to the Hellinger distance. Pixels are weighted by brightness, because the chromaticity of dark pixels is
 mostly noise. *Not from these papers:* the 64 × 64 bins of (r, g), the square root, the width of the kernel, and
 λ. They were not tuned on generated images, see docs/decisions/0056-settings-of-learned-methods.md.

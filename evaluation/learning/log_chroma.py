@@ -45,7 +45,7 @@ class Penalties:
     """Weights of the regularisation.
 
     - `smoothness`: weights of squared differences between neighbouring bins of pixel filter, edge filter and bias.
-    - `size`: weights of the squares of their bins, in the same order.
+    - `size`: weights of the squares of the bins of these three, in the same order.
     - `spread`: variance added to the distribution along each axis, bins².
     """
 
@@ -203,8 +203,8 @@ def train(
 
 def _fourier_scale(smoothness: float, size: float) -> npt.NDArray[np.float64]:
     # Factors (64, 33) from scaled parameters to Fourier coefficients, see `train`. The authors' penalty is
-    # Σ |F|² (smoothness (|1 − e^iα|² + |1 − e^iβ|²) / 8 + size) over all coefficients F. The constant coefficient is
-    # omitted, because it does not change the softmax.
+    # Σ |F|² (smoothness (|1 − e^iα|² + |1 − e^iβ|²) / 8 + size) over all coefficients F with the
+    # angular frequencies α and β. The constant coefficient is omitted, because it does not change the softmax.
     differences = (2 - 2 * np.cos(_BIN_ANGLE * np.arange(BINS))) / 8
     weights = smoothness * (differences[:, None] + differences[None, : BINS // 2 + 1]) + size
     weights[0, 0] = np.inf
@@ -226,7 +226,7 @@ class LogChroma(FeatureLearner):
     """Settings of the method.
 
     Most default weights are from the authors' program for thumbnails of Gehler-Shi. `bias_smoothness` and the three
-    sizes were selected by cross-validation with the Canon 5DSR of INTEL-TAU
+    weights of squares were selected by cross-validation with the Canon 5DSR of INTEL-TAU
     (docs/decisions/0056-settings-of-learned-methods.md).
 
     - `working_size`: longer side of the reduced image, px, up to 255.
@@ -234,7 +234,7 @@ class LogChroma(FeatureLearner):
     - `crossentropy`: weight of the cross-entropy, the first loss.
     - `likelihood`: weight of the von Mises likelihood, the second loss.
     - `pixel_smoothness`, `edge_smoothness`, `bias_smoothness`: weights of squared differences of neighbouring bins.
-    - `pixel_size`, `edge_size`, `bias_size`: weights of squares.
+    - `pixel_size`, `edge_size`, `bias_size`: weights of the squares of the bins.
     - `spread`: variance added to the distribution along each axis, bins².
     - `pretraining`, `training`: iterations of L-BFGS with the first and the second loss.
     """
@@ -318,8 +318,8 @@ class LogChroma(FeatureLearner):
             penalties,
             ((self.pretraining, self.crossentropy, 0.0), (self.training, 0.0, self.likelihood)),
         )
-        # The torus is cut opposite to the centre. The centre is the middle of the range, because the median can be near
-        # one end. The cut could then be inside the range.
+        # The torus is cut opposite to the centre. The centre is the middle of the range of chromas. With the median as
+        # centre, the cut could be inside the range, because the median can be near one end.
         centre = (chromas.min(axis=0) + chromas.max(axis=0)) / 2
         return LogChromaModel(filters, bias, centre, np.array(grid))
 

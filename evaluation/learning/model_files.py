@@ -36,12 +36,12 @@ from foundation.version import software
 
 _FORMAT = "croplab model 1"
 _ABOUT = "about"
-_TRAINED = "trained_on"
+_IDENTITIES = "trained_on"
 _REMEDY = "give a file made by evaluate train"
 
 
-# The images are stored as an array, not in the JSON text.
-_Images = Annotated[npt.NDArray[np.uint64], PlainValidator(np.asarray), Field(exclude=True)]
+# Hashes that identify the training images. They are stored as an array, not in the JSON text.
+_Identities = Annotated[npt.NDArray[np.uint64], PlainValidator(np.asarray), Field(exclude=True)]
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class TrainingRecord:
     software: str
     date: str
     adapted_from: str = ""
-    images: _Images = field(default_factory=lambda: np.empty((0, 2), np.uint64), compare=False)
+    images: _Identities = field(default_factory=lambda: np.empty((0, 2), np.uint64), compare=False)
 
     def description(self) -> str:
         """Return the record as one line of text."""
@@ -92,7 +92,7 @@ class StoredMethod(LearnedMethod):
 def provenance_of(
     data: SceneSet, seed: int, clock: Clock, adapted_from: TrainingRecord | None = None
 ) -> TrainingRecord:
-    """Return the record of a training on a data set; the images of `adapted_from` are added, if given."""
+    """Return the record of a training on a data set; with `adapted_from`, its images are added."""
     images = identities(data.scenes)
     return TrainingRecord(
         data_name=data.name,
@@ -141,7 +141,7 @@ def save_model(path: Path, method: Method, provenance: TrainingRecord) -> None:
     }
     arrays: dict[str, Any] = {
         _ABOUT: np.array(json.dumps(about, indent=1, sort_keys=True)),
-        _TRAINED: provenance.images,
+        _IDENTITIES: provenance.images,
         **method.model.arrays(),
     }
     with atomic_file(path) as stream:
@@ -159,13 +159,13 @@ def load_model(path: Path) -> StoredMethod:
         if about["method"] not in learners:
             raise ValueError(f"its method is {about['method']!r}, expected {', '.join(learners)}")
         learner = _apply_settings(learners[about["method"]], about["settings"])
-        images = arrays.pop(_TRAINED)
+        images = arrays.pop(_IDENTITIES)
         provenance = from_plain(TrainingRecord, about["provenance"] | {"images": images}, path, _REMEDY)
         # Adapted models have the images of both trainings.
         is_complete = len(images) == provenance.scenes or (provenance.adapted_from and len(images) > provenance.scenes)
         if images.dtype != np.uint64 or images.shape[1:] != (2,) or not is_complete:
             raise ValueError(
-                f"its {_TRAINED} is {images.dtype} of the shape {images.shape}, expected uint64, (images, 2)"
+                f"its {_IDENTITIES} is {images.dtype} of the shape {images.shape}, expected uint64, (images, 2)"
             )
         model = restore(learner, arrays)
     except (FileNotFoundError, IsADirectoryError) as error:

@@ -7,10 +7,10 @@ by the r of their illuminant. For each tree, a window of consecutive images has 
 on which features agree are used (section 3).
 
 Constants are from OpenCV (`xphoto::LearningBasedWB` and its training script): 64³ bins, a palette of 300 colours, the
-kernel max(0, 1 − d² / 0.1²), trees of depth 4, 20 windows of 2⌈N / 21⌉ images with weight 20, and agreement within
-0.025. The paper does not define agreement. Here, three of four features agree if each two of their estimates are within
-this distance. The result is the median of the estimates that agree. If none agree, it is the median of all estimates.
-The histogram is scaled to the largest usable value of the image; OpenCV scales it to the white level.
+kernel max(0, 1 − d² / 0.1²), trees of depth 4, 20 windows of 2⌈N / 21⌉ of the N images with weight 20, and agreement
+within 0.025. The paper does not define agreement. Here, three of four features agree if each two of their estimates are
+within this distance. The result is the median of the estimates that agree. If none agree, it is the median of all
+estimates. The histogram is scaled to the largest usable value of the image; OpenCV scales it to the white level.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from evaluation.scene import Image
 
 _FEATURES = 4  # mean, brightest, dominant and palette mode (section 3.1)
 _TARGETS = 2  # one tree for r and one for g (section 3.2)
-_WINDOW_WEIGHT = 20  # weight of the images in a window: their repetitions in the training script of OpenCV
+_WINDOW_WEIGHT = 20  # weight of images in a window; OpenCV's training script repeats them 20 times
 _MIN_AGREEING = 3  # number of the four features that must agree
 
 
@@ -162,12 +162,12 @@ class Forest:
         """Return the estimate of each tree, (windows, 4, 2) float64, r and g, for features (8,) float32."""
         windows, _, _, nodes = self.split.shape
         starts: npt.NDArray[np.int64] = np.arange(windows * _FEATURES * _TARGETS, dtype=np.int64) * nodes
-        offsets = np.tile(np.repeat(np.arange(_FEATURES), _TARGETS), windows)
+        feature_indices = np.tile(np.repeat(np.arange(_FEATURES), _TARGETS), windows)
         node_indices = np.zeros(len(starts), dtype=np.int64)
         for _ in range(self.depth):
             nodes_at: npt.NDArray[np.int64] = starts + node_indices
             split_feature = self.split.ravel()[nodes_at]
-            is_lower = feature[2 * offsets + np.maximum(split_feature, 0)] <= self.threshold.ravel()[nodes_at]
+            is_lower = feature[2 * feature_indices + np.maximum(split_feature, 0)] <= self.threshold.ravel()[nodes_at]
             child = np.where(is_lower, self.left.ravel()[nodes_at], self.right.ravel()[nodes_at])
             node_indices = np.where(split_feature < 0, node_indices, child)
         return self.value.ravel()[starts + node_indices].reshape(windows, _FEATURES, _TARGETS)

@@ -24,7 +24,7 @@ from evaluation.learning.working_size import chromaticities, lights_from_chromat
 from evaluation.metrics import recovery_error
 from evaluation.scene import Image
 
-FINE_BINS = 720  # bins of the extracted histograms, 0 … 1; a multiple of every number in `BIN_CHOICES`
+FINE_BINS = 720  # bins of the extracted histograms of r, 0 … 1; a multiple of every number in `BIN_CHOICES`
 # Candidate numbers of bins. The smallest cannot separate illuminants; the largest overfit the data of the paper.
 BIN_CHOICES = (3, 4, 5, 6, 8, 9, 10, 12, 15, 16, 18, 20, 24, 30, 36, 40, 48, 60)
 _FOLDS = 5  # folds of the training images, for the selection of the number of bins
@@ -84,7 +84,7 @@ class SmartColorCat(FeatureLearner):
 class LightLine:
     """Fitted line.
 
-    - `weights`: (K,) float64, coefficients of the position for the fractions of K bins.
+    - `weights`: (K,) float64, coefficients of the map from the fractions of K bins to a position on the line.
     - `centre`, `direction`: (2,) float64, point of the line in the plane of r and b, and its unit vector.
     - `ends`: (2,) float64, smallest and largest position of a training illuminant.
     """
@@ -116,7 +116,7 @@ def _fit_line(features: Features, truths: npt.NDArray[np.float64], bins: int) ->
     _, _, axes = np.linalg.svd(red_blue - centre)
     direction = axes[0] * (1 if axes[0, 0] >= 0 else -1)
     positions = (red_blue - centre) @ direction
-    # The fractions have the sum 1, so their coefficients include a constant.
+    # The fractions have the sum 1, so the map needs no separate constant term.
     solve: Any = np.linalg.lstsq
     weights: npt.NDArray[np.float64] = solve(_sum_bins(features, bins), positions)[0]
     return LightLine(weights, centre, direction, np.array([positions.min(), positions.max()]))

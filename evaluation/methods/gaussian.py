@@ -391,9 +391,9 @@ def filter_rows(
     w0 = weights.ctypes.data
     w1 = w0 + weights.shape[1] * _FLOAT
     w2 = w1 + weights.shape[1] * _FLOAT
-    # `block`: bytes of one order in `filtered`. `column`, `plane`: bytes of one column and of one order in `columns`.
-    block = filtered.shape[1] * LINE
-    blocks = filtered.ctypes.data
+    # `order_bytes`: bytes of an order in `filtered`. `column`, `plane`: bytes of a column and of an order in `columns`.
+    order_bytes = filtered.shape[1] * LINE
+    filtered_start = filtered.ctypes.data
     column = columns.shape[2] * LINE
     plane = columns.shape[1] * column
     if top:
@@ -415,16 +415,16 @@ def filter_rows(
             for channel in range(3):
                 for pixel in range(0, INTERLEAVED_PIXELS, OUTPUTS):
                     source = transposed.ctypes.data + (3 * radius + i * LANES + 3 * pixel + channel) * LINE
-                    smooth = blocks + (3 * pixel + channel) * LINE
+                    smooth = filtered_start + (3 * pixel + channel) * LINE
                     if order == 0:
                         smooth_x(source, radius, w0, smooth)
                     elif order == 1:
-                        slope_x(source, radius, w0, w1, smooth, smooth + block)
+                        slope_x(source, radius, w0, w1, smooth, smooth + order_bytes)
                     else:
-                        curve_x(source, radius, w0, w1, w2, smooth, smooth + block, smooth + 2 * block)
+                        curve_x(source, radius, w0, w1, w2, smooth, smooth + order_bytes, smooth + 2 * order_bytes)
             for n in range(order + 1):
                 for vector in range(3):
-                    source = blocks + n * block + vector * LANES * LINE
+                    source = filtered_start + n * order_bytes + vector * LANES * LINE
                     transpose(source, LINE, target + n * plane + (i + vector) * column)
         next_y += ROW_GROUP
     for i in range(columns.shape[1] * (order + 1)):

@@ -30,8 +30,8 @@ import numpy.typing as npt
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 from evaluation.scene import Image
 
-DERIVATIVE_SIGMA = 0.5  # scale of the derivatives, px, from both programs
-MEAN_SIDE = 7  # side of the mean filters, px, from both programs
+DERIVATIVE_SIGMA = 0.5  # scale of the derivatives, px, from both programs of Qian et al.
+MEAN_SIDE = 7  # side of the mean filters, px, from both programs of Qian et al.
 DARK_SUM = 8 / 255  # largest red + green + blue of excluded pixels, fraction of white, from the authors' examples
 _KERNEL_RADIUS = 2  # px; as in the authors' program, exp(-x² / 2σ²) is below 1e-6 outside
 _HALO = 8  # extra rows above and below a strip, for the mean filter and the derivative
@@ -219,9 +219,9 @@ def _k_means(positions: npt.NDArray[np.float64], count: int) -> tuple[npt.NDArra
 # are sampled evenly in reading order. An image of 0.2 megapixels has this number.
 MAX_CANDIDATES = 2000
 BANDWIDTH = 0.1  # h of the mean shift (the authors' `bandwidth`)
-_LARGEST_DISTANCE = 0.01 * BANDWIDTH  # limit for colours near a mean: angle (radians) times squared distance
-_SMALLEST_STEP = 1e-3 * BANDWIDTH  # a mean that moves less is final: distance times angle (radians)
-_MERGING_DISTANCE = BANDWIDTH / 2  # means within it are one cluster: distance times angle (radians)
+_LARGEST_DISTANCE = 0.01 * BANDWIDTH  # of a colour near a mean: angle (radians) times squared distance
+_SMALLEST_STEP = 1e-3 * BANDWIDTH  # of a mean that still moves: distance times angle (radians)
+_MERGING_DISTANCE = BANDWIDTH / 2  # of means that form one cluster: distance times angle (radians)
 _MAX_STEPS = 100  # limit for steps of a mean, which needs far fewer
 # A channel with at most this derivative of its logarithm is flat. Rounding to float32 can cause this value. A step of
 # one 16-bit count near white causes 3e-6.
@@ -279,7 +279,7 @@ def largest_cluster(colours: npt.NDArray[np.float64], order: npt.NDArray[np.floa
     directions = colours / np.maximum(np.linalg.norm(colours, axis=1, keepdims=True), np.finfo(float).tiny)
     was_near = np.zeros(len(colours), dtype=bool)
     centres: list[npt.NDArray[np.float64]] = []
-    votes: list[npt.NDArray[np.int64]] = []
+    near_counts_by_centre: list[npt.NDArray[np.int64]] = []
     for start in np.argsort(order, kind="stable"):
         if was_near[start]:
             continue
@@ -290,13 +290,13 @@ def largest_cluster(colours: npt.NDArray[np.float64], order: npt.NDArray[np.floa
         if any(is_near):
             # As in the authors' program, the weights of the two means are their numbers of near colours.
             nearest = is_near.index(True)
-            shares = np.array([near_counts.sum(), votes[nearest].sum()], dtype=np.float64)
+            shares = np.array([near_counts.sum(), near_counts_by_centre[nearest].sum()], dtype=np.float64)
             centres[nearest] = (mean * shares[0] + centres[nearest] * shares[1]) / shares.sum()
-            votes[nearest] = votes[nearest] + near_counts
+            near_counts_by_centre[nearest] = near_counts_by_centre[nearest] + near_counts
         else:
             centres.append(mean)
-            votes.append(near_counts)
-    member = np.stack(votes).argmax(axis=0)
+            near_counts_by_centre.append(near_counts)
+    member = np.stack(near_counts_by_centre).argmax(axis=0)
     return member == np.bincount(member).argmax()
 
 

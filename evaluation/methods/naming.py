@@ -2,7 +2,7 @@
 
     gray-edge-1            a method of `standard.standard_methods`
     gray-edge-1:p=4:sigma=2, shades-of-gray:p=6      a method of the Gray-Edge framework with other parameters
-    package.module:Class   a class or value of an installed module or of one in the working folder
+    package.module:Class   a class or value of an installed module, or of a module in the working folder
     path/file.py:Class     a class or value of a file, which can import modules of its folder
 
 All of these can have a suffix:
@@ -56,7 +56,7 @@ _MODIFIERS = re.compile(r"(?P<size>[0-9]{1,6})|patches(=(?P<patches>[0-9]{1,6}))
 # Largest accepted scale of a Gaussian, px. It limits the width of the filter.
 LARGEST_SIGMA = 1000
 
-_FORMS = "a name of this suite, module:Class or path/file.py:Class"
+_NAME_FORMS = "a name of this suite, module:Class or path/file.py:Class"
 
 
 def find_method(text: str) -> Method | Learner:
@@ -99,7 +99,7 @@ def find_method(text: str) -> Method | Learner:
         suggestion = nearest_names(name, methods) or f"the methods are {', '.join(methods)}"
         raise InputError(f"method {name!r} is unknown; {suggestion}; give your own as module:Class or file.py:Class")
     if not location or not class_name:
-        raise InputError(f"method {name!r} is incomplete, expected {_FORMS}; complete it")
+        raise InputError(f"method {name!r} is incomplete, expected {_NAME_FORMS}; complete it")
     is_file = location.endswith(".py")
     module = _load_file(Path(location)) if is_file else _load_module(location)
     candidate = getattr(module, class_name, None)
@@ -230,7 +230,7 @@ def _load_module(name: str) -> ModuleType:
 
 
 def _describe_failure(error: BaseException, file: Path | None = None) -> str:
-    """Return the error with its last line in `file`. Without `file`, return it with its last file and line."""
+    """Return the error and the last line of `file` that caused it; without `file`, return the last file and line."""
     # Lines of naming.py itself do not help the author of the method.
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 
-# Pixels are used if their projection is below a lower or above an upper limit. With at least this number of usable
-# pixels, the limits are first estimated from a sample.
+# Pixels are used if their projection is below a lower or above an upper limit. If an image has this number of
+# usable pixels or more, the limits are first estimated from a sample.
 _SPARSE_COUNT = 1 << 16
 _SPARSE_INTERVAL = 16  # one of this number of pixels is sampled
 # A limit is searched within this number of standard deviations around its estimated rank. If it is not there, all
@@ -90,10 +90,10 @@ def _sum_of_products(
             high = BINS - 1 - int(np.searchsorted(high_ranks, tail))
             ends = [collected[(bins < low) | (bins > high)]]
             lower, upper = collected[bins == low], collected[bins == high]
-            remaining = tail - int(low_ranks[low] - bin_counts[low])
-            ends.append(lower[np.argsort(lower[:, 3], kind="stable")][:remaining])
-            remaining = tail - int(high_ranks[BINS - 1 - high] - bin_counts[high])
-            ends.append(upper[np.argsort(upper[:, 3], kind="stable")][len(upper) - remaining :])
+            needed_count = tail - int(low_ranks[low] - bin_counts[low])
+            ends.append(lower[np.argsort(lower[:, 3], kind="stable")][:needed_count])
+            needed_count = tail - int(high_ranks[BINS - 1 - high] - bin_counts[high])
+            ends.append(upper[np.argsort(upper[:, 3], kind="stable")][len(upper) - needed_count :])
             selected = np.concatenate(ends)[:, :3]
             return total + selected.T @ selected
     raise AssertionError("all pixels were counted, but no bin contains the limits")

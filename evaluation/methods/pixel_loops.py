@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 
 SPAN = 64  # pixels of a row that are added with vector instructions, if all of them are usable
-# Number of spans after which the 32-bit sums are added to the result and reset. They can hold 65 537 spans. The
-# difference is a margin of one row, because the number is checked at the end of a row.
+# Number of spans after which the 32-bit sums are added to the result and reset. The sums can hold 65 537
+# spans. The number is checked only at the end of a row, so the difference must be larger than the spans of a row.
 LARGEST_SPAN_COUNT = 60_000
 CHUNK = 256  # pixels that are processed together; they fit into the first-level cache
 BLOCK = 16  # pixels per step of `_add_powers`: three vectors of float32, converted to six of float64
@@ -293,7 +293,7 @@ def sum_powers(
 
 
 # Number of equal bins of projections, from 0 to the largest possible projection. In an image of 18 megapixels, the bins
-# that are sorted have a few thousand pixels.
+# that `pca` sorts have a few thousand pixels.
 BINS = 4096
 # The first counted pixel moves by this number of columns from row to row, so that all columns are counted.
 _ROW_SHIFT = 5

@@ -5,8 +5,8 @@ Color Sparrow
     each point of a grid, Random Sprays Retinex divides the pixel by the maximum of a spray. A spray is a set of random
     pixels around the point, denser near the point (E. Provenzi et al., 2009). The illuminant at a point is the smoothed
     pixel divided by the smoothed ratio. The estimate is the mean over all points. Constants are from the authors'
-    program, version 0.1. It rounds sprays before it scales them to the image. Here they are not rounded, as in the
-    paper.
+    program, version 0.1. The program rounds the positions in a spray before it scales them to the image. Here, as in
+    the paper, they are not rounded.
 Improved White-Patch
     N. Banić, S. Lončarić, "Improving the White Patch method by subsampling", ICIP 2014. A sample of few pixels rarely
     includes a highlight or a noisy pixel, and the mean of the maxima of several samples is stable. The paper selects

@@ -12,14 +12,14 @@ page, ipg.fer.hr/ipg/resources/color_constancy. The black level is 2048; the low
 column 2050 is masked; `Peaks` gives the saturation. Four public preprocessing programs use the same layout, black level
 and rectangle. Not verified against a real copy.
 
-Cube++ and SimpleCube++: 4890 images of Canon EOS 550D and 600D, and 2234 of them at a quarter of the size.
+Cube++ and SimpleCube++: 4890 images of Canon EOS 550D and 600D, and 2234 of them at a quarter of height and width.
 
     gt.csv            image, then r, g, b of mean, left, right, left_white, right_white (mean_r …), r + g + b = 1
     properties.csv    image contents, and MakerNotes:NormalWhiteLevel; optional
     PNG/00_0001.png   16 bits, half-size demosaiced raw, 2592 × 1728 (other folders PNG… are read too)
 
     train/gt.csv, test/gt.csv      image,r,g,b: the mean of both grey faces
-    train/PNG/…, test/PNG/…        648 × 432, the means of 4 × 4 px, the cube painted over with zeros
+    train/PNG/…, test/PNG/…        648 × 432, the means of 4 × 4 px, the SpyderCube painted over with zeros
 
 E. Ershov et al., "The Cube++ illumination estimation dataset", IEEE Access 8, 2020 (arXiv:2011.10028), and
 github.com/Visillect/CubePlusPlus: description/description.md for layout, levels and ground truths,
@@ -55,7 +55,7 @@ from foundation.errors import FormatError, InputError
 
 BELOW_PEAK = 2  # values up to this number of counts below the largest value are clipped, see `Peaks`
 
-# Description of the rule in results.
+# Text in results that describes the rule of `Peaks`.
 PEAK_RULE = (
     "from m - 2, where m is the largest value in any channel of the image (advice of the authors of Cube+, "
     "ipg.fer.hr/ipg/resources/color_constancy)"
@@ -103,7 +103,7 @@ class PeakScene(RawScene):
         return image
 
 
-# Black level of all files: the data set's page; for Cube++ "approximately 2048, not subtracted" (description.md).
+# Black level of all files, from the data set's page. The source for Cube++ is description.md ("approximately 2048").
 BLACK = 2048
 # Upper left corner of the masked rectangle, which extends to the lower right corner, px; the data set's page.
 CUBE_ROW, CUBE_COLUMN = 1050, 2050
@@ -174,7 +174,7 @@ SIMPLE_SCALE = 4  # reduction of SimpleCube++ in both directions (code/build_sim
 CUBE_HEIGHT, CUBE_WIDTH = 1000, 700
 
 _TRUTHS = ("mean", "left", "right", "left_white", "right_white")
-_PUBLISHED = {"Cube++": 4890, "SimpleCube++": 2234}
+_PUBLISHED_COUNTS = {"Cube++": 4890, "SimpleCube++": 2234}
 _WHITE_COLUMN = "MakerNotes:NormalWhiteLevel"
 _SPLITS = ("train", "test")
 
@@ -332,4 +332,4 @@ def _white_levels(path: Path) -> dict[str, float]:
 
 
 def _published_note(name: str, count: int) -> str:
-    return "" if count == _PUBLISHED[name] else f"; the published {name} has {_PUBLISHED[name]}"
+    return "" if count == _PUBLISHED_COUNTS[name] else f"; the published {name} has {_PUBLISHED_COUNTS[name]}"

@@ -1,14 +1,15 @@
 """Read INTEL-TAU: 7022 images of three cameras as processed 1080p files.
 
-    CAMERA/field_1_cameras/NAME_12.tiff   16 bits, black subtracted and scaled by the authors, privacy masked
+    CAMERA/field_1_cameras/NAME_12.tiff   16 bits; black subtracted, values scaled and faces masked by the authors
     CAMERA/field_1_cameras/NAME_12.wp     ground truth: red, green, blue (or with leading zeros: NAME_012.wp)
     CAMERA/field_3_cameras, lab_printouts, lab_realscene: as field_1_cameras
     splits/Intel-TAU_v3_filelist_subset01.txt … 10   the authors' ten folds, optional
 
 Cameras: Canon_5DSR, Nikon_D810, Sony_IMX135_BLCCSC. F. Laakom et al., "INTEL-TAU: a color constancy dataset", IEEE
 Access 9, 2021 (arXiv:1910.10404): processed images are corrected for the black level and normalised by saturation. The
-layout follows the public loader of the first author and a published inventory of the archives, 2109 + 2793 + 2120
-pairs. The saturation 65535 and the zeros on masked faces and charts are not verified against a real copy.
+layout follows the public loader of the first author and a published inventory of the archives: 2109 + 2793 + 2120
+images with ground truth. The saturation 65535 and the zeros on masked faces and charts are not verified against a real
+copy.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@
 
 Y.-K. Lee et al., "RL-AWB: deep reinforcement learning for auto white balance correction in low-light night-time
 scenes", 2026 (arXiv:2601.05249). All rules are from `RGB_estimation` in utils/Algorithm.py of their program,
-github.com/BrianChen1120/RL-AWB: it subtracts no black level, excludes pixels of the mask above 0, and pixels with a
-channel of 0.95 m or more, where m is the largest value of the image. It also excludes the neighbours of such pixels and
-reduces the images; both are omitted here. Not verified against a real copy.
+github.com/BrianChen1120/RL-AWB. The program subtracts no black level. It excludes pixels whose mask is above 0, and
+pixels with a channel of 0.95 m or more, where m is the largest value of the image. It also excludes the neighbours of
+these clipped pixels and reduces the images; this reader does neither. Not verified against a real copy.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _TRUTH_FILE = "gt.mat"
 _VARIABLES = ("gts", "gt", "real_rgb")  # in the order in which the authors' program looks for them
 _CLIPPED_SHARE = 0.95  # of the largest value of an image
 _NAMES: Final = {700: "LEVI", 513: "NCC", 559: "Gehler (RL-AWB)"}  # by number of images (dataset/README.md)
-# Largest masked fraction of an image. Charts cover a few per cent; a mask with exchanged values covers nearly all.
+# Largest masked fraction of an image. Charts cover a few per cent; an inverted mask covers nearly the whole image.
 _LARGEST_MASK = 0.5
 
 

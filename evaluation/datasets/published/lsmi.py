@@ -1,8 +1,8 @@
-"""Read LSMI: 7486 images of 2700 places under one to three illuminants, with three cameras and mixing weights.
+"""Read LSMI: 7486 images of 2700 places by three cameras, under one to three illuminants that are known by pixel.
 
 Layout::
 
-    galaxy/meta.json         for each place: NumOfLights, MCCCoord (mcc1 … mcc3: four corners), Light1 … (r, 1, b)
+    galaxy/meta.json         for each place: NumOfLights, MCCCoord (mcc1 … mcc3: corners of a chart), Light1 … (r, 1, b)
     galaxy/split.json        places by subset: two_illum_train, two_illum_val, two_illum_test, three_illum_…
     galaxy/Place1/Place1_12.tiff   the place under illuminants 1 and 2: 16 bits, half-size raw, black not subtracted
     galaxy/Place1/Place1_12.npy    (H, W, K): fraction of each illuminant in the green of a pixel, -1 if unknown
@@ -15,7 +15,7 @@ Run the authors' programs first. 0_cvt2tiff.py makes the .tiff files from the pu
 multi-illuminant (LSMI) dataset for developing white balance algorithm under mixed illumination", ICCV 2021, and
 github.com/DY112/LSMI-dataset, the source of all levels and masks. Not verified against a real copy.
 
-The illuminant of a pixel is the sum of the illuminants of the place, scaled to green 1 and weighted by their fractions
+The illuminants of a place are scaled to green 1. The illuminant of a pixel is their mean, weighted by their fractions
 in the pixel. As in the authors' programs, levels of the Sony are constants; levels of the Galaxy and Nikon are read
 from a raw file.
 """
@@ -38,10 +38,11 @@ from evaluation.scene import Image, Scene, SceneSet
 from foundation.errors import FormatError, InputError, first_few
 from generator.files import decode_png
 
-_SONY: Final = (128.0, 4095.0)  # black level and saturation of Sony's .tiff files, counts (1_make_mixture_map.py)
+# Black level and saturation of Sony's .tiff files, counts (1_make_mixture_map.py).
+_SONY_LEVELS: Final = (128.0, 4095.0)
 _REDUCTION = 2  # chart corners are in px of the raw file; the .tiff is half as large (1_make_mixture_map.py)
 _SUBSETS = ("train", "val", "test")
-_MIXES: Final = {"single": (1,), "mixed": (2, 3)}
+_MIXES: Final = {"single": (1,), "mixed": (2, 3)}  # numbers of illuminants of the images
 _IMAGE_NAME = re.compile(r"(?P<place>.+)_(?P<lights>[123]{1,3})\.tiff?")
 _RAW_ENDINGS = (".dng", ".nef", ".arw")
 
@@ -84,7 +85,7 @@ class LsmiMixedScene(LsmiScene):
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """Ground truth (3,) float64, r + g + b = 1: mean over the pixels whose illuminant is known; read once."""
+        """Ground truth (3,) float64, r + g + b = 1: mean over the pixels whose illuminant is known."""
         if "" not in self._means:
             weights = self.read_weights().reshape(-1, len(self.illuminants))
             mean = weights[np.isfinite(weights[:, 0])].mean(axis=0, dtype=np.float64) @ self.lights
@@ -241,7 +242,7 @@ class _Camera:
         if black_option is not None and white_option is not None:
             return float(black_option), white_option, "the user"
         if "sony" in self.name.lower():
-            black, white, source = *_SONY, "1_make_mixture_map.py"
+            black, white, source = *_SONY_LEVELS, "1_make_mixture_map.py"
         else:
             black, white, source = self._read_raw_levels()
         return black if black_option is None else black_option, white if white_option is None else white_option, source

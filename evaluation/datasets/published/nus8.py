@@ -37,7 +37,7 @@ Box = tuple[int, int, int, int]
 _COORDS = "CC_coords"
 _MASK_FOLDER = "CHECKER"
 # Smallest intersection of two boxes of the same chart, fraction of their union. Boxes may have different margins. The
-# intersection is smaller if an image was rotated, or if rows and columns were exchanged.
+# intersection is below this limit if an image was rotated, or if rows and columns were exchanged.
 _LEAST_OVERLAP = 0.5
 
 
@@ -134,10 +134,10 @@ def _mask_files(path: Path, root: Folder) -> dict[str, Path]:
 
 
 _MAT_ENDING = "_gt.mat"
-# A chart box may extend this far beyond the image edge, px. Rounding and counting from 0 instead of 1 cause up to 2.
+# A chart box may extend this far beyond the image edge, px. Rounding and counting from 0 instead of 1 cause up to 2 px.
 _LARGEST_OVERHANG = 2
 # Number of images of each camera, from the list of ground truths in github.com/TheZino/COCOA.
-_PUBLISHED: Final = {
+_PUBLISHED_COUNTS: Final = {
     "Canon1DsMkIII": 259,
     "Canon600D": 200,
     "FujifilmXM1": 196,
@@ -190,7 +190,7 @@ def open_nus8(location: str, options: DataOptions, scanned_folder: Folder | None
         if camera in (None, name):
             camera_scenes, note, (black, white), source = _open_camera(folder, name, path, options)
             scenes.extend(camera_scenes)
-            published = _PUBLISHED.get(name, len(camera_scenes))
+            published = _PUBLISHED_COUNTS.get(name, len(camera_scenes))
             published_note = "" if len(camera_scenes) == published else f" (published: {published})"
             notes.append(f"{name} {note}{published_note}")
             blacks.append(f"{name} {black:g}")

@@ -52,7 +52,7 @@ def test_applies_levels_mask_and_ground_truth_of_each_camera(copy: Path) -> None
 
 def test_published_counts_add_up() -> None:
     # Authors' page: 1736 images of eight cameras; list of ground truths: 1853 with the ninth.
-    counts = dict(published._PUBLISHED)
+    counts = dict(published._PUBLISHED_COUNTS)
     assert (len(counts), counts.pop("NikonD40"), sum(counts.values())) == (9, 117, 1736)
     assert counts["Canon1DsMkIII"] == 259
 
