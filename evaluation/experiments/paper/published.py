@@ -95,14 +95,14 @@ def is_c1(images: Sequence[str]) -> bool:
     return len(images) == len(stems) == _C1_IMAGES and all(_C1_NAME.fullmatch(stem) for stem in stems)
 
 
-def cell_name(name: str, images: Sequence[str]) -> str:
+def name_in_table1(name: str, images: Sequence[str]) -> str:
     """Return the name of pictures or illuminants in table 1.
 
     Images of C1 get the name C1. Other images with the name C1 or Random get this name in quotes.
 
     Examples
     --------
-    >>> cell_name("600D", ["Canon600D_0001"]), cell_name("C1", ["a"]), cell_name("Random", ["a"])
+    >>> name_in_table1("600D", ["Canon600D_0001"]), name_in_table1("C1", ["a"]), name_in_table1("Random", ["a"])
     ('600D', '"C1"', '"Random"')
     """
     if is_c1(images):
