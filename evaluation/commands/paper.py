@@ -104,7 +104,7 @@ def table1(
     from evaluation.experiments.paper.material import read_truths
     from evaluation.experiments.paper.published import name_in_table1
     from evaluation.experiments.paper.reporting import table1_report
-    from evaluation.experiments.paper.table1 import settings, size_dependence
+    from evaluation.experiments.paper.table1 import plan_blocks, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
 
     sides = _parse_sides(sizes)
@@ -113,7 +113,7 @@ def table1(
     scenes, pictures_text, pictures_name = _open_pictures(pictures, matrix)
     truths = read_truths(lights_like)
     names = name_in_table1(pictures_name, [scene.name for scene in scenes]), name_in_table1(truths.name, truths.images)
-    data_sets = settings(opened, scenes, truths.lights, side, seed, names)
+    data_sets = plan_blocks(opened, scenes, truths.lights, side, seed, names)
     threads = workers or processor_count()
     with image_steps(sum(len(data_set.scenes) for data_set in data_sets)) as step:
         blocks = run(data_sets, threads, step)

@@ -32,8 +32,9 @@ class PublishedRow:
 Cell = tuple[str, str, str]  # Scenes, sensor and illuminants of a data set of table 1
 
 # Table 1, by data set and method in the order of the paper. C1 is the Canon 1Ds Mark III of the NUS data set.
-# Section 4.1 calls the errors reproduction errors. This cannot be true for all: the largest possible reproduction error
-# is arccos(1/√3) = 54.74°, but one worst 25 % is 59.80°. The commands therefore report both kinds of error.
+# Section 4.1 calls the errors reproduction errors. This cannot be true for all numbers: the largest possible
+# reproduction error is arccos(1/√3) = 54.74°, but one worst 25 % is 59.80°. The commands therefore report both kinds of
+# error.
 TABLE1: Final[Mapping[Cell, Mapping[str, PublishedRow]]] = {
     ("C1", "6D", "C1"): {
         "White-Patch": PublishedRow(2.61, 2.59, 2.50, 1.03, 4.38, 2.38),
@@ -96,7 +97,7 @@ def is_c1(images: Sequence[str]) -> bool:
 
 
 def name_in_table1(name: str, images: Sequence[str]) -> str:
-    """Return the name of pictures or illuminants in table 1.
+    """Return the name of a set of pictures or of ground truths for table 1.
 
     Images of C1 get the name C1. Other images with the name C1 or Random get this name in quotes.
 
