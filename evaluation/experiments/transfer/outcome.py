@@ -260,9 +260,9 @@ def adaptation_table(figures: TransferFigures, name: str) -> Table | None:
         ("Method", "Set", "N", "N alone", "Set alone", "Adapted", "Adapted / better alone"),
         tuple(rows),
         notes=(
-            "N: number of real images, from the other folds. N alone: trained on these images. Set alone: trained on the "
-            "set. Adapted: trained on the set, then adapted to these images. The last column divides this error by the "
-            "smaller of the other two. All statistics are in results.csv.",
+            "N: number of real images, from the other folds. N alone: trained on these images. Set alone: trained on "
+            "the set. Adapted: trained on the set, then adapted to these images. The last column divides this error by "
+            "the smaller of the other two. All statistics are in results.csv.",
         ),
     )
 
