@@ -87,7 +87,7 @@ def compare(
 def _match_pairs(
     runs: Sequence[Mapping[str, MethodErrors]], locations: Sequence[str], names: Sequence[str] | None, error: ErrorKind
 ) -> list[MatchedErrors]:
-    """Return the pairs to compare: all pairs of one run, or each method of both runs."""
+    """Return the pairs to compare: all pairs of methods in one run, or each method that two runs share."""
     from evaluation.experiments.comparing import match
 
     run_a, run_b = runs[0], runs[-1]
@@ -125,14 +125,14 @@ def _table_name(name: str) -> str:
 
 
 def _treatment_notes(locations: Sequence[str]) -> list[str]:
-    # Runs with different treatments of the images differ in more than their methods.
+    # If two runs treated the images differently, their errors differ even for the same method.
     first, second = (_read_treatment(location) for location in (locations[0], locations[-1]))
     differences = [aspect for aspect in first if aspect in second and first[aspect] != second[aspect]]
     return [f"the runs differ in {aspect}: first {first[aspect]}, second {second[aspect]}" for aspect in differences]
 
 
 def _read_treatment(location: str) -> dict[str, Any]:
-    """Return images and treatment of a run from its run.json; empty if it cannot be read."""
+    """Return location and treatment of the images from the run.json of a run; empty if the file cannot be read."""
     path = Path(location) if Path(location).is_dir() else Path(location).parent
     try:
         record = json.loads((path / "run.json").read_text(encoding="utf-8"))

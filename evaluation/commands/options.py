@@ -107,8 +107,8 @@ def reading_options(texts: Sequence[str]) -> tuple[str | None, DataOptions]:
     for text in texts:
         key, separator, value = text.partition("=")
         if key not in keys:
-            question = nearest_names(key, keys)
-            raise InputError(f"--read {text}: expected one of {', '.join(keys)}; {question or 'correct it'}")
+            suggestion = nearest_names(key, keys)
+            raise InputError(f"--read {text}: expected one of {', '.join(keys)}; {suggestion or 'correct it'}")
         if key in values:
             raise InputError(f"--read {text}: {key} is given twice, expected once; omit one")
         if (key == "partial") == bool(separator):
@@ -129,7 +129,7 @@ def choose_methods(texts: Iterable[str]) -> list[Method]:
     """Return the named methods in their order, each once.
 
     `standard` stands for the methods of `STANDARD`, `all` for all `standard_methods`. A method that is named
-    in addition to its group is used once. A name that is given twice is refused.
+    in addition to `standard` or `all` is used once. A name that is given twice is refused.
 
     Examples
     --------
@@ -178,7 +178,7 @@ def _distinct_names(texts: Iterable[str]) -> list[str]:
 def choose_without_constant(texts: Sequence[str]) -> tuple[list[Learner], list[str]]:
     """Return the named learners without the constant illuminant, and notes on omitted learners.
 
-    Learners of `all` are omitted if a requirement is not installed. The commands add the constant illuminant.
+    `all` omits learners that need a library that is not installed. The commands add the constant illuminant.
     """
     from evaluation.learning.constant_light import ConstantLight
     from evaluation.learning.feature_learner import missing_requirement
@@ -230,8 +230,8 @@ def _load_learner(text: str) -> Learner:
     if text in standard_methods() or text.endswith(".npz"):
         raise InputError(f"{text} cannot be trained, {expected}; give one of these")
     if ":" not in text:
-        question = nearest_names(text, learners)
-        raise InputError(f"{text!r} is not a learned method, {expected}; {question or 'give one of these'}")
+        suggestion = nearest_names(text, learners)
+        raise InputError(f"{text!r} is not a learned method, {expected}; {suggestion or 'give one of these'}")
     learner = _load_named(text)
     if not callable(getattr(learner, "fit", None)):
         raise InputError(f"{text} has no method fit(scenes, seed), expected one; use evaluate run")

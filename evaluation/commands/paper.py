@@ -46,7 +46,7 @@ ErrorOption = Annotated[AngularError, typer.Option(help="Angular error to print.
 Out = Annotated[Path | None, option("FOLDER", "Write page, tables and figures here.")]
 Workers = Annotated[int | None, thread_option()]
 
-# This note is added to the conditions if pictures or ground truths differ from those of the paper.
+# Printed with the conditions if pictures or ground truths differ from those of the paper.
 _NOT_C1_NOTE = (
     "The paper uses C1, the 259 images of the Canon 1Ds Mark III of NUS, for pictures and ground truths. "
     "Published numbers are shown only if both scenes and illuminants are from C1 or random."
@@ -102,9 +102,9 @@ def table1(
 ) -> None:
     """Run statistics-based methods on eight generated data sets."""
     from evaluation.experiments.paper.material import read_truths
-    from evaluation.experiments.paper.published import cell_name
+    from evaluation.experiments.paper.published import name_in_table1
     from evaluation.experiments.paper.reporting import table1_report
-    from evaluation.experiments.paper.table1 import settings, size_dependence
+    from evaluation.experiments.paper.table1 import plan_blocks, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
 
     sides = _parse_sides(sizes)
@@ -112,11 +112,11 @@ def table1(
     opened = _open_luts(luts)
     scenes, pictures_text, pictures_name = _open_pictures(pictures, matrix)
     truths = read_truths(lights_like)
-    names = cell_name(pictures_name, [scene.name for scene in scenes]), cell_name(truths.name, truths.images)
-    empty_blocks = settings(opened, scenes, truths.lights, side, seed, names)
+    names = name_in_table1(pictures_name, [scene.name for scene in scenes]), name_in_table1(truths.name, truths.images)
+    data_sets = plan_blocks(opened, scenes, truths.lights, side, seed, names)
     threads = workers or processor_count()
-    with image_steps(sum(len(block.scenes) for block in empty_blocks)) as step:
-        blocks = run(empty_blocks, threads, step)
+    with image_steps(sum(len(data_set.scenes) for data_set in data_sets)) as step:
+        blocks = run(data_sets, threads, step)
     size_rows = size_dependence(opened, scenes, truths.lights, sides, seed, threads, names)
     conditions = (
         f"Pictures: {pictures_text}. Images: longest side {side} px. Illuminants like {truths.name}. Seed {seed}.",
@@ -184,7 +184,7 @@ def table2(
         f"{len(training)} images. {error.capitalize()} error, degrees.",
         _treatment_text(real),
         *shared_notes,
-        *(() if is_cube else ("The paper's table is for Cube+, so only its ratios are shown.",)),
+        *(() if is_cube else ("The published errors are for Cube+. Of them, only the ratios of medians are shown.",)),
     )
     _show(table2_report(table2_tables(comparisons, error, real.name, is_cube), conditions), conditions, out, output)
 
@@ -304,7 +304,7 @@ def _open_luts(folders: Sequence[Path]) -> list[Lut]:
 
 
 def _open_pictures(location: str, matrix: str) -> tuple[Sequence[Source], str, str]:
-    """Return the source pictures at a location, a text on their origin, and their name."""
+    """Return the source pictures at a location, a text on their origin, and the name of their set."""
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
     from evaluation.experiments.paper.material import develop_sources

@@ -64,7 +64,7 @@ def train(
     from evaluation.learning.model_files import load_model, provenance_of, save_model
     from evaluation.reports.table_output import show_notes
 
-    # Learners of `all` that are not installed are omitted, as in evaluate cv.
+    # `all` omits learners that need a library that is not installed, as in evaluate cv.
     names = split_names([method])
     chosen, notes = choose_learners(names), list[str]()
     if "all" in map(str.lower, names):
@@ -93,7 +93,7 @@ def train(
             raise InputError(
                 f"{adapt} is a model of {base_model.learner.key}, expected {method}; give a model of {method}"
             )
-        # The settings of the base model apply, which may differ from the present defaults.
+        # The settings of the base model are used. They may differ from the present defaults.
         learners = [base_model.learner]
     data_set = open_data(data, read)
     truths = truths_of(data_set.scenes)

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from evaluation.experiments.transfer.plan import TransferPlan
     from evaluation.scene import Scene
 
-# If the longest sides of images differ by more than this ratio, all images are reduced to one size. Learned methods
-# reduce images by whole factors, so the sizes that they use already differ by up to 2.
+# If the longest sides of two sets differ by more than this ratio, all images are reduced to one size. Smaller ratios
+# occur anyway, because learned methods reduce images by whole factors.
 _MAX_SIZE_RATIO = 2.0
 _MAX_MEASURED = 25  # Largest number of images of a set that are read to measure its size
 
@@ -161,7 +161,7 @@ def _parse_counts(real: str | None) -> tuple[int | None, ...]:
 def _possible_counts(
     counts: Sequence[int | None], folds: Sequence[npt.NDArray[np.int64]]
 ) -> tuple[tuple[int | None, ...], list[str]]:
-    """Return the numbers of real images that are available outside every fold (N,) int64, and notes on the others."""
+    """Return the numbers of real images that exist outside each fold, and notes on omitted ones; folds: (N,) int64."""
     import numpy as np
 
     max_count = min(len(fold_numbers) - int(np.bincount(fold_numbers).max()) for fold_numbers in folds)
@@ -185,5 +185,5 @@ def _common_side(test: Sequence[Scene], plan: TransferPlan) -> tuple[int | None,
 
 
 def _median_side(scenes: Sequence[Scene]) -> int:
-    # At most `_MAX_MEASURED` images are read, evenly spaced in the order of the set.
+    # At most `_MAX_MEASURED` images of the set are read, at equal steps.
     return median_low(max(scene.read()[0].shape) for scene in scenes[:: ceil(len(scenes) / _MAX_MEASURED)])

@@ -42,7 +42,7 @@ _STATISTIC_HEADS: Final = dict(zip(STATISTICS, ERROR_COLUMNS[1:], strict=True))
 
 _VALUE_HEADS: Final = ("Of first", "Of second", "Difference", "from", "to", "Ratio", "ratio from", "ratio to")
 
-# Largest number of comparisons with details on the terminal and unfolded details on the page.
+# With more comparisons than this, the terminal shows no details, and the page folds them.
 MAX_DETAILED: Final = 3
 
 TEST_NOTES: Final = (
@@ -64,7 +64,7 @@ class MatchedErrors:
     errors_b: npt.NDArray[np.float64]
     # Group of each image, such as its source picture; None if every image is its own group
     groups: tuple[str, ...] | None = None
-    notes: tuple[str, ...] = ()  # A sentence for each method that lacks images of the other
+    notes: tuple[str, ...] = ()  # A sentence for each method without errors on some images of the other method
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -162,7 +162,7 @@ def signed_rank(errors_a: npt.ArrayLike, errors_b: npt.ArrayLike) -> SignedRank:
 
 
 def holm(probabilities: Sequence[float]) -> list[float]:
-    """Return p-values that are corrected for several tests, so that the level is valid for all tests together.
+    """Return p-values that are corrected for several tests, so that all tests together have the level of one test.
 
     S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statistics 6 (1979) 65-70.
 
@@ -172,10 +172,10 @@ def holm(probabilities: Sequence[float]) -> list[float]:
     [0.03, 0.06, 0.06]
     """
     corrected = [1.0] * len(probabilities)
-    smallest = 0.0
+    largest = 0.0
     for rank, index in enumerate(sorted(range(len(probabilities)), key=lambda index: probabilities[index])):
-        smallest = max(smallest, min(1.0, (len(probabilities) - rank) * probabilities[index]))
-        corrected[index] = smallest
+        largest = max(largest, min(1.0, (len(probabilities) - rank) * probabilities[index]))
+        corrected[index] = largest
     return corrected
 
 
@@ -315,7 +315,7 @@ def _interval_cells(pair: PairedFigure) -> list[Cell]:
 def write_comparisons(
     folder: Path, comparisons: Sequence[Comparison], notes: Sequence[str], figures: FigureForm | None = None
 ) -> None:
-    """Write a new folder: `tests.csv`, `statistics.csv`, `tables.tex`, `report.html`, and figures of a form."""
+    """Write a new folder: `tests.csv`, `statistics.csv`, `tables.tex`, `report.html`, and figures if requested."""
     tables = {"tests.csv": tests_table(comparisons), "statistics.csv": statistics_table(comparisons)}
     texts = {name: table_to_csv(table) for name, table in tables.items()}
     texts["tables.tex"] = "\n".join(map(table_to_latex, tables.values()))

@@ -35,7 +35,7 @@ from evaluation.scene import Image, Scene, report_progress
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
-# Smallest usable fraction of the area of a reduced pixel. Below, rounding errors of areas dominate its colour.
+# Smallest usable fraction of the area of a reduced pixel. With less area, rounding errors dominate its colour.
 _MIN_USABLE_AREA: Final = 1e-3
 
 
@@ -98,7 +98,7 @@ def shrink_image(
 
 Indices = npt.NDArray[np.int64]  # (P,) int64: indices of scenes in a data set, from 0
 
-AnyLearner = Learner | FeatureLearner  # Is fitted to scenes, or to features of scenes
+AnyLearner = Learner | FeatureLearner  # A learner is fitted to scenes, a feature learner to their features
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,10 +131,10 @@ def collect_material(
     truths = truths_of(scenes)
     if side is not None:
         scenes, on_scene = shrink_scenes(scenes, side, workers, on_scene), None
-    extracting = [learner for learner in learners if isinstance(learner, FeatureLearner)]
-    extracted = iter(extract(scenes, extracting, workers, on_scene) if extracting else ())
+    feature_learners = [learner for learner in learners if isinstance(learner, FeatureLearner)]
+    extracted = iter(extract(scenes, feature_learners, workers, on_scene) if feature_learners else ())
     features = tuple(next(extracted) if isinstance(learner, FeatureLearner) else None for learner in learners)
-    if on_scene and not extracting:
+    if on_scene and not feature_learners:
         for _ in scenes:
             on_scene()
     return Material(tuple(scenes), truths, features)
@@ -162,7 +162,7 @@ def estimate_on(method: Method, number: int, material: Material, indices: Indice
 
 
 def result_of(name: str, answers: Sequence[SceneAnswer], truths: npt.NDArray[np.float64]) -> Result:
-    """Return the result of N answers; `truths`: (N, 3) float64."""
+    """Return the result of the method `name` from its N answers; `truths`: (N, 3) float64."""
     (result,) = collect_results([name], truths, [[answer] for answer in answers])
     return result
 
@@ -210,7 +210,7 @@ class FamilySetting:
     text: str  # Value of `--method` for this set: "gray-edge-1:p=4:sigma=2"
     name: str  # Name of the method in tables
     spread: float  # Standard deviation of the green chromaticity g / (r + g + b) of its estimates
-    errors: Summary | None  # Its errors on the counted images, degrees; None if not requested
+    errors: Summary | None  # Its errors on the images of `Tuning.counted`, degrees; None if not requested
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ class Tuning:
 
 
 def family_settings(family: str) -> tuple[tuple[str, Method], ...]:
-    """Return the value of `--method` and the method of each set of parameters of a family.
+    """Return for each set of parameters of a family the value of `--method`, and the method.
 
     Examples
     --------

@@ -97,7 +97,7 @@ def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.
     if groups is None:
         names = [scene.name for scene in scenes]
         copy_names = tuple(names[first] for first in first_copies(scenes))
-        # Without copies, `groups` stays None. Names as groups would change the drawn folds.
+        # Without copies, `groups` stays None. `draw_folds` would sort names, and thus draw other folds.
         groups = copy_names if len(set(copy_names)) < len(copy_names) else None
     return draw_folds(len(scenes), folds, seed, groups)
 

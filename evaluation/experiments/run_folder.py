@@ -165,7 +165,7 @@ def _files(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], bytes
 
 
 def _pictures(run: Run, scenes: Sequence[Scene], metric: ErrorKind, workers: int) -> dict[tuple[int, int], bytes]:
-    # Each image is read once for all methods.
+    # JPEG files by indices of method and image. Each image is read once for all methods.
     methods_by_image: dict[int, list[int]] = {}
     for number, result in enumerate(run.results[:MAX_METHODS]):
         for image in sum(chosen_images(result, metric), ()):

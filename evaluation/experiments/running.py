@@ -2,7 +2,7 @@
 
 A method has no estimate for an image if it returns None, or values that are negative, NaN, infinite or all 0. Such
 images are counted and listed, and grey is used as the estimate. An exception, or a value that is not three numbers,
-ends the run with the name of the method and the image, and the line in the user's file.
+ends the run. The message names the method, the image, and the line in the user's file.
 """
 
 from __future__ import annotations
@@ -170,17 +170,19 @@ def fit_copy(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
 
 
 def _checked_map(returned_value: object, image: Any) -> tuple[npt.NDArray[np.floating[Any]], str]:
-    """Return the estimate of each pixel, (H, W, 3) float, grey if missing; and a note on the number of missing ones."""
-    lights = np.asarray(returned_value)
-    if lights.shape != image.shape or not np.issubdtype(lights.dtype, np.floating):
+    """Return the estimates (H, W, 3) float with grey for missing ones, and a note on their number or ""."""
+    estimates = np.asarray(returned_value)
+    if estimates.shape != image.shape or not np.issubdtype(estimates.dtype, np.floating):
         raise ValueError(
-            f"estimate_map returned {lights.dtype} of shape {lights.shape}, expected floats {tuple(image.shape)}"
+            f"estimate_map returned {estimates.dtype} of shape {estimates.shape}, expected floats {tuple(image.shape)}"
         )
-    is_missing = np.asarray(~(np.isfinite(lights).all(axis=2) & (lights >= 0).all(axis=2) & lights.any(axis=2)))
+    is_missing = np.asarray(
+        ~(np.isfinite(estimates).all(axis=2) & (estimates >= 0).all(axis=2) & estimates.any(axis=2))
+    )
     if not is_missing.any():
-        return lights, ""
+        return estimates, ""
     note = f"no estimate in {int(is_missing.sum())} of {is_missing.size} pixels of its map"
-    return np.where(is_missing[..., None], GREY, lights), note
+    return np.where(is_missing[..., None], GREY, estimates), note
 
 
 def _map_error(
@@ -191,14 +193,14 @@ def _map_error(
     image: npt.NDArray[Any],
     mask: npt.NDArray[np.bool_] | None,
 ) -> MapError:
-    lights, weights = truth
-    if lights.shape != image.shape or weights.shape[:2] != image.shape[:2]:
+    truths, weights = truth
+    if truths.shape != image.shape or weights.shape[:2] != image.shape[:2]:
         raise FormatError(
-            f"{scene.name} is {image.shape[1]}x{image.shape[0]} px, its map of illuminants {lights.shape[1]}x"
-            f"{lights.shape[0]}, its weights {weights.shape[1]}x{weights.shape[0]}, expected the same size; correct it"
+            f"{scene.name} is {image.shape[1]}x{image.shape[0]} px, its map of illuminants {truths.shape[1]}x"
+            f"{truths.shape[0]}, its weights {weights.shape[1]}x{weights.shape[0]}, expected the same size; correct it"
         )
     estimate = estimate_map if estimate_map is not None else np.array(GREY if answer.light is None else answer.light)
-    return measure_map(estimate, lights, weights, scene.lights, image, scene.saturation, mask)
+    return measure_map(estimate, truths, weights, scene.lights, image, scene.saturation, mask)
 
 
 def _reason(error: BaseException) -> str:
@@ -213,7 +215,7 @@ def _reason(error: BaseException) -> str:
 
 def _remedy(method: object) -> str:
     if callable(getattr(method, "fit", None)):
-        # The usual cause for a class with `fit` is that it was not trained.
+        # A class with `fit` usually fails here because it was not trained.
         return f"if it must be trained first, use evaluate cv, otherwise correct it, {RUN_AGAIN}"
     return f"correct it, {RUN_AGAIN}"
 

@@ -1,8 +1,8 @@
 """Detect estimates or ground truths that were probably written in another convention.
 
 Red and blue may be exchanged, values may be gains (reciprocals), or the images may be in another order. The errors are
-then as large as with a poor method. If one of these other readings fits the ground truths far better, a note is
-printed; results are not changed.
+then as large as with a poor method. Each of these possibilities is another reading of the estimates. If it fits the
+ground truths far better, a note is printed; results are not changed.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ _Lights = npt.NDArray[np.float64]
 
 _MIN_IMAGES: Final = 8  # A median of fewer images is not reliable
 
-# Below this median error, degrees, no other reading is tried. Near grey, all readings fit about equally.
+# Below this median error, degrees, no other reading is tried. Illuminants near grey have small errors in every reading.
 _MIN_MEDIAN_DEG: Final = 5.0
 
-# Largest median error of another reading, as a fraction of the present median error. Correct data have a far larger
-# ratio.
+# Largest median error of another reading, as a fraction of the median error of the estimates as given. If these are
+# correct, the fraction is far larger.
 _MAX_RATIO: Final = 0.5
 
-# Largest median error of another reading, degrees. A poor fit is no evidence for that reading.
+# Largest median error of another reading, degrees. A reading with larger errors is not evident.
 _MAX_OTHER_DEG: Final = 8.0
 
 _MIN_CHANNEL: Final = 1e-9  # Replaces smaller channels before inversion; fraction of the largest channel

@@ -26,22 +26,22 @@ from foundation.colorimetry import srgb_codes
 from foundation.errors import counted
 from foundation.plots import FAINT, FigureForm, draw_svg, legend_label, series_style
 
-# The axis of errors ends at this percentile of all methods' errors, because a few outliers would compress the curves.
+# The axis of errors ends at this percentile of the errors of all methods, because outliers would compress the curves.
 _AXIS_PERCENTILE = 98
 
 _STEPS = 300  # Points of a curve: about one for each pixel of its width on the page
 
-_PANELS = 12  # Largest number of methods with a panel; more panels would be too small to read
+_MAX_PANELS = 12  # Largest number of methods with a panel; more panels would be too small to read
 
-_COLUMNS = 3  # Panels in a row, for a page width of 1100 px
+_MAX_COLUMNS = 3  # Panels in a row, for a page width of 1100 px
 
 # Largest number of points drawn as vectors. More are drawn as a bitmap, because a page with millions of circles opens
 # slowly.
 _MAX_VECTOR_POINTS = 3000
 
-_MIN_REACH = 0.01  # Half of the smallest range of an axis, for data sets with one illuminant
+_MIN_REACH = 0.01  # Smallest half range of an axis, used for data sets with one illuminant
 
-_SCALE_PERCENTILE = 95  # The colour scale ends at this percentile of all methods' errors
+_SCALE_PERCENTILE = 95  # The colour scale ends at this percentile of the errors of all methods
 
 
 def error_curves(results: Sequence[Result], metric: ErrorKind, form: FigureForm = "page") -> bytes:
@@ -77,7 +77,7 @@ def error_planes(
 
     `truths`: (N, 3) float64, ground truths, camera RGB of any length. `black_bodies`: camera RGB by temperature, K.
     """
-    drawn = results[:_PANELS]
+    drawn = results[:_MAX_PANELS]
     columns = _column_count(len(drawn))
     # Panels are squares, with a title above each.
     width, height = (
@@ -88,7 +88,7 @@ def error_planes(
 
 def _column_count(panels: int) -> int:
     # Four panels in two rows of two look better than three and one.
-    return 2 if panels == 4 else min(_COLUMNS, panels)
+    return 2 if panels == 4 else min(_MAX_COLUMNS, panels)
 
 
 def _draw_planes(
@@ -104,7 +104,7 @@ def _draw_planes(
     kelvins = sorted(black_bodies)
     colours = np.vstack([truths, *(black_bodies[kelvin] for kelvin in kelvins)])
     rb = (colours / colours.sum(axis=1, keepdims=True))[:, ::2]
-    shares, locus = rb[: len(truths)], rb[len(truths) :]
+    truth_rb, locus = rb[: len(truths)], rb[len(truths) :]
     # Both axes have the same scale, so that equal distances look equal.
     middle, reach = (rb.max(axis=0) + rb.min(axis=0)) / 2, max(0.6 * float(np.ptp(rb, axis=0).max()), _MIN_REACH)
     limits = np.stack([middle - reach, middle + reach])
@@ -119,7 +119,7 @@ def _draw_planes(
         errors = result.errors[metric]
         order = np.argsort(errors, kind="stable")  # The largest errors lie on top.
         points = axes.scatter(
-            *shares[order].T,
+            *truth_rb[order].T,
             c=errors[order],
             s=9,
             cmap=colours,
@@ -139,7 +139,7 @@ def _draw_planes(
     for axes in panels[len(results) :]:
         axes.remove()
     for axes in panels[len(results) - columns : len(results)]:
-        # The lowest panel of each column has the labels, also above an empty position.
+        # The lowest panel of each column has tick labels, even if the position below it is empty.
         axes.tick_params(labelbottom=True)
     figure.supxlabel("r = R / (R + G + B) of the ground truth", fontsize=9)
     figure.supylabel("b = B / (R + G + B)", fontsize=9)
@@ -206,7 +206,7 @@ def _encode_jpeg(picture: npt.NDArray[np.uint8]) -> bytes:
 
 
 def _gains(light: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    # Gains leave green unchanged.
+    # Gains that make the illuminant grey and leave green unchanged.
     channels = np.asarray(light, dtype=np.float64)
     floored = np.maximum(channels, _MIN_CHANNEL * channels.max(axis=-1, keepdims=True))
     return (floored[..., 1:2] / floored).astype(np.float32)
@@ -228,9 +228,9 @@ MAX_METHODS = 12  # Largest number of methods with images; more would make the p
 
 _DEFINITIONS = (
     "Recovery error: angle between estimated and true illuminant. Reproduction error: angle between white and a white "
-    "surface after correction. Tri.: (Q1 + 2 Q2 + Q3) / 4. Best and worst 25%: mean of the errors up to the 25th and "
-    "from the 75th percentile. Avg.: geometric mean of mean, median, trimean, best and worst 25%. Worst 5%: mean of "
-    "the errors from the 95th percentile. Percentiles as in MATLAB's prctile (Hazen)."
+    "surface after correction. Tri.: (Q1 + 2 Q2 + Q3) / 4. Best 25%: mean of the errors up to the 25th percentile. "
+    "Worst 25%: mean of the errors from the 75th percentile. Avg.: geometric mean of mean, median, trimean, best 25% "
+    "and worst 25%. Worst 5%: mean of the errors from the 95th percentile. Percentiles as in MATLAB's prctile (Hazen)."
 )
 
 
@@ -255,7 +255,7 @@ def run_page(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], byt
     kinds: tuple[ErrorKind, ErrorKind] = ("reproduction", "recovery")
     ordered = kinds if metric == "reproduction" else kinds[::-1]
     tables = [summary_table(run.subject, run.results, name, with_further=True) for name in ordered]
-    # Notes on images without an estimate are the same for both tables.
+    # Notes are removed from the second table, because they are the same for both.
     tables[1] = Table(tables[1].title, tables[1].columns, tables[1].rows)
     elements = [
         pages.paragraph(f"{counted(len(run.subject.images), 'image')} from {run.location} (layout {run.layout})."),
@@ -289,7 +289,7 @@ def run_page(run: Run, metric: ErrorKind, pictures: Mapping[tuple[int, int], byt
 
 
 def _omitted_methods_text(results: Sequence[Result]) -> str:
-    # Methods after the first `MAX_METHODS` have no images.
+    # Methods after the first `MAX_METHODS` have neither panels nor images.
     names = [result.method for result in results[MAX_METHODS:]]
     return f" Only {MAX_METHODS} of {len(results)} methods are shown, without {', '.join(names)}." if names else ""
 

@@ -2,7 +2,7 @@
 
 On a narrow terminal, names are wrapped; numbers are never cut. LaTeX needs the package booktabs, and graphicx for wide
 tables. Tables are floats with a caption and a label, the best numbers are bold, and headings of several words are
-stacked. Tables with the same columns can be joined, each with its title.
+stacked. Tables with the same columns can be joined in one float, each with its title.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ class MethodErrors:
     - `images`: names of the N images, each once.
     - `truths`: (N, 3) float64, linear camera RGB of any length.
     - `errors`: (N,) float64, degrees, by kind of error.
-    - `guessed`: (N,) bool, True if no pixel was usable and the estimate is therefore grey.
-    - `groups`: for each image, the group of related images; None if a line has no group.
+    - `guessed`: (N,) bool, True if the method returned no illuminant and grey replaces it.
+    - `groups`: for each image, the group of related images; None if any line of the file has no group.
     """
 
     method: str
@@ -99,7 +99,7 @@ def read_errors(location: Path | str) -> dict[str, MethodErrors]:
     return {method: _method_errors(method, images) for method, images in lines_by_method.items()}
 
 
-_Line = tuple[list[float], bool, str]  # Of one image: errors and ground truth, guessed, group
+_Line = tuple[list[float], bool, str]  # Of one image: its errors and ground truth, `guessed`, `group`
 
 
 def _method_errors(method: str, images: Mapping[str, _Line]) -> MethodErrors:
@@ -167,9 +167,9 @@ def errors_csv(
 def several_lights_csv(images: Sequence[str], results: Sequence[Result]) -> tuple[str, str]:
     """Return the text of `pixels.csv` and `regions.csv`: errors by pixel and by region under several illuminants.
 
-    Columns of the first: image, method, pixel_recovery (LSMI's MAE_illum), pixel_reproduction, pixel_rgb (MAE_rgb).
-    Columns of the second: image, method, light (index from 0), share (fraction of the evaluated pixels), recovery,
-    reproduction. Errors are degrees; empty if no pixel of an image is evaluated.
+    Columns of `pixels.csv`: image, method, pixel_recovery (LSMI's MAE_illum), pixel_reproduction, pixel_rgb (MAE_rgb).
+    Columns of `regions.csv`: image, method, light (index from 0), share (fraction of the evaluated pixels), recovery,
+    reproduction. Errors are degrees, or empty fields if no pixel is evaluated.
     """
     pixels: list[tuple[object, ...]] = [("image", "method", "pixel_recovery", "pixel_reproduction", "pixel_rgb")]
     regions: list[tuple[object, ...]] = [("image", "method", "light", "share", "recovery", "reproduction")]
@@ -203,7 +203,7 @@ class GivenEstimates:
     name: str  # Name in the tables
     file: str  # Name of the file
     sha256: str  # Hash of its bytes
-    # Estimate (3,) float64 of each image, by its name, as in the file; values are not checked
+    # Estimate (3,) float64 by name of the image, as written in the file; values are not checked
     lights: Mapping[str, npt.NDArray[np.float64]]
 
     def estimate_scene(self, scene: Scene) -> npt.NDArray[np.float64]:
@@ -229,7 +229,7 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
         else:
             lights[image] = light
     missing = [image for image in images if image not in lights]
-    # A file for another part of the data set is refused, because errors of the common images alone would mislead.
+    # A file that lacks images of the data set is refused, because errors of the other images alone would mislead.
     faults = [
         f"{counted(len(faulty_images), singular, plural)} ({first_few(faulty_images)})"
         for faulty_images, singular, plural in (

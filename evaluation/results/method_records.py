@@ -1,7 +1,7 @@
 """Records of methods for a results folder: class, settings and source file.
 
 Two runs used the same method if its records are equal, so a record must not depend on the process. Data that a class
-reads while it runs, such as the weights of a network, are recorded only if the object holds them as an array.
+reads from files, such as the weights of a network, are recorded only if the object holds them as an array.
 """
 
 from __future__ import annotations

@@ -25,10 +25,10 @@ class Result:
     - `errors`: (N,) float64 for each kind of error, degrees. Under several illuminants, it is the error against their
       mean.
     - `guessed`: (N,) bool, True if the method returned no illuminant and grey replaces it.
-    - `causes`: by index of the image, the reason why the image or some of its pixels have no estimate; None if not
+    - `causes`: reason why an image or some of its pixels have no estimate, by index of the image; None if not
       recorded.
-    - `maps`: by index of the image in ascending order, its errors by pixel and region; None if no image has several
-      illuminants, or if none was measured.
+    - `maps`: errors by pixel and region of images under several illuminants, by index of the image, ascending; None if
+      there are none.
     """
 
     method: str
@@ -168,7 +168,7 @@ class Run:
     """Methods on a data set, with their results."""
 
     subject: Subject
-    # As in `scene.SceneSet`
+    # These three as in `scene.SceneSet`
     layout: str
     location: str
     treatment: Mapping[str, str]

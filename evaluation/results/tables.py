@@ -33,7 +33,7 @@ class Table:
     - `rows`: each with one value for each column. A column of numbers and None is aligned as numbers.
     - `digits`: number of decimals of a float in printed tables; CSV has nine significant digits.
     - `notes`: sentences below the table.
-    - `best`: for columns of numbers, whether the smallest or the largest is printed bold in LaTeX.
+    - `best`: for columns of numbers, whether the smallest or the largest number is printed bold in LaTeX.
     - `margins`: half-widths of the intervals of numbers by row and column; printed after "±", not in CSV.
 
     Examples
@@ -71,7 +71,7 @@ class Table:
         )
 
     def best_cells(self) -> set[tuple[int, int]]:
-        """Return row and column of the best numbers of the columns in `best`; equal texts are equal."""
+        """Return row and column of the best numbers of the columns in `best`; several if their texts are equal."""
         best: set[tuple[int, int]] = set()
         for name, direction in self.best.items() if len(self.rows) > 1 else ():
             column = self.columns.index(name)
@@ -129,7 +129,7 @@ def table_to_csv(table: Table) -> str:
 
 PAPER_COLUMNS = ("Algorithm", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")  # Columns of Banić et al. 2019
 
-# Columns of all tables that do not reproduce tables of the paper.
+# Columns of tables of errors that do not repeat a table of the paper.
 ERROR_COLUMNS = (*PAPER_COLUMNS, "Worst 5%")
 
 BEST_ERRORS: Mapping[str, Literal["smallest"]] = dict.fromkeys(ERROR_COLUMNS[1:], "smallest")
@@ -242,7 +242,7 @@ def _mixed_table(subject: Subject, results: Sequence[Result]) -> Table:
         ("Algorithm", *("MAE_illum", "med.", "MAE_rgb", "med.", "By region", "med.", "Mean light", "med.")),
         tuple(rows),
         notes=(
-            "Each column is the mean over images (by region: over all regions), followed by the median",
+            "Each mean over images (by region: over all regions) has its median in the next column",
             "MAE_illum and MAE_rgb: by pixel, averaged over pixels and then over images, as LSMI defines them (Kim et "
             "al., ICCV 2021)",
             "By region: against the illuminant that gives more than half of a pixel's light; all regions count equally",

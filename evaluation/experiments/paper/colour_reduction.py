@@ -96,7 +96,7 @@ def paper_methods(sigma: float = GRAY_EDGE_SIGMA) -> tuple[Method, ...]:
 class BitsResult:
     """Results of methods on unchanged images, and on images with bits set to zero."""
 
-    raw: tuple[Result, ...]  # One result for each method on the unchanged images
+    raw: tuple[Result, ...]  # Results on the unchanged images, one for each method
     reduced: Mapping[int, tuple[Result, ...]]  # Results of the methods, by number of bits set to zero
 
 
@@ -112,7 +112,7 @@ def remove_bits(
 
     def answers_for(scene: Scene) -> list[list[SceneAnswer]]:
         image, mask = scene.read()
-        # Clipped pixels must be found before the reduction. Flash is still fitted to them, as in a camera.
+        # Clipped pixels must be found before the reduction. Flash is fitted to all unmasked pixels, as in a camera.
         excluded = ~usable(image, scene.saturation, mask)
         versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
         return [[read_estimate(method.estimate(version, None, excluded)) for method in methods] for version in versions]
@@ -140,7 +140,8 @@ def bits_table(bits_result: BitsResult, metric: ErrorKind, name: str) -> Table:
     )
 
 
-PANEL: Final = 200  # Longest side of a panel, px. Eight panels fit a page, and effects of 3 bits are still visible
+# Longest side of a panel, px: one copy of a picture in `reduction_strip`. Eight panels fit a page.
+PANEL: Final = 200
 
 _GAP: Final = 6  # White gap between panels, px
 
@@ -148,9 +149,9 @@ _PANELS_IN_ROW: Final = 4  # Panels in a row
 
 
 def reduction_strip(picture: npt.NDArray[np.uint8], bits: Sequence[int] = BITS) -> npt.NDArray[np.uint8]:
-    """Return an image with copies of a picture with bits set to zero, four in a row: (h, w, 3) uint8, sRGB codes.
+    """Return an image (h, w, 3) uint8, sRGB codes: a copy of a picture for each number of bits set to zero.
 
-    `picture`: (H, W, 3) uint8, sRGB codes; it is reduced if a side is longer than `PANEL`.
+    `picture`: (H, W, 3) uint8, sRGB codes; it is reduced if a side is longer than `PANEL`. Four copies are in a row.
     """
     import cv2
 

@@ -136,7 +136,7 @@ def render_scenes(lut: Lut, sources: Sequence[Source], lights: ChosenLights, see
     return tuple(RenderedScene(lut, source, light, number, seed) for number, (source, light) in enumerate(pairs))
 
 
-WHITE_PERCENTILE: Final = 99.0  # Percentile that becomes white, as in dcraw ("99th-percentile white point")
+WHITE_PERCENTILE: Final = 99.0  # Percentile of values that becomes white, as in dcraw ("99th-percentile white point")
 
 _MIN_WHITE: Final = 1e-12  # Replaces a white of 0, so that a black image stays black
 
@@ -171,12 +171,12 @@ def develop_image(
     if not (np.isfinite(light).all() and light.min() > 0):
         raise InputError(f"the illuminant is {light.tolist()}, expected three numbers above 0; correct it")
     # Channels are balanced with green unchanged. Then all channels are clipped at the lowest balanced saturation, so
-    # that clipped skies become white and not pink (dcraw -H 0). Without a saturation level, they stay pink.
+    # that clipped skies become white (dcraw -H 0). Without a saturation level, clipped skies are pink.
     linear: npt.NDArray[np.float64] = np.asarray(image, dtype=np.float64) * (light[1] / light)
     if saturation is not None:
         linear = np.minimum(linear, saturation * float((light[1] / light).min()))
     if matrix is not None:
-        # White is the same before and after the matrix.
+        # The matrix does not change white.
         linear = np.asarray(linear @ np.linalg.inv(matrix.rows).T, dtype=np.float64)
     usable = linear.reshape(-1, 3) if mask is None else linear[~mask]
     white = float(np.percentile(usable, WHITE_PERCENTILE, axis=0).max()) if len(usable) else 0.0

@@ -32,8 +32,9 @@ class PublishedRow:
 Cell = tuple[str, str, str]  # Scenes, sensor and illuminants of a data set of table 1
 
 # Table 1, by data set and method in the order of the paper. C1 is the Canon 1Ds Mark III of the NUS data set.
-# Section 4.1 calls the errors reproduction errors. This cannot be true for all: the largest possible reproduction error
-# is arccos(1/√3) = 54.74°, but one worst 25 % is 59.80°. The commands therefore report both kinds of error.
+# Section 4.1 calls the errors reproduction errors. This cannot be true for all numbers: the largest possible
+# reproduction error is arccos(1/√3) = 54.74°, but one worst 25 % is 59.80°. The commands therefore report both kinds of
+# error.
 TABLE1: Final[Mapping[Cell, Mapping[str, PublishedRow]]] = {
     ("C1", "6D", "C1"): {
         "White-Patch": PublishedRow(2.61, 2.59, 2.50, 1.03, 4.38, 2.38),
@@ -95,14 +96,14 @@ def is_c1(images: Sequence[str]) -> bool:
     return len(images) == len(stems) == _C1_IMAGES and all(_C1_NAME.fullmatch(stem) for stem in stems)
 
 
-def cell_name(name: str, images: Sequence[str]) -> str:
-    """Return the name of pictures or illuminants in table 1.
+def name_in_table1(name: str, images: Sequence[str]) -> str:
+    """Return the name of a set of pictures or of ground truths for table 1.
 
     Images of C1 get the name C1. Other images with the name C1 or Random get this name in quotes.
 
     Examples
     --------
-    >>> cell_name("600D", ["Canon600D_0001"]), cell_name("C1", ["a"]), cell_name("Random", ["a"])
+    >>> name_in_table1("600D", ["Canon600D_0001"]), name_in_table1("C1", ["a"]), name_in_table1("Random", ["a"])
     ('600D', '"C1"', '"Random"')
     """
     if is_c1(images):

@@ -24,7 +24,7 @@ from evaluation.experiments.paper.table1 import (
     block_title,
     joint_table,
     noise_table,
-    print_table,
+    printed_colours_table,
     size_table,
 )
 from evaluation.metrics import ErrorKind
@@ -206,21 +206,21 @@ def table1_report(
 ) -> PaperReport:
     """Return the report of table 1 with both kinds of error, `metric` first; `sizes` may be empty."""
     other_metric: ErrorKind = "recovery" if metric == "reproduction" else "reproduction"
-    tables_one, tables_two = ([block_table(block, name) for block in blocks] for name in (metric, other_metric))
-    noise, colours = noise_table(luts), print_table(luts)
+    first_tables, second_tables = ([block_table(block, name) for block in blocks] for name in (metric, other_metric))
+    noise, colours = noise_table(luts), printed_colours_table(luts)
     files = {
         "table1.csv": table_to_csv(joint_table(blocks)).encode(),
-        "table1.tex": tables_to_latex(_TABLE1_TEXT.format(metric=metric), tables_one).encode(),
-        f"table1_{other_metric}.tex": tables_to_latex(_TABLE1_TEXT.format(metric=other_metric), tables_two).encode(),
+        "table1.tex": tables_to_latex(_TABLE1_TEXT.format(metric=metric), first_tables).encode(),
+        f"table1_{other_metric}.tex": tables_to_latex(_TABLE1_TEXT.format(metric=other_metric), second_tables).encode(),
         "noise.csv": table_to_csv(noise).encode(),
         "print.csv": table_to_csv(colours).encode(),
     }
     elements = [
         *map(pages.paragraph, conditions),
         pages.heading(f"{metric.capitalize()} error, degrees"),
-        *map(table_part, tables_one),
+        *map(table_part, first_tables),
     ]
-    tables = [*tables_one, noise, colours]
+    tables = [*first_tables, noise, colours]
     if sizes:
         size_plot = draw_svg(_draw_sizes, sizes, "White-Patch", inches=(7.6, 4.8))
         table = size_table(sizes)
@@ -229,7 +229,7 @@ def table1_report(
         caption = "White-Patch uses the largest values. They increase with the number of pixels, because of noise."
         elements += [pages.heading("Images of other sizes"), pages.figure(size_plot, caption), table_part(table)]
     elements += [pages.heading("Look-up tables"), table_part(noise), table_part(colours)]
-    elements += [pages.heading(f"{other_metric.capitalize()} error, degrees"), *map(table_part, tables_two)]
+    elements += [pages.heading(f"{other_metric.capitalize()} error, degrees"), *map(table_part, second_tables)]
     return PaperReport("Table 1: methods on generated data sets", tuple(tables), tuple(elements), files)
 
 

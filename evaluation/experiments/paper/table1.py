@@ -41,18 +41,19 @@ if TYPE_CHECKING:
     from generator import Lut
 
 
-# Colour temperature of the illuminant in `print_table`, K. It is close to the white balance of usual pictures.
+# Colour temperature of the illuminant in `printed_colours_table`, K: close to the white balance of usual pictures.
 DAYLIGHT_K: Final = 5600.0
 
 
 def noise_table(luts: Sequence[Lut]) -> Table:
     """Return level and noise of the white patch in LUTs, percent. They determine the errors of White-Patch.
 
-    Values are medians over the illuminants. Level: mean of the brightest channel / saturation level. Spread: standard
-    deviation of the samples / mean. Largest sample: largest sample / mean, minus 1.
+    Values are medians over the illuminants. Level: mean of the brightest channel, relative to the saturation level.
+    Spread: standard deviation of the samples, relative to their mean. Largest sample: its excess over the mean,
+    relative to the mean.
     """
     # The paper's White-Patch errors with the 550D (means of 9 to 26°) are too large to be caused by noise. A hot
-    # photosite could cause them, because it can exceed every white of its channel. `sim table --hot` simulates hot
+    # photosite could cause them, because its value can be larger than those of white. `sim table --hot` simulates hot
     # photosites.
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:
@@ -70,7 +71,7 @@ def noise_table(luts: Sequence[Lut]) -> Table:
     )
 
 
-def print_table(luts: Sequence[Lut]) -> Table:
+def printed_colours_table(luts: Sequence[Lut]) -> Table:
     """Return mean and root mean square of all colours of prints, for the errors of Gray-world and Shades-of-Gray.
 
     Values are percent of white, and an angle from grey. The illuminant is the one with the colour temperature nearest
@@ -100,11 +101,11 @@ METHODS: Final = ("white-patch", "gray-world", "shades-of-gray")
 # Default longest side of an image, px. White-Patch uses the largest of noisy values, so its error grows with the side.
 SIDE: Final = 512
 
-# Largest number of images in the study of image sizes. It is sufficient to show how medians depend on size. More images
-# would take long, because all are rendered again for each size.
+# Largest number of images in the study of image sizes. It suffices to show how medians depend on size. All images are
+# rendered again for each size, which takes long.
 MAX_STUDIED: Final = 64
 
-# Name of the sensor in the paper, by camera name in a LUT.
+# Names of cameras in the paper, by their names in LUTs.
 SENSORS: Final[Mapping[str, str]] = {"Canon EOS 550D": "550D", "Canon EOS 6D Mark II": "6D"}
 
 # Names of pictures and of ground truths if the paper has no numbers for them.
@@ -116,7 +117,7 @@ _BLOCK_COLUMNS: Final = ("scenes", "sensor", "illuminations", "images", "method"
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One of the eight data sets, with the results of the methods."""
+    """One of the eight data sets, a block of table 1, with the results of the methods."""
 
     # Scenes, sensor and illuminants as in the paper: ``("C1", "6D", "Random")``. This is the key of published numbers,
     # so other scenes and illuminants must have other names.
@@ -131,7 +132,7 @@ def sensor_of(lut: Lut) -> str:
     return SENSORS.get(lut.provenance.camera, lut.provenance.camera)
 
 
-def settings(
+def plan_blocks(
     luts: Sequence[Lut],
     pictures: Sequence[Source],
     truths: npt.NDArray[np.float64],
@@ -179,7 +180,7 @@ def evenly_spaced(items: Sequence[_Item], max_count: int = MAX_STUDIED) -> Seque
 
 
 def table1(blocks: Sequence[Block], workers: int = 1, on_scene: Callable[[], None] | None = None) -> tuple[Block, ...]:
-    """Return the data sets with the results of the methods."""
+    """Run the methods on the data sets, and return the data sets with the results."""
     methods = [standard_methods()[name] for name in METHODS]
     return tuple(replace(block, results=evaluate(block.scenes, methods, workers, on_scene)) for block in blocks)
 
@@ -249,11 +250,11 @@ def size_dependence(
 ) -> tuple[SizeRow, ...]:
     """Return median reproduction errors for several image sizes; at most `MAX_STUDIED` pictures are used.
 
-    `truths`: as in `settings`. `sides`: longest sides of the images, px.
+    `truths`: as in `plan_blocks`. `sides`: longest sides of the images, px.
     """
     rows: list[SizeRow] = []
     for side in sides:
-        for block in table1(settings(luts, evenly_spaced(pictures), truths, side, seed, names), workers):
+        for block in table1(plan_blocks(luts, evenly_spaced(pictures), truths, side, seed, names), workers):
             medians = {result.method: result.summary("reproduction").median for result in block.results}
             rows.append(SizeRow(block.cell, side, medians))
     return tuple(rows)

@@ -150,15 +150,15 @@ def _spread(seeds: Sequence[ErrorSample]) -> tuple[float, ...] | None:
     return tuple(float(deviation) for deviation in deviations)
 
 
-# All statistics, because a single statistic can mislead.
+# Tables have all statistics, because a single statistic can mislead.
 STATISTIC_HEADS: Final = ERROR_COLUMNS[1:]
 
 
 def errors_table(figures: TransferFigures, name: str, images: int) -> Table:
-    """Return the statistics of all rows without `real_use`; with several seeds, their means."""
+    """Return the statistics of all rows without N real images; with several seeds, their means."""
     unadapted = [row for row in figures.rows if not row.row.real_use]
     seeds = max(len(row.row.results) for row in figures.rows)
-    # Student's interval of a mean over seeds; the first three columns are texts.
+    # Student's interval of a mean over seeds. The statistics begin in column 3.
     margins = {
         (number, column): float(stats.t.ppf((1 + LEVEL) / 2, seeds - 1)) * deviation / math.sqrt(seeds)
         for number, row in enumerate(unadapted)
@@ -182,7 +182,7 @@ def errors_table(figures: TransferFigures, name: str, images: int) -> Table:
 
 
 def intervals_table(figures: TransferFigures, name: str) -> Table:
-    """Return the confidence intervals of the statistics in `errors_table`."""
+    """Return the confidence intervals over test images of the statistics in `errors_table`."""
     return Table(
         f"{name}: {LEVEL * 100:.0f} % intervals of the {figures.error} angular error, degrees",
         ("Method", "Trained on", "Images", *STATISTIC_HEADS),
@@ -260,8 +260,9 @@ def adaptation_table(figures: TransferFigures, name: str) -> Table | None:
         ("Method", "Set", "N", "N alone", "Set alone", "Adapted", "Adapted / better alone"),
         tuple(rows),
         notes=(
-            "N: number of real images, from the other folds. Adapted: trained on the set, then adapted to these N "
-            "images. All statistics are in results.csv.",
+            "N: number of real images, from the other folds. N alone: trained on these images. Set alone: trained on "
+            "the set. Adapted: trained on the set, then adapted to these images. The last column divides this error by "
+            "the smaller of the other two. All statistics are in results.csv.",
         ),
     )
 
@@ -309,7 +310,7 @@ def long_table(figures: TransferFigures) -> Table:
     return Table("All numbers", _LONG_COLUMNS, tuple(rows))
 
 
-# Columns of results.csv; empty if a row has no such number.
+# Columns of results.csv; `way` is the use of real images. Fields are empty for numbers that a row does not have.
 _LONG_COLUMNS: Final = (
     *("method", "training", "data", "images", "seeds", "error", "statistic"),
     *("degrees", "low", "high", "seed_sd", "ratio_to_real", "ratio_low", "ratio_high"),
@@ -377,7 +378,7 @@ def _draw_panels(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, B
         axes.set(title=method, xlabel="real images")
     grid[0].set_ylabel(f"mean {error} error, degrees")
     handles, names = grid[0].get_legend_handles_labels()
-    # Names are long, so two columns need the width of two panels.
+    # Names of methods and sets are long, so each column of the legend needs the width of a panel.
     columns = min(2, len(panels))
     labelled = [legend_label(name) for name in names]
     figure.legend(handles, labelled, loc="outside lower center", ncols=columns, fontsize=8)

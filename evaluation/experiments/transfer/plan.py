@@ -207,7 +207,7 @@ def naive_image(
     """
     linear = _LINEAR_OF_CODE[codes]
     if matrix is not None:
-        # Colours outside the camera's gamut are negative.
+        # The matrix gives negative values for colours outside the camera's gamut.
         linear = np.maximum(linear @ matrix.T, 0)
     return np.clip(np.rint(linear * light), 0, np.floor(saturation)).astype(np.uint16)
 
@@ -237,7 +237,7 @@ class NaiveScene:
 
     @cached_property
     def whites(self) -> npt.NDArray[np.float64]:
-        """Illuminants (K, 3) float64 of the image, in counts of the white reference of the LUT."""
+        """Camera RGB (K, 3) float64 of the LUT's white reference under each illuminant of the image, counts."""
         entry, description = self.generated.entry, self.generated.dataset.description
         levels = {light.illumination: sum(light.white) for light in description.lights}
         whites: list[npt.NDArray[np.float64]] = []
@@ -315,7 +315,7 @@ class RelitScene:
 
 
 def relit_scenes(scenes: Sequence[Scene], lights: Sequence[npt.NDArray[np.float64]]) -> tuple[RelitScene, ...]:
-    """Return one relit scene for each illuminant (3,) float64; all scenes are used about equally often."""
+    """Return one relit scene for each illuminant (3,) float64; each scene is used about equally often."""
     random = np.random.default_rng(0)
     rounds = [random.permutation(len(scenes)) for _ in range(-(-len(lights) // len(scenes)))]
     scene_indices: list[int] = np.concatenate(rounds)[: len(lights)].tolist()
@@ -336,7 +336,7 @@ class TransferPlan:
 
 
 def is_generated(scene_set: SceneSet) -> bool:
-    """Return True if images of the set were made by `generate`."""
+    """Return True if any image of the set was made by `generate`."""
     return any(isinstance(scene, GeneratedScene) for scene in scene_set.scenes)
 
 
@@ -404,7 +404,7 @@ def _with_naive(name: str, images: Sequence[GeneratedScene], folder: Path | str,
     """Return the generated images with a picture in the folder, and their naive counterparts."""
     dataset = images[0].dataset
     if dataset.description.options.get("variation", {}).get("gradient"):
-        # Counterparts have one brightness for the whole image.
+        # Naive images have the same brightness everywhere.
         raise InputError(f"{name} was made with a gradient, expected none for naive images; omit --naive")
     found_pictures, missing = find_source_pictures(dataset, folder)
     with_picture = tuple(scene for scene in images if scene.entry.source in found_pictures)

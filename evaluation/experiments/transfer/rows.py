@@ -1,8 +1,8 @@
 """Train on one data set, test on another: one row of results for each method and each kind of training.
 
-A method can also use N real images. It is trained on these images alone, or it is trained on a set and then adapted to
-these images. For each fold of the test set, the N images are drawn from the other folds, so no model is tested on its
-training images. The images of a smaller N are a subset of the images of a larger N.
+A method can also use N real images. It is trained on these images alone, or on another training set and then adapted
+to these images. For each fold of the test set, the N images are drawn from the other folds, so no model is tested on
+its training images. The images of a smaller N are a subset of the images of a larger N.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from foundation.errors import InputError
 # - none: no training.
 Training = Literal["cross-validation", "generated", "naive", "naive with matrix", "relit", "other", "real", "none"]
 
-# Use of N real images: none; training on them alone; adaptation to them after training on a set.
+# Use of N real images: no use; training on them alone; adaptation to them after training on another set.
 RealUse = Literal["", "alone", "adapted"]
 
 NAIVE: Final[tuple[Training, ...]] = ("naive", "naive with matrix")  # Both naive baselines
@@ -165,7 +165,7 @@ def transfer(
         raise InputError(f"{len(learners)} learned methods and {len(folds)} seeds, expected one each; add some")
     for seed_folds in folds:
         require_groups_together(test, seed_folds)
-    # All inputs are checked before the first image is read.
+    # The number of images is checked before the first image is read.
     indices_by_set = [_drawn_indices(train_set, len(folds), images) for train_set in training]
     tests = collect_material(test, learners, side, workers, on_scene)
     subsets = _RealSubsets(tests, folds)
@@ -177,7 +177,7 @@ def transfer(
         # The constant illuminant uses no image content, so it has no rows with N real images.
         for count in () if isinstance(learner, ConstantLight) else real_counts:
             # Training on all images of the other folds is cross-validation.
-            results = crossed if count is None else subsets.results(number, learner, count, subsets.alone)
+            results = crossed if count is None else subsets.results(number, learner, count, subsets.fit_alone)
             label = _count_label(count)
             entries.append(TransferRow(learner.name, "real", generated_name, count or fewest, results, "alone", label))
     for train_set, seed_indices in zip(training, indices_by_set, strict=True):
@@ -187,7 +187,7 @@ def transfer(
         material = collect_material(scenes, learners, side, workers, on_scene)
         positions = [np.searchsorted(used_indices, indices).astype(np.int64) for indices in seed_indices]
         for number, learner in enumerate(learners):
-            # Naive counterparts have the illuminants of the generated set, so the row would be the same.
+            # Naive counterparts have the illuminants of the generated set, so its row would be repeated.
             if isinstance(learner, ConstantLight) and train_set.kind in NAIVE:
                 continue
             fitted = [fit_on(learner, number, material, indices, seed) for seed, indices in enumerate(positions)]
@@ -200,7 +200,7 @@ def transfer(
             if not isinstance(learner, FeatureLearner) or isinstance(learner, ConstantLight):
                 continue
             for count in real_counts:
-                results = subsets.results(number, learner, count, partial(subsets.adapted, fitted))
+                results = subsets.results(number, learner, count, partial(subsets.fit_adapted, fitted))
                 entries.append(replace(row, results=results, real_use="adapted", real=_count_label(count)))
     rows = [entry for learner in learners for entry in entries if entry.method == learner.name]
     if methods:
@@ -219,20 +219,20 @@ class _RealSubsets:
 
     - `tests`: material of the test images.
     - `folds`: for each seed the fold of each image, (N,) int64.
-    - `learned`: models trained on N images alone, by learner, seed and images; all training sets use them.
+    - `local_fits`: models trained on N images alone, by learner, seed and images; every training set needs them.
     """
 
     tests: Material
     folds: Sequence[npt.NDArray[np.int64]]
-    learned: dict[tuple[int, int, bytes], LocalFit] = field(default_factory=dict)
+    local_fits: dict[tuple[int, int, bytes], LocalFit] = field(default_factory=dict)
 
     @property
     def min_images(self) -> int:
-        """Number of images of the smallest training part."""
+        """Smallest number of images outside a fold, of all folds and seeds."""
         return min(len(seed_folds) - int(np.bincount(seed_folds).max()) for seed_folds in self.folds)
 
     def results(self, number: int, learner: AnyLearner, real: int | None, fit: _Fit) -> tuple[Result, ...]:
-        """Return one result for each seed; each fold is estimated by a model of `real` images from the other folds."""
+        """Return a result for each seed; the model that estimates a fold uses `real` images of the other folds."""
         results: list[Result] = []
         for seed, folds in enumerate(self.folds):
             order = np.random.default_rng(seed).permutation(len(folds))
@@ -247,28 +247,28 @@ class _RealSubsets:
             results.append(result_of(learner.name, ordered, self.tests.truths))
         return tuple(results)
 
-    def alone(self, learner: AnyLearner, number: int, indices: Indices, seed: int) -> Method:
+    def fit_alone(self, learner: AnyLearner, number: int, indices: Indices, seed: int) -> Method:
         """Return the method fitted to real images alone, with indices (N,) int64."""
         if isinstance(learner, FeatureLearner):
-            return self._learned(learner, number, indices, seed).method
+            return self._fit_local_once(learner, number, indices, seed).method
         return fit_on(learner, number, self.tests, indices, seed)
 
-    def adapted(
+    def fit_adapted(
         self, fitted: Sequence[Method], learner: AnyLearner, number: int, indices: Indices, seed: int
     ) -> LearnedMethod:
-        """Return the method fitted to a set with this seed, adapted to real images with indices (N,) int64."""
+        """Return the method of `fitted` for this seed, adapted to real images with indices (N,) int64."""
         method = fitted[seed]
         if not isinstance(learner, FeatureLearner) or not isinstance(method, LearnedMethod):
             raise TypeError(f"{learner.name} cannot be adapted, expected a method with features")
-        return adapt(method, self._learned(learner, number, indices, seed))
+        return adapt(method, self._fit_local_once(learner, number, indices, seed))
 
-    def _learned(self, learner: FeatureLearner, number: int, indices: Indices, seed: int) -> LocalFit:
+    def _fit_local_once(self, learner: FeatureLearner, number: int, indices: Indices, seed: int) -> LocalFit:
         key = number, seed, indices.tobytes()
-        if key not in self.learned:
+        if key not in self.local_fits:
             features = self.tests.features[number]
             drawn_features = [] if features is None else [features[int(index)] for index in indices]
-            self.learned[key] = fit_local(learner, drawn_features, self.tests.truths[indices], seed)
-        return self.learned[key]
+            self.local_fits[key] = fit_local(learner, drawn_features, self.tests.truths[indices], seed)
+        return self.local_fits[key]
 
 
 def _count_label(count: int | None) -> str:

@@ -118,7 +118,7 @@ def test_interval_is_reproducible_for_any_batch_size(monkeypatch: pytest.MonkeyP
     first = intervals(errors, seed=4)
     assert intervals(errors, seed=4) == first
     assert intervals(errors, seed=5) != first
-    monkeypatch.setattr("evaluation.experiments.bootstrap._COUNTS_AT_ONCE", 1)
+    monkeypatch.setattr("evaluation.experiments.bootstrap._MAX_ELEMENTS", 1)
     for name, ends in intervals(errors, seed=4).items():
         assert ends == pytest.approx(first[name], rel=1e-12)
 

@@ -9,8 +9,8 @@ from evaluation.experiments.paper.published import TABLE1
 from evaluation.experiments.paper.table1 import (
     Block,
     noise_table,
-    print_table,
-    settings,
+    plan_blocks,
+    printed_colours_table,
     table1,
     table2,
 )
@@ -35,7 +35,7 @@ def test_noise_of_print_white(make_table: TableMaker) -> None:
 
 
 def test_print_of_codes_is_grey(make_table: TableMaker) -> None:
-    mean, rms = print_table([make_table("Test")]).rows
+    mean, rms = printed_colours_table([make_table("Test")]).rows
     # Of the black bodies of 3002 and 3003 K the second is nearer to daylight. The codes are 0, 1/7 … 1.
     assert mean[:3] == ("Test", 3, "mean")
     assert rms[:3] == ("Test", 3, "root mean square")
@@ -49,7 +49,7 @@ SIX_D, FIVE_FIFTY_D = "Canon EOS 6D Mark II", "Canon EOS 550D"
 
 def small(make_table: TableMaker, noise: tuple[float, float] = (0.0, 0.0)) -> tuple[Block, ...]:
     luts = [make_table(SIX_D, noise[0]), make_table(FIVE_FIFTY_D, noise[1])]
-    return settings(luts, PICTURES, TRUTHS, side=48, seed=3, names=("C1", "C1"))
+    return plan_blocks(luts, PICTURES, TRUTHS, side=48, seed=3, names=("C1", "C1"))
 
 
 def test_data_sets_are_in_paper_order(make_table: TableMaker) -> None:
