@@ -80,5 +80,5 @@ _OTHER_NAMES = {
 
 @pytest.mark.parametrize("tag", TiffTag)
 def test_tags_have_the_codes_of_the_registry(tag: TiffTag) -> None:
-    registered = str(tifffile.TIFF.TAGS.get(tag.value))
+    registered = tifffile.TIFF.TAGS[int(tag)]
     assert _OTHER_NAMES.get(registered, registered).replace("_", "").lower() == tag.name.replace("_", "").lower()
