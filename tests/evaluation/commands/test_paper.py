@@ -68,7 +68,7 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
     arguments = ("--generated", str(generated_set), "--method", "smart-color-cat", "--out", str(out))
     assert main(["paper", "table2", str(thumbnails), *arguments]) == 0
     printed = capsys.readouterr().out
-    assert "The paper's table is for Cube+" in printed
+    assert "The published errors are for Cube+" in printed
     real, generated = (rows_of(out / f"trained_on_{name}.csv") for name in ("real", "generated"))
     (ratio,) = rows_of(out / "ratios.csv")
     assert float(ratio["Ratio"]) == pytest.approx(float(generated[0]["Med."]) / float(real[0]["Med."]))
