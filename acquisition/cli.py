@@ -42,7 +42,7 @@ class Arrangement(Enum):
     """Arrangement of the colours on the sheet."""
 
     TAGGED = "tagged"
-    PAPER = "paper"
+    PUBLISHED = "paper"
 
 
 class Rig(Enum):
@@ -66,7 +66,7 @@ def init(
     page: Annotated[str | None, typer.Option(help="Sheet of the new chart, as in acquire chart.")] = None,
     existing_chart: Annotated[
         Path | None,
-        option("CHART", "Use this chart, a folder of acquire chart or its chart.json; none is made.", "--chart"),
+        option("CHART", "Existing chart to use instead of a new one: its chart.json, or the folder.", "--chart"),
     ] = None,
 ) -> None:
     """Create a lab: a commented LAB.toml, the chart to print and the 707 illuminants.
@@ -95,7 +95,7 @@ def init(
     text = files("acquisition").joinpath("data", f"{rig.value}.toml").read_text("utf-8")
     location = chart_file.resolve()
     inside = location.is_relative_to(lab.resolve())
-    # JSON writes a text like TOML.
+    # JSON and TOML quote strings in the same way.
     chart_text = json.dumps(
         (location.relative_to(lab.resolve()) if inside else location).as_posix(), ensure_ascii=False
     )
@@ -137,7 +137,7 @@ def chart(
     from experiment.chart.proof import save_instructions, save_proof
     from experiment.framing.finding import small_parts_warning
 
-    design = paper_chart(_page(page), bits) if arrangement is Arrangement.PAPER else design_chart(bits, _page(page))
+    design = paper_chart(_page(page), bits) if arrangement is Arrangement.PUBLISHED else design_chart(bits, _page(page))
     with atomic_folder(out, "the chart") as folder:
         save_preview(design, folder / "preview.png")
         save_pdf(design, folder / "chart.pdf")

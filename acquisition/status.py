@@ -17,18 +17,18 @@ LAST = 5  # Number of the newest verdicts, and of the newest events, that are sh
 
 
 # Text after a value that is beyond its limits, if the check did not refuse the frame.
-BEYOND = " (beyond its limit, but accepted, or explained by another cause)"
+BEYOND = " (beyond its limit, but not a reason for refusal)"
 
 # Meanings of the checks of docs/reference/judge.md.
 MEANINGS = {
-    "data": "share of photosites without counts",
+    "data": "share of photosites with counts below half of the black level",
     "clipping": "share of clipped photosites",
     "exposure": "level of the brightest photosites, share of saturation",
     "chart": "number of detected tags, or of white references if the chart has no tags",
     "repeated": "share of the noise that is not in an earlier frame; 0 if the camera sent a frame twice",
     "movement": "distance of the chart from its rest position",
     "blur": "blur compared with the first white frame",
-    "rows": "number of strips (quarters of a row) with unexpected content",
+    "rows": "number of strips with unexpected content; a strip is a quarter of a row of 2×2 blocks",
     "uniformity": "largest deviation of a region of the frame from the rest",
     "off_codes_deg": "angle between ordered and measured illuminant",
     "off_brightness": "brightness relative to the prediction from earlier frames",
@@ -63,7 +63,7 @@ def status_lines(view: SessionView, now: datetime) -> list[str]:
     ]
     if (drift := _white_drift(view)) is not None:
         lines.append(f"white       {drift:+.2%} since the first white frame")
-    lines += _block("doubts", doubts_of(view.events))
+    lines += _block("warnings", doubts_of(view.events))
     lines += _block("last measured", [check_text(check) for check in _newest_checks(view).values()])
     judged = [attempt for attempt in view.attempts if attempt.verdict is not None]
     lines += _block("last verdicts", [_verdict_text(attempt) for attempt in judged[-LAST:]])
@@ -101,7 +101,7 @@ def _remaining_text(head: Head) -> str:
     if head.done == head.total:
         return "none"
     if not head.alive:
-        reason = "this is a copy without a run" if head.state == "copy" else "no run is active"
+        reason = "no run is active in this copy" if head.state == "copy" else "no run is active"
         return f"{counted(head.total - head.done, 'frame')}; {reason}"
     ready = f", ready at {head.eta.astimezone():%H:%M}" if head.eta is not None else ""
     return f"{duration_text(head.remaining_s)}{ready}"
@@ -109,12 +109,12 @@ def _remaining_text(head: Head) -> str:
 
 def _white_drift(view: SessionView) -> float | None:
     white_steps = {step.number for step in view.steps if step.kind == "white"}
-    rgb = [
+    whites = [
         attempt.seen
         for attempt in view.attempts
         if attempt.step in white_steps and attempt.verdict == ACCEPTED and attempt.seen is not None
     ]
-    return sum(rgb[-1]) / sum(rgb[0]) - 1 if len(rgb) > 1 and sum(rgb[0]) > 0 else None
+    return sum(whites[-1]) / sum(whites[0]) - 1 if len(whites) > 1 and sum(whites[0]) > 0 else None
 
 
 def _newest_checks(view: SessionView) -> Mapping[str, Check]:

@@ -76,9 +76,9 @@ def srgb_codes(linear: npt.ArrayLike) -> npt.NDArray[np.uint8]:
 
 
 def fit_white_matrix(linear: _Array, responses: _Array) -> _Array:
-    """Return the matrix (3, 3) with rows of sum 1 from linear sRGB (N, 3) to responses (N, 3), 1 for white.
+    """Return the matrix (3, 3) that maps linear sRGB (N, 3) to responses (N, 3). White is 1 in all channels of both.
 
-    For a response a, least squares fit a - G = c_r (R - G) + c_b (B - G), which makes the sums of rows 1.
+    For a response a, least squares fit a - G = c_r (R - G) + c_b (B - G), so every row sums to 1.
     """
     differences, green = linear[:, [0, 2]] - linear[:, [1]], linear[:, [1]]
     coefficients = np.asarray(np.linalg.lstsq(differences, responses - green, rcond=None)[0], np.float64).T

@@ -2,8 +2,9 @@
 
 The same camera, illuminants, settings and seed give the same bytes with any number of threads. Computed frames are
 evaluated like photographs in `calibration.pipeline.measuring`: the black level is subtracted, flat field and white are
-measured on the white references, and samples are divided by the flat field of their patch colour. Therefore the ground
-truth has the same kinds of errors as in a LUT from photographs.
+measured on the white references, and samples are divided by the flat field. The primaries of a projector have different
+flat fields, so the divisor depends on the colour of the patch. Therefore the ground truth has the same kinds of errors
+as in a LUT from photographs.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class ComputedFrame:
     share_at_zero: float  # Share of samples that are 0
     highest: npt.NDArray[np.uint16]  # (C,), highest raw count of each patch
     black: _Array  # (2, 2) float64, subtracted black level in counts
-    paper: Paper  # Flat field, ground truth and its standard error
+    paper: Paper  # Measurements on bare paper: flat field, ground truth and its standard error
     greys: _Array  # (G, 3) float64, counts of each grey level, divided by the flat field
     grey_errors: _Array  # (G, 3) float64, their standard errors
 

@@ -32,10 +32,10 @@ def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:
     from matplotlib.figure import Figure
 
     lines = _verdict_lines(report)
-    frame_in, text_in = 10.2, 0.19 * len(lines) + 0.3
-    figure: Any = Figure(figsize=(15, frame_in + text_in), layout="constrained")
+    frame_inches, text_inches = 10.2, 0.19 * len(lines) + 0.3
+    figure: Any = Figure(figsize=(15, frame_inches + text_inches), layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(3, 2, height_ratios=[frame_in / 2, frame_in / 2, text_in])
+    grid = figure.add_gridspec(3, 2, height_ratios=[frame_inches / 2, frame_inches / 2, text_inches])
     _draw_frame(figure.add_subplot(grid[0, 0]), trial, chart)
     map_axes = [figure.add_subplot(grid[position]) for position in ((0, 1), (1, 0), (1, 1))]
     if trial.table is None:
@@ -127,5 +127,5 @@ def _draw_print(axes: Any, table: TableMeasurements, chart: Chart) -> None:
     )
     stained = points[stains.stained]
     axes.scatter(stained[:, 0], stained[:, 1], s=2 * size, facecolors="none", edgecolors="#d400ff", linewidths=1)
-    axes.figure.colorbar(marks, ax=axes, shrink=0.8, label="measured over expected, %")
+    axes.figure.colorbar(marks, ax=axes, shrink=0.8, label="deviation from the prediction, %")
     _page(axes, chart, "print: surroundings of patches, deviation from their printed colours")

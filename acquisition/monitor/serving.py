@@ -42,7 +42,7 @@ class MonitorServer(LocalServer):
         return self.watch.head().state != "absent"
 
     def answer(self, request: Request) -> Response | Refusal:
-        """Return the page, the changes since the cursor of the page, the summary, or the preview of an attempt."""
+        """Return the page, the changes since its last update, the summary, or the preview of an attempt."""
         match request.path:
             case "":
                 text, policy = self.page

@@ -239,11 +239,12 @@ def _is_lit(projector: Projector) -> bool:
 
 
 def _warm_up(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> None:
-    while sequence.warm_up_s and not _stayed_lit(projector, sequence, retry):
+    while sequence.warm_up_s and not _wait_for_warm_up(projector, sequence, retry):
         pass
 
 
-def _stayed_lit(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> bool:
+def _wait_for_warm_up(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> bool:
+    """Return False if the lamp went out during the wait."""
     until = retry.clock.monotonic() + sequence.warm_up_s
     wait = duration_text(sequence.warm_up_s)
     retry.report("warming up", f"the lamp was just switched on; the run waits {wait} until its colour is steady")
@@ -335,7 +336,7 @@ class Devices:
 
 
 @dataclass(frozen=True)
-class LightNotShown:
+class DryRunPresenter:
     """Presenter of a dry run, which shows nothing.
 
     `display_texts`: warnings about the display, which are known although nothing is shown.
@@ -445,12 +446,12 @@ def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> No
 # Time before the second try, s. Many disturbances are shorter, for example a notification over the picture.
 RETRY_S: Final = 1.0
 PAUSE_S: Final = 5.0  # Interval between two tries in a pause, s
-# If the first try takes longer than this, s, its driver has already tried several times, and the pause starts at once.
+# Limit for the first try, s. If the try takes longer, its driver has already repeated it, and the pause starts at once.
 SLOW_S: Final = 10.0
 # Longest time between two signs of life during a try, s. A camera driver may wait several minutes for a long exposure.
 TRY_S: Final = 300.0
-# If fewer frames are accepted between two pauses for the same device, the durations of the pauses are added. Their sum
-# is compared with the time limit, so that an intermittent fault also ends a run.
+# If fewer accepted frames than this lie between two pauses for the same device, the durations of the pauses are added.
+# The sum is compared with the time limit, so that an intermittent fault also ends a run.
 RECURS_WITHIN: Final = 10
 # Time between the second and the third try of a refused frame, s. Each later interval is twice the previous interval.
 BACK_OFF_S: Final = 5.0
@@ -526,7 +527,7 @@ class RetryPolicy:
                 return result
 
     def pause(self, name: str, *, idle: bool = True) -> Pause:
-        """Return the pause for `name`; parameters as in `attempt`."""
+        """Return the pause for the device or disk `name`. `idle`: whether waits call the `idle` of this policy."""
         return Pause(self, name, idle, self._histories.setdefault(name, _History()))
 
     def report(self, event: str, sentence: str) -> None:
@@ -677,7 +678,7 @@ def _general_class(fault: CropError) -> type[CropError]:
 
 TICK_S: Final = 1.0  # Interval between two checks of the time, s
 
-# If a check of the time is delayed by more than this, s, the program was stopped. A busy computer delays it less.
+# Longest delay of a check of the time on a busy computer, s. A longer delay means that the program was suspended.
 GAP_S: Final = 10.0
 
 # A step is late if it takes longer than this multiple of its expected duration, plus `LATE_S`.

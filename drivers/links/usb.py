@@ -192,7 +192,7 @@ class OpenUsbDevice:
         if self._closed:
             return
         self._closed = True
-        # If the device was unplugged, these calls fail, but then nothing must be released.
+        # If the device was unplugged, these calls fail, but then there is nothing to release.
         with contextlib.suppress(usb.core.USBError, NotImplementedError):
             if self._detached is not None:
                 usb.util.release_interface(self._device, self._detached)

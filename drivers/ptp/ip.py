@@ -1,8 +1,9 @@
 """PTP over a network (PTP/IP): transactions on one TCP connection, events on a second one.
 
-A packet has its length with header (32 bits), its type (32 bits), and the fields of the type. The initiator opens the
-command channel with `InitCommandRequest`. The reply `InitCommandAck` has a connection number, with which the initiator
-opens the event channel (`InitEventRequest`, reply `InitEventAck`). To refuse, the camera replies `InitFail`.
+A header of two numbers of 32 bits, the length of the packet and its type, precedes the fields of the type. The length
+includes the header. The initiator opens the command channel with `InitCommandRequest`. The reply `InitCommandAck` has a
+connection number, with which the initiator opens the event channel (`InitEventRequest`, reply `InitEventAck`). To
+refuse, the camera replies `InitFail`.
 Transactions use the command channel. Events, `Ping` and `Pong` use the event channel. There is no thread: a call that
 waits for a reply also answers the pings of the camera.
 
@@ -111,7 +112,7 @@ def _read_total(cursor: Cursor, field: str) -> int | None:
 def _read_sends_data(cursor: Cursor, _: str) -> bool:
     phase = cursor.u32("data phase")
     if phase > _DATA_OUT:
-        raise cursor.fault("data phase", "1 none or in, 2 out", phase)
+        raise cursor.fault("data phase", "1 (no data, or data to the initiator) or 2 (data to the responder)", phase)
     return phase == _DATA_OUT
 
 
@@ -403,7 +404,7 @@ EVENT_CHANNEL_S: Final = 2.0
 
 RETRY_S: Final = 0.1  # Pause between two attempts, seconds
 
-_PING_EVERY_S: Final = 1.0  # Interval at which the event channel is read during a wait, seconds
+_EVENT_READ_INTERVAL_S: Final = 1.0  # Interval at which the event channel is read during a wait, seconds
 
 # Most packets that one call reads from the event channel, because a faulty device may never stop sending.
 _MAX_PACKETS_PER_READ: Final = 1 << 17
@@ -507,7 +508,7 @@ class IpTransport(CableTransport):
         self._command.close()
 
     def cancel(self, transaction: int) -> bool:
-        """Cancel a transaction if the caller cannot take its data; return whether its end arrived."""
+        """Cancel a transaction whose data the caller cannot take; return whether its response arrived."""
         deadline = self._clock.monotonic() + _CANCEL_S
         with contextlib.suppress(LinkError, ProtocolError):
             self._event.send(Cancel(transaction), _CANCEL_S)
@@ -520,7 +521,7 @@ class IpTransport(CableTransport):
     def _next_packet(self, timeout: float) -> Packet:
         remaining = timeout
         while True:
-            wait = min(remaining, _PING_EVERY_S)
+            wait = min(remaining, _EVENT_READ_INTERVAL_S)
             try:
                 return self._command.next(wait)
             except LinkTimeout as error:
@@ -539,7 +540,7 @@ class IpTransport(CableTransport):
                     case PtpEvent() as event:
                         self._events.append(event)
                     case Ping():
-                        self._event.send(Pong(), _PING_EVERY_S)
+                        self._event.send(Pong(), _EVENT_READ_INTERVAL_S)
 
     def _connect(self, *transient: type[Exception]) -> tuple[Channel, Channel, str]:
         # A camera refuses new connections until it has detected the end of the previous one.

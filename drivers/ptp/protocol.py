@@ -381,7 +381,7 @@ TRANSIENT = (ResponseCode.DEVICE_BUSY, ResponseCode.EOS_OBJECT_NOT_READY, Respon
 
 _FIRST_PAUSE_S = 0.05  # Pause before the first repetition, seconds; later pauses double
 _LONGEST_PAUSE_S = 1.0  # Longest pause, seconds, so that a device that is ready waits at most 1 s
-# Highest session number that is tried if a device declines the transaction number, as in libgphoto2.
+# Largest session number. If OpenSession returns INVALID_TRANSACTION_ID, the next number is tried, as in libgphoto2.
 _LAST_SESSION = 8
 
 
@@ -475,7 +475,7 @@ class PtpSession:
             _log.debug("%s%s: %s", describe(Operation, operation), parameters, response_name)
             if transaction.response.ok:
                 return transaction.response.parameters, transaction.data
-            # A device that declines an operation sends no data, so `receive` gets no data twice.
+            # A device that declines an operation sends no data, so `receive` gets the data only once.
             if transaction.response.code not in TRANSIENT or not next(pauses, False):
                 raise self._declined_error(request, transaction.response.code)
 
@@ -718,7 +718,7 @@ class CableTransport(Transport, ABC):
 
     @abstractmethod
     def cancel(self, transaction: int) -> bool:
-        """Cancel a transaction if the caller cannot take its data; return whether another transaction is possible."""
+        """Cancel a transaction whose data the caller cannot take; return whether another transaction is possible."""
 
     def transact(
         self,

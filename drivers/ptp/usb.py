@@ -380,7 +380,7 @@ class UsbTransport(CableTransport):
         return max(packet_size, min(PIECE, remaining // packet_size * packet_size))
 
     def cancel(self, transaction: int) -> bool:
-        """Cancel a transaction if the caller cannot take its data; return whether another transaction is possible."""
+        """Cancel a transaction whose data the caller cannot take; return whether another transaction is possible."""
         with contextlib.suppress(LinkError, ProtocolError):
             self._pipes.control_out(ControlRequest.CANCEL, encode_cancel(transaction), _CONTROL_S)
             self._await_ready()

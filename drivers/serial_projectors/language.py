@@ -76,10 +76,10 @@ def _require_fault_part(part: str) -> str:
     return part
 
 
-Words = Annotated[str, AfterValidator(_require_ascii)]  # A text that is sent or received
-PlainWords = Annotated[Words, AfterValidator(_require_no_value)]  # A text without a value, not empty
-Texts = Annotated[tuple[PlainWords, ...], BeforeValidator(_as_tuple)]  # One text without a value, or a list of them
-Template = Annotated[Words, AfterValidator(_require_value)]  # A text with one value
+Text = Annotated[str, AfterValidator(_require_ascii)]  # A text that is sent or received
+FixedText = Annotated[Text, AfterValidator(_require_no_value)]  # A text without a value, not empty
+FixedTexts = Annotated[tuple[FixedText, ...], BeforeValidator(_as_tuple)]  # One text without a value, or a list of them
+Template = Annotated[Text, AfterValidator(_require_value)]  # A text with one value
 # One text with a value, or a list of alternatives.
 Templates = Annotated[tuple[Template, ...], BeforeValidator(_as_tuple), Field(min_length=1)]
 State = Annotated[Power, Field(strict=False)]  # A power state, by its name
@@ -102,15 +102,15 @@ class LineFormat(_Table):
     """Format of a command. `{}` is its text, and the characters after `{}` end the command."""
     answer: Template
     """Format of a reply. `{}` is its text, and the characters before `{}` may be missing."""
-    ends: Annotated[Words, Field(min_length=1)]
+    ends: Annotated[Text, Field(min_length=1)]
     """Characters that end a reply."""
-    unended: Texts = ()
+    unended: FixedTexts = ()
     """Replies that may arrive without any character of `ends`."""
     echo: bool = False
     """True if the projector may repeat a command before its reply."""
-    prompt: Words = ""
+    prompt: Text = ""
     """Text that the projector sends when it is ready for a command; empty if it sends none."""
-    wake: Words = ""
+    wake: Text = ""
     """Text that is sent first over a new connection, and has a reply; empty if none is needed."""
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 5.0
     """Longest time until a reply, seconds."""
@@ -140,9 +140,9 @@ class LineFormat(_Table):
 class Handshake(_Table):
     """First messages of a connection over TCP."""
 
-    send: Words
+    send: Text
     """Text that is sent over a new connection."""
-    answer_begins: Words
+    answer_begins: Text
     """First characters of the reply."""
     answer_length: Annotated[int, Field(ge=1, le=256)]
     """Length of the reply, bytes."""
@@ -172,12 +172,12 @@ class Network(_Table):
 class Refusals(_Table):
     """Replies that refuse a command or query."""
 
-    unknown: Texts = ()
+    unknown: FixedTexts = ()
     """Replies if the projector does not support the command."""
-    busy: Texts = ()
+    busy: FixedTexts = ()
     """Replies if it cannot execute the command now; to the power query, they mean warm-up or cooling."""
-    unclear: Texts = ()
-    """Replies with both meanings; if the projector is on, the command is not supported."""
+    unclear: FixedTexts = ()
+    """Replies that mean either `unknown` or `busy`; for an optional query, `unknown` if the projector is on."""
 
     @model_validator(mode="after")
     def _check_not_empty(self) -> Refusals:
@@ -194,7 +194,7 @@ class Refusals(_Table):
 class Question(_Table):
     """A query and its accepted replies."""
 
-    ask: PlainWords
+    ask: FixedText
     """Text of the query."""
     answer: Templates
     """Text of the reply."""
@@ -210,11 +210,11 @@ class TextQuestion(Question):
 class _Commands(_Table):
     """Commands for the two values of a setting."""
 
-    on: PlainWords
-    """Command that switches on, or mutes the image."""
-    off: PlainWords
-    """Command that switches off, or shows the image."""
-    done: Words
+    on: FixedText
+    """Command that switches the projector on (`power`) or mutes the image (`mute`)."""
+    off: FixedText
+    """Command that switches the projector off (`power`) or shows the image (`mute`)."""
+    done: Text
     """Reply to both commands. It may contain `{}` for the new state; the driver accepts any value."""
 
     @model_validator(mode="after")
@@ -224,7 +224,7 @@ class _Commands(_Table):
         return self
 
 
-class PowerWords(_Commands, Question):
+class PowerCommands(_Commands, Question):
     """Commands and replies for the power state."""
 
     states: Annotated[dict[str, State], AfterValidator(_uppercase_keys)]
@@ -235,7 +235,7 @@ class PowerWords(_Commands, Question):
     """Longest time until the reply `done`, seconds, if it is sent after switching; 0 if it is sent at once."""
 
     @model_validator(mode="after")
-    def _check_states(self) -> PowerWords:
+    def _check_states(self) -> PowerCommands:
         for required in (Power.ON, Power.STANDBY):
             if required not in self.states.values():
                 raise ValueError(f'expected a value for "{required.value}" in states')
@@ -248,10 +248,10 @@ class PowerWords(_Commands, Question):
         return next((value for value, meaning in self.states.items() if meaning is power), None)
 
 
-class MuteWords(_Commands):
+class MuteCommands(_Commands):
     """Commands and replies for the image mute."""
 
-    ask: Words = ""
+    ask: Text = ""
     """Text of the query, which requires `states`. If empty, there is no query, and the last command counts."""
     answer: Templates = (_VALUE,)
     """Text of the reply."""
@@ -261,7 +261,7 @@ class MuteWords(_Commands):
     """True if the projector may refuse a command that changes nothing; it is then not sent."""
 
     @model_validator(mode="after")
-    def _check_states(self) -> MuteWords:
+    def _check_states(self) -> MuteCommands:
         if self.ask and set(self.states.values()) != {True, False}:
             raise ValueError("ask is given: expected states with a value for true and one for false")
         if not self.ask and "answer" in self.model_fields_set:
@@ -276,7 +276,7 @@ class MuteWords(_Commands):
 class FaultWords(Question):
     """Query and replies for faults; several faults are separated by spaces."""
 
-    healthy: PlainWords
+    healthy: FixedText
     """Value that means "no fault"."""
     parts: Annotated[dict[str, Part], AfterValidator(_uppercase_keys), Field(min_length=1)]
     """Faulty component by value; a value that is not listed means "other"."""
@@ -302,7 +302,7 @@ class FaultWords(Question):
 class Unasked(_Table):
     """A message that the projector sends without a query."""
 
-    text: Words
+    text: Text
     """The message; `{}` matches any text."""
     power: State | None = None
     """Power state that the message announces."""
@@ -320,8 +320,8 @@ class Language(_Table):
     line: LineFormat
     network: Network | None = None
     refusals: Refusals
-    power: PowerWords
-    mute: MuteWords
+    power: PowerCommands
+    mute: MuteCommands
     faults: FaultWords | None = None
     lamp_hours: Question | None = None
     model: TextQuestion | None = None
@@ -432,7 +432,7 @@ def answer_parser(language: Language, sent: str = "") -> MessageParser[str]:
                 if text.startswith(word) and language.match_unasked(rest):
                     return word, data.index(word.encode("ascii"), start) + len(word)
             start = min(end_positions) + 1
-            # An echo in other capitals than the command is only recognized for queries: to pow=on, POW=ON is the reply.
+            # Only the echo of a query may differ in case, because the reply to the command pow=on is POW=ON.
             is_echo = text == sent or ("?" in sent and text.upper() == sent.upper())
             if not line.echo or not is_echo or has_echo:
                 return text, start

@@ -288,8 +288,8 @@ _LETTER_PX = 7.4  # Width of a letter at `_SCALE`, px
 
 _SCALE = 0.42  # Scale of OpenCV's font: the smallest that is easy to read
 
-# Smallest level that a preview shows at full brightness, relative to white paper. A lower level would make the noise of
-# a dark frame visible.
+# Full brightness of a preview is at least this level, relative to white paper. With a lower level, the noise of a dark
+# frame would be visible.
 _LEAST_FULL_LEVEL = 0.01
 
 

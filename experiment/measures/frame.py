@@ -150,7 +150,7 @@ class Measured:
     # `BRIGHTEST_PERCENTILE` of the counts above black, for the brightest of the four positions in a block
     brightest_dn: float
     clipped: float  # fraction of photosites close to saturation, 0 … 1
-    empty: float  # fraction of photosites without counts, 0 … 1
+    empty: float  # fraction of photosites with counts below half of the black level, 0 … 1
     camera: str  # from the file; "" if missing
     serial: str  # from the file; "" if missing
     places: FramePlaces

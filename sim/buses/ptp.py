@@ -94,7 +94,7 @@ class PtpIpService:
                     case Ping():
                         _send(channel, Pong())
                     case _:
-                        # Packets that still arrive of a cancelled transaction are ignored.
+                        # Late packets of a cancelled transaction are ignored.
                         pass
         finally:
             initiator.hang_up()

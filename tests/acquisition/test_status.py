@@ -112,7 +112,7 @@ def test_keeps_doubts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with closing(Journal.open_for_run(folder / "journal.sqlite")) as journal:
         for what in ("doubt", "doubt", *["moved"] * 10):
             journal.note(datetime.now(UTC), what, f"a {what} of the night")
-    assert "doubts:\n  a doubt of the night\nlast" in say(folder, capsys)
+    assert "warnings:\n  a doubt of the night\nlast" in say(folder, capsys)
 
 
 def test_copy_is_no_active_run(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -121,7 +121,7 @@ def test_copy_is_no_active_run(folder: Path, tmp_path: Path, capsys: pytest.Capt
     output = say(copy, capsys)
     assert f"state       copied from {folder.resolve()} at 20" in output
     assert "or later, and the run continues there; use" in output
-    assert "left        4 frames; this is a copy without a run\n" in output
+    assert "left        4 frames; no run is active in this copy\n" in output
     assert main(["status", "--json", str(copy)]) == 0
     values = json.loads(capsys.readouterr().out)
     assert (values["state"], values["alive"], values["remaining_s"]) == ("copy", False, None)

@@ -36,7 +36,7 @@ const CHECKS = {
   projector: ["Projector", "Faults that the projector reports"],
   other_camera: ["Camera", "Whether model, serial number and frame size are those of the session"],
   settings: ["Camera settings", "Whether aperture, shutter time and ISO speed are as requested"],
-  data: ["Photosites without counts", "Share of the photosites without counts, for example after a faulty download"],
+  data: ["Photosites without counts", "Share of the photosites below half of the black level, as in a damaged file"],
   repeated: ["Difference from earlier frames", "By their noise: 1 is a new exposure, 0 a file of an earlier frame"],
   clipping: ["Saturated photosites", "Share of the photosites on the chart that are saturated"],
   exposure: ["Exposure", "Brightest level on the chart, in percent of the saturation level"],
@@ -308,7 +308,7 @@ function drawChoice(frames) {
   $("checks").tBodies[0].replaceChildren(
     ...(frame.checks ?? []).map(([name, unit, value, low, high, reason]) => {
       const beyond = value !== null && ((low !== null && value < low) || (high !== null && value > high));
-      const mark = beyond && !reason ? " (beyond its limit, but accepted, or explained by another cause)" : "";
+      const mark = beyond && !reason ? " (beyond its limit, but not a reason for refusal)" : "";
       const result = value !== null ? `${withUnit(value, unit)}${mark}` : reason ? "refused" : "no fault";
       return element(
         "tr",

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from acquisition.run.devices import Devices, LightNotShown, ask_all, require_whole_turns
+from acquisition.run.devices import Devices, DryRunPresenter, ask_all, require_whole_turns
 from drivers.camera import Camera
 from drivers.canon import CanonEos
 from drivers.display.fullscreen import FullScreen, display_warnings, identify_displays, list_displays
@@ -43,7 +43,7 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, 
     """Open the camera, the projector and its display.
 
     `session`: the resumed session, after whose last frame the clock continues; None for a new session. `opens_display`:
-    whether to open the display; if not, a `LightNotShown` replaces it.
+    whether to open the display; if not, a `DryRunPresenter` replaces it.
     """
     _hold_lab(settings.file, opened)
     clock = session_clock(session)
@@ -70,7 +70,7 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, 
         if opens_display and cameras and projectors:
             presenters.append(FullScreen(display, clock))
         else:
-            presenters.append(LightNotShown(display_warnings(display)))
+            presenters.append(DryRunPresenter(display_warnings(display)))
         opened.callback(presenters[0].close)
 
     # All faults are reported together. The display is opened last, and only if camera and projector are free, because

@@ -276,7 +276,7 @@ def test_answers_pings_between_transactions() -> None:
 
 
 def test_answers_pings_during_a_long_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.ptp.ip._PING_EVERY_S", 0.01)
+    monkeypatch.setattr("drivers.ptp.ip._EVENT_READ_INTERVAL_S", 0.01)
     far, transport = connected()
     far.heard(far.event)
     far.event.write(packet(13), PATIENCE_S)
