@@ -25,7 +25,7 @@ class Scene(Protocol):
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """Ground truth: the illuminant (3,) float64, linear camera RGB of any length.
+        """Ground truth: the illuminant (3,) float64, linear camera RGB of any scale.
 
         If the scene has several illuminants, the ground truth is their mean over the pixels. Estimates of a single
         illuminant are compared with this mean.
@@ -56,7 +56,7 @@ class MixedScene(Scene, Protocol):
 
     @property
     def lights(self) -> npt.NDArray[np.float64]:
-        """The illuminants (K, 3) float64, linear camera RGB of any length, K ≥ 2."""
+        """The illuminants (K, 3) float64, linear camera RGB of any scale, K ≥ 2."""
         ...
 
     def read_weights(self) -> npt.NDArray[np.float32]:

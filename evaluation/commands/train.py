@@ -74,8 +74,8 @@ def train(
     learners = [learner for learner in chosen if isinstance(learner, FeatureLearner)]
     if len(learners) < len(chosen):
         raise InputError(
-            f"{method} has your own class, expected methods of this suite for model files; use evaluate cv {method} "
-            f"{data} to train and test it, and let its fit write its own file to keep it"
+            f"{method} includes your own class, expected only methods of this suite; use evaluate cv {method} "
+            f"{data} to train and test your class, and save its model in its method fit"
         )
     is_single = len(learners) == 1
     if is_single != (out.suffix == ".npz"):

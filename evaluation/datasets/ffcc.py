@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from evaluation.datasets.files import Folder, PaintedScene, decode_image
+from evaluation.datasets.files import Folder, ZeroMaskedScene, decode_image
 from evaluation.datasets.options import DataOptions, level_note
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, first_few
@@ -23,7 +23,7 @@ _SAMPLED_NAMES = 100  # thumbnails of a folder that are checked to recognise the
 
 
 @dataclass(frozen=True, slots=True)
-class ThumbnailScene(PaintedScene):
+class ThumbnailScene(ZeroMaskedScene):
     """A linear thumbnail; `white` is None unless the user gives it."""
 
     def decode(self) -> Image:

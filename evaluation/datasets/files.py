@@ -283,7 +283,7 @@ class RawScene:
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """Ground truth (3,) float64, linear camera RGB of any length."""
+        """Ground truth (3,) float64, linear camera RGB of any scale."""
         return np.array(read_light(self.light) if isinstance(self.light, str) else self.light)
 
     @property
@@ -348,7 +348,7 @@ def black_level_warning(scenes: Sequence[RawScene]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class PaintedScene(RawScene):
+class ZeroMaskedScene(RawScene):
     """Image whose charts or faces are painted over with zeros; pixels that are zero in every channel are masked."""
 
     def mask(self, image: Image) -> Mask:

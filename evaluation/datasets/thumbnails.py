@@ -27,9 +27,9 @@ class Thumbnail:
     """Thumbnail in memory.
 
     - `name`: name of the image.
-    - `truth`: ground truth (3,) float64, linear camera RGB of any length.
+    - `truth`: ground truth (3,) float64, linear camera RGB of any scale.
     - `image`: (H, W, 3) float32 or uint16, linear camera RGB minus black level.
-    - `saturation`: value from which a pixel is clipped; None if unknown, because averaging hides clipped pixels.
+    - `saturation`: value from which a pixel is clipped; None if unknown.
     """
 
     name: str

@@ -44,7 +44,7 @@ class SmallScene:
     """A scene in memory, reduced in size if it was larger than requested."""
 
     name: str
-    truth: npt.NDArray[np.float64]  # (3,) float64, ground truth, linear camera RGB of any length
+    truth: npt.NDArray[np.float64]  # (3,) float64, ground truth, linear camera RGB of any scale
     image: Image  # (H, W, 3), linear camera RGB, in the unit of the original image; float32 if reduced
     mask: npt.NDArray[np.bool_] | None  # (H, W) bool, True for pixels that must not be used; None if all may be used
     saturation: float | None  # level of the original image; None if reduced, because averages exclude clipped pixels
@@ -106,7 +106,7 @@ class Material:
     """Scenes, with their features for the learners that use features."""
 
     scenes: tuple[Scene, ...]
-    truths: npt.NDArray[np.float64]  # (N, 3) float64, linear camera RGB of any length
+    truths: npt.NDArray[np.float64]  # (N, 3) float64, linear camera RGB of any scale
     # One entry for each learner: the features of each scene, or None if the learner reads images itself. A scene
     # without usable pixel has the features None.
     features: tuple[Sequence[Features | None] | None, ...]

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from evaluation.datasets.identity import find_training_images
 from evaluation.experiments.folds import folds_to_csv, groups_of
 from evaluation.experiments.running import SceneMethod, evaluate, require_truths
-from evaluation.experiments.suspicions import suspicions
+from evaluation.experiments.suspicions import detect_other_conventions
 from evaluation.learning.model_files import StoredMethod, TrainingRecord, scenes_sha256
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
@@ -56,7 +56,7 @@ def run_methods(
     records = {item.name: item.provenance for item in methods if isinstance(item, StoredMethod) and item.provenance}
     training_notes = [_training_note(name, record, data, run.data_sha256) for name, record in records.items()]
     results = evaluate(data.scenes, methods, workers, on_scene)
-    convention_notes = suspicions(run.subject.images, truths, results)
+    convention_notes = detect_other_conventions(run.subject.images, truths, results)
     notes = (*filter(None, training_notes), *convention_notes, *indistinct_methods(results, data.truth_uncertainty_deg))
     return replace(run, results=results, notes=notes)
 
@@ -117,8 +117,8 @@ def _training_note(name: str, record: TrainingRecord, data: SceneSet, sha256: st
     shared = find_training_images(data.scenes, record.images)
     if shared:
         return (
-            f"{name}: {len(shared)} of {len(data.scenes)} images were used for training, by name and ground truth or "
-            f"by source picture: {first_few(shared, 3)}; its errors are not valid for other images"
+            f"{name}: {len(shared)} of {len(data.scenes)} images were used for training (same name and ground "
+            f"truth, or same source picture): {first_few(shared, 3)}; its errors are not valid for other images"
         )
     if record.data_name != data.name:
         return ""

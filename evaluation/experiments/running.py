@@ -40,7 +40,7 @@ class SceneMethod(Protocol):
         ...
 
     def estimate_scene(self, scene: Scene) -> npt.NDArray[np.float64] | None:
-        """Return the estimate (3,) float64 for a scene, camera RGB of any length; None without an estimate."""
+        """Return the estimate (3,) float64 for a scene, camera RGB of any scale; None without an estimate."""
         ...
 
 
@@ -73,7 +73,7 @@ def evaluate(
 
 
 def require_truths(scenes: Sequence[Scene], methods: Sequence[object]) -> npt.NDArray[np.float64]:
-    """Return the ground truths (N, 3) float64 of scenes, camera RGB of any length. Invalid ones raise InputError."""
+    """Return the ground truths (N, 3) float64 of scenes, camera RGB of any scale. Invalid ones raise InputError."""
     if not scenes or not methods:
         raise InputError(f"{len(methods)} methods on {len(scenes)} images, expected at least one of each; give some")
     return np.stack([_checked_truth(scene) for scene in scenes])

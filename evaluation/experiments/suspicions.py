@@ -33,16 +33,16 @@ _MAX_OTHER_DEG: Final = 8.0
 _MIN_CHANNEL: Final = 1e-9  # Replaces smaller channels before inversion; fraction of the largest channel
 
 
-def suspicions(images: Sequence[str], truths: npt.NDArray[np.float64], results: Sequence[Result]) -> tuple[str, ...]:
+def detect_other_conventions(images: Sequence[str], truths: _Lights, results: Sequence[Result]) -> tuple[str, ...]:
     """Return a note for each other reading of the estimates that fits the ground truths far better.
 
-    `truths`: (N, 3) float64, linear camera RGB of any length.
+    `truths`: (N, 3) float64, linear camera RGB of any scale.
 
     Examples
     --------
     >>> truths = np.random.default_rng(0).random((9, 3)) + [2, 1, 0.2]
     >>> swapped = Result("Mine", truths[:, ::-1], {}, np.zeros(9, bool))
-    >>> suspicions(list("abcdefghi"), truths, [swapped])[0][:86]
+    >>> detect_other_conventions(list("abcdefghi"), truths, [swapped])[0][:86]
     'Mine: with red and blue exchanged its median recovery error would be 0.00 instead of 4'
     """
     if len(images) < _MIN_IMAGES:

@@ -101,7 +101,7 @@ def stacked_share(
     [0.0, 0.5, 1.0]
     """
     # Stacking: L. Breiman, "Stacked regressions", Machine Learning 24, 1996. A prior is added, because twenty images
-    # are too few to select the weight, and because the final models, fitted to all images, are better than those here.
+    # are too few to select the weight. Also, the final models are fitted to more images than the models compared here.
     if not len(truths):
         return expected
     errors = np.array([recovery_error(_log_mean(first, second, share), truths).sum() for share in _WEIGHTS])

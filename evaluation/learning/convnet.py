@@ -80,7 +80,10 @@ class ConvNet(FeatureLearner):
     def tune(
         self, model: LightModel, features: Features, truths: npt.NDArray[np.float64], worth: float, seed: int = 0
     ) -> ConvNetModel:
-        """Return the network after further training with smaller steps and fewer epochs; `worth` is not used."""
+        """Return the network after further training with smaller steps and fewer epochs.
+
+        See `FeatureLearner.tune`; `worth` is not used.
+        """
         del worth
         if not isinstance(model, ConvNetModel):
             raise TypeError(f"the model is {type(model).__name__}, expected ConvNetModel")

@@ -211,8 +211,8 @@ def _fourier_scale(smoothness: float, size: float) -> npt.NDArray[np.float64]:
     return 1 / (BINS * np.sqrt(weights))
 
 
-# Bins of extracted histograms along each axis. For training and estimates, histograms are folded to 64 bins. A folded
-# bin has a width of 1/32, as in the paper, or of 1/16 if training illuminants are widely spread.
+# Bins of extracted histograms along each axis. `fold` reduces them to 64. It adds bins 64 apart, so the width remains
+# 1/32 as in the paper. If training illuminants are widely spread, it adds neighbours, so the width becomes 1/16.
 _FINE_BINS = 128
 _FINE_WIDTH = 1 / 32  # width of a bin, natural logarithm (section 5 of the paper)
 _CHANNELS = 2  # histograms per image: pixels and edges
@@ -302,7 +302,7 @@ class LogChroma(FeatureLearner):
         is_wide = span > _LARGEST_SPAN * BINS * _FINE_WIDTH
         if span > _LARGEST_SPAN * _FINE_BINS * _FINE_WIDTH:
             raise InputError(
-                f"training illuminants span {span:.2f} natural logarithms of green over red or blue, expected at most "
+                f"ln(G/R) or ln(G/B) of the training illuminants has a range of {span:.2f}, expected at most "
                 f"{_LARGEST_SPAN * _FINE_BINS * _FINE_WIDTH:g}; exclude saturated illuminants, or use another method"
             )
         grid = (2 * _FINE_WIDTH, _FINE_WIDTH / 2) if is_wide else (_FINE_WIDTH, 0.0)

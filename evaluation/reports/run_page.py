@@ -75,7 +75,7 @@ def error_planes(
 ) -> bytes:
     """Return the errors over the chromaticity plane, one panel for each of the first twelve methods.
 
-    `truths`: (N, 3) float64, ground truths, camera RGB of any length. `black_bodies`: camera RGB by temperature, K.
+    `truths`: (N, 3) float64, ground truths, camera RGB of any scale. `black_bodies`: camera RGB by temperature, K.
     """
     drawn = results[:_MAX_PANELS]
     columns = _column_count(len(drawn))
@@ -169,7 +169,7 @@ _MIN_CHANNEL = 1e-6  # Replaces a channel of 0 before division, relative to the 
 def developed_pictures(scene: Scene, estimates: Sequence[npt.NDArray[np.float64]]) -> list[bytes]:
     """Return a JPEG file for each estimate: the scene as recorded, corrected by the estimate, and by the ground truth.
 
-    `estimates`: (3,) float64 each, camera RGB of any length.
+    `estimates`: (3,) float64 each, camera RGB of any scale.
     """
     image, mask = scene.read()
     linear = image.astype(np.float32)

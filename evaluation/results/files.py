@@ -43,7 +43,7 @@ class MethodErrors:
 
     - `method`: name of the method.
     - `images`: names of the N images, each once.
-    - `truths`: (N, 3) float64, linear camera RGB of any length.
+    - `truths`: (N, 3) float64, linear camera RGB of any scale.
     - `errors`: (N,) float64, degrees, by kind of error.
     - `guessed`: (N,) bool, True if the method returned no illuminant and grey replaces it.
     - `groups`: for each image, the group of related images; None if any line of the file has no group.
@@ -140,7 +140,7 @@ def errors_csv(
     if images are grouped. Illuminants have the sum 1; errors are degrees. `guessed` is 1 if the method returned no
     illuminant, so that grey is recorded; `cause` is the reason.
 
-    `truths`: (N, 3) float64, camera RGB of any length. `groups`: group of each image; None if images are not grouped.
+    `truths`: (N, 3) float64, camera RGB of any scale. `groups`: group of each image; None if images are not grouped.
     """
     chromaticities = truths / truths.sum(axis=1, keepdims=True)
     estimated = [result.estimates / result.estimates.sum(axis=1, keepdims=True) for result in results]
@@ -207,7 +207,7 @@ class GivenEstimates:
     lights: Mapping[str, npt.NDArray[np.float64]]
 
     def estimate_scene(self, scene: Scene) -> npt.NDArray[np.float64]:
-        """Return the estimate (3,) float64 for a scene, camera RGB of any length."""
+        """Return the estimate (3,) float64 for a scene, camera RGB of any scale."""
         return self.lights[scene.name]
 
 

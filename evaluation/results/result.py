@@ -173,7 +173,7 @@ class Run:
     location: str
     treatment: Mapping[str, str]
     data_sha256: str  # Hash of image names and ground truths; see `learning.model_files.scenes_sha256`
-    truths: npt.NDArray[np.float64]  # (N, 3) float64, camera RGB of any length
+    truths: npt.NDArray[np.float64]  # (N, 3) float64, camera RGB of any scale
     results: tuple[Result, ...]  # One for each method
     methods: tuple[Mapping[str, Any], ...]  # A JSON object for each method; see `method_records.describe_method`
     # Other settings of the run, such as a seed, as JSON

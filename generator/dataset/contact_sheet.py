@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 MAX_ROWS: Final = 12  # Largest number of sources on a sheet; more images would be too small on a full screen
 MAX_COLUMNS: Final = 8  # Largest number of illuminants on a sheet, for the same reason
-# The grid has this number of images for each allowed row: 24 large images fill a screen like 12 rows of small images.
+# Largest number of images in the grid, as a multiple of `max_rows`; with 12 rows, 24 images fill a screen.
 _GRID_IMAGES: Final = 2
 # Ratio of columns to rows of the grid, about that of screens and of most pictures.
 _GRID_ASPECT: Final = 1.5
-_NAME: Final = 26  # Largest number of characters of a name below an image; more would overlap the next name
+_NAME_LENGTH: Final = 26  # Largest number of characters of a name below an image; more would overlap the next name
 _PAPER: Final = "#16171a"
 _INK: Final = "#e8e6e1"
 _FAINT: Final = "#8d8f96"
@@ -83,9 +83,9 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     lights = len(dataset.light_labels)
     table_lights = {light.illumination: light for light in dataset.description.lights}
     light_names = {str(number): light.label for number, light in table_lights.items()}
-    is_shared = all([entry.lights for entry in line] == [entry.lights for entry in grid[0]] for line in grid)
+    has_common_lights = all([entry.lights for entry in line] == [entry.lights for entry in grid[0]] for line in grid)
     if is_grid:
-        is_shared = len({entry.lights for line in grid for entry in line}) == 1
+        has_common_lights = len({entry.lights for line in grid for entry in line}) == 1
 
     # Sizes in inches. A cell is the place of one image; a row is as high as its highest image. In a grid, images in
     # portrait format are reduced to squares, because their neighbours are mostly in landscape format.
@@ -94,8 +94,8 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     heights = [
         max(min(picture.shape[0] / picture.shape[1], max_aspect) for picture in line) * cell for line in pictures
     ]
-    header = 1.0 + (0.42 if is_shared else 0.0)
-    gap_below = gap + 0.2 if is_shared else gap + caption + 0.2
+    header = 1.0 + (0.42 if has_common_lights else 0.0)
+    gap_below = gap + 0.2 if has_common_lights else gap + caption + 0.2
     columns = max(map(len, grid))
     width = 2 * margin + columns * cell + (columns - 1) * gap
     width = max(width, 5.2)
@@ -144,8 +144,8 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
             axes = figure.add_axes((x0 / width, 1 - (top + height_in) / height, width_in / width, height_in / height))
             axes.imshow(picture, interpolation="lanczos", aspect="auto")
             axes.axis("off")
-            is_header = is_shared and row == 0 and (column == 0 or not is_grid)
-            if is_header or not is_shared:
+            is_header = has_common_lights and row == 0 and (column == 0 or not is_grid)
+            if is_header or not has_common_lights:
                 y = header - 0.2 if is_header else top + heights[row] + 0.15
                 for dot_index, light in enumerate(entry.lights):
                     draw(x0 + 0.13 * dot_index, y, light)
@@ -153,9 +153,9 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
                 label = _shortened(" and ".join(labels), 28)
                 size, ink = (8, _INK) if is_header else (7, _FAINT)
                 write(x0 + 0.05 + 0.13 * len(entry.lights), y + 0.04, label, size, ink)
-        name_y = top + heights[row] + (0.0 if is_shared else caption)
+        name_y = top + heights[row] + (0.0 if has_common_lights else caption)
         for column, entry in enumerate(line if is_grid else line[:1]):
-            name = _shortened(entry.source, _NAME) if is_grid else _shortened(entry.source)
+            name = _shortened(entry.source, _NAME_LENGTH) if is_grid else _shortened(entry.source)
             write(margin + column * (cell + gap), name_y + 0.17, name, 7, _FAINT, style="italic")
         top += heights[row] + gap_below
     write(margin, height - 0.25, "Tone mapped (Flash) image by image; camera RGB, no white balance", 6.5, _FAINT)

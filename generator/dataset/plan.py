@@ -64,7 +64,7 @@ class DatasetOptions:
     crops
         Number of crops of each picture, 1 or more; the sources must be prepared with the same number.
     reading
-        Preparation of the sources as plain values. It is recorded in `dataset.json` and has no effect.
+        Record of the preparation of the sources, plain values for `dataset.json`. It does not change the images.
     rendering
         ``"colorimetric"``: the print reproduces the colours of the picture; ``"codes"``: the codes of the picture are
         the codes of the print, as in the paper.

@@ -71,13 +71,13 @@ def read_entries(store: Store, description: Description) -> Iterator[Entry]:
         last, count = -1, 0
         for image, group in groupby(_numbered_rows(name, table), key=lambda numbered: numbered[1].get("image")):
             count += 1
-            source, labels, whites = _read_rows(name, group)
+            source, labels, chromaticities = _read_rows(name, group)
             number = _number(image or "")
             if image is None or number <= last:
-                raise FormatError(f"{name}: the image {image!r} is not in its order; make the data set again")
+                raise FormatError(f"{name}: the image {image!r} is out of numerical order; make the data set again")
             last = number
-            truth = _truth(store, next(truths, ""), count, image, whites)
-            yield Entry(image, source, labels, whites, truth, split_of_image.get(number))
+            truth = _truth(store, next(truths, ""), count, image, chromaticities)
+            yield Entry(image, source, labels, chromaticities, truth, split_of_image.get(number))
         if count != description.images:
             raise FormatError(
                 f"{name} has rows of {count} images, expected {description.images} as in {DESCRIPTION}; make the "
@@ -213,7 +213,7 @@ def _require_description(store: Store) -> None:
     try:
         store.get(DESCRIPTION)
     except FormatError as error:
-        # The answer of a store tells a missing bucket from a missing file.
+        # The error of a store shows whether its bucket or only the file is missing.
         answer = f" ({error.__cause__})" if isinstance(store, RemoteStore) else ""
         raise FormatError(
             f"{store.location} is not a data set, because {DESCRIPTION} is missing{answer}; correct the address, or "
@@ -370,7 +370,7 @@ class Dataset:
 
     @cached_property
     def details(self) -> dict[str, dict[str, str]]:
-        """Details of each image from `images.csv`, by image name; empty if the options need none."""
+        """Details of each image from `images.csv`, by image name; empty if there is no such file."""
         if not self.store.has(IMAGES):
             return {}
         rows = csv.DictReader(io.StringIO(self._list(IMAGES)))

@@ -4,8 +4,8 @@ numba does not vectorise pixel loops that shuffle bytes, and cannot load eight b
 steps of this module do both; only compiled functions can call them. LLVM maps a vector to the registers of the
 processor: one of AVX-512, two of AVX2 or four of NEON. Bytes are shuffled within 16 bytes, which all of these can do.
 
-Addresses are plain integers, and the caller must ensure that they are valid. Docstrings report bytes that are read or
-written in addition to the result. Large images are streamed: written past the caches, which then keep the samples.
+Addresses are plain integers, and the caller must ensure that they are valid. A docstring reports if a step reads or
+writes bytes beyond its result. Large images are streamed: written past the caches, which then keep the samples.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from llvmlite import ir
 from foundation.compiled import inlined, intrinsic
 
 LANES: Final = 16  # 32-bit numbers per vector: one register of AVX-512
-GROUP: Final = 2 * LANES  # Pixels of a group: one vector of random words chooses their samples, two by each word
+GROUP: Final = 2 * LANES  # Pixels of a group; each word of a random vector chooses the samples of two pixels
 EIGHT: Final = 8  # Pixels that are written to float32 planes together: one register of AVX2 per channel
 SAMPLE_BYTES: Final = 6  # Bytes of a sample: red, green and blue, uint16 each
 LINE: Final = 64  # Bytes of a cache line on x86-64 and on most arm64 processors
@@ -298,7 +298,7 @@ def _any_nonzero(builder: Builder, words: Value) -> Value:
 
 @step(ADDRESS, "int64", returned="int64")
 def weight_flags(builder: Builder, weights: Value, count: Value) -> Value:
-    """Return four flags for the weights of two illuminants, two float32 for each of `count` ≥ 8 pixels.
+    """Return four flags for the weights of two illuminants at `count` ≥ 8 pixels; a pixel has two float32 weights.
 
     Bits 0 and 1 are set if any weight of the first and second illuminant is not 0; bits 2 and 3 if any is not 1.
     """
@@ -482,7 +482,7 @@ STREAMED_BYTES: Final = 24 << 20
 
 
 def line_buffer_bytes(segment_bytes: int) -> int:
-    """Return the size of the buffer of a segment, with reserve because it may begin anywhere in a cache line."""
+    """Return the buffer size for a segment of a row, with reserve because both may begin anywhere in a cache line."""
     return segment_bytes + 3 * LINE
 
 

@@ -1,7 +1,7 @@
 """Distributions of illuminants in the rb-chromaticity plane, and files of ground truths.
 
-A distribution converts random words to chromaticities. The caller repeats a draw that is outside the gamut of the LUT.
-This cuts the distribution to the gamut and keeps its shape inside.
+A distribution converts random 32-bit integers to chromaticities. The caller repeats a draw that is outside the gamut
+of the LUT. This cuts the distribution to the gamut and keeps its shape inside.
 """
 
 from __future__ import annotations
@@ -208,5 +208,5 @@ def parse_distribution(text: str) -> Distribution:
         spread = [numbers.get(name, numbers.get("sd")) for name in ("sd_r", "sd_b")]
         if "r" in numbers and "b" in numbers and spread[0] is not None and spread[1] is not None:
             return Gaussian(numbers["r"], numbers["b"], spread[0], spread[1], numbers.get("corr", 0.0))
-        raise InputError(f"{text!r} is incomplete; write gaussian:r=0.3,b=0.25,sd=0.02, or sd_r, sd_b, corr for sd")
+        raise InputError(f"{text!r} is incomplete; write gaussian:r=0.3,b=0.25,sd=0.02, or sd_r and sd_b, not sd")
     raise InputError(f"{text!r} is not a distribution; write uniform, gaussian:r=0.3,b=0.25,sd=0.02, or a file")

@@ -218,19 +218,19 @@ class SourcePicture:
 class _FileValues:
     """Content of a picture file before conversion.
 
-    - `light`: (H, W, 3), codes 0 … 255, or linear values 0 … 1 in float64.
+    - `pixels`: (H, W, 3), codes 0 … 255, or linear values 0 … 1 in float64.
     - `alpha`: (H, W), 0 … 1; None without transparency.
     - `is_associated`: whether the colours are multiplied by alpha already.
     """
 
-    light: npt.NDArray[Any]
+    pixels: npt.NDArray[Any]
     alpha: npt.NDArray[np.float64] | None
     is_associated: bool
     is_linear: bool
     orientation: int
     icc: bytes | None
     is_adobe_rgb: bool = False
-    space: RgbSpace | None = None  # space of `light`, if it is neither sRGB nor given by `icc`
+    space: RgbSpace | None = None  # space of `pixels`, if it is neither sRGB nor given by `icc`
 
 
 def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
@@ -279,20 +279,20 @@ def open_picture(
     of the file, if they were read already. `most_pixels`: largest number of pixels; `LARGEST_PICTURE` if None.
     """
     values = _read(path, data, LARGEST_PICTURE if most_pixels is None else most_pixels)
-    light = values.light
+    pixels = values.pixels
     if values.is_linear:
-        light = np.clip(np.nan_to_num(light, nan=0.0, posinf=1.0, neginf=0.0), 0.0, None)
+        pixels = np.clip(np.nan_to_num(pixels, nan=0.0, posinf=1.0, neginf=0.0), 0.0, None)
     if values.alpha is not None:
         coverage = values.alpha[..., None]
         white = (1.0 - coverage) * (1.0 if values.is_linear else 255.0)
-        light = (light if values.is_associated else light * coverage) + white
+        pixels = (pixels if values.is_associated else pixels * coverage) + white
     if values.space is not None:
-        codes = values.space.srgb_codes(light if values.is_linear else light / 255)
+        codes = values.space.srgb_codes(pixels if values.is_linear else pixels / 255)
     elif values.is_linear:
-        codes = srgb_codes(light)
+        codes = srgb_codes(pixels)
     else:
         # Rounding takes seconds for a large picture; 8-bit codes need none.
-        codes = (light if light.dtype == np.uint8 else np.rint(np.clip(light, 0, 255))).astype(np.uint8, copy=False)
+        codes = (pixels if pixels.dtype == np.uint8 else np.rint(np.clip(pixels, 0, 255))).astype(np.uint8, copy=False)
     if values.space is not None:
         treatment = f"{values.space.name}, converted to sRGB"
     elif values.is_linear:
@@ -317,7 +317,7 @@ def open_picture(
 
 def _read(path: Path, data: bytes | None, most_pixels: int) -> _FileValues:
     if not path.is_file():
-        raise FormatError(f"cannot read {path}: no such file; name a picture")
+        raise FormatError(f"cannot read {path}: no such file; correct the path")
     chunks = _checked_png(path, data)
     with _utf8_file_name(path) as name:
         values = _read_named(path, name, data, most_pixels, chunks)
@@ -721,7 +721,7 @@ def _folder_exists(store: AbstractFileSystem, path: str) -> bool:
 def _unreadable_error(location: str, error: Exception, is_file_fault: bool) -> FormatError | StorageError:
     reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split()).rstrip(".")
     if is_file_fault:
-        return FormatError(f"cannot read {location}: {reason}; name a picture")
+        return FormatError(f"cannot read {location}: {reason}; use another picture")
     return StorageError(
         f"cannot read {location}: {reason}; make it readable on every machine that works on the data set, then run the "
         "same command again"

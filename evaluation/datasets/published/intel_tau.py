@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from evaluation.datasets.files import Folder, PaintedScene, read_text
+from evaluation.datasets.files import Folder, ZeroMaskedScene, read_text
 from evaluation.datasets.options import DataOptions, choose_name, level_note
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError, first_few
@@ -40,13 +40,13 @@ def open_intel_tau(location: str, options: DataOptions, scanned_folder: Folder |
     folder = scanned_folder or Folder(Path(location))
     cameras = _cameras(folder)
     if not cameras:
-        raise FormatError(f"{location}: no folder has {' or '.join(SUBSETS)}, expected INTEL-TAU; add a camera")
+        raise FormatError(f"{location}: no folder has {' or '.join(SUBSETS)}, expected INTEL-TAU; unpack it there")
     camera = choose_name(options.camera, cameras, "camera", location)
     available = [name for name in SUBSETS if any(name in camera_folder.folders for camera_folder in cameras.values())]
     subset = choose_name(options.subset, available, "subset", location)
     black = 0.0 if options.black is None else options.black
     white = float(WHITE) if options.saturation is None else options.saturation
-    scenes: list[PaintedScene] = []
+    scenes: list[ZeroMaskedScene] = []
     counts: list[str] = []
     for name, camera_folder in cameras.items():
         if camera not in (None, name):
@@ -85,7 +85,7 @@ def _cameras(folder: Folder) -> dict[str, Folder]:
     return {name: child for name, child in folder.folders.items() if not child.folders.keys().isdisjoint(SUBSETS)}
 
 
-def _scenes(folder: Folder, prefix: str, black: float, white: float, partial: bool) -> list[PaintedScene]:
+def _scenes(folder: Folder, prefix: str, black: float, white: float, partial: bool) -> list[ZeroMaskedScene]:
     images = folder.images((".tiff", ".tif"))
     lights = {_strip_zeros(name[:-3]): name for name in folder.files if name.endswith(".wp")}
     names_by_key = {_strip_zeros(name): name for name in images}
@@ -102,7 +102,7 @@ def _scenes(folder: Folder, prefix: str, black: float, white: float, partial: bo
             "expected one for each; complete the copy, or use the existing images with --read partial"
         )
     return [
-        PaintedScene(f"{prefix}{name}.tiff", images[name], str(folder.path / lights[key]), black, white)
+        ZeroMaskedScene(f"{prefix}{name}.tiff", images[name], str(folder.path / lights[key]), black, white)
         for key, name in names_by_key.items()
     ]
 
@@ -113,7 +113,7 @@ def _strip_zeros(name: str) -> str:
     return f"{stem}_{int(number)}" if number.isdecimal() else name
 
 
-def _authors_folds(folder: Folder, scenes: Sequence[PaintedScene]) -> tuple[int, ...] | None:
+def _authors_folds(folder: Folder, scenes: Sequence[ZeroMaskedScene]) -> tuple[int, ...] | None:
     """Return the authors' fold of each scene; None if their lists are missing or incomplete."""
     lists = folder.folders.get("splits")
     paths = (

@@ -79,18 +79,18 @@ class LsmiMixedScene(LsmiScene):
 
     illuminants: tuple[Light, ...] = ()
     shares_path: str = ""
-    _means: dict[str, npt.NDArray[np.float64]] = field(
+    _cached: dict[str, npt.NDArray[np.float64]] = field(
         default_factory=dict[str, npt.NDArray[np.float64]], repr=False, compare=False
     )
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
         """Ground truth (3,) float64, r + g + b = 1: mean over the pixels whose illuminant is known."""
-        if "" not in self._means:
+        if "truth" not in self._cached:
             weights = self.read_weights().reshape(-1, len(self.illuminants))
             mean = weights[np.isfinite(weights[:, 0])].mean(axis=0, dtype=np.float64) @ self.lights
-            self._means[""] = mean / mean.sum()
-        return self._means[""]
+            self._cached["truth"] = mean / mean.sum()
+        return self._cached["truth"]
 
     @property
     def lights(self) -> npt.NDArray[np.float64]:

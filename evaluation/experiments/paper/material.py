@@ -105,7 +105,7 @@ class ChosenLights:
 def lights_like(lut: Lut, truths: npt.NDArray[np.float64], count: int) -> ChosenLights:
     """Return for each image the illuminant of the LUT with the smallest angle to its ground truth.
 
-    `truths`: (N, 3) float64 ≥ 0, linear camera RGB of any length and any camera. Image i has ground truth i modulo N.
+    `truths`: (N, 3) float64 ≥ 0, linear camera RGB of any scale and any camera. Image i has ground truth i modulo N.
     """
     matches = nearest_lights(lut, truths).matches
     numbers = tuple(matches[image % len(matches)].mixture.lights[0] for image in range(count))
@@ -151,7 +151,7 @@ def develop_image(
     """Return the sRGB picture (H, W, 3) uint8 of a raw image.
 
     `image`: (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, black level subtracted, any unit. `light`:
-    (3,) float64 > 0, ground truth, linear camera RGB of any length. `mask`: (H, W) bool, True for pixels that do not
+    (3,) float64 > 0, ground truth, linear camera RGB of any scale. `mask`: (H, W) bool, True for pixels that do not
     influence the white; None for no mask. `matrix`: colour matrix of the camera; None uses balanced camera RGB as
     linear sRGB. `saturation`: value from which a channel is clipped; None for no clipping.
 
@@ -224,7 +224,7 @@ class Truths:
     """Ground truths with a name for tables and legends."""
 
     name: str  # Name of the data set or file
-    lights: npt.NDArray[np.float64]  # (N, 3) float64 ≥ 0, linear camera RGB of any length
+    lights: npt.NDArray[np.float64]  # (N, 3) float64 ≥ 0, linear camera RGB of any scale
     images: tuple[str, ...] = ()  # Names of the N images; empty if unknown
 
 

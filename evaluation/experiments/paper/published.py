@@ -29,13 +29,13 @@ class PublishedRow:
         return astuple(self)
 
 
-Cell = tuple[str, str, str]  # Scenes, sensor and illuminants of a data set of table 1
+BlockKey = tuple[str, str, str]  # Scenes, sensor and illuminants of a data set of table 1
 
 # Table 1, by data set and method in the order of the paper. C1 is the Canon 1Ds Mark III of the NUS data set.
 # Section 4.1 calls the errors reproduction errors. This cannot be true for all numbers: the largest possible
 # reproduction error is arccos(1/√3) = 54.74°, but one worst 25 % is 59.80°. The commands therefore report both kinds of
 # error.
-TABLE1: Final[Mapping[Cell, Mapping[str, PublishedRow]]] = {
+TABLE1: Final[Mapping[BlockKey, Mapping[str, PublishedRow]]] = {
     ("C1", "6D", "C1"): {
         "White-Patch": PublishedRow(2.61, 2.59, 2.50, 1.03, 4.38, 2.38),
         "Gray-world": PublishedRow(6.27, 5.32, 5.58, 3.34, 10.75, 5.82),

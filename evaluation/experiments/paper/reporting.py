@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 def rb_chromaticities(lights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the rb-chromaticities (N, 2) float64 of illuminants (N, 3) float64, linear camera RGB of any length.
+    """Return the rb-chromaticities (N, 2) float64 of illuminants (N, 3) float64, linear camera RGB of any scale.
 
     Examples
     --------
@@ -63,7 +63,7 @@ def chromaticity_rows(luts: Sequence[Lut]) -> Table:
 def coverage_table(luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float64]]) -> Table:
     """Return the angles from ground truths of data sets to the nearest illuminants of LUTs.
 
-    `sets`: ground truths by name of the data set, (N, 3) float64, linear camera RGB of any length.
+    `sets`: ground truths by name of the data set, (N, 3) float64, linear camera RGB of any scale.
     """
     rows: list[tuple[str | float | None, ...]] = []
     for lut in luts:
@@ -114,13 +114,13 @@ def _draw_bits(figure: Any, bits_result: BitsResult, metric: ErrorKind) -> None:
 
 def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:
     axes = figure.add_subplot()
-    for index, cell in enumerate(dict.fromkeys(row.cell for row in rows)):
-        cell_rows = [row for row in rows if row.cell == cell]
+    for index, key in enumerate(dict.fromkeys(row.key for row in rows)):
+        block_rows = [row for row in rows if row.key == key]
         axes.plot(
-            [row.side for row in cell_rows],
-            [row.medians[method] for row in cell_rows],
+            [row.side for row in block_rows],
+            [row.medians[method] for row in block_rows],
             marker=_MARKERS[index % len(_MARKERS)],
-            label=legend_label(block_title(cell)),
+            label=legend_label(block_title(key)),
             **series_style(index),
         )
     sides = sorted({row.side for row in rows})

@@ -24,7 +24,7 @@ from evaluation.experiments.paper.material import (
     lights_like,
     render_scenes,
 )
-from evaluation.experiments.paper.published import TABLE1, TABLE2, Cell
+from evaluation.experiments.paper.published import TABLE1, TABLE2, BlockKey
 from evaluation.experiments.running import evaluate, fit_copy
 from evaluation.methods.method import Learner
 from evaluation.methods.standard import standard_methods
@@ -121,7 +121,7 @@ class Block:
 
     # Scenes, sensor and illuminants as in the paper: ``("C1", "6D", "Random")``. This is the key of published numbers,
     # so other scenes and illuminants must have other names.
-    cell: Cell
+    key: BlockKey
     scenes: tuple[RenderedScene, ...]
     lights: str  # Text that describes the choice of illuminants
     results: tuple[Result, ...] = ()  # One for each method, in the order of `METHODS`; empty before evaluation
@@ -185,7 +185,7 @@ def table1(blocks: Sequence[Block], workers: int = 1, on_scene: Callable[[], Non
     return tuple(replace(block, results=evaluate(block.scenes, methods, workers, on_scene)) for block in blocks)
 
 
-def block_title(cell: Cell) -> str:
+def block_title(key: BlockKey) -> str:
     """Return the title of a data set as in the paper.
 
     Examples
@@ -193,13 +193,13 @@ def block_title(cell: Cell) -> str:
     >>> block_title(("C1", "6D", "Random"))
     'C1 scenes, 6D sensor, random illuminations'
     """
-    scenes, sensor, lights = (name.lower() if name == "Random" else name for name in cell)
+    scenes, sensor, lights = (name.lower() if name == "Random" else name for name in key)
     return f"{scenes[0].upper()}{scenes[1:]} scenes, {sensor} sensor, {lights} illuminations"
 
 
 def block_table(block: Block, metric: ErrorKind) -> Table:
     """Return the table of one data set: statistics of each method, each followed by published statistics if known."""
-    published = TABLE1.get(block.cell, {})
+    published = TABLE1.get(block.key, {})
     rows: list[tuple[str | float | None, ...]] = []
     for result in block.results:
         rows.append((result.marked_name, *result.summary(metric).as_tuple()[:6]))
@@ -212,7 +212,7 @@ def block_table(block: Block, metric: ErrorKind) -> Table:
         for result in block.results
         if result.guessed.any()
     ]
-    return Table(block_title(block.cell), PAPER_COLUMNS, tuple(rows), notes=tuple(notes))
+    return Table(block_title(block.key), PAPER_COLUMNS, tuple(rows), notes=tuple(notes))
 
 
 def joint_table(blocks: Sequence[Block]) -> Table:
@@ -220,9 +220,9 @@ def joint_table(blocks: Sequence[Block]) -> Table:
     kinds: tuple[ErrorKind, ...] = ("reproduction", "recovery")
     rows: list[tuple[str | float | None, ...]] = []
     for block in blocks:
-        published = TABLE1.get(block.cell, {})
+        published = TABLE1.get(block.key, {})
         for result in block.results:
-            row_start = (*block.cell, len(block.scenes), result.method)
+            row_start = (*block.key, len(block.scenes), result.method)
             statistics = {str(metric): result.summary(metric).as_tuple()[:6] for metric in kinds}
             if result.method in published:
                 statistics["paper"] = published[result.method].as_tuple()
@@ -234,7 +234,7 @@ def joint_table(blocks: Sequence[Block]) -> Table:
 class SizeRow:
     """Median errors of the methods on one data set with images of one size."""
 
-    cell: Cell
+    key: BlockKey
     side: int  # Longest side of the images, px
     medians: Mapping[str, float]  # Median reproduction error by method, degrees
 
@@ -256,7 +256,7 @@ def size_dependence(
     for side in sides:
         for block in table1(plan_blocks(luts, evenly_spaced(pictures), truths, side, seed, names), workers):
             medians = {result.method: result.summary("reproduction").median for result in block.results}
-            rows.append(SizeRow(block.cell, side, medians))
+            rows.append(SizeRow(block.key, side, medians))
     return tuple(rows)
 
 
@@ -266,7 +266,7 @@ def size_table(rows: Sequence[SizeRow]) -> Table:
     return Table(
         "Median reproduction error for images of several sizes, degrees",
         ("Data set", "Side, px", *names),
-        tuple((block_title(row.cell), row.side, *(row.medians[name] for name in names)) for row in rows),
+        tuple((block_title(row.key), row.side, *(row.medians[name] for name in names)) for row in rows),
     )
 
 

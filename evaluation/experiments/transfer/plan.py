@@ -80,7 +80,7 @@ def trainable_images(
 ) -> tuple[tuple[Scene, ...], str]:
     """Return the images of a set that may be used for training, and a note on images shared with the test set, or "".
 
-    `leave_out`: True excludes shared images; False keeps them, but refuses copies of test images.
+    `leave_out`: True excludes shared images. False keeps images with equal names; equal content raises InputError.
     """
     common = shared_images(training, test)
     if not common:
@@ -92,7 +92,7 @@ def trainable_images(
         shared_positions = {image.position for image in common}
         return tuple(scene for position, scene in enumerate(training.scenes) if position not in shared_positions), note
     if any(image.by == "content" for image in common):
-        raise InputError(f"{note}, expected test images that are not in the training set; use --unseen to exclude them")
+        raise InputError(f"{note}, expected no test image in the training set; use --unseen to exclude shared images")
     return training.scenes, note
 
 
@@ -329,7 +329,7 @@ def relit_scenes(scenes: Sequence[Scene], lights: Sequence[npt.NDArray[np.float6
 class TransferPlan:
     """Training sets of a transfer, and the notes on their preparation."""
 
-    # Sets without excluded images. A generated set is followed by its naive and relit sets, if requested
+    # Excluded images are already removed. A generated set is followed by its naive and relit sets, if requested
     training: tuple[TrainingSet, ...]
     sets: tuple[SceneSet, ...]  # The data sets as opened
     notes: tuple[str, ...]  # Excluded images, colour matrices and cautions, as sentences

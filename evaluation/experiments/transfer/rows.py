@@ -38,7 +38,7 @@ from foundation.errors import InputError
 # Training data of a method:
 # - cross-validation: other folds of the test set;
 # - generated: a set made by `generate`;
-# - naive, naive with matrix: naive counterparts of the generated set, see `plan`;
+# - naive, naive with matrix: pictures of the generated set times its illuminants, without print and camera (plan.py);
 # - relit: real scenes of another camera under the illuminants of the generated set;
 # - other: a set that was not generated;
 # - real: only N images of other folds of the test set;
@@ -187,7 +187,7 @@ def transfer(
         material = collect_material(scenes, learners, side, workers, on_scene)
         positions = [np.searchsorted(used_indices, indices).astype(np.int64) for indices in seed_indices]
         for number, learner in enumerate(learners):
-            # Naive counterparts have the illuminants of the generated set, so its row would be repeated.
+            # Naive counterparts have the illuminants of the generated set, so the constant illuminant is the same.
             if isinstance(learner, ConstantLight) and train_set.kind in NAIVE:
                 continue
             fitted = [fit_on(learner, number, material, indices, seed) for seed, indices in enumerate(positions)]
@@ -219,12 +219,12 @@ class _RealSubsets:
 
     - `tests`: material of the test images.
     - `folds`: for each seed the fold of each image, (N,) int64.
-    - `local_fits`: models trained on N images alone, by learner, seed and images; every training set needs them.
+    - `real_only_fits`: models trained on N images alone, by learner, seed and images; every training set needs them.
     """
 
     tests: Material
     folds: Sequence[npt.NDArray[np.int64]]
-    local_fits: dict[tuple[int, int, bytes], LocalFit] = field(default_factory=dict)
+    real_only_fits: dict[tuple[int, int, bytes], LocalFit] = field(default_factory=dict)
 
     @property
     def min_images(self) -> int:
@@ -250,7 +250,7 @@ class _RealSubsets:
     def fit_alone(self, learner: AnyLearner, number: int, indices: Indices, seed: int) -> Method:
         """Return the method fitted to real images alone, with indices (N,) int64."""
         if isinstance(learner, FeatureLearner):
-            return self._fit_local_once(learner, number, indices, seed).method
+            return self._fit_real_only_once(learner, number, indices, seed).method
         return fit_on(learner, number, self.tests, indices, seed)
 
     def fit_adapted(
@@ -260,15 +260,15 @@ class _RealSubsets:
         method = fitted[seed]
         if not isinstance(learner, FeatureLearner) or not isinstance(method, LearnedMethod):
             raise TypeError(f"{learner.name} cannot be adapted, expected a method with features")
-        return adapt(method, self._fit_local_once(learner, number, indices, seed))
+        return adapt(method, self._fit_real_only_once(learner, number, indices, seed))
 
-    def _fit_local_once(self, learner: FeatureLearner, number: int, indices: Indices, seed: int) -> LocalFit:
+    def _fit_real_only_once(self, learner: FeatureLearner, number: int, indices: Indices, seed: int) -> LocalFit:
         key = number, seed, indices.tobytes()
-        if key not in self.local_fits:
+        if key not in self.real_only_fits:
             features = self.tests.features[number]
             drawn_features = [] if features is None else [features[int(index)] for index in indices]
-            self.local_fits[key] = fit_local(learner, drawn_features, self.tests.truths[indices], seed)
-        return self.local_fits[key]
+            self.real_only_fits[key] = fit_local(learner, drawn_features, self.tests.truths[indices], seed)
+        return self.real_only_fits[key]
 
 
 def _count_label(count: int | None) -> str:

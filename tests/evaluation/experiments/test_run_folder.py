@@ -99,7 +99,7 @@ def test_reports_model_tested_on_training_data() -> None:
     learner = standard_learners()["regression-trees"]
     model = StoredMethod(learner, Flat(), data.name, record)
     (first_note,) = run_methods(larger_set, [model]).notes
-    assert ": 3 of 4 images were used for training, by name and ground truth or by source picture" in first_note
+    assert ": 3 of 4 images were used for training (same name and ground truth, or same source picture): " in first_note
     # The name of the data set, the order of its images and their file extensions may differ.
     renamed = tuple(Wall(f"copies/{Path(wall.name).stem.upper()}.TIF", wall.truth) for wall in reversed(walls(4)))
     assert (

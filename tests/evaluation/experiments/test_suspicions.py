@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evaluation.experiments.running import evaluate
-from evaluation.experiments.suspicions import suspicions
+from evaluation.experiments.suspicions import detect_other_conventions
 from evaluation.methods import GrayEdge
 from tests.evaluation.made_up import Wall
 
@@ -18,6 +18,6 @@ def test_reports_only_wrong_conventions() -> None:
     truths = TRUTHS * [2, 1, 1]
     scenes = [Wall(name, truth) for name, truth in zip(NAMES, truths, strict=True)]
     results = evaluate(scenes, [GrayEdge("Gray-world", 0, 1, 0), GrayEdge("White-Patch", 0, np.inf, 0)])
-    assert suspicions(NAMES, truths, results) == ()
-    assert "red and blue exchanged" in suspicions(NAMES, truths[:, ::-1], results)[0]
-    assert "as gains" in suspicions(NAMES, 1 / truths, results)[0]
+    assert detect_other_conventions(NAMES, truths, results) == ()
+    assert "red and blue exchanged" in detect_other_conventions(NAMES, truths[:, ::-1], results)[0]
+    assert "as gains" in detect_other_conventions(NAMES, 1 / truths, results)[0]

@@ -37,9 +37,9 @@ def printed(text: str) -> list[tuple[str, dict[str, PublishedRow]]]:
 def test_numbers_match_paper_source(path: Path) -> None:
     blocks = printed(path.read_text())
     assert len(blocks) == len(TABLE1) + len(TABLE2) == 10
-    for (head, rows), (cell, ours) in zip(blocks, TABLE1.items(), strict=False):
+    for (head, rows), (key, ours) in zip(blocks, TABLE1.items(), strict=False):
         words = [value.strip("~ ") for value in head.split(",")]
-        assert [word.split()[0] for word in words] == list(cell)
+        assert [word.split()[0] for word in words] == list(key)
         assert [word.split()[1] for word in words] == ["scenes", "sensor", "illuminations"]
         assert rows == ours
     (head, rows), (theirs, moved) = blocks[8:]
@@ -61,5 +61,5 @@ def test_average_is_geometric_mean(name: str, row: PublishedRow) -> None:
 def test_published_row_exceeds_reproduction_error() -> None:
     # White corrected to a single channel is as far from white as the error can be.
     largest = math.degrees(math.acos(1 / math.sqrt(3)))
-    beyond = [(cell, method) for cell, rows in TABLE1.items() for method, row in rows.items() if row.worst25 > largest]
+    beyond = [(key, method) for key, rows in TABLE1.items() for method, row in rows.items() if row.worst25 > largest]
     assert beyond == [(("Random", "550D", "Random"), "White-Patch")]

@@ -54,7 +54,7 @@ def small(make_table: TableMaker, noise: tuple[float, float] = (0.0, 0.0)) -> tu
 
 def test_data_sets_are_in_paper_order(make_table: TableMaker) -> None:
     blocks = small(make_table)
-    assert [block.cell for block in blocks] == list(TABLE1)
+    assert [block.key for block in blocks] == list(TABLE1)
     assert all(len(block.scenes) == 5 for block in blocks)
     images = [block.scenes[0].read()[0] for block in blocks]
     assert [image.shape for image in images] == [(32, 48, 3)] * 4 + [(48, 48, 3)] * 4
@@ -66,7 +66,7 @@ def test_data_sets_are_in_paper_order(make_table: TableMaker) -> None:
 
 
 def test_white_pixel_is_illuminant_without_noise(make_table: TableMaker) -> None:
-    random = [block for block in table1(small(make_table)) if block.cell[0] == "Random"]
+    random = [block for block in table1(small(make_table)) if block.key[0] == "Random"]
     assert len(random) == 4
     for block in random:
         # 2304 pixels in 512 colours hold each channel's brightest code; rounding is 1 in 1000.
@@ -76,7 +76,7 @@ def test_white_pixel_is_illuminant_without_noise(make_table: TableMaker) -> None
 
 
 def test_noise_increases_error_of_white_patch_only(make_table: TableMaker) -> None:
-    blocks = {block.cell: block for block in table1(small(make_table, (0.02, 0.2)))}
+    blocks = {block.key: block for block in table1(small(make_table, (0.02, 0.2)))}
     for scenes, lights in (("Random", "C1"), ("Random", "Random")):
         quiet, noisy = blocks[scenes, "6D", lights], blocks[scenes, "550D", lights]
         medians = [[result.summary("recovery").median for result in block.results] for block in (quiet, noisy)]
