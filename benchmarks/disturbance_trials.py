@@ -48,8 +48,8 @@ class Trial:
 
 
 TRIALS = (
-    Trial("frozen screen, from a frame on", "another light", special="frozen"),
-    Trial("stale frame", "once", stays=False, special="frozen"),
+    Trial("frozen screen", "for several frames", special="frozen"),
+    Trial("frozen screen", "for one frame", stays=False, special="frozen"),
     Trial("pop-up during the exposure", "window, whole time", (PopUp(),), stays=False, at=LIT),
     Trial("pop-up during the exposure", "window, 10 % of it", (PopUp(share=0.1),), stays=False, at=LIT),
     Trial("pop-up during the exposure", "whole picture (255, 136, 0)", (PopUp(place=(-9, -9, 9, 9)),), False, LIT),
@@ -99,8 +99,7 @@ _ELSEWHERE = "darken the room|other light than|other light falls on the chart|th
 
 # Pattern of the right cause for each disturbance, with alternatives if one frame cannot distinguish several causes.
 NAMED = {
-    "frozen screen, from a frame on": _ANOTHER_LIGHT,
-    "stale frame": _ANOTHER_LIGHT,
+    "frozen screen": _ANOTHER_LIGHT,
     "pop-up during the exposure": f"a window (may have )?cover|a window or a screen saver covers|{_ANOTHER_LIGHT}",
     "bump": "the chart has moved|not detected at its last position",
     "lamp": "the lamp",

@@ -329,7 +329,7 @@ def report_session(name: str, measured: SessionTimes) -> None:
         f"{name}: unavoidable",
         measured.unavoidable_s / frames,
         "s",
-        "exposure, then the longer of settling and download",
+        "shortest possible time: exposure + longer of settling and download",
     )
     report(f"{name}: efficiency", measured.efficiency, "ratio", "unavoidable time / time taken")
     for phase, seconds in measured.timings.items():

@@ -29,8 +29,8 @@ _FIGURES_HEAD = """# Figures
 beyond the *refused* limit, no LUT is made. `report.json` uses the same names. The columns are:
 
 - *In check*: `acquire check` judges the figure before a session, from trial frames.
-- *From one frame*: `build-lut check` judges the figure from one frame. With *beyond*, it judges the figure only if
-  the value of this frame is already beyond the accepted limit.
+- *From one frame*: `build-lut check` judges the figure from one frame. With *beyond*, one frame can only show
+  that the figure is beyond the accepted limit.
 - *Basis*: origin of the limits, or values without and with faults.
 
 Terms in the tables:
@@ -48,9 +48,9 @@ Terms in the tables:
 _CAUSES_HEAD = """# Causes
 
 Each remark and refusal of `build-lut` names the frame, the position on the print, the probable cause and the remedy.
-Each row of *The rules* is a rule. For a figure beyond its limit, the first rule decides whose conditions all hold for
-the evidence. A value that was not measured satisfies no condition. If no rule applies, the cause is reported as
-unknown, and the position is circled in the report. `report.json` contains the evidence under `causes`.
+Each row of *The rules* is a rule. For a figure beyond its limit, the first rule whose conditions all hold gives the
+cause. A value that was not measured satisfies no condition. If no rule applies, the cause is reported as unknown, and
+the position is circled in the report. `report.json` contains the evidence under `causes`.
 
 *Written by `python -m docs.reference_pages` from `calibration/causes`.*
 """
@@ -65,7 +65,7 @@ _REPEATED_FRAMES = {
 # Lower limit of an interval that excludes 0; it is printed as "0 <".
 _ABOVE_ZERO = 1e-9
 
-_OF_ONE_FRAME = {"known": "yes", "bounded": "beyond", "unknown": "–"}  # Text for each value of `Figure.of_one_frame`
+_FROM_ONE_FRAME = {"yes": "yes", "beyond": "beyond", "no": "–"}  # Text for each value of `Figure.from_one_frame`
 
 
 def figures_page() -> str:
@@ -99,8 +99,8 @@ def _refused(limit: Limit) -> str:
 def _limits(figure: Figure) -> str:
     refused, before_session = _refused(figure), "yes" if figure.before_session else "–"
     remedy = figure.remedy or "depends on the detected fault"
-    of_one_frame = _OF_ONE_FRAME[figure.of_one_frame]
-    limits = f"{figure.expected} | {refused} | {before_session} | {of_one_frame}"
+    from_one_frame = _FROM_ONE_FRAME[figure.from_one_frame]
+    limits = f"{figure.expected} | {refused} | {before_session} | {from_one_frame}"
     return f"| {figure.title} (`{figure.name}`) | {limits} | {figure.why} | {figure.source} | {remedy} |"
 
 

@@ -166,8 +166,8 @@ class Evidence:
 
     - `frames`: number of compared frames.
     - `showing`: fraction of these frames that show the deviation.
-    - `even_showing`: fraction of the white frames among them that show the deviation; 0 without white frames.
-    - `white_residual`: fraction of white frames with white references that have at least half of this deviation.
+    - `even_showing`: as `showing`, for the evenly lit (white) frames only; 0 without white frames.
+    - `white_residual`: fraction of white frames in which white references have at least half of `deviation` there.
     - `some_whites`: 1 if white references deviate at the position in some white frames but not in all; else 0.
     - `spot`: fraction of the patches at the position that have a wrong colour in the mean of the white frames.
     - `in_first`: 1 if at least 80 % of the frames differ at the position from the frame registered first; else 0.
@@ -181,7 +181,7 @@ class Evidence:
     - `radial`: fraction of the variance of the references' deviations that depends on the distance from the centre.
     - `hot`: fraction of the affected patches with a photosite that is hot in every dark frame.
     - `scatter`: relative scatter of all patches of the frame about the colours expected from their codes.
-    - `softer`: additional light of neighbouring patches in the worst sample, because of blur, as a fraction.
+    - `softer`: light from neighbouring patches that additional blur brings into the worst sample, as a fraction.
     - `moved_px`: distance of the chart from its registered position, half-size px.
     - `anew`: fraction of frames in which the chart was registered again.
     - `agreement`: correlation of the patches with the chart at the registered position.
@@ -394,7 +394,7 @@ RULES: tuple[Rule, ...] = (
         ROOM_LIGHT,
         STRAY,
         (Condition("stray_primaries", 0.004, 0.1),),
-        "the sum of red, green and blue alone exceeds white by the same fraction in each, and the lamp is steady; "
+        "white has less of each primary than the frame of this primary, by the same fraction, and the lamp is steady; "
         "a projector that reduces full white has the same effect",
     ),
     Rule(
@@ -453,7 +453,7 @@ RULES: tuple[Rule, ...] = (
             Condition("showing", 0.8, 1),
             Condition("share", 0, 0.5),
         ),
-        "nearly all frames differ at one position from the frame with which they are compared",
+        "nearly all frames differ at one position from the frame registered first, so the object is in that frame",
     ),
     Rule(
         OBJECT_IN_FRAME,

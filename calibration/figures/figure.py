@@ -150,9 +150,8 @@ class Figure(Limit):
 
     - `measure`: returns the value; None if it could not be measured, for example without tags or dark frames.
     - `before_session`: True if the trial frames of `acquire check` are sufficient to judge the value.
-    - `of_one_frame`: use in `build-lut check`, which reads one light or white frame and one dark frame. `known`: the
-      value is judged. `bounded`: a value beyond its limit is judged, because more frames cannot bring it back.
-      `unknown`: the value is not judged.
+    - `from_one_frame`: whether `build-lut check` judges the value from one light or white frame and one dark frame.
+      With `beyond`, only a value beyond its limit is judged, because more frames cannot bring it back.
     - `where`: returns the frames, illuminants or position beyond the accepted limit as text; None if the cause
       contains them.
     - `retake`: returns the frames beyond a limit; None if all frames are, or if the value is not of single frames.
@@ -166,7 +165,7 @@ class Figure(Limit):
     _: KW_ONLY
     measure: Callable[[TableMeasurements], float | None]
     before_session: bool = True
-    of_one_frame: Literal["known", "bounded", "unknown"] = "unknown"
+    from_one_frame: Literal["yes", "beyond", "no"] = "no"
     where: Callable[[TableMeasurements, float], str] | None = None
     retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None = None
     cause: Explanation | None = None
@@ -178,9 +177,9 @@ class Figure(Limit):
     def judged_value(self, table: TableMeasurements) -> float | None:
         """Return the value to judge; None if it was not measured or if other frames may change its outcome."""
         value = self.measure(table)
-        if value is None or not table.is_of_one_frame or self.of_one_frame == "known":
+        if value is None or not table.is_of_one_frame or self.from_one_frame == "yes":
             return value
-        return value if self.of_one_frame == "bounded" and self.outcome(value) != "accept" else None
+        return value if self.from_one_frame == "beyond" and self.outcome(value) != "accept" else None
 
 
 def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:

@@ -51,7 +51,7 @@ def _tags_row(table: TableMeasurements) -> SummaryRow:
 TAGS_FOUND = Figure(
     "tags_found", "Detected tags", "geometry", "share", "at least", 1.0, MIN_TAG_SHARE,
     why="near a missing tag, registration uses the patches alone", source=JUDGEMENT,
-    remedy="bring the whole chart into the frame, and uncover it", measure=_tag_fraction, of_one_frame="known",
+    remedy="bring the whole chart into the frame, and uncover it", measure=_tag_fraction, from_one_frame="yes",
     cause=Explanation("chart", chart_evidence), drawing="chart", lines=(Line(30, _tags_row),),
 )  # fmt: skip
 
@@ -66,7 +66,7 @@ CELL_PX = Figure(
     why="the outermost samples contain light from outside their patch",
     source="calculated: with 8.6 px and a blur of σ = 0.7 px, this light is 1.3 % of the worst sample",
     remedy="move the camera closer or use a longer lens",
-    measure=lambda table: table.registration.cell_px, of_one_frame="known",
+    measure=lambda table: table.registration.cell_px, from_one_frame="yes",
     drawing="chart", lines=(Line(40, _cell_row),),
 )  # fmt: skip
 
@@ -93,7 +93,7 @@ BLEED = Figure(
     why="the blur of the lens adds light of neighbouring patches to the outermost samples",
     source="calculated: a sharp lens gives 0.2 % in patches of 10 px. A patch mean contains a thirtieth of it",
     remedy="focus on the print, stop down to f/8, move the camera closer, or use a smaller window (build-lut "
-    "--window)", measure=_worst_sample_bleed, of_one_frame="known", drawing="chart",
+    "--window)", measure=_worst_sample_bleed, from_one_frame="yes", drawing="chart",
     lines=(
         Line(50, _window_row),
         Line(60, lambda table: SummaryRow("Blur", f"σ {table.registration.blur_px:.2f} px", "about 0.6 px is sharp")),
@@ -178,7 +178,7 @@ TAG_RESIDUAL_PX = Figure(
     "tag_residual_px", "Distance of tags from a plane sheet", "geometry", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,
     why="the sheet is so wavy that only the patches show its shape",
     source=SIMULATED + ": waves of 6 mm with a curl of 10 mm give 2.3 px", remedy=_HANG_FLATTER,
-    measure=lambda table: table.registration.lens_residual_px, of_one_frame="known", drawing="residuals",
+    measure=lambda table: table.registration.lens_residual_px, from_one_frame="yes", drawing="residuals",
     lines=(Line(90, _plane_residual_row),),
 )  # fmt: skip
 
@@ -188,7 +188,7 @@ TAG_FINAL_PX = Figure(
     why="patches and tags give different positions of the print",
     source=SIMULATED + ": 0.05 to 0.2 px. The error of the tag detector is 0.09 px",
     remedy="check that chart.json belongs to this print, and that the print is one flat sheet",
-    measure=lambda table: table.registration.marks_rms_px / table.registration.clearance, of_one_frame="known",
+    measure=lambda table: table.registration.marks_rms_px / table.registration.clearance, from_one_frame="yes",
     drawing="residuals", lines=(Line(80, _final_residual_row),),
 )  # fmt: skip
 
@@ -202,7 +202,7 @@ BLOCK_RESIDUAL_PX = Figure(
     "block_residual_px", "Residual of patch blocks, scaled to patches of 10 px", "geometry", "px RMS", "at most", 0.1,
     MAX_BLOCK_RESIDUAL_PX, why="patches are not sampled at their centres",
     source=SIMULATED + ": 0.01 to 0.06 px", remedy=_HANG_FLATTER,
-    measure=lambda table: table.registration.block_rms_px / table.registration.clearance, of_one_frame="known",
+    measure=lambda table: table.registration.block_rms_px / table.registration.clearance, from_one_frame="yes",
     drawing="residuals", lines=(Line(100, _blocks_row),),
 )  # fmt: skip
 
@@ -210,7 +210,7 @@ BLOCKS_GOOD = Figure(
     "blocks_good", "Patch blocks that match the chart", "geometry", "share", "at least", 0.98, MIN_GOOD_BLOCKS,
     why="part of the print is covered, damaged, or from another print", source=JUDGEMENT,
     remedy="uncover the print, or print it again",
-    measure=lambda table: float(table.registration.blocks.good.mean()), of_one_frame="known",
+    measure=lambda table: float(table.registration.blocks.good.mean()), from_one_frame="yes",
     cause=Explanation("chart", chart_evidence), drawing="residuals",
 )  # fmt: skip
 
@@ -225,6 +225,6 @@ AGREEMENT = Figure(
     why="the colours of the patches differ from the chart",
     source=SIMULATED + ": at least 0.99. A chart with another order of patches has about 0",
     remedy="use the chart.json of this print, and print without colour management",
-    measure=lambda table: table.registration.agreement, of_one_frame="known",
+    measure=lambda table: table.registration.agreement, from_one_frame="yes",
     cause=Explanation("chart", chart_evidence), drawing="chart", lines=(Line(110, _agreement_row),),
 )  # fmt: skip

@@ -90,7 +90,7 @@ REPEATED_FILES = Figure(
     "repeated_files", "Frames with the same file as another frame", "light", "", "at most", 0.0, None,
     why="one photograph is used for several frames: changes between them, such as drift of the lamp, are not measured",
     source="two exposures never have the same bytes", remedy="correct the list of imported frames",
-    measure=_repeated_count, of_one_frame="bounded", where=_repeated_files_text,
+    measure=_repeated_count, from_one_frame="beyond", where=_repeated_files_text,
 )  # fmt: skip
 
 
@@ -167,7 +167,7 @@ LEAK_SHARE = Figure(
     why="every illuminant contains this light of projector and room, so that saturated colours become paler",
     source=JUDGEMENT + ". A projector with a contrast of 1500 : 1 has 0.07 %",
     remedy="darken the room, cover lamps and displays, or subtract this light (build-lut --subtract-dark)",
-    measure=_leak_share, of_one_frame="known", cause=Explanation("dark", dark_evidence), lines=(Line(210, _dark_row),),
+    measure=_leak_share, from_one_frame="yes", cause=Explanation("dark", dark_evidence), lines=(Line(210, _dark_row),),
 )  # fmt: skip
 
 DARK_DRIFT = Figure(
@@ -176,7 +176,7 @@ DARK_DRIFT = Figure(
     why="the light of the room changes; illuminants contain varying amounts of it, or a wrong amount is subtracted",
     source=JUDGEMENT + ": 0.2 % of white is 1 % of the light of a patch with a reflectance of 20 %",
     remedy="darken the room, and keep daylight out",
-    measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None, of_one_frame="bounded",
+    measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None, from_one_frame="beyond",
     cause=Explanation("dark", dark_evidence),
 )  # fmt: skip
 
@@ -247,7 +247,7 @@ LINEARITY = Figure(
     source=JUDGEMENT + "; defined in EMVA 1288",
     remedy="expose less, and switch the camera's highlight priority and noise reduction off; a series of exposures "
     "of the chart, given with --linearity, shows the range of the deviation",
-    measure=_linearity_deviation, of_one_frame="known", lines=(Line(185, _linearity_row),),
+    measure=_linearity_deviation, from_one_frame="yes", lines=(Line(185, _linearity_row),),
 )  # fmt: skip
 
 
@@ -436,7 +436,8 @@ CODE_MISFIT = Figure(
     "code_misfit", "Disagreement of all illuminants with their codes, for up to 24 illuminants", "light", "", "at most",
     1.0, None,
     why="at least one illuminant has wrong codes, but it cannot be identified",
-    source=SIMULATED + ": below 1 without faults. With more than 24 illuminants, each illuminant is judged separately",
+    source=SIMULATED + ": χ² relative to its limit for correct codes. "
+    "With more than 24 illuminants, each illuminant is judged separately",
     remedy="check that frames and illuminants belong together, and that the lamp was steady",
     before_session=False, measure=_code_value(lambda codes: codes.misfit), drawing="lights",
 )  # fmt: skip
@@ -563,5 +564,5 @@ GREY_TINT_DEG = Figure(
     "by codes",
     source=JUDGEMENT + ". Simulated prints have 1° to 2.5° with the printer's profile, and 4.5° to 8° without it",
     remedy="render by colour (the default), which uses the measured print; or have the chart printed with the "
-    "printer's profile (docs/printing.md)", measure=_largest_tint, of_one_frame="known", lines=(Line(270, _tint_row),),
+    "printer's profile (docs/printing.md)", measure=_largest_tint, from_one_frame="yes", lines=(Line(270, _tint_row),),
 )  # fmt: skip

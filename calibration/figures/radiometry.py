@@ -78,20 +78,20 @@ UNFIT_SHARE = Figure(
     "unfit_share", "Unfit patches", "radiometry", "share", "at most", 0.005, 0.1,
     why="generated images lack the colours of unfit patches", source=JUDGEMENT, remedy="",
     detail=_unfit_detail, measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1),
-    of_one_frame="bounded",
+    from_one_frame="beyond",
     cause=Explanation("unfit cells", unfit_evidence, follows=("block_deviation",)), drawing="errors",
     lines=(Line(290, _unfit_row),),
 )  # fmt: skip
 
 
 DOUBTFUL_SHARE = Figure(
-    "doubtful_share", "Patches in areas that deviate by 1 % from their codes' colours", "radiometry", "share",
+    "doubtful_share", "Patches in areas that deviate by 1 % from their predicted colours", "radiometry", "share",
     "at most", 0.0003, None,
     why="the print, or the light on it, differs in these areas; patches that deviate by 2 % are listed as unfit",
     source=SIMULATED + ": 0 on a clean flat print",
     remedy="clean the print, hang it flatter, and look for shadows on it",
     measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.is_known else None,
-    of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
+    from_one_frame="yes", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
 
 
@@ -103,7 +103,7 @@ ADDED_LIGHT = Figure(
     "10 % brighter by a tenth",
     remedy="turn the print or the projector until the print shows no reflection, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.is_known else None,
-    of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
+    from_one_frame="yes", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
 
 
@@ -125,12 +125,12 @@ def _most_blurred_text(table: TableMeasurements, accepted: float) -> str:
 
 
 FRAME_BLUR = Figure(
-    "frame_blur", "Additional light of neighbouring patches in the most blurred frame", "geometry", "share", "at most",
+    "frame_blur", "Light from neighbouring patches, added by blur in the worst frame", "geometry", "share", "at most",
     0.003, 0.012,
     why="a frame is more blurred than the frame registered first, because it is out of focus or shaken",
     source=SIMULATED + ": a blur of 0.9 px instead of 0.5 px adds 0.8 %, and causes errors of 1.2 % in patches",
     remedy="switch off autofocus and stabilisation, and keep the camera free from vibration",
-    measure=lambda table: table.added_bleed(_most_blurred(table)), of_one_frame="bounded",
+    measure=lambda table: table.added_bleed(_most_blurred(table)), from_one_frame="beyond",
     where=_most_blurred_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
     cause=Explanation("frame", blur_evidence), drawing="frames",
 )  # fmt: skip
@@ -145,12 +145,12 @@ def _largest_of_frames(value: _FrameValue) -> Callable[[TableMeasurements], floa
 
 
 FRAME_SCATTER = Figure(
-    "frame_scatter", "Scatter of patches about their codes' colours, worst frame", "radiometry", "share", "at most",
+    "frame_scatter", "Scatter of patches about their predicted colours, worst frame", "radiometry", "share", "at most",
     0.012, 0.03,
     why="the frame's samples do not have the colours of their patches",
     source=SIMULATED + ": up to 0.8 % without faults, 5 % with a blur of 1.5 px, and 50 % with another print",
     remedy="keep everything unchanged during the session",
-    measure=_largest_of_frames(lambda table, frame: frame.consistency.scatter), of_one_frame="bounded",
+    measure=_largest_of_frames(lambda table, frame: frame.consistency.scatter), from_one_frame="beyond",
     where=lambda table, accepted: f"in {max(table.frames, key=lambda frame: frame.consistency.scatter).record.file}",
     retake=_frames_beyond(lambda table, frame: frame.consistency.scatter),
     cause=Explanation("frame", scatter_evidence, follows=("block_deviation", "disturbed_cells")), drawing="frames",
@@ -163,7 +163,7 @@ BLOCK_DEVIATION = Figure(
     why="an object or a light changed the samples of an area in this frame, or in the frame registered first",
     source=SIMULATED + ": up to 0.4 % without faults",
     remedy="keep people out of the space between lamp, print and camera",
-    measure=_largest_of_frames(lambda table, frame: frame.consistency.block), of_one_frame="bounded",
+    measure=_largest_of_frames(lambda table, frame: frame.consistency.block), from_one_frame="beyond",
     retake=_frames_beyond(lambda table, frame: frame.consistency.block),
     cause=Explanation("block", block_evidence), drawing="frames",
 )  # fmt: skip
@@ -181,7 +181,7 @@ DISTURBED_CELLS = Figure(
     why="the samples of these patches are wrong under the illuminant, so that the patches are listed as unfit",
     source=SIMULATED + ": 0 without faults. Two adjacent patches count if they deviate by five standard deviations and "
     "have no hot photosites",
-    remedy="keep the space between lamp, print and camera free", measure=_disturbed_count, of_one_frame="bounded",
+    remedy="keep the space between lamp, print and camera free", measure=_disturbed_count, from_one_frame="beyond",
     cause=Explanation("few cells", disturbed_evidence, follows=("block_deviation",)), drawing="errors",
 )  # fmt: skip
 
@@ -204,7 +204,7 @@ REREGISTERED_FRAMES = Figure(
     "reregistered_frames", "Frames registered again", "geometry", "", "at most", 0, None,
     why="the chart or the camera moved between frames; samples were taken at the new positions", source=JUDGEMENT,
     remedy="fasten camera and print, and keep people away",
-    measure=lambda table: float(_reregistered_count(table)), of_one_frame="bounded",
+    measure=lambda table: float(_reregistered_count(table)), from_one_frame="beyond",
     cause=Explanation("movement", movement_evidence), drawing="frames", lines=(Line(120, _movement_row),),
 )  # fmt: skip
 
@@ -220,7 +220,7 @@ OTHER_CAMERA = Figure(
     "other_camera", "Frames of another camera", "radiometry", "", "at most", 0, 0.5,
     why="a LUT belongs to one camera: other bodies and models record other colours", source="by definition",
     remedy="take these frames again with the session's camera",
-    foremost=True, measure=lambda table: float(len(table.origins.other_camera)), of_one_frame="bounded",
+    foremost=True, measure=lambda table: float(len(table.origins.other_camera)), from_one_frame="beyond",
     where=lambda table, accepted: _foreign_frames_text(table.origins.other_camera),
     retake=lambda table, limit: [frame.record for frame in table.origins.other_camera],
     cause=Explanation("camera", camera_evidence),
@@ -230,7 +230,7 @@ OTHER_LENS = Figure(
     "other_lens", "Frames through another lens", "radiometry", "", "at most", 0, None,
     why="lenses differ in tint, blur and shading", source="by definition",
     remedy="take these frames again with the session's lens",
-    measure=lambda table: float(len(table.origins.other_lens)), of_one_frame="bounded",
+    measure=lambda table: float(len(table.origins.other_lens)), from_one_frame="beyond",
     where=lambda table, accepted: _foreign_frames_text(table.origins.other_lens),
     cause=Explanation("camera", camera_evidence),
 )  # fmt: skip
@@ -245,8 +245,8 @@ OTHER_EXPOSURE = Figure(
     "other_exposure", "Difference between the recorded exposure of a frame and that of most frames", "radiometry",
     "share", "at most", 0.01, 0.1,
     why="illuminants of equal brightness would differ in brightness, and the noise would change with the ISO speed",
-    source="larger than the rounding of times in files; a step of the shutter time is 26 %", remedy=_KEEP_EXPOSURE,
-    foremost=True, measure=lambda table: table.origins.exposure_difference, of_one_frame="bounded",
+    source="rounding of times in files is smaller; a step of the shutter time is 26 %", remedy=_KEEP_EXPOSURE,
+    foremost=True, measure=lambda table: table.origins.exposure_difference, from_one_frame="beyond",
     where=lambda table, accepted: _foreign_frames_text(table.origins.other_exposure), retake=_frames_of_other_exposure,
     cause=Explanation("brightness", light_evidence),
 )  # fmt: skip
@@ -255,7 +255,7 @@ OTHER_ISO = Figure(
     "other_iso", "Frames of another ISO speed", "radiometry", "", "at most", 0, None,
     why="these frames differ in noise and saturation; their exposure is judged separately",
     source="by definition", remedy=_KEEP_EXPOSURE,
-    measure=lambda table: float(len(table.origins.other_iso)), of_one_frame="bounded",
+    measure=lambda table: float(len(table.origins.other_iso)), from_one_frame="beyond",
     where=lambda table, accepted: _foreign_frames_text(table.origins.other_iso), cause=Explanation("iso", iso_evidence),
 )  # fmt: skip
 
@@ -278,5 +278,5 @@ BLACK_DRIFT_COUNTS = Figure(
     "black_drift_counts", "Drift of the black level", "radiometry", "counts", "at most", MAX_BLACK_DRIFT, 16.0,
     why="the sensor warmed up; the black level of each frame is subtracted, but its error affects dark patches",
     source=JUDGEMENT, remedy="let the camera run for some minutes before the session, and pause between frames",
-    measure=lambda table: table.black_drift, of_one_frame="bounded", drawing="frames", lines=(Line(140, _black_row),),
+    measure=lambda table: table.black_drift, from_one_frame="beyond", drawing="frames", lines=(Line(140, _black_row),),
 )  # fmt: skip

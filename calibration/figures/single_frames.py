@@ -79,7 +79,7 @@ UNIFORMITY: Final = Limit(
 )  # fmt: skip
 
 ROWS: Final = Limit(
-    "rows", "Strips of rows with unexpected content", "devices", "", "at most", 3, 3,
+    "rows", "Strips (quarters of rows of pixels) with unexpected content", "devices", "", "at most", 3, 3,
     why="the file was damaged during transfer, or an object covers part of the frame",
     source="an insect in front of the chart covers three strips",
     remedy="check the cable, the memory card and the frame",

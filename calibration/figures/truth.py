@@ -44,7 +44,7 @@ NOISE_MISFIT = Figure(
     why="photons and sensor do not explain the scatter: the camera smooths its raw files, or the lamp flickers",
     source=SIMULATED + ": 5 to 15 %. The curve is the model of EMVA 1288",
     remedy="switch the camera's noise reduction off",
-    measure=lambda table: float(table.sensor.transfer.misfit.max()), of_one_frame="known", drawing="noise",
+    measure=lambda table: float(table.sensor.transfer.misfit.max()), from_one_frame="yes", drawing="noise",
     lines=(Line(170, _noise_row), Line(200, _at_zero_row)),
 )  # fmt: skip
 
@@ -62,7 +62,7 @@ NOISY_SHARE = Figure(
     why="the patches are not uniform: dirt, a fold, or the edge of a neighbour",
     source=JUDGEMENT + ". A patch counts if its variance is more than 3.5 times the curve",
     remedy="clean the print, hang it flatter, and focus",
-    measure=lambda table: float(table.sensor.transfer.noisy.mean()), of_one_frame="known",
+    measure=lambda table: float(table.sensor.transfer.noisy.mean()), from_one_frame="yes",
     cause=Explanation("noisy cells", noisy_evidence), drawing="noise", lines=(Line(180, _transfer_row),),
 )  # fmt: skip
 
@@ -80,7 +80,7 @@ REFERENCES_USED = Figure(
     "references_used", "Used white references, worst frame", "truth", "share", "at least", 0.9, 0.3,
     why="flat field and ground truth are based on few positions", source=JUDGEMENT,
     remedy="uncover the print, bring all of it into the frame, and expose so that bare paper stays below saturation",
-    measure=_fraction_of_references, of_one_frame="bounded", where=_fewest_references_text, drawing="frames",
+    measure=_fraction_of_references, from_one_frame="beyond", where=_fewest_references_text, drawing="frames",
 )  # fmt: skip
 
 
@@ -98,7 +98,7 @@ REFERENCE_SPREAD = Figure(
     why="the flat field does not describe local changes or an unusual fall-off of light, which remain in the samples",
     source=SIMULATED + ": 0.3 %, from noise and from differences between photosites",
     remedy="clean or flatten the print, and look for shadows on it",
-    measure=lambda table: max(map(_frame_reference_spread, table.white_frames), default=None), of_one_frame="bounded",
+    measure=lambda table: max(map(_frame_reference_spread, table.white_frames), default=None), from_one_frame="beyond",
     cause=Explanation("references", reference_evidence), drawing="field",
 )  # fmt: skip
 
@@ -155,7 +155,7 @@ BRIGHTEST_SHARE = Figure(
     why="patches saturate at positions with more light",
     source=JUDGEMENT + ", with a margin of 10 % for uneven light", remedy="expose less",
     measure=lambda table: float(table.lights.white.max()) / table.sensor.white_level,
-    of_one_frame="bounded", where=_brightest_text, drawing="lights", lines=(Line(150, _saturation_row),),
+    from_one_frame="beyond", where=_brightest_text, drawing="lights", lines=(Line(150, _saturation_row),),
 )  # fmt: skip
 
 
@@ -174,5 +174,5 @@ DARKEST_COUNTS = Figure(
     source="calculated: the mean of 25 samples of 300 counts has an error of 1 %",
     remedy="expose longer",
     measure=lambda table: float(table.lights.white.max(axis=1).min()),
-    of_one_frame="bounded", where=_darkest_text, drawing="lights", lines=(Line(160, _darkest_row),),
+    from_one_frame="beyond", where=_darkest_text, drawing="lights", lines=(Line(160, _darkest_row),),
 )  # fmt: skip

@@ -1,7 +1,7 @@
 """Accumulate measurements of the frames of a session, and list the unfit patches.
 
 Frames are added in the order taken. Each state depends only on the frames added so far. Therefore an interrupted build
-resumes with identical results. C patches of S samples, in the order of colour indices.
+resumes with identical results. Arrays have C patches in the order of colour indices, with S samples each.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Accumulator:
     ) -> Accumulator:
         """Return the state before the first frame.
 
-        `saturation`: raw count of the first registered frame. `first_dark`: first dark frame, which is
+        `saturation`: count of saturation in the first registered frame. `first_dark`: first dark frame, which is
         subtracted from the frames before it.
         """
         count, samples, first = baseline.chart.colour_count, baseline.options.samples, baseline.first

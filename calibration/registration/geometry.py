@@ -9,7 +9,7 @@
   at the corner. The linear term is the chromatic difference of magnification, the cubic term the chromatic difference
   of distortion (W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 10).
 
-A measured displacement d is passed as `information`, its inverse covariance A, and `pull`, the product A d.
+Functions receive a measured displacement d as two arrays: its inverse covariance A (`information`) and A d (`pull`).
 Positions are half-size pixels with pixel centres at integers, x right, y down; points on the print are millimetres.
 """
 
@@ -50,8 +50,8 @@ ROUGHNESS_PX = 0.2
 # Prior standard deviation for the roughest accepted sheet: waves of 6 mm with a period of 150 mm.
 MAX_ROUGHNESS_PX = 2.0
 
-# Prior standard deviation of the displacement within the plane of the sheet, between its centre and its edge. Causes
-# are lens distortion beyond Brown's model, and paper expanded by humidity. Chosen by judgement.
+# Prior standard deviation of the in-plane displacement of the sheet's edge relative to its centre. Causes are lens
+# distortion beyond Brown's model, and paper expanded by humidity. Chosen by judgement.
 _IN_PLANE_PX = 2.0
 
 # Added to the diagonal of the normal matrix, px⁻². It makes the matrix regular at knots without measurements.
@@ -108,10 +108,10 @@ class Lens:
         return distorted * self.radius_px + self.centre_px
 
     def parallax(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the movement (N, 2) float64 of the images of points (N, 2) mm per unit of height above the plane.
+        """Return the relative movement (N, 2) float64 of the images of points (N, 2) mm that rise above the plane.
 
         Points move away from the foot of the perpendicular from the camera to the plane. The movement is proportional
-        to the distance from the foot; it is 1 at a distance of half the frame diagonal.
+        to the distance from the foot, and scaled to 1 at a distance of half the frame diagonal.
         Source: plane and parallax (R. Hartley and A. Zisserman, "Multiple View Geometry", 2nd edition, section 13.3).
         """
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
@@ -188,7 +188,7 @@ class Displacement:
     knot_mm: _Array  # (2,) distance of knots in x and y
     coefficients: _Array  # (rows, columns, 2) half-size px (dx, dy)
     lens: Lens | None = None  # maps heights to the frame; None: displacement without heights
-    # (rows, columns) heights, as the movement in half-size px where `Lens.parallax` is 1; None without `lens`
+    # (rows, columns) heights; unit: the height that moves a point by 1 half-size px where `Lens.parallax` is 1
     heights: _Array | None = None
 
     @classmethod
@@ -392,9 +392,9 @@ class LateralColour:
     def remeasured(self, positions_px: _Array, information: _Array, pull: _Array) -> LateralColour:
         """Return the most likely shifts after a comparison of blocks in each channel.
 
-        `positions_px`: (B, 2) float64, centres of the blocks. `information`: (3, B, 2, 2) float64 px⁻², for the
-        distance of each channel from its current position; 0 without a measurement. `pull`: (3, B, 2)
-        float64 px⁻¹.
+        `positions_px`: (B, 2) float64, centres of the blocks. `information`: (3, B, 2, 2) float64 px⁻²
+        and `pull`: (3, B, 2) float64 px⁻¹, of each channel's displacement from the position that these shifts predict;
+        0 without a measurement.
         """
         # A displacement common to all channels is no lateral colour and is eliminated from each block.
         total: _Array = information.sum(axis=0)

@@ -1,4 +1,4 @@
-"""Compare a rectified frame with the predicted print, in blocks or in tiles of a raster on the print.
+"""Compare a rectified frame with the predicted image of the print, in blocks or in tiles of a raster on the print.
 
 `find_blocks` locates blocks of patches by correlation. `compare_tiles` estimates the displacement of each tile with one
 step of the method of Lucas and Kanade, with local gain and offset, and Huber weights (B. D. Lucas and T. Kanade, "An
@@ -23,7 +23,7 @@ _Array = npt.NDArray[np.float64]
 
 ToPixels = Callable[[_Array], _Array]  # from points (N, 2) mm to positions (N, 2) px
 
-# Spacing of the nodes where the map is calculated exactly, in elements. Positions between nodes are interpolated.
+# Spacing of raster nodes whose positions in the frame are calculated exactly, in elements. Others are interpolated.
 _LATTICE_STRIDE = 8
 
 # Minimum correlation of frame and predicted print around a tile; other tiles are not used. Chosen by judgement.
@@ -137,11 +137,11 @@ class Raster:
             (value[inside], ((rows * width + columns)[inside], patch)), shape=(height * width, len(centres_mm))
         )
 
-    def near(self, cover: sparse.csr_array, per_cell: int) -> _Mask:
+    def near(self, cover: sparse.csr_array, cell_elements: int) -> _Mask:
         """Return the elements (H, W) bool on a patch, or at most a fifth of a patch width away from it."""
         # The margin outside these elements may contain rulers, text or pins.
         covered = (np.diff(cover.indptr) > 0).reshape(self.shape).astype(np.uint8)
-        reach = 2 * max(1, round(0.2 * per_cell)) + 1
+        reach = 2 * max(1, round(0.2 * cell_elements)) + 1
         return np.asarray(cv2.dilate(covered, np.ones((reach, reach), dtype=np.uint8))).astype(np.bool_)
 
     def outside_tags(self, tags: tuple[Tag, ...]) -> _Mask:
@@ -227,7 +227,7 @@ class TileComparison:
         return self.of(self.points_mm, information, pull - np.einsum("cnij,cnj->cni", information, shift), self.score)
 
     def weakened(self, times: float) -> TileComparison:
-        """Return the comparison with information divided by `times`, if `times` measurements have the same error."""
+        """Return the comparison with information divided by `times`, because `times` measurements share one error."""
         information, pull = self.of_channels
         return self.of(self.points_mm, information / times, pull / times, self.score)
 
@@ -243,11 +243,11 @@ def compare_tiles(
     cell_px: float,
     without_gradient: bool = False,
 ) -> TileComparison:
-    """Estimate the displacement of the frame from the map in tiles of size × size elements.
+    """Estimate how far the frame deviates from the mapped positions, in tiles of size × size elements.
 
     `expected`, `measured`: (H, W, 3) float32 counts, the predicted print and the rectified frame. `weight`: (H, W)
     float32, 1 for comparable elements, else 0. `window`: width of the window for gain and offset, in elements.
-    `to_pixels`: the map, from points (N, 2) mm to positions (N, 2) px. `without_gradient`: ignore even gradients.
+    `to_pixels`: the map, from points (N, 2) mm to positions (N, 2) px. `without_gradient`: ignore uniform gradients.
     """
     mean = _LocalMean(weight, window, without_gradient)
     agreeing = np.zeros(raster.shape, dtype=np.float32)
@@ -292,17 +292,17 @@ def compare_tiles(
 class _LocalMean:
     """Weighted mean over a window around each element."""
 
-    def __init__(self, weight: _Float, window: int, includes_gradient: bool) -> None:
+    def __init__(self, weight: _Float, window: int, without_gradient: bool) -> None:
         self._weight, self._window = weight, window
         # (H, W) valid share of each window
         self.share = np.maximum(box_mean(weight, window), np.float32(1e-3))
         rows, columns = (np.flatnonzero(weight.any(axis=axis)) for axis in (1, 0))
         self._inner: tuple[slice, slice] | None = None
-        if includes_gradient and min(len(rows), len(columns)) > window:
+        if without_gradient and min(len(rows), len(columns)) > window:
             self._inner = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
     def __call__(self, image: _Float) -> _Float:
-        """Return the mean (H, W). With `includes_gradient`, it contains even gradients, also at the border."""
+        """Return the mean (H, W). With `without_gradient`, it follows a uniform gradient up to the border."""
         if self._inner is None:
             return np.asarray(box_mean(image * self._weight, self._window) / self.share, dtype=np.float32)
         margin = self._window // 2 + 1

@@ -408,9 +408,9 @@ def page(
 
 
 def summary(table: TableMeasurements, group: Group | None = None) -> list[SummaryRow]:
-    """Return the summary rows of all figures or of a group; for one frame, only rows of figures that it can show."""
+    """Return the summary rows of all figures or of a group; a table of one frame lacks figures of several frames."""
     session = table.session
-    figures = [figure for figure in FIGURES if not table.is_of_one_frame or figure.of_one_frame != "unknown"]
+    figures = [figure for figure in FIGURES if not table.is_of_one_frame or figure.from_one_frame != "no"]
     lines = (line for figure in figures if group in (None, figure.group) for line in figure.lines)
     candidates = (line.row(table) for line in sorted(lines, key=lambda line: line.position))
     rows = [row for row in candidates if row is not None]

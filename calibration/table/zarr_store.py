@@ -238,7 +238,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
     """
     zarr = _zarr()
     if expect is not None and not HASH.fullmatch(expect):
-        raise InputError(f"{expect!r} is not the hash of a LUT; give the 64 digits in the line LUT of build-lut info")
+        raise InputError(f"{expect!r} is not the hash of a LUT; give the 64 digits after LUT in build-lut info")
     require_free(folder, "the LUT")
     metadata = read_metadata(url)
     attributes = table_attributes(metadata)

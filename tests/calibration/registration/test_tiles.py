@@ -99,8 +99,8 @@ def test_coverage_is_fractional_up_to_border() -> None:
     assert np.argwhere(second).tolist() == [[5, 10], [5, 11]]
     assert second[5].tolist()[10:] == [0.5, 1]
     # Margin of a fifth of a patch, at least one element.
-    for per_cell, reach in ((10, 2), (2, 1)):
-        near = raster.near(raster.coverage(np.array([[6.5, 3.5]]), np.array([[1.0, 1.0]])), per_cell)
+    for cell_elements, reach in ((10, 2), (2, 1)):
+        near = raster.near(raster.coverage(np.array([[6.5, 3.5]]), np.array([[1.0, 1.0]])), cell_elements)
         assert np.argwhere(near).tolist() == [
             [y, x] for y in range(max(0, 3 - reach), min(6, 4 + reach)) for x in range(6 - reach, 7 + reach)
         ]
