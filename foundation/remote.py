@@ -13,7 +13,7 @@ from foundation.secret_texts import masked
 if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
 
-# Classes of errors without an answer of the server, in the libraries of stores: botocore, aiohttp, requests, Python.
+# Classes of errors that are raised if a server does not answer: of botocore, aiohttp, requests and Python.
 _UNREACHABLE: Final = frozenset(
     {"HTTPClientError", "ClientConnectionError", "ConnectionError", "TimeoutError", "FSTimeoutError", "gaierror"}
 )

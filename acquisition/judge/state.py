@@ -7,10 +7,10 @@ with large residuals are lit differently from the rest. Without frames of the pr
 camera channels under white.
 
 **Model of the projector** (`ProjectorModel`). The model predicts the amounts from the codes. Each amount is 1 at code
-`TOP`. The logarithm of an amount is the sum of four terms: a power law of the code, a smooth deviation (tone curve),
-the overlap, and the lamp brightness. The overlap is additional light of mixed colours, for example from the white
-segment of a colour wheel ("brilliant colour"). All terms form one Gaussian state with a covariance. The response frames
-determine the state, and every accepted illuminant refines it.
+`TOP`, the code of the brightest grey. The logarithm of an amount is the sum of four terms: a power law of the code, a
+smooth deviation (tone curve), the overlap, and the lamp brightness. The overlap is additional light of mixed colours,
+for example from the white segment of a colour wheel ("brilliant colour"). All terms form one Gaussian state with a
+covariance. The response frames determine the state, and every accepted illuminant refines it.
 
 **State of a session** (`JudgeState`). The state is an immutable value, and `updated` returns the next one. Frames of an
 earlier run are also passed to `updated`, so a resumed run has the state of an uninterrupted one.
@@ -19,7 +19,7 @@ Sources: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Lea
 curves are Gaussian processes on nodes); extended Kalman filter in Joseph form. Overlaps are functions of the least of
 two and of three codes, as in `calibration.checks.projector_model`.
 
-Shapes: T tiles, S strips (quarters of rows), K entries of the state of the projector.
+Shapes: T tiles, S strips (quarters of rows of 2 × 2 blocks), K entries of the state of the projector.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _DIFFERENT_SHARE = 0.15
 # Prior standard deviation of the level of a primary at `TOP`, relative. A colour wheel contributes 0.5 %.
 _LEVEL_SIGMA = 0.01
 
-_OVERLAP_SIGMA = 0.25  # Prior standard deviation of overlaps, relative. White segments add up to half.
+_OVERLAP_SIGMA = 0.25  # Prior standard deviation of overlaps, relative. A white segment adds at most half of the light.
 
 # Relative error of the assumed form of an overlap, because the added light need not follow the least code.
 _OVERLAP_SHAPE = 0.15
@@ -75,7 +75,7 @@ _DARK_SIGMA = 3e-4
 # with a jitter of 0.5 ms change R/G by 0.24 % at 0.5 s.
 _PRIOR_CHROMA_SCATTER, _PRIOR_BRIGHTNESS_SCATTER = 0.004, 0.002
 
-_PRIOR_WEIGHT = 12.0  # Weight of this prior scatter, in number of amounts
+_PRIOR_WEIGHT = 12.0  # Weight of this prior scatter: it counts like so many measured amounts
 
 # Lower limits of the scatter, because tiles and tone curves are not more accurate.
 _MIN_CHROMA_SCATTER, _MIN_BRIGHTNESS_SCATTER = 0.0006, 0.0006

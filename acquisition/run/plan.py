@@ -183,7 +183,7 @@ def order_of(steps: Sequence[SessionStep], settings: LabSettings) -> str:
     return "shuffled by another seed, kept from the start of the session"
 
 
-# Space is required for this fraction of the frames to be repeated. Chosen by judgement.
+# A run reserves space to repeat this fraction of the frames. Chosen by judgement.
 RETAKEN_SHARE: Final = 0.1
 EXTRA_BYTES: Final = 150_000  # Space for the preview of a frame and its rows in the journal, bytes
 # Space that remains free, bytes, because other programs need it and full disks are slow.
@@ -193,7 +193,7 @@ BYTES_PER_PIXEL: Final = 1.5
 # Assumed size for cameras that may write 16 bits per photosite (Sony), and for the simulated cameras, bytes.
 PADDED_BYTES_PER_PIXEL: Final = 2.0
 UNKNOWN_BYTES: Final = 60_000_000  # Assumed size of a raw file of an unknown camera, bytes
-# Number of photosites in millions, and models with at most this number: as stated by the maker, plus 5 % for borders.
+# Millions of photosites, and models with at most this number. It is the maker's number plus 5 % for borders.
 # Only the numbers of the EOS 550D, 6D Mark II, 5D Mark II, 5DS and 1Ds Mark III were verified.
 _MODELS: Final = (
     (0.52, "CroP Test"),

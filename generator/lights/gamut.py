@@ -5,7 +5,8 @@ plane of r = R / (R + G + B) and b = B / (R + G + B), this cone is the convex hu
 suffice for any point in it (Carathéodory). `Gamut.match` selects, in this order:
 
 1. one illuminant, if it is within `TOLERANCE_DEG` of the target;
-2. two neighbours, if a mixture of them is within this angle; of several such pairs, the pair with the smallest angle;
+2. two neighbours, if a mixture of them is within this angle; of several such pairs, the pair with the smallest angle
+   between its illuminants;
 3. the three neighbours around the target, which match exactly.
 
 Neighbours are defined by the Delaunay triangulation of the rb-chromaticities. Neighbours have similar spectra, so their

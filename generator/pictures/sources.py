@@ -322,7 +322,7 @@ def _read(path: Path, data: bytes | None, most_pixels: int) -> _FileValues:
     with _utf8_file_name(path) as name:
         values = _read_named(path, name, data, most_pixels, chunks)
     has_profile = b"iCCP" in chunks and values.space is None
-    # OpenImageIO silently drops a profile that it cannot use. An empty profile is treated as damaged.
+    # OpenImageIO silently drops a profile that it cannot use. It is replaced by an empty one, which counts as damaged.
     profile_was_dropped = has_profile and values.icc is None and not values.is_adobe_rgb
     return replace(values, icc=b"") if profile_was_dropped else values
 
