@@ -13,7 +13,8 @@ import math
 import struct
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -364,30 +365,50 @@ class NativeImage:
     compression: str
 
 
-def read_native(path: Path) -> NativeImage:
-    """Return the full picture of an image file as stored; raises ValueError or CropError if it cannot be read."""
+@contextmanager
+def opened_image(path: Path) -> Generator[Any]:
+    """Open an image file with OpenImageIO at its full picture, with colours not multiplied by alpha; ValueError if not.
+
+    If its own name is not UTF-8, the file is opened through a link.
+    """
     import OpenImageIO as oiio  # noqa: N813
 
     request = oiio.ImageSpec()
     request.attribute("oiio:UnassociatedAlpha", 1)
-    stream = oiio.ImageInput.open(str(path), request)
-    if stream is None:
-        raise ValueError(oiio.geterror().replace(str(path), "the file"))
-    try:
-        form = stream.format_name()
-        if form == "tiff":
+    with ExitStack() as resources:
+        name = str(path)
+        try:
+            name.encode()
+        except UnicodeEncodeError:
+            suffix = path.suffix.encode("ascii", "ignore").decode()
+            link = Path(resources.enter_context(tempfile.TemporaryDirectory())) / f"picture{suffix}"
+            link.symlink_to(path.absolute())
+            name = str(link)
+        stream = oiio.ImageInput.open(name, request)
+        if stream is None:
+            raise ValueError(oiio.geterror().replace(name, str(path)))
+        resources.callback(stream.close)
+        if stream.format_name() == "tiff":
             stream.seek_subimage(full_picture_index(path), 0)
-        spec = stream.spec()
+        yield stream
+
+
+def alpha_channel(spec: Any) -> int | None:
+    """Return the index of the transparency channel of an OpenImageIO image, or None."""
+    # For a GIF file, OpenImageIO reports an index that is too high by one.
+    return min(spec.alpha_channel, spec.nchannels - 1) if spec.alpha_channel > 0 else None
+
+
+def read_native(path: Path) -> NativeImage:
+    """Return the full picture of an image file as stored; raises ValueError or CropError if it cannot be read."""
+    with opened_image(path) as stream:
+        spec, form = stream.spec(), stream.format_name()
         pixels = stream.read_image(spec.format)
         if pixels is None or stream.has_error:
             raise ValueError(stream.geterror().replace(str(path), "the file"))
-    finally:
-        stream.close()
     values = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
-    # For a GIF file, OpenImageIO reports an alpha channel that is too high by one.
-    alpha = min(spec.alpha_channel, spec.nchannels - 1) if spec.alpha_channel > 0 else None
     compression = spec.get_string_attribute("compression")
-    return NativeImage(values, alpha, spec.get_int_attribute("Orientation", 1), form, compression)
+    return NativeImage(values, alpha_channel(spec), spec.get_int_attribute("Orientation", 1), form, compression)
 
 
 def upright(picture: npt.NDArray[Any], orientation: int) -> npt.NDArray[Any]:

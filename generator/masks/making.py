@@ -501,7 +501,7 @@ class GivenMaskPlan:
             )
         plan = self if missing else replace(self, set_of_picture=tuple(map(indices.__getitem__, stems)))
         plan = replace(plan, images_each=images_each)
-        for position, picture in enumerate(pictures):
+        for position, picture in enumerate(pictures if _log.isEnabledFor(logging.INFO) else ()):
             _log.info(
                 "%s: masks %s", picture, ", ".join(file.name for file in plan.maker(position * images_each).files)
             )

@@ -27,7 +27,7 @@ import struct
 import tempfile
 import zlib
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
@@ -41,7 +41,7 @@ from foundation.files import file_sha256, sha256_of, stream_sha256
 from foundation.remote import filesystem, is_remote, remote_error
 from foundation.secret_texts import masked
 from generator import philox
-from generator.files import full_picture_index, upright
+from generator.files import SIGNATURE, alpha_channel, opened_image, upright
 from generator.pictures.conversion import (
     RgbSpace,
     from_adobe_rgb,
@@ -63,8 +63,6 @@ ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"  # Treatment of
 LINEAR: Final = "floating-point values, taken as linear light"
 TRANSPARENT: Final = "transparent, composited on white"
 PROFILE_UNUSED: Final = "colour profile not applied"
-
-_PNG: Final = b"\x89PNG\r\n\x1a\n"  # First bytes of a PNG file
 
 # Number of candidates for each crop after the first, chosen by judgement. With one candidate, two crops could be nearly
 # equal.
@@ -319,8 +317,7 @@ def _read(path: Path, data: bytes | None, most_pixels: int) -> _FileValues:
     if not path.is_file():
         raise FormatError(f"cannot read {path}: no such file; correct the path")
     chunks = _checked_png(path, data)
-    with _utf8_file_name(path) as name:
-        values = _read_named(path, name, data, most_pixels, chunks)
+    values = _read_values(path, data, most_pixels, chunks)
     has_profile = b"iCCP" in chunks and values.space is None
     # OpenImageIO silently drops a profile that it cannot use. It is replaced by an empty one, which counts as damaged.
     profile_was_dropped = has_profile and values.icc is None and not values.is_adobe_rgb
@@ -336,13 +333,13 @@ def _checked_png(path: Path, data: bytes | None) -> Mapping[bytes, bytes]:
     # libpng would print its own messages.
     try:
         with path.open("rb") as stream:
-            if stream.read(len(_PNG)) != _PNG:
+            if stream.read(len(SIGNATURE)) != SIGNATURE:
                 return {}
-            content = memoryview(_PNG + stream.read() if data is None else data)
+            content = memoryview(SIGNATURE + stream.read() if data is None else data)
     except OSError:
         # OpenImageIO reports the fault.
         return {}
-    position, colour_chunks = len(_PNG), dict[bytes, bytes]()
+    position, colour_chunks = len(SIGNATURE), dict[bytes, bytes]()
     while position + 8 <= len(content):
         size, chunk_type = struct.unpack(">I4s", content[position : position + 8])
         end = position + 12 + size
@@ -377,18 +374,19 @@ _RADIANCE_HEAD_BYTES: Final = 4096
 _RADIANCE_PRIMARIES: Final = re.compile(rb"^PRIMARIES=((?:\s+[-+.0-9eE]+){8})\s*$", re.MULTILINE)
 
 
-def _stated_space(path: Path, spec: Any, chunks: Mapping[bytes, bytes], icc: bytes | None) -> RgbSpace | None:
+def _stated_space(path: Path, stream: Any, chunks: Mapping[bytes, bytes], icc: bytes | None) -> RgbSpace | None:
     # The colour space that a file states by primaries and transfer function, or by a profile of linear light.
     if b"cICP" not in chunks and icc is not None:
         return linear_space(icc)
     if chunks:
         return _png_space(chunks)
+    spec = stream.spec()
     if (cicp := spec.getattribute("CICP")) is not None:
         return space_of_cicp(cicp)
     if (chromaticities := spec.getattribute("chromaticities")) is not None:
         return space_of_primaries("linear light by chromaticities", chromaticities)
     name = str(spec.get_string_attribute("oiio:ColorSpace"))
-    if path.suffix.lower() in (".hdr", ".rgbe"):
+    if stream.format_name() == "hdr":
         with path.open("rb") as stream:
             primaries = _RADIANCE_PRIMARIES.search(stream.read(_RADIANCE_HEAD_BYTES).partition(b"\n\n")[0])
         if primaries:
@@ -402,20 +400,21 @@ def _stated_space(path: Path, spec: Any, chunks: Mapping[bytes, bytes], icc: byt
 _KNOWN_SPACES: Final = ("srgb", "rec709", "lin_srgb", "lin_rec709", "linear", "scene_linear", "g22_rec709")
 
 
-def _read_named(
-    path: Path, name: str, data: bytes | None, most_pixels: int, chunks: Mapping[bytes, bytes]
-) -> _FileValues:
+@contextmanager
+def _opened(path: Path) -> Generator[Any]:
+    with ExitStack() as resources:
+        try:
+            stream = resources.enter_context(opened_image(path))
+        except ValueError as error:
+            reason = _reason(str(error))
+            raise FormatError(f"cannot read {path}: {reason}; use another picture, or convert it to PNG") from error
+        yield stream
+
+
+def _read_values(path: Path, data: bytes | None, most_pixels: int, chunks: Mapping[bytes, bytes]) -> _FileValues:
     import OpenImageIO as oiio  # noqa: N813
 
-    request = oiio.ImageSpec()
-    request.attribute("oiio:UnassociatedAlpha", 1)
-    stream = oiio.ImageInput.open(name, request)
-    if stream is None:
-        reason = _reason(oiio.geterror()).replace(name, str(path))
-        raise FormatError(f"cannot read {path}: {reason}; use another picture, or convert it to PNG")
-    try:
-        if stream.format_name() == "tiff":
-            stream.seek_subimage(full_picture_index(path), 0)
+    with _opened(path) as stream:
         spec = stream.spec()
         if spec.deep or spec.depth > 1 or spec.nchannels < 1:
             raise FormatError(f"cannot read {path}: it is a deep or 3D picture, expected a flat one; convert it to PNG")
@@ -429,7 +428,7 @@ def _read_named(
         icc_values = spec.getattribute("ICCProfile")
         icc = None if icc_values is None else np.asarray(icc_values, dtype=np.uint8).tobytes()
         try:
-            own_space = _stated_space(path, spec, chunks, icc)
+            own_space = _stated_space(path, stream, chunks, icc)
         except FormatError as error:
             raise FormatError(f"cannot read {path}: {error}") from error
         own_space = None if own_space is None or own_space.is_srgb else own_space
@@ -444,23 +443,19 @@ def _read_named(
             raise FormatError(
                 f"cannot read {path}: {_reason(stream.geterror())}; the file is damaged, use another copy"
             )
-        alpha_channel = spec.alpha_channel
         is_separate = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) or stream.format_name() not in _PREMULTIPLIED
         orientation = spec.get_int_attribute("Orientation", 1)
         is_uncalibrated = spec.get_int_attribute("Exif:ColorSpace", 0) == _UNCALIBRATED
-    finally:
-        stream.close()
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
-    # For GIF files, OpenImageIO reports an alpha channel that is too high by one.
-    alpha_channel = min(alpha_channel, spec.nchannels - 1)
+    transparency = alpha_channel(spec)
     alpha = None
-    if alpha_channel > 0:
+    if transparency is not None:
         largest = 1.0 if is_floating else float(np.iinfo(pixels.dtype).max)
-        alpha = np.clip(pixels[..., alpha_channel].astype(np.float64) / largest, 0.0, 1.0)
+        alpha = np.clip(pixels[..., transparency].astype(np.float64) / largest, 0.0, 1.0)
         # The fourth byte of a plain BMP file is unused, and most programs write 0.
         if alpha.min() == 1.0 or (not alpha.any() and stream.format_name() == "bmp"):
             alpha = None
-    colours = [channel for channel in range(spec.nchannels) if channel != alpha_channel]
+    colours = [channel for channel in range(spec.nchannels) if channel != transparency]
     if colours[:3] == [0, 1, 2]:
         values = pixels[..., :3]
     else:
@@ -477,21 +472,6 @@ def _read_named(
         is_associated = is_associated and not bool(np.any(values > 255.0 * alpha[..., None] + 1.0))
     is_adobe_rgb = is_uncalibrated and icc is None and own_space is None and _interoperability(path) == "R03"
     return _FileValues(values, alpha, is_associated, is_linear, orientation, icc, is_adobe_rgb, own_space)
-
-
-@contextmanager
-def _utf8_file_name(path: Path) -> Generator[str]:
-    """Yield a file name for OpenImageIO: a link to the file if its own name is not UTF-8."""
-    try:
-        str(path).encode()
-    except UnicodeEncodeError:
-        with tempfile.TemporaryDirectory() as folder:
-            suffix = path.suffix.encode("ascii", "ignore").decode()
-            link = Path(folder) / f"picture{suffix}"
-            link.symlink_to(path.absolute())
-            yield str(link)
-    else:
-        yield str(path)
 
 
 def _interoperability(path: Path) -> str:

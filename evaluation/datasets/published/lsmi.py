@@ -295,13 +295,16 @@ class _Camera:
             for image, lights in images:
                 if len(lights) not in counts:
                     continue
+                origin = f"{self.folder.path / 'meta.json'}, {place}"
                 try:
-                    yield self._scene(folder, place, image, lights, black, white)
+                    illuminants = tuple(self._parse_light(place, number, origin) for number in lights)
                 except FormatError:
                     # The authors' meta.json has NaN as the illuminant of some places.
                     if not self.options.partial:
                         raise
                     self.excluded.append(image)
+                    continue
+                yield self._scene(folder, place, image, illuminants, black, white)
         if missing and not self.options.partial:
             raise FormatError(
                 f"{self.folder.path} lacks the .tiff files of {len(missing)} of {len(places)} places "
@@ -309,10 +312,15 @@ class _Camera:
             )
 
     def _scene(
-        self, folder: Folder, place: str, image: str, lights: str, black: float, white: float | None
+        self,
+        folder: Folder,
+        place: str,
+        image: str,
+        illuminants: tuple[Light, ...],
+        black: float,
+        white: float | None,
     ) -> LsmiScene:
         origin = f"{self.folder.path / 'meta.json'}, {place}"
-        illuminants = tuple(self._parse_light(place, number, origin) for number in lights)
         name, path = f"{self.name}/{image}", str(folder.path / image)
         mask_path = str(folder.path / f"{place}_mask.png") if self.is_preprocessed else ""
         charts = () if self.is_preprocessed else self._chart_corners(place, origin)
