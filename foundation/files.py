@@ -140,8 +140,7 @@ def read_text(path: Path, remedy: str, description: str = "", is_table: bool = F
     """
     try:
         data = path.read_bytes()
-        is_utf_16 = is_table and data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        text = data.decode("utf-16" if is_utf_16 else "utf-8-sig")
+        text = data.decode(table_encoding(data) if is_table else "utf-8-sig")
     except OSError as error:
         raise reading_error(path, error, remedy, description) from error
     except UnicodeDecodeError as error:
@@ -149,9 +148,14 @@ def read_text(path: Path, remedy: str, description: str = "", is_table: bool = F
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
+def table_encoding(start: bytes) -> str:
+    """Return the encoding of a table from its first bytes: UTF-16 with a byte order mark, else UTF-8."""
+    return "utf-16" if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+
+
 def _not_utf_8(path: Path, error: UnicodeDecodeError, remedy: str) -> FormatError:
-    start, valid = error.object[:4], error.object[: error.start]
-    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and error.encoding == "utf-8":
+    valid = error.object[: error.start]
+    if table_encoding(error.object) == "utf-16" and error.encoding == "utf-8":
         problem = "text in UTF-16, expected UTF-8"
     elif b"\0" in error.object or error.encoding != "utf-8":
         return FormatError("binary data, expected text in UTF-8", about=path, remedy=remedy)

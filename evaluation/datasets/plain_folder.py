@@ -17,7 +17,6 @@ JPEG and 8-bit sRGB are refused, because their values are not proportional to li
 
 from __future__ import annotations
 
-import codecs
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -44,6 +43,7 @@ from evaluation.datasets.options import DataOptions, level_note
 from evaluation.scene import Image, SceneSet
 from foundation.compiled import ordered_map, processor_count
 from foundation.errors import FormatError, InputError, first_few
+from foundation.files import table_encoding
 from foundation.names import comparable
 
 COLUMNS = ("image", "r", "g", "b")  # required columns of the table
@@ -218,8 +218,7 @@ def _headers(folder: Folder, endings: tuple[str, ...] = (".csv",)) -> dict[str, 
         except OSError:
             continue
         # Bytes that are not UTF-8 are reported when the table is read.
-        is_utf_16 = start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        text = start.decode("utf-16" if is_utf_16 else "utf-8-sig", errors="ignore")
+        text = start.decode(table_encoding(start), errors="ignore")
         headers[name] = next((line for line in text.splitlines() if not line.startswith("#")), "")
     return headers
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -60,11 +60,26 @@ _CICP_PRIMARIES: Final[dict[int, tuple[str, tuple[float, ...]]]] = {
 }
 SRGB_PRIMARIES: Final = _CICP_PRIMARIES[1][1]
 
-# Exponents of transfer functions by code point of ITU-T H.273 (table 3); 0 is the curve of sRGB, -1 that of BT.709.
-_SRGB_CURVE, _BT709_CURVE = 0.0, -1.0
-_CICP_EXPONENTS: Final = {
-    **dict.fromkeys((1, 6, 14, 15), _BT709_CURVE),
-    **{4: 2.2, 5: 2.8, 8: 1.0, 13: _SRGB_CURVE},
+_Decode = Callable[[_Array], _Array]  # Transfer function from codes to light, both 0 … 1
+
+
+def _linear(codes: _Array) -> _Array:
+    return codes
+
+
+def _decode_bt709(codes: _Array) -> _Array:
+    # Inverse of the curve of ITU-R BT.709-6, item 1.2.
+    return np.where(codes < 0.081, codes / 4.5, ((np.maximum(codes, 0.081) + 0.099) / 1.099) ** (1 / 0.45))
+
+
+def _decode_power(exponent: float) -> _Decode:
+    return lambda codes: np.maximum(codes, 0) ** exponent
+
+
+# Transfer functions by code point of ITU-T H.273 (table 3).
+_CICP_DECODERS: Final[dict[int, _Decode]] = {
+    **dict.fromkeys((1, 6, 14, 15), _decode_bt709),
+    **{4: _decode_power(2.2), 5: _decode_power(2.8), 8: _linear, 13: decode_srgb},
 }
 _CICP_HDR: Final = {16: "PQ", 18: "HLG"}
 
@@ -88,39 +103,31 @@ class RgbSpace:
 
     - `name`: such as ``"Display P3 by cICP"``.
     - `matrix`: (3, 3) float64, from its linear light to linear sRGB.
-    - `exponent`: of the transfer function from codes to light; 0 for sRGB, -1 for BT.709.
+    - `decode`: transfer function from codes to light.
     """
 
     name: str
     matrix: _Array
-    exponent: float
+    decode: _Decode
 
     @property
     def is_srgb(self) -> bool:
         """Whether codes of this space are sRGB codes."""
-        return self.exponent == _SRGB_CURVE and bool(np.abs(self.matrix - np.eye(3)).max() < _SAME_MATRIX)
+        return self.decode is decode_srgb and bool(np.abs(self.matrix - np.eye(3)).max() < _SAME_MATRIX)
 
     def srgb_codes(self, values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
         """Return the sRGB codes (H, W, 3) uint8 of values (H, W, 3) in this space, 0 … 1."""
         out = np.empty(values.shape, np.uint8)
         for top in range(0, len(values), _BAND_ROWS):
             band = np.asarray(values[top : top + _BAND_ROWS], dtype=np.float64)
-            out[top : top + _BAND_ROWS] = srgb_codes(self._light(band) @ self.matrix.T)
+            out[top : top + _BAND_ROWS] = srgb_codes(self.decode(band) @ self.matrix.T)
         return out
 
-    def _light(self, values: _Array) -> _Array:
-        if self.exponent == _SRGB_CURVE:
-            return decode_srgb(values)
-        if self.exponent == _BT709_CURVE:
-            # Inverse of the curve of ITU-R BT.709-6, item 1.2.
-            return np.where(values < 0.081, values / 4.5, ((np.maximum(values, 0.081) + 0.099) / 1.099) ** (1 / 0.45))
-        return values if self.exponent == 1 else np.maximum(values, 0) ** self.exponent
 
-
-def space_of_primaries(name: str, chromaticities: Sequence[float], exponent: float = 1.0) -> RgbSpace:
+def space_of_primaries(name: str, chromaticities: Sequence[float], decode: _Decode = _linear) -> RgbSpace:
     """Return the space with the chromaticities x, y of red, green, blue and white (8 values).
 
-    `exponent` is that of the transfer function; 1 for linear light. Raises FormatError if the values define no space.
+    `decode` is the transfer function, by default of linear light. Raises FormatError if the values define no space.
     """
     given = np.asarray(chromaticities, dtype=np.float64).reshape(4, 2)
     matrix: _Array = np.full((3, 3), math.nan)
@@ -131,7 +138,7 @@ def space_of_primaries(name: str, chromaticities: Sequence[float], exponent: flo
             f"its chromaticities {' '.join(f'{value:g}' for value in given.ravel())} define no colour space; convert "
             "it to an sRGB PNG"
         )
-    return RgbSpace(name, matrix, exponent)
+    return RgbSpace(name, matrix, decode)
 
 
 def _xyz_of_rgb(chromaticities: _Array) -> _Array:
@@ -162,13 +169,13 @@ def space_of_cicp(codes: Sequence[int]) -> RgbSpace:
             f"it is an HDR picture ({_CICP_HDR[transfer]} by CICP {codes_text(codes)}), expected a picture for print; "
             "convert it to an sRGB PNG"
         )
-    if primaries not in _CICP_PRIMARIES or transfer not in _CICP_EXPONENTS or matrix or not is_full:
+    if primaries not in _CICP_PRIMARIES or transfer not in _CICP_DECODERS or matrix or not is_full:
         raise FormatError(
             f"its colour space CICP {codes_text(codes)} is not supported, expected RGB of full range in BT.709, "
             "BT.2020 or Display P3; convert it to an sRGB PNG"
         )
     name, chromaticities = _CICP_PRIMARIES[primaries]
-    return space_of_primaries(f"{name} by CICP", chromaticities, _CICP_EXPONENTS[transfer])
+    return space_of_primaries(f"{name} by CICP", chromaticities, _CICP_DECODERS[transfer])
 
 
 def codes_text(codes: Sequence[int]) -> str:
@@ -182,12 +189,12 @@ def space_of_gamma(file_gamma: float, chromaticities: Sequence[float] | None) ->
     `file_gamma`: exponent from light to codes; 0 without gAMA. `chromaticities`: x, y of white, red, green and blue.
     """
     is_srgb_curve = not file_gamma or abs(file_gamma / _SRGB_FILE_GAMMA - 1) <= _SRGB_GAMMA_TOLERANCE
-    exponent = _SRGB_CURVE if is_srgb_curve else 1 / file_gamma
+    decode = decode_srgb if is_srgb_curve else _decode_power(1 / file_gamma)
     chunks = ("gAMA" if file_gamma else "", "cHRM" if chromaticities else "")
     name = f"colours by {' and '.join(filter(None, chunks))}"
     if chromaticities is None:
-        return RgbSpace(name, np.eye(3), exponent)
-    return space_of_primaries(name, (*chromaticities[2:], *chromaticities[:2]), exponent)
+        return RgbSpace(name, np.eye(3), decode)
+    return space_of_primaries(name, (*chromaticities[2:], *chromaticities[:2]), decode)
 
 
 def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes) -> tuple[npt.NDArray[np.uint8], str]:
@@ -253,9 +260,9 @@ def _transform(icc: bytes) -> tuple[ImageCmsTransform | None, str, str, RgbSpace
     if np.abs(grey_codes - srgb_codes(greys / 255)[..., None]).max() <= _LINEAR_TOLERANCE:
         colorants, srgb_colorants = _colorants(profile), _colorants(srgb)
         if mode == "L":
-            space = RgbSpace(name, np.eye(3), 1.0)
+            space = RgbSpace(name, np.eye(3), _linear)
         elif colorants is not None and srgb_colorants is not None:
-            space = RgbSpace(name, _solve(srgb_colorants, colorants), 1.0)
+            space = RgbSpace(name, _solve(srgb_colorants, colorants), _linear)
     return transform, mode, f"{name}, converted to sRGB", space
 
 

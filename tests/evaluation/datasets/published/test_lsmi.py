@@ -126,8 +126,9 @@ def test_refuses_invalid_metadata(copy: Path, key: str, value: object, message: 
 def test_refuses_missing_files(copy: Path) -> None:
     camera = copy / "sony"
     (camera / "Place1" / "Place1_12.npy").unlink()
-    with pytest.raises(FormatError, match=r"Place1_12\.npy.*1_make_mixture_map\.py"):
-        open_scenes(copy)
+    for options in (DataOptions(), DataOptions(partial=True)):
+        with pytest.raises(FormatError, match=r"Place1_12\.npy.*1_make_mixture_map\.py"):
+            open_scenes(copy, options=options)
     shutil.rmtree(camera / "Place1")
     with pytest.raises(FormatError, match=r"1.*2.*Place1"):
         open_scenes(copy)
